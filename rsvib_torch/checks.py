@@ -1,0 +1,58 @@
+"""Checks of user values: every failure names the value and what was expected."""
+
+import math
+from numbers import Real
+
+__all__ = ["check_choice", "check_number"]
+
+
+def check_number(
+    name: str,
+    value: object,
+    *,
+    above: float = -math.inf,
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+) -> float:
+    """Return ``value`` as a finite float within its bounds.
+
+    Args:
+        name: What the value is called in the message.
+        value: The value to check; booleans are not numbers here.
+        above: The value must be larger than this.
+        at_least: The value must not be smaller than this.
+        at_most: The value must not be larger than this.
+
+    Returns:
+        The value as a float.
+
+    Raises:
+        TypeError: If the value is not a real number.
+        ValueError: If it is not finite or out of bounds.
+
+    Example:
+        >>> check_number("row_time", 2e-5, above=0.0)
+        2e-05
+    """
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name} must be a number, got {value!r} ({type(value).__name__})")
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(f"{name} must be finite, got {number}")
+    if number <= above:
+        raise ValueError(f"{name} must be larger than {above:g}, got {number:g}")
+    if number < at_least:
+        raise ValueError(f"{name} must be at least {at_least:g}, got {number:g}")
+    if number > at_most:
+        raise ValueError(f"{name} must be at most {at_most:g}, got {number:g}")
+    return number
+
+
+def check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:
+    """Raise a ``ValueError`` that lists the choices unless ``value`` is one of them.
+
+    Example:
+        >>> check_choice("method", "bands", ("bands",))
+    """
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}; got {value!r}")

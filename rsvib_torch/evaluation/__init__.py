@@ -1,0 +1,1 @@
+"""How good a result is: image quality, offset errors, test targets."""

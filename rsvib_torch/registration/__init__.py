@@ -1,0 +1,1 @@
+"""Offsets of row bands between frames."""

@@ -1,0 +1,109 @@
+"""B-spline interpolation on a unit grid: basis weights and the prefilter that turns samples into coefficients."""
+
+from functools import cache
+
+import torch
+from torch import Tensor
+
+__all__ = ["bspline_coefficients", "bspline_coefficients_adjoint", "bspline_weights", "mirrored_index"]
+
+_PRECISION = 1e-9
+
+
+def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
+    """Weights of the ``degree + 1`` B-splines that are not zero at a position (Cox-de Boor recursion).
+
+    The value at ``x = n + fraction`` is ``sum_k weights[k] c[n + first_tap(degree) + k]`` with coefficients ``c``
+    and ``first_tap(degree) = -(degree // 2)``. ``degree`` must be odd, 1 is linear interpolation.
+
+    Args:
+        fraction: Fractional positions in [0, 1], any shape S.
+        degree: Odd degree of the spline.
+
+    Returns:
+        Tensor of shape (S, degree + 1); its last axis sums to 1.
+
+    Example:
+        >>> bspline_weights(torch.tensor(0.25), 1).tolist()
+        [0.75, 0.25]
+    """
+    weights = [torch.ones_like(fraction)]
+    for order in range(1, degree + 1):
+        previous = weights
+        weights = [torch.zeros_like(fraction) for _ in range(order + 1)]
+        for tap, weight in enumerate(previous):
+            # knots of the spline of this order that starts `order - 1 - tap` before the cell of the position
+            rising = (fraction + (order - 1 - tap)) / order
+            weights[tap] = weights[tap] + (1 - rising) * weight
+            weights[tap + 1] = weights[tap + 1] + rising * weight
+    return torch.stack(weights, dim=-1)
+
+
+@cache
+def _prefilter_taps(degree: int) -> tuple[float, ...]:
+    """One half (taps 0, 1, 2 ...) of the symmetric inverse of the sampled B-spline."""
+    length = 1024
+    samples = bspline_weights(torch.zeros((), dtype=torch.float64), degree)[:-1]
+    kernel = torch.zeros(length, dtype=torch.float64)
+    half = len(samples) // 2
+    for tap, value in enumerate(samples.tolist()):
+        kernel[(tap - half) % length] = value
+    inverse = torch.fft.irfft(1.0 / torch.fft.rfft(kernel).real, n=length)
+    reach = int((inverse[: length // 2].abs() > _PRECISION).nonzero().max()) + 1
+    return tuple(inverse[:reach].tolist())
+
+
+def mirrored_index(start: int, stop: int, length: int, device: torch.device | None = None) -> Tensor:
+    """Indices ``start .. stop - 1`` folded into ``0 .. length - 1`` by mirroring about the end samples."""
+    index = torch.arange(start, stop, device=device)
+    if length == 1:
+        return torch.zeros_like(index)
+    index = index.remainder(2 * (length - 1))
+    return torch.where(index >= length, 2 * (length - 1) - index, index)
+
+
+def _filter_symmetric(samples: Tensor, taps: tuple[float, ...], dim: int) -> Tensor:
+    """Correlate along ``dim`` with a symmetric kernel, valid part only."""
+    reach = len(taps) - 1
+    length = samples.shape[dim] - 2 * reach
+    result = samples.narrow(dim, reach, length) * taps[0]
+    for tap in range(1, len(taps)):
+        result = result + taps[tap] * (
+            samples.narrow(dim, reach - tap, length) + samples.narrow(dim, reach + tap, length)
+        )
+    return result
+
+
+def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
+    """B-spline coefficients along ``dim`` that interpolate the samples, with mirrored ends.
+
+    The inverse of the sampled spline is applied as a finite symmetric filter, cut where it is below 1e-9.
+
+    Args:
+        samples: Tensor of samples.
+        degree: Odd degree of the spline; 1 returns the samples.
+        dim: Axis to filter.
+
+    Returns:
+        Coefficients of the same shape.
+    """
+    if degree == 1:
+        return samples
+    taps = _prefilter_taps(degree)
+    length, reach = samples.shape[dim], len(taps) - 1
+    index = mirrored_index(-reach, length + reach, length, samples.device)
+    return _filter_symmetric(samples.index_select(dim, index), taps, dim)
+
+
+def bspline_coefficients_adjoint(values: Tensor, degree: int, dim: int) -> Tensor:
+    """Adjoint (transpose) of ``bspline_coefficients``."""
+    if degree == 1:
+        return values
+    taps = _prefilter_taps(degree)
+    length, reach = values.shape[dim], len(taps) - 1
+    shape = list(values.shape)
+    shape[dim] = 2 * reach
+    edge = values.new_zeros(shape)
+    spread = _filter_symmetric(torch.cat([edge, values, edge], dim), taps, dim)
+    index = mirrored_index(-reach, length + reach, length, values.device)
+    return torch.zeros_like(values).index_add(dim, index, spread)

@@ -1,0 +1,24 @@
+#!/usr/bin/env bash
+# Makes .venv in the project's root with the tested versions of everything; does nothing when it is up to date.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+python=${PYTHON:-}
+if [ -z "$python" ]; then
+  for candidate in python3.11 python3 python3.12 python3.13; do
+    if command -v "$candidate" >/dev/null 2>&1 && "$candidate" -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then
+      python=$candidate
+      break
+    fi
+  done
+fi
+if [ -z "$python" ]; then
+  echo "setup: Python 3.11 or newer with venv is needed (Debian: apt-get install python3-venv)" >&2
+  exit 2
+fi
+stamp=$(cat pyproject.toml scripts/constraints.txt | cksum)
+if [ "$(cat .venv/installed 2>/dev/null)" != "$stamp" ] || ! .venv/bin/rsvib --version >/dev/null 2>&1; then
+  echo "setup: installing into .venv (a few minutes the first time)"
+  [ -x .venv/bin/python ] || "$python" -m venv .venv
+  .venv/bin/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt -e '.[test,benchmark]'
+  printf '%s' "$stamp" > .venv/installed
+fi
