@@ -73,7 +73,7 @@ class SensorTiming:
             )
         if exposure_rows > frame_rows:
             raise ValueError(
-                f"exposure_rows={exposure_rows:g} is longer than the frame period of frame_rows={frame_rows:g} row times"
+                f"exposure_rows={exposure_rows:g} exceeds the frame period of frame_rows={frame_rows:g} row times"
             )
         if isinstance(self.scan_axis, bool) or self.scan_axis not in _SCAN_AXES:
             raise ValueError(f"scan_axis must be -2 ('y') or -1 ('x'), got {self.scan_axis!r}")

@@ -229,4 +229,5 @@ def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
         torch.arange(1, math.floor(highest * interval) + 1, dtype=torch.float64) / interval
         for interval in (timing.frame_period, timing.exposure_time)
     ]
-    return torch.cat(found).unique(sorted=True)
+    frequencies: Tensor = torch.cat(found).unique(sorted=True)
+    return frequencies
