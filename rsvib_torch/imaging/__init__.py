@@ -1,1 +1,21 @@
 """How a scene becomes a frame: motion within an exposure, point spread functions, blur, simulation."""
+
+from rsvib_torch.imaging.blur import RowVaryingBlur, blur_rows, blur_rows_adjoint
+from rsvib_torch.imaging.coupling import rows_showing
+from rsvib_torch.imaging.noise import SensorNoise
+from rsvib_torch.imaging.psf import RowPSF, row_psf
+from rsvib_torch.imaging.simulate import simulate_frames
+from rsvib_torch.imaging.trajectory import exposure_nodes, exposure_trajectory
+
+__all__ = [
+    "RowPSF",
+    "RowVaryingBlur",
+    "SensorNoise",
+    "blur_rows",
+    "blur_rows_adjoint",
+    "exposure_nodes",
+    "exposure_trajectory",
+    "row_psf",
+    "rows_showing",
+    "simulate_frames",
+]

@@ -1,0 +1,131 @@
+"""The row-varying blur operator and its exact adjoint."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from rsvib_torch.imaging.psf import RowPSF
+from rsvib_torch.splines import bspline_coefficients, bspline_coefficients_adjoint, mirrored_index
+
+__all__ = ["RowVaryingBlur", "blur_rows", "blur_rows_adjoint"]
+
+
+def _gather_index(psf: RowPSF, tap: int, scene_size: tuple[int, int], width: int, origin: tuple[int, int]) -> Tensor:
+    """Flat scene index (..., R, width + KW - 1) of the pixels that kernel row ``tap`` of each row may touch."""
+    device = psf.weights.device
+    num_rows, kernel_width = psf.weights.shape[-3], psf.weights.shape[-1]
+    rows = origin[0] + torch.arange(num_rows, device=device) - psf.first_tap[..., 1] - tap
+    columns = origin[1] + torch.arange(-(kernel_width - 1), width, device=device) - psf.first_tap[..., 0, None]
+    folded = []
+    for index, length in ((rows, scene_size[0]), (columns, scene_size[1])):
+        reach = int(torch.stack([-index.amin(), index.amax() - (length - 1)]).amax().clamp(min=0))
+        folded.append(mirrored_index(-reach, length + reach, length, device)[index + reach])
+    return folded[0][..., None] * scene_size[1] + folded[1]
+
+
+def _frame_size(
+    psf: RowPSF, scene: tuple[int, int], frame_width: int | None, origin: tuple[int, int] | None
+) -> tuple[int, tuple[int, int]]:
+    width = scene[1] if frame_width is None else frame_width
+    if origin is None:
+        origin = ((scene[0] - psf.weights.shape[-3]) // 2, (scene[1] - width) // 2)
+    return width, origin
+
+
+def blur_rows(
+    scene: Tensor, psf: RowPSF, *, frame_width: int | None = None, origin: tuple[int, int] | None = None
+) -> Tensor:
+    """Form frames: every output row is the scene convolved with that row's kernel (Eq. 38).
+
+    The output row selects the kernel: convolve, then take the row. Where a kernel looks past the edge of the scene,
+    the scene is mirrored.
+
+    Args:
+        scene: (..., Hs, Ws); leading dimensions broadcast against those of the kernels.
+        psf: Kernels of R rows.
+        frame_width: Width W of the frame, by default that of the scene.
+        origin: Scene pixel (row, column) that frame pixel (0, 0) shows at rest; by default the frame is centred.
+
+    Returns:
+        Frames (..., R, W).
+    """
+    size = (scene.shape[-2], scene.shape[-1])
+    width, origin = _frame_size(psf, size, frame_width, origin)
+    coefficients = bspline_coefficients(bspline_coefficients(scene, psf.degree, -1), psf.degree, -2)
+    weights = psf.weights.to(scene.dtype)
+    lead = torch.broadcast_shapes(scene.shape[:-2], weights.shape[:-3])
+    flat = coefficients.flatten(-2).expand(*lead, -1)
+    num_rows, kernel_height, kernel_width = weights.shape[-3:]
+    frames = scene.new_zeros(*lead, num_rows, width)
+    for tap in range(kernel_height):
+        index = _gather_index(psf, tap, size, width, origin)
+        pixels = flat.gather(-1, index.flatten(-2).expand(*lead, -1)).unflatten(-1, index.shape[-2:])
+        for column in range(kernel_width):
+            part = pixels.narrow(-1, kernel_width - 1 - column, width)
+            frames = frames + weights[..., tap, column, None] * part
+    return frames
+
+
+def blur_rows_adjoint(
+    frames: Tensor, psf: RowPSF, scene_shape: tuple[int, ...], *, origin: tuple[int, int] | None = None
+) -> Tensor:
+    """Apply the exact adjoint of ``blur_rows``: ``<blur_rows(f), g> = <f, blur_rows_adjoint(g)>``.
+
+    Args:
+        frames: (..., R, W).
+        psf: Kernels of R rows.
+        scene_shape: Shape (..., Hs, Ws) of the scene; leading dimensions that were broadcast are summed.
+        origin: As in ``blur_rows``.
+
+    Returns:
+        Tensor of shape ``scene_shape``.
+    """
+    size = (scene_shape[-2], scene_shape[-1])
+    width, origin = _frame_size(psf, size, frames.shape[-1], origin)
+    weights = psf.weights.to(frames.dtype)
+    lead = torch.broadcast_shapes(frames.shape[:-2], weights.shape[:-3])
+    flat = frames.new_zeros(*lead, math.prod(size))
+    num_rows, kernel_height, kernel_width = weights.shape[-3:]
+    for tap in range(kernel_height):
+        pixels = frames.new_zeros(*lead, num_rows, width + kernel_width - 1)
+        for column in range(kernel_width):
+            pixels.narrow(-1, kernel_width - 1 - column, width).add_(weights[..., tap, column, None] * frames)
+        index = _gather_index(psf, tap, size, width, origin)
+        flat = flat.scatter_add(-1, index.flatten(-2).expand(*lead, -1), pixels.flatten(-2))
+    scene = flat.unflatten(-1, size).sum_to_size(scene_shape)
+    return bspline_coefficients_adjoint(bspline_coefficients_adjoint(scene, psf.degree, -2), psf.degree, -1)
+
+
+class RowVaryingBlur(nn.Module):
+    """``blur_rows`` with fixed kernels as a module, with its adjoint.
+
+    Args:
+        psf: Kernels of all rows (kept as buffers).
+        frame_width: Width of the frame, by default that of the scene.
+        origin: As in ``blur_rows``.
+    """
+
+    first_tap: Tensor
+    weights: Tensor
+
+    def __init__(self, psf: RowPSF, frame_width: int | None = None, origin: tuple[int, int] | None = None) -> None:
+        super().__init__()
+        self.register_buffer("first_tap", psf.first_tap)
+        self.register_buffer("weights", psf.weights)
+        self.degree = psf.degree
+        self.frame_width = frame_width
+        self.origin = origin
+
+    @property
+    def psf(self) -> RowPSF:
+        """The kernels."""
+        return RowPSF(self.first_tap, self.weights, self.degree)
+
+    def forward(self, scene: Tensor) -> Tensor:
+        """Form frames (..., R, W) from a scene (..., Hs, Ws)."""
+        return blur_rows(scene, self.psf, frame_width=self.frame_width, origin=self.origin)
+
+    def adjoint(self, frames: Tensor, scene_shape: tuple[int, ...]) -> Tensor:
+        """Apply the exact adjoint to frames (..., R, W)."""
+        return blur_rows_adjoint(frames, self.psf, scene_shape, origin=self.origin)

@@ -1,0 +1,130 @@
+"""Frames of a vibrating rolling-shutter camera from a still scene."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.imaging.noise import SensorNoise
+from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.orientation import frames_from_row_order, frames_to_row_order, vibration_to_row_order
+from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.spectral import extend_rows, fast_length
+from rsvib_torch.splines import bspline_coefficients, bspline_weights, mirrored_index
+from rsvib_torch.vibration import Vibration
+
+__all__ = ["simulate_frames"]
+
+_DEGREE = 9  # of the spline across rows: off by 2e-5 of the amplitude at a quarter cycle per pixel
+_MARGIN = 16  # px between what a frame sees and the edge of the scene
+_CHUNK = 64  # rows formed at a time
+
+
+def simulate_frames(
+    scene: Tensor,
+    timing: SensorTiming,
+    vibration: Vibration,
+    num_frames: int = 2,
+    *,
+    frame_size: tuple[int, int] | None = None,
+    noise: SensorNoise | None = None,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Simulate the frames that a vibrating rolling-shutter camera takes of a still scene (Eq. 9).
+
+    ``g(x, y) = 1/T_e int f[x - X(t), y - Y(t)] dt`` for every row over its own exposure. Displacement along rows is
+    a phase ramp on the row's Fourier transform, across rows a B-spline of degree 9, the integral a Gauss-Legendre
+    sum: accurate for any band-limited scene. The scene has to be larger than the frame, so that no pixel is made up.
+
+    Args:
+        scene: (H, W) or (C, H, W), floating point, full scale 1.
+        timing: The sensor.
+        vibration: One vibration (not a batch), in image axes.
+        num_frames: Frames to take.
+        frame_size: (height, width) of the frames, centred on the scene; by default the largest that never comes
+            nearer than 16 px to the edge of the scene.
+        noise: Noise of the sensor, by default none.
+        generator: Source of the noise.
+
+    Returns:
+        Frames (T, h, w) or (T, C, h, w) in the dtype and on the device of the scene. Frame pixel (r, c) shows, at
+        rest, scene pixel ``(r + (H - h) // 2, c + (W - w) // 2)``.
+
+    Raises:
+        TypeError: If the scene is not a floating-point tensor.
+        ValueError: If the scene is too small for the frame and motion, or is not finite.
+
+    Example:
+        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
+        >>> simulate_frames(torch.rand(128, 256), timing, Vibration(2.0, 50.0)).shape
+        torch.Size([2, 92, 220])
+    """
+    if not isinstance(scene, Tensor) or not scene.dtype.is_floating_point:
+        raise TypeError("scene must be a floating-point tensor whose full scale is 1")
+    if scene.ndim not in (2, 3) or not bool(torch.isfinite(scene).all()):
+        raise ValueError(f"scene must be a finite (H, W) or (C, H, W) tensor, got shape {tuple(scene.shape)}")
+    if num_frames < 1:
+        raise ValueError(f"num_frames must be at least 1, got {num_frames}")
+    if vibration.batch_shape:
+        raise ValueError("simulate_frames takes one vibration, not a batch")
+    motion = vibration_to_row_order(vibration, timing).to(scene.device)
+    if timing.scan_axis == -1 and frame_size is not None:
+        frame_size = (frame_size[1], frame_size[0])
+    scene = frames_to_row_order(scene, timing)
+    timing_in_rows = timing.in_row_order()
+
+    first = timing_in_rows.frame_starts(num_frames)
+    last = float(first[-1]) + timing.frame_period + timing.exposure_time
+    reach = motion.largest_displacement(float(first[0]), last).tolist()
+    margins = tuple(_MARGIN + math.ceil(r) for r in reversed(reach))
+    available = tuple(size - 2 * margin for size, margin in zip(scene.shape[-2:], margins, strict=True))
+    size = available if frame_size is None else frame_size
+    if min(size) < 1 or any(wanted > free for wanted, free in zip(size, available, strict=True)):
+        needed = tuple(max(s, 1) + 2 * m for s, m in zip(size, margins, strict=True))
+        raise ValueError(
+            f"scene of {tuple(scene.shape[-2:])} (rows, columns in read order) is too small: a frame of {tuple(size)} "
+            f"with this motion needs at least {needed}"
+        )
+    timing_in_rows.check_rows(size[0])
+    starts = timing_in_rows.row_starts(num_frames, size[0], scene.device)
+    frames = _form_rows(scene, starts, timing_in_rows, motion, size[1])
+    frames = frames_from_row_order(frames, timing)
+    return frames if noise is None else noise.apply(frames, generator)
+
+
+def _form_rows(scene: Tensor, starts: Tensor, timing: SensorTiming, motion: Vibration, width: int) -> Tensor:
+    """Form frames (T, ..., R, width) whose rows are exposed from ``starts`` (T, R) on, centred on the scene."""
+    height, scene_width = scene.shape[-2:]
+    num_rows = starts.shape[-1]
+    top, left = (height - num_rows) // 2, (scene_width - width) // 2
+    length = fast_length(scene_width + 2 * _MARGIN)
+    spectra = torch.fft.rfft(extend_rows(bspline_coefficients(scene, _DEGREE, -2), length))
+    frequencies = torch.fft.rfftfreq(length, dtype=torch.float64, device=scene.device)
+    fold = mirrored_index(-height, 2 * height, height, scene.device)
+    taps = torch.arange(_DEGREE + 1, device=scene.device) - _DEGREE // 2
+
+    rows = torch.arange(num_rows, device=scene.device)
+    formed = []
+    for begin in range(0, num_rows, _CHUNK):
+        chunk = rows[begin : begin + _CHUNK]
+        displacement, node_weights = exposure_trajectory(motion, starts[:, chunk], timing, "gauss")
+        cell = displacement[..., 1].floor()
+        spline = bspline_weights(displacement[..., 1] - cell, _DEGREE) * node_weights[:, None]
+        base = cell.amin(-1, keepdim=True)
+        place = (cell - base).long()[..., None] + torch.arange(_DEGREE + 1, device=scene.device)
+        count = int(place.amax()) + 1
+        spread = spline.new_zeros(*spline.shape[:-1], count).scatter(-1, place, spline)
+        ramps = torch.polar(
+            torch.ones((), dtype=torch.float64, device=scene.device).expand(*displacement.shape[:-1], len(frequencies)),
+            -2 * math.pi * displacement[..., 0, None] * frequencies,
+        ).to(spectra.dtype)
+        transfer = spread.transpose(-2, -1).to(spectra.dtype) @ ramps  # (T, rows, taps, frequencies)
+        source = top + chunk[:, None] - base.long() - taps[0] - torch.arange(count, device=scene.device)
+        source = fold[source + height]  # (T, rows, taps)
+        if scene.ndim == 3:
+            picked = spectra[:, source].movedim(0, 1)
+            row_spectra = (picked * transfer[:, None]).sum(-2)
+        else:
+            row_spectra = (spectra[source] * transfer).sum(-2)
+        formed.append(torch.fft.irfft(row_spectra, n=length)[..., left : left + width])
+    return torch.cat(formed, dim=-2).contiguous()

@@ -1,0 +1,42 @@
+"""Fourier transforms along rows of images that are not periodic."""
+
+import torch
+from scipy.fft import next_fast_len
+from torch import Tensor
+
+__all__ = ["extend_rows", "fast_length"]
+
+
+def fast_length(minimum: int) -> int:
+    """Smallest FFT length from ``minimum`` on without large prime factors (a prime length costs 4-5 times more)."""
+    return int(next_fast_len(minimum, real=True))
+
+
+def extend_rows(images: Tensor, length: int) -> Tensor:
+    """Extend rows at their right end to ``length`` so that they close smoothly into a period.
+
+    Both ends go on by odd reflection, which keeps value and slope, and fade to their mean: interpolation in the
+    Fourier domain then stays local, where a jump or kink would ring into the image.
+
+    Args:
+        images: (..., W).
+        length: Length of the period, at least W.
+
+    Returns:
+        Tensor (..., length) whose first W columns are the image.
+    """
+    width = images.shape[-1]
+    extra = length - width
+    if extra <= 0:
+        return images
+    reach = min(extra, width - 1)
+    steps = torch.arange(1, reach + 1, device=images.device)
+    taper = 0.5 + 0.5 * torch.cos(torch.pi * steps.to(images.dtype) / (reach + 1))
+    first, last = images[..., :1], images[..., -1:]
+    middle = 0.5 * (first + last)
+    after = (2 * last - images[..., width - 1 - steps] - middle) * taper
+    before = (2 * first - images[..., steps] - middle) * taper
+    gap = middle.expand(*images.shape[:-1], extra).clone()
+    gap[..., :reach] += after
+    gap[..., extra - reach :] += before.flip(-1)
+    return torch.cat([images, gap], dim=-1)
