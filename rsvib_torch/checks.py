@@ -3,7 +3,7 @@
 import math
 from numbers import Real
 
-__all__ = ["check_choice", "check_number"]
+__all__ = ["check_choice", "check_number", "check_whole_number"]
 
 
 def check_number(
@@ -56,3 +56,21 @@ def check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:
     """
     if value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}; got {value!r}")
+
+
+def check_whole_number(name: str, value: object, *, at_least: int) -> int:
+    """Return ``value`` as an int that is not smaller than ``at_least``.
+
+    Raises:
+        TypeError: If the value is not a whole number.
+        ValueError: If it is too small.
+
+    Example:
+        >>> check_whole_number("band_rows", 32, at_least=4)
+        32
+    """
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"{name} must be a whole number, got {value!r}")
+    if value < at_least:
+        raise ValueError(f"{name} must be at least {at_least}, got {value}")
+    return value

@@ -70,7 +70,7 @@ def blur_rows(
 def blur_rows_adjoint(
     frames: Tensor, psf: RowPSF, scene_shape: tuple[int, ...], *, origin: tuple[int, int] | None = None
 ) -> Tensor:
-    """Apply the exact adjoint of ``blur_rows``: ``<blur_rows(f), g> = <f, blur_rows_adjoint(g)>``.
+    """Apply the exact adjoint (transpose) of the operator that forms frames.
 
     Args:
         frames: (..., R, W).

@@ -1,0 +1,123 @@
+"""Offsets of all bands of all frame pairs of a stack."""
+
+import torch
+from kornia.filters import gaussian_blur2d
+from torch import Tensor
+from torch.nn import functional
+
+from rsvib_torch.checks import check_choice, check_whole_number
+from rsvib_torch.orientation import as_float_frames, frames_to_row_order, offsets_from_row_order
+from rsvib_torch.registration.coarse import coarse_offset
+from rsvib_torch.registration.curve import OffsetCurve
+from rsvib_torch.registration.methods import BAND_METHODS, BandTask, Registration, projection_height
+from rsvib_torch.registration.windows import band_tops
+from rsvib_torch.sensor import SensorTiming
+
+__all__ = ["register_bands", "register_rows"]
+
+_LOWEST_QUALITY = 0.1  # correlation below this is chance
+_SMOOTHING = 1.0  # px, sigma: lets the peak between pixels be found from whole-pixel lags, and damps noise
+_MEMORY = 2**28  # bytes of windows at a time
+
+
+def register_bands(
+    frames: Tensor,
+    timing: SensorTiming,
+    *,
+    method: Registration = "ncc",
+    band_rows: int = 32,
+    band_step: int = 16,
+    search: int = 16,
+    full_scale: float | None = None,
+) -> OffsetCurve:
+    """Measure the offset of every row band between consecutive frames (Sec. 2.2 of Liu et al. 2023).
+
+    A whole-frame offset is found first, so that image motion of hundreds of px is no obstacle; the search range
+    counts from there.
+
+    Args:
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) with T >= 2.
+        timing: The sensor.
+        method: ``"projection"`` (gray projection, the paper), ``"ncc"`` or ``"phase"``.
+        band_rows: Rows of a band (the paper's window size).
+        band_step: Rows from one band to the next (the paper's window interval).
+        search: Search range in px; a peak at its edge counts as failed.
+        full_scale: Count that means 1.0, for integer frames.
+
+    Returns:
+        The offset curve, axes (x, y) of the image, rows in read order.
+
+    Raises:
+        ValueError: If there are fewer than two frames, or the frames are too small for the bands and search range.
+    """
+    frames = frames_to_row_order(as_float_frames(frames, full_scale, minimum_frames=2), timing)
+    curve = register_rows(
+        frames, timing.in_row_order(), method=method, band_rows=band_rows, band_step=band_step, search=search
+    )
+    offsets = offsets_from_row_order(curve.offsets, timing)
+    heights = (curve.heights[1], curve.heights[0]) if timing.scan_axis == -1 else curve.heights
+    return OffsetCurve(curve.pairs, curve.rows, curve.times, curve.later_times, offsets, curve.quality, heights)
+
+
+def register_rows(
+    frames: Tensor,
+    timing: SensorTiming,
+    *,
+    method: Registration = "ncc",
+    band_rows: int = 32,
+    band_step: int = 16,
+    search: int = 16,
+) -> OffsetCurve:
+    """``register_bands`` behind the door: float frames in row order; arguments as there."""
+    check_choice("registration", method, tuple(BAND_METHODS))
+    for name, value, least in (("band_rows", band_rows, 4), ("band_step", band_step, 1), ("search", search, 2)):
+        check_whole_number(name, value, at_least=least)
+    batched = frames.ndim == 5
+    grey = frames if frames.ndim == 3 else frames.mean(-3)
+    grey = grey if batched else grey[None]
+    grey = grey.to(torch.float32) if grey.dtype in (torch.float16, torch.bfloat16) else grey
+    batch, num_frames, num_rows, width = grey.shape
+    timing.check_rows(num_rows)
+    needed = (band_rows + 2 * search, 4 * (search + 8))
+    if num_rows < needed[0] or width < needed[1]:
+        raise ValueError(
+            f"frames of {num_rows} x {width} px (rows in read order x px a row) are too small for bands of "
+            f"{band_rows} rows searched over {search} px: at least {needed[0]} x {needed[1]} are needed"
+        )
+    grey = _flatten_rows(gaussian_blur2d(grey, (7, 7), (_SMOOTHING, _SMOOTHING)))
+    tops = band_tops(num_rows, band_rows, band_step, grey.device)
+    first, second = grey[:, :-1].flatten(0, 1), grey[:, 1:].flatten(0, 1)
+    cost = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4
+    chunk = max(1, _MEMORY // cost)
+    offsets, quality = [], []
+    for begin in range(0, len(first), chunk):
+        pair = slice(begin, begin + chunk)
+        task = BandTask(first[pair], second[pair], coarse_offset(first[pair], second[pair]), tops, band_rows, search)
+        if task.width < search:
+            raise ValueError(f"frames {width} px wide overlap too little after their whole-frame offset")
+        measured, correlation = BAND_METHODS[method](task)
+        failed = ~(correlation > _LOWEST_QUALITY)
+        offsets.append(torch.where(failed[..., None], torch.nan, measured))
+        quality.append(torch.where(failed, 0.0, correlation))
+    shape = (batch, num_frames - 1) if batched else (num_frames - 1,)
+    rows = tops.to(torch.float64) + 0.5 * (band_rows - 1)
+    starts = timing.frame_starts(num_frames, grey.device)[:, None] + rows * timing.row_time
+    index = torch.arange(num_frames, device=grey.device)
+    height_y = projection_height(band_rows, search, num_rows) if method == "projection" else band_rows
+    return OffsetCurve(
+        pairs=torch.stack([index[:-1], index[1:]], dim=-1),
+        rows=rows,
+        times=starts[:-1],
+        later_times=starts[1:],
+        offsets=torch.cat(offsets).to(torch.float64).unflatten(0, shape),
+        quality=torch.cat(quality).to(torch.float64).unflatten(0, shape),
+        heights=(band_rows, height_y),
+    )
+
+
+def _flatten_rows(images: Tensor) -> Tensor:
+    """Take out the slow course of the row means: products of windows then keep their precision in float32."""
+    course = images.mean(-1)
+    size = min(65, (course.shape[-1] - 1) // 2 * 2 + 1)
+    padded = functional.pad(course, (size // 2, size // 2), mode="replicate")
+    return images - functional.avg_pool1d(padded, size, stride=1)[..., None]
