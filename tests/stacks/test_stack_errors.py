@@ -1,0 +1,238 @@
+"""Files that are no good: a clear message, and nothing half-written."""
+
+import os
+import re
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+import torch
+
+from rsvib_torch.stacks import check_stack_target, read_stack, read_stack_info, whole_file, whole_folder, write_stack
+
+FRAMES = torch.rand(3, 9, 7, generator=torch.Generator().manual_seed(1))
+
+
+def tiff_bytes(tmp_path, kind):
+    path = tmp_path / "good.tif"
+    stored = (FRAMES.numpy() * 4095).astype("uint16")
+    if kind == "ours":
+        write_stack(path, FRAMES, dtype="uint16", full_scale=4095)
+    elif kind == "pages":
+        with tifffile.TiffWriter(path, bigtiff=True) as tif:
+            for frame in stored:
+                tif.write(frame, metadata=None)
+    else:
+        tifffile.imwrite(path, stored, photometric="minisblack", compression="zlib", metadata=None)
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["ours", "pages", "packed"])
+def test_tiff_truncated_anywhere_is_refused(tmp_path, kind):
+    data = tiff_bytes(tmp_path, kind)
+    path = tmp_path / "cut.tif"
+    needed = len(data) if kind != "ours" else len(data) - 16  # the resolution of the last page comes last: no pixels
+    for length in range(needed):
+        path.write_bytes(data[:length])
+        with pytest.raises(ValueError, match=r"cut\.tif: not a readable TIFF stack: .") as caught:
+            read_stack(path, full_scale=4095)
+        assert "\n" not in str(caught.value)
+
+
+def test_tiff_header_that_promises_too_much_is_refused(tmp_path):
+    tifffile.imwrite(tmp_path / "huge.tif", np.zeros((8, 8), "uint8"), compression="zlib", metadata=None)
+    with tifffile.TiffFile(tmp_path / "huge.tif", mode="r+b") as tif:
+        for tag in ("ImageWidth", "ImageLength", "RowsPerStrip"):
+            tif.pages[0].tags[tag].overwrite(60_000, dtype="I")
+    for read in (read_stack, read_stack_info):
+        with pytest.raises(ValueError, match="promises 3600000000 bytes of pixels"):
+            read(tmp_path / "huge.tif")
+
+
+def test_tiff_pages_in_a_circle_are_refused(tmp_path):
+    data = bytearray(tiff_bytes(tmp_path, "packed"))
+    with tifffile.TiffFile(tmp_path / "good.tif") as tif:
+        first, last = tif.pages[0].offset, tif.pages[-1]
+        following = last.offset + 2 + 12 * len(last.tags)
+    data[following : following + 4] = first.to_bytes(4, "little")
+    (tmp_path / "circle.tif").write_bytes(data)
+    with pytest.raises(ValueError, match="runs in a circle"):
+        read_stack(tmp_path / "circle.tif", full_scale=4095)
+
+
+def test_tiff_kinds_that_are_no_stack(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "sizes.tif") as tif:
+        tif.write(np.zeros((9, 7), "uint8"), metadata=None)
+        tif.write(np.zeros((5, 7), "uint8"), metadata=None)
+    tifffile.imwrite(tmp_path / "white.tif", np.zeros((9, 7), "uint8"), photometric="miniswhite")
+    tifffile.imwrite(tmp_path / "bits.tif", np.zeros((9, 8), bool), photometric="minisblack")
+    tifffile.imwrite(
+        tmp_path / "axes.tif", np.zeros((2, 5, 9, 7), "uint8"), photometric="minisblack", metadata={"axes": "TZYX"}
+    )
+    for name, message in {
+        "sizes": r"frames of different size or kind: \(9, 7\) uint8, \(5, 7\) uint8",
+        "white": "MINISWHITE",
+        "bits": "pixels are bool",
+        "axes": "one axis of frames",
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            read_stack(tmp_path / f"{name}.tif")
+
+
+def test_png_damage_is_refused(tmp_path):
+    write_stack(tmp_path / "good.png", FRAMES[:1], dtype="uint8")
+    data = (tmp_path / "good.png").read_bytes()
+    path = tmp_path / "bad.png"
+    for length in range(len(data)):
+        path.write_bytes(data[:length])
+        with pytest.raises(ValueError, match=r"bad\.png: (truncated|not a) PNG file"):
+            read_stack(path)
+    for place in range(8, len(data), 5):
+        path.write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
+        with pytest.raises(ValueError, match=r"bad\.png"):
+            read_stack(path)
+
+
+def test_png_folders_that_are_no_stack(tmp_path):
+    with pytest.raises(ValueError, match="holds no PNG files"):
+        read_stack(tmp_path)
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 5), np.uint8))
+    cv2.imwrite(str(tmp_path / "b.png"), np.zeros((4, 6), np.uint8))
+    with pytest.raises(
+        ValueError, match=r"different size or kind: a.png is \(4, 5\) uint8 .*, b.png is \(4, 6\) uint8"
+    ):
+        read_stack(tmp_path)
+
+
+def test_npy_damage_is_refused(tmp_path):
+    path = tmp_path / "frames.npy"
+    np.save(path, np.zeros((3, 9, 7), np.uint8))
+    data = path.read_bytes()
+    for length in range(len(data)):
+        path.write_bytes(data[:length])
+        with pytest.raises(ValueError, match=r"frames\.npy: (truncated|not a readable \.npy)"):
+            read_stack(path)
+    path.write_bytes(data.replace(b"(3, 9, 7)", b"(3, 9" + b"9" * 3 + b")"))
+    with pytest.raises(ValueError, match="truncated: the header promises"):
+        read_stack_info(path)
+    np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(ValueError, match="pixels are object"):
+        read_stack(path)
+    for shape, message in (((5,), "expected"), ((2, 9, 7, 3), "channels go second"), ((0, 9, 7), "expected")):
+        np.save(path, np.zeros(shape, np.uint8))
+        with pytest.raises(ValueError, match=message):
+            read_stack(path)
+
+
+def test_videos_that_cannot_be_read(tmp_path, capfd):
+    for name, data in (("noise.avi", os.urandom(5000)), ("empty.mp4", b""), ("head.mp4", b"\0\0\0\x20ftypisom" * 9)):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(ValueError, match=rf"{re.escape(name)}: not a readable video"):
+            read_stack(tmp_path / name)
+    writer = cv2.VideoWriter(str(tmp_path / "cut.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 24, (64, 48))
+    for _ in range(20):
+        writer.write(np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8))
+    writer.release()
+    data = (tmp_path / "cut.avi").read_bytes()
+    (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
+    with pytest.raises(ValueError, match=r"cut\.avi: truncated: \d+ of 20 frames"):
+        read_stack(tmp_path / "cut.avi")
+    assert capfd.readouterr().err == ""
+
+
+def test_full_scale_has_to_be_known_and_to_fit(tmp_path):
+    path = tmp_path / "frames.npy"
+    np.save(path, np.full((2, 4, 4), 4096, np.uint16))
+    with pytest.raises(ValueError, match="uint16 frames do not say their full scale; state full_scale"):
+        read_stack(path)
+    with pytest.raises(ValueError, match="counts reach 4096, beyond full_scale=4095"):
+        read_stack(path, full_scale=4095)
+    with pytest.raises(ValueError, match=r"full_scale=70000 is more than uint16 can hold \(65535\)"):
+        read_stack(path, full_scale=70000)
+    for bad in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="full_scale must be"):
+            read_stack(path, full_scale=bad)
+    with pytest.raises(ValueError, match="full_scale must be stated to write uint16"):
+        write_stack(tmp_path / "new.tif", FRAMES, dtype="uint16")
+    with pytest.raises(ValueError, match="full_scale=300 is more than uint8"):
+        write_stack(tmp_path / "new.tif", FRAMES, dtype="uint8", full_scale=300)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["frames.npy"]
+
+
+def test_names_that_are_no_stack(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"gone\.tif does not exist"):
+        read_stack(tmp_path / "gone.tif")
+    (tmp_path / "frames.xyz").write_text("")
+    with pytest.raises(ValueError, match=r"unknown file ending '\.xyz'; expected \.tif"):
+        read_stack(tmp_path / "frames.xyz")
+    with pytest.raises(ValueError, match=r"unknown file ending '\.jpg'"):
+        write_stack(tmp_path / "frames.jpg", FRAMES)
+    with pytest.raises(ValueError, match="videos are only read"):
+        write_stack(tmp_path / "frames.mp4", FRAMES, dtype="uint8")
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "options", "message"),
+    [
+        ("a.png", FRAMES, {"dtype": "uint8"}, "a PNG file holds one frame, got 3"),
+        ("a.png", FRAMES[:1], {}, "png files hold uint8, uint16; got dtype float32"),
+        ("a", FRAMES[:, None].expand(3, 5, 9, 7), {"dtype": "uint8"}, "1, 3 or 4 channels, got 5"),
+        ("a.tif", FRAMES[0], {}, r"frames must have shape .* got \(9, 7\)"),
+        ("a.tif", FRAMES / 0, {"dtype": "uint8"}, "NaN or infinite pixels, which uint8 cannot"),
+        ("a.tif", FRAMES, {"dtype": "complex64"}, "got dtype complex64"),
+    ],
+)
+def test_frames_that_the_file_cannot_hold(tmp_path, name, frames, options, message):
+    with pytest.raises(ValueError, match=message):
+        write_stack(tmp_path / name, frames, **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_integer_tensors_are_refused_on_writing(tmp_path):
+    with pytest.raises(TypeError, match=r"floating-point tensor .* got torch\.uint8"):
+        write_stack(tmp_path / "a.tif", torch.zeros(1, 4, 4, dtype=torch.uint8))
+
+
+def test_png_folder_with_other_frames_is_not_mixed(tmp_path):
+    write_stack(tmp_path / "frames", FRAMES, dtype="uint8")
+    write_stack(tmp_path / "frames", 1 - FRAMES, dtype="uint8")  # the same names again
+    torch.testing.assert_close(read_stack(tmp_path / "frames"), 1 - FRAMES, atol=0.002, rtol=0)
+    with pytest.raises(ValueError, match=r"holds other PNG files, e\.g\. frame_0002\.png"):
+        write_stack(tmp_path / "frames", FRAMES[:2], dtype="uint8")
+    assert len(list((tmp_path / "frames").iterdir())) == 3
+
+
+def test_failure_while_writing_leaves_the_old_file_and_nothing_else(tmp_path):
+    (tmp_path / "a.txt").write_text("old")
+    with pytest.raises(ZeroDivisionError), whole_file(tmp_path / "a.txt") as part:
+        part.write_text("half" * (1 // part.write_text("")))
+    with pytest.raises(ZeroDivisionError), whole_folder(tmp_path / "new" / "deep") as folder:
+        (folder / "b.txt").write_text("half" * (1 // (folder / "a.txt").write_text("")))
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+    assert (tmp_path / "a.txt").read_text() == "old"
+    with whole_folder(tmp_path / "new" / "deep") as folder:
+        (folder / "b.txt").write_text("whole")
+    assert (tmp_path / "new" / "deep" / "b.txt").read_text() == "whole"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.txt", "new"]
+
+
+def test_places_that_cannot_be_written(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder.tif").mkdir()
+    for path, message in {
+        tmp_path / "none" / "a.tif": "none does not exist",
+        tmp_path / "file" / "a.tif": "file does not exist",
+        tmp_path / "folder.tif": "it is a folder",
+        tmp_path / "file": "a file of that name is there",
+    }.items():
+        with pytest.raises(OSError, match=message):
+            write_stack(path, FRAMES, dtype="uint8")
+
+    def refuse(*args, **kwargs):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("tempfile.mkdtemp", refuse)
+    for path in (tmp_path / "a.tif", tmp_path / "folder"):
+        with pytest.raises(OSError, match=r"cannot write .* is not writable \(Permission denied\)"):
+            check_stack_target(path, (3, 9, 7), dtype="uint8")
