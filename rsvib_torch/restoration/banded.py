@@ -1,0 +1,172 @@
+"""Row-banded restoration: every row deconvolved within a slab of rows that is given one PSF (Sec. 3.2)."""
+
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
+from rsvib_torch.restoration.motion import FrameMotion
+from rsvib_torch.restoration.noise import estimate_noise, gradient_energy
+from rsvib_torch.restoration.rows import continue_rows
+from rsvib_torch.spectral import fast_length
+from rsvib_torch.splines import bspline_weights, mirrored_index
+
+__all__ = ["restore_banded"]
+
+_AUTOMATIC_RANGE = (5e-3, 10.0)  # below, the slab's own approximation is amplified more than noise would be
+_MARGIN = 16  # px beyond what the motion shows, more than the reach of a deconvolution filter
+_ALIGN_ROWS = 256  # rows moved at a time
+_CHUNK_ELEMENTS = {"cpu": 1 << 19, "cuda": 1 << 26}  # of a filter bank: stays in cache, or fills a GPU
+
+
+def _turn(frequencies: Tensor, places: Tensor) -> Tensor:
+    """Phase ramps exp(-2 pi i frequency place), shape of places + shape of frequencies."""
+    angle = -2 * math.pi * places[..., None] * frequencies
+    return torch.polar(torch.ones_like(angle), angle)
+
+
+def _spline_transfer(places: Tensor, frequencies: Tensor, degree: int) -> Tensor:
+    """Transfer functions of shifting by ``places`` px with a B-spline of ``degree``."""
+    cell = places.detach().floor()
+    weights = bspline_weights(places - cell, degree)
+    taps = torch.arange(degree + 1, dtype=places.dtype, device=places.device) - degree // 2
+    samples = bspline_weights(torch.zeros((), dtype=places.dtype, device=places.device), degree).to(torch.complex128)
+    ramps = _turn(frequencies, taps)
+    at_rest = (samples @ ramps).real if degree > 1 else torch.ones_like(frequencies)
+    return _turn(frequencies, cell) * ((weights.to(torch.complex128) @ ramps) / at_rest)
+
+
+def _linear_pair(x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    return _spline_transfer(x, u, 1), _spline_transfer(y, v, 1)
+
+
+def _cubic_pair(x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    return _turn(u, x), _spline_transfer(y, v, 3)
+
+
+_TRANSFERS: dict[str, tuple[Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]], Quadrature]] = {
+    "linear": (_linear_pair, "midpoint"),
+    "cubic": (_cubic_pair, "gauss"),
+}
+
+
+def _noise_to_signal(frames: Tensor, value: float | Literal["auto"]) -> Tensor:
+    """Weight of the gradient prior of each stack, (B,)."""
+    if value != "auto":
+        number = check_number("noise_to_signal", value, at_least=0.0)
+        return torch.full((frames.shape[0],), number, dtype=frames.dtype, device=frames.device)
+    variance = estimate_noise(frames).square().flatten(1).mean(1)
+    gradients = gradient_energy(frames).flatten(1).mean(1) - 2.0 * variance
+    tiny = torch.finfo(frames.dtype).tiny
+    return (variance / gradients.clamp(min=tiny)).clamp(*_AUTOMATIC_RANGE)
+
+
+def _filters(
+    displacement: Tensor, node_weights: Tensor, grid: tuple[Tensor, Tensor], weight: Tensor, interpolation: str
+) -> Tensor:
+    """Wiener filters in (u, slab lag) of slabs whose scene moved by ``displacement`` (n, N, 2), shape (n, U, V)."""
+    u, v = grid
+    along, across = _TRANSFERS[interpolation][0](displacement[..., 0], displacement[..., 1], u, v)
+    kind = torch.complex64 if weight.dtype == torch.float32 else torch.complex128
+    along = (along * node_weights[:, None]).transpose(-2, -1).to(kind)
+    transfer = along @ across.to(kind)
+    prior = (4 * torch.sin(math.pi * u).square())[:, None] + 4 * torch.sin(math.pi * v).square()
+    power = torch.view_as_real(transfer).square().sum(-1)
+    floor = torch.finfo(weight.dtype).tiny
+    response = transfer.conj() / (power + weight[:, None, None] * prior.to(weight.dtype)).clamp(min=floor)
+    filters: Tensor = torch.fft.ifft(response)
+    return filters
+
+
+def _aligned_spectra(frames: Tensor, motion: FrameMotion, u: Tensor, length: int) -> Tensor:
+    """Fourier transform of the rows, each moved back by its own mean displacement along it, (B T, H, C, U)."""
+    B, T, _, H, _ = frames.shape
+    starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device))
+    starts = starts.expand(B, T, H)
+    mean = motion.vibration.mean_displacement(starts, motion.timing.exposure_time)[..., 0] - motion.shift[..., 0, None]
+    spectra = torch.fft.rfft(continue_rows(frames, length)).transpose(-3, -2).flatten(0, 2)
+    moved = [
+        rows * _turn(u, -places).to(rows.dtype)[:, None]
+        for rows, places in zip(spectra.split(_ALIGN_ROWS), mean.flatten().split(_ALIGN_ROWS), strict=True)
+    ]
+    aligned: Tensor = torch.cat(moved).unflatten(0, (B * T, H))
+    return aligned
+
+
+def restore_banded(
+    frames: Tensor,
+    motion: FrameMotion,
+    *,
+    half_rows: int = 16,
+    stride: int = 1,
+    interpolation: Literal["linear", "cubic"] = "cubic",
+    noise_to_signal: float | Literal["auto"] = "auto",
+    chunk_rows: int | None = None,
+) -> Tensor:
+    """Restore frames slab by slab (Sec. 3.2 of Liu et al. 2023).
+
+    Scene row k is shown by frame row r(k). The slab of rows r(k) - l ... r(k) + l is taken to have the PSF of that
+    row all over, deconvolved by the Wiener filter ``H* / (|H|^2 + w (4 sin^2 pi u + 4 sin^2 pi v))`` and only its
+    central rows are kept. The whole pixels of the displacement move the slab, so that it need not be tall; the prior
+    is shaped like image gradients, so that the mean is conserved. Rows are transformed once per frame, and the filter
+    is evaluated at the central row only. Rows are extended smoothly at their ends and mirrored above and below.
+
+    Args:
+        frames: (B, T, C, H, W) in row order.
+        motion: Motion of the frames.
+        half_rows: l.
+        stride: Central rows kept per slab.
+        interpolation: How the PSF displaces the scene: ``"linear"`` is the paper's (Eqs. 26-39, N_e samples), which
+            takes its own blur for the camera's; ``"cubic"`` is a cubic B-spline across rows, exact along them.
+        noise_to_signal: w, the variance of the noise over that of the scene's gradients; ``"auto"`` estimates it.
+        chunk_rows: Slabs filtered at a time; bounds the memory, does not change the result.
+
+    Returns:
+        Restored frames of the same shape.
+    """
+    half_rows = check_whole_number("half_rows", half_rows, at_least=1)
+    stride = check_whole_number("stride", stride, at_least=1)
+    check_choice("interpolation", interpolation, tuple(_TRANSFERS))
+    weights = _noise_to_signal(frames, noise_to_signal)
+    B, T, C, H, W = frames.shape
+    length = fast_length(W + 4 * (_MARGIN + motion.reach(H)))
+    size = 2 * half_rows + 1
+    u = torch.fft.rfftfreq(length, dtype=torch.float64, device=frames.device)
+    v = torch.fft.fftfreq(size, dtype=torch.float64, device=frames.device)
+    if chunk_rows is None:
+        chunk_rows = max(1, _CHUNK_ELEMENTS.get(frames.device.type, 1 << 22) // (size * len(u)))
+    chunk_rows = check_whole_number("chunk_rows", chunk_rows, at_least=1)
+
+    # one slab for every `stride` scene rows: its middle, the frame row that shows it, its motion relative to that row
+    centres = torch.arange((stride - 1) // 2, H + stride - 1, stride, device=frames.device)[: -(-H // stride)]
+    shown_by = motion.frame_rows(centres.to(torch.float64))
+    displacement, node_weights = exposure_trajectory(
+        motion.vibration, motion.row_starts(shown_by), motion.timing, _TRANSFERS[interpolation][1]
+    )
+    rows = shown_by.detach().round()
+    mean = motion.vibration.mean_displacement(motion.row_starts(shown_by), motion.timing.exposure_time)
+    moved = torch.stack([mean[..., 0], rows - centres + motion.shift[..., 1, None]], dim=-1)
+    displacement = (displacement - moved[..., None, :]).flatten(0, 2)
+    slab_rows = rows.flatten().to(torch.int64)
+    image = torch.arange(B * T, device=frames.device).repeat_interleave(len(centres))
+    weight = weights.repeat_interleave(T * len(centres))
+
+    reach = int(torch.stack([-slab_rows.amin(), slab_rows.amax() - (H - 1)]).amax().clamp(min=0)) + half_rows + stride
+    fold = mirrored_index(-reach, H + reach, H, frames.device)
+    lags = torch.fft.fftfreq(size, d=1.0 / size, device=frames.device).round().to(torch.int64)
+    kept = torch.arange(stride, device=frames.device) - (stride - 1) // 2
+    spectra = _aligned_spectra(frames, motion, u, length)
+    restored = frames.new_empty(B * T * len(centres), stride, C, W)
+    for begin in range(0, len(slab_rows), chunk_rows):
+        chunk = slice(begin, begin + chunk_rows)
+        bank = _filters(displacement[chunk], node_weights, (u, v), weight[chunk], interpolation)
+        source = fold[slab_rows[chunk, None, None] + kept[:, None] - lags + reach]  # (n, stride, V)
+        slabs = spectra[image[chunk, None, None], source]  # (n, stride, V, C, U)
+        rows_out = torch.einsum("nkvcu,nuv->nkcu", slabs, bank)
+        restored[chunk] = torch.fft.irfft(rows_out, n=length)[..., :W]
+    stacked: Tensor = restored.unflatten(0, (B, T, len(centres))).flatten(2, 3)[:, :, :H]
+    return stacked.movedim(3, 2)

@@ -1,0 +1,29 @@
+"""How rows go on beyond their ends, so that neither their Fourier transform nor a displacement wraps around."""
+
+import torch
+from torch import Tensor
+
+__all__ = ["continue_rows"]
+
+
+def continue_rows(images: Tensor, length: int) -> Tensor:
+    """Continue rows at their right end to a period of ``length``.
+
+    Both ends go on by odd reflection, which keeps value and slope; halfway through the gap one smoothly takes over
+    from the other, so that what lies near one end is never seen from the other.
+
+    Args:
+        images: (..., W).
+        length: Length of the period, more than W.
+
+    Returns:
+        Tensor (..., length) whose first W columns are the image.
+    """
+    width = images.shape[-1]
+    steps = torch.arange(1, length - width + 1, device=images.device)
+    back = steps.flip(0)
+    after = 2 * images[..., -1:] - images[..., (width - 1 - steps).clamp(min=0)]
+    before = 2 * images[..., :1] - images[..., back.clamp(max=width - 1)]
+    progress = ((steps / (length - width + 1) - 0.25) * 2).clamp(0, 1)
+    share = (0.5 + 0.5 * torch.cos(torch.pi * progress)).to(images.dtype)
+    return torch.cat([images, share * after + (1 - share) * before], dim=-1)

@@ -1,0 +1,186 @@
+import pytest
+import torch
+from restoration_truth import Motion, crop, decibel, draw_scene, take_frames
+
+from rsvib_torch import SensorTiming, Vibration
+from rsvib_torch.restoration import VibrationRestorer, estimate_noise, restore, visible_pixels
+
+TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+NOISE = 0.003
+
+
+def as_tensor(array, dtype=torch.float32):
+    return torch.from_numpy(array).to(dtype)
+
+
+@pytest.fixture(scope="module")
+def short():
+    """A short stack for the invariances: scene, frames and motion."""
+    motion = Motion()
+    scene = draw_scene(256, 192, seed=11)
+    return crop(scene), take_frames(scene, TIMING, motion, 2, NOISE), motion
+
+
+@pytest.mark.parametrize("seed", [101, 102])
+def test_gains_over_12_db_on_both_frames_of_the_paper_camera(seed):
+    motion = Motion(phase=(0.9 * seed, 0.3 * seed))
+    scene = draw_scene(2048, 336, seed)
+    frames = take_frames(scene, TIMING, motion, 2, NOISE, seed=seed)
+    truth = crop(scene)
+    restored = restore(as_tensor(frames), TIMING, motion.vibration(), method="banded").numpy()
+    halfway = restore(as_tensor(frames), TIMING, motion.scaled(0.5).vibration(), method="banded").numpy()
+    for frame, good, half in zip(frames, restored, halfway, strict=True):
+        before = decibel(frame, truth)
+        assert decibel(good, truth) > before + 20
+        assert decibel(half, truth) < before + 12
+    assert decibel(restored[0], truth) > 48.5  # a still camera has 50.5
+
+
+def test_long_exposure_is_sharpened_not_only_moved(short):
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=200, frame_rows=2048)
+    motion = Motion(amplitude=(3.0, 3.0), frequency=(60.0, 60.0))
+    scene = draw_scene(512, 256, seed=21)
+    frames = take_frames(scene, timing, motion, 1, 0.002, samples=100)
+    middle = timing.row_starts(1, frames.shape[1])
+    moved = torch.from_numpy(motion.displacement((middle + timing.exposure_time / 2).numpy()))
+    sharpened = decibel(restore(as_tensor(frames), timing, motion.vibration(), method="banded")[0], crop(scene))
+    # the same geometry from an exposure that does not blur
+    instant = SensorTiming(row_time=20.52e-6, exposure_rows=1, frame_rows=2048)
+    vibration = motion.vibration()
+    shrunk = vibration.amplitude * torch.sinc(vibration.frequency * timing.exposure_time)
+    late = vibration.phase + 2 * torch.pi * vibration.frequency * (timing.exposure_time - instant.exposure_time) / 2
+    geometry = restore(as_tensor(frames), instant, Vibration(shrunk, vibration.frequency, late), method="banded")
+    assert moved.abs().max() > 1.0
+    assert sharpened > decibel(geometry[0], crop(scene)) + 4
+
+
+def test_linear_interpolation_is_the_papers_and_blurs(short):
+    truth, frames, motion = short
+    linear, cubic = (
+        decibel(restore(as_tensor(frames), TIMING, motion.vibration(), method="banded", interpolation=name), truth)
+        for name in ("linear", "cubic")
+    )
+    assert decibel(frames, truth) + 12 < linear < cubic - 1
+
+
+def test_flux_is_conserved(short):
+    _, _, motion = short
+    flat = restore(torch.full((2, 96, 80), 0.37, dtype=torch.float64), TIMING, motion.vibration(), method="banded")
+    assert (flat - 0.37).abs().max() < 1e-12
+    lamp = torch.full((1, 96, 96), 0.2, dtype=torch.float64)
+    lamp[0, 40:50, 45:52] = torch.rand(10, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    blurred = restore(lamp, TIMING, Vibration.still(), method="banded", noise_to_signal=0.1)
+    assert blurred.sum().item() == pytest.approx(lamp.sum().item(), rel=1e-9)
+    assert (blurred - lamp).abs().max() > 0.05
+
+
+def test_nothing_wraps_around():
+    frames = torch.full((1, 128, 96), 0.2)
+    frames[:, :, :12] = 1.0
+    frames[:, :12] = 1.0
+    restored = restore(frames, TIMING, Vibration([3.1, 5.2], [50.0, 30.0], [0.5, 1.0]), method="banded")
+    assert (restored[:, 40:, -16:] - 0.2).abs().max() < 1e-3
+    assert (restored[:, -16:, 40:] - 0.2).abs().max() < 1e-3
+    assert restored.amax() > 0.8
+
+
+def test_batch_and_channels_equal_the_loop_of_singles(short):
+    _, frames, _ = short
+    stacks = as_tensor(frames)[None, :, None, :, :96] * torch.tensor([1.0, 0.5]).reshape(2, 1, 1, 1, 1)
+    stacks = torch.cat([stacks, stacks.flip(-1)], dim=2)
+    vibrations = Vibration(
+        torch.tensor([[[3.1], [5.2]], [[2.0], [1.0]]]), torch.tensor([[50.0], [30.0]]), torch.tensor([[0.4], [1.3]])
+    )
+    together = restore(stacks, TIMING, vibrations, method="banded")
+    for index in range(2):
+        single = restore(stacks[index], TIMING, vibrations[index], method="banded")
+        torch.testing.assert_close(together[index], single, rtol=0, atol=2e-6)
+        grey = restore(stacks[index, :, 0], TIMING, vibrations[index], method="banded", noise_to_signal=0.01)
+        colour = restore(stacks[index], TIMING, vibrations[index], method="banded", noise_to_signal=0.01)
+        torch.testing.assert_close(colour[:, 0], grey, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "forward"), (-1, "reverse")])
+def test_turned_problem_gives_turned_answer(short, scan_axis, direction):
+    _, frames, _ = short
+    frames = as_tensor(frames)
+    motion = Motion(image_motion=(120.0, -90.0))
+    expected = restore(frames, TIMING, motion.vibration(), method="banded")
+    timing = SensorTiming(20.52e-6, 20, 2048, scan_axis=scan_axis, readout_direction=direction)
+    sign = -1.0 if direction == "reverse" else 1.0
+    axes = [[*motion.amplitude], [*motion.frequency], [*motion.phase], [*motion.image_motion]]
+    if direction == "reverse":
+        axes[2][1] += torch.pi
+        axes[3][1] *= sign
+        frames, expected = frames.flip(-2), expected.flip(-2)
+    if scan_axis == -1:
+        axes = [values[::-1] for values in axes]
+        frames, expected = frames.transpose(-2, -1), expected.transpose(-2, -1)
+    torch.testing.assert_close(restore(frames, timing, Vibration(*axes), method="banded"), expected, rtol=0, atol=3e-6)
+
+
+def test_chunks_do_not_change_the_result(short):
+    _, frames, motion = short
+    frames = as_tensor(frames)[..., :64]
+    results = [
+        restore(frames, TIMING, motion.vibration(), method="banded", stride=3, chunk_rows=rows) for rows in (1, 7, 999)
+    ]
+    torch.testing.assert_close(results[0], results[1], rtol=0, atol=2e-6)
+    torch.testing.assert_close(results[0], results[2], rtol=0, atol=2e-6)
+
+
+def test_float32_agrees_with_float64_and_dtypes_come_back(short):
+    _, frames, motion = short
+    exact = restore(as_tensor(frames, torch.float64), TIMING, motion.vibration(), method="banded")
+    single = restore(as_tensor(frames), TIMING, motion.vibration(), method="banded")
+    assert (exact.dtype, single.dtype) == (torch.float64, torch.float32)
+    assert (exact - single).abs().max() < 2e-5
+    counts = (as_tensor(frames).clamp(0, 1) * 4095).round().to(torch.int32)
+    module = VibrationRestorer(TIMING, method="banded", full_scale=4095)
+    assert (module(counts, motion.vibration()) - single).abs().mean() < 3e-4
+    assert restore(as_tensor(frames, torch.float16), TIMING, motion.vibration(), method="banded").dtype == torch.float16
+
+
+def test_push_scan_frames_are_restored_where_they_look():
+    motion = Motion(amplitude=(1.5, 2.0), image_motion=(900.0, 400.0))  # 38 and 17 px from frame to frame
+    margin = 160
+    scene = draw_scene(160 + 2 * margin, 160 + 2 * margin, seed=31)
+    frames = take_frames(scene, TIMING, motion, 3, NOISE, margin=margin)
+    restored = restore(as_tensor(frames), TIMING, motion.vibration(), method="banded")
+    mask, shift = visible_pixels(TIMING, motion.vibration(), (160, 160), 3)
+    assert shift[2].abs().min() > 30
+    for frame, good, seen, (x, y) in zip(frames, restored, mask, shift.to(int).tolist(), strict=True):
+        truth = scene[margin - y : margin - y + 160, margin - x : margin - x + 160]
+        assert decibel(good, truth, 16) > max(decibel(frame, truth, 16) + 12, 46)
+        error = (good.numpy() - truth)[seen.numpy()]
+        assert (error**2).mean() ** 0.5 < 0.012
+
+
+def test_noise_is_estimated_under_texture():
+    scene = draw_scene(256, 256, seed=3)
+    for noise in (0.003, 0.02):
+        frame = scene + noise * torch.randn(256, 256, generator=torch.Generator().manual_seed(1)).numpy()
+        assert estimate_noise(torch.from_numpy(frame)).item() == pytest.approx(noise, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"method": "magic"}, ValueError, "method must be one of 'banded'"),
+        ({"half_row": 3}, TypeError, "method='banded' has no option 'half_row'; its options are half_rows, stride"),
+        ({"half_rows": 0}, ValueError, "half_rows must be at least 1, got 0"),
+        ({"stride": 1.5}, TypeError, "stride must be a whole number"),
+        ({"chunk_rows": 0}, ValueError, "chunk_rows must be at least 1"),
+        ({"noise_to_signal": -1.0}, ValueError, "noise_to_signal must be at least 0"),
+        ({"noise_to_signal": "much"}, TypeError, "noise_to_signal must be a number, got 'much'"),
+        ({"interpolation": "lanczos"}, ValueError, "interpolation must be one of 'linear', 'cubic'"),
+        ({"frames": torch.zeros(8, 8)}, ValueError, r"frames must have shape .* got \(8, 8\)"),
+        ({"frames": torch.zeros(1, 8, 8, dtype=torch.int16)}, ValueError, "do not say their full scale"),
+        ({"frames": torch.zeros(1, 4096, 8)}, ValueError, "frame_rows=2048 is less than the 4096 rows"),
+        ({"vibration": Vibration.still((3,))}, ValueError, r"vibration of batch shape \(3,\) does not fit"),
+    ],
+)
+def test_bad_input(change, error, message):
+    arguments = {"frames": torch.zeros(2, 16, 16), "timing": TIMING, "vibration": Vibration(1.0, 50.0)}
+    with pytest.raises(error, match=message):
+        restore(**{**arguments, "method": "banded", **change})
