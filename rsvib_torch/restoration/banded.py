@@ -23,34 +23,27 @@ _ALIGN_ROWS = 256  # rows moved at a time
 _CHUNK_ELEMENTS = {"cpu": 1 << 19, "cuda": 1 << 26}  # of a filter bank: stays in cache, or fills a GPU
 
 
-def _turn(frequencies: Tensor, places: Tensor) -> Tensor:
-    """Phase ramps exp(-2 pi i frequency place), shape of places + shape of frequencies."""
+def _turn(frequencies: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+    """Real and imaginary part of exp(-2 pi i frequency place), shape of places + shape of frequencies."""
     angle = -2 * math.pi * places[..., None] * frequencies
-    return torch.polar(torch.ones_like(angle), angle)
+    return angle.cos(), angle.sin()
 
 
-def _spline_transfer(places: Tensor, frequencies: Tensor, degree: int) -> Tensor:
+def _spline_transfer(places: Tensor, frequencies: Tensor, degree: int) -> tuple[Tensor, Tensor]:
     """Transfer functions of shifting by ``places`` px with a B-spline of ``degree``."""
     cell = places.detach().floor()
     weights = bspline_weights(places - cell, degree)
+    samples = bspline_weights(torch.zeros((), dtype=places.dtype, device=places.device), degree)
     taps = torch.arange(degree + 1, dtype=places.dtype, device=places.device) - degree // 2
-    samples = bspline_weights(torch.zeros((), dtype=places.dtype, device=places.device), degree).to(torch.complex128)
-    ramps = _turn(frequencies, taps)
-    at_rest = (samples @ ramps).real if degree > 1 else torch.ones_like(frequencies)
-    return _turn(frequencies, cell) * ((weights.to(torch.complex128) @ ramps) / at_rest)
+    at_rest = samples @ _turn(frequencies, taps)[0] if degree > 1 else torch.ones_like(frequencies)
+    real, imaginary = _turn(frequencies, cell[..., None] + taps)
+    weights = weights[..., None]
+    return (weights * real).sum(-2) / at_rest, (weights * imaginary).sum(-2) / at_rest
 
 
-def _linear_pair(x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    return _spline_transfer(x, u, 1), _spline_transfer(y, v, 1)
-
-
-def _cubic_pair(x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    return _turn(u, x), _spline_transfer(y, v, 3)
-
-
-_TRANSFERS: dict[str, tuple[Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]], Quadrature]] = {
-    "linear": (_linear_pair, "midpoint"),
-    "cubic": (_cubic_pair, "gauss"),
+_TRANSFERS: dict[str, tuple[Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], int, Quadrature]] = {
+    "linear": (lambda places, u: _spline_transfer(places, u, 1), 1, "midpoint"),
+    "cubic": (lambda places, u: _turn(u, places), 3, "gauss"),
 }
 
 
@@ -68,17 +61,28 @@ def _noise_to_signal(frames: Tensor, value: float | Literal["auto"]) -> Tensor:
 def _filters(
     displacement: Tensor, node_weights: Tensor, grid: tuple[Tensor, Tensor], weight: Tensor, interpolation: str
 ) -> Tensor:
-    """Wiener filters in (u, slab lag) of slabs whose scene moved by ``displacement`` (n, N, 2), shape (n, U, V)."""
+    """Wiener filters of slabs whose scene moved by ``displacement`` (n, N, 2): lag by frequency.
+
+    Returns:
+        Real and imaginary parts, (n, 2, V, U).
+    """
     u, v = grid
-    along, across = _TRANSFERS[interpolation][0](displacement[..., 0], displacement[..., 1], u, v)
-    kind = torch.complex64 if weight.dtype == torch.float32 else torch.complex128
-    along = (along * node_weights[:, None]).transpose(-2, -1).to(kind)
-    transfer = along @ across.to(kind)
-    prior = (4 * torch.sin(math.pi * u).square())[:, None] + 4 * torch.sin(math.pi * v).square()
-    power = torch.view_as_real(transfer).square().sum(-1)
-    floor = torch.finfo(weight.dtype).tiny
-    response = transfer.conj() / (power + weight[:, None, None] * prior.to(weight.dtype)).clamp(min=floor)
-    filters: Tensor = torch.fft.ifft(response)
+    along_rows, degree, _ = _TRANSFERS[interpolation]
+    along = along_rows(displacement[..., 0], u)
+    across = (part.transpose(-2, -1) * node_weights.to(v) for part in _spline_transfer(displacement[..., 1], v, degree))
+    a, b = torch.cat(along, dim=-2), tuple(across)
+    # complex products as real matrix products: [Re; Im] of the transfer function, (n, 2, V, U)
+    transfer = torch.cat([torch.cat([b[0], -b[1]], -1), torch.cat([b[1], b[0]], -1)], dim=-2) @ a
+    transfer = transfer.unflatten(-2, (2, len(v)))
+    prior = 4 * (torch.sin(math.pi * v).square()[:, None] + torch.sin(math.pi * u).square())
+    damped = torch.addcmul(transfer[:, 0].square(), transfer[:, 1], transfer[:, 1])
+    damped = torch.addcmul(damped, weight[:, None, None], prior).clamp(min=torch.finfo(u.dtype).tiny)
+    response = transfer / damped[:, None]
+    # inverse Fourier transform over v of the conjugate, taken at all lags of the slab
+    lags = torch.fft.fftfreq(len(v), d=1.0 / len(v), dtype=v.dtype, device=v.device)
+    cosine, sine = (part / len(v) for part in _turn(v, lags))
+    inverse = torch.cat([torch.cat([cosine, -sine], -1), torch.cat([-sine, -cosine], -1)], dim=-2)
+    filters: Tensor = (inverse @ response.flatten(1, 2)).unflatten(-2, (2, len(v)))
     return filters
 
 
@@ -90,7 +94,7 @@ def _aligned_spectra(frames: Tensor, motion: FrameMotion, u: Tensor, length: int
     mean = motion.vibration.mean_displacement(starts, motion.timing.exposure_time)[..., 0] - motion.shift[..., 0, None]
     spectra = torch.fft.rfft(continue_rows(frames, length)).transpose(-3, -2).flatten(0, 2)
     moved = [
-        rows * _turn(u, -places).to(rows.dtype)[:, None]
+        rows * torch.complex(*(part.to(frames.dtype) for part in _turn(u, -places)))[:, None]
         for rows, places in zip(spectra.split(_ALIGN_ROWS), mean.flatten().split(_ALIGN_ROWS), strict=True)
     ]
     aligned: Tensor = torch.cat(moved).unflatten(0, (B * T, H))
@@ -102,7 +106,7 @@ def restore_banded(
     motion: FrameMotion,
     *,
     half_rows: int = 16,
-    stride: int = 1,
+    stride: int = 2,
     interpolation: Literal["linear", "cubic"] = "cubic",
     noise_to_signal: float | Literal["auto"] = "auto",
     chunk_rows: int | None = None,
@@ -119,7 +123,7 @@ def restore_banded(
         frames: (B, T, C, H, W) in row order.
         motion: Motion of the frames.
         half_rows: l.
-        stride: Central rows kept per slab.
+        stride: Central rows kept per slab: 2 halve the time of 1 and cost 0.02 dB (paper camera, noise 0.003).
         interpolation: How the PSF displaces the scene: ``"linear"`` is the paper's (Eqs. 26-39, N_e samples), which
             takes its own blur for the camera's; ``"cubic"`` is a cubic B-spline across rows, exact along them.
         noise_to_signal: w, the variance of the noise over that of the scene's gradients; ``"auto"`` estimates it.
@@ -145,12 +149,13 @@ def restore_banded(
     centres = torch.arange((stride - 1) // 2, H + stride - 1, stride, device=frames.device)[: -(-H // stride)]
     shown_by = motion.frame_rows(centres.to(torch.float64))
     displacement, node_weights = exposure_trajectory(
-        motion.vibration, motion.row_starts(shown_by), motion.timing, _TRANSFERS[interpolation][1]
+        motion.vibration, motion.row_starts(shown_by), motion.timing, _TRANSFERS[interpolation][2]
     )
     rows = shown_by.detach().round()
     mean = motion.vibration.mean_displacement(motion.row_starts(shown_by), motion.timing.exposure_time)
     moved = torch.stack([mean[..., 0], rows - centres + motion.shift[..., 1, None]], dim=-1)
-    displacement = (displacement - moved[..., None, :]).flatten(0, 2)
+    displacement = (displacement - moved[..., None, :]).flatten(0, 2).to(frames.dtype)
+    grid = (u.to(frames.dtype), v.to(frames.dtype))
     slab_rows = rows.flatten().to(torch.int64)
     image = torch.arange(B * T, device=frames.device).repeat_interleave(len(centres))
     weight = weights.repeat_interleave(T * len(centres))
@@ -159,14 +164,17 @@ def restore_banded(
     fold = mirrored_index(-reach, H + reach, H, frames.device)
     lags = torch.fft.fftfreq(size, d=1.0 / size, device=frames.device).round().to(torch.int64)
     kept = torch.arange(stride, device=frames.device) - (stride - 1) // 2
-    spectra = _aligned_spectra(frames, motion, u, length)
+    spectra = torch.view_as_real(_aligned_spectra(frames, motion, u, length)).movedim(-1, 0).contiguous()
     restored = frames.new_empty(B * T * len(centres), stride, C, W)
     for begin in range(0, len(slab_rows), chunk_rows):
         chunk = slice(begin, begin + chunk_rows)
-        bank = _filters(displacement[chunk], node_weights, (u, v), weight[chunk], interpolation)
+        bank = _filters(displacement[chunk], node_weights, grid, weight[chunk], interpolation)
         source = fold[slab_rows[chunk, None, None] + kept[:, None] - lags + reach]  # (n, stride, V)
-        slabs = spectra[image[chunk, None, None], source]  # (n, stride, V, C, U)
-        rows_out = torch.einsum("nkvcu,nuv->nkcu", slabs, bank)
+        a, b = bank[:, 0, None, :, None], bank[:, 1, None, :, None]
+        real, imaginary = spectra[:, image[chunk, None, None], source]  # each (n, stride, V, C, U)
+        rows_out = torch.complex(
+            torch.addcmul(real * a, imaginary, b, value=-1).sum(2), torch.addcmul(real * b, imaginary, a).sum(2)
+        )
         restored[chunk] = torch.fft.irfft(rows_out, n=length)[..., :W]
     stacked: Tensor = restored.unflatten(0, (B, T, len(centres))).flatten(2, 3)[:, :, :H]
     return stacked.movedim(3, 2)
