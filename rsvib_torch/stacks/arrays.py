@@ -29,7 +29,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[tuple[int, ...], np.dtype[
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read(file)
         check_dtype(dtype)
-    except (ValueError, EOFError) as error:
+    except Exception as error:  # a damaged header can fail anywhere in its parser
         raise ValueError(f"{path}: not a readable .npy file ({' '.join(str(error).split())})") from error
     needed = dtype.itemsize
     for size in shape:

@@ -11,13 +11,13 @@ from rsvib_torch.checks import check_number
 
 __all__ = ["check_dtype", "check_full_scale", "counts_to_frames", "frames_to_counts", "known_full_scale"]
 
-_KINDS = "uif"  # counts and floats; not bool, complex, text, objects
+_LARGEST_SIZES = {"u": 4, "i": 4, "f": 8}  # bytes; other kinds are bool, complex, text, objects
 
 
 def check_dtype(dtype: np.dtype[Any]) -> None:
     """Raise a ``ValueError`` unless pixels of ``dtype`` are numbers."""
-    if dtype.kind not in _KINDS or dtype.itemsize > 8:
-        raise ValueError(f"pixels are {dtype}; expected integers or floats of up to 64 bits")
+    if dtype.itemsize > _LARGEST_SIZES.get(dtype.kind, 0):
+        raise ValueError(f"pixels are {dtype}; expected integers of up to 32 bits, or floats of up to 64")
 
 
 def known_full_scale(dtype: np.dtype[Any], stated: object = None) -> float | None:
