@@ -32,10 +32,10 @@ def _workplace(path: Path) -> Iterator[Path]:
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _check_file_place(path: Path) -> None:
+def _check_file_place(path: Path, *, parent_exists: bool = True) -> None:
     if path.is_dir():
         raise IsADirectoryError(f"cannot write {path}: it is a folder")
-    if not path.absolute().parent.is_dir():
+    if parent_exists and not path.absolute().parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: folder {path.absolute().parent} does not exist")
 
 
@@ -100,6 +100,9 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         part = work / "new"
         part.mkdir()
         yield part
+        files = sorted(part.iterdir())
+        for file in files:
+            _check_file_place(target / file.name, parent_exists=False)
         target.mkdir(parents=True, exist_ok=True)
-        for file in sorted(part.iterdir()):
+        for file in files:
             os.replace(file, target / file.name)

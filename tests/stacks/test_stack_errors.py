@@ -211,10 +211,14 @@ def test_failure_while_writing_leaves_the_old_file_and_nothing_else(tmp_path):
         (folder / "b.txt").write_text("half" * (1 // (folder / "a.txt").write_text("")))
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "old"
+    (tmp_path / "taken" / "z.txt").mkdir(parents=True)
+    with pytest.raises(IsADirectoryError, match=r"z\.txt: it is a folder"), whole_folder(tmp_path / "taken") as folder:
+        (folder / "b.txt").write_text((folder / "z.txt").write_text("half") * "x")
+    assert [p.name for p in (tmp_path / "taken").iterdir()] == ["z.txt"]
     with whole_folder(tmp_path / "new" / "deep") as folder:
         (folder / "b.txt").write_text("whole")
     assert (tmp_path / "new" / "deep" / "b.txt").read_text() == "whole"
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.txt", "new"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.txt", "new", "taken"]
 
 
 def test_places_that_cannot_be_written(tmp_path, monkeypatch):
