@@ -1,0 +1,164 @@
+"""Quality of restored images and of measured offset curves."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from kornia.metrics import ssim as kornia_ssim
+from torch import Tensor
+
+from rsvib_torch.checks import check_choice, check_number, check_whole_number
+
+__all__ = ["offset_endpoint_error", "psnr", "ssim"]
+
+_SSIM_WINDOW = 11  # taps of scikit-image's Gaussian window of sigma 1.5 px, cut at 3.5 sigma
+
+
+def _compared(image: Tensor, reference: Tensor, rim: int) -> tuple[Tensor, Tensor]:
+    """Both images in float64 without their rim, as (N, C, H, W), one entry of N an image."""
+    for name, value in (("image", image), ("reference", reference)):
+        if not isinstance(value, Tensor):
+            raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
+        if value.dtype.is_complex or value.dtype == torch.bool:
+            raise TypeError(f"{name} must be real numbers, got {value.dtype}")
+    if not 2 <= image.ndim <= 5:
+        raise ValueError(
+            f"image must have shape (H, W), (T, H, W), (T, C, H, W) or (B, T, C, H, W), got {tuple(image.shape)}"
+        )
+    if reference.ndim > image.ndim or reference.ndim < 2 or reference.shape[-2:] != image.shape[-2:]:
+        raise ValueError(f"reference of shape {tuple(reference.shape)} does not fit image {tuple(image.shape)}")
+    rim = check_whole_number("rim", rim, at_least=0)
+    if min(image.shape[-2:]) <= 2 * rim:
+        raise ValueError(f"rim={rim} leaves nothing of an image of {image.shape[-2]} x {image.shape[-1]} px")
+    try:
+        pair = torch.broadcast_tensors(image, reference)
+    except RuntimeError as error:
+        raise ValueError(
+            f"reference of shape {tuple(reference.shape)} does not fit image {tuple(image.shape)}"
+        ) from error
+    if pair[0].shape != image.shape:
+        raise ValueError(f"reference of shape {tuple(reference.shape)} holds more images than {tuple(image.shape)}")
+    first, second = (
+        value[..., rim : value.shape[-2] - rim, rim : value.shape[-1] - rim].to(torch.float64) for value in pair
+    )
+    channels = image.shape[-3] if image.ndim >= 4 else 1
+    size = (-1, channels, *first.shape[-2:])
+    return first.reshape(size), second.reshape(size)
+
+
+def _per_image(values: Tensor, image: Tensor) -> Tensor:
+    """Values (N,) in the leading shape of the images: (), (T,) or (B, T)."""
+    return values.reshape(image.shape[: -3 if image.ndim >= 4 else -2])
+
+
+def psnr(image: Tensor, reference: Tensor, data_range: float, *, rim: int = 0) -> Tensor:
+    """Peak signal-to-noise ratio of each image.
+
+    ``10 log10(data_range^2 / mean (image - reference)^2)`` in dB, the mean over the pixels and channels of one image;
+    infinite where both are identical.
+
+    Args:
+        image: (H, W), or a stack (T, H, W), (T, C, H, W) or (B, T, C, H, W).
+        reference: The truth, same shape, or one that broadcasts: one scene for all frames.
+        data_range: Full scale of the values: 1 for frames as ``read_stack`` gives them.
+        rim: Pixels to leave out at each border.
+
+    Returns:
+        float64 tensor with one value an image: shape (), (T,) or (B, T).
+
+    Raises:
+        TypeError: If the images are not tensors of real numbers.
+        ValueError: If the shapes do not fit, the rim leaves nothing, or the data range is not positive.
+
+    Example:
+        >>> psnr(torch.full((2, 8, 8), 0.6), torch.full((8, 8), 0.5), 1.0)
+        tensor([20.0000, 20.0000], dtype=torch.float64)
+    """
+    data_range = check_number("data_range", data_range, above=0.0)
+    first, second = _compared(image, reference, rim)
+    error = (first - second).square().flatten(1).mean(1)
+    return _per_image(10.0 * torch.log10(data_range**2 / error), image)
+
+
+def ssim(image: Tensor, reference: Tensor, data_range: float, *, rim: int = 0) -> Tensor:
+    """Structural similarity of each image (Wang et al. 2004).
+
+    Equal to scikit-image's with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False``: Gaussian window of
+    11 x 11 px, mean over the pixels whose window lies inside, and over channels. Computed in float64, where the
+    differences of second moments keep their digits.
+
+    Args:
+        image: (H, W), or a stack (T, H, W), (T, C, H, W) or (B, T, C, H, W).
+        reference: The truth, same shape, or one that broadcasts: one scene for all frames.
+        data_range: Full scale of the values: 1 for frames as ``read_stack`` gives them.
+        rim: Pixels to leave out at each border.
+
+    Returns:
+        float64 tensor with one value in -1 ... 1 an image: shape (), (T,) or (B, T).
+
+    Raises:
+        TypeError: If the images are not tensors of real numbers.
+        ValueError: If the shapes do not fit, fewer than 11 px are left within the rim, or the data range is not
+            positive.
+
+    Example:
+        >>> scene = torch.rand(32, 32)
+        >>> ssim(scene, scene, 1.0)
+        tensor(1., dtype=torch.float64)
+    """
+    data_range = check_number("data_range", data_range, above=0.0)
+    first, second = _compared(image, reference, rim)
+    if min(first.shape[-2:]) < _SSIM_WINDOW:
+        raise ValueError(
+            f"ssim needs at least {_SSIM_WINDOW} x {_SSIM_WINDOW} px within the rim, "
+            f"got {first.shape[-2]} x {first.shape[-1]}"
+        )
+    # Images ride on the channel axis: the separable filters run several times faster there than on the batch axis.
+    folded = (value.flatten(0, 1)[None] for value in (first, second))
+    similarity = kornia_ssim(*folded, _SSIM_WINDOW, max_val=data_range, eps=0.0, padding="valid")
+    return _per_image(similarity[0].unflatten(0, first.shape[:2]).flatten(1).mean(1), image)
+
+
+def _root_mean_square(distance: Tensor) -> Tensor:
+    return distance.square().nanmean(-1).sqrt()
+
+
+_REDUCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "mean": lambda distance: distance.nanmean(-1),
+    "rms": _root_mean_square,
+    "none": lambda distance: distance,
+}
+
+
+def offset_endpoint_error(
+    measured: Tensor, truth: Tensor, *, reduction: Literal["mean", "rms", "none"] = "mean"
+) -> Tensor:
+    """Distance between measured and true offsets in px.
+
+    ``|measured - truth|`` as vectors (x, y). Bands that registration gave up (NaN) do not count towards the mean:
+    how many those are is a figure of its own, ``isfinite(measured)``.
+
+    Args:
+        measured: (..., N, 2) px, axes (x, y); NaN where registration failed.
+        truth: True offsets at the same bands, broadcastable to the same shape.
+        reduction: ``"mean"`` or ``"rms"`` over the bands of each curve, or ``"none"``.
+
+    Returns:
+        float64 tensor: (...) per curve (NaN where all bands failed), or (..., N) without reduction.
+
+    Raises:
+        ValueError: If the shapes do not fit.
+
+    Example:
+        >>> offset_endpoint_error(torch.tensor([[3.0, 4.0], [0.0, 0.0]]), torch.zeros(2, 2))
+        tensor(2.5000, dtype=torch.float64)
+    """
+    check_choice("reduction", reduction, tuple(_REDUCTIONS))
+    for name, value in (("measured", measured), ("truth", truth)):
+        if value.ndim < 2 or value.shape[-1] != 2:
+            raise ValueError(f"{name} must have shape (..., N, 2), got {tuple(value.shape)}")
+    try:
+        difference = measured.to(torch.float64) - truth.to(torch.float64)
+    except RuntimeError as error:
+        raise ValueError(f"truth of shape {tuple(truth.shape)} does not fit {tuple(measured.shape)}") from error
+    return _REDUCTIONS[reduction](torch.linalg.vector_norm(difference, dim=-1))

@@ -1,0 +1,141 @@
+"""Image quality against scikit-image, offset errors against hand-made ones."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from rsvib_torch.evaluation import offset_endpoint_error, psnr, ssim
+
+
+def smooth_pair(shape, seed, noise=0.05):
+    """An image with structure at several scales and a degraded copy of it."""
+    generator = torch.Generator().manual_seed(seed)
+    white = torch.randn(shape, generator=generator, dtype=torch.float64)
+    frequency = torch.fft.fftfreq(shape[-2])[:, None].square() + torch.fft.rfftfreq(shape[-1]).square()
+    image = torch.fft.irfft2(torch.fft.rfft2(white) / (0.02 + frequency.sqrt()), s=shape[-2:])
+    image = 0.5 + 0.15 * image / image.std()
+    degraded = image.roll(1, -1) + noise * torch.randn(shape, generator=generator, dtype=torch.float64)
+    return image, degraded
+
+
+def reference_ssim(image, reference, data_range):
+    return structural_similarity(
+        image.numpy(),
+        reference.numpy(),
+        data_range=data_range,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+    )
+
+
+@pytest.mark.parametrize("data_range", [1.0, 4095.0])
+def test_each_image_of_a_stack_agrees_with_scikit_image(data_range):
+    scene, degraded = (data_range * t for t in smooth_pair((3, 61, 84), seed=4))
+    degraded[1] = 0.3 * degraded[1] + 0.7 * scene[1]  # pooling the stack would give all three the same value
+    wanted_psnr = [
+        peak_signal_noise_ratio(s.numpy(), d.numpy(), data_range=data_range)
+        for s, d in zip(scene, degraded, strict=True)
+    ]
+    wanted_ssim = [reference_ssim(d, s, data_range) for s, d in zip(scene, degraded, strict=True)]
+    np.testing.assert_allclose(psnr(degraded, scene, data_range).numpy(), wanted_psnr, rtol=1e-12)
+    np.testing.assert_allclose(ssim(degraded, scene, data_range).numpy(), wanted_ssim, rtol=0, atol=1e-12)
+    assert np.ptp(wanted_psnr) > 5
+    assert np.ptp(wanted_ssim) > 0.1
+
+
+def test_rim_is_left_out_as_if_it_were_cropped():
+    scene, degraded = smooth_pair((60, 70), seed=5)
+    degraded[:4] = 0.0
+    degraded[:, -5:] = 1.0
+    inner = (slice(5, -5), slice(5, -5))
+    wanted = reference_ssim(degraded[inner], scene[inner], 1.0)
+    assert ssim(degraded, scene, 1.0, rim=5).item() == pytest.approx(wanted, abs=1e-12)
+    assert ssim(degraded, scene, 1.0).item() < wanted - 0.02
+    wanted = peak_signal_noise_ratio(scene[inner].numpy(), degraded[inner].numpy(), data_range=1.0)
+    assert psnr(degraded, scene, 1.0, rim=5).item() == pytest.approx(wanted, rel=1e-12)
+
+
+def test_channels_belong_to_their_image():
+    scene, degraded = smooth_pair((2, 2, 3, 40, 30), seed=6)
+    degraded[1, 0] = scene[1, 0] + 0.1
+    assert psnr(degraded, scene, 1.0).shape == ssim(degraded, scene, 1.0).shape == (2, 2)
+    assert psnr(degraded, scene, 1.0)[1, 0].item() == pytest.approx(20.0)
+    wanted = np.mean([reference_ssim(degraded[0, 1, c], scene[0, 1, c], 1.0) for c in range(3)])
+    assert ssim(degraded, scene, 1.0)[0, 1].item() == pytest.approx(wanted, abs=1e-12)
+    assert ssim(degraded[0], scene[0], 1.0)[1].item() == pytest.approx(wanted, abs=1e-12)
+
+
+def test_one_reference_serves_all_frames():
+    scene, _ = smooth_pair((40, 30), seed=7)
+    frames = torch.stack([scene + 0.01, scene - 0.1])
+    np.testing.assert_allclose(psnr(frames, scene, 1.0).numpy(), [40.0, 20.0], rtol=1e-9)
+    assert ssim(frames, scene, 1.0).shape == (2,)
+
+
+def test_identical_images():
+    scene, _ = smooth_pair((2, 40, 30), seed=8)
+    frames = torch.stack([scene[0], scene[1] + 0.1])
+    assert psnr(frames, scene, 1.0).isinf().tolist() == [True, False]
+    assert ssim(frames, scene, 1.0)[0].item() == pytest.approx(1.0, abs=1e-14)
+    assert ssim(torch.zeros(20, 20), torch.zeros(20, 20), 1.0).item() == 1.0
+
+
+def test_float32_and_counts_lose_nothing():
+    scene, degraded = smooth_pair((64, 64), seed=9)
+    pair = degraded.float(), scene.float()
+    assert ssim(*pair, 1.0).item() == pytest.approx(reference_ssim(*(t.double() for t in pair), 1.0), abs=1e-12)
+    counts = [(4095 * t.clamp(0, 1)).round().to(torch.int32) for t in pair]
+    wanted = peak_signal_noise_ratio(*(t.numpy() for t in counts), data_range=4095)
+    assert psnr(*counts, 4095).item() == pytest.approx(wanted, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("image", "reference", "options", "match"),
+    [
+        (torch.zeros(20, 20), torch.zeros(20, 21), {}, r"\(20, 21\)"),
+        (torch.zeros(20, 20), torch.zeros(2, 20, 20), {}, "does not fit"),
+        (torch.zeros(1, 20, 20), torch.zeros(2, 20, 20), {}, "more images"),
+        (torch.zeros(3, 20, 20), torch.zeros(2, 20, 20), {}, "does not fit"),
+        (torch.zeros(20), torch.zeros(20), {}, r"\(20,\)"),
+        (torch.zeros(20, 20), torch.zeros(20, 20), {"rim": 10}, "rim=10"),
+        (torch.zeros(20, 20), torch.zeros(20, 20), {"data_range": 0.0}, "data_range"),
+        (torch.zeros(20, 20), torch.zeros(20, 20), {"data_range": math.nan}, "data_range"),
+    ],
+)
+@pytest.mark.parametrize("measure", [psnr, ssim])
+def test_what_does_not_fit_is_refused(measure, image, reference, options, match):
+    with pytest.raises(ValueError, match=match):
+        measure(image, reference, **{"data_range": 1.0, **options})
+
+
+def test_wrong_types_and_tiny_images_are_refused():
+    with pytest.raises(TypeError, match="ndarray"):
+        psnr(np.zeros((20, 20)), torch.zeros(20, 20), 1.0)
+    with pytest.raises(TypeError, match="complex"):
+        psnr(torch.zeros(20, 20, dtype=torch.complex64), torch.zeros(20, 20), 1.0)
+    with pytest.raises(ValueError, match="10 x 20"):
+        ssim(torch.zeros(14, 24), torch.zeros(14, 24), 1.0, rim=2)
+
+
+def test_offset_endpoint_error_is_a_distance_and_skips_failed_bands():
+    truth = torch.tensor([[1.0, 2.0], [1.0, 2.0], [0.0, 0.0]], dtype=torch.float64)
+    measured = torch.tensor([[4.0, 6.0], [1.0, 1.0], [math.nan, math.nan]])
+    assert offset_endpoint_error(measured, truth).item() == pytest.approx(3.0)
+    assert offset_endpoint_error(measured, truth, reduction="rms").item() == pytest.approx(math.sqrt(13.0))
+    distances = offset_endpoint_error(torch.stack([measured, measured]), truth, reduction="none")
+    assert distances.shape == (2, 3)
+    assert distances[1].nan_to_num(-1.0).tolist() == [5.0, 1.0, -1.0]
+    assert offset_endpoint_error(torch.full((4, 2), math.nan), torch.zeros(4, 2)).isnan().item()
+
+
+def test_offset_endpoint_error_refuses_other_shapes():
+    with pytest.raises(ValueError, match=r"\(4, 3\)"):
+        offset_endpoint_error(torch.zeros(4, 3), torch.zeros(4, 3))
+    with pytest.raises(ValueError, match=r"\(5, 2\)"):
+        offset_endpoint_error(torch.zeros(4, 2), torch.zeros(5, 2))
+    with pytest.raises(ValueError, match="reduction"):
+        offset_endpoint_error(torch.zeros(4, 2), torch.zeros(4, 2), reduction="sum")
