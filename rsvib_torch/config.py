@@ -1,0 +1,198 @@
+"""TOML files that describe a camera and what to do with its frames."""
+
+import inspect
+import os
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, create_model, model_validator
+
+from rsvib_torch.checks import check_number, check_whole_number
+from rsvib_torch.detection import detect_vibration
+from rsvib_torch.imaging import SensorNoise, simulate_frames
+from rsvib_torch.restoration import restore
+from rsvib_torch.restoration.restore import METHODS
+from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.validation import Section, checked, options_section, validate
+from rsvib_torch.vibration import Vibration
+
+__all__ = ["Config", "Simulation", "TimingSection", "VibrationSection", "read_config"]
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What ``[simulation]`` says.
+
+    Attributes:
+        vibration: The motion to simulate.
+        num_frames: Frames to take.
+        frame_size: (height, width) of the frames; None for the largest that the scene allows.
+        noise: Noise of the sensor; None for none.
+        seed: Seed of the noise.
+    """
+
+    vibration: Vibration
+    num_frames: int
+    frame_size: tuple[int, int] | None
+    noise: SensorNoise | None
+    seed: int
+
+
+@dataclass(frozen=True)
+class Config:
+    """What a config file says.
+
+    Attributes:
+        timing: The sensor.
+        full_scale: Count that means 1.0 in the camera's integer frames; None where the file does not say.
+        detection: Options for ``detect_vibration``; those not in the file are not here either.
+        restoration: Options for ``restore``, likewise.
+        simulation: What to simulate; None where the file does not say.
+    """
+
+    timing: SensorTiming
+    full_scale: float | None
+    detection: dict[str, Any]
+    restoration: dict[str, Any]
+    simulation: Simulation | None
+
+
+class TimingSection(Section):
+    """Fields of ``SensorTiming``, which checks them."""
+
+    row_time: float
+    exposure_rows: float
+    frame_rows: float
+    scan_axis: Literal["y", "x"] = "y"
+    readout_direction: Literal["forward", "reverse"] = "forward"
+    frame_start_times: list[float] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> "TimingSection":
+        checked(self.timing)
+        return self
+
+    def timing(self) -> SensorTiming:
+        """The sensor."""
+        return SensorTiming(**{name: getattr(self, name) for name in TimingSection.model_fields})
+
+
+class _SensorSection(TimingSection):
+    """``[sensor]``: the timing, and the full scale of the camera's counts."""
+
+    full_scale: float | None = None
+
+    @model_validator(mode="after")
+    def _check_full_scale(self) -> "_SensorSection":
+        if self.full_scale is not None:
+            check_number("full_scale", self.full_scale, above=0.0)
+        return self
+
+
+class VibrationSection(Section):
+    """Fields of ``Vibration``, which checks them: two numbers (x, y), or two lists for several tones an axis."""
+
+    amplitude: list[float] | list[list[float]]
+    frequency: list[float] | list[list[float]]
+    phase: list[float] | list[list[float]] = Field(default_factory=lambda: [0.0, 0.0])
+    image_motion: list[float] = Field(default_factory=lambda: [0.0, 0.0])
+
+    @model_validator(mode="after")
+    def _check(self) -> "VibrationSection":
+        for name in ("amplitude", "frequency", "phase"):
+            rows = getattr(self, name)
+            if len(rows) != 2 or len({len(row) if isinstance(row, list) else 1 for row in rows}) != 1:
+                raise ValueError(f"{name} must be two numbers (x, y), or two lists of the same length, got {rows}")
+        checked(self.vibration)
+        return self
+
+    def vibration(self) -> Vibration:
+        """The vibration."""
+        return Vibration(self.amplitude, self.frequency, self.phase, self.image_motion)
+
+
+_NoiseSection = options_section("_NoiseSection", SensorNoise)
+
+
+class _SimulationSection(Section):
+    """``[simulation]``."""
+
+    vibration: VibrationSection
+    num_frames: int = inspect.signature(simulate_frames).parameters["num_frames"].default
+    frame_size: list[int] | None = None
+    noise: _NoiseSection | None = None  # type: ignore[valid-type]
+    seed: int = 0
+
+    @model_validator(mode="after")
+    def _check(self) -> "_SimulationSection":
+        check_whole_number("num_frames", self.num_frames, at_least=1)
+        check_whole_number("seed", self.seed, at_least=0)
+        if self.frame_size is not None and (len(self.frame_size) != 2 or min(self.frame_size) < 1):
+            raise ValueError(f"frame_size must be [height, width] in px, got {self.frame_size}")
+        checked(self.simulation)
+        return self
+
+    def simulation(self) -> Simulation:
+        """What to simulate."""
+        size = None if self.frame_size is None else (self.frame_size[0], self.frame_size[1])
+        noise = None if self.noise is None else SensorNoise(**dict(self.noise))
+        return Simulation(self.vibration.vibration(), self.num_frames, size, noise, self.seed)
+
+
+_DetectionSection = options_section("_DetectionSection", detect_vibration, skip=("full_scale",))
+
+
+def _restoration_section(method: object) -> Any:
+    """``[restoration]``: the keys are those of the method."""
+    default = inspect.signature(restore).parameters["method"].default
+    chosen = METHODS[method if isinstance(method, str) and method in METHODS else default]
+    return options_section("_RestorationSection", chosen, method=(Literal[*METHODS], default))
+
+
+def read_config(path: str | os.PathLike[str]) -> Config:
+    """Read a config file.
+
+    ``[sensor]`` holds the fields of ``SensorTiming`` and ``full_scale``; ``[detection]`` and ``[restoration]`` the
+    options of ``detect_vibration`` and ``restore``; ``[simulation]`` frames, size and seed, with
+    ``[simulation.vibration]`` (fields of ``Vibration``) and ``[simulation.noise]`` (fields of ``SensorNoise``). Only
+    ``[sensor]`` is required.
+
+    Args:
+        path: The TOML file.
+
+    Raises:
+        OSError: If the file cannot be opened.
+        ValueError: If it is not TOML, or a key is missing, unknown or has a wrong type or value: one line a mistake
+            with the path of the key, its value and what was expected.
+    """
+    path = Path(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: not a TOML file: {error}") from error
+    restoration = data.get("restoration")
+    method = restoration.get("method") if isinstance(restoration, dict) else None
+    root: Any = create_model(
+        "_Root",
+        __base__=Section,
+        sensor=(_SensorSection, ...),
+        detection=(_DetectionSection | None, None),
+        restoration=(_restoration_section(method) | None, None),
+        simulation=(_SimulationSection | None, None),
+    )
+    checked_data = validate(root, data, str(path))
+    sensor, simulation = checked_data.sensor, checked_data.simulation
+    return Config(
+        timing=sensor.timing(),
+        full_scale=sensor.full_scale,
+        detection=_given(checked_data.detection),
+        restoration=_given(checked_data.restoration),
+        simulation=None if simulation is None else simulation.simulation(),
+    )
+
+
+def _given(section: Any) -> dict[str, Any]:
+    """The keys that the file has: defaults stay with the function that takes them."""
+    return {} if section is None else section.model_dump(exclude_unset=True)

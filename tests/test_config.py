@@ -1,0 +1,150 @@
+"""Config files: those shipped are read, mistakes are told in one line each."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from rsvib_torch.config import read_config
+from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.vibration import blind_frequencies
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+SENSOR = "[sensor]\nrow_time = 2e-5\nexposure_rows = 20\nframe_rows = 512\n"
+
+
+def read(tmp_path, text):
+    (tmp_path / "camera.toml").write_text(text)
+    return read_config(tmp_path / "camera.toml")
+
+
+@pytest.mark.parametrize(
+    ("name", "amplitude", "frequency", "image_motion", "num_frames"),
+    [
+        ("iso12233", [3.1, 5.2], [50, 30], [0, 0], 2),
+        ("in_orbit", [0.2, 0.13], [155, 155], [0, 0], 2),
+        ("push_scan", [1.2, 0.8], [83, 110], [500, 0], 4),
+    ],
+)
+def test_shipped_configs(name, amplitude, frequency, image_motion, num_frames):
+    config = read_config(CONFIGS / f"{name}.toml")
+    assert config.timing == SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+    assert config.full_scale == 4095
+    simulation = config.simulation
+    assert simulation is not None
+    assert simulation.vibration.amplitude[:, 0].tolist() == amplitude
+    assert simulation.vibration.frequency[:, 0].tolist() == frequency
+    assert simulation.vibration.image_motion.tolist() == image_motion
+    assert simulation.num_frames == num_frames
+    assert simulation.noise is not None
+    assert simulation.noise.read_noise == 0.003
+    assert simulation.vibration.gain(config.timing.frame_period).abs().min() > 0.5
+    assert set(config.detection) <= {"method", "registration", "tones", "band_rows", "band_step", "search"}
+    assert config.restoration == {"method": "banded"}
+
+
+def test_every_shipped_config_has_a_test():
+    assert {path.name for path in CONFIGS.iterdir()} == {"iso12233.toml", "in_orbit.toml", "push_scan.toml"}
+    timing = read_config(CONFIGS / "iso12233.toml").timing
+    torch.testing.assert_close(blind_frequencies(timing, 30.0), torch.tensor([1 / (2048 * 20.52e-6)]).double())
+
+
+def test_only_the_sensor_is_required_and_only_what_is_given_is_handed_on(tmp_path):
+    config = read(tmp_path, SENSOR)
+    assert config.timing == SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
+    assert (config.full_scale, config.detection, config.restoration, config.simulation) == (None, {}, {}, None)
+    config = read(tmp_path, SENSOR + 'scan_axis = "x"\nreadout_direction = "reverse"\nframe_start_times = [0.0, 0.5]\n')
+    assert (config.timing.scan_axis, config.timing.readout_direction) == (-1, "reverse")
+    assert config.timing.frame_start_times == (0.0, 0.5)
+    text = "[detection]\ntones = 2\n[restoration]\nmethod = 'banded'\nhalf_rows = 8\nnoise_to_signal = 1e-3\n"
+    config = read(tmp_path, SENSOR + text)
+    assert config.detection == {"tones": 2}
+    assert config.restoration == {"method": "banded", "half_rows": 8, "noise_to_signal": 1e-3}
+
+
+def test_two_tones_an_axis(tmp_path):
+    text = "[simulation.vibration]\namplitude = [[1, 0.5], [2, 0]]\nfrequency = [[40, 90], [55, 0]]\n"
+    simulation = read(tmp_path, SENSOR + text).simulation
+    assert simulation is not None
+    assert simulation.vibration.amplitude.tolist() == [[1.0, 0.5], [2.0, 0.0]]
+    assert simulation.noise is None
+    assert simulation.frame_size is None
+
+
+VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (SENSOR.replace("2e-5", "'fast'"), "sensor.row_time: expected a number, got 'fast'"),
+        (SENSOR.replace("2e-5", "'2e-5'"), "sensor.row_time: expected a number, got '2e-5'"),
+        (SENSOR.replace("20", "true"), "sensor.exposure_rows: expected a number, got True"),
+        (SENSOR.replace("20", "0"), "sensor: exposure_rows must be larger than 0, got 0"),
+        (SENSOR.replace("20", "nan"), "sensor: exposure_rows must be finite, got nan"),
+        (SENSOR.replace("2e-5", "0.02"), "sensor: row_time=0.02 s is longer than 10 ms; row_time is in seconds"),
+        (SENSOR.replace("frame_rows = 512", ""), "sensor.frame_rows: missing key; expected a number"),
+        ("", "sensor: missing key; expected a table with row_time, exposure_rows"),
+        ("sensor = 3", "sensor: expected a table with row_time, exposure_rows"),
+        (
+            SENSOR + "rows = 5",
+            "sensor.rows: unknown key; expected one of row_time, exposure_rows, frame_rows, scan_axis",
+        ),
+        (SENSOR + "[camera]\n", "camera: unknown key; expected one of sensor, detection, restoration, simulation"),
+        (SENSOR + "scan_axis = 'z'", "sensor.scan_axis: expected 'y' or 'x', got 'z'"),
+        (SENSOR + "full_scale = -1", "sensor: full_scale must be larger than 0, got -1"),
+        (SENSOR + "frame_start_times = [0, 'a']", "sensor.frame_start_times[1]: expected a number, got 'a'"),
+        (SENSOR + "[detection]\nband_rows = 32.5", "detection.band_rows: expected a whole number, got 32.5"),
+        (SENSOR + "[detection]\ntones = 'few'", "detection.tones: expected"),
+        (SENSOR + "[detection]\nregistration = 'sift'", "detection.registration: expected 'projection' or 'ncc' or"),
+        (SENSOR + "[detection]\nfull_scale = 9", "detection.full_scale: unknown key; expected one of method,"),
+        (SENSOR + "[restoration]\nmethod = 'magic'", "restoration.method: expected '"),
+        (
+            SENSOR + "[restoration]\nmethod = 'banded'\nhalf_row = 1",
+            "restoration.half_row: unknown key; expected one of half_rows, stride",
+        ),
+        (SENSOR + "[simulation]\nseed = 1", "simulation.vibration: missing key; expected a table with amplitude, freq"),
+        (
+            SENSOR + VIBRATION.replace("[1, 2]", "[-1, 2]"),
+            "simulation.vibration: amplitude must not be negative, got -1",
+        ),
+        (SENSOR + VIBRATION.replace("[1, 2]", "[1]"), "simulation.vibration: amplitude must be two numbers (x, y), or"),
+        (
+            SENSOR + VIBRATION.replace("[1, 2]", "'1'"),
+            "simulation.vibration.amplitude: expected a list of numbers or a",
+        ),
+        (SENSOR + VIBRATION + "[simulation.noise]\nbits = 99", "simulation: bits must be at most 32, got 99"),
+        (
+            SENSOR + VIBRATION + "[simulation.noise]\nfull_well = 0",
+            "simulation: full_well must be larger than 0, got 0",
+        ),
+        (SENSOR + "[simulation]\nnum_frames = 0\n" + VIBRATION, "simulation: num_frames must be at least 1, got 0"),
+        (
+            SENSOR + "[simulation]\nframe_size = [9]\n" + VIBRATION,
+            "simulation: frame_size must be [height, width] in px",
+        ),
+        ("[sensor", "not a TOML file: Expected ']'"),
+        ("a = 1\na = 2", "not a TOML file: Cannot overwrite a value"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(tmp_path, text, message):
+    with pytest.raises(ValueError) as caught:
+        read(tmp_path, text)
+    assert str(caught.value).startswith(f"{tmp_path / 'camera.toml'}: {message}")
+    assert "\n" not in str(caught.value)
+
+
+def test_every_mistake_has_its_line(tmp_path):
+    text = SENSOR.replace("2e-5", "'fast'") + "gain = 3\n[detection]\nsearch = 'far'\n"
+    with pytest.raises(ValueError) as caught:
+        read(tmp_path, text)
+    lines = [line.removeprefix(f"{tmp_path / 'camera.toml'}: ") for line in str(caught.value).splitlines()]
+    assert [line.split(":")[0] for line in lines] == ["sensor.row_time", "sensor.gain", "detection.search"]
+
+
+def test_files_that_are_no_config(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        read_config(tmp_path / "none.toml")
+    (tmp_path / "image.toml").write_bytes(b"\x89PNG\xff\xfe")
+    with pytest.raises(ValueError, match=r"image\.toml: not a TOML file"):
+        read_config(tmp_path / "image.toml")
