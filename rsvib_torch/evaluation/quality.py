@@ -15,7 +15,7 @@ _SSIM_WINDOW = 11  # taps of scikit-image's Gaussian window of sigma 1.5 px, cut
 
 
 def _compared(image: Tensor, reference: Tensor, rim: int) -> tuple[Tensor, Tensor]:
-    """Both images in float64 without their rim, as (N, C, H, W), one entry of N an image."""
+    """Both images without their rim in float32 or float64, as (N, C, H, W), one entry of N an image."""
     for name, value in (("image", image), ("reference", reference)):
         if not isinstance(value, Tensor):
             raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
@@ -38,9 +38,10 @@ def _compared(image: Tensor, reference: Tensor, rim: int) -> tuple[Tensor, Tenso
         ) from error
     if pair[0].shape != image.shape:
         raise ValueError(f"reference of shape {tuple(reference.shape)} holds more images than {tuple(image.shape)}")
-    first, second = (
-        value[..., rim : value.shape[-2] - rim, rim : value.shape[-1] - rim].to(torch.float64) for value in pair
-    )
+    dtype = torch.promote_types(image.dtype, reference.dtype)
+    if dtype != torch.float32:
+        dtype = torch.float32 if dtype in (torch.float16, torch.bfloat16) else torch.float64
+    first, second = (value[..., rim : value.shape[-2] - rim, rim : value.shape[-1] - rim].to(dtype) for value in pair)
     channels = image.shape[-3] if image.ndim >= 4 else 1
     size = (-1, channels, *first.shape[-2:])
     return first.reshape(size), second.reshape(size)
@@ -76,7 +77,7 @@ def psnr(image: Tensor, reference: Tensor, data_range: float, *, rim: int = 0) -
     """
     data_range = check_number("data_range", data_range, above=0.0)
     first, second = _compared(image, reference, rim)
-    error = (first - second).square().flatten(1).mean(1)
+    error = (first - second).flatten(1).to(torch.float64).square().mean(1)
     return _per_image(10.0 * torch.log10(data_range**2 / error), image)
 
 
@@ -84,8 +85,8 @@ def ssim(image: Tensor, reference: Tensor, data_range: float, *, rim: int = 0) -
     """Structural similarity of each image (Wang et al. 2004).
 
     Equal to scikit-image's with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False``: Gaussian window of
-    11 x 11 px, mean over the pixels whose window lies inside, and over channels. Computed in float64, where the
-    differences of second moments keep their digits.
+    11 x 11 px, mean over the pixels whose window lies inside, and over channels. Computed in the dtype of the images:
+    float64 agrees to rounding, float32 is several times faster and within 1e-5.
 
     Args:
         image: (H, W), or a stack (T, H, W), (T, C, H, W) or (B, T, C, H, W).
@@ -116,7 +117,7 @@ def ssim(image: Tensor, reference: Tensor, data_range: float, *, rim: int = 0) -
     # Images ride on the channel axis: the separable filters run several times faster there than on the batch axis.
     folded = (value.flatten(0, 1)[None] for value in (first, second))
     similarity = kornia_ssim(*folded, _SSIM_WINDOW, max_val=data_range, eps=0.0, padding="valid")
-    return _per_image(similarity[0].unflatten(0, first.shape[:2]).flatten(1).mean(1), image)
+    return _per_image(similarity[0].unflatten(0, first.shape[:2]).flatten(1).mean(1, dtype=torch.float64), image)
 
 
 def _root_mean_square(distance: Tensor) -> Tensor:

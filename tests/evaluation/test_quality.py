@@ -84,13 +84,17 @@ def test_identical_images():
     assert ssim(torch.zeros(20, 20), torch.zeros(20, 20), 1.0).item() == 1.0
 
 
-def test_float32_and_counts_lose_nothing():
-    scene, degraded = smooth_pair((64, 64), seed=9)
+@pytest.mark.parametrize(("level", "contrast"), [(0.0, 1.0), (0.9, 0.02)])
+def test_float32_is_close_and_counts_lose_nothing(level, contrast):
+    scene, degraded = (level + contrast * t for t in smooth_pair((64, 64), seed=9))
     pair = degraded.float(), scene.float()
-    assert ssim(*pair, 1.0).item() == pytest.approx(reference_ssim(*(t.double() for t in pair), 1.0), abs=1e-12)
+    assert ssim(*pair, 1.0).item() == pytest.approx(reference_ssim(degraded, scene, 1.0), abs=1e-5)
+    assert ssim(*pair, 1.0).dtype == psnr(*pair, 1.0).dtype == torch.float64
     counts = [(4095 * t.clamp(0, 1)).round().to(torch.int32) for t in pair]
     wanted = peak_signal_noise_ratio(*(t.numpy() for t in counts), data_range=4095)
     assert psnr(*counts, 4095).item() == pytest.approx(wanted, rel=1e-9)
+    wanted = reference_ssim(*(t.double() for t in counts), 4095)
+    assert ssim(*counts, 4095).item() == pytest.approx(wanted, abs=1e-12)
 
 
 @pytest.mark.parametrize(
