@@ -1,0 +1,212 @@
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from restoration_truth import Motion, crop, decibel, draw_scene, take_frames
+
+import rsvib_torch.restoration.exact as exact_module
+from rsvib_torch import SensorTiming, Vibration
+from rsvib_torch.restoration import restore as restore_by_any_method
+from rsvib_torch.restoration import visible_pixels
+
+restore = partial(restore_by_any_method, method="exact")
+TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+
+
+def as_tensor(array, dtype=torch.float32):
+    return torch.from_numpy(array).to(dtype)
+
+
+@pytest.fixture(scope="module")
+def short():
+    motion = Motion()
+    scene = draw_scene(336, 288, seed=12)
+    return crop(scene), take_frames(scene, TIMING, motion, 2), motion
+
+
+@pytest.fixture
+def prior_fitted_once(monkeypatch):
+    """The prior of the first call stays, so that results depend on the frames through the solution only."""
+    fitted = []
+
+    def fit_once(*arguments):
+        if not fitted:
+            fitted.append(original(*arguments))
+        return fitted[0]
+
+    original = exact_module.fit_prior
+    monkeypatch.setattr(exact_module, "fit_prior", fit_once)
+
+
+def noisy(frames, noise, seed=5, dtype=torch.float32):
+    return as_tensor(frames + noise * np.random.default_rng(seed).standard_normal(frames.shape), dtype)
+
+
+@pytest.mark.parametrize(("noise", "one", "two"), [(0.0, 64.0, 67.5), (0.005, 47.0, 49.2), (0.02, 38.0, 40.0)])
+def test_as_good_as_a_still_camera(short, noise, one, two):
+    truth, frames, motion = short
+    frames = noisy(frames, noise)
+    single = restore(frames, TIMING, motion.vibration())
+    joint = restore(frames, TIMING, motion.vibration(), joint=True)
+    assert joint.shape == (1, *truth.shape)
+    assert min(decibel(frame, truth) for frame in single) > one
+    assert decibel(joint[0], truth) > two
+    half = restore(frames, TIMING, motion.scaled(0.5).vibration(), joint=True)
+    assert decibel(half[0], truth) < one - 10
+
+
+@pytest.mark.parametrize(("rows", "one", "two"), [(100, 45.0, 47.0), (400, 38.0, 42.5)])
+def test_long_exposures(rows, one, two):
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
+    motion = Motion()
+    scene = draw_scene(464, 288, seed=13)
+    frames = noisy(take_frames(scene, timing, motion, 2, samples=48), 0.005)
+    single = restore(frames, timing, motion.vibration())
+    joint = restore(frames, timing, motion.vibration(), joint=2)
+    assert np.mean([decibel(frame, crop(scene)) for frame in single]) > one
+    assert joint.shape == frames.shape
+    assert decibel(joint, crop(scene)) > two
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.005, 0.02, 0.05])
+def test_regularisation_from_the_data_is_near_the_best_by_hand(short, noise):
+    truth, frames, motion = short
+    frames = noisy(frames, noise)[:1]
+    found = decibel(restore(frames, TIMING, motion.vibration()), truth)
+    for factor in (0.3, 3.0):
+        by_hand = restore(frames, TIMING, motion.vibration(), regularisation=factor)
+        assert decibel(by_hand, truth) < found + 0.3
+
+
+def test_beats_the_slabs(short):
+    truth, frames, motion = short
+    frames = noisy(frames, 0.005)
+    slabs = restore_by_any_method(frames, TIMING, motion.vibration(), method="banded")
+    assert decibel(restore(frames, TIMING, motion.vibration()), truth) > decibel(slabs, truth) + 1
+
+
+def test_noisier_frames_count_less(short):
+    truth, frames, motion = short
+    frames = torch.cat([noisy(frames[:1], 0.003), noisy(frames[1:], 0.01, seed=6)])
+    alone = restore(frames[:1], TIMING, motion.vibration())
+    joint = restore(frames, TIMING, motion.vibration(), joint=True)
+    assert decibel(joint, truth) > decibel(alone, truth)
+
+
+def test_flat_scene_stays_flat_and_flux_is_conserved():
+    flat = torch.full((2, 96, 80), 0.37, dtype=torch.float64)
+    assert (restore(flat, TIMING, Motion().vibration()) - 0.37).abs().max() < 1e-9
+    lamp = torch.full((1, 128, 128), 0.2, dtype=torch.float64)
+    lamp[0, 60:70, 60:66] = torch.rand(10, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    restored = restore(lamp, TIMING, Vibration.still(), noise=0.05)
+    assert (restored - lamp).abs().max() > 0.01
+    assert (restored - 0.2).sum().item() == pytest.approx((lamp - 0.2).sum().item(), rel=5e-3)
+
+
+def test_nothing_wraps_around(short, prior_fitted_once):
+    _, frames, motion = short
+    frames = as_tensor(frames)
+    other = frames.clone()
+    other[:, :8] = 1.0
+    other[:, :, :8] = 1.0
+    options = {"noise": 0.01, "regularisation": 1.0}
+    change = restore(other, TIMING, motion.vibration(), **options) - restore(
+        frames, TIMING, motion.vibration(), **options
+    )
+    assert change[:, :4, :4].abs().max() > 0.1
+    assert change[:, 64:, -32:].abs().max() < 0.01
+    assert change[:, -32:, 64:].abs().max() < 0.01
+
+
+def test_batch_and_chunks_and_channels_change_nothing(short):
+    _, frames, motion = short
+    stacks = noisy(frames[:, :96, :80], 0.005, dtype=torch.float64)[None, :, None]
+    stacks = torch.cat([stacks, 0.5 * stacks], dim=0)
+    vibrations = Vibration(
+        torch.tensor([[[3.1], [5.2]], [[2.0], [1.0]]]), torch.tensor([[50.0], [30.0]]), torch.tensor([[0.4], [1.3]])
+    )
+    together = restore(stacks, TIMING, vibrations)
+    for index in range(2):
+        single = restore(stacks[index, :, 0], TIMING, vibrations[index], chunk_frequencies=7)
+        torch.testing.assert_close(together[index, :, 0], single, rtol=0, atol=1e-9)
+    colour = restore(torch.cat([stacks[0], stacks[0]], dim=1), TIMING, motion.vibration())
+    grey = restore(stacks[0, :, 0], TIMING, motion.vibration())
+    torch.testing.assert_close(colour[:, 1], grey, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "forward"), (-1, "reverse")])
+def test_turned_problem_gives_turned_answer(short, scan_axis, direction):
+    _, frames, motion = short
+    frames = noisy(frames, 0.005)[..., :96]
+    expected = restore(frames, TIMING, motion.vibration())
+    timing = SensorTiming(20.52e-6, 20, 2048, scan_axis=scan_axis, readout_direction=direction)
+    axes = [[*motion.amplitude], [*motion.frequency], [*motion.phase]]
+    if direction == "reverse":
+        axes[2][1] += torch.pi
+        frames, expected = frames.flip(-2), expected.flip(-2)
+    if scan_axis == -1:
+        axes = [values[::-1] for values in axes]
+        frames, expected = frames.transpose(-2, -1), expected.transpose(-2, -1)
+    torch.testing.assert_close(restore(frames, timing, Vibration(*axes)), expected, rtol=0, atol=2e-5)
+
+
+def test_push_scan_frames_are_joined_where_they_overlap():
+    motion = Motion(amplitude=(1.5, 2.0), image_motion=(900.0, 400.0))  # 38 and 17 px from frame to frame
+    margin, size = 180, 224
+    scene = draw_scene(size + 2 * margin, size + 2 * margin, seed=31)
+    frames = noisy(take_frames(scene, TIMING, motion, 3, margin=margin), 0.01)
+    single = restore(frames, TIMING, motion.vibration())
+    joint = restore(frames, TIMING, motion.vibration(), joint=True)
+    _, shift = visible_pixels(TIMING, motion.vibration(), (size, size), 3)
+    x, y = shift[1].int().tolist()
+    truth = scene[margin - y : margin - y + size, margin - x : margin - x + size]
+    inner = decibel(joint[0], truth, 60) - decibel(single[1], truth, 60)
+    assert 2.0 < inner < 6.0
+    assert decibel(joint[0], truth, 8) > decibel(single[1], truth, 8) - 0.1
+
+
+def test_ignored_pixels_are_filled_from_the_others(short):
+    truth, frames, motion = short
+    frames = noisy(frames, 0.005)
+    ignore = torch.rand(frames.shape, generator=torch.Generator().manual_seed(2)) < 0.01
+    ignore[0, 100:104, 120:124] = True
+    spoiled = frames.masked_fill(ignore, float("nan"))
+    joint = restore(spoiled, TIMING, motion.vibration(), joint=True, ignore=ignore)
+    single = restore(spoiled, TIMING, motion.vibration(), ignore=ignore)
+    assert decibel(single, truth) > decibel(restore(frames, TIMING, motion.vibration()), truth) - 1.5
+    assert decibel(joint, truth) > decibel(restore(frames, TIMING, motion.vibration(), joint=True), truth) - 0.5
+    blind = restore(frames.masked_fill(ignore, 1.0), TIMING, motion.vibration())
+    assert decibel(blind, truth) < decibel(single, truth) - 10
+
+
+def test_gradients_to_frames_and_vibration(prior_fitted_once):
+    generator = torch.Generator().manual_seed(0)
+    timing = SensorTiming(row_time=1e-3, exposure_rows=2, frame_rows=8)
+    frames = torch.rand(1, 6, 5, generator=generator, dtype=torch.float64)
+    vibration = Vibration([0.8, 0.6], [20.0, 30.0], [0.3, 1.0])
+
+    def run(images, amplitude, frequency, phase):
+        return restore(images, timing, Vibration(amplitude, frequency, phase), noise=0.05)
+
+    inputs = (frames, vibration.amplitude, vibration.frequency, vibration.phase)
+    assert torch.autograd.gradcheck(run, tuple(value.clone().requires_grad_() for value in inputs))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"joint": 0}, ValueError, "joint must be at least 1"),
+        ({"joint": "all"}, TypeError, "joint must be a whole number, got 'all'"),
+        ({"noise": -1.0}, ValueError, "noise must be at least 0"),
+        ({"noise": "low"}, TypeError, "noise must be a number, got 'low'"),
+        ({"regularisation": 0.0}, ValueError, "regularisation must be larger than 0"),
+        ({"chunk_frequencies": 0}, ValueError, "chunk_frequencies must be at least 1"),
+        ({"ignore": torch.zeros(3)}, ValueError, r"ignore must be a boolean mask of shape \(2, 16, 16\)"),
+        ({"ignore": torch.ones(2, 16, 16, dtype=torch.bool)}, ValueError, "ignore leaves no pixel"),
+        ({"half_rows": 3}, TypeError, "method='exact' has no option 'half_rows'"),
+    ],
+)
+def test_bad_input(options, error, message):
+    with pytest.raises(error, match=message):
+        restore(torch.zeros(2, 16, 16), TIMING, Vibration(1.0, 50.0), **options)
