@@ -25,7 +25,7 @@ _FILL_ITERATIONS = 8  # of filling values that were not measured
 _MOSTLY = 0.9  # frames with at least this part of the most complete one start the filling
 _SPLINE = (1 / 6, 4 / 6, 1 / 6)  # cubic B-spline at the integers
 _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
-_CHUNK_ELEMENTS = {"cpu": 1 << 18, "cuda": 1 << 26}  # rows times frequencies solved at a time
+_CHUNK_ELEMENTS = {"cpu": 3 << 18, "cuda": 1 << 26}  # rows times frequencies solved at a time
 
 
 @dataclass(frozen=True, eq=False)

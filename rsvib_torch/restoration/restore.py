@@ -15,6 +15,7 @@ from rsvib_torch.orientation import (
     vibration_to_row_order,
 )
 from rsvib_torch.restoration.banded import restore_banded
+from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact import restore_exact
 from rsvib_torch.restoration.motion import as_batch, frame_motion
 from rsvib_torch.sensor import SensorTiming
@@ -22,7 +23,7 @@ from rsvib_torch.vibration import Vibration
 
 __all__ = ["METHODS", "VibrationRestorer", "restore"]
 
-METHODS: dict[str, Callable[..., Tensor]] = {"exact": restore_exact, "banded": restore_banded}
+METHODS: dict[str, Callable[..., Tensor]] = {"exact": restore_exact, "banded": restore_banded, "dewarp": restore_dewarp}
 
 
 def _check_options(method: str, options: dict[str, Any]) -> None:
@@ -82,11 +83,11 @@ def restore(
         timing: The sensor.
         vibration: The motion in image axes: one for all, or a batch (B,) for a batch of stacks.
         method: ``"exact"``: all rows coupled, several frames jointly on demand; ``"banded"``: row by row within
-            slabs (Sec. 3.2 of Liu et al. 2023).
+            slabs (Sec. 3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest.
         full_scale: Count that means 1.0, for integer frames other than uint8.
         ignore: Boolean mask shaped like the frames of pixels that do not count (no data, saturated); they may hold
             anything, NaN included, and are filled from the others. Method ``"exact"`` only.
-        **options: Options of the method, see ``restore_exact`` and ``restore_banded``.
+        **options: Options of the method, see ``restore_exact``, ``restore_banded`` and ``restore_dewarp``.
 
     Returns:
         Restored frames of the same shape and floating dtype (float32 where integers went in, full scale 1); with

@@ -166,7 +166,7 @@ def test_noise_is_estimated_under_texture():
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"method": "magic"}, ValueError, "method must be one of 'exact', 'banded'"),
+        ({"method": "magic"}, ValueError, "method must be one of 'exact', 'banded', 'dewarp'"),
         ({"half_row": 3}, TypeError, "method='banded' has no option 'half_row'; its options are half_rows, stride"),
         ({"half_rows": 0}, ValueError, "half_rows must be at least 1, got 0"),
         ({"stride": 1.5}, TypeError, "stride must be a whole number"),
