@@ -1,7 +1,36 @@
 """See and undo the vibration of a rolling-shutter camera."""
 
+from rsvib_torch.detection import DetectionResult, VibrationDetector, VibrationStd, detect_vibration
+from rsvib_torch.evaluation import offset_endpoint_error, psnr, ssim
+from rsvib_torch.imaging import RowVaryingBlur, SensorNoise, row_psf, simulate_frames
+from rsvib_torch.registration import OffsetCurve, register_bands
+from rsvib_torch.restoration import VibrationRestorer, restore
 from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.stacks import StackInfo, read_stack, read_stack_info, write_stack
 from rsvib_torch.vibration import Vibration, blind_frequencies
 
-__all__ = ["SensorTiming", "Vibration", "blind_frequencies"]
+__all__ = [
+    "DetectionResult",
+    "OffsetCurve",
+    "RowVaryingBlur",
+    "SensorNoise",
+    "SensorTiming",
+    "StackInfo",
+    "Vibration",
+    "VibrationDetector",
+    "VibrationRestorer",
+    "VibrationStd",
+    "blind_frequencies",
+    "detect_vibration",
+    "offset_endpoint_error",
+    "psnr",
+    "read_stack",
+    "read_stack_info",
+    "register_bands",
+    "restore",
+    "row_psf",
+    "simulate_frames",
+    "ssim",
+    "write_stack",
+]
 __version__ = "0.1.0"

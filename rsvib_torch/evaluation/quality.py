@@ -115,8 +115,8 @@ def ssim(image: Tensor, reference: Tensor, data_range: float, *, rim: int = 0) -
             f"got {first.shape[-2]} x {first.shape[-1]}"
         )
     # Images ride on the channel axis: the separable filters run several times faster there than on the batch axis.
-    folded = (value.flatten(0, 1)[None] for value in (first, second))
-    similarity = kornia_ssim(*folded, _SSIM_WINDOW, max_val=data_range, eps=0.0, padding="valid")
+    folded = [value.flatten(0, 1)[None] for value in (first, second)]
+    similarity = kornia_ssim(folded[0], folded[1], _SSIM_WINDOW, max_val=data_range, eps=0.0, padding="valid")
     return _per_image(similarity[0].unflatten(0, first.shape[:2]).flatten(1).mean(1, dtype=torch.float64), image)
 
 

@@ -1,0 +1,6 @@
+#!/usr/bin/env bash
+# Sets up .venv, then simulates, detects and restores two drawn scenes into out/demo/. Options go to demo.py.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+bash scripts/setup.sh
+exec .venv/bin/python scripts/demo.py "$@"

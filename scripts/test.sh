@@ -1,0 +1,16 @@
+#!/usr/bin/env bash
+# Sets up .venv, then checks format, lint and types and runs the tests. --slow runs the long checks too.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+marker="not slow"
+for argument in "$@"; do
+  case "$argument" in
+    --slow) marker="slow or not slow" ;;
+    *) echo "test.sh: unknown argument '$argument'; the only one is --slow" >&2; exit 2 ;;
+  esac
+done
+bash scripts/setup.sh
+.venv/bin/python -m ruff format --check .
+.venv/bin/python -m ruff check .
+.venv/bin/python -m mypy
+.venv/bin/python -m pytest -m "$marker"
