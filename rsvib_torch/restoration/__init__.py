@@ -3,5 +3,13 @@
 from rsvib_torch.restoration.motion import visible_pixels
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restore import VibrationRestorer, restore
+from rsvib_torch.restoration.verdict import RestorationVerdict, judge_restoration
 
-__all__ = ["VibrationRestorer", "estimate_noise", "restore", "visible_pixels"]
+__all__ = [
+    "RestorationVerdict",
+    "VibrationRestorer",
+    "estimate_noise",
+    "judge_restoration",
+    "restore",
+    "visible_pixels",
+]
