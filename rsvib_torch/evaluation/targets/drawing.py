@@ -1,0 +1,140 @@
+"""Shapes as seen through Gaussian optics: coverages between 0 and 1 without a jagged edge.
+
+A straight edge blurred by a Gaussian is an error function of the signed distance, and so are products and sums of
+edges at right angles or in parallel: rectangles and bars come out exact, curved edges as good as exact.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+__all__ = ["Canvas", "bars", "disc", "edge", "fractal_texture", "rectangle", "rotated", "sectors", "smoothed"]
+
+
+def edge(distance: Tensor, sigma: float) -> Tensor:
+    """Coverage at a signed distance (px, positive inside) from a straight edge."""
+    return 0.5 + 0.5 * torch.erf(distance / (math.sqrt(2.0) * sigma))
+
+
+def rotated(x: Tensor, y: Tensor, angle: float | Tensor) -> tuple[Tensor, Tensor]:
+    """Coordinates along axes that are turned by ``angle`` (rad)."""
+    turn = torch.as_tensor(angle, dtype=x.dtype, device=x.device)
+    cosine, sine = turn.cos(), turn.sin()
+    return x * cosine + y * sine, y * cosine - x * sine
+
+
+def rectangle(x: Tensor, y: Tensor, half_width: float | Tensor, half_height: float | Tensor, sigma: float) -> Tensor:
+    """Coverage of the rectangle ``|x| <= half_width, |y| <= half_height``."""
+    across = edge(x + half_width, sigma) - edge(x - half_width, sigma)
+    return across * (edge(y + half_height, sigma) - edge(y - half_height, sigma))
+
+
+def disc(x: Tensor, y: Tensor, radius: float, sigma: float) -> Tensor:
+    """Coverage of a disc; its curvature over the width of the blur is neglected."""
+    return edge(radius - torch.hypot(x, y), sigma)
+
+
+def bars(cycles: Tensor, frequency: Tensor | float, count: int, sigma: float) -> Tensor:
+    """Coverage of ``count`` bars, half a cycle wide each, from 0 to ``count - 1/2`` cycles.
+
+    Args:
+        cycles: Position across the bars, in cycles.
+        frequency: Local frequency in cycles/px: constant for a bar group, varying along the bars for a wedge.
+        count: Bars.
+        sigma: Blur in px.
+    """
+    coverage = torch.zeros_like(cycles)
+    for index in range(2 * count):
+        step = edge((cycles - 0.5 * index) / frequency, sigma)
+        coverage = coverage - step if index % 2 else coverage + step
+    return coverage
+
+
+def sectors(x: Tensor, y: Tensor, count: int, sigma: float) -> Tensor:
+    """Coverage of a star of ``count`` sectors; right where the radius exceeds ``count / pi`` px (Nyquist)."""
+    frequency = count / (2 * math.pi * torch.hypot(x, y).clamp(min=1e-3))
+    cycles = torch.remainder(torch.atan2(y, x) * (count / (2 * math.pi)), 1.0) + 2.0
+    return bars(cycles, frequency, 6, sigma).clamp(0.0, 1.0)
+
+
+def smoothed(image: Tensor, sigma: float) -> Tensor:
+    """Image blurred by a Gaussian, periodic at its borders (a product of Fourier transforms)."""
+    height, width = image.shape[-2:]
+    v = torch.fft.fftfreq(height, dtype=image.dtype, device=image.device)[:, None]
+    u = torch.fft.rfftfreq(width, dtype=image.dtype, device=image.device)
+    transfer = torch.exp(-2 * (math.pi * sigma) ** 2 * (v.square() + u.square()))
+    blurred: Tensor = torch.fft.irfft2(torch.fft.rfft2(image) * transfer, s=(height, width))
+    return blurred
+
+
+def fractal_texture(
+    height: int, width: int, generator: torch.Generator, *, exponent: float, longest: float, sigma: float
+) -> Tensor:
+    """Random texture of zero mean and unit variance whose amplitude spectrum falls as ``frequency^-exponent``.
+
+    Args:
+        height: Rows.
+        width: Columns.
+        generator: Source of randomness.
+        exponent: 0 for white noise, 1 for natural scenes.
+        longest: Wavelength in px beyond which the spectrum is flat.
+        sigma: Blur of the optics in px.
+
+    Returns:
+        float32 tensor (height, width).
+    """
+    white = torch.randn(height, width, generator=generator)
+    v = torch.fft.fftfreq(height)[:, None]
+    u = torch.fft.rfftfreq(width)
+    squared = v.square() + u.square()
+    shape = (squared + longest**-2) ** (-0.5 * exponent) * torch.exp(-2 * (math.pi * sigma) ** 2 * squared)
+    shape[0, 0] = 0.0
+    texture: Tensor = torch.fft.irfft2(torch.fft.rfft2(white) * shape, s=(height, width))
+    return texture / texture.std()
+
+
+class Canvas:
+    """An image to paint on, one shape after another, each within its own window.
+
+    Args:
+        image: (H, W), painted in place.
+        sigma: Blur of the optics in px.
+    """
+
+    def __init__(self, image: Tensor, sigma: float) -> None:
+        self.image = image
+        self.sigma = sigma
+
+    def paint(
+        self,
+        centre: tuple[float, float],
+        reach: float | tuple[float, float],
+        tone: float | Callable[[Tensor], Tensor],
+        coverage: Callable[[Tensor, Tensor], Tensor],
+    ) -> None:
+        """Lay a tone over the image.
+
+        Args:
+            centre: Column and row of the origin of the shape's coordinates.
+            reach: Half size (x, y) of the window in px, or one number for both.
+            tone: Value to lay over, or a function of what lies beneath.
+            coverage: Function of the coordinates x (1, w) and y (h, 1) in px from the centre.
+        """
+        half = reach if isinstance(reach, tuple) else (reach, reach)
+        pad = 5 * self.sigma
+        begin, end = (
+            [int(min(max(limit, 0), size)) for limit, size in zip(limits, reversed(self.image.shape), strict=True)]
+            for limits in (
+                [math.floor(c - h - pad) for c, h in zip(centre, half, strict=True)],
+                [math.ceil(c + h + pad) + 1 for c, h in zip(centre, half, strict=True)],
+            )
+        )
+        if begin[0] >= end[0] or begin[1] >= end[1]:
+            return
+        x = torch.arange(begin[0], end[0], dtype=torch.float32)[None] - centre[0]
+        y = torch.arange(begin[1], end[1], dtype=torch.float32)[:, None] - centre[1]
+        window = self.image[begin[1] : end[1], begin[0] : end[0]]
+        wanted = tone(window) if callable(tone) else tone
+        window += coverage(x, y) * (wanted - window)
