@@ -1,6 +1,6 @@
 import pytest
 import torch
-from restoration_truth import Motion, crop, decibel, draw_scene, take_frames
+from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
 from rsvib_torch.restoration import VibrationRestorer, estimate_noise, restore, visible_pixels

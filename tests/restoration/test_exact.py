@@ -3,7 +3,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from restoration_truth import Motion, crop, decibel, draw_scene, take_frames
+from truth import Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch.restoration.exact as exact_module
 from rsvib_torch import SensorTiming, Vibration

@@ -1,6 +1,6 @@
 import pytest
 import torch
-from restoration_truth import Motion, draw_scene, take_frames
+from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.restoration import judge_restoration, restore

@@ -1,4 +1,4 @@
-"""Truth for restoration tests, made without the package: scenes, motion and frames in NumPy float64.
+"""Truth for tests, made without the package: scenes, motion and frames in NumPy float64.
 
 Displacement along rows is a Fourier shift of a scene larger than the frame, across rows a quintic spline with
 SciPy's prefilter, and the exposure a plain midpoint sum.
