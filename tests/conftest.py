@@ -1,0 +1,11 @@
+"""Cameras that all tests share."""
+
+import pytest
+
+from rsvib_torch import SensorTiming
+
+
+@pytest.fixture(scope="session")
+def paper_camera():
+    """The camera of the paper: 20.52 us a row, 20 rows exposure, no blanking."""
+    return SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)

@@ -1,0 +1,391 @@
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from truth import Motion, draw_scene, take_frames
+
+from rsvib_torch import SensorTiming, Vibration, VibrationDetector, detect_vibration, simulate_frames
+from rsvib_torch.detection.inversion import vibration_of_fit
+from rsvib_torch.detection.tones import Measurements, fit_tones
+
+METHODS = ("projection", "ncc", "phase")
+ROW_TIME = 20.52e-6
+NOISE = 0.003
+# period %, amplitude %, phase in pi: what each registration has to hold on the paper's pair
+LIMITS = {"projection": (1.0, 2.0, 0.05), "ncc": (0.15, 1.0, 0.004), "phase": (0.15, 1.5, 0.004)}
+
+
+@dataclass(frozen=True)
+class Tones:
+    """Several tones an axis, (2, K) each."""
+
+    amplitude: tuple
+    frequency: tuple
+    phase: tuple
+    image_motion: tuple = (0.0, 0.0)
+
+    def displacement(self, times):
+        tones = zip(self.amplitude, self.frequency, self.phase, self.image_motion, strict=True)
+        return np.stack(
+            [
+                sum(a * np.sin(2 * np.pi * f * times + p) for a, f, p in zip(aa, ff, pp, strict=True)) + v * times
+                for aa, ff, pp, v in tones
+            ],
+            axis=-1,
+        )
+
+
+def random_phase(seed):
+    return tuple(np.random.default_rng([7, seed]).uniform(-np.pi, np.pi, 2).tolist())
+
+
+def shoot(timing, motion, seed, num_frames=2, *, rows=2048, columns=384, noise=NOISE, margin=40):
+    """A noisy stack of a scene drawn from the seed, float32."""
+    scene = draw_scene(rows + 2 * margin, columns + 2 * margin, seed)
+    frames = take_frames(scene, timing, motion, num_frames, noise, seed=seed, margin=margin, samples=6)
+    return torch.from_numpy(frames).float()
+
+
+def phase_error(measured, truth):
+    """Difference of two phases, folded into -pi ... pi."""
+    return np.abs((np.asarray(measured) - np.asarray(truth) + np.pi) % (2 * np.pi) - np.pi)
+
+
+def errors(result, motion):
+    """Largest error over the axes of the first tone: period %, amplitude %, phase in pi."""
+    found = result.vibration
+    period = np.abs(found.period[:, 0].numpy() * np.array(motion.frequency) - 1).max() * 100
+    amplitude = np.abs(found.amplitude[:, 0].numpy() / np.array(motion.amplitude) - 1).max() * 100
+    return period, amplitude, phase_error(found.phase[:, 0], motion.phase).max() / np.pi
+
+
+@pytest.fixture(scope="module")
+def pairs(paper_camera):
+    """Three pairs of the paper's case with their motions."""
+    motions = [Motion(phase=random_phase(seed)) for seed in (11, 12, 13)]
+    return [(shoot(paper_camera, motion, 11 + i), motion) for i, motion in enumerate(motions)]
+
+
+@pytest.mark.parametrize("registration", METHODS)
+@pytest.mark.parametrize("case", range(3))
+def test_paper_pair(pairs, paper_camera, registration, case):
+    frames, motion = pairs[case]
+    result = detect_vibration(frames, paper_camera, registration=registration)
+    for error, limit in zip(errors(result, motion), LIMITS[registration], strict=True):
+        assert error < limit
+    assert result.vibration.amplitude.shape == (2, 1)
+    assert result.reliable.tolist() == [True, True]
+    assert result.reasons == ((), ())
+    # 50 Hz has the gain +0.62, 30 Hz the gain -1.46: amplitudes stay positive, the sign is in the phase
+    assert result.gain[:, 0].tolist() == pytest.approx([0.626, -1.461], abs=0.03)
+    assert bool((result.vibration.amplitude > 0).all())
+
+
+@pytest.mark.parametrize("phase", [0.0, 1.5707963, 3.1, -1.2])
+def test_negative_gain(paper_camera, phase):
+    motion = Motion(amplitude=(1.5, 2.5), frequency=(30.0, 30.0), phase=(phase, phase + 0.5))
+    result = detect_vibration(shoot(paper_camera, motion, 3), paper_camera)
+    period, amplitude, angle = errors(result, motion)
+    assert period < 0.3
+    assert amplitude < 1.0
+    assert angle < 0.01
+    assert bool((result.gain < -1.4).all())
+
+
+@pytest.mark.parametrize("registration", METHODS)
+def test_fitted_curve_and_residual(pairs, paper_camera, registration):
+    frames, _ = pairs[0]
+    result = detect_vibration(frames, paper_camera, registration=registration)
+    good = result.offsets.good
+    difference = (result.offsets.offsets - result.fitted)[good].abs().mean(0)
+    assert torch.allclose(difference, result.residual, rtol=1e-9)
+    size = result.offsets.offsets[good].abs().mean(0)
+    assert bool((result.residual < 0.06 * size).all())
+
+
+@pytest.mark.parametrize("registration", METHODS)
+def test_image_motion_is_separated(paper_camera, registration):
+    motion = Motion(phase=random_phase(5), image_motion=(500.0, -240.0))
+    frames = shoot(paper_camera, motion, 5, columns=704, margin=60)
+    result = detect_vibration(frames, paper_camera, registration=registration)
+    for error, limit in zip(errors(result, motion), LIMITS[registration], strict=True):
+        assert error < limit
+    assert result.vibration.image_motion.tolist() == pytest.approx([500.0, -240.0], abs=3.0)
+    assert bool(result.reliable.all())
+
+
+@pytest.mark.parametrize("registration", METHODS)
+@pytest.mark.parametrize("image_motion", [(0.0, 0.0), (300.0, 150.0)])
+def test_without_vibration_there_is_no_tone(paper_camera, registration, image_motion):
+    motion = Motion(amplitude=(0.0, 0.0), image_motion=image_motion)
+    result = detect_vibration(shoot(paper_camera, motion, 4, margin=60), paper_camera, registration=registration)
+    assert bool((result.vibration.amplitude == 0).all())
+    assert result.reliable.tolist() == [False, False]
+    assert all("no significant tone" in reasons for reasons in result.reasons)
+    assert result.vibration.image_motion.tolist() == pytest.approx(image_motion, abs=2.0)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("multiple", [1, 2])
+def test_blind_frequency_is_refused(paper_camera, seed, multiple):
+    blind = multiple / (2048 * ROW_TIME)
+    motion = Motion(frequency=(blind, blind), phase=random_phase(seed))
+    result = detect_vibration(shoot(paper_camera, motion, seed), paper_camera)
+    assert not bool(result.reliable[0])
+    # along the scan the coupling makes a blind tone visible in the second order, too weakly to be trusted
+    assert not bool(result.reliable[1])
+    assert all(result.reasons)
+
+
+@pytest.mark.parametrize("registration", METHODS)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_noise_is_no_vibration(paper_camera, registration, seed):
+    frames = torch.randn(2, 1024, 256, generator=torch.Generator().manual_seed(seed))
+    result = detect_vibration(frames, paper_camera, registration=registration)
+    assert not bool(result.reliable.any())
+
+
+def test_small_amplitudes(paper_camera):
+    motion = Motion(amplitude=(0.2, 0.13), frequency=(155.0, 155.0), phase=(0.9, -2.0))
+    result = detect_vibration(shoot(paper_camera, motion, 8, columns=640), paper_camera)
+    period, amplitude, phase = errors(result, motion)
+    assert period < 0.5
+    assert amplitude < 6.0
+    assert phase < 0.06
+    assert bool(result.reliable.all())
+
+
+def test_two_tones_over_four_frames(paper_camera):
+    motion = Tones(((1.5, 0.6), (1.2, 0.5)), ((41.0, 110.0), (63.0, 180.0)), ((0.3, 1.0), (-0.7, 2.0)))
+    result = detect_vibration(shoot(paper_camera, motion, 9, 4), paper_camera)
+    found = result.vibration
+    assert found.amplitude.shape == (2, 2)
+    assert found.frequency.numpy() == pytest.approx(np.array(motion.frequency), rel=2e-3)
+    assert found.amplitude.numpy() == pytest.approx(np.array(motion.amplitude), rel=0.03)
+    assert phase_error(found.phase, motion.phase).max() < 0.05 * np.pi
+    assert bool(result.reliable.all())
+
+
+def test_number_of_tones_can_be_set(pairs, paper_camera):
+    frames, motion = pairs[0]
+    result = detect_vibration(frames, paper_camera, tones=2)
+    assert result.vibration.amplitude.shape == (2, 2)
+    assert result.vibration.amplitude[:, 0].numpy() == pytest.approx(np.array(motion.amplitude), rel=0.05)
+    assert bool((result.vibration.amplitude[:, 1] < 0.1 * result.vibration.amplitude[:, 0]).all())
+
+
+@pytest.mark.parametrize("registration", METHODS)
+def test_batch_is_loop_of_singles(paper_camera, registration):
+    timing = SensorTiming(row_time=40e-6, exposure_rows=10, frame_rows=1100)
+    stacks = []
+    for seed in (1, 2):
+        motion = Motion(phase=random_phase(seed), frequency=(61.0, 47.0 + seed))
+        grey = shoot(timing, motion, seed, rows=640, columns=256)
+        stacks.append(torch.stack([grey, 0.5 * grey, 0.2 + grey], dim=1))
+    together = detect_vibration(torch.stack(stacks), timing, registration=registration)
+    assert together.vibration.batch_shape == (2,)
+    for index, stack in enumerate(stacks):
+        alone = detect_vibration(stack, timing, registration=registration)
+        one = together[index]
+        for name in ("amplitude", "frequency", "phase", "image_motion"):
+            torch.testing.assert_close(
+                getattr(one.vibration, name), getattr(alone.vibration, name), rtol=1e-4, atol=1e-5, msg=name
+            )
+            torch.testing.assert_close(getattr(one.std, name), getattr(alone.std, name), rtol=1e-3, atol=1e-6)
+        torch.testing.assert_close(one.offsets.offsets, alone.offsets.offsets, rtol=0, atol=1e-4, equal_nan=True)
+        torch.testing.assert_close(one.fitted, alone.fitted, rtol=0, atol=1e-4)
+        assert one.reasons == alone.reasons
+        assert one.reliable.tolist() == alone.reliable.tolist()
+
+
+@pytest.mark.parametrize("scan_axis", [-2, -1])
+@pytest.mark.parametrize("direction", ["forward", "reverse"])
+def test_orientation(pairs, paper_camera, scan_axis, direction):
+    """The transposed or flipped problem has the transposed or flipped answer."""
+    frames, motion = pairs[0]
+    upright = detect_vibration(frames, paper_camera)
+    turned = frames.flip(-2) if direction == "reverse" else frames
+    turned = turned.transpose(-2, -1) if scan_axis == -1 else turned
+    timing = replace(paper_camera, scan_axis=scan_axis, readout_direction=direction)
+    result = detect_vibration(turned.contiguous(), timing)
+
+    sign = torch.tensor([1.0, -1.0 if direction == "reverse" else 1.0], dtype=torch.float64)
+    order = [1, 0] if scan_axis == -1 else [0, 1]
+    rotation = torch.where(sign < 0, math.pi, 0.0)[:, None]
+    expected_phase = (upright.vibration.phase + rotation)[order]
+    torch.testing.assert_close(result.vibration.amplitude, upright.vibration.amplitude[order], rtol=1e-4, atol=0)
+    torch.testing.assert_close(result.vibration.frequency, upright.vibration.frequency[order], rtol=1e-5, atol=0)
+    assert phase_error(result.vibration.phase, expected_phase).max() < 1e-4
+    torch.testing.assert_close(
+        result.vibration.image_motion, (sign * upright.vibration.image_motion)[order], rtol=0, atol=1e-3
+    )
+    torch.testing.assert_close(result.std.amplitude, upright.std.amplitude[order], rtol=1e-3, atol=0)
+    torch.testing.assert_close(result.gain, upright.gain[order], rtol=1e-4, atol=0)
+    torch.testing.assert_close(result.residual, upright.residual[order], rtol=1e-3, atol=0)
+    torch.testing.assert_close(
+        result.offsets.offsets, (sign * upright.offsets.offsets)[..., order], rtol=0, atol=1e-4, equal_nan=True
+    )
+    assert np.array(motion.amplitude)[order] == pytest.approx(result.vibration.amplitude[:, 0].numpy(), rel=0.02)
+
+
+def synthetic_measurements(noise, seed, batch):
+    """Offset curves by Eqs. (2) and (4) and the band average, with independent Gaussian noise."""
+    height, step, exposure, interval = 32, 32, 20 * ROW_TIME, 2048 * ROW_TIME
+    starts = np.arange(16, 2048, step) * ROW_TIME
+    later = starts + interval
+    motion = Motion(phase=(0.6, -1.1), image_motion=(100.0, 0.0))
+    frequency, amplitude = np.array(motion.frequency), np.array(motion.amplitude)
+    shrink = np.sinc(frequency * exposure) * np.sinc(frequency * height * ROW_TIME)
+    middle = exposure / 2
+
+    def mean(times):
+        angle = 2 * np.pi * frequency * (times[:, None] + middle) + np.array(motion.phase)
+        return amplitude * shrink * np.sin(angle)
+
+    offsets = mean(later) - mean(starts) + np.array(motion.image_motion) * interval
+    offsets = offsets + noise * np.random.default_rng(seed).standard_normal((batch, *offsets.shape))
+    values = torch.from_numpy(offsets)
+    information = torch.eye(2, dtype=torch.float64).expand(*values.shape[:2], 2, 2)
+    times = [torch.from_numpy(t).expand(batch, -1) for t in (starts, later)]
+    return Measurements(*times, values, information, exposure, (height * ROW_TIME, height * ROW_TIME)), motion
+
+
+def fitted_vibration(measurements, start=(52.0, 28.5)):
+    batch = len(measurements.starts)
+    frequencies = torch.tensor(start, dtype=torch.float64).expand(batch, 2)[..., None].clone()
+    fit = fit_tones(measurements, frequencies, torch.ones(batch, 2, 1, dtype=torch.bool))
+    return vibration_of_fit(measurements, fit)
+
+
+def test_inversion_is_exact_without_noise():
+    measurements, motion = synthetic_measurements(0.0, 0, 1)
+    vibration, _ = fitted_vibration(measurements)
+    assert vibration.amplitude[0, :, 0].tolist() == pytest.approx(motion.amplitude, rel=1e-6)
+    assert vibration.frequency[0, :, 0].tolist() == pytest.approx(motion.frequency, rel=1e-6)
+    assert phase_error(vibration.phase[0, :, 0], motion.phase).max() < 1e-6
+    assert vibration.image_motion[0].tolist() == pytest.approx(motion.image_motion, abs=1e-4)
+
+
+def test_error_bars_agree_with_scatter():
+    batch = 400
+    measurements, motion = synthetic_measurements(0.03, 1, batch)
+    vibration, std = fitted_vibration(measurements)
+    for name in ("amplitude", "frequency", "period", "phase"):
+        values = getattr(vibration, name)[..., 0].numpy()
+        scatter = values.std(0)
+        claimed = getattr(std, name)[..., 0].mean(0).numpy()
+        assert claimed == pytest.approx(scatter, rel=0.15), name
+    claimed = std.image_motion.mean(0).numpy()
+    assert claimed == pytest.approx(vibration.image_motion.numpy().std(0), rel=0.15)
+    for name in ("amplitude", "frequency"):
+        bias = getattr(vibration, name)[..., 0].mean(0).numpy() - np.array(getattr(motion, name))
+        # the mean of 400 runs may lie 4 of its own standard errors off
+        assert bool((np.abs(bias) < 4 * getattr(std, name)[..., 0].mean(0).numpy() / math.sqrt(batch)).all())
+
+
+def test_error_bars_of_frames_are_honest(paper_camera):
+    """Error over its standard deviation, over noise seeds, scenes and phases, is of order one."""
+    ratios = []
+    for seed in range(20, 26):
+        motion = Motion(phase=random_phase(seed))
+        result = detect_vibration(shoot(paper_camera, motion, seed, columns=256), paper_camera)
+        found, std = result.vibration, result.std
+        for name in ("amplitude", "frequency"):
+            error = getattr(found, name)[:, 0].numpy() - np.array(getattr(motion, name))
+            ratios.append(error / getattr(std, name)[:, 0].numpy())
+    spread = np.sqrt(np.mean(np.square(ratios)))
+    assert 1 / 3 < spread < 3
+
+
+def test_dropped_frame_times(paper_camera):
+    """With frame start times of its own, a pair with a dropped frame in between is a longer baseline."""
+    motion = Motion(phase=random_phase(2))
+    frames = shoot(paper_camera, motion, 2, 3)[[0, 2]]
+    timing = replace(paper_camera, frame_start_times=[0.0, 2 * paper_camera.frame_period])
+    result = detect_vibration(frames, timing)
+    period, amplitude, phase = errors(result, motion)
+    assert period < 0.3
+    assert amplitude < 1.0
+    assert phase < 0.01
+
+
+def test_integer_frames(pairs, paper_camera):
+    frames, motion = pairs[0]
+    counts = (frames.clamp(0, 1) * 4095).round().to(torch.int32).to(torch.uint16)
+    result = detect_vibration(counts, paper_camera, full_scale=4095)
+    for error, limit in zip(errors(result, motion), LIMITS["ncc"], strict=True):
+        assert error < limit
+
+
+def test_module_is_the_function(pairs, paper_camera):
+    frames, _ = pairs[0]
+    options = {"registration": "phase", "band_step": 32}
+    one = VibrationDetector(paper_camera, **options)(frames).vibration
+    other = detect_vibration(frames, paper_camera, **options).vibration
+    assert torch.equal(one.amplitude, other.amplitude)
+    assert torch.equal(one.phase, other.phase)
+
+
+def test_agrees_with_the_simulator(paper_camera):
+    """The package's own simulator and its detection share one sign convention."""
+    scene = torch.from_numpy(draw_scene(2048 + 40, 300 + 40, 6))
+    vibration = Vibration([2.0, 3.0], [70.0, 36.0], [0.5, 2.5])
+    result = detect_vibration(simulate_frames(scene, paper_camera, vibration, frame_size=(2048, 300)), paper_camera)
+    period, amplitude, phase = errors(result, Motion((2.0, 3.0), (70.0, 36.0), (0.5, 2.5)))
+    assert period < 0.3
+    assert amplitude < 1.0
+    assert phase < 0.01
+
+
+def detail(*shape):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(0))
+
+
+def with_pixel(value):
+    frames = detail(2, 256, 128)
+    frames[1, 17, 5] = value
+    return frames
+
+
+@pytest.mark.parametrize(
+    ("frames", "options", "error", "message"),
+    [
+        (detail(1, 256, 128), {}, ValueError, "at least 2 frames are needed, got 1"),
+        (detail(256, 128), {}, ValueError, r"frames must have shape .* got \(256, 128\)"),
+        (with_pixel(math.nan), {}, ValueError, r"pixel \(1, 17, 5\) is nan"),
+        (with_pixel(math.inf), {}, ValueError, r"pixel \(1, 17, 5\) is inf"),
+        (with_pixel(-math.inf), {}, ValueError, r"pixel \(1, 17, 5\) is -inf"),
+        (torch.full((2, 256, 128), 0.4), {}, ValueError, "frame 0 is constant"),
+        (torch.cat([detail(1, 256, 128), torch.zeros(1, 256, 128)]), {}, ValueError, "frame 1 is constant"),
+        (torch.zeros(2, 256, 128, dtype=torch.uint16), {}, ValueError, "uint16 frames do not say their full scale"),
+        (torch.zeros(2, 256, 128, dtype=torch.bool), {}, TypeError, "frames must be real numbers"),
+        (detail(2, 24, 128), {}, ValueError, "too small for bands of 32 rows searched over 16 px"),
+        (detail(2, 256, 40), {}, ValueError, "too small for bands"),
+        (detail(2, 2100, 128), {}, ValueError, "frame_rows=2048 is less than the 2100 rows"),
+        (detail(2, 256, 128), {"tones": 0}, ValueError, "tones must be at least 1, got 0"),
+        (detail(2, 256, 128), {"tones": 9}, ValueError, "tones must be 'auto' or 1 to 4, got 9"),
+        (detail(2, 256, 128), {"tones": "many"}, TypeError, "tones must be a whole number, got 'many'"),
+        (detail(2, 256, 128), {"tones": 1.5}, TypeError, "tones must be a whole number, got 1.5"),
+        (detail(2, 256, 128), {"method": "magic"}, ValueError, "method must be one of .*got 'magic'"),
+        (detail(2, 256, 128), {"registration": "orb"}, ValueError, "registration must be one of .*got 'orb'"),
+        (detail(2, 256, 128), {"band_rows": 2}, ValueError, "band_rows must be at least 4, got 2"),
+        (detail(2, 256, 128), {"band_step": 0}, ValueError, "band_step must be at least 1, got 0"),
+        (detail(2, 256, 128), {"search": 1}, ValueError, "search must be at least 2, got 1"),
+    ],
+)
+def test_bad_input(paper_camera, frames, options, error, message):
+    with pytest.raises(error, match=message):
+        detect_vibration(frames, paper_camera, **options)
+
+
+def test_frames_of_different_size(paper_camera):
+    with pytest.raises(TypeError, match="frames must be a tensor or array of numbers, got list"):
+        detect_vibration([detail(256, 128), detail(256, 130)], paper_camera)
+
+
+def test_too_few_start_times():
+    timing = SensorTiming(ROW_TIME, 20, 2048, frame_start_times=[0.0, 0.05])
+    with pytest.raises(ValueError, match="frame_start_times has 2 entries for 3 frames"):
+        detect_vibration(detail(3, 256, 128), timing)
