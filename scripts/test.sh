@@ -10,6 +10,7 @@ for argument in "$@"; do
   esac
 done
 bash scripts/setup.sh
+export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive} # threads that wait by spinning crawl where cores are shared
 .venv/bin/python -m ruff format --check .
 .venv/bin/python -m ruff check .
 .venv/bin/python -m mypy

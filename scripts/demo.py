@@ -1,0 +1,194 @@
+#!/usr/bin/env python
+"""The whole chain on two drawn scenes: simulate a vibrating camera, detect, restore, compare with the truth.
+
+The camera is that of Liu et al. 2023 (Sensors 23, 5953), with 12-bit counts and noise; the vibration has its
+amplitudes and frequencies, and random phases.
+"""
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from matplotlib.figure import Figure
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+import rsvib_torch as rsv
+from rsvib_torch.evaluation import city_and_fields, resolution_chart
+from rsvib_torch.pictures import detailed_places, offset_figure, save_figure
+from rsvib_torch.report import write_offsets, write_vibration
+from rsvib_torch.stacks import whole_folder
+from rsvib_torch.terminal import warnings_in_one_line, working
+
+TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+AMPLITUDE, FREQUENCY = (3.1, 5.2), (50.0, 30.0)
+FULL_SCALE, NOISE = 4095, 0.003
+MARGIN = 32  # px of scene around the frame, on every side
+RIM = 32  # px at the border that no figure counts: the camera did not see all of them
+SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
+    "chart": lambda height, width, seed: resolution_chart(height, width, seed=seed),
+    "city": city_and_fields,
+}
+
+
+@dataclass
+class Trial:
+    """One scene on its way through the chain."""
+
+    name: str
+    seed: int
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def step(self, what: str) -> Iterator[None]:
+        """Show what is being done and note how long it takes."""
+        begin = time.perf_counter()
+        with working(f"{self.name}: {what}"):
+            yield
+        self.seconds[what] = round(time.perf_counter() - begin, 3)
+
+
+def wrapped(angle: float) -> float:
+    """Angle in -pi ... pi."""
+    return math.remainder(angle, 2 * math.pi)
+
+
+def compare(truth: rsv.Vibration, detected: rsv.Vibration) -> list[dict[str, Any]]:
+    """True and detected values of each axis, with the error in the unit of the goal that it has to meet."""
+    lines = []
+    for axis, name in enumerate("xy"):
+        for quantity, unit, scale in (("period", "ms", 1e3), ("amplitude", "px", 1.0), ("phase", "π", 1 / math.pi)):
+            true, found = (scale * float(getattr(v, quantity)[axis, 0]) for v in (truth, detected))
+            if quantity == "phase":
+                error = f"{wrapped(math.pi * (found - true)) / math.pi:+.4f} π"
+            else:
+                error = f"{100 * (found / true - 1):+.3f} %"
+            value = float(error.split()[0])
+            lines.append(
+                {"axis": name, "quantity": quantity, "unit": unit, "true": true, "detected": found}
+                | {"error": value, "error_unit": error.split()[1]}
+            )
+    return lines
+
+
+def show(console: Console, trial: Trial, lines: list[dict[str, Any]], quality: dict[str, Any]) -> None:
+    """Print both tables of a scene."""
+    heads = ("axis", "quantity", "true", "detected", "error")
+    table = Table(*heads, title=f"{trial.name}: vibration", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for line in lines:
+        digits = 4 if line["unit"] == "px" else 3
+        table.add_row(
+            line["axis"],
+            f"{line['quantity']} ({line['unit']})",
+            f"{line['true']:.{digits}f}",
+            f"{line['detected']:.{digits}f}",
+            f"{line['error']:+.3f} {line['error_unit']}",
+        )
+    console.print(table)
+    heads = ("frame", "PSNR before (dB)", "PSNR after", "SSIM before", "SSIM after")
+    table = Table(*heads, title=f"{trial.name}: frames", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for frame, (psnr_before, psnr_after, ssim_before, ssim_after) in enumerate(
+        zip(*(quality[f"{what}_{when}"] for what in ("psnr", "ssim") for when in ("before", "after")), strict=True)
+    ):
+        table.add_row(str(frame), f"{psnr_before:.2f}", f"{psnr_after:.2f}", f"{ssim_before:.4f}", f"{ssim_after:.4f}")
+    console.print(table)
+
+
+def before_after(frame: Tensor, restored: Tensor, still: Tensor) -> Figure:
+    """Draw a column of the frame with its bends magnified, a detail, and the detail's difference from the truth."""
+    middle, strip, size = frame.shape[-1] // 2, 40, 160
+    places = detailed_places(still[2 * RIM : -2 * RIM, 2 * RIM : -2 * RIM], size, 1)
+    row, column = (place + 2 * RIM for place in places[0])
+    detail = (slice(row, row + size), slice(column, column + size))
+    figure = Figure(figsize=(12.0, 8.4), layout="constrained")
+    panels = figure.subplots(2, 3)
+    for line, (name, image) in enumerate((("as taken", frame), ("restored", restored))):
+        error = (image - still)[RIM:-RIM, RIM:-RIM]
+        shown = (
+            (image[:, middle - strip : middle + strip], f"{name}: middle columns, widened", {"aspect": "auto"}),
+            (image[detail], f"{name}: detail", {}),
+            ((image - still)[detail], "minus the still scene", {"vmin": -0.3, "vmax": 0.3}),
+        )
+        for panel, (part, title, options) in zip(panels[line], shown, strict=True):
+            panel.imshow(part.numpy(), cmap="gray", interpolation="nearest", **{"vmin": 0.0, "vmax": 1.0, **options})
+            panel.set_title(title, loc="left", fontsize=11)
+            panel.set_xticks([])
+            panel.set_yticks([])
+        panels[line, 2].set_xlabel(f"whole frame: rms {error.square().mean().sqrt():.4f} of full scale", fontsize=11)
+    return figure
+
+
+def run(trial: Trial, size: tuple[int, int], out: Path, console: Console) -> None:
+    """Take one scene through the chain and leave everything in ``out``."""
+    generator = torch.Generator().manual_seed(trial.seed)
+    phase = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1) * math.pi
+    truth = rsv.Vibration(AMPLITUDE, FREQUENCY, phase)
+    with trial.step("drawing the scene"):
+        scene = SCENES[trial.name](size[0] + 2 * MARGIN, size[1] + 2 * MARGIN, trial.seed)
+    with trial.step("simulating two frames"):
+        noise = rsv.SensorNoise(read_noise=NOISE, bits=12)
+        frames = rsv.simulate_frames(scene, TIMING, truth, 2, frame_size=size, noise=noise, generator=generator)
+    with trial.step("detecting the vibration"):
+        detection = rsv.detect_vibration(frames, TIMING)
+    with trial.step("restoring both frames"):
+        restored = rsv.restore(frames, TIMING, detection.vibration)
+    still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    with trial.step("comparing with the still scene"):
+        quality = {
+            f"{what}_{when}": [round(value, 4) for value in measure(images, still, 1.0, rim=RIM).tolist()]
+            for what, measure in (("psnr", rsv.psnr), ("ssim", rsv.ssim))
+            for when, images in (("before", frames), ("after", restored))
+        }
+    lines = compare(truth, detection.vibration)
+    show(console, trial, lines, quality)
+    with trial.step("writing files and pictures"), whole_folder(out) as folder:
+        rsv.write_stack(folder / "frames.tif", frames, dtype="uint16", full_scale=FULL_SCALE)
+        rsv.write_stack(folder / "restored.tif", restored, dtype="uint16", full_scale=FULL_SCALE)
+        write_vibration(folder / "vibration.json", detection, TIMING)
+        write_offsets(folder / "offsets.csv", detection)
+        save_figure(offset_figure(detection), folder / "offsets.png")
+        save_figure(before_after(frames[0], restored[0], still), folder / "before_after.png", dpi=80)
+        summary = {
+            "scene": trial.name,
+            "seed": trial.seed,
+            "frame_size": list(size),
+            "noise_of_full_scale": NOISE,
+            "vibration": lines,
+            "reliable": detection.reliable.tolist(),
+            "failed_bands": round(1.0 - detection.offsets.good.double().mean().item(), 4),
+            "residual_px": [round(value, 4) for value in detection.residual.tolist()],
+            **quality,
+            "rim": RIM,
+            "seconds": trial.seconds,
+            "threads": torch.get_num_threads(),
+            "versions": {"rsvib_torch": rsv.__version__, "torch": torch.__version__},
+        }
+        (folder / "summary.json").write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder to write to (default: out/demo)")
+    parser.add_argument("--seed", type=int, default=2023, help="seed of scene, phases and noise (default: 2023)")
+    parser.add_argument("--quick", action="store_true", help="narrow frames: 2048 rows of 320 px")
+    options = parser.parse_args(arguments)
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 100)
+    begin = time.perf_counter()
+    for name in SCENES:
+        with warnings_in_one_line():
+            run(Trial(name, options.seed), (2048, 320 if options.quick else 2048), options.out / name, console)
+    console.print(f"{time.perf_counter() - begin:.0f} s; frames, pictures and figures are in {options.out}")
+
+
+if __name__ == "__main__":
+    main()
