@@ -21,16 +21,15 @@ def frequency_grid(measurements: Measurements, sample_interval: float) -> Tensor
     return grid * step
 
 
-def strongest_frequency(measurements: Measurements, residual: Tensor, sample_interval: float) -> Tensor:
-    """Frequency whose tone, with a uniform motion, explains most of the residual offsets.
+def strongest_frequency(measurements: Measurements, sample_interval: float) -> Tensor:
+    """Frequency whose tone, with a uniform motion, explains most of the offsets.
 
     For every frequency of a grid a tone is fitted with all that lies between it and an offset (gain, exposure, band
     average, coupling). A weak prior on its amplitude keeps blind frequencies, where a huge tone would leave a small
     offset, from explaining noise.
 
     Args:
-        measurements: The offsets and their weights.
-        residual: (B, M, 2) px, what the tones found so far leave.
+        measurements: The offsets that the tones found so far leave, and their weights.
         sample_interval: Seconds between neighbouring rows or bands.
 
     Returns:
@@ -46,7 +45,7 @@ def strongest_frequency(measurements: Measurements, residual: Tensor, sample_int
         design = torch.stack([response.real, -response.imag, interval[..., None].expand(response.shape)], dim=-1)
         weighted = design * weights[..., None, None]
         matrix = torch.einsum("bmafi,bmafj->bafij", weighted, design)
-        right = torch.einsum("bmafi,bma->bafi", weighted, residual)
+        right = torch.einsum("bmafi,bma->bafi", weighted, measurements.offsets)
         # prior: an offset gain of 0.1 counts as half blind
         prior = 1e-2 * weights.sum(1)[..., None]
         lift = torch.stack([prior, prior, 1e-12 * matrix[..., 2, 2].amax(-1, keepdim=True)], dim=-1)

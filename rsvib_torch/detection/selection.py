@@ -1,5 +1,7 @@
 """How many tones: added one by one, strongest first, as long as the data ask for them."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -25,15 +27,7 @@ def reweighted(measurements: Measurements, residual: Tensor) -> Measurements:
     factor = (1 - ratio.square()).clamp(min=0.0).square()
     root = factor.sqrt()
     information = measurements.information * root[..., :, None] * root[..., None, :]
-    return Measurements(
-        measurements.starts,
-        measurements.later_starts,
-        measurements.offsets,
-        information,
-        measurements.exposure_time,
-        measurements.average_times,
-        measurements.independent,
-    )
+    return replace(measurements, information=information)
 
 
 def _robust_fit(measurements: Measurements, frequencies: Tensor, active: Tensor) -> tuple[ToneFit, Measurements]:
@@ -46,7 +40,7 @@ def _robust_fit(measurements: Measurements, frequencies: Tensor, active: Tensor)
     return fit, weighed
 
 
-def find_tones(measurements: Measurements, sample_interval: float, tones: int | None = None) -> ToneFit:
+def find_tones(measurements: Measurements, sample_interval: float, tones: int | None = None, group: int = 1) -> ToneFit:
     """Find and fit the tones of both axes without start values.
 
     The strongest tone of the gain-aware periodogram is added and all parameters are fitted again, until ``tones`` are
@@ -57,6 +51,7 @@ def find_tones(measurements: Measurements, sample_interval: float, tones: int | 
         measurements: The offsets.
         sample_interval: Seconds between neighbouring rows or bands.
         tones: Number of tones of each axis; None to choose it from the data.
+        group: Neighbouring measurements averaged for the periodogram.
 
     Returns:
         The fit, with K the largest number of tones of any axis (at least 1).
@@ -68,9 +63,8 @@ def find_tones(measurements: Measurements, sample_interval: float, tones: int | 
     fit, weighed = _robust_fit(measurements, frequencies, active)
     known = (measurements.weights > 0).sum(1) * measurements.independent  # (B, 2)
     for count in range(1, (MAX_TONES if tones is None else tones) + 1):
-        candidate = strongest_frequency(
-            weighed, measurements.offsets - model_offsets(measurements, fit), sample_interval
-        )
+        left = replace(weighed, offsets=measurements.offsets - model_offsets(measurements, fit)).grouped(group)
+        candidate = strongest_frequency(left, sample_interval)
         trial_active = torch.cat([fit.active, torch.ones_like(active)], -1) if count > 1 else torch.ones_like(active)
         if tones is None and count > 1:
             # an axis that stopped stays stopped

@@ -50,6 +50,17 @@ class Measurements:
         """(B, M, 2) information of each axis alone."""
         return self.information.diagonal(dim1=-2, dim2=-1)
 
+    def grouped(self, size: int) -> "Measurements":
+        """Weighted means of groups of ``size`` neighbouring measurements, each axis for itself."""
+        if size <= 1:
+            return self
+        count = self.offsets.shape[1] // size * size
+        weights = self.weights[:, :count].unflatten(1, (-1, size))
+        total = weights.sum(2)
+        values = (weights * self.offsets[:, :count].unflatten(1, (-1, size))).sum(2) / total.clamp(min=1e-300)
+        starts, later = (t[:, :count].unflatten(1, (-1, size)).mean(2) for t in (self.starts, self.later_starts))
+        return Measurements(starts, later, values, torch.diag_embed(total), self.exposure_time, self.average_times)
+
 
 @dataclass(frozen=True, eq=False)
 class ToneFit:
