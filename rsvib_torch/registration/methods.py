@@ -252,6 +252,8 @@ def register_projection(task: BandTask) -> tuple[Tensor, Tensor]:
     tall = projection_height(task.height, task.search, num_rows)
     aside = (task.height - tall) // 2
     tall_tops = (task.tops + aside).clamp(0, num_rows - tall)
+    # lags beyond the search range give the peaks near its edge the neighbours to interpolate from
+    reach = task.search + _LAGS - 1
     row_means = [
         _differences(take_windows(image, torch.zeros_like(left), left, num_rows, task.width).mean(-1))[:, 0]
         for image, left in (
@@ -259,12 +261,12 @@ def register_projection(task: BandTask) -> tuple[Tensor, Tensor]:
             (task.second, (task.left + task.coarse[:, 0])[:, None]),
         )
     ]
-    begin = tall_tops + task.coarse[:, 1:] - task.search
-    later = take_windows(row_means[1][..., None], begin, torch.zeros_like(begin), tall + 2 * task.search, 1)[..., 0]
+    begin = tall_tops + task.coarse[:, 1:] - reach
+    later = take_windows(row_means[1][..., None], begin, torch.zeros_like(begin), tall + 2 * reach, 1)[..., 0]
     template = row_means[0][:, tall_tops[:, None] + torch.arange(tall, device=begin.device)]
     surface = correlate_profiles(template, later)
-    lag_begin = begin[..., None] + torch.arange(2 * task.search + 1, device=begin.device)
-    surface = torch.where((lag_begin >= 0) & (lag_begin + tall <= num_rows), surface, -1.0)
+    lag_begin = begin[..., None] + torch.arange(2 * reach + 1, device=begin.device)
+    surface = torch.where((lag_begin >= 0) & (lag_begin + tall <= num_rows), surface, -torch.inf)
     y, quality_y = _profile_peak(surface)
     # windows held back by the edge of the frame do not measure the offset at the band's centre
     y = torch.where(tall_tops == task.tops + aside, y, torch.nan)
@@ -276,7 +278,7 @@ def register_projection(task: BandTask) -> tuple[Tensor, Tensor]:
         _differences(take_windows(image, top, left, task.height, columns).mean(-2))
         for image, top, left, columns in (
             (task.first, places[..., 1], places[..., 0], task.width),
-            (task.second, rows, moved[..., 0] - task.search, task.width + 2 * task.search),
+            (task.second, rows, moved[..., 0] - reach, task.width + 2 * reach),
         )
     ]
     x, quality_x = _profile_peak(correlate_profiles(pair[0], pair[1]))
@@ -291,12 +293,20 @@ def _differences(profile: Tensor) -> Tensor:
 
 
 def _profile_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
-    """Sub-pixel lag of the peaks of (L, N, 2 search + 1) correlations, NaN where there is none, and quality."""
+    """Sub-pixel lag of the peaks of correlations, NaN where there is none, and quality.
+
+    Args:
+        surface: (L, N, 2 reach + 1) where the search range is ``reach - _LAGS + 1``; -infinity at lags that leave the
+            frame. A peak at the edge of the search range, or with such a lag beside it, has failed.
+    """
     flat = surface.flatten(0, 1)[..., None]
     place, _ = integer_peak(flat)
-    position, value = subpixel_peak(_cut_lags(flat, place, (min(_LAGS - 1, flat.shape[1] // 2), 0)))
+    around = _cut_lags(flat, place, (_LAGS - 1, 0))
+    whole = torch.isfinite(around).all(1)[:, 0]
+    position, value = subpixel_peak(torch.where(whole[:, None, None], around, 0.0))
     lag = (place + position)[:, 0] - flat.shape[1] // 2
-    ok = ~_at_edge(place, flat) & torch.isfinite(lag)
+    search = flat.shape[1] // 2 - _LAGS + 1
+    ok = whole & (lag.abs() < search) & torch.isfinite(lag)
     lag, value = torch.where(ok, lag, torch.nan), torch.where(ok, value.clamp(0.0, 1.0), 0.0)
     return lag.unflatten(0, surface.shape[:2]), value.unflatten(0, surface.shape[:2])
 

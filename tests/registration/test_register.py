@@ -1,0 +1,255 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from truth import Motion, draw_scene, take_frames
+
+from rsvib_torch import SensorTiming, register_bands
+
+METHODS = ("projection", "ncc", "phase")
+# rms error in px along the rows and along the scan, good bands only; the offsets are 1.4 and 5 px rms
+RMS = {"projection": (0.08, 0.8), "ncc": (0.03, 0.08), "phase": (0.025, 0.04)}
+
+
+def float_frames(frames):
+    return torch.from_numpy(frames).float()
+
+
+def true_offsets(curve, timing, motion):
+    """Offsets (P, N, 2) by Eqs. (1), (2), integrated numerically, at the rows where the content went."""
+    steps = (np.arange(64) + 0.5) / 64 * timing.exposure_time
+
+    def mean(times):
+        return motion.displacement(times[..., None] + steps).mean(-2)
+
+    early, late = curve.times.numpy(), curve.later_times.numpy()
+    offsets = mean(late) - mean(early)
+    for _ in range(8):
+        offsets = mean(late + offsets[..., 1] * timing.row_time) - mean(early)
+    return offsets
+
+
+@pytest.fixture(scope="module")
+def pair(paper_camera):
+    motion = Motion()
+    scene = draw_scene(2048 + 80, 448 + 80, 31)
+    return float_frames(take_frames(scene, paper_camera, motion, noise=0.003, seed=1, samples=6)), motion
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_offsets_against_truth(pair, paper_camera, method):
+    frames, motion = pair
+    curve = register_bands(frames, paper_camera, method=method)
+    truth = true_offsets(curve, paper_camera, motion)
+    error = curve.offsets.numpy() - truth
+    rms = np.sqrt(np.nanmean(error**2, axis=(0, 1)))
+    assert bool((rms < RMS[method]).all()), rms
+    assert bool((np.sqrt(np.mean(truth**2, axis=(0, 1))) > 1.0).all())
+    assert curve.good.double().mean() > 0.9
+    assert (curve.quality[curve.good] > 0.5).double().mean() > 0.98
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_layout(pair, paper_camera, method):
+    frames, _ = pair
+    curve = register_bands(frames, paper_camera, method=method, band_rows=48, band_step=24)
+    count = (2048 - 48) // 24 + 1
+    assert curve.offsets.shape == (1, count, 2)
+    assert curve.offsets.dtype == torch.float64
+    assert curve.quality.shape == (1, count)
+    assert curve.pairs.tolist() == [[0, 1]]
+    assert curve.rows[:2].tolist() == [23.5, 47.5]
+    assert curve.times[0, 0].item() == pytest.approx(23.5 * 20.52e-6)
+    assert (curve.later_times - curve.times).flatten().tolist() == pytest.approx([2048 * 20.52e-6] * count)
+    assert curve.heights[0] == 48
+    assert (curve.heights[1] > 48) == (method == "projection")
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.4), (3.5, 2.25)])
+def test_uniform_shift_to_subpixel(method, shift):
+    """A still scene moved as a whole between the frames: every band has the same offset."""
+    timing = SensorTiming(row_time=10e-6, exposure_rows=1e-3, frame_rows=1000)
+    # a motion as slow as that is a shift of every frame, and none worth mention within a frame
+    motion = Motion(amplitude=(0.0, 0.0), image_motion=(shift[0] / 10e-3, shift[1] / 10e-3))
+    scene = draw_scene(512 + 80, 512 + 80, 5)
+    frames = float_frames(take_frames(scene, timing, motion, samples=1))
+    curve = register_bands(frames, timing, method=method)
+    error = curve.offsets.numpy() - true_offsets(curve, timing, motion)
+    limit = {"projection": (0.05, 0.05), "ncc": (0.03, 0.05), "phase": (0.03, 0.03)}[method]
+    assert bool((np.sqrt(np.nanmean(error**2, axis=(0, 1))) < limit).all())
+    assert curve.good.double().mean() > 0.7
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("shift", [(260.0, 3.0), (-240.0, -150.0), (20.0, 300.0)])
+def test_push_scan_shift_of_hundreds_of_pixels(method, shift):
+    """The frames are cut from one drawn scene at places far apart, so that the truth is a whole number of px."""
+    timing = SensorTiming(row_time=10e-6, exposure_rows=10, frame_rows=1024)
+    scene = torch.from_numpy(draw_scene(1024, 1088, 9)).float()
+    x, y = (int(part) for part in shift)
+    tall, wide = 1024 - abs(y), 1088 - abs(x)
+    size = (min(640, tall), min(704, wide))
+    top, left = max(0, y), max(0, x)
+    first = scene[top : top + size[0], left : left + size[1]]
+    second = scene[top - y : top - y + size[0], left - x : left - x + size[1]]
+    curve = register_bands(torch.stack([first, second]), timing, method=method)
+    good = curve.good
+    least = 0.25 if y == 300 and method == "projection" else 0.4
+    assert good.double().mean() > least
+    error = (curve.offsets[good] - torch.tensor(shift, dtype=torch.float64)).abs()
+    assert error.median(0).values.tolist() == pytest.approx([0.0, 0.0], abs=0.03 if method == "projection" else 0.005)
+    assert (error.amax(-1) < 0.1).double().mean() > 0.95
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_failed_bands(method):
+    """Bands without texture are NaN with quality 0; the others stay good."""
+    timing = SensorTiming(row_time=10e-6, exposure_rows=10, frame_rows=1024)
+    frame = torch.from_numpy(draw_scene(1024, 256, 2)).float()
+    flat = slice(256, 640)
+    frame[flat] = 0.5
+    curve = register_bands(torch.stack([frame, frame]), timing, method=method)
+    assert torch.equal(torch.isnan(curve.offsets).any(-1), torch.isnan(curve.offsets).all(-1))
+    assert torch.equal(curve.quality == 0, ~curve.good)
+    half = (curve.heights[1] // 2) + 40
+    inside = (curve.rows > flat.start + half) & (curve.rows < flat.stop - half)
+    outside = (curve.rows < flat.start - half) | (curve.rows > flat.stop + half)
+    away = outside & (curve.rows > half) & (curve.rows < 1024 - half)
+    assert int(inside.sum()) > 5
+    assert not bool(curve.good[0, inside].any())
+    assert int(away.sum()) > 5
+    assert bool(curve.good[0, away].all())
+    assert curve.offsets[0, away].abs().max() < (0.1 if method == "projection" else 0.01)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("axis", [-1, -2])
+def test_peak_at_the_edge_of_the_search_has_failed(method, axis):
+    """Half the frame moves by more than the search range about the other half: never an offset at the edge."""
+    timing = SensorTiming(row_time=10e-6, exposure_rows=10, frame_rows=1024)
+    scene = torch.from_numpy(draw_scene(1100, 360, 3)).float()
+    first = scene[40:1064, 40:320]
+    second = first.clone()
+    moved = scene.roll(12, axis)[40:1064, 40:320]
+    second[700:] = moved[700:]
+    curve = register_bands(torch.stack([first, second]), timing, method=method, search=8)
+    component = 0 if axis == -1 else 1
+    reach = curve.heights[1] // 2 + 24
+    still = (curve.rows > reach) & (curve.rows < 700 - reach)
+    far = curve.rows > 700 + reach
+    assert curve.good[0, still].double().mean() > 0.95
+    assert curve.offsets[0, still & curve.good[0], component].abs().max() < (0.25 if method == "projection" else 0.1)
+    found = curve.offsets[0, far & curve.good[0], component]
+    # whatever is found there is inside the range, and of low quality
+    assert bool((found.abs() < 8).all())
+    assert int(far.sum()) > 5
+    assert curve.good[0, far].double().mean() < 0.6
+    assert bool((curve.quality[0, far & curve.good[0]] < 0.8).all())
+    # with the range to reach it, the very same bands have the offset
+    wide = register_bands(torch.stack([first, second]), timing, method=method, search=16)
+    reach = wide.heights[1] // 2 + 24
+    far = (wide.rows > 700 + reach) & (wide.rows < 1024 - reach)
+    assert int(far.sum()) > 2
+    assert (wide.offsets[0, far, component] - 12).abs().max() < 0.05
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_noise_lowers_quality(pair, paper_camera, method):
+    frames, _ = pair
+    noise = torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
+    clean = register_bands(frames[:, :512], paper_camera, method=method).quality.mean()
+    noisy = register_bands((frames + 0.3 * noise)[:, :512], paper_camera, method=method).quality.mean()
+    assert noisy < 0.95 * clean
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_brightness_and_contrast_do_not_matter(pair, paper_camera, method):
+    frames, _ = pair
+    frames = frames[:, :768].double()
+    changed = frames.clone()
+    changed[1] = 0.3 + 0.5 * changed[1]
+    one = register_bands(frames, paper_camera, method=method).offsets
+    other = register_bands(changed, paper_camera, method=method).offsets
+    torch.testing.assert_close(one, other, rtol=0, atol=2e-3, equal_nan=True)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_order_of_the_frames_turns_the_sign(pair, paper_camera, method):
+    frames, _ = pair
+    there = register_bands(frames, paper_camera, method=method)
+    back = register_bands(frames.flip(0), paper_camera, method=method)
+    total = (there.offsets + back.offsets)[there.good & back.good]
+    # the bands of the way back lie a few rows aside, hence the residual
+    assert total.abs().median(0).values.tolist() == pytest.approx([0.0, 0.0], abs=0.25)
+    assert there.offsets[there.good].abs().median(0).values.min() > 1.0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_batch_channels_and_pairs_equal_singles(pair, paper_camera, method):
+    frames = pair[0][:, :512, :256]
+    three = torch.cat([frames, frames[:1]])
+    other = three.flip(-1)
+    batch = torch.stack([three, other])[:, :, None].repeat(1, 1, 2, 1, 1)
+    together = register_bands(batch, paper_camera, method=method)
+    assert together.offsets.shape[:2] == (2, 2)
+    assert together.pairs.tolist() == [[0, 1], [1, 2]]
+    for index, stack in enumerate((three, other)):
+        for p in range(2):
+            alone = register_bands(stack[p : p + 2], paper_camera, method=method)
+            torch.testing.assert_close(together[index].offsets[p], alone.offsets[0], rtol=0, atol=2e-4, equal_nan=True)
+            torch.testing.assert_close(together[index].quality[p], alone.quality[0], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("scan_axis", "direction"), [(-1, "forward"), (-2, "reverse"), (-1, "reverse")])
+def test_orientation(pair, paper_camera, method, scan_axis, direction):
+    frames = pair[0][:, :512, :256]
+    upright = register_bands(frames, paper_camera, method=method)
+    turned = frames.flip(-2) if direction == "reverse" else frames
+    turned = turned.transpose(-2, -1) if scan_axis == -1 else turned
+    timing = replace(paper_camera, scan_axis=scan_axis, readout_direction=direction)
+    result = register_bands(turned, timing, method=method)
+    expected = upright.offsets * torch.tensor([1.0, -1.0 if direction == "reverse" else 1.0])
+    expected = expected.flip(-1) if scan_axis == -1 else expected
+    torch.testing.assert_close(result.offsets, expected, rtol=0, atol=1e-6, equal_nan=True)
+    assert torch.equal(result.rows, upright.rows)
+    assert torch.equal(result.times, upright.times)
+    assert result.heights == (upright.heights[::-1] if scan_axis == -1 else upright.heights)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_float32_against_float64(pair, paper_camera, method):
+    frames = pair[0][:, :512, :256]
+    single = register_bands(frames, paper_camera, method=method).offsets
+    double = register_bands(frames.double(), paper_camera, method=method).offsets
+    torch.testing.assert_close(single, double, rtol=0, atol=1e-3, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"method": "sift"}, ValueError, "registration must be one of 'projection', 'ncc', 'phase'; got 'sift'"),
+        ({"band_rows": 3}, ValueError, "band_rows must be at least 4, got 3"),
+        ({"band_rows": 32.0}, TypeError, "band_rows must be a whole number, got 32.0"),
+        ({"band_step": 0}, ValueError, "band_step must be at least 1, got 0"),
+        ({"search": 1}, ValueError, "search must be at least 2, got 1"),
+        (
+            {"search": 60},
+            ValueError,
+            "frames of 256 x 200 px .* bands of 32 rows searched over 60 px",
+        ),
+        ({"band_rows": 240}, ValueError, "too small for bands of 240 rows"),
+    ],
+)
+def test_bad_options(paper_camera, options, error, message):
+    frames = torch.rand(2, 256, 200, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(error, match=message):
+        register_bands(frames, paper_camera, **options)
+
+
+def test_single_curve_is_not_a_batch(pair, paper_camera):
+    curve = register_bands(pair[0][:, :256], paper_camera)
+    with pytest.raises(IndexError, match="this offset curve is not a batch"):
+        curve[0]
