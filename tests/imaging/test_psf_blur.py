@@ -1,0 +1,235 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from rsvib_torch import RowVaryingBlur, SensorTiming, Vibration, row_psf
+from rsvib_torch.imaging import RowPSF, blur_rows, blur_rows_adjoint, exposure_nodes, exposure_trajectory
+
+PAPER = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+LONG = SensorTiming(row_time=20e-6, exposure_rows=400, frame_rows=2048)
+MOTION = Vibration([3.1, 5.2], [50.0, 30.0], [0.4, 1.3], [120.0, -40.0])
+
+
+def literal_kernel(start, timing, size, centre):
+    """Eqs. (25) to (39), one sample and one tap after the other."""
+    amplitude, frequency, phase, speed = (3.1, 5.2), (50.0, 30.0), (0.4, 1.3), (120.0, -40.0)
+    count = int(timing.exposure_rows)
+    kernel = np.zeros(size)
+    for i in range(1, count + 1):
+        t = start + (i - 0.5) * timing.row_time
+        x, y = (
+            a * math.sin(2 * math.pi * f * t + p) + v * t
+            for a, f, p, v in zip(amplitude, frequency, phase, speed, strict=True)
+        )
+        x_min, y_min = math.floor(x), math.floor(y)
+        taps = {
+            (x_min, y_min): (x_min + 1 - x) * (y_min + 1 - y),
+            (x_min, y_min + 1): (x_min + 1 - x) * (y - y_min),
+            (x_min + 1, y_min): (x - x_min) * (y_min + 1 - y),
+            (x_min + 1, y_min + 1): (x - x_min) * (y - y_min),
+        }
+        for (column, row), weight in taps.items():
+            kernel[row + centre, column + centre] += weight / count
+    return kernel
+
+
+@pytest.mark.parametrize("timing", [PAPER, LONG])
+@pytest.mark.parametrize("row", [0, 17, 900, 2047])
+def test_kernel_is_equations_26_to_39(timing, row):
+    starts = timing.row_starts(2, 2048)
+    psf = row_psf(MOTION, starts, timing)
+    expected = literal_kernel(starts[1, row].item(), timing, (41, 41), 20)
+    kernel = np.zeros((41, 41))
+    x, y = (20 + psf.first_tap[1, row]).tolist()
+    height, width = psf.weights.shape[-2:]
+    kernel[y : y + height, x : x + width] = psf.weights[1, row].numpy()
+    assert np.abs(kernel - expected).max() < 1e-12
+
+
+def test_dense_kernels_are_the_same_kernels():
+    starts = PAPER.row_starts(1, 2048)[0, ::64]
+    psf = row_psf(MOTION, starts, PAPER)
+    dense, (x, y) = psf.dense()
+    for row in range(len(starts)):
+        expected = literal_kernel(starts[row].item(), PAPER, (41, 41), 20)
+        height, width = dense.shape[-2:]
+        assert np.abs(dense[row].numpy() - expected[20 + y :, 20 + x :][:height, :width]).max() < 1e-12
+        assert dense[row].sum().item() == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+@pytest.mark.parametrize("quadrature", ["midpoint", "gauss"])
+@pytest.mark.parametrize("timing", [PAPER, LONG])
+def test_centroid_is_the_mean_displacement(interpolation, quadrature, timing):
+    """The kernel moves the image by the displacement of Eq. (2), and conserves its flux."""
+    starts = timing.row_starts(2, 2048)
+    psf = row_psf(MOTION, starts, timing, interpolation=interpolation, quadrature=quadrature)
+    expected = MOTION.mean_displacement(starts, timing.exposure_time)
+    # midpoints of N_e samples err by (2 pi f T_row)^2 A / 24; gauss is exact
+    limit = 1e-5 if quadrature == "midpoint" else 1e-8
+    assert (psf.centroid() - expected).abs().max() < limit
+    assert (psf.weights.sum((-2, -1)) - 1).abs().max() < 1e-12
+    assert bool((psf.weights >= -1e-15).all())
+
+
+def test_gauss_needs_far_fewer_nodes():
+    long, weights = exposure_trajectory(MOTION, LONG.row_starts(1, 8), LONG, "gauss")
+    assert len(weights) < 30
+    assert long.shape == (1, 8, len(weights), 2)
+    midpoint = row_psf(MOTION, PAPER.row_starts(1, 256), PAPER, interpolation="cubic", num_nodes=400)
+    gauss = row_psf(MOTION, PAPER.row_starts(1, 256), PAPER, interpolation="cubic", quadrature="gauss", num_nodes=6)
+    assert (midpoint.dense()[0] - gauss.dense()[0]).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("quadrature", ["midpoint", "gauss"])
+@pytest.mark.parametrize("exposure_rows", [0.5, 1, 2.5, 20])
+def test_nodes_integrate(quadrature, exposure_rows):
+    timing = SensorTiming(row_time=20e-6, exposure_rows=exposure_rows, frame_rows=100)
+    times, weights = exposure_nodes(timing, quadrature)
+    assert weights.sum().item() == pytest.approx(1.0)
+    assert (weights * times).sum().item() == pytest.approx(timing.exposure_time / 2)
+    if quadrature == "gauss":
+        assert (weights * times**5).sum().item() == pytest.approx(timing.exposure_time**5 / 6)
+    else:
+        assert len(times) == math.ceil(exposure_rows)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"interpolation": "nearest"}, "interpolation must be one of 'linear', 'cubic'; got 'nearest'"),
+        ({"quadrature": "simpson"}, "quadrature must be one of 'midpoint', 'gauss'; got 'simpson'"),
+    ],
+)
+def test_bad_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        row_psf(MOTION, PAPER.row_starts(1, 8), PAPER, **options)
+
+
+def fast_motion(batch=None):
+    """A motion that differs much from row to row of a small frame."""
+    amplitude = torch.tensor([[3.3], [2.4]], dtype=torch.float64)
+    if batch is not None:
+        amplitude = amplitude * torch.linspace(0.4, 1.3, batch, dtype=torch.float64)[:, None, None]
+    return Vibration(amplitude, [[2000.0], [1300.0]], [[0.4], [1.1]], [900.0, -700.0])
+
+
+SMALL = SensorTiming(row_time=20e-6, exposure_rows=6, frame_rows=64)
+
+
+def small_psf(interpolation, rows=14, batch=None):
+    starts = SMALL.row_starts(1, rows)[0]
+    starts = starts if batch is None else starts.expand(batch, -1)
+    return row_psf(fast_motion(batch), starts, SMALL, interpolation=interpolation)
+
+
+def noise(*shape, seed=0, dtype=torch.float64):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_output_row_selects_its_kernel(interpolation):
+    """Away from the borders the frame is the double sum over taps, row by row."""
+    psf = small_psf(interpolation)
+    scene = noise(46, 50)
+    frame = blur_rows(scene, psf, frame_width=18, origin=(16, 16))
+    samples = scene
+    if interpolation == "cubic":
+        from scipy import ndimage
+
+        samples = torch.from_numpy(ndimage.spline_filter(scene.numpy(), order=3, mode="mirror"))
+    for r in range(14):
+        x, y = psf.first_tap[r].tolist()
+        for c in (0, 7, 17):
+            total = sum(
+                psf.weights[r, j, k] * samples[16 + r - y - j, 16 + c - x - k]
+                for j in range(psf.weights.shape[-2])
+                for k in range(psf.weights.shape[-1])
+            )
+            assert frame[r, c].item() == pytest.approx(total.item(), abs=1e-7)
+
+
+def test_sign_of_the_displacement():
+    """Scene content at s appears at s + D."""
+    still = Vibration(0.0, 0.0, image_motion=[0.0, 0.0])
+    psf = row_psf(still, SMALL.row_starts(1, 20)[0], SMALL)
+    scene = torch.zeros(40, 40, dtype=torch.float64)
+    scene[15, 18] = 1.0
+    shifted = RowPSF(psf.first_tap + torch.tensor([3, -2]), psf.weights, psf.degree)
+    for kernels, place in ((psf, (5, 8)), (shifted, (3, 11))):
+        frame = blur_rows(scene, kernels, frame_width=20, origin=(10, 10))
+        assert frame[place].item() == pytest.approx(1.0)
+        assert frame.sum().item() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+@pytest.mark.parametrize(
+    ("scene_size", "width", "origin"),
+    [
+        ((30, 34), 18, None),
+        ((14, 18), 18, None),
+        ((14, 18), None, (0, 0)),
+        ((9, 12), 16, (-4, 3)),
+        ((40, 21), 33, (20, -9)),
+    ],
+)
+def test_adjoint(interpolation, scene_size, width, origin):
+    psf = small_psf(interpolation)
+    scene = noise(*scene_size, seed=1)
+    frame = noise(14, scene_size[1] if width is None else width, seed=2)
+    forward = (blur_rows(scene, psf, frame_width=width, origin=origin) * frame).sum()
+    backward = (scene * blur_rows_adjoint(frame, psf, scene_size, origin=origin)).sum()
+    assert forward.abs() > 1e-3
+    assert forward.item() == pytest.approx(backward.item(), rel=1e-11)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+@pytest.mark.parametrize("scene_lead", [(), (3,), (2, 1), (2, 3)])
+def test_adjoint_of_batches(interpolation, scene_lead):
+    psf = small_psf(interpolation, batch=3)
+    scene = noise(*scene_lead, 24, 28, seed=1)
+    frame = blur_rows(scene, psf, frame_width=18)
+    lead = torch.broadcast_shapes(scene_lead, (3,))
+    assert frame.shape == (*lead, 14, 18)
+    other = noise(*frame.shape, seed=2)
+    back = blur_rows_adjoint(other, psf, tuple(scene.shape))
+    assert back.shape == scene.shape
+    assert (frame * other).sum().item() == pytest.approx((scene * back).sum().item(), rel=1e-11)
+    for index in range(3):
+        one = RowPSF(psf.first_tap[index], psf.weights[index], psf.degree)
+        expected = blur_rows(scene.expand(*lead, 24, 28)[..., index, :, :], one, frame_width=18)
+        torch.testing.assert_close(frame[..., index, :, :], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_gradients(interpolation):
+    psf = small_psf(interpolation, rows=5)
+    scene = noise(9, 8).requires_grad_()
+    frame = noise(5, 7).requires_grad_()
+    assert torch.autograd.gradcheck(lambda s: blur_rows(s, psf, frame_width=7), scene)
+    assert torch.autograd.gradcheck(lambda g: blur_rows_adjoint(g, psf, (9, 8)), frame)
+    image = blur_rows(scene, psf, frame_width=7)
+    (gradient,) = torch.autograd.grad(image, scene, frame)
+    torch.testing.assert_close(gradient, blur_rows_adjoint(frame, psf, (9, 8)), rtol=0, atol=1e-12)
+
+
+def test_flux_and_constants_are_conserved():
+    for interpolation in ("linear", "cubic"):
+        psf = small_psf(interpolation)
+        frame = blur_rows(torch.full((14, 18), 0.7, dtype=torch.float64), psf)
+        assert (frame - 0.7).abs().max() < 1e-8
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_module(dtype):
+    psf = small_psf("cubic")
+    blur = RowVaryingBlur(psf, frame_width=18, origin=(3, 4))
+    scene = noise(24, 28, dtype=dtype)
+    frame = blur(scene)
+    assert frame.dtype == dtype
+    assert torch.equal(frame, blur_rows(scene, psf, frame_width=18, origin=(3, 4)))
+    assert torch.equal(blur.adjoint(frame, (24, 28)), blur_rows_adjoint(frame, psf, (24, 28), origin=(3, 4)))
+    assert {name for name, _ in blur.named_buffers()} == {"first_tap", "weights"}
+    torch.testing.assert_close(frame.double(), blur(scene.double()), rtol=0, atol=1e-5)
