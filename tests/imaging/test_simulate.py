@@ -1,0 +1,210 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from truth import MARGIN, Motion, draw_scene, take_frames
+
+from rsvib_torch import SensorNoise, SensorTiming, Vibration, row_psf, simulate_frames
+from rsvib_torch.imaging import blur_rows, rows_showing
+
+TIMING = SensorTiming(row_time=60e-6, exposure_rows=20, frame_rows=300)
+MOTION = Motion((3.1, 5.2), (50.0, 30.0), (0.4, 1.3), (60.0, -25.0))
+# cycles per px along x and y, and phase: up to a quarter cycle per pixel
+WAVES = ((0.25, 0.0, 0.3), (0.0, 0.25, 1.0), (0.17, -0.18, 2.0), (-0.03, 0.22, 0.7), (0.06, 0.05, 0.1))
+
+
+def analytic(rows, columns):
+    """A scene of five sines, full scale 1, at any place."""
+    return 0.5 + sum(0.09 * np.sin(2 * np.pi * (u * columns + v * rows) + p) for u, v, p in WAVES)
+
+
+def analytic_frames(timing, motion, num_frames, size, corner):
+    """Frames of the analytic scene: no interpolation, only the exposure is a sum (64 midpoints)."""
+    rows, columns = np.arange(size[0])[:, None], np.arange(size[1])
+    frames = np.zeros((num_frames, *size))
+    for p in range(num_frames):
+        for n in range(64):
+            times = (p * timing.frame_rows + rows[:, 0]) * timing.row_time + (n + 0.5) / 64 * timing.exposure_time
+            x, y = motion.displacement(times).T
+            frames[p] += analytic(rows + corner[0] - y[:, None], columns + corner[1] - x[:, None]) / 64
+    return frames
+
+
+@pytest.fixture(scope="module")
+def waves():
+    rows, columns = np.meshgrid(np.arange(300), np.arange(260), indexing="ij")
+    return torch.from_numpy(analytic(rows, columns))
+
+
+def test_against_analytic_scene(waves):
+    frames = simulate_frames(waves, TIMING, MOTION.vibration(), 3, frame_size=(220, 180)).numpy()
+    truth = analytic_frames(TIMING, MOTION, 3, (220, 180), (40, 40))
+    still = analytic(np.arange(220)[:, None] + 40, np.arange(180) + 40)
+    assert np.abs(truth - still).max() > 0.3
+    assert np.abs(frames - truth).max() < 3e-4
+
+
+def test_cubic_kernels_beat_linear_ones(waves):
+    truth = analytic_frames(TIMING, MOTION, 1, (220, 180), (40, 40))[0]
+    error = {}
+    for interpolation in ("linear", "cubic"):
+        psf = row_psf(MOTION.vibration(), TIMING.row_starts(1, 220)[0], TIMING, interpolation=interpolation)
+        frame = blur_rows(waves, psf, frame_width=180, origin=(40, 40)).numpy()
+        error[interpolation] = np.sqrt(np.mean((frame - truth) ** 2))
+    assert error["cubic"] < 0.1 * error["linear"]
+    assert error["linear"] < 0.05
+
+
+def test_against_independent_simulator():
+    scene = draw_scene(260, 240, 4)
+    truth = take_frames(scene, TIMING, MOTION, 2, samples=64)
+    frames = simulate_frames(
+        torch.from_numpy(scene), TIMING, MOTION.vibration(), frame_size=(260 - 2 * MARGIN, 240 - 2 * MARGIN)
+    ).numpy()
+    assert np.sqrt(np.mean((frames - truth) ** 2)) < 5e-4
+    assert np.abs(frames - scene[MARGIN:-MARGIN, MARGIN:-MARGIN]).max() > 0.1
+
+
+def test_still_camera_shows_the_centre_of_the_scene():
+    scene = torch.from_numpy(draw_scene(120, 121, 4))
+    frames = simulate_frames(scene, TIMING, Vibration.still(), 2, frame_size=(60, 70))
+    torch.testing.assert_close(frames, scene[30:90, 25:95].expand(2, -1, -1), rtol=0, atol=1e-6)
+
+
+def test_channels_equal_singles_and_dtype_is_kept():
+    scene = torch.from_numpy(draw_scene(120, 120, 4))
+    colours = torch.stack([scene, 1 - scene, scene.flip(-1)]).float()
+    frames = simulate_frames(colours, TIMING, MOTION.vibration(), 2)
+    assert frames.shape[:2] == (2, 3)
+    assert frames.dtype == torch.float32
+    for index in range(3):
+        alone = simulate_frames(colours[index], TIMING, MOTION.vibration(), 2)
+        torch.testing.assert_close(frames[:, index], alone, rtol=0, atol=1e-6)
+        double = simulate_frames(colours[index].double(), TIMING, MOTION.vibration(), 2)
+        assert double.dtype == torch.float64
+        torch.testing.assert_close(alone.double(), double, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(("scan_axis", "direction"), [(-1, "forward"), (-2, "reverse"), (-1, "reverse")])
+def test_orientation(scan_axis, direction):
+    """A transposed or flipped scene under the transposed or flipped motion gives transposed or flipped frames."""
+    scene = torch.from_numpy(draw_scene(140, 120, 4))
+    upright = simulate_frames(scene, TIMING, MOTION.vibration(), 2, frame_size=(80, 64))
+    amplitude, frequency, phase, speed = (
+        list(part) for part in (MOTION.amplitude, MOTION.frequency, MOTION.phase, MOTION.image_motion)
+    )
+    if direction == "reverse":
+        phase[1] += np.pi
+        speed[1] *= -1
+    parts = (amplitude, frequency, phase, speed)
+    size = (80, 64)
+    if scan_axis == -1:
+        parts = tuple(part[::-1] for part in parts)
+        size = (64, 80)
+
+    def turn(image):
+        image = image.flip(-2) if direction == "reverse" else image
+        return image.transpose(-2, -1) if scan_axis == -1 else image
+
+    timing = replace(TIMING, scan_axis=scan_axis, readout_direction=direction)
+    frames = simulate_frames(turn(scene), timing, Vibration(*parts), 2, frame_size=size)
+    torch.testing.assert_close(frames, turn(upright), rtol=0, atol=1e-9)
+    assert (frames - turn(upright).flip(0)).abs().max() > 0.05
+
+
+def test_default_frame_keeps_its_distance_from_the_edge():
+    """16 px and the amplitude on every side."""
+    scene = torch.from_numpy(draw_scene(140, 140, 4))
+    frames = simulate_frames(scene, TIMING, Vibration([3.0, 5.0], [50.0, 30.0]))
+    assert frames.shape == (2, 140 - 2 * 21, 140 - 2 * 19)
+
+
+def test_scene_too_small():
+    scene = torch.rand(60, 60, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match=r"scene of \(60, 60\) .* is too small: a frame of \(60, 60\) .* \(104, 100\)"):
+        simulate_frames(scene, TIMING, Vibration([3.5, 5.5], [50.0, 30.0]), frame_size=(60, 60))
+    with pytest.raises(ValueError, match="is too small"):
+        simulate_frames(scene, TIMING, Vibration(40.0, 50.0))
+
+
+@pytest.mark.parametrize(
+    ("scene", "options", "error", "message"),
+    [
+        (torch.zeros(99, 99, dtype=torch.uint8), {}, TypeError, "scene must be a floating-point tensor"),
+        (np.zeros((99, 99)), {}, TypeError, "scene must be a floating-point tensor"),
+        (torch.zeros(1, 1, 99, 99), {}, ValueError, "scene must be a finite .* got shape"),
+        (torch.full((99, 99), torch.nan), {}, ValueError, "scene must be a finite"),
+        (torch.zeros(99, 99), {"num_frames": 0}, ValueError, "num_frames must be at least 1, got 0"),
+        (torch.zeros(600, 99), {}, ValueError, "frame_rows=300 is less than the"),
+    ],
+)
+def test_bad_input(scene, options, error, message):
+    with pytest.raises(error, match=message):
+        simulate_frames(scene, TIMING, Vibration(1.0, 50.0), **options)
+
+
+def test_batch_of_vibrations_is_refused():
+    with pytest.raises(ValueError, match="takes one vibration, not a batch"):
+        simulate_frames(torch.zeros(99, 99), TIMING, Vibration.still((2,)))
+
+
+def test_read_and_shot_noise_have_their_variance():
+    generator = torch.Generator().manual_seed(3)
+    frames = torch.full((400, 500), 0.3, dtype=torch.float64)
+    read = SensorNoise(read_noise=0.02).apply(frames, generator) - 0.3
+    assert read.std().item() == pytest.approx(0.02, rel=0.01)
+    assert abs(read.mean().item()) < 2e-4
+    shot = SensorNoise(full_well=5000).apply(frames, generator) - 0.3
+    assert shot.var().item() == pytest.approx(0.3 / 5000, rel=0.02)
+    assert abs(shot.mean().item()) < 1e-4
+    both = SensorNoise(full_well=5000, read_noise=0.01).apply(frames, generator) - 0.3
+    assert both.var().item() == pytest.approx(0.3 / 5000 + 1e-4, rel=0.02)
+
+
+@pytest.mark.parametrize("bits", [1, 8, 12])
+def test_quantisation(bits):
+    frames = torch.linspace(-0.2, 1.2, 5000, dtype=torch.float64)
+    levels = 2**bits - 1
+    counts = SensorNoise(bits=bits).apply(frames) * levels
+    torch.testing.assert_close(counts, counts.round(), rtol=0, atol=1e-9)
+    assert counts.min() == 0
+    assert counts.max() == levels
+    assert (counts / levels - frames.clamp(0, 1)).abs().max() <= 0.5 / levels + 1e-12
+
+
+def test_noise_follows_the_generator():
+    scene = torch.from_numpy(draw_scene(120, 120, 4)).float()
+    noise = SensorNoise(full_well=10000, read_noise=0.01, bits=10)
+
+    def shoot(seed):
+        generator = torch.Generator().manual_seed(seed)
+        return simulate_frames(scene, TIMING, MOTION.vibration(), noise=noise, generator=generator)
+
+    assert torch.equal(shoot(1), shoot(1))
+    assert not torch.equal(shoot(1), shoot(2))
+    clean = simulate_frames(scene, TIMING, MOTION.vibration())
+    assert (shoot(1) - clean).std() > 0.009
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "message"),
+    [
+        ({"full_well": 0}, ValueError, "full_well must be larger than 0"),
+        ({"read_noise": -0.1}, ValueError, "read_noise must be at least 0"),
+        ({"bits": 0}, ValueError, "bits must be at least 1"),
+        ({"bits": 7.5}, TypeError, "bits must be a whole number, got 7.5"),
+    ],
+)
+def test_bad_noise(values, error, message):
+    with pytest.raises(error, match=message):
+        SensorNoise(**values)
+
+
+def test_rows_showing_is_the_fixed_point():
+    rows = torch.arange(0, 300, dtype=torch.float64)
+    start = torch.tensor(TIMING.frame_period, dtype=torch.float64)
+    found = rows_showing(rows, start, TIMING, MOTION.vibration())
+    mean = MOTION.vibration().mean_displacement(start + found * TIMING.row_time, TIMING.exposure_time)[..., 1]
+    assert (found - rows - mean).abs().max() < 1e-6
+    assert (found - rows).abs().max() > 4.0
