@@ -1,0 +1,155 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from rsvib_torch import SensorTiming, Vibration, blind_frequencies
+
+TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+AMPLITUDE = np.array([[3.1, 0.4], [5.2, 0.7]])
+FREQUENCY = np.array([[50.0, 155.0], [30.0, 88.0]])
+PHASE = np.array([[0.4, -1.0], [1.3, 2.2]])
+MOTION = np.array([120.0, -40.0])
+
+
+def vibration():
+    return Vibration(*(torch.from_numpy(part) for part in (AMPLITUDE, FREQUENCY, PHASE, MOTION)))
+
+
+def displacement(times):
+    angle = 2 * np.pi * FREQUENCY * times[..., None, None] + PHASE
+    return (AMPLITUDE * np.sin(angle)).sum(-1) + MOTION * times[..., None]
+
+
+def test_displacement_is_equation_1():
+    times = np.linspace(-0.1, 0.3, 57).reshape(3, 19)
+    assert vibration().displacement(torch.from_numpy(times)).numpy() == pytest.approx(displacement(times), abs=1e-12)
+
+
+@pytest.mark.parametrize("exposure", [1e-9, 20 * 20.52e-6, 5e-3, 0.04])
+def test_mean_displacement_is_the_integral(exposure):
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    starts = np.linspace(0.0, 0.1, 21)
+    expected = (displacement(starts[:, None] + (nodes + 1) / 2 * exposure) * weights[:, None] / 2).sum(1)
+    found = vibration().mean_displacement(torch.from_numpy(starts), exposure).numpy()
+    assert found == pytest.approx(expected, abs=1e-9)
+
+
+def test_offset_is_later_minus_earlier():
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+
+    def mean(starts):
+        times = starts[:, None] + (nodes + 1) / 2 * TIMING.exposure_time
+        return (displacement(times) * weights[:, None] / 2).sum(1)
+
+    starts = np.linspace(0.0, 0.04, 21)
+    later = starts + TIMING.frame_period
+    found = vibration().offset(torch.from_numpy(starts), torch.from_numpy(later), TIMING.exposure_time).numpy()
+    assert found == pytest.approx(mean(later) - mean(starts), abs=1e-9)
+    assert np.abs(found).max() > 3.0
+
+
+def test_velocity_is_the_derivative():
+    times = np.linspace(0.0, 0.1, 21)
+    step = 1e-6
+    expected = (displacement(times + step) - displacement(times - step)) / (2 * step)
+    assert vibration().velocity(torch.from_numpy(times)).numpy() == pytest.approx(expected, rel=1e-5, abs=1e-3)
+
+
+def test_gain():
+    gain = Vibration([3.1, 5.2], [50.0, 30.0]).gain(TIMING.frame_period)
+    assert gain[:, 0].tolist() == pytest.approx([0.62, -1.46], abs=0.01)
+    assert Vibration(1.0, 1 / TIMING.frame_period).gain(TIMING.frame_period).abs().max() < 1e-12
+
+
+def test_blind_frequencies():
+    found = blind_frequencies(TIMING, 100.0)
+    assert found.tolist() == pytest.approx([23.795, 47.591, 71.386, 95.182], abs=1e-3)
+    high = blind_frequencies(TIMING, 5000.0)
+    assert high.tolist() == sorted(high.tolist())
+    for j in (1, 2):
+        assert (high - j / TIMING.exposure_time).abs().min() < 1e-9
+    starts = TIMING.row_starts(1, 2048)[0]
+    for frequency in found.tolist():
+        tone = Vibration(5.0, frequency, 0.7)
+        assert tone.offset(starts, starts + TIMING.frame_period, TIMING.exposure_time).abs().max() < 1e-9
+    averaged = Vibration(5.0, 1 / TIMING.exposure_time, 0.7)
+    assert averaged.mean_displacement(starts, TIMING.exposure_time).abs().max() < 1e-9
+
+
+def test_displacement_within_a_row_time():
+    fast = Vibration([3.1, 5.2], [500.0, 300.0], 0.0, [200.0, 0.0])
+    times = torch.linspace(0, 1 / 50, 200001, dtype=torch.float64)
+    still = Vibration([3.1, 5.2], [500.0, 300.0])
+    largest = (still.displacement(times + TIMING.row_time) - still.displacement(times)).abs().amax(0)
+    assert still.displacement_within_row_time(TIMING.row_time).tolist() == pytest.approx(largest.tolist(), rel=1e-6)
+    extra = fast.displacement_within_row_time(TIMING.row_time) - largest
+    assert extra.tolist() == pytest.approx([200.0 * TIMING.row_time, 0.0], abs=1e-6)
+
+
+def test_largest_displacement_is_a_bound():
+    times = torch.linspace(-0.2, 0.5, 5000, dtype=torch.float64)
+    bound = vibration().largest_displacement(-0.2, 0.5)
+    assert bool((vibration().displacement(times).abs() <= bound).all())
+    assert bound.tolist() == pytest.approx([3.5 + 60.0, 5.9 + 20.0])
+
+
+def test_tones_are_sorted_by_amplitude():
+    mixed = Vibration([[0.4, 3.1], [5.2, 0.7]], [[155.0, 50.0], [30.0, 88.0]], [[-1.0, 0.4], [1.3, 2.2]], MOTION)
+    for name in ("amplitude", "frequency", "phase", "image_motion"):
+        assert torch.equal(getattr(mixed, name), getattr(vibration(), name))
+
+
+def test_shapes_and_defaults():
+    one = Vibration(2.0, 50.0)
+    assert one.amplitude.tolist() == [[2.0], [2.0]]
+    assert one.phase.tolist() == [[0.0], [0.0]]
+    assert one.image_motion.tolist() == [0.0, 0.0]
+    assert one.period.tolist() == [[0.02], [0.02]]
+    assert one.amplitude.dtype == torch.float64
+    assert Vibration.still().displacement(torch.linspace(0, 1, 5)).abs().max() == 0
+    assert math.isinf(Vibration.still().period[0, 0])
+
+
+def test_batch_equals_singles():
+    amplitude = torch.rand(3, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    batch = Vibration(amplitude, torch.from_numpy(FREQUENCY), torch.from_numpy(PHASE), MOTION)
+    assert batch.batch_shape == (3,)
+    times = torch.linspace(0, 0.1, 7, dtype=torch.float64).expand(3, -1)
+    together = batch.mean_displacement(times, 1e-3)
+    assert together.shape == (3, 7, 2)
+    for index in range(3):
+        alone = batch[index]
+        assert alone.batch_shape == ()
+        torch.testing.assert_close(together[index], alone.mean_displacement(times[index], 1e-3))
+    with pytest.raises(IndexError, match="not a batch"):
+        batch[0][0]
+    with pytest.raises(ValueError, match="times must have the batch dimensions"):
+        batch.displacement(torch.tensor(0.0))
+
+
+def test_gradients_reach_the_parameters():
+    amplitude = torch.tensor([3.1, 5.2], dtype=torch.float64, requires_grad=True)
+    Vibration(amplitude, [50.0, 30.0], [0.4, 1.3]).displacement(torch.tensor(0.003)).sum().backward()
+    expected = [math.sin(2 * math.pi * f * 0.003 + p) for f, p in ((50.0, 0.4), (30.0, 1.3))]
+    assert amplitude.grad.tolist() == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"amplitude": -1.0, "frequency": 50.0}, "amplitude must not be negative, got -1"),
+        ({"amplitude": 1.0, "frequency": -50.0}, "frequency must not be negative, got -50"),
+        ({"amplitude": math.nan, "frequency": 50.0}, "amplitude must be finite"),
+        ({"amplitude": 1.0, "frequency": math.inf}, "frequency must be finite"),
+        ({"amplitude": 1.0, "frequency": 50.0, "phase": math.nan}, "phase must be finite"),
+        ({"amplitude": 1.0, "frequency": 50.0, "image_motion": [math.inf, 0.0]}, "image_motion must be finite"),
+        ({"amplitude": [1.0, 2.0, 3.0], "frequency": 50.0}, r"amplitude must have shape \(2,\)"),
+        ({"amplitude": 1.0, "frequency": 50.0, "image_motion": [1.0, 2.0, 3.0]}, "image_motion must have shape"),
+        ({"amplitude": [[1.0, 2.0], [1.0, 2.0]], "frequency": [[1.0, 2.0, 3.0]] * 2}, "do not fit together"),
+    ],
+)
+def test_bad_values(values, message):
+    with pytest.raises(ValueError, match=message):
+        Vibration(**values)
