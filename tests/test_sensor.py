@@ -1,0 +1,86 @@
+import math
+
+import pytest
+import torch
+
+from rsvib_torch import SensorTiming
+
+GOOD = {"row_time": 20.52e-6, "exposure_rows": 20, "frame_rows": 2048}
+
+
+def test_times():
+    timing = SensorTiming(**GOOD)
+    assert timing.exposure_time == pytest.approx(410.4e-6)
+    assert timing.frame_period == pytest.approx(42.02496e-3)
+    assert timing.frame_rate == pytest.approx(23.79538, abs=1e-5)
+    starts = timing.row_starts(3, 100)
+    assert starts.shape == (3, 100)
+    assert starts.dtype == torch.float64
+    for p, i in ((0, 0), (1, 0), (2, 99)):
+        assert starts[p, i].item() == pytest.approx((p * 2048 + i) * 20.52e-6, rel=1e-12)
+
+
+def test_frame_start_times():
+    for times in ([0.0, 0.05, 0.2], torch.tensor([0.0, 0.05, 0.2], dtype=torch.float64)):
+        timing = SensorTiming(**GOOD, frame_start_times=times)
+        assert timing.frame_starts(2).tolist() == [0.0, 0.05]
+        assert timing.row_starts(3, 4)[2].tolist() == pytest.approx([0.2 + i * 20.52e-6 for i in range(4)])
+        with pytest.raises(ValueError, match="frame_start_times has 3 entries for 4 frames"):
+            timing.frame_starts(4)
+
+
+@pytest.mark.parametrize(("given", "kept"), [(-2, -2), ("y", -2), (-1, -1), ("x", -1)])
+def test_scan_axis_names(given, kept):
+    timing = SensorTiming(**GOOD, scan_axis=given, readout_direction="reverse")
+    assert timing.scan_axis == kept
+    in_rows = timing.in_row_order()
+    assert (in_rows.scan_axis, in_rows.readout_direction) == (-2, "forward")
+    assert in_rows.frame_period == timing.frame_period
+
+
+def test_equal_timings_are_equal():
+    assert SensorTiming(**GOOD) == SensorTiming(**GOOD, scan_axis="y")
+    assert SensorTiming(**GOOD) != SensorTiming(**GOOD, scan_axis="x")
+
+
+def test_rows_of_a_frame():
+    SensorTiming(**GOOD).check_rows(2048)
+    with pytest.raises(ValueError, match="frame_rows=2048 is less than the 2049 rows of the frames"):
+        SensorTiming(**GOOD).check_rows(2049)
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_nothing_has_a_default_that_is_a_guess(name):
+    with pytest.raises(TypeError, match=name):
+        SensorTiming(**{key: value for key, value in GOOD.items() if key != name})
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "message"),
+    [
+        ({"row_time": 0.02052}, ValueError, "row_time=0.02052 s is longer than 10 ms"),
+        ({"row_time": 20.52}, ValueError, "row_time is in seconds"),
+        ({"row_time": 5e-3, "frame_rows": 2048}, ValueError, "frame period of 10.24 s, longer than 10 s"),
+        ({"row_time": 0.0}, ValueError, "row_time must be larger than 0"),
+        ({"row_time": -1e-5}, ValueError, "row_time must be larger than 0"),
+        ({"row_time": math.nan}, ValueError, "row_time must be finite"),
+        ({"row_time": "20us"}, TypeError, "row_time must be a number, got '20us'"),
+        ({"row_time": None}, TypeError, "row_time must be a number, got None"),
+        ({"row_time": True}, TypeError, "row_time must be a number, got True"),
+        ({"exposure_rows": 0}, ValueError, "exposure_rows must be larger than 0"),
+        ({"exposure_rows": -3}, ValueError, "exposure_rows must be larger than 0"),
+        ({"exposure_rows": 2049}, ValueError, "exposure_rows=2049 exceeds the frame period"),
+        ({"frame_rows": 0}, ValueError, "frame_rows must be larger than 0"),
+        ({"frame_rows": math.inf}, ValueError, "frame_rows must be finite"),
+        ({"scan_axis": 0}, ValueError, r"scan_axis must be -2 \('y'\) or -1 \('x'\), got 0"),
+        ({"scan_axis": "rows"}, ValueError, "scan_axis must be .* got 'rows'"),
+        ({"scan_axis": True}, ValueError, "scan_axis must be .* got True"),
+        ({"readout_direction": "up"}, ValueError, "readout_direction must be one of 'forward', 'reverse'; got 'up'"),
+        ({"frame_start_times": [0.0, 0.2, 0.1]}, ValueError, "frame_start_times must be strictly increasing"),
+        ({"frame_start_times": [0.0, 0.0]}, ValueError, "frame_start_times must be strictly increasing"),
+        ({"frame_start_times": [0.0, math.nan]}, ValueError, "frame_start_times must be finite"),
+    ],
+)
+def test_bad_values(values, error, message):
+    with pytest.raises(error, match=message):
+        SensorTiming(**{**GOOD, **values})
