@@ -1,0 +1,89 @@
+"""Equations of Liu et al. 2023, one by one, against numerical integration."""
+
+import numpy as np
+import pytest
+import torch
+
+from rsvib_torch import SensorTiming, Vibration
+from rsvib_torch.detection.inversion import vibration_of_fit
+from rsvib_torch.detection.tones import Measurements, fit_tones
+
+CAMERA = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+ROWS = np.arange(2048)
+CASES = [(3.1, 50.0, 0.4), (5.2, 30.0, 1.3), (0.2, 155.0, -2.0), (1.0, 7.0, 3.0)]
+
+
+def integral(amplitude, frequency, phase, ends):
+    """Mean displacement by numerical integration over the exposure that ends at ``ends`` (Eq. 2, left side)."""
+    nodes, weights = np.polynomial.legendre.leggauss(24)
+    times = ends[:, None] - CAMERA.exposure_time * (1 - nodes) / 2
+    return (amplitude * np.sin(2 * np.pi * frequency * times + phase) * weights / 2).sum(-1)
+
+
+@pytest.mark.parametrize(("amplitude", "frequency", "phase"), CASES)
+def test_equation_2(amplitude, frequency, phase):
+    """A_a sin(omega t + phi - omega T_e / 2) with A_a = A sinc(f T_e), t at the end of the exposure."""
+    ends = ROWS * CAMERA.row_time + CAMERA.exposure_time
+    expected = integral(amplitude, frequency, phase, ends)
+    omega = 2 * np.pi * frequency
+    attenuated = amplitude * np.sinc(frequency * CAMERA.exposure_time)
+    assert attenuated * np.sin(omega * ends + phase - omega * CAMERA.exposure_time / 2) == pytest.approx(
+        expected, abs=1e-9
+    )
+    vibration = Vibration(amplitude, frequency, phase)
+    starts = CAMERA.row_starts(1, 2048)[0]
+    found = vibration.mean_displacement(starts, CAMERA.exposure_time)[:, 0].numpy()
+    assert found == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(("amplitude", "frequency", "phase"), CASES)
+def test_equation_4_with_its_sign(amplitude, frequency, phase):
+    """The offset y2 - y1 (not y1 - y2) is 2 A_a sin(pi f m T) cos(...), by numerical integration of Eq. (2)."""
+    ends = ROWS * CAMERA.row_time + CAMERA.exposure_time
+    offset = integral(amplitude, frequency, phase, ends + CAMERA.frame_period) - integral(
+        amplitude, frequency, phase, ends
+    )
+    omega = 2 * np.pi * frequency
+    attenuated = amplitude * np.sinc(frequency * CAMERA.exposure_time)
+    gain = 2 * np.sin(np.pi * frequency * CAMERA.frame_period)
+    middle = ends - CAMERA.exposure_time / 2 + CAMERA.frame_period / 2
+    printed = attenuated * gain * np.cos(omega * middle + phase)
+    assert printed == pytest.approx(offset, abs=1e-9)
+    assert np.abs(printed + offset).max() > 0.1 * amplitude
+    starts = CAMERA.row_starts(2, 2048)
+    vibration = Vibration(amplitude, frequency, phase)
+    found = vibration.offset(starts[0], starts[1], CAMERA.exposure_time)[:, 0].numpy()
+    assert found == pytest.approx(offset, abs=1e-9)
+    assert vibration.gain(CAMERA.frame_period)[0, 0].item() == pytest.approx(gain, abs=1e-12)
+
+
+@pytest.mark.parametrize(("amplitude", "frequency", "phase"), CASES[:3])
+def test_equations_6_to_8_invert_the_offsets(amplitude, frequency, phase):
+    """Amplitude and phase come back from the offset curve, positive gain or negative."""
+    ends = ROWS[::8] * CAMERA.row_time + CAMERA.exposure_time
+    offset = integral(amplitude, frequency, phase, ends + CAMERA.frame_period) - integral(
+        amplitude, frequency, phase, ends
+    )
+    starts = torch.from_numpy(ROWS[::8] * CAMERA.row_time)[None]
+    offsets = torch.from_numpy(np.stack([offset, offset], -1))[None]
+    information = torch.eye(2, dtype=torch.float64).expand(1, offsets.shape[1], 2, 2)
+    measurements = Measurements(
+        starts, starts + CAMERA.frame_period, offsets, information, CAMERA.exposure_time, (0.0, 0.0)
+    )
+    start = torch.full((1, 2, 1), 1.02 * frequency, dtype=torch.float64)
+    found, _ = vibration_of_fit(measurements, fit_tones(measurements, start, torch.ones(1, 2, 1, dtype=torch.bool)))
+    for axis in (0, 1):
+        assert found.amplitude[0, axis, 0].item() == pytest.approx(amplitude, rel=1e-6)
+        assert found.period[0, axis, 0].item() == pytest.approx(1 / frequency, rel=1e-7)
+        assert found.phase[0, axis, 0].item() == pytest.approx(phase, abs=1e-6)
+
+
+@pytest.mark.parametrize(("amplitude", "frequency", "phase"), CASES)
+def test_equation_24(amplitude, frequency, phase):
+    times = np.linspace(0, 1 / frequency, 40001)
+    step = np.sin(2 * np.pi * frequency * (times + CAMERA.row_time) + phase) - np.sin(
+        2 * np.pi * frequency * times + phase
+    )
+    largest = Vibration(amplitude, frequency, phase).displacement_within_row_time(CAMERA.row_time)
+    assert largest.tolist() == pytest.approx([amplitude * np.abs(step).max()] * 2, rel=1e-6)
+    assert bool((largest < 0.1).all())
