@@ -42,7 +42,7 @@ def simulate_frames(
         vibration: One vibration (not a batch), in image axes.
         num_frames: Frames to take.
         frame_size: (height, width) of the frames, centred on the scene; by default the largest that never comes
-            nearer than 16 px to the edge of the scene.
+            nearer than 16 px to the edge of the scene and has no more rows than ``timing.frame_rows``.
         noise: Noise of the sensor, by default none.
         generator: Source of the noise.
 
@@ -78,7 +78,7 @@ def simulate_frames(
     reach = motion.largest_displacement(float(first[0]), last).tolist()
     margins = tuple(_MARGIN + math.ceil(r) for r in reversed(reach))
     available = tuple(size - 2 * margin for size, margin in zip(scene.shape[-2:], margins, strict=True))
-    size = available if frame_size is None else frame_size
+    size = (min(available[0], int(timing.frame_rows)), available[1]) if frame_size is None else frame_size
     if min(size) < 1 or any(wanted > free for wanted, free in zip(size, available, strict=True)):
         needed = tuple(max(s, 1) + 2 * m for s, m in zip(size, margins, strict=True))
         raise ValueError(

@@ -12,13 +12,14 @@ from rsvib_torch.registration.correlation import correlate_bands, correlate_prof
 from rsvib_torch.registration.peak import integer_peak, subpixel_peak
 from rsvib_torch.registration.windows import take_windows
 
-__all__ = ["BAND_METHODS", "BandTask", "Registration", "projection_height"]
+__all__ = ["BAND_METHODS", "BandTask", "Registration"]
 
 Registration = Literal["projection", "ncc", "phase"]
 
 _BINNING = 4  # columns averaged for the search for whole pixels
 _LAGS = 4  # px either side of the whole-pixel peak for the sub-pixel peak
 _TALL = 8  # search ranges that a gray projection along the rows' axis is tall
+_LEAST_PROFILE_QUALITY = 0.6  # profiles of a few dozen rows correlate up to this by chance
 _PHASE_PASSES = 2  # the window moves with the scene, to a fraction of a pixel in the last pass
 
 
@@ -236,60 +237,86 @@ def _phase_surface(
     return lags
 
 
-def projection_height(height: int, search: int, num_rows: int) -> int:
-    """Rows of the windows that gray projection takes along the scan axis, of the parity of ``height``."""
-    tall = min(max(height, _TALL * search), num_rows // 2)
-    return max(height, tall - (tall - height) % 2)
-
-
 def register_projection(task: BandTask) -> tuple[Tensor, Tensor]:
     """Gray projection: rows or columns summed to profiles, and the profiles correlated.
 
-    Along the scan axis a band of few rows gives too short a profile, so that windows eight search ranges tall are
-    taken there; along the rows, the bands themselves, moved by the offset found along the scan axis.
+    Along the scan axis a band of few rows gives too short a profile for the search range: windows eight search ranges
+    tall find the course of the offset first. Moved by it, the bands themselves give the offset along the rows, and,
+    moved by that too, what remains along the scan axis.
     """
-    num_rows = task.first.shape[-2]
-    tall = projection_height(task.height, task.search, num_rows)
-    aside = (task.height - tall) // 2
-    tall_tops = (task.tops + aside).clamp(0, num_rows - tall)
+    places = task.places()
+    course = _smooth_course(_search_rows(task)).round().long()
+    shift = task.start + torch.stack([torch.zeros_like(course), course], dim=-1)
     # lags beyond the search range give the peaks near its edge the neighbours to interpolate from
+    x, quality_x = _band_profiles(task, places, shift, (0, task.search + _LAGS - 1))
+    shift[..., 0] += torch.nan_to_num(x).round().long()
+    y, quality_y = _band_profiles(task, places, shift, (2 * _LAGS, 0))
+    offsets = torch.stack([task.start[..., 0] + x, shift[..., 1] + y], dim=-1)
+    ok = torch.isfinite(offsets).all(-1) & ((offsets - task.start).abs() < task.search).all(-1)
+    return torch.where(ok[..., None], offsets, torch.nan), torch.where(ok, torch.minimum(quality_x, quality_y), 0.0)
+
+
+def _search_rows(task: BandTask) -> Tensor:
+    """Offsets along the scan axis (L, N) beyond the coarse one, from tall windows; NaN where there is no peak."""
+    num_rows = task.first.shape[-2]
+    tall = min(max(task.height, _TALL * task.search), num_rows // 2)
+    tops = (task.tops + (task.height - tall) // 2).clamp(0, num_rows - tall)
     reach = task.search + _LAGS - 1
     row_means = [
-        _differences(take_windows(image, torch.zeros_like(left), left, num_rows, task.width).mean(-1))[:, 0]
+        functional.pad(
+            _differences(take_windows(image, torch.zeros_like(left), left, num_rows, task.width).mean(-1)), (1, 1)
+        )[:, 0]
         for image, left in (
             (task.first, task.left[:, None]),
             (task.second, (task.left + task.coarse[:, 0])[:, None]),
         )
     ]
-    begin = tall_tops + task.coarse[:, 1:] - reach
+    begin = tops + task.coarse[:, 1:] - reach
     later = take_windows(row_means[1][..., None], begin, torch.zeros_like(begin), tall + 2 * reach, 1)[..., 0]
-    template = row_means[0][:, tall_tops[:, None] + torch.arange(tall, device=begin.device)]
+    template = row_means[0][:, tops[:, None] + torch.arange(tall, device=begin.device)]
     surface = correlate_profiles(template, later)
     lag_begin = begin[..., None] + torch.arange(2 * reach + 1, device=begin.device)
-    surface = torch.where((lag_begin >= 0) & (lag_begin + tall <= num_rows), surface, -torch.inf)
-    y, quality_y = _profile_peak(surface)
-    # windows held back by the edge of the frame do not measure the offset at the band's centre
-    y = torch.where(tall_tops == task.tops + aside, y, torch.nan)
+    return _profile_peak(torch.where((lag_begin >= 0) & (lag_begin + tall <= num_rows), surface, -torch.inf))[0]
 
-    places = task.places()
-    moved = places + task.start
-    rows = moved[..., 1] + torch.nan_to_num(y).round().long()
-    pair = [
-        _differences(take_windows(image, top, left, task.height, columns).mean(-2))
-        for image, top, left, columns in (
-            (task.first, places[..., 1], places[..., 0], task.width),
-            (task.second, rows, moved[..., 0] - reach, task.width + 2 * reach),
-        )
-    ]
-    x, quality_x = _profile_peak(correlate_profiles(pair[0], pair[1]))
-    offsets = task.start + torch.stack([x, y], -1)
-    ok = torch.isfinite(offsets).all(-1)
-    return torch.where(ok[..., None], offsets, torch.nan), torch.where(ok, torch.minimum(quality_x, quality_y), 0.0)
+
+def _smooth_course(course: Tensor) -> Tensor:
+    """Course (L, N) without gaps, which take the value of the nearest band, and without single wrong peaks."""
+    count = course.shape[-1]
+    order = torch.arange(count, device=course.device)
+    known = torch.isfinite(course)
+    before = torch.where(known, order, -1).cummax(-1).values
+    after = torch.where(known, order, count).flip(-1).cummin(-1).values.flip(-1)
+    nearest = torch.where((before < 0) | ((after < count) & (after - order < order - before)), after, before)
+    filled = torch.nan_to_num(course.gather(-1, nearest.clamp(0, count - 1)))
+    padded = functional.pad(filled[:, None], (2, 2), mode="replicate")[:, 0]
+    return padded.unfold(-1, 5, 1).median(-1).values
+
+
+def _band_profiles(task: BandTask, places: Tensor, shift: Tensor, reach: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Offset of bands beyond ``shift`` along the axis whose ``reach`` (rows, columns) is not 0, (L, N), and quality."""
+    summed = -1 if reach[0] else -2
+    moved = places + shift
+    width = task.width
+    first = take_windows(task.first, places[..., 1], places[..., 0], task.height, width)
+    second = take_windows(
+        task.second,
+        moved[..., 1] - reach[0],
+        moved[..., 0] - reach[1],
+        task.height + 2 * reach[0],
+        width + 2 * reach[1],
+    )
+    surface = correlate_profiles(_differences(first.mean(summed)), _differences(second.mean(summed)))
+    lags = torch.arange(-reach[0], reach[0] + 1, device=surface.device)
+    begin = moved[..., 1, None] + lags
+    inside = (begin >= 0) & (begin + task.height <= task.second.shape[-2])
+    offset, quality = _profile_peak(torch.where(inside, surface, -torch.inf))
+    sure = quality > _LEAST_PROFILE_QUALITY
+    return torch.where(sure, offset, torch.nan), torch.where(sure, quality, 0.0)
 
 
 def _differences(profile: Tensor) -> Tensor:
-    """Central differences: they weigh detail against slow changes of brightness."""
-    return functional.pad(profile[..., 2:] - profile[..., :-2], (1, 1))
+    """Central differences, without the ends: they weigh detail against slow changes of brightness."""
+    return profile[..., 2:] - profile[..., :-2]
 
 
 def _profile_peak(surface: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ from rsvib_torch.checks import check_choice, check_whole_number
 from rsvib_torch.orientation import as_float_frames, frames_to_row_order, offsets_from_row_order
 from rsvib_torch.registration.coarse import coarse_offset
 from rsvib_torch.registration.curve import OffsetCurve
-from rsvib_torch.registration.methods import BAND_METHODS, BandTask, Registration, projection_height
+from rsvib_torch.registration.methods import BAND_METHODS, BandTask, Registration
 from rsvib_torch.registration.windows import band_tops
 from rsvib_torch.sensor import SensorTiming
 
@@ -103,7 +103,6 @@ def register_rows(
     rows = tops.to(torch.float64) + 0.5 * (band_rows - 1)
     starts = timing.frame_starts(num_frames, grey.device)[:, None] + rows * timing.row_time
     index = torch.arange(num_frames, device=grey.device)
-    height_y = projection_height(band_rows, search, num_rows) if method == "projection" else band_rows
     return OffsetCurve(
         pairs=torch.stack([index[:-1], index[1:]], dim=-1),
         rows=rows,
@@ -111,7 +110,7 @@ def register_rows(
         later_times=starts[1:],
         offsets=torch.cat(offsets).to(torch.float64).unflatten(0, shape),
         quality=torch.cat(quality).to(torch.float64).unflatten(0, shape),
-        heights=(band_rows, height_y),
+        heights=(band_rows, band_rows),
     )
 
 

@@ -208,3 +208,8 @@ def test_rows_showing_is_the_fixed_point():
     mean = MOTION.vibration().mean_displacement(start + found * TIMING.row_time, TIMING.exposure_time)[..., 1]
     assert (found - rows - mean).abs().max() < 1e-6
     assert (found - rows).abs().max() > 4.0
+
+
+def test_default_frame_has_no_more_rows_than_the_sensor():
+    timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=300)
+    assert simulate_frames(torch.rand(600, 99), timing, Vibration(0.0, 0.0)).shape == (2, 300, 67)

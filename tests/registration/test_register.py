@@ -62,8 +62,7 @@ def test_layout(pair, paper_camera, method):
     assert curve.rows[:2].tolist() == [23.5, 47.5]
     assert curve.times[0, 0].item() == pytest.approx(23.5 * 20.52e-6)
     assert (curve.later_times - curve.times).flatten().tolist() == pytest.approx([2048 * 20.52e-6] * count)
-    assert curve.heights[0] == 48
-    assert (curve.heights[1] > 48) == (method == "projection")
+    assert curve.heights == (48, 48)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -149,7 +148,8 @@ def test_peak_at_the_edge_of_the_search_has_failed(method, axis):
     assert bool((curve.quality[0, far & curve.good[0]] < 0.8).all())
     # with the range to reach it, the very same bands have the offset
     wide = register_bands(torch.stack([first, second]), timing, method=method, search=16)
-    reach = wide.heights[1] // 2 + 24
+    # gray projection searches with windows 8 search ranges tall: bands nearer to the border may stay unknown
+    reach = (4 * 16 if method == "projection" else wide.heights[1] // 2) + 24
     far = (wide.rows > 700 + reach) & (wide.rows < 1024 - reach)
     assert int(far.sum()) > 2
     assert (wide.offsets[0, far, component] - 12).abs().max() < (0.25 if method == "projection" else 0.05)
