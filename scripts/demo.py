@@ -6,6 +6,7 @@ amplitudes and frequencies, and random phases.
 """
 
 import argparse
+import inspect
 import json
 import math
 import sys
@@ -14,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from matplotlib.figure import Figure
@@ -24,9 +25,11 @@ from rich.table import Table
 from torch import Tensor
 
 import rsvib_torch as rsv
+from rsvib_torch.detection.detect import DetectionMethod
 from rsvib_torch.evaluation import city_and_fields, resolution_chart
 from rsvib_torch.pictures import detailed_places, offset_figure, save_figure
 from rsvib_torch.report import write_offsets, write_vibration
+from rsvib_torch.restoration.restore import METHODS
 from rsvib_torch.stacks import whole_folder
 from rsvib_torch.terminal import warnings_in_one_line, working
 
@@ -47,6 +50,7 @@ class Trial:
 
     name: str
     seed: int
+    methods: dict[str, dict[str, str]]  # of detection and restoration, where not the default
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
@@ -56,6 +60,11 @@ class Trial:
         with working(f"{self.name}: {what}"):
             yield
         self.seconds[what] = round(time.perf_counter() - begin, 3)
+
+
+def method_used(function: Callable[..., Any], options: dict[str, str]) -> str:
+    """Method that a function follows with these options."""
+    return options.get("method", inspect.signature(function).parameters["method"].default)
 
 
 def wrapped(angle: float) -> float:
@@ -72,7 +81,7 @@ def compare(truth: rsv.Vibration, detected: rsv.Vibration) -> list[dict[str, Any
             if quantity == "phase":
                 error = f"{wrapped(math.pi * (found - true)) / math.pi:+.4f} π"
             else:
-                error = f"{100 * (found / true - 1):+.3f} %"
+                error = f"{100 * (found / true - 1):+.4f} %"
             value = float(error.split()[0])
             lines.append(
                 {"axis": name, "quantity": quantity, "unit": unit, "true": true, "detected": found}
@@ -92,7 +101,7 @@ def show(console: Console, trial: Trial, lines: list[dict[str, Any]], quality: d
             f"{line['quantity']} ({line['unit']})",
             f"{line['true']:.{digits}f}",
             f"{line['detected']:.{digits}f}",
-            f"{line['error']:+.3f} {line['error_unit']}",
+            f"{line['error']:+.4f} {line['error_unit']}",
         )
     console.print(table)
     heads = ("frame", "PSNR before (dB)", "PSNR after", "SSIM before", "SSIM after")
@@ -139,9 +148,9 @@ def run(trial: Trial, size: tuple[int, int], out: Path, console: Console) -> Non
         noise = rsv.SensorNoise(read_noise=NOISE, bits=12)
         frames = rsv.simulate_frames(scene, TIMING, truth, 2, frame_size=size, noise=noise, generator=generator)
     with trial.step("detecting the vibration"):
-        detection = rsv.detect_vibration(frames, TIMING)
+        detection = rsv.detect_vibration(frames, TIMING, **trial.methods["detection"])
     with trial.step("restoring both frames"):
-        restored = rsv.restore(frames, TIMING, detection.vibration)
+        restored = rsv.restore(frames, TIMING, detection.vibration, **trial.methods["restoration"])
     still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
     with trial.step("comparing with the still scene"):
         quality = {
@@ -162,6 +171,10 @@ def run(trial: Trial, size: tuple[int, int], out: Path, console: Console) -> Non
             "scene": trial.name,
             "seed": trial.seed,
             "frame_size": list(size),
+            "methods": {
+                "detection": method_used(rsv.detect_vibration, trial.methods["detection"]),
+                "restoration": method_used(rsv.restore, trial.methods["restoration"]),
+            },
             "noise_of_full_scale": NOISE,
             "vibration": lines,
             "reliable": detection.reliable.tolist(),
@@ -181,12 +194,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder to write to (default: out/demo)")
     parser.add_argument("--seed", type=int, default=2023, help="seed of scene, phases and noise (default: 2023)")
     parser.add_argument("--quick", action="store_true", help="narrow frames: 2048 rows of 320 px")
+    parser.add_argument("--detection", choices=get_args(DetectionMethod), help="method of detection")
+    parser.add_argument("--restoration", choices=tuple(METHODS), help="method of restoration")
     options = parser.parse_args(arguments)
+    methods = {
+        name: {"method": chosen} if chosen else {}
+        for name, chosen in (("detection", options.detection), ("restoration", options.restoration))
+    }
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 100)
     begin = time.perf_counter()
     for name in SCENES:
         with warnings_in_one_line():
-            run(Trial(name, options.seed), (2048, 320 if options.quick else 2048), options.out / name, console)
+            run(Trial(name, options.seed, methods), (2048, 320 if options.quick else 2048), options.out / name, console)
     console.print(f"{time.perf_counter() - begin:.0f} s; frames, pictures and figures are in {options.out}")
 
 
