@@ -87,7 +87,11 @@ def refine_directly(
         measurements = measure_rows(spectra, timing, motion, frames.shape[1])
         active = motion.amplitude > 0
         if step == 1:
-            # the first round removed the error of the bands: now weak tones show
+            # the first round removed the error of the bands: now weak tones show, and must stand above noise that
+            # neighbouring rows share
+            known = fit_tones(measurements, motion.frequency, active)
+            residual = measurements.offsets - model_offsets(measurements, known)
+            measurements = replace(measurements, independent=independent_fraction(measurements, residual))
             fit = find_tones(measurements, interval, tones, group=max(1, round(interval / timing.row_time)))
         else:
             fit = fit_tones(measurements, motion.frequency, active)
