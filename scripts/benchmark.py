@@ -32,17 +32,20 @@ SEED, NOISE = 7, 0.003
 MARGIN = RIM = 32
 BAND_ROWS, BAND_STEP, HALF_ROWS = 32, 16, 16
 OUTLIER = 0.5  # px
+PEER = "skimage loop"
 BALANCES = (0.001, 0.003, 0.01, 0.03)  # regularisation of skimage.restoration.wiener; the best for the scene counts
 
 
-def median_seconds(work: Callable[[], Any], runs: int) -> tuple[float, Any]:
-    """Median time of several runs after one that warms up, and what the last one returned."""
-    result, seconds = work(), []
+def in_turns(works: dict[str, Callable[[], Any]], runs: int) -> dict[str, tuple[float, Any]]:
+    """Median time of each piece of work, and its result, all taking turns so that a busy moment hits all alike."""
+    results = {name: work() for name, work in works.items()}  # warms up
+    seconds: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(runs):
-        begin = time.perf_counter()
-        result = work()
-        seconds.append(time.perf_counter() - begin)
-    return statistics.median(seconds), result
+        for name, work in works.items():
+            begin = time.perf_counter()
+            work()
+            seconds[name].append(time.perf_counter() - begin)
+    return {name: (statistics.median(seconds[name]), results[name]) for name in works}
 
 
 def true_offsets(rows: Tensor, height: int, timing: rsv.SensorTiming, truth: rsv.Vibration) -> Tensor:
@@ -65,30 +68,31 @@ def benchmark_registration(
     frames: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration, runs: int
 ) -> list[dict[str, Any]]:
     """Time and error of each way to register all bands of the pair."""
-    results: list[dict[str, Any]] = []
-
-    def note(name: str, seconds: float, offsets: Tensor, rows: Tensor, heights: tuple[int, int]) -> None:
+    options = {"band_rows": BAND_ROWS, "band_step": BAND_STEP}
+    array = frames.numpy()
+    tops = list(range(0, frames.shape[-2] - BAND_ROWS + 1, BAND_STEP))
+    works: dict[str, Callable[[], Any]] = {
+        method: lambda m=method: rsv.register_bands(frames, timing, method=m, **options)
+        for method in ("projection", "ncc", "phase")
+    }
+    done = in_turns(works | {PEER: lambda: register_by_skimage(array, tops)}, runs)
+    results = []
+    for name, (seconds, found) in done.items():
+        rows = torch.tensor(tops, dtype=torch.float64) + 0.5 * (BAND_ROWS - 1)
+        heights = (BAND_ROWS, BAND_ROWS) if name == PEER else found.heights
+        offsets = found if name == PEER else found.offsets[0]
         wanted = torch.stack([true_offsets(rows, h, timing, truth)[:, a] for a, h in enumerate(heights)], dim=-1)
         error = (offsets - wanted).abs()
         off = ~(error < OUTLIER).all(-1)  # NaN, a band given up, counts as off
         rms = error[~off].square().mean(0).sqrt().tolist()
-        results.append({"method": name, "seconds": seconds, "rms_px": rms, "share_off": off.double().mean().item()})
+        share = off.double().mean().item()
+        results.append({"method": name, "seconds": seconds, "rms_px": rms, "share_off": share})
+    return with_ratios(results)
 
-    rows = torch.zeros(0)
-    for method in ("projection", "ncc", "phase"):
-        seconds, curve = median_seconds(
-            lambda m=method: rsv.register_bands(frames, timing, method=m, band_rows=BAND_ROWS, band_step=BAND_STEP),
-            runs,
-        )
-        rows = curve.rows
-        note(method, seconds, curve.offsets[0], curve.rows, curve.heights)
-    tops = [round(top) for top in (rows - 0.5 * (BAND_ROWS - 1)).tolist()]
-    array = frames.numpy()
-    seconds, offsets = median_seconds(lambda: register_by_skimage(array, tops), max(1, runs // 2))
-    note("skimage loop", seconds, offsets, rows, (BAND_ROWS, BAND_ROWS))
-    for result in results:
-        result["ratio"] = seconds / result["seconds"]
-    return results
+
+def with_ratios(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The results, each with how many times faster it is than the loop, which is the last one."""
+    return [{**result, "ratio": results[-1]["seconds"] / result["seconds"]} for result in results]
 
 
 def slab_kernels(
@@ -139,25 +143,24 @@ def benchmark_restoration(
     def quality(restored: Tensor) -> float:
         return float(rsv.psnr(restored[:, RIM:-RIM], still[rows, RIM:-RIM], 1.0))
 
-    results: list[dict[str, Any]] = []
     options: dict[str, dict[str, Any]] = {name: {"method": name} for name in METHODS}
     options["banded, a slab for every row"] = {"method": "banded", "stride": 1}
-    for name, chosen in options.items():
-        seconds, restored = median_seconds(lambda o=chosen: rsv.restore(frame[None], timing, truth, **o)[0], runs)
-        results.append({"method": name, "seconds": seconds, "psnr_db": quality(restored[rows])})
+    works: dict[str, Callable[[], Any]] = {
+        name: lambda o=chosen: rsv.restore(frame[None], timing, truth, **o)[0, rows] for name, chosen in options.items()
+    }
     middles, kernels = slab_kernels(rows, timing, truth)
     array = frame.numpy()
-    tried = [
-        (quality(torch.from_numpy(restore_by_skimage(array, middles, kernels, balance))), balance)
-        for balance in BALANCES
+
+    def loop(balance: float) -> Tensor:
+        return torch.from_numpy(restore_by_skimage(array, middles, kernels, balance))
+
+    balance = max(BALANCES, key=lambda b: quality(loop(b)))
+    done = in_turns(works | {PEER: lambda: loop(balance)}, runs)
+    results = [
+        {"method": name, "seconds": seconds * (height / len(rows) if name == PEER else 1), "psnr_db": quality(restored)}
+        for name, (seconds, restored) in done.items()
     ]
-    best, balance = max(tried)
-    seconds, _ = median_seconds(lambda: restore_by_skimage(array, middles, kernels, balance), max(1, runs // 2))
-    seconds *= height / len(rows)
-    results.append({"method": "skimage loop", "seconds": seconds, "psnr_db": best})
-    for result in results:
-        result["ratio"] = seconds / result["seconds"]
-    return results
+    return with_ratios(results)
 
 
 def report(summary: dict[str, Any]) -> str:
@@ -192,7 +195,7 @@ def report(summary: dict[str, Any]) -> str:
         "",
         f"The restoring loop ran on {summary['sampled_rows']} rows drawn at random; its time is scaled to {size} rows, "
         "and making its kernels is not counted. "
-        f"Times are medians of {summary['runs']} runs (loops: {max(1, summary['runs'] // 2)}).",
+        f"Times are medians of {summary['runs']} runs in turns.",
     ]
     return "\n".join(lines)
 
