@@ -1,17 +1,14 @@
 #!/usr/bin/env python
-"""Speed and accuracy next to loops of scikit-image, in one run on one machine.
+"""Speed and accuracy next to peers, in one run on one machine.
 
 Registration: all bands of a pair of frames, against skimage.registration.phase_cross_correlation band by band.
-Restoration: one frame, against skimage.restoration.wiener row by row on the slabs of the banded method.
+Restoration: one frame, see benchmarks/restoration.py.
 """
 
 import argparse
 import json
 import math
 import os
-import platform
-import statistics
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,33 +16,20 @@ from typing import Any
 import numpy as np
 import skimage
 import torch
+from benchmarks import restoration
+from benchmarks.measure import in_turns, machine
 from skimage.registration import phase_cross_correlation
-from skimage.restoration import wiener
 from torch import Tensor
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
 from rsvib_torch.imaging import rows_showing
-from rsvib_torch.restoration.restore import METHODS
 
 SEED, NOISE = 7, 0.003
-MARGIN = RIM = 32
-BAND_ROWS, BAND_STEP, HALF_ROWS = 32, 16, 16
+MARGIN = 32
+BAND_ROWS, BAND_STEP = 32, 16
 OUTLIER = 0.5  # px
 PEER = "skimage loop"
-BALANCES = (0.001, 0.003, 0.01, 0.03)  # regularisation of skimage.restoration.wiener; the best for the scene counts
-
-
-def in_turns(works: dict[str, Callable[[], Any]], runs: int) -> dict[str, tuple[float, Any]]:
-    """Median time of each piece of work, and its result, all taking turns so that a busy moment hits all alike."""
-    results = {name: work() for name, work in works.items()}  # warms up
-    seconds: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(runs):
-        for name, work in works.items():
-            begin = time.perf_counter()
-            work()
-            seconds[name].append(time.perf_counter() - begin)
-    return {name: (statistics.median(seconds[name]), results[name]) for name in works}
 
 
 def true_offsets(rows: Tensor, height: int, timing: rsv.SensorTiming, truth: rsv.Vibration) -> Tensor:
@@ -95,109 +79,48 @@ def with_ratios(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [{**result, "ratio": results[-1]["seconds"] / result["seconds"]} for result in results]
 
 
-def slab_kernels(
-    scene_rows: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration
-) -> tuple[list[int], list[np.ndarray]]:
-    """Frame row in the middle of each row's slab, and the centred kernel of the whole slab (Eqs. 26-39)."""
-    start = timing.frame_starts(1)[0]
-    shown_by = rows_showing(scene_rows.double(), start, timing, truth)
-    middles = shown_by.round().long()
-    psf = rsv.row_psf(truth, start + shown_by * timing.row_time, timing)
-    kernels, (left, top) = psf.dense()
-    padded = []
-    for kernel, moved in zip(kernels, (middles - scene_rows).tolist(), strict=True):
-        # centred on displacement (0, moved): the slab already follows its middle row
-        height, width = kernel.shape
-        y, x = top - moved, left
-        half = max(abs(y), abs(y + height - 1)), max(abs(x), abs(x + width - 1))
-        canvas = np.zeros((2 * half[0] + 1, 2 * half[1] + 1))
-        canvas[half[0] + y : half[0] + y + height, half[1] + x : half[1] + x + width] = kernel.numpy()
-        rows, columns = (np.flatnonzero(canvas.sum(axis)) for axis in (1, 0))
-        keep = [max(abs(int(i[0]) - h), abs(int(i[-1]) - h)) for i, h in zip((rows, columns), half, strict=True)]
-        inner = tuple(slice(h - k, h + k + 1) for h, k in zip(half, keep, strict=True))
-        padded.append(canvas[inner])
-    return middles.tolist(), padded
-
-
-def restore_by_skimage(
-    frame: np.ndarray, middles: Sequence[int], kernels: Sequence[np.ndarray], balance: float
-) -> np.ndarray:
-    """Central rows of slabs deconvolved one after another."""
-    return np.stack(
-        [
-            wiener(frame[m - HALF_ROWS : m + HALF_ROWS + 1], kernel, balance, clip=False)[HALF_ROWS]
-            for m, kernel in zip(middles, kernels, strict=True)
-        ]
-    )
-
-
-def benchmark_restoration(
-    frame: Tensor, still: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration, runs: int, sample: int
-) -> list[dict[str, Any]]:
-    """Time and PSNR of each way to restore one frame; the loop is timed on a sample of rows."""
-    height = frame.shape[-1]
-    safe = RIM + HALF_ROWS
+def registration_rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Registration of a pair of frames of a drawn scene."""
+    timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
     generator = torch.Generator().manual_seed(SEED)
-    rows = (torch.randperm(height - 2 * safe, generator=generator)[:sample] + safe).sort().values
-
-    def quality(restored: Tensor) -> float:
-        return float(rsv.psnr(restored[:, RIM:-RIM], still[rows, RIM:-RIM], 1.0))
-
-    options: dict[str, dict[str, Any]] = {name: {"method": name} for name in METHODS}
-    options["banded, a slab for every row"] = {"method": "banded", "stride": 1}
-    works: dict[str, Callable[[], Any]] = {
-        name: lambda o=chosen: rsv.restore(frame[None], timing, truth, **o)[0, rows] for name, chosen in options.items()
-    }
-    middles, kernels = slab_kernels(rows, timing, truth)
-    array = frame.numpy()
-
-    def loop(balance: float) -> Tensor:
-        return torch.from_numpy(restore_by_skimage(array, middles, kernels, balance))
-
-    balance = max(BALANCES, key=lambda b: quality(loop(b)))
-    done = in_turns(works | {PEER: lambda: loop(balance)}, runs)
-    results = [
-        {"method": name, "seconds": seconds * (height / len(rows) if name == PEER else 1), "psnr_db": quality(restored)}
-        for name, (seconds, restored) in done.items()
-    ]
-    return with_ratios(results)
+    phase = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1) * math.pi
+    truth = rsv.Vibration([3.1, 5.2], [50.0, 30.0], phase)
+    scene = city_and_fields(options.size + 2 * MARGIN, options.size + 2 * MARGIN, SEED)
+    noise, size = rsv.SensorNoise(read_noise=NOISE), (options.size, options.size)
+    frames = rsv.simulate_frames(scene, timing, truth, 2, frame_size=size, noise=noise, generator=generator)
+    return benchmark_registration(frames, timing, truth, options.runs)
 
 
-def report(summary: dict[str, Any]) -> str:
-    """The figures as Markdown tables."""
-    machine = summary["machine"]
-    size = summary["size"]
+def registration_lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+    """The figures as a Markdown table."""
+    bands = (options.size - BAND_ROWS) // BAND_STEP + 1
     lines = [
-        f"{size} x {size} px, noise {100 * NOISE:g} % of full scale, "
-        f"{machine['cores']} cores ({machine['processor']}),",
-        f"Python {machine['python']}, torch {machine['torch']} on {machine['threads']} threads, "
-        f"scikit-image {machine['skimage']}.",
+        f"{options.size} x {options.size} px, noise {100 * NOISE:g} % of full scale.",
         "",
-        f"| registration of {summary['bands']} bands | seconds | loop / this | rms x, y (px) | given up or off > "
-        f"{OUTLIER} px |",
+        f"| registration of {bands} bands | seconds | loop / this | rms x, y (px) | given up or off > {OUTLIER} px |",
         "|---|---|---|---|---|",
     ]
-    for r in summary["registration"]:
+    for r in results:
         rms = ", ".join(f"{value:.4f}" for value in r["rms_px"])
         lines.append(
             f"| {r['method']} | {r['seconds']:.3f} | {r['ratio']:.1f} | {rms} | {100 * r['share_off']:.1f} % |"
         )
-    lines += [
-        "",
-        "| restoration of one frame | seconds | loop / this | PSNR of the sampled rows (dB) |",
-        "|---|---|---|---|",
-    ]
-    lines += [
-        f"| {r['method']} | {r['seconds']:.3f} | {r['ratio']:.1f} | {r['psnr_db']:.2f} |"
-        for r in summary["restoration"]
-    ]
-    lines += [
-        "",
-        f"The restoring loop ran on {summary['sampled_rows']} rows drawn at random; its time is scaled to {size} rows, "
-        "and making its kernels is not counted. "
-        f"Times are medians of {summary['runs']} runs in turns.",
-    ]
-    return "\n".join(lines)
+    return lines
+
+
+# rows(options) measures, lines(rows, options) makes a Markdown table of it
+PARTS: dict[str, tuple[Callable[..., list[dict[str, Any]]], Callable[..., list[str]]]] = {
+    "registration": (registration_rows, registration_lines),
+    "restoration": (restoration.rows, restoration.lines),
+}
+
+
+def machine_line(machine: dict[str, Any]) -> str:
+    """What the figures were taken on, in words."""
+    return (
+        f"{machine['cores']} cores ({machine['processor']}), Python {machine['python']}, torch {machine['torch']} on "
+        f"{machine['threads']} threads, scikit-image {machine['skimage']}."
+    )
 
 
 def main() -> None:
@@ -205,40 +128,24 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/benchmark"), help="folder for benchmark.md and .json")
     parser.add_argument("--size", type=int, default=2048, help="rows and columns of the frames (default: 2048)")
     parser.add_argument("--runs", type=int, default=5, help="timed runs of each (default: 5)")
-    parser.add_argument("--rows", type=int, default=64, help="rows that the restoring loop is timed on (default: 64)")
+    parser.add_argument("--only", choices=PARTS, nargs="+", default=PARTS, help="parts to run (default: all)")
+    restoration.add_options(parser)
     options = parser.parse_args()
-    threads = os.cpu_count() or 1
-    torch.set_num_threads(threads)
-    timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
-    generator = torch.Generator().manual_seed(SEED)
-    phase = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1) * math.pi
-    truth = rsv.Vibration([3.1, 5.2], [50.0, 30.0], phase)
-    size = options.size
-    scene = city_and_fields(size + 2 * MARGIN, size + 2 * MARGIN, SEED)
-    noise = rsv.SensorNoise(read_noise=NOISE)
-    frames = rsv.simulate_frames(scene, timing, truth, 2, frame_size=(size, size), noise=noise, generator=generator)
-    still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
-    summary = {
-        "size": size,
+    torch.set_num_threads(os.cpu_count() or 1)
+    summary: dict[str, Any] = {
+        "size": options.size,
         "runs": options.runs,
-        "sampled_rows": options.rows,
-        "bands": (size - BAND_ROWS) // BAND_STEP + 1,
-        "registration": benchmark_registration(frames, timing, truth, options.runs),
-        "restoration": benchmark_restoration(frames[0], still, timing, truth, options.runs, options.rows),
-        "machine": {
-            "cores": threads,
-            "threads": torch.get_num_threads(),
-            "processor": platform.processor() or platform.machine(),
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "skimage": skimage.__version__,
-        },
+        "machine": {**machine(), "skimage": skimage.__version__},
     }
+    text = [machine_line(summary["machine"])]
+    for name in options.only:
+        rows, lines = PARTS[name]
+        summary[name] = rows(options)
+        text += ["", *lines(summary[name], options)]
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "benchmark.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
-    text = report(summary)
-    (options.out / "benchmark.md").write_text(text + "\n", encoding="utf-8")
-    print(text)
+    (options.out / "benchmark.md").write_text("\n".join(text) + "\n", encoding="utf-8")
+    print("\n".join(text))
 
 
 if __name__ == "__main__":
