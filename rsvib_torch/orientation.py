@@ -44,7 +44,8 @@ def _mirror_rows(vibration: Vibration, timing: SensorTiming) -> Vibration:
     phase = torch.where(
         turn > 0, torch.remainder(vibration.phase + turn + math.pi, 2 * math.pi) - math.pi, vibration.phase
     )
-    return Vibration(vibration.amplitude, vibration.frequency, phase, vibration.image_motion * sign)
+    motion, acceleration = vibration.image_motion * sign, vibration.image_acceleration * sign
+    return Vibration(vibration.amplitude, vibration.frequency, phase, motion, acceleration)
 
 
 def _swap_axes(vibration: Vibration, timing: SensorTiming) -> Vibration:
@@ -56,6 +57,7 @@ def _swap_axes(vibration: Vibration, timing: SensorTiming) -> Vibration:
         vibration.frequency.flip(-2),
         vibration.phase.flip(-2),
         vibration.image_motion.flip(-1),
+        vibration.image_acceleration.flip(-1),
     )
 
 

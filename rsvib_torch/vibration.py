@@ -31,19 +31,31 @@ def _tones(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
     return tensor
 
 
+def _of_axes(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
+    """Turn a float, (2,) or (..., 2) value into a (..., 2) float64 tensor."""
+    tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
+    tensor = tensor.expand(2) if tensor.ndim == 0 else tensor
+    if tensor.shape[-1] != 2:
+        raise ValueError(f"{name} must have shape (..., 2) for axes (x, y), got {tuple(tensor.shape)}")
+    if not bool(torch.isfinite(tensor).all()):
+        raise ValueError(f"{name} must be finite")
+    return tensor
+
+
 @dataclass(frozen=True, eq=False)
 class Vibration:
-    """Sinusoidal displacement of the image on the sensor, with a uniform image motion.
+    """Sinusoidal displacement of the image on the sensor, with an image motion.
 
-    ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t`` per axis (Eq. 1 of Liu et al. 2023, several tones, Sec. 2.3):
-    scene content at ``s`` appears at ``s + D(t)``. Axes are ordered (x, y). Tones are kept sorted by amplitude,
+    ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t + a t^2 / 2`` per axis (Eq. 1 of Liu et al. 2023, several tones,
+    Sec. 2.3; the paper's image motion is uniform, a = 0): scene content at ``s`` appears at ``s + D(t)``. Axes are ordered (x, y). Tones are kept sorted by amplitude,
     largest first; an axis with fewer tones than the other has amplitude 0 in the rest.
 
     Args:
         amplitude: A >= 0 in px: a float, ``(2,)`` (one tone an axis), ``(2, K)`` or ``(..., 2, K)`` for a batch.
         frequency: f >= 0 in Hz, same shape.
         phase: phi in rad at the time origin (exposure start of the first row of frame 0), same shape.
-        image_motion: v in px/s, ``(2,)`` or ``(..., 2)``.
+        image_motion: v in px/s at the time origin, ``(2,)`` or ``(..., 2)``.
+        image_acceleration: a in px/s^2, same shape.
 
     Raises:
         ValueError: If shapes do not fit, a value is not finite, or an amplitude or frequency is negative.
@@ -60,6 +72,7 @@ class Vibration:
     frequency: Tensor
     phase: Tensor
     image_motion: Tensor
+    image_acceleration: Tensor
 
     def __init__(
         self,
@@ -67,23 +80,21 @@ class Vibration:
         frequency: TensorLike,
         phase: TensorLike = 0.0,
         image_motion: TensorLike = (0.0, 0.0),
+        image_acceleration: TensorLike = (0.0, 0.0),
     ) -> None:
-        device = next((v.device for v in (amplitude, frequency, phase, image_motion) if isinstance(v, Tensor)), None)
+        given = (amplitude, frequency, phase, image_motion, image_acceleration)
+        device = next((value.device for value in given if isinstance(value, Tensor)), None)
         tones = [
             _tones(name, value, device)
             for name, value in (("amplitude", amplitude), ("frequency", frequency), ("phase", phase))
         ]
-        motion = torch.as_tensor(image_motion, dtype=torch.float64, device=device)
-        motion = motion.expand(2) if motion.ndim == 0 else motion
-        if motion.shape[-1] != 2:
-            raise ValueError(f"image_motion must have shape (..., 2) for axes (x, y), got {tuple(motion.shape)}")
-        if not bool(torch.isfinite(motion).all()):
-            raise ValueError("image_motion must be finite")
+        motion = _of_axes("image_motion", image_motion, device)
+        acceleration = _of_axes("image_acceleration", image_acceleration, device)
         try:
             tones = list(torch.broadcast_tensors(*tones))
-            batch = torch.broadcast_shapes(tones[0].shape[:-2], motion.shape[:-1])
+            batch = torch.broadcast_shapes(tones[0].shape[:-2], motion.shape[:-1], acceleration.shape[:-1])
         except RuntimeError as error:
-            shapes = ", ".join(str(tuple(t.shape)) for t in (*tones, motion))
+            shapes = ", ".join(str(tuple(t.shape)) for t in (*tones, motion, acceleration))
             raise ValueError(f"amplitude, frequency, phase and image_motion do not fit together: {shapes}") from error
         for name, tensor in zip(("amplitude", "frequency"), tones[:2], strict=True):
             if bool((tensor < 0).any()):
@@ -93,6 +104,7 @@ class Vibration:
         for name, tensor in zip(("amplitude", "frequency", "phase"), tones, strict=True):
             object.__setattr__(self, name, tensor.take_along_dim(order, dim=-1))
         object.__setattr__(self, "image_motion", motion.expand(*batch, 2))
+        object.__setattr__(self, "image_acceleration", acceleration.expand(*batch, 2))
 
     @property
     def period(self) -> Tensor:
@@ -123,7 +135,7 @@ class Vibration:
     def still(cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None) -> Self:
         """No vibration and no image motion: the camera stands still."""
         zeros = torch.zeros(*batch_shape, 2, 1, dtype=torch.float64, device=device)
-        return cls(zeros, zeros, zeros, zeros[..., 0])
+        return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0])
 
     def _angle(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Tone angles (..., S, 2, K) with amplitude and frequency shaped to match, for times (..., S)."""
@@ -136,9 +148,16 @@ class Vibration:
         amplitude, frequency, phase = (t.reshape(shape) for t in (self.amplitude, self.frequency, self.phase))
         return 2 * math.pi * frequency * times[..., None, None] + phase, amplitude, frequency
 
-    def _drift(self, times: Tensor) -> Tensor:
-        steps = times.ndim - len(self.batch_shape)
-        return self.image_motion.reshape(*self.batch_shape, *(1,) * steps, 2) * times[..., None]
+    def drift(self, times: Tensor) -> Tensor:
+        """Displacement v t + a t^2 / 2 of the image motion alone in px; arguments and shapes as in ``displacement``."""
+        times = times.to(dtype=torch.float64, device=self.device)[..., None]
+        return (
+            self._per_axis(self.image_motion, times) + 0.5 * self._per_axis(self.image_acceleration, times) * times
+        ) * times
+
+    def _per_axis(self, values: Tensor, times: Tensor) -> Tensor:
+        """(..., 2) values shaped to match times (..., S, 1)."""
+        return values.reshape(*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), 2)
 
     def displacement(self, times: Tensor) -> Tensor:
         """Displacement D(t) in px (Eq. 1).
@@ -151,7 +170,7 @@ class Vibration:
         """
         times = times.to(dtype=torch.float64, device=self.device)
         angle, amplitude, _ = self._angle(times)
-        return (amplitude * angle.sin()).sum(-1) + self._drift(times)
+        return (amplitude * angle.sin()).sum(-1) + self.drift(times)
 
     def mean_displacement(self, starts: Tensor, exposure_time: float) -> Tensor:
         """Mean displacement over exposures [start, start + T_e] in px (Eq. 2).
@@ -167,7 +186,8 @@ class Vibration:
         """
         middle = starts.to(dtype=torch.float64, device=self.device) + 0.5 * exposure_time
         angle, amplitude, frequency = self._angle(middle)
-        return (amplitude * torch.sinc(frequency * exposure_time) * angle.sin()).sum(-1) + self._drift(middle)
+        bend = self._per_axis(self.image_acceleration, middle[..., None]) * (exposure_time**2 / 24.0)
+        return (amplitude * torch.sinc(frequency * exposure_time) * angle.sin()).sum(-1) + self.drift(middle) + bend
 
     def offset(self, starts: Tensor, later_starts: Tensor, exposure_time: float) -> Tensor:
         """Offset: mean displacement of the later exposure minus that of the earlier one, in px (Eq. 4).
@@ -188,7 +208,8 @@ class Vibration:
         """Velocity dD/dt in px/s; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
         angle, amplitude, frequency = self._angle(times)
-        drift = self._drift(torch.ones_like(times))
+        span = times[..., None]
+        drift = self._per_axis(self.image_motion, span) + self._per_axis(self.image_acceleration, span) * span
         return (2 * math.pi * frequency * amplitude * angle.cos()).sum(-1) + drift
 
     def gain(self, interval: float) -> Tensor:
@@ -200,7 +221,12 @@ class Vibration:
 
     def largest_displacement(self, first: float, last: float) -> Tensor:
         """Bound on |D(t)| for ``first <= t <= last``, (..., 2), in px."""
-        return self.amplitude.sum(-1) + self.image_motion.abs() * max(abs(first), abs(last))
+        longest = max(abs(first), abs(last))
+        return (
+            self.amplitude.sum(-1)
+            + self.image_motion.abs() * longest
+            + 0.5 * self.image_acceleration.abs() * longest**2
+        )
 
     def displacement_within_row_time(self, row_time: float) -> Tensor:
         """Largest displacement within one row time, (..., 2), in px (Eq. 24, summed over tones, with motion).
