@@ -62,16 +62,26 @@ def mirrored_index(start: int, stop: int, length: int, device: torch.device | No
     return torch.where(index >= length, 2 * (length - 1) - index, index)
 
 
+_BLOCK = 64  # samples filtered together: one small dense matrix serves all blocks
+
+
 def _filter_symmetric(samples: Tensor, taps: tuple[float, ...], dim: int) -> Tensor:
-    """Correlate along ``dim`` with a symmetric kernel, valid part only."""
+    """Correlate along ``dim`` with a symmetric kernel, valid part only, as products with a Toeplitz matrix."""
     reach = len(taps) - 1
     length = samples.shape[dim] - 2 * reach
-    result = samples.narrow(dim, reach, length) * taps[0]
-    for tap in range(1, len(taps)):
-        result = result + taps[tap] * (
-            samples.narrow(dim, reach - tap, length) + samples.narrow(dim, reach + tap, length)
-        )
-    return result
+    kernel = torch.tensor(taps[:0:-1] + taps, dtype=samples.dtype, device=samples.device)
+    block = min(_BLOCK, length)
+    matrix = kernel.new_zeros(block, block + 2 * reach)
+    row = torch.arange(block, device=samples.device)[:, None]
+    matrix[row, row + torch.arange(len(kernel), device=samples.device)] = kernel
+    moved = samples.movedim(dim, -2) if samples.ndim > 1 else samples[:, None]
+    count = -(-length // block)
+    missing = count * block - length
+    moved = torch.nn.functional.pad(moved, (0, 0, 0, missing)) if missing else moved
+    windows = moved.unfold(-2, block + 2 * reach, block)  # (..., count, W, block + 2 reach), a view
+    filtered = torch.matmul(matrix, windows.transpose(-2, -1)).flatten(-3, -2)
+    filtered = filtered.narrow(-2, 0, length)
+    return filtered.movedim(-2, dim) if samples.ndim > 1 else filtered[:, 0]
 
 
 def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
