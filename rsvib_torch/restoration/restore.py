@@ -1,6 +1,7 @@
 """The door to restoration: orientation, batches and dtypes resolved once, then one of the methods."""
 
 import inspect
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -17,11 +18,18 @@ from rsvib_torch.orientation import (
 from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact import restore_exact
+from rsvib_torch.restoration.judging import judge_frames, pairs_to_judge
+from rsvib_torch.restoration.missing import fill_roughly
 from rsvib_torch.restoration.motion import as_batch, frame_motion
+from rsvib_torch.restoration.pixels import Saturation, hidden_pixels, saturated_pixels
+from rsvib_torch.restoration.trust import Detected, trusted_vibration
+from rsvib_torch.restoration.verdict import RestorationWarning, TooLittleInCommonError
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
 __all__ = ["METHODS", "VibrationRestorer", "restore"]
+
+_JUDGED_PAIRS, _JUDGED_COLUMNS = 2, 256  # of every stack
 
 METHODS: dict[str, Callable[..., Tensor]] = {"exact": restore_exact, "banded": restore_banded, "dewarp": restore_dewarp}
 
@@ -30,7 +38,7 @@ def _check_options(method: str, options: dict[str, Any]) -> None:
     known = [
         name
         for name, parameter in inspect.signature(METHODS[method]).parameters.items()
-        if parameter.kind is inspect.Parameter.KEYWORD_ONLY
+        if parameter.kind is inspect.Parameter.KEYWORD_ONLY and name not in ("ignore", "clipped")
     ]
     for name in options:
         if name not in known:
@@ -43,17 +51,20 @@ def _with_added_axes(frames: Tensor) -> Tensor:
     return frames[:, :, None] if frames.ndim < 5 else frames
 
 
-def _without_ignored(
-    frames: Tensor, ignore: Tensor, timing: SensorTiming, options: dict[str, Any]
+def _without_lost_pixels(
+    images: Tensor, hidden: Tensor | None, clipped: Tensor | None, method: str, options: dict[str, Any]
 ) -> tuple[Tensor, dict[str, Any]]:
-    """Blank the pixels to be ignored and hand their mask on, in row order."""
-    frames = torch.as_tensor(frames)
-    if not isinstance(ignore, Tensor) or ignore.dtype != torch.bool or ignore.shape != frames.shape:
-        raise ValueError(f"ignore must be a boolean mask of shape {tuple(frames.shape)} like the frames")
-    if bool(ignore.all()):
-        raise ValueError("ignore leaves no pixel")
-    mask = frames_to_row_order(_with_added_axes(ignore), timing)
-    return frames.masked_fill(ignore, 0), {**options, "ignore": mask}
+    """Hand the masks (B, T, C, H, W) to a method that knows them; fill what is missing for one that does not."""
+    known = inspect.signature(METHODS[method]).parameters
+    if clipped is not None and "clipped" in known:
+        options = {**options, "clipped": clipped}
+    elif clipped is not None and "ignore" in known:
+        hidden = clipped if hidden is None else hidden | clipped
+    if hidden is None:
+        return images, options
+    if "ignore" in known:
+        return images, {**options, "ignore": hidden}
+    return fill_roughly(images, hidden), options
 
 
 def _without_added_axes(restored: Tensor, ndim: int) -> Tensor:
@@ -65,11 +76,13 @@ def _without_added_axes(restored: Tensor, ndim: int) -> Tensor:
 def restore(
     frames: Tensor,
     timing: SensorTiming,
-    vibration: Vibration,
+    vibration: Vibration | Detected,
     *,
     method: str = "exact",
     full_scale: float | None = None,
     ignore: Tensor | None = None,
+    saturation: Saturation = "auto",
+    check: bool = True,
     **options: Any,
 ) -> Tensor:
     """Restore frames taken by a vibrating rolling-shutter camera: geometry and sharpness.
@@ -78,15 +91,23 @@ def restore(
     of that motion at the middle of the frame (``visible_pixels`` tells them); what a frame never exposed, a rim as
     wide as the displacement, is continued by mirroring (``visible_pixels`` tells which pixels those are).
 
+    Pixels without data (NaN, or ``ignore``) and saturated pixels do not count. Method ``"exact"`` finds what they
+    would have shown from all others, jointly from all frames where it is told to; ``"banded"`` and ``"dewarp"`` put
+    local means in place of pixels without data, and leave saturated pixels at their level.
+
     Args:
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation.
         timing: The sensor.
-        vibration: The motion in image axes: one for all, or a batch (B,) for a batch of stacks.
+        vibration: The motion in image axes: one for all, or a batch (B,) for a batch of stacks. Or what
+            ``detect_vibration`` returned: axes that it does not trust are then left alone, see ``trusted_vibration``.
         method: ``"exact"``: all rows coupled, several frames jointly on demand; ``"banded"``: row by row within
             slabs (Sec. 3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest.
         full_scale: Count that means 1.0, for integer frames other than uint8.
-        ignore: Boolean mask shaped like the frames of pixels that do not count (no data, saturated); they may hold
-            anything, NaN included, and are filled from the others. Method ``"exact"`` only.
+        ignore: Boolean mask shaped like the frames of pixels that do not count; they may hold anything.
+        saturation: Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for
+            integer frames, none for floats, which do not say where they were cut; None for none.
+        check: Judge the result on a part of the frames, and warn where it is no better than what came in; needs two
+            frames. ``judge_restoration`` does it on all of them.
         **options: Options of the method, see ``restore_exact``, ``restore_banded`` and ``restore_dewarp``.
 
     Returns:
@@ -97,34 +118,91 @@ def restore(
         TypeError: If an argument has the wrong type or the method does not know an option.
         ValueError: If a value is out of range, or frames, timing and vibration do not fit together.
 
+    Warns:
+        RestorationWarning: If an axis is left alone, or the restored frames are no better than the raw ones.
+
     Example:
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
         >>> round(restore(torch.full((2, 64, 48), 0.5), timing, Vibration(2.0, 50.0)).mean().item(), 5)
         0.5
     """
     check_choice("method", method, tuple(METHODS))
-    if ignore is not None:
-        frames, options = _without_ignored(frames, ignore, timing, options)
     _check_options(method, options)
-    images = as_float_frames(frames, full_scale)
+    given = _as_tensor(frames)
+    hidden = hidden_pixels(given, ignore)
+    clipped = saturated_pixels(given, saturation, full_scale)
+    for mask, message in ((hidden, "ignore leaves no pixel"), (clipped, "every pixel is saturated")):
+        if mask is not None and bool(mask.all()):
+            raise ValueError(message)
+    images = as_float_frames(given if hidden is None else given.masked_fill(hidden, 0), full_scale)
     dtype = images.dtype
     if dtype not in (torch.float32, torch.float64):
         images = images.to(torch.float32)
-    images = _with_added_axes(images)
-    images = frames_to_row_order(images, timing)
+    images = frames_to_row_order(_with_added_axes(images), timing)
+    hidden, clipped = (
+        None if mask is None else frames_to_row_order(_with_added_axes(mask), timing) for mask in (hidden, clipped)
+    )
     B, T, _, H, _ = images.shape
     rowwise = timing.in_row_order()
     rowwise.check_rows(H)
-    if vibration.batch_shape not in ((), (B,)) or (vibration.batch_shape and torch.as_tensor(frames).ndim < 5):
+    vibration = _to_undo(vibration, timing, T, H)
+    if vibration.batch_shape not in ((), (B,)) or (vibration.batch_shape and given.ndim < 5):
         raise ValueError(
             f"vibration of batch shape {tuple(vibration.batch_shape)} does not fit frames of shape "
-            f"{tuple(torch.as_tensor(frames).shape)}; one vibration, or one per stack of a (B, T, C, H, W) batch"
+            f"{tuple(given.shape)}; one vibration, or one per stack of a (B, T, C, H, W) batch"
         )
     motion = vibration_to_row_order(vibration, timing).to(images.device)
     motion = motion if motion.batch_shape else as_batch(motion, B)
-    restored = METHODS[method](images, frame_motion(motion, rowwise, T, H), **options)
+    images, chosen = _without_lost_pixels(images, hidden, clipped, method, options)
+    restored = METHODS[method](images, frame_motion(motion, rowwise, T, H), **chosen)
+    if check:
+        raw = images if hidden is None or method != "exact" else fill_roughly(images, hidden)
+        _warn_if_worse(raw.detach(), restored.detach(), motion, timing, options.get("joint", False))
     restored = frames_from_row_order(restored, timing)
-    return _without_added_axes(restored, torch.as_tensor(frames).ndim).to(dtype)
+    return _without_added_axes(restored, given.ndim).to(dtype)
+
+
+def _as_tensor(frames: Tensor) -> Tensor:
+    try:
+        return torch.as_tensor(frames)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"frames must be a tensor or array of numbers, got {type(frames).__name__}") from error
+
+
+def _to_undo(vibration: Vibration | Detected, timing: SensorTiming, num_frames: int, num_rows: int) -> Vibration:
+    """The vibration to undo: all of one that was given, the trusted part of one that was detected."""
+    if isinstance(vibration, Vibration):
+        return vibration
+    if not all(hasattr(vibration, name) for name in ("vibration", "std", "reliable", "reasons")):
+        raise TypeError(f"vibration must be a Vibration or a detection, got {type(vibration).__name__}")
+    trusted, notes = trusted_vibration(vibration, timing, num_frames, num_rows)
+    for note in notes:
+        warnings.warn(note, RestorationWarning, stacklevel=3)
+    return trusted
+
+
+def _warn_if_worse(raw: Tensor, restored: Tensor, motion: Vibration, timing: SensorTiming, joint: bool | int) -> None:
+    """Judge each stack of a batch in row order on a strip of columns of a few pairs of frames."""
+    count = raw.shape[1]
+    if count < 2:
+        return
+    pairs = pairs_to_judge(count, joint, _JUDGED_PAIRS)
+    shared = count if joint is True else max(int(joint), 1)
+    for stack in range(len(raw)):
+        still = Vibration(*(getattr(motion[stack], name).detach() for name in motion.__dataclass_fields__))
+        if not bool((still.amplitude > 0).any()):
+            continue
+        moved = frame_motion(as_batch(still, 1), timing.in_row_order(), count, raw.shape[-2])
+        try:
+            verdict = judge_frames(
+                raw[stack], restored[stack], moved, pairs, shared=min(shared, count), columns=_JUDGED_COLUMNS
+            )
+        except TooLittleInCommonError:
+            continue  # frames that share no scene cannot be compared
+        if verdict.overall in ("partly", "worse"):
+            where = f"stack {stack}: " if len(raw) > 1 else ""
+            summary = verdict.in_image_axes(timing).summary
+            warnings.warn(f"{where}{summary}", RestorationWarning, stacklevel=3)
 
 
 class VibrationRestorer(nn.Module):
@@ -134,20 +212,33 @@ class VibrationRestorer(nn.Module):
         timing: The sensor.
         method: As in ``restore``.
         full_scale: As in ``restore``.
+        saturation: As in ``restore``.
+        check: As in ``restore``.
         **options: As in ``restore``.
     """
 
     def __init__(
-        self, timing: SensorTiming, *, method: str = "exact", full_scale: float | None = None, **options: Any
+        self,
+        timing: SensorTiming,
+        *,
+        method: str = "exact",
+        full_scale: float | None = None,
+        saturation: Saturation = "auto",
+        check: bool = True,
+        **options: Any,
     ) -> None:
         super().__init__()
         check_choice("method", method, tuple(METHODS))
         _check_options(method, options)
         self.timing = timing
-        self.method = method
-        self.full_scale = full_scale
-        self.options = options
+        self.options = {
+            "method": method,
+            "full_scale": full_scale,
+            "saturation": saturation,
+            "check": check,
+            **options,
+        }
 
-    def forward(self, frames: Tensor, vibration: Vibration) -> Tensor:
+    def forward(self, frames: Tensor, vibration: Vibration | Detected, ignore: Tensor | None = None) -> Tensor:
         """Restore a stack of frames."""
-        return restore(frames, self.timing, vibration, method=self.method, full_scale=self.full_scale, **self.options)
+        return restore(frames, self.timing, vibration, ignore=ignore, **self.options)

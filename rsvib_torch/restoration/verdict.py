@@ -1,86 +1,91 @@
-"""Did restoration help? Judged without truth, by how well frames of one scene agree."""
+"""What is said of a restoration, without knowing the truth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from rsvib_torch.orientation import as_float_frames, time_axis
-from rsvib_torch.restoration.motion import visible_pixels
 from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.vibration import Vibration
 
-__all__ = ["RestorationVerdict", "judge_restoration"]
+__all__ = ["OUTCOMES", "Outcome", "RestorationVerdict", "RestorationWarning", "TooLittleInCommonError"]
+
+Outcome = Literal["helps", "unknown", "partly", "worse"]
+OUTCOMES: tuple[Outcome, ...] = ("helps", "unknown", "partly", "worse")  # in order of concern
+
+
+class RestorationWarning(UserWarning):
+    """A restored frame may be worse than the raw one, or a part of the vibration was left alone."""
+
+
+class TooLittleInCommonError(ValueError):
+    """Two frames show too little of the same scene to be compared."""
 
 
 @dataclass(frozen=True, eq=False)
 class RestorationVerdict:
-    """How far consecutive frames disagree where both show the scene, as root-mean-square pixel difference.
+    """What P pairs of frames of one scene say about a restoration.
+
+    Displacements and levels are root-mean-square values over the pixels that both frames show.
 
     Attributes:
-        before: (P,) disagreement of the raw frames of each pair, moved onto each other by whole pixels.
-        after: (P,) disagreement of the restored frames.
+        before: (P,) difference of the raw frames, moved onto each other by whole pixels, full scale 1.
+        after: (P,) difference of the restored frames; NaN for one image restored jointly from all.
+        misfit_before: (P, 2) px, how far the raw frames lie apart, axes (x, y).
+        misfit_after: (P, 2) px, how far a raw frame lies from what the other one, restored and blurred again by the
+            motion of the first, says it should show.
+        resolution: (P, 2) px, misfits below this are not told from zero.
+        noise: (P,) standard deviation of the noise of the raw frames.
+        chi_square: (P,) mean square of that frame's difference from its prediction, over the variance of the noise:
+            1 ... 2 where motion, blur and noise explain the frame.
+        predicted_gain: (P,) dB, estimated PSNR of the restored frames less that of the raw ones.
+        outcome: For each pair: ``"helps"``; ``"partly"``: closer together, but the vibration explains a part only;
+            ``"worse"``; ``"unknown"``: the frames do not show this vibration (too small, or a blind frequency).
+        reasons: Why, for each pair; empty where it helps.
     """
 
     before: Tensor
     after: Tensor
+    misfit_before: Tensor
+    misfit_after: Tensor
+    resolution: Tensor
+    noise: Tensor
+    chi_square: Tensor
+    predicted_gain: Tensor
+    outcome: tuple[Outcome, ...]
+    reasons: tuple[str, ...]
 
     @property
     def helped(self) -> Tensor:
-        """(P,) whether the restored frames agree better than the raw ones."""
-        return self.after < self.before
+        """(P,) whether restored is better than raw, as far as the pair tells."""
+        return torch.tensor([outcome == "helps" for outcome in self.outcome], device=self.before.device)
 
+    @property
+    def overall(self) -> Outcome:
+        """The outcome of greatest concern over all pairs."""
+        return max(self.outcome, key=OUTCOMES.index)
 
-def judge_restoration(
-    frames: Tensor,
-    restored: Tensor,
-    timing: SensorTiming,
-    vibration: Vibration,
-    *,
-    full_scale: float | None = None,
-) -> RestorationVerdict:
-    """Compare how well consecutive frames of a still scene agree before and after restoration.
+    @property
+    def summary(self) -> str:
+        """The verdict in one line."""
+        worst = self.outcome.index(self.overall)
+        gain = float(self.predicted_gain.nanmean())
+        counted = f" ({self.outcome.count(self.overall)} of {len(self.outcome)} pairs)" if len(self.outcome) > 1 else ""
+        words = {
+            "helps": f"restored frames agree; estimated gain {gain:+.1f} dB",
+            "unknown": f"whether restoration helps cannot be told{counted}: {self.reasons[worst]}",
+            "partly": f"restoration helps in part only{counted}: {self.reasons[worst]}",
+            "worse": f"restored is no better than raw{counted}: {self.reasons[worst]}",
+        }
+        return words[self.overall]
 
-    A vibration displaces frames differently; a right one, undone, brings them together, a wrong one drives them
-    further apart. It says nothing about an axis that displaces all frames alike (a blind frequency), and frames
-    restored jointly share their noise: judge frames restored one by one.
-
-    Args:
-        frames: Raw stack (T, H, W) or (T, C, H, W), at least two frames.
-        restored: What ``restore`` made of it, one frame from each.
-        timing: The sensor.
-        vibration: The vibration that was undone, in image axes.
-        full_scale: As in ``restore``.
-
-    Returns:
-        Disagreement of each of the T - 1 pairs.
-
-    Raises:
-        ValueError: If there is one frame only, shapes differ, or two frames have nothing in common.
-    """
-    raw = as_float_frames(frames, full_scale, minimum_frames=2)
-    if raw.ndim == 5 or time_axis(raw) != 0:
-        raise ValueError(f"frames must be one stack (T, H, W) or (T, C, H, W), got shape {tuple(raw.shape)}")
-    if restored.shape != raw.shape:
-        raise ValueError(f"restored must have the shape {tuple(raw.shape)} of the frames, got {tuple(restored.shape)}")
-    height, width = raw.shape[-2:]
-    mask, shift = visible_pixels(timing, vibration, (height, width), raw.shape[0])
-    steps = (shift[1:] - shift[:-1]).round().to(torch.int64).tolist()
-    before: list[Tensor] = []
-    after: list[Tensor] = []
-    for pair, (x, y) in enumerate(steps):
-        if abs(x) >= width or abs(y) >= height:
-            raise ValueError(f"frames {pair} and {pair + 1} have nothing in common: they lie ({x}, {y}) px apart")
-        rows, columns = _overlap(y, height), _overlap(x, width)
-        both = mask[pair][rows[0], columns[0]] & mask[pair + 1][rows[1], columns[1]]
-        if not bool(both.any()):
-            raise ValueError(f"frames {pair} and {pair + 1} have nothing in common")
-        for images, found in ((raw, before), (restored, after)):
-            change = images[pair + 1][..., rows[1], columns[1]] - images[pair][..., rows[0], columns[0]]
-            found.append(change[..., both].square().mean().sqrt())
-    return RestorationVerdict(torch.stack(before), torch.stack(after))
-
-
-def _overlap(step: int, size: int) -> tuple[slice, slice]:
-    """Slices of the earlier and the later frame that show the same scene, for content moved by ``step`` px."""
-    return slice(max(-step, 0), size - max(step, 0)), slice(max(step, 0), size - max(-step, 0))
+    def in_image_axes(self, timing: SensorTiming) -> "RestorationVerdict":
+        """The verdict on frames in row order, with axes named as in the image."""
+        if timing.scan_axis == -2:
+            return self
+        swapped = {name: getattr(self, name).flip(-1) for name in ("misfit_before", "misfit_after", "resolution")}
+        other = {"x: ": "y: ", "y: ": "x: "}
+        reasons = tuple(
+            "; ".join(other.get(part[:3], part[:3]) + part[3:] for part in why.split("; ")) for why in self.reasons
+        )
+        return replace(self, reasons=reasons, **swapped)

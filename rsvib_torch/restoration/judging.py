@@ -1,0 +1,314 @@
+"""Did restoration help? Judged without truth, by how well frames of one scene agree."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.checks import check_whole_number
+from rsvib_torch.orientation import as_float_frames, frames_to_row_order, time_axis, vibration_to_row_order
+from rsvib_torch.restoration.misfit import RIM, misfit
+from rsvib_torch.restoration.missing import fill_roughly
+from rsvib_torch.restoration.motion import FrameMotion, as_batch, frame_motion
+from rsvib_torch.restoration.noise import estimate_noise
+from rsvib_torch.restoration.pixels import hidden_pixels
+from rsvib_torch.restoration.reblur import reblur
+from rsvib_torch.restoration.verdict import OUTCOMES, Outcome, RestorationVerdict, TooLittleInCommonError
+from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.vibration import Vibration
+
+__all__ = ["judge_frames", "judge_restoration", "pairs_to_judge"]
+
+_EXPLAINED = 0.35  # of the displacement between the raw frames may remain
+_UNCHANGED = 0.9  # of it remaining means that nothing was gained
+_FINEST = 0.03  # px, a misfit that never matters
+_DOUBTFUL_GAIN, _BAD_GAIN = -1.0, -3.0  # dB; the estimate errs by as much where the exposure blurs most
+_WELCOME_GAIN = 1.0  # dB
+_QUIETEST = 1e-5  # noise level below which none is assumed, of full scale
+_MARGIN = 4  # px between the pixels judged and what was made up
+
+
+def _overlap(step: int, size: int) -> tuple[slice, slice]:
+    """Slices of the earlier and the later frame that show the same scene, for content moved by ``step`` px."""
+    return slice(max(-step, 0), size - max(step, 0)), slice(max(step, 0), size - max(-step, 0))
+
+
+def _best_columns(image: Tensor, count: int) -> slice:
+    """The ``count`` neighbouring columns of (C, H, W) with the most detail."""
+    width = image.shape[-1]
+    if width <= count:
+        return slice(0, width)
+    detail = image.diff(dim=-2).square().sum((0, 1), dtype=torch.float64).cumsum(0)
+    first = int((detail[count:] - detail[:-count]).argmax())
+    return slice(first, first + count)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Two raw frames and their restored ones where all show the same scene, (C, h, w) each."""
+
+    earlier: Tensor
+    later: Tensor
+    restored: Tensor  # of the earlier one
+    restored_later: Tensor | None  # None: there is one restored image of all frames
+    predicted: Tensor  # the later frame, from ``restored``
+    changed: Tensor  # what the motion of the later frame does to ``restored``
+    changed_later: Tensor  # and to ``restored_later``, where there is one
+
+
+def _swing(motion: FrameMotion, frames: Sequence[int], num_rows: int) -> tuple[int, int]:
+    """Rim (x, y) of these frames in which content may come from outside, in whole px."""
+    rows = torch.arange(num_rows, dtype=torch.float64, device=motion.frame_starts.device)
+    starts = motion.frame_starts[list(frames), None] + rows * motion.timing.row_time
+    moved = motion.vibration.mean_displacement(starts[None], motion.timing.exposure_time)
+    rest = (moved - motion.shift[:, list(frames), None]).abs().amax((0, 1, 2)) + motion.vibration.amplitude.new_zeros(2)
+    x, y = (math.ceil(value) + _MARGIN for value in rest.tolist())
+    return x, y
+
+
+def _pair(raw: Tensor, restored: Tensor, motion: FrameMotion, frames: tuple[int, int], columns: int | None) -> _Pair:
+    """Cut what two frames have in common; rows are those of the later one."""
+    earlier, later = frames
+    height, width = raw.shape[-2:]
+    x, y = (int(step) for step in (motion.shift[0, later] - motion.shift[0, earlier]).tolist())
+    if abs(x) >= width or abs(y) >= height:
+        raise TooLittleInCommonError(
+            f"frames {earlier} and {later} have nothing in common: they lie ({x}, {y}) px apart"
+        )
+    rows, cols = _overlap(y, height), _overlap(x, width)
+    rim_x, rim_y = _swing(motion, frames, height)
+    cut = tuple(slice(rim, size - rim) for rim, size in ((rim_y, height - abs(y)), (rim_x, width - abs(x))))
+    room = [size - 2 * rim for rim, size in ((rim_y, height - abs(y)), (rim_x, width - abs(x)))]
+    if min(room) < 2 * RIM + 3:
+        raise TooLittleInCommonError(
+            f"frames {earlier} and {later} have nothing in common but {max(room[0], 0)} x {max(room[1], 0)} px"
+        )
+    strip = slice(0, width - abs(x))
+    if columns is not None:
+        wide = _best_columns(raw[later][:, rows[1], cols[1]][..., cut[1]], columns)
+        strip = slice(wide.start, min(wide.stop + 2 * rim_x, width - abs(x)))
+        cut = (cut[0], slice(rim_x, strip.stop - strip.start - rim_x))
+    single = len(restored) == 1
+    scene = restored[0 if single else earlier][:, rows[0], cols[0]][..., strip]
+    inner = (..., cut[0], cut[1])
+    predicted = reblur(scene, motion, later, first_row=rows[1].start)[inner]
+    changed = changed_later = predicted - scene[inner]
+    second = None
+    if not single:
+        other = restored[later][:, rows[1], cols[1]][..., strip]
+        second = other[inner]
+        changed_later = reblur(other, motion, later, first_row=rows[1].start)[inner] - second
+    return _Pair(
+        raw[earlier][:, rows[0], cols[0]][..., strip][inner],
+        raw[later][:, rows[1], cols[1]][..., strip][inner],
+        scene[inner],
+        second,
+        predicted,
+        changed,
+        changed_later,
+    )
+
+
+def _mean_square(difference: Tensor) -> Tensor:
+    return difference.square().mean(dtype=torch.float64)
+
+
+def _moves(motion: FrameMotion) -> tuple[bool, bool]:
+    """Whether the vibration claims to move the image along x, y."""
+    swing = motion.vibration.amplitude.detach().sum(-1)[0] + motion.vibration.image_motion.detach()[0].abs()
+    x, y = (swing > 0).tolist()
+    return x, y
+
+
+def _outcome(
+    before: list[float],
+    after: list[float],
+    resolution: list[float],
+    moves: tuple[bool, bool],
+    gain: float,
+    difference: tuple[float, float],
+) -> tuple[Outcome, str]:
+    """The verdict on one pair, and why.
+
+    Args:
+        before: Misfit of the raw frames (x, y) in px.
+        after: Misfit that remains.
+        resolution: Misfits that are not told from 0.
+        moves: Which axes the vibration moves.
+        gain: Estimated gain in dB.
+        difference: Root-mean-square difference of the raw and of the restored frames; the latter NaN for one image.
+    """
+    found: list[tuple[Outcome, str]] = []
+    trust_gain = True
+    for axis, name in enumerate("xy"):
+        least = max(resolution[axis], _FINEST)
+        if not moves[axis]:
+            trust_gain &= before[axis] <= least
+            continue
+        apart = f"{name}: frames lie {before[axis]:.2g} px apart, {after[axis]:.2g} px are left unexplained"
+        if after[axis] > max(_UNCHANGED * before[axis], least):
+            # less noise may outweigh a motion that was not undone, but not one that was made up
+            outweighed = gain > _WELCOME_GAIN and before[axis] > least and not math.isnan(difference[1])
+            found.append(("partly" if outweighed else "worse", apart))
+        elif after[axis] > max(_EXPLAINED * before[axis], least):
+            found.append(("partly", apart))
+        elif before[axis] <= least:
+            found.append(("unknown", f"{name}: frames lie less than {least:.2g} px apart, all are displaced alike"))
+        else:
+            found.append(("helps", ""))
+    if not found:
+        return "unknown", "no vibration was undone"
+    outcome = max((outcome for outcome, _ in found), key=OUTCOMES.index)
+    if outcome in ("helps", "unknown") and trust_gain and gain < _DOUBTFUL_GAIN:
+        # a wrong motion makes the estimate of the gain wrong as well: it counts where the motion is right
+        return (
+            "worse" if gain < _BAD_GAIN else "partly",
+            f"noise and artefacts outweigh what was undone ({gain:.1f} dB)",
+        )
+    return outcome, "; ".join(why for kind, why in found if kind == outcome and why)
+
+
+def _judge_pair(pair: _Pair, moves: tuple[bool, bool], shared: int) -> RestorationVerdict:
+    """The verdict on one pair, its values without a leading axis."""
+    noise = estimate_noise(torch.stack([pair.earlier, pair.later])).square().mean(dtype=torch.float64)
+    noise = noise.clamp(min=_QUIETEST**2)
+    # what was made of both frames lies between them: their distance from it is the smaller
+    widening = math.sqrt(2.0 * shared / (shared - 1.0)) if shared > 1 else 1.0
+    misfit_before, coarse = misfit(pair.earlier, pair.later)
+    misfit_after, fine = (widening * value for value in misfit(pair.predicted, pair.later))
+    resolution = torch.minimum(coarse, fine)
+    unexplained = _mean_square(pair.later - pair.predicted)
+    error = (unexplained - noise).clamp(min=0.0)
+    after = error.new_tensor(math.nan)
+    if pair.restored_later is not None:
+        after = _mean_square(pair.restored_later - pair.restored)
+    error = torch.maximum(error, 0.5 * after) if shared == 1 else error + noise / shared
+    # what the motion does to the scene; noise of two restored frames drops out of the product
+    raw_error = (pair.changed * pair.changed_later).mean(dtype=torch.float64).clamp(min=0.0) + noise
+    gain = 10.0 * torch.log10(raw_error / error.clamp(min=_QUIETEST**2))
+    before, after = _mean_square(pair.later - pair.earlier).sqrt(), after.sqrt()
+    outcome, why = _outcome(
+        misfit_before.tolist(),
+        misfit_after.tolist(),
+        resolution.tolist(),
+        moves,
+        float(gain),
+        (float(before), float(after)),
+    )
+    return RestorationVerdict(
+        before,
+        after,
+        misfit_before,
+        misfit_after,
+        resolution,
+        noise.sqrt(),
+        unexplained / noise,
+        gain,
+        (outcome,),
+        (why,),
+    )
+
+
+@torch.no_grad()
+def judge_frames(
+    raw: Tensor,
+    restored: Tensor,
+    motion: FrameMotion,
+    pairs: Sequence[tuple[int, int]],
+    *,
+    shared: int = 1,
+    columns: int | None = None,
+) -> RestorationVerdict:
+    """Judge a stack in row order; ``judge_restoration`` with everything made ready.
+
+    Args:
+        raw: (T, C, H, W).
+        restored: (T, C, H, W), or (1, C, H, W) in the coordinates of the first frame of every pair.
+        motion: Motion of the frames, batch of one.
+        pairs: Frames to compare.
+        shared: Frames that each restored one was made of.
+        columns: Judge on so many columns only, those with the most detail.
+
+    Raises:
+        TooLittleInCommonError: If two frames have too little in common.
+    """
+    verdicts = [_judge_pair(_pair(raw, restored, motion, frames, columns), _moves(motion), shared) for frames in pairs]
+    tensors = (
+        "before",
+        "after",
+        "misfit_before",
+        "misfit_after",
+        "resolution",
+        "noise",
+        "chi_square",
+        "predicted_gain",
+    )
+    joined = {name: torch.stack([getattr(verdict, name) for verdict in verdicts]) for name in tensors}
+    outcome = tuple(verdict.outcome[0] for verdict in verdicts)
+    return replace(verdicts[0], **joined, outcome=outcome, reasons=tuple(verdict.reasons[0] for verdict in verdicts))
+
+
+def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> list[tuple[int, int]]:
+    """Pairs of ``count`` frames to compare, at most ``most`` of them, evenly spread."""
+    middle = count // 2
+    pairs = (
+        [(middle, p) for p in range(count) if p != middle] if joint is True else [(p, p + 1) for p in range(count - 1)]
+    )
+    if most is None or len(pairs) <= most:
+        return pairs
+    chosen = torch.linspace(0, len(pairs) - 1, most).round().to(torch.int64).tolist()
+    return [pairs[index] for index in chosen]
+
+
+def judge_restoration(
+    frames: Tensor,
+    restored: Tensor,
+    timing: SensorTiming,
+    vibration: Vibration,
+    *,
+    joint: bool | int = False,
+    full_scale: float | None = None,
+    ignore: Tensor | None = None,
+) -> RestorationVerdict:
+    """Judge without truth whether restored frames are better than raw ones.
+
+    Three things are looked at. Every restored frame, blurred again by the motion of the next one, should be that
+    next frame: a wrong vibration leaves the two apart. Restored frames should agree with each other better than raw
+    frames do, noise and ringing included. And what is left unexplained should be noise (``chi_square``).
+
+    What displaces all frames alike (a blind frequency) cannot be seen this way; the outcome is then ``"unknown"``.
+
+    Args:
+        frames: Raw stack (T, H, W) or (T, C, H, W), at least two frames.
+        restored: What ``restore`` made of it: one frame from each, or one image (1, ...) from all.
+        timing: The sensor.
+        vibration: The vibration that was undone, in image axes.
+        joint: What ``restore`` was told.
+        full_scale: As in ``restore``.
+        ignore: As in ``restore``; local means take the place of what is ignored, and of NaN.
+
+    Returns:
+        Verdict on each pair of neighbouring frames; on each frame with the middle one where there is one image.
+
+    Raises:
+        ValueError: If there is one frame only, shapes differ, or two frames have too little in common.
+    """
+    hidden = hidden_pixels(torch.as_tensor(frames), ignore)
+    raw = as_float_frames(frames if hidden is None else frames.masked_fill(hidden, 0), full_scale, minimum_frames=2)
+    raw = raw if hidden is None else fill_roughly(raw, hidden)
+    if raw.ndim == 5 or time_axis(raw) != 0:
+        raise ValueError(f"frames must be one stack (T, H, W) or (T, C, H, W), got shape {tuple(raw.shape)}")
+    wanted = (1, *raw.shape[1:]) if joint is True else tuple(raw.shape)
+    if tuple(restored.shape) != wanted:
+        raise ValueError(f"restored must have the shape {wanted}, got {tuple(restored.shape)}")
+    count = len(raw)
+    shared = count if joint is True else min(check_whole_number("joint", int(joint) or 1, at_least=1), count)
+    raw, restored = (
+        frames_to_row_order(images if images.ndim == 4 else images[:, None], timing) for images in (raw, restored)
+    )
+    rowwise = as_batch(vibration_to_row_order(vibration, timing).to(raw.device), 1)
+    motion = frame_motion(rowwise, timing.in_row_order(), count, raw.shape[-2])
+    verdict = judge_frames(raw, restored, motion, pairs_to_judge(count, joint), shared=shared)
+    return verdict.in_image_axes(timing)

@@ -1,0 +1,63 @@
+"""What a frame would look like if a restored scene were the truth."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.restoration.motion import FrameMotion
+from rsvib_torch.restoration.rows import continue_rows
+from rsvib_torch.spectral import fast_length
+from rsvib_torch.splines import bspline_coefficients, bspline_weights, mirrored_index
+
+__all__ = ["reblur"]
+
+_DEGREE = 5  # of the spline across rows
+_MARGIN = 16  # px beyond what the motion shows
+
+
+def reblur(scene: Tensor, motion: FrameMotion, frame: int, *, first_row: int = 0) -> Tensor:
+    """Form one frame from a restored scene (Eq. 9), independently of how it was restored.
+
+    Displacement along rows is a phase ramp, across rows a quintic B-spline, the exposure a Gauss-Legendre sum.
+
+    Args:
+        scene: (C, H, W) in row order, in the coordinates in which frame ``frame`` is restored; it may be a part of
+            the rows and columns, and is mirrored beyond.
+        motion: Motion of the frames, batch of one.
+        frame: Index of the frame to form.
+        first_row: Row of the frame that row 0 of the scene lies on.
+
+    Returns:
+        The same part (C, H, W) of the frame.
+    """
+    height, width = scene.shape[-2:]
+    rows = torch.arange(height, dtype=torch.float64, device=scene.device)
+    starts = motion.frame_starts[frame] + (first_row + rows) * motion.timing.row_time
+    displacement, node_weights = exposure_trajectory(motion.vibration[0], starts, motion.timing, "gauss")
+    displacement = displacement - motion.shift[0, frame]
+    reach = math.ceil(float(displacement[..., 0].abs().amax()))
+    length = fast_length(width + 4 * (_MARGIN + reach))
+    u = torch.fft.rfftfreq(length, dtype=torch.float64, device=scene.device)
+    spectra = torch.fft.rfft(continue_rows(bspline_coefficients(scene, _DEGREE, -2), length))
+
+    place = rows[:, None] - displacement[..., 1]
+    cell = place.floor()
+    first = cell.amin(-1)
+    spline = bspline_weights(place - cell, _DEGREE) * node_weights[:, None]
+    offset = (cell - first[:, None]).to(torch.int64)[..., None] + torch.arange(_DEGREE + 1, device=scene.device)
+    count = int(offset.amax()) + 1
+    taps = spline.new_zeros(*spline.shape[:-1], count).scatter(-1, offset, spline).transpose(-2, -1)
+    turns = displacement[..., 0, None] * u
+    angle = (turns.round() - turns) * (2 * math.pi)
+    transfer = torch.complex(taps @ angle.cos(), taps @ angle.sin()).to(spectra.dtype)  # (H, count, U)
+    source = first.to(torch.int64) - _DEGREE // 2
+    beyond = max(int(-source.amin()), int(source.amax()) + count - height, 0)
+    fold = mirrored_index(-beyond, height + beyond, height, scene.device)
+    formed = sum(
+        (transfer[:, tap] * spectra[:, fold[source + tap + beyond]] for tap in range(count)),
+        start=spectra.new_zeros(()),
+    )
+    image: Tensor = torch.fft.irfft(formed, n=length)[..., :width]
+    return image
