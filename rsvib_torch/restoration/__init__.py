@@ -1,5 +1,6 @@
 """How frames become a scene."""
 
+from rsvib_torch.restoration.gain import predict_noise_gain
 from rsvib_torch.restoration.judging import judge_restoration
 from rsvib_torch.restoration.motion import visible_pixels
 from rsvib_torch.restoration.noise import estimate_noise
@@ -14,6 +15,7 @@ __all__ = [
     "displacement_uncertainty",
     "estimate_noise",
     "judge_restoration",
+    "predict_noise_gain",
     "restore",
     "trusted_vibration",
     "visible_pixels",

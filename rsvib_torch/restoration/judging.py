@@ -2,113 +2,31 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.checks import check_whole_number
 from rsvib_torch.orientation import as_float_frames, frames_to_row_order, time_axis, vibration_to_row_order
-from rsvib_torch.restoration.misfit import RIM, misfit
+from rsvib_torch.restoration.misfit import misfit
 from rsvib_torch.restoration.missing import fill_roughly
 from rsvib_torch.restoration.motion import FrameMotion, as_batch, frame_motion
 from rsvib_torch.restoration.noise import estimate_noise
+from rsvib_torch.restoration.pairs import FramePair, pairs_to_judge, shared_part
 from rsvib_torch.restoration.pixels import hidden_pixels
-from rsvib_torch.restoration.reblur import reblur
-from rsvib_torch.restoration.verdict import OUTCOMES, Outcome, RestorationVerdict, TooLittleInCommonError
+from rsvib_torch.restoration.verdict import OUTCOMES, Outcome, RestorationVerdict
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
-__all__ = ["judge_frames", "judge_restoration", "pairs_to_judge"]
+__all__ = ["judge_frames", "judge_restoration"]
 
 _EXPLAINED = 0.35  # of the displacement between the raw frames may remain
 _UNCHANGED = 0.9  # of it remaining means that nothing was gained
 _FINEST = 0.03  # px, a misfit that never matters
-_DOUBTFUL_GAIN, _BAD_GAIN = -1.0, -3.0  # dB; the estimate errs by as much where the exposure blurs most
+_DOUBTFUL_GAIN, _BAD_GAIN = -2.0, -4.0  # dB; the estimate is low by as much where the exposure blurs most
 _WELCOME_GAIN = 1.0  # dB
 _QUIETEST = 1e-5  # noise level below which none is assumed, of full scale
-_MARGIN = 4  # px between the pixels judged and what was made up
-
-
-def _overlap(step: int, size: int) -> tuple[slice, slice]:
-    """Slices of the earlier and the later frame that show the same scene, for content moved by ``step`` px."""
-    return slice(max(-step, 0), size - max(step, 0)), slice(max(step, 0), size - max(-step, 0))
-
-
-def _best_columns(image: Tensor, count: int) -> slice:
-    """The ``count`` neighbouring columns of (C, H, W) with the most detail."""
-    width = image.shape[-1]
-    if width <= count:
-        return slice(0, width)
-    detail = image.diff(dim=-2).square().sum((0, 1), dtype=torch.float64).cumsum(0)
-    first = int((detail[count:] - detail[:-count]).argmax())
-    return slice(first, first + count)
-
-
-@dataclass(frozen=True, eq=False)
-class _Pair:
-    """Two raw frames and their restored ones where all show the same scene, (C, h, w) each."""
-
-    earlier: Tensor
-    later: Tensor
-    restored: Tensor  # of the earlier one
-    restored_later: Tensor | None  # None: there is one restored image of all frames
-    predicted: Tensor  # the later frame, from ``restored``
-    changed: Tensor  # what the motion of the later frame does to ``restored``
-    changed_later: Tensor  # and to ``restored_later``, where there is one
-
-
-def _swing(motion: FrameMotion, frames: Sequence[int], num_rows: int) -> tuple[int, int]:
-    """Rim (x, y) of these frames in which content may come from outside, in whole px."""
-    rows = torch.arange(num_rows, dtype=torch.float64, device=motion.frame_starts.device)
-    starts = motion.frame_starts[list(frames), None] + rows * motion.timing.row_time
-    moved = motion.vibration.mean_displacement(starts[None], motion.timing.exposure_time)
-    rest = (moved - motion.shift[:, list(frames), None]).abs().amax((0, 1, 2)) + motion.vibration.amplitude.new_zeros(2)
-    x, y = (math.ceil(value) + _MARGIN for value in rest.tolist())
-    return x, y
-
-
-def _pair(raw: Tensor, restored: Tensor, motion: FrameMotion, frames: tuple[int, int], columns: int | None) -> _Pair:
-    """Cut what two frames have in common; rows are those of the later one."""
-    earlier, later = frames
-    height, width = raw.shape[-2:]
-    x, y = (int(step) for step in (motion.shift[0, later] - motion.shift[0, earlier]).tolist())
-    if abs(x) >= width or abs(y) >= height:
-        raise TooLittleInCommonError(
-            f"frames {earlier} and {later} have nothing in common: they lie ({x}, {y}) px apart"
-        )
-    rows, cols = _overlap(y, height), _overlap(x, width)
-    rim_x, rim_y = _swing(motion, frames, height)
-    cut = tuple(slice(rim, size - rim) for rim, size in ((rim_y, height - abs(y)), (rim_x, width - abs(x))))
-    room = [size - 2 * rim for rim, size in ((rim_y, height - abs(y)), (rim_x, width - abs(x)))]
-    if min(room) < 2 * RIM + 3:
-        raise TooLittleInCommonError(
-            f"frames {earlier} and {later} have nothing in common but {max(room[0], 0)} x {max(room[1], 0)} px"
-        )
-    strip = slice(0, width - abs(x))
-    if columns is not None:
-        wide = _best_columns(raw[later][:, rows[1], cols[1]][..., cut[1]], columns)
-        strip = slice(wide.start, min(wide.stop + 2 * rim_x, width - abs(x)))
-        cut = (cut[0], slice(rim_x, strip.stop - strip.start - rim_x))
-    single = len(restored) == 1
-    scene = restored[0 if single else earlier][:, rows[0], cols[0]][..., strip]
-    inner = (..., cut[0], cut[1])
-    predicted = reblur(scene, motion, later, first_row=rows[1].start)[inner]
-    changed = changed_later = predicted - scene[inner]
-    second = None
-    if not single:
-        other = restored[later][:, rows[1], cols[1]][..., strip]
-        second = other[inner]
-        changed_later = reblur(other, motion, later, first_row=rows[1].start)[inner] - second
-    return _Pair(
-        raw[earlier][:, rows[0], cols[0]][..., strip][inner],
-        raw[later][:, rows[1], cols[1]][..., strip][inner],
-        scene[inner],
-        second,
-        predicted,
-        changed,
-        changed_later,
-    )
 
 
 def _mean_square(difference: Tensor) -> Tensor:
@@ -170,7 +88,7 @@ def _outcome(
     return outcome, "; ".join(why for kind, why in found if kind == outcome and why)
 
 
-def _judge_pair(pair: _Pair, moves: tuple[bool, bool], shared: int) -> RestorationVerdict:
+def _judge_pair(pair: FramePair, moves: tuple[bool, bool], shared: int) -> RestorationVerdict:
     """The verdict on one pair, its values without a leading axis."""
     noise = estimate_noise(torch.stack([pair.earlier, pair.later])).square().mean(dtype=torch.float64)
     noise = noise.clamp(min=_QUIETEST**2)
@@ -186,7 +104,7 @@ def _judge_pair(pair: _Pair, moves: tuple[bool, bool], shared: int) -> Restorati
         after = _mean_square(pair.restored_later - pair.restored)
     error = torch.maximum(error, 0.5 * after) if shared == 1 else error + noise / shared
     # what the motion does to the scene; noise of two restored frames drops out of the product
-    raw_error = (pair.changed * pair.changed_later).mean(dtype=torch.float64).clamp(min=0.0) + noise
+    raw_error = ((pair.predicted - pair.restored) * pair.changed_later).mean(dtype=torch.float64).clamp(min=0.0) + noise
     gain = 10.0 * torch.log10(raw_error / error.clamp(min=_QUIETEST**2))
     before, after = _mean_square(pair.later - pair.earlier).sqrt(), after.sqrt()
     outcome, why = _outcome(
@@ -234,7 +152,9 @@ def judge_frames(
     Raises:
         TooLittleInCommonError: If two frames have too little in common.
     """
-    verdicts = [_judge_pair(_pair(raw, restored, motion, frames, columns), _moves(motion), shared) for frames in pairs]
+    verdicts = [
+        _judge_pair(shared_part(raw, restored, motion, frames, columns), _moves(motion), shared) for frames in pairs
+    ]
     tensors = (
         "before",
         "after",
@@ -248,18 +168,6 @@ def judge_frames(
     joined = {name: torch.stack([getattr(verdict, name) for verdict in verdicts]) for name in tensors}
     outcome = tuple(verdict.outcome[0] for verdict in verdicts)
     return replace(verdicts[0], **joined, outcome=outcome, reasons=tuple(verdict.reasons[0] for verdict in verdicts))
-
-
-def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> list[tuple[int, int]]:
-    """Pairs of ``count`` frames to compare, at most ``most`` of them, evenly spread."""
-    middle = count // 2
-    pairs = (
-        [(middle, p) for p in range(count) if p != middle] if joint is True else [(p, p + 1) for p in range(count - 1)]
-    )
-    if most is None or len(pairs) <= most:
-        return pairs
-    chosen = torch.linspace(0, len(pairs) - 1, most).round().to(torch.int64).tolist()
-    return [pairs[index] for index in chosen]
 
 
 def judge_restoration(

@@ -18,9 +18,10 @@ from rsvib_torch.orientation import (
 from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact import restore_exact
-from rsvib_torch.restoration.judging import judge_frames, pairs_to_judge
+from rsvib_torch.restoration.judging import judge_frames
 from rsvib_torch.restoration.missing import fill_roughly
 from rsvib_torch.restoration.motion import as_batch, frame_motion
+from rsvib_torch.restoration.pairs import pairs_to_judge
 from rsvib_torch.restoration.pixels import Saturation, hidden_pixels, saturated_pixels
 from rsvib_torch.restoration.trust import Detected, trusted_vibration
 from rsvib_torch.restoration.verdict import RestorationWarning, TooLittleInCommonError
@@ -29,7 +30,7 @@ from rsvib_torch.vibration import Vibration
 
 __all__ = ["METHODS", "VibrationRestorer", "restore"]
 
-_JUDGED_PAIRS, _JUDGED_COLUMNS = 2, 256  # of every stack
+_JUDGED_PAIRS, _JUDGED_COLUMNS = 2, 160  # of every stack
 
 METHODS: dict[str, Callable[..., Tensor]] = {"exact": restore_exact, "banded": restore_banded, "dewarp": restore_dewarp}
 

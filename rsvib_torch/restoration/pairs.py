@@ -1,0 +1,116 @@
+"""Two frames of a stack cut to the scene that both show, with what restoration made of them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.restoration.misfit import RIM
+from rsvib_torch.restoration.motion import FrameMotion
+from rsvib_torch.restoration.reblur import reblur
+from rsvib_torch.restoration.verdict import TooLittleInCommonError
+
+__all__ = ["FramePair", "pairs_to_judge", "shared_part"]
+
+_MARGIN = 4  # px between the pixels judged and what was made up
+
+
+@dataclass(frozen=True, eq=False)
+class FramePair:
+    """Two raw frames and their restored ones where all show the same scene, (C, h, w) each.
+
+    Attributes:
+        earlier: Raw.
+        later: Raw.
+        restored: Of the earlier one, or the one image of all frames.
+        restored_later: Of the later one; None where there is one image.
+        predicted: The later raw frame, from ``restored``.
+        changed_later: What the motion of the later frame does to its restored one.
+    """
+
+    earlier: Tensor
+    later: Tensor
+    restored: Tensor
+    restored_later: Tensor | None
+    predicted: Tensor
+    changed_later: Tensor
+
+
+def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> list[tuple[int, int]]:
+    """Pairs of ``count`` frames to compare, at most ``most`` of them, evenly spread."""
+    middle = count // 2
+    pairs = [(p, p + 1) for p in range(count - 1)]
+    if joint is True:
+        pairs = [(middle, p) for p in range(count) if p != middle]
+    if most is None or len(pairs) <= most:
+        return pairs
+    chosen = torch.linspace(0, len(pairs) - 1, most).round().to(torch.int64).tolist()
+    return [pairs[index] for index in chosen]
+
+
+def shared_part(
+    raw: Tensor, restored: Tensor, motion: FrameMotion, frames: tuple[int, int], columns: int | None
+) -> FramePair:
+    """Cut what two frames have in common; rows are those of the later one.
+
+    Args:
+        raw: (T, C, H, W) in row order.
+        restored: (T, C, H, W), or (1, C, H, W) in the coordinates of the first of ``frames``.
+        motion: Motion of the frames, batch of one.
+        frames: Which two.
+        columns: Cut to so many columns, those with the most detail; None for all.
+
+    Raises:
+        TooLittleInCommonError: If hardly any scene is left.
+    """
+    earlier, later = frames
+    x, y = (int(step) for step in (motion.shift[0, later] - motion.shift[0, earlier]).tolist())
+    height, width = (size - abs(step) for size, step in zip(raw.shape[-2:], (y, x), strict=True))
+    rim_x, rim_y = _rim(motion, frames, raw.shape[-2])
+    if min(height - 2 * rim_y, width - 2 * rim_x) < 2 * RIM + 3:
+        raise TooLittleInCommonError(
+            f"frames {earlier} and {later} have nothing in common, or too little: they lie ({x}, {y}) px apart"
+        )
+    before, after = (_same_scene(step, raw.shape[-2:]) for step in ((y, x), (-y, -x)))
+    first, second = raw[earlier][before], raw[later][after]
+    single = len(restored) == 1
+    scene = restored[0 if single else earlier][before]
+    other = scene if single else restored[later][after]
+    strip = slice(0, width)
+    if columns is not None:
+        detailed = _best_columns(second[..., rim_x : width - rim_x], columns)
+        strip = slice(detailed.start, detailed.stop + 2 * rim_x)
+    cut = (..., slice(rim_y, height - rim_y), slice(rim_x, -rim_x))
+    first, second, scene, other = (image[..., strip] for image in (first, second, scene, other))
+    formed = reblur(torch.cat([scene, other]), motion, later, first_row=max(y, 0))
+    predicted, formed_later = (part[cut] for part in formed.chunk(2))
+    return FramePair(
+        first[cut], second[cut], scene[cut], None if single else other[cut], predicted, formed_later - other[cut]
+    )
+
+
+def _same_scene(step: tuple[int, int], size: Sequence[int]) -> tuple[Any, ...]:
+    """Part of an image whose content is found ``step`` px further on in another image."""
+    return (..., *(slice(max(-s, 0), n - max(s, 0)) for s, n in zip(step, size, strict=True)))
+
+
+def _rim(motion: FrameMotion, frames: Sequence[int], num_rows: int) -> tuple[int, int]:
+    """Rim (x, y) of these frames in which content may come from outside, in whole px."""
+    rows = torch.arange(num_rows, dtype=torch.float64, device=motion.frame_starts.device)
+    starts = motion.frame_starts[list(frames), None] + rows * motion.timing.row_time
+    moved = motion.vibration.mean_displacement(starts[None], motion.timing.exposure_time)
+    x, y = (moved - motion.shift[:, list(frames), None]).abs().amax((0, 1, 2)).tolist()
+    return math.ceil(x) + _MARGIN, math.ceil(y) + _MARGIN
+
+
+def _best_columns(image: Tensor, count: int) -> slice:
+    """The ``count`` neighbouring columns of (C, H, W) with the most detail."""
+    width = image.shape[-1]
+    if width <= count:
+        return slice(0, width)
+    detail = image.diff(dim=-2).square().sum((0, 1), dtype=torch.float64).cumsum(0)
+    first = int((detail[count:] - detail[:-count]).argmax())
+    return slice(first, first + count)
