@@ -78,7 +78,9 @@ def offsets_from_row_order(offsets: Tensor, timing: SensorTiming) -> Tensor:
     return offsets.flip(-1) if timing.scan_axis == -1 else offsets
 
 
-def as_float_frames(frames: Tensor, full_scale: float | None = None, *, minimum_frames: int = 1) -> Tensor:
+def as_float_frames(
+    frames: Tensor, full_scale: float | None = None, *, minimum_frames: int = 1, nan_is_missing: bool = False
+) -> Tensor:
     """Check a stack of frames and turn integers into floats where full scale is 1.
 
     Floats keep their values and dtype. 8-bit integers have full scale 255; other integers do not say theirs (a
@@ -88,6 +90,7 @@ def as_float_frames(frames: Tensor, full_scale: float | None = None, *, minimum_
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W); a NumPy array is accepted.
         full_scale: Count that means 1.0, for integer frames.
         minimum_frames: How many frames the stack must have.
+        nan_is_missing: NaN marks a pixel that was not measured and is let through; infinity never is.
 
     Returns:
         Floating-point tensor of the same shape.
@@ -118,7 +121,10 @@ def as_float_frames(frames: Tensor, full_scale: float | None = None, *, minimum_
         raise TypeError(f"frames must be real numbers, got {frames.dtype}")
     if frames.dtype.is_floating_point:
         if not bool(torch.isfinite(torch.stack(frames.aminmax())).all()):  # one pass: NaN and infinity come through
-            bad = (~torch.isfinite(frames)).nonzero()[0].tolist()
+            wrong = torch.isinf(frames) if nan_is_missing else ~torch.isfinite(frames)
+            if not bool(wrong.any()):
+                return frames
+            bad = wrong.nonzero()[0].tolist()
             raise ValueError(f"frames must be finite, but pixel {tuple(bad)} is {frames[tuple(bad)].item()}")
         return frames
     if full_scale is None:

@@ -28,7 +28,7 @@ def draw_result() -> DetectionResult:
     vibration = Vibration(
         [[2.0, 0.5], [1.0, 0.0]], [[60.0, 145.0], [130.0, 0.0]], [[0.3, 2.0], [-1.0, 0.0]], [20.0, 0.0]
     )
-    std = VibrationStd(*(0.01 * torch.ones_like(vibration.amplitude) for _ in range(4)), 0.1 * torch.ones(2).double())
+    std = VibrationStd(*(0.01 * torch.ones_like(vibration.amplitude) for _ in range(4)), 0.1 * torch.ones(2).double(), torch.zeros(2).double())
     std.period[1, 1] = math.inf
     rows = torch.arange(16, 480, 16).double()
     times = torch.arange(2)[:, None] * TIMING.frame_period + rows * TIMING.row_time

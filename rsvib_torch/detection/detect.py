@@ -1,20 +1,21 @@
 """Frames in, vibration out."""
 
-import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from rsvib_torch.checks import check_choice, check_whole_number
-from rsvib_torch.detection.direct import refine_directly
+from rsvib_torch.detection.direct import LARGEST_GROUP, refine_directly
 from rsvib_torch.detection.inversion import vibration_of_fit
-from rsvib_torch.detection.result import DetectionResult, VibrationStd
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.result import DetectionResult, OtherMotion, VibrationStd, stacked
 from rsvib_torch.detection.selection import MAX_TONES, find_tones
-from rsvib_torch.detection.tones import Measurements, ToneFit, model_offsets
+from rsvib_torch.detection.tones import MotionModel, ToneFit, model_displacements
 from rsvib_torch.detection.verdict import judge
+from rsvib_torch.missing import fill_roughly
 from rsvib_torch.orientation import (
     as_float_frames,
     frames_to_row_order,
@@ -24,11 +25,13 @@ from rsvib_torch.orientation import (
 from rsvib_torch.registration import OffsetCurve, Registration
 from rsvib_torch.registration.register import register_rows
 from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.vibration import Vibration
 
 __all__ = ["DetectionMethod", "VibrationDetector", "detect_vibration"]
 
-DetectionMethod = Literal["bands", "direct"]
+DetectionMethod = Literal["direct", "bands"]
+
+_LEAST_VALID = 0.5  # of the pixels of a band
+_LEAST_FRAME = 0.1  # of the pixels of a frame
 
 
 def measurements_of_curve(curve: OffsetCurve, timing: SensorTiming, band_step: int) -> Measurements:
@@ -44,92 +47,98 @@ def measurements_of_curve(curve: OffsetCurve, timing: SensorTiming, band_step: i
     typical = weight.sum(1, keepdim=True) / good.sum(1, keepdim=True).clamp(min=1)
     weight = weight / typical.clamp(min=1e-300)
     offsets = torch.where(good[..., None], offsets, 0.0)
-    information = torch.diag_embed(weight[..., None].expand(-1, -1, 2))
-    batch = len(offsets)
-    starts = curve.times.flatten().expand(batch, -1)
     # content that moved along the scan axis is exposed that many row times later in the later frame
     later = curve.later_times.flatten() + offsets[..., 1] * timing.row_time
-    return Measurements(
-        starts=starts,
+    return Measurements.of_pairs(
+        starts=curve.times.flatten().expand(len(offsets), -1),
         later_starts=later,
         offsets=offsets,
-        information=information,
+        information=torch.diag_embed(weight[..., None].expand(-1, -1, 2)),
         exposure_time=timing.exposure_time,
         average_times=(curve.heights[0] * timing.row_time, curve.heights[1] * timing.row_time),
         independent=min(1.0, band_step / max(curve.heights)),
     )
 
 
+@dataclass(frozen=True)
+class _Options:
+    """Options of ``detect_vibration`` behind the door."""
+
+    method: DetectionMethod
+    registration: Registration
+    tones: int | None
+    model: MotionModel
+    band_rows: int
+    band_step: int
+    search: int
+
+
 def _detect_bands(
-    frames: Tensor, timing: SensorTiming, tones: int | None, registration: Registration, bands: tuple[int, int, int]
-) -> tuple[Vibration, VibrationStd, OffsetCurve, Tensor]:
-    """The paper's method: offsets of row bands, and a fit of tones to them."""
-    height, step, search = bands
-    curve = register_rows(frames, timing, method=registration, band_rows=height, band_step=step, search=search)
-    measurements = measurements_of_curve(curve, timing, step)
-    fit = find_tones(measurements, step * timing.row_time, tones)
-    return _described(measurements, fit, curve, measurements)
+    curve: OffsetCurve, frames: Tensor, valid: Tensor | None, timing: SensorTiming, options: _Options
+) -> tuple[ToneFit, OtherMotion | None]:
+    """The paper's method: a fit of tones to the offsets of row bands."""
+    measurements = measurements_of_curve(curve, timing, options.band_step)
+    return find_tones(measurements, options.band_step * timing.row_time, options.tones, options.model), None
 
 
 def _detect_direct(
-    frames: Tensor, timing: SensorTiming, tones: int | None, registration: Registration, bands: tuple[int, int, int]
-) -> tuple[Vibration, VibrationStd, OffsetCurve, Tensor]:
+    curve: OffsetCurve, frames: Tensor, valid: Tensor | None, timing: SensorTiming, options: _Options
+) -> tuple[ToneFit, OtherMotion | None]:
     """The bands' result, refined on the images themselves, row by row."""
-    start, _, curve, _ = _detect_bands(frames, timing, tones, registration, bands)
-    grey = frames.mean(-3)
-    measurements, fit = refine_directly(grey, timing, start, tones)
-    return _described(measurements, fit, curve, measurements_of_curve(curve, timing, bands[1]))
-
-
-def _described(
-    measurements: Measurements, fit: ToneFit, curve: OffsetCurve, of_bands: Measurements
-) -> tuple[Vibration, VibrationStd, OffsetCurve, Tensor]:
-    """Vibration and standard deviations of a fit, and the offsets it predicts for the bands."""
-    vibration, std = vibration_of_fit(measurements, fit)
-    turn = 2 * math.pi * fit.frequencies * (of_bands.centre - measurements.centre)[:, None, None]
-    recentred = replace(fit, coefficients=fit.coefficients * torch.polar(torch.ones_like(turn), turn))
-    fitted = model_offsets(of_bands, recentred).unflatten(1, curve.quality.shape[1:])
-    return vibration, std, curve, fitted
+    start, _ = _detect_bands(curve, frames, valid, timing, options)
+    found = refine_directly(frames, valid, timing, start, options.tones)
+    return found.fit, found.other_motion
 
 
 _METHODS: dict[
     str,
     Callable[
-        [Tensor, SensorTiming, int | None, Registration, tuple[int, int, int]],
-        tuple[Vibration, VibrationStd, OffsetCurve, Tensor],
+        [OffsetCurve, Tensor, Tensor | None, SensorTiming, _Options],
+        tuple[ToneFit, OtherMotion | None],
     ],
-] = {"bands": _detect_bands, "direct": _detect_direct}
+] = {"direct": _detect_direct, "bands": _detect_bands}
 
 
 def detect_vibration(
     frames: Tensor,
     timing: SensorTiming,
     *,
-    method: DetectionMethod = "bands",
+    method: DetectionMethod = "direct",
     registration: Registration = "ncc",
     tones: Literal["auto"] | int = "auto",
+    harmonics: int = 1,
+    image_acceleration: bool = False,
+    window: int | None = None,
+    window_step: int | None = None,
     band_rows: int = 32,
     band_step: int = 16,
     search: int = 16,
+    ignore: Tensor | None = None,
     full_scale: float | None = None,
 ) -> DetectionResult:
     """Detect the vibration of the camera from consecutive frames (Sec. 2 of Liu et al. 2023).
 
     Row bands are registered between frames, and the offset curve is fitted with sinusoids and a uniform motion
     (Eq. 5) whose gain, exposure, band average and coupling with the scan are part of the model (Eqs. 4, 6-8). Start
-    values come from the data.
+    values come from the data. The direct method then warps the frames to the scene with what was found, lets every
+    row tell what it still misses, and fits again: all frames of a stack together, down to the noise.
 
     Args:
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames; floats, or integers of known
-            full scale.
-        timing: The sensor.
-        method: ``"bands"`` (the paper's method), or ``"direct"``: its result refined on the images themselves, row by
-            row, several times slower and about ten times more accurate.
+            full scale. NaN marks pixels that were not measured.
+        timing: The sensor. Frame start times of its own (dropped frames) open frequencies that even ones are blind to.
+        method: ``"direct"``, or ``"bands"`` (the paper's method), several times faster and ten times less accurate.
         registration: ``"ncc"``, ``"phase"`` or ``"projection"``.
         tones: Number of tones of each axis, 1 to 4, or ``"auto"`` to choose it from the data.
+        harmonics: Every tone comes with its multiples up to this one, tied to one frequency; 1 leaves tones free.
+        image_acceleration: Whether the image motion may change its speed steadily.
+        window: Frames that one result comes from: the vibration is followed through the stack, and the result is a
+            batch of one entry a window (a leading dimension behind B). None for one result from all frames.
+        window_step: Frames from one window to the next; half a window when not given.
         band_rows: Rows of a band.
         band_step: Rows from one band to the next.
         search: Search range in px around the whole-frame offset.
+        ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out (dead, saturated).
         full_scale: Count that means 1.0, for integer frames.
 
     Returns:
@@ -137,29 +146,109 @@ def detect_vibration(
 
     Raises:
         TypeError: If frames are not numbers.
-        ValueError: If there are fewer than two frames, a pixel is not finite, frames have no detail at all, or an
+        ValueError: If there are fewer than two frames, a frame has no detail or hardly a pixel that counts, or an
             option is out of range.
+
+    Example:
+        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+        >>> detect_vibration(torch.rand(1, 256, 256), timing)
+        Traceback (most recent call last):
+        ...
+        ValueError: at least 2 frames are needed, got 1
     """
     check_choice("method", method, tuple(_METHODS))
     if tones != "auto":
         check_whole_number("tones", tones, at_least=1)
         if tones > MAX_TONES:
             raise ValueError(f"tones must be 'auto' or 1 to {MAX_TONES}, got {tones}")
-    frames = frames_to_row_order(as_float_frames(frames, full_scale, minimum_frames=2), timing)
+    check_whole_number("harmonics", harmonics, at_least=1)
+    frames = as_float_frames(frames, full_scale, minimum_frames=2, nan_is_missing=True)
+    valid = _valid_pixels(frames, ignore)
+    frames = frames_to_row_order(frames, timing)
     batched = frames.ndim == 5
     frames = frames if batched else frames[None] if frames.ndim == 4 else frames[None, :, None]
+    if valid is not None:
+        valid = frames_to_row_order(valid, timing)
+        valid = valid if batched else valid[None]
+        share = valid.float().mean((-2, -1))
+        if bool((share < _LEAST_FRAME).any()):
+            where = (share < _LEAST_FRAME).nonzero()[0].tolist()
+            raise ValueError(f"frame {where[-1]} has only {share[*where]:.1%} of pixels that count")
+        frames = fill_roughly(frames, ~valid[:, :, None].expand(frames.shape))
     flat = frames.flatten(-3).std(-1) <= 1e-7 * frames.flatten(-3).abs().amax(-1)
     if bool(flat.any()):
         where = flat.nonzero()[0].tolist()
         raise ValueError(f"frame {where[-1]} is constant: without detail there is nothing to register")
+    count = None if tones == "auto" else tones
+    model = MotionModel(harmonics, 2 if image_acceleration else 1)
+    options = _Options(method, registration, count, model, band_rows, band_step, search)
+    grey = frames.mean(-3)
+    if window is None:
+        result = _detect(grey, valid, timing, options)
+        return result if batched else result[0]
+    results = [
+        _detect(grey[:, part], None if valid is None else valid[:, part], within, options)
+        for part, within in _windows(grey.shape[1], window, window_step, timing)
+    ]
+    followed = stacked(results)
+    return followed if batched else followed[0]
+
+
+def _valid_pixels(frames: Tensor, ignore: Tensor | None) -> Tensor | None:
+    """Pixels (..., T, H, W) that count, in image orientation; None where all do."""
+    missing = torch.isnan(frames)
+    missing = missing if frames.ndim == 3 else missing.any(-3)
+    if ignore is not None:
+        ignore = torch.as_tensor(ignore, device=frames.device)
+        if ignore.dtype != torch.bool:
+            raise TypeError(f"ignore must be a bool tensor, got {ignore.dtype}")
+        try:
+            missing = missing | ignore
+        except RuntimeError as error:
+            raise ValueError(f"ignore {tuple(ignore.shape)} does not fit frames {tuple(missing.shape)}") from error
+    return ~missing if bool(missing.any()) else None
+
+
+def _windows(num_frames: int, window: int, step: int | None, timing: SensorTiming) -> list[tuple[slice, SensorTiming]]:
+    """Windows of frames, the last one flush with the end, each with the start times of its frames."""
+    check_whole_number("window", window, at_least=2)
+    if window > num_frames:
+        raise ValueError(f"window of {window} frames is longer than the stack of {num_frames}")
+    step = max(1, window // 2) if step is None else step
+    check_whole_number("window_step", step, at_least=1)
+    firsts = list(range(0, num_frames - window + 1, step))
+    if firsts[-1] + window < num_frames:
+        firsts.append(num_frames - window)
+    starts = timing.frame_starts(num_frames)
+    return [
+        (slice(first, first + window), replace(timing, frame_start_times=starts[first : first + window]))
+        for first in firsts
+    ]
+
+
+def _detect(frames: Tensor, valid: Tensor | None, timing: SensorTiming, options: _Options) -> DetectionResult:
+    """``detect_vibration`` of grey frames (B, T, H, W) in row order; the result is a batch in image axes."""
     in_rows = timing.in_row_order()
-    vibration, std, curve, fitted = _METHODS[method](
-        frames, in_rows, None if tones == "auto" else tones, registration, (band_rows, band_step, search)
+    curve = register_rows(
+        frames[:, :, None],
+        in_rows,
+        method=options.registration,
+        band_rows=options.band_rows,
+        band_step=options.band_step,
+        search=options.search,
     )
+    if valid is not None:
+        curve = _without_spoilt_bands(curve, valid)
+    fit, other_motion = _METHODS[options.method](curve, frames, valid, in_rows, options)
+    vibration, std = vibration_of_fit(fit)
+    predicted = model_displacements(measurements_of_curve(curve, in_rows, options.band_step), fit)
+    fitted = (predicted[:, :, 1] - predicted[:, :, 0]).unflatten(1, curve.quality.shape[1:])
     difference = (curve.offsets - fitted).abs().nanmean(dim=(1, 2))
 
-    duration = float(curve.times.max() - curve.times.min()) + band_rows * timing.row_time
-    intervals = (curve.later_times - curve.times)[:, 0].unique()
+    duration = float(curve.later_times.max() - curve.times.min()) + options.band_rows * timing.row_time
+    starts = in_rows.frame_starts(frames.shape[1], frames.device)
+    baselines = 1 if options.method == "bands" else min(len(starts), LARGEST_GROUP) - 1
+    intervals = torch.cat([starts[step:] - starts[:-step] for step in range(1, baselines + 1)])
     verdicts = [
         judge(
             vibration[index],
@@ -169,6 +258,7 @@ def detect_vibration(
             intervals=intervals,
             duration=duration,
             timing=in_rows,
+            other_motion=None if other_motion is None else other_motion[index],
         )
         for index in range(len(frames))
     ]
@@ -176,17 +266,13 @@ def detect_vibration(
     swap = timing.scan_axis == -1
     reasons = tuple((r[1], r[0]) if swap else r for _, r in verdicts)
     in_image = vibration_from_row_order(vibration, timing)
-    result = DetectionResult(
+    return DetectionResult(
         vibration=in_image,
         std=_swap_std(std) if swap else std,
-        offsets=OffsetCurve(
-            curve.pairs,
-            curve.rows,
-            curve.times,
-            curve.later_times,
-            offsets_from_row_order(curve.offsets, timing),
-            curve.quality,
-            (curve.heights[1], curve.heights[0]) if swap else curve.heights,
+        offsets=replace(
+            curve,
+            offsets=offsets_from_row_order(curve.offsets, timing),
+            heights=(curve.heights[1], curve.heights[0]) if swap else curve.heights,
         ),
         fitted=offsets_from_row_order(fitted, timing),
         gain=in_image.gain(float(intervals[0])),
@@ -194,7 +280,21 @@ def detect_vibration(
         reliable=reliable.flip(-1) if swap else reliable,
         reasons=reasons,
     )
-    return result if batched else result[0]
+
+
+def _without_spoilt_bands(curve: OffsetCurve, valid: Tensor) -> OffsetCurve:
+    """The curve without the bands whose pixels hardly count in one of the frames."""
+    rows = valid.double().mean(-1)  # (B, T, H)
+    height = max(curve.heights)
+    bands = torch.nn.functional.avg_pool1d(rows, height, stride=1)
+    tops = (curve.rows - 0.5 * (height - 1)).round().to(torch.int64)
+    share = bands[..., tops]
+    spoilt = torch.minimum(share[:, curve.pairs[:, 0]], share[:, curve.pairs[:, 1]]) < _LEAST_VALID
+    return replace(
+        curve,
+        offsets=torch.where(spoilt[..., None], torch.nan, curve.offsets),
+        quality=torch.where(spoilt, 0.0, curve.quality),
+    )
 
 
 def _swap_std(std: VibrationStd) -> VibrationStd:
@@ -204,6 +304,7 @@ def _swap_std(std: VibrationStd) -> VibrationStd:
         std.period.flip(-2),
         std.phase.flip(-2),
         std.image_motion.flip(-1),
+        std.image_acceleration.flip(-1),
     )
 
 

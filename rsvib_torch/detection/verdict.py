@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from rsvib_torch.detection.result import VibrationStd
+from rsvib_torch.detection.result import OtherMotion, VibrationStd
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
@@ -11,9 +11,12 @@ __all__ = ["judge"]
 
 _LEAST_GAIN = 0.1  # |gain| below this multiplies noise more than tenfold
 _LEAST_SIGNIFICANCE = 4.0  # amplitude over its standard deviation
+_LARGEST_UNCERTAINTY = 0.1  # of a frequency
 _LEAST_GOOD = 0.5  # of the bands
 _LARGEST_MISFIT = 0.3  # mean absolute residual over mean absolute offset about its mean
 _SMALLEST_MISFIT = 0.05  # px, residuals below this are never held against a fit
+_SMALLEST_OTHER = 0.03  # px, other motion below this is never held against a fit
+_LARGEST_OTHER = 0.15  # of the rms offset that the tones make
 _ROW_MOTION = 0.1  # px within a row time, condition (24)
 
 
@@ -26,6 +29,7 @@ def judge(
     intervals: Tensor,
     duration: float,
     timing: SensorTiming,
+    other_motion: OtherMotion | None = None,
 ) -> tuple[Tensor, tuple[tuple[str, ...], tuple[str, ...]]]:
     """Verdict on one vibration (not a batch).
 
@@ -34,9 +38,10 @@ def judge(
         std: Its standard deviations.
         offsets: (M, 2) px measured offsets, NaN where unknown.
         fitted: (M, 2) px, what the result predicts.
-        intervals: Distinct times between the frames compared, s.
+        intervals: Times between the frames compared, s.
         duration: Length of the record in seconds.
         timing: The sensor.
+        other_motion: What the rows tell that the vibration does not explain, where they were asked.
 
     Returns:
         (2,) bool and the reasons against each axis.
@@ -52,26 +57,57 @@ def judge(
             found.append(f"too few good bands: {share:.0%} of {len(good)}")
         if not bool((amplitude > 0).any()):
             found.append("no significant tone")
-        for k in range(len(amplitude)):
-            size, hertz = float(amplitude[k]), float(vibration.frequency[axis, k])
-            if size == 0:
-                continue
-            name = f"tone of {hertz:.4g} Hz"
-            if size < _LEAST_SIGNIFICANCE * float(std.amplitude[axis, k]):
-                found.append(f"{name} not significant: amplitude {size:.3g} +- {float(std.amplitude[axis, k]):.2g} px")
-            if float(gain[axis, k]) < _LEAST_GAIN:
-                found.append(f"{name} nearly blind: gain {float(gain[axis, k]):.3f} (every frame is displaced alike)")
-            if hertz * duration < 1.0:
-                found.append(f"{name} has a period longer than the record of {1e3 * duration:.3g} ms")
-            if hertz * timing.exposure_time > 1.0:
-                found.append(f"{name} is above 1/T_e = {1 / timing.exposure_time:.4g} Hz: the exposure averages it out")
+        for k in amplitude.nonzero()[:, 0].tolist():
+            found.extend(_against_tone(vibration, std, axis, k, float(gain[axis, k]), duration, timing))
         if bool(good.any()):
             values, model = offsets[good, axis], fitted[good, axis]
             misfit = float((values - model).abs().mean())
             swing = float((values - values.mean()).abs().mean())
             if misfit > max(_SMALLEST_MISFIT, _LARGEST_MISFIT * swing):
                 found.append(f"fit does not explain the curve: residual {misfit:.3g} px of {swing:.3g} px")
+        if other_motion is not None:
+            found.extend(_held_against(other_motion, axis, vibration.amplitude[axis] * gain[axis]))
         if within_row[axis] > _ROW_MOTION:
             found.append(f"moves {within_row[axis]:.2g} px within a row time, condition (24) allows {_ROW_MOTION} px")
     reliable = torch.tensor([not found for found in reasons], device=vibration.device)
     return reliable, (tuple(reasons[0]), tuple(reasons[1]))
+
+
+def _against_tone(
+    vibration: Vibration,
+    std: VibrationStd,
+    axis: int,
+    tone: int,
+    gain: float,
+    duration: float,
+    timing: SensorTiming,
+) -> list[str]:
+    """Reasons against one tone."""
+    size, hertz = float(vibration.amplitude[axis, tone]), float(vibration.frequency[axis, tone])
+    size_std, hertz_std = float(std.amplitude[axis, tone]), float(std.frequency[axis, tone])
+    name = f"tone of {hertz:.4g} Hz"
+    found = []
+    if size < _LEAST_SIGNIFICANCE * size_std:
+        found.append(f"{name} not significant: amplitude {size:.3g} +- {size_std:.2g} px")
+    elif hertz_std > _LARGEST_UNCERTAINTY * hertz:
+        found.append(f"{name} not known well enough: frequency {hertz:.4g} +- {hertz_std:.2g} Hz")
+    if gain < _LEAST_GAIN:
+        found.append(f"{name} nearly blind: gain {gain:.3f} (every frame is displaced alike)")
+    if hertz * duration < 1.0:
+        found.append(f"{name} has a period longer than the record of {1e3 * duration:.3g} ms")
+    if hertz * timing.exposure_time > 1.0:
+        found.append(f"{name} is above 1/T_e = {1 / timing.exposure_time:.4g} Hz: the exposure averages it out")
+    return found
+
+
+def _held_against(other: OtherMotion, axis: int, swing: Tensor) -> list[str]:
+    """Reasons from motion that no vibration explains, given the offset amplitudes (K,) of the tones."""
+    allowed = max(_SMALLEST_OTHER, _LARGEST_OTHER * float(swing.square().sum().sqrt()) / 2**0.5)
+    found = []
+    if float(other.unexplained[axis]) > allowed:
+        found.append(f"rows move by {float(other.unexplained[axis]):.3g} px that no tone explains")
+    if float(other.slant[axis]) > allowed:
+        found.append(
+            f"left and right halves of the rows move apart by {float(other.slant[axis]):.3g} px: rotation or parallax"
+        )
+    return found

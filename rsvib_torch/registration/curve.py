@@ -18,8 +18,8 @@ class OffsetCurve:
     Attributes:
         pairs: (P, 2) int64, indices of the earlier and the later frame.
         rows: (N,) float64, centre row of each band in the earlier frame, in read order.
-        times: (P, N) float64, exposure start of the centre row in the earlier frame, s.
-        later_times: (P, N) float64, exposure start of the same row in the later frame, s.
+        times: (P, N) float64, exposure start of the centre row in the earlier frame, s; windows of a stack lead it.
+        later_times: Same shape, exposure start of the same row in the later frame, s.
         offsets: (..., P, N, 2) float64 px, axes (x, y); NaN where registration failed.
         quality: (..., P, N) float64 in 0 ... 1; correlation of the matched bands, 0 where registration failed.
         heights: Rows averaged for the offset along x and y, (x, y).
@@ -42,11 +42,12 @@ class OffsetCurve:
         """The curve of one stack out of a batch."""
         if self.offsets.ndim == 3:
             raise IndexError("this offset curve is not a batch")
+        own = self.times.ndim > 2
         return OffsetCurve(
             self.pairs,
             self.rows,
-            self.times,
-            self.later_times,
+            self.times[index] if own else self.times,
+            self.later_times[index] if own else self.later_times,
             self.offsets[index],
             self.quality[index],
             self.heights,

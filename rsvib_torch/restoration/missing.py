@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from rsvib_torch.missing import fill_roughly
+
 __all__ = ["fill_roughly", "measured_values"]
 
 
@@ -17,32 +19,3 @@ def measured_values(along: Tensor, hidden: Tensor | None, shape: torch.Size, wid
     if hidden is not None:
         valid[..., :width] &= ~hidden
     return valid
-
-
-def fill_roughly(frames: Tensor, ignore: Tensor) -> Tensor:
-    """Put local means where pixels (..., H, W) are to be ignored."""
-    images, holes = frames.flatten(0, -3)[:, None], ignore.flatten(0, -3)[:, None]
-    known = (~holes).to(frames.dtype)
-    images = images * known
-    filled = torch.where(known.sum((-2, -1), keepdim=True) > 0, images, torch.zeros_like(images))
-    for size in (3, 9, 33, 129, 513, 2 * max(frames.shape[-2:]) + 1):
-        weight = _box(known, size)
-        mean = _box(images, size) / weight.clamp(min=1e-9)
-        filled = torch.where(holes & (weight > 0), mean, filled)
-        holes = holes & (weight <= 0)
-        if not bool(holes.any()):
-            break
-    rough: Tensor = filled[:, 0].unflatten(0, frames.shape[:-2])
-    return rough
-
-
-def _box(images: Tensor, size: int) -> Tensor:
-    half = size // 2
-    for dim in (-2, -1):
-        total = torch.nn.functional.pad(images.cumsum(dim), (1, 0) if dim == -1 else (0, 0, 1, 0))
-        length = images.shape[dim]
-        index = torch.arange(length, device=images.device)
-        images = total.index_select(dim, (index + half + 1).clamp(max=length)) - total.index_select(
-            dim, (index - half).clamp(min=0)
-        )
-    return images

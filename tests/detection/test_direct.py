@@ -6,7 +6,7 @@ import torch
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import detect_vibration, register_bands
-from rsvib_torch.registration.gradients import RowSpectra, remaining_offsets
+from rsvib_torch.registration.gradients import RowSpectra, row_gradients, row_shifts
 
 MARGIN = 40
 
@@ -92,22 +92,35 @@ def test_still_camera_and_blind_frequency_are_refused(paper_camera):
 
 
 @pytest.mark.parametrize("remaining", [0.0, 0.05, -0.3])
-def test_remaining_offset_of_a_known_shift(remaining):
+@pytest.mark.parametrize("num_frames", [2, 3])
+def test_rows_tell_a_known_shift(remaining, num_frames):
+    """Frames moved along the rows by multiples of a shift: every row tells each frame's place about the mean."""
     scene = draw_scene(96, 192, 46)
     u = np.fft.rfftfreq(192)
-    moved = np.fft.irfft(np.fft.rfft(scene) * np.exp(-2j * np.pi * u * remaining), n=192)
-    frames = torch.from_numpy(np.stack([scene, moved]))[None, :, :, 16:-16]
-    rows = torch.arange(96, dtype=torch.float64)[None]
-    zero = torch.zeros_like(rows)
-    offsets, information = remaining_offsets(RowSpectra(frames), (0, 1), (rows, rows), (zero, zero))
-    known = information[0, :, 0, 0] > 0
-    assert known.sum() > 60
-    assert (offsets[0, known, 0] - remaining).abs().max() < 0.06 * abs(remaining) + 1e-6
-    assert offsets[0, known, 1].abs().max() < 0.06 * abs(remaining) + 1e-6
+    moved = [
+        np.fft.irfft(np.fft.rfft(scene) * np.exp(-2j * np.pi * u * p * remaining), n=192) for p in range(num_frames)
+    ]
+    noise = 1e-5 * np.random.default_rng(1).standard_normal((num_frames, 96, 192))
+    frames = torch.from_numpy(np.stack(moved) + noise)[None, :, :, 16:-16]
+    spectra = RowSpectra(frames)
+    rows = torch.arange(96, dtype=torch.float64).expand(1, num_frames, 96)
+    seen = ((rows >= 8) & (rows <= 87)).double()
+    none = torch.zeros_like(rows)
+    gradients = row_gradients(spectra, rows, none, seen)
+    expected = remaining * (torch.arange(num_frames) - (num_frames - 1) / 2)
+
+    def told(shift):
+        matrix, right = row_shifts(spectra, gradients, rows, shift, seen)
+        known = matrix[0, :, 0, 0] > 0
+        assert known.tolist() == seen[0, 0].bool().tolist()
+        total, sums = matrix[0].sum(0), right[0].sum(1)
+        return torch.linalg.solve(total, sums[..., None])[..., 0]
+
+    shifts = told(none)
+    torch.testing.assert_close(shifts[:, 0], expected.double(), rtol=0.1, atol=2e-4)
+    assert shifts[:, 1].abs().max() < 0.02 * abs(remaining) + 1e-5
     # what is taken out beforehand does not remain
-    back = torch.full_like(rows, remaining)
-    offsets, _ = remaining_offsets(RowSpectra(frames), (0, 1), (rows, rows), (zero, back))
-    assert offsets.abs().max() < 2e-3
+    assert told(expected[None, :, None].expand(1, -1, 96).double()).abs().max() < 1e-3
 
 
 def test_direct_refuses_what_bands_refuse(paper_camera):

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from rsvib_torch import SensorTiming, Vibration
+from rsvib_torch.detection.fit import fit_tones
 from rsvib_torch.detection.inversion import vibration_of_fit
-from rsvib_torch.detection.tones import Measurements, fit_tones
+from rsvib_torch.detection.measurements import Measurements
 
 CAMERA = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 ROWS = np.arange(2048)
@@ -67,11 +68,11 @@ def test_equations_6_to_8_invert_the_offsets(amplitude, frequency, phase):
     starts = torch.from_numpy(ROWS[::8] * CAMERA.row_time)[None]
     offsets = torch.from_numpy(np.stack([offset, offset], -1))[None]
     information = torch.eye(2, dtype=torch.float64).expand(1, offsets.shape[1], 2, 2)
-    measurements = Measurements(
+    measurements = Measurements.of_pairs(
         starts, starts + CAMERA.frame_period, offsets, information, CAMERA.exposure_time, (0.0, 0.0)
     )
     start = torch.full((1, 2, 1), 1.02 * frequency, dtype=torch.float64)
-    found, _ = vibration_of_fit(measurements, fit_tones(measurements, start, torch.ones(1, 2, 1, dtype=torch.bool)))
+    found, _ = vibration_of_fit(fit_tones(measurements, start, torch.ones(1, 2, 1, dtype=torch.bool)))
     for axis in (0, 1):
         assert found.amplitude[0, axis, 0].item() == pytest.approx(amplitude, rel=1e-6)
         assert found.period[0, axis, 0].item() == pytest.approx(1 / frequency, rel=1e-7)

@@ -1,0 +1,107 @@
+"""What registration tells the fit: displacements of scene rows between frames, with no image left."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+__all__ = ["Measurements"]
+
+_TUNING = 4.685  # of Tukey's biweight: 95 % efficient for Gaussian errors
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Displacements of scene rows in the frames of a batch of stacks, in row order.
+
+    Every scene row n is seen in a group of G frames (two of them make an offset). Where the scene itself lies is
+    unknown, so only differences within a group count: displacements have their mean over the group taken out, and so
+    has every model that is held against them.
+
+    Attributes:
+        moments: (B, N, G) float64 s, exposure start of the row of each frame that shows scene row n.
+        displacements: (B, N, G, 2) float64 px, axes (x, y), with zero mean over the frames that see the row.
+        seen: (B, N, G) float64, 1 where a frame sees the row, else 0.
+        information: (B, N, 2, 2) float64 px^-2, inverse covariance of the displacement in one frame up to a common
+            factor; 0 where unknown.
+        exposure_time: T_e in seconds.
+        average_times: Duration over which each displacement (x, y) is an average: rows of a band times the row time.
+        independent: Fraction of the measurements that are independent (bands may overlap).
+    """
+
+    moments: Tensor
+    displacements: Tensor
+    seen: Tensor
+    information: Tensor
+    exposure_time: float
+    average_times: tuple[float, float] = (0.0, 0.0)
+    independent: float = 1.0
+
+    @classmethod
+    def of_pairs(
+        cls,
+        starts: Tensor,
+        later_starts: Tensor,
+        offsets: Tensor,
+        information: Tensor,
+        exposure_time: float,
+        average_times: tuple[float, float] = (0.0, 0.0),
+        independent: float = 1.0,
+    ) -> "Measurements":
+        """Measurements of offsets (B, N, 2) between rows exposed from ``starts`` and ``later_starts`` (B, N) on."""
+        return cls(
+            torch.stack([starts, later_starts], dim=-1),
+            torch.stack([-0.5 * offsets, 0.5 * offsets], dim=-2),
+            torch.ones(*starts.shape, 2, dtype=torch.float64, device=starts.device),
+            2.0 * information,  # an offset tells of two displacements that are equal and opposite
+            exposure_time,
+            average_times,
+            independent,
+        )
+
+    @property
+    def centre(self) -> Tensor:
+        """(B,) mid-time of the record in seconds: phases are fitted there, where they depend least on frequency."""
+        return 0.5 * (self.moments.amin((1, 2)) + self.moments.amax((1, 2)) + self.exposure_time)
+
+    @property
+    def duration(self) -> Tensor:
+        """(B,) seconds from the first to the last row of the record, in any frame but the last of a group."""
+        first = self.moments.amin(-1)
+        return first.amax(1) - first.amin(1)
+
+    @property
+    def weights(self) -> Tensor:
+        """(B, N, 2) information of each axis alone."""
+        return self.information.diagonal(dim1=-2, dim2=-1)
+
+    @property
+    def differences(self) -> Tensor:
+        """(B, N) independent differences within each group: one less than the frames that see the row."""
+        return (self.seen.sum(-1) - 1).clamp(min=0.0)
+
+    @property
+    def known(self) -> Tensor:
+        """(B, 2) number of independent measurements of each axis."""
+        return ((self.weights > 0) * self.differences[..., None]).sum(1) * self.independent
+
+    def relative(self, values: Tensor) -> Tensor:
+        """Values (B, N, G, ...) of every frame less their mean over the frames that see the row, 0 where unseen."""
+        seen = self.seen.reshape(*self.seen.shape, *(1,) * (values.ndim - 3))
+        mean = (seen * values).sum(2, keepdim=True) / seen.sum(2, keepdim=True).clamp(min=1.0)
+        return seen * (values - mean)
+
+    def square(self, residual: Tensor) -> Tensor:
+        """(B, 2) weighted sum of squares of residuals (B, N, G, 2), each axis with its share of the cross terms."""
+        return torch.einsum("bnga,bnac,bngc->ba", residual, self.information, residual)
+
+    def reweighted(self, residual: Tensor) -> "Measurements":
+        """The measurements with outliers weighed down by Tukey's biweight of their residual, axis by axis."""
+        known = (self.weights > 0) & (self.differences[..., None] > 0)
+        square = residual.square().sum(2) / self.differences[..., None].clamp(min=1.0)
+        size = torch.where(known, (square * self.weights).sqrt(), torch.nan)
+        spread = 1.4826 * size.nanmedian(dim=1, keepdim=True).values
+        spread = spread.nan_to_num(1.0).clamp(min=1e-9)
+        ratio = torch.where(known, size / (_TUNING * spread), 1.0)
+        root = (1 - ratio.square()).clamp(min=0.0)  # the square root of the biweight
+        return replace(self, information=self.information * root[..., :, None] * root[..., None, :])
