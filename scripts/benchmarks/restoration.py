@@ -1,120 +1,223 @@
-"""Restoration of one frame, against skimage.restoration.wiener row by row on the slabs of the banded method."""
+"""Restoration next to its peers: quality over scenes, exposures and noise, speed in FFT round trips, memory.
+
+Peers: unwarping by ``cv2.remap`` (Lanczos-4), a loop of ``skimage.restoration.wiener`` over the rows, and CGLS on
+``pylops.signalprocessing.NonStationaryConvolve2D`` where pylops is installed (extra ``compare``). What a peer has to be
+told (balance, damping, iterations) is the best of several for the truth; ours chooses for itself.
+"""
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from benchmarks.measure import in_turns
-from skimage.restoration import wiener
+from benchmarks.restoration_peers import Peer, remap_lanczos, wiener_rows
 from torch import Tensor
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
-from rsvib_torch.imaging import rows_showing
+from rsvib_torch.evaluation import city_and_fields, resolution_chart
 from rsvib_torch.restoration.restore import METHODS
 
-SEED, NOISE = 7, 0.003
-MARGIN = RIM = 32
-HALF_ROWS = 16
-PEER = "skimage loop"
-BALANCES = (0.001, 0.003, 0.01, 0.03)  # regularisation of skimage.restoration.wiener; the best for the scene counts
+try:
+    from benchmarks.pylops_peer import cgls_restore
+except ImportError:  # pylops or numba is not installed
+    cgls_restore = None
 
-
-def slab_kernels(
-    scene_rows: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration
-) -> tuple[list[int], list[np.ndarray]]:
-    """Frame row in the middle of each row's slab, and the centred kernel of the whole slab (Eqs. 26-39)."""
-    start = timing.frame_starts(1)[0]
-    shown_by = rows_showing(scene_rows.double(), start, timing, truth)
-    middles = shown_by.round().long()
-    psf = rsv.row_psf(truth, start + shown_by * timing.row_time, timing)
-    kernels, (left, top) = psf.dense()
-    padded = []
-    for kernel, moved in zip(kernels, (middles - scene_rows).tolist(), strict=True):
-        # centred on displacement (0, moved): the slab already follows its middle row
-        height, width = kernel.shape
-        y, x = top - moved, left
-        half = max(abs(y), abs(y + height - 1)), max(abs(x), abs(x + width - 1))
-        canvas = np.zeros((2 * half[0] + 1, 2 * half[1] + 1))
-        canvas[half[0] + y : half[0] + y + height, half[1] + x : half[1] + x + width] = kernel.numpy()
-        rows, columns = (np.flatnonzero(canvas.sum(axis)) for axis in (1, 0))
-        keep = [max(abs(int(i[0]) - h), abs(int(i[-1]) - h)) for i, h in zip((rows, columns), half, strict=True)]
-        inner = tuple(slice(h - k, h + k + 1) for h, k in zip(half, keep, strict=True))
-        padded.append(canvas[inner])
-    return middles.tolist(), padded
-
-
-def restore_by_skimage(
-    frame: np.ndarray, middles: Sequence[int], kernels: Sequence[np.ndarray], balance: float
-) -> np.ndarray:
-    """Central rows of slabs deconvolved one after another."""
-    return np.stack(
-        [
-            wiener(frame[m - HALF_ROWS : m + HALF_ROWS + 1], kernel, balance, clip=False)[HALF_ROWS]
-            for m, kernel in zip(middles, kernels, strict=True)
-        ]
-    )
+SEED = 7
+RIM, MARGIN = 32, 48
+AMPLITUDE, FREQUENCY = (3.1, 5.2), (50.0, 30.0)
+NOISES = (0.0, 0.005, 0.02)
+EXPOSURES = (20, 100, 400)
+TIMED_NOISE = 0.005
+SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
+    "city": city_and_fields,
+    "chart": lambda height, width, seed: resolution_chart(height, width, seed=seed),
+}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this part."""
-    parser.add_argument("--rows", type=int, default=64, help="rows that the restoring loop is timed on (default: 64)")
+    parser.add_argument(
+        "--grid-size", type=int, default=512, help="frame side where quality is compared (default: 512)"
+    )
+    parser.add_argument("--exposures", type=int, nargs="+", default=EXPOSURES, help="exposures in row times")
+    parser.add_argument("--noises", type=float, nargs="+", default=NOISES, help="noise levels of full scale")
+    parser.add_argument("--scenes", choices=SCENES, nargs="*", default=list(SCENES), help="drawn scenes to compare on")
+    parser.add_argument("--images", type=Path, nargs="*", default=[], help="images to compare on as well")
+    parser.add_argument("--no-pylops", action="store_true", help="leave pylops out: it takes minutes")
+
+
+def camera(exposure_rows: int) -> rsv.SensorTiming:
+    """The paper's camera with another exposure."""
+    return rsv.SensorTiming(row_time=20.52e-6, exposure_rows=exposure_rows, frame_rows=2048)
+
+
+def vibration() -> rsv.Vibration:
+    """The paper's vibration, with phases of its own."""
+    generator = torch.Generator().manual_seed(SEED)
+    phase = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1) * math.pi
+    return rsv.Vibration(AMPLITUDE, FREQUENCY, phase)
+
+
+def scenes(options: argparse.Namespace) -> dict[str, Tensor]:
+    """Scenes to compare on, a margin larger than the frames."""
+    size = options.grid_size + 2 * MARGIN
+    found = {name: SCENES[name](size, size, SEED) for name in options.scenes}
+    for path in options.images:
+        image = rsv.read_stack(path)[0]
+        image = image if image.ndim == 2 else image.mean(0)
+        if min(image.shape) < size:
+            raise SystemExit(f"{path}: at least {size} x {size} px are needed, got {tuple(image.shape)}")
+        top, left = ((side - size) // 2 for side in image.shape)
+        found[path.stem] = image[top : top + size, left : left + size].contiguous()
+    return found
+
+
+def quality(restored: Tensor, still: Tensor) -> float:
+    """PSNR in dB without the rim."""
+    return float(rsv.psnr(restored, still, 1.0, rim=RIM).mean())
+
+
+def methods(
+    frames: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration, still: Tensor, options: argparse.Namespace
+) -> dict[str, Callable[[], Peer]]:
+    """Every way to restore the first frame; ours take nothing but frames, camera and vibration."""
+
+    def ours(number: int = 1, **chosen: Any) -> Callable[[], Peer]:
+        def run() -> Peer:
+            begin = time.perf_counter()
+            restored = rsv.restore(frames[:number], timing, truth, check=False, **chosen)
+            return Peer(restored[0], time.perf_counter() - begin, "")
+
+        return run
+
+    found = {name: ours(method=name) for name in METHODS}
+    found["exact, 2 frames jointly"] = ours(2, method="exact", joint=True)
+    array = frames[0].numpy()
+    found["cv2.remap, Lanczos-4"] = lambda: remap_lanczos(array, timing, truth)
+    found["skimage wiener, row loop"] = lambda: wiener_rows(array, timing, truth, still, RIM)
+    if cgls_restore is not None and not options.no_pylops:
+        found["pylops CGLS"] = lambda: cgls_restore(array, timing, truth, still, RIM)
+    return found
+
+
+def compare(name: str, scene: Tensor, exposure: int, options: argparse.Namespace) -> list[dict[str, Any]]:
+    """PSNR of all methods on one scene with one exposure, for every noise."""
+    timing, truth, size = camera(exposure), vibration(), (options.grid_size, options.grid_size)
+    clean = rsv.simulate_frames(scene, timing, truth, 2, frame_size=size)
+    still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    results: dict[str, dict[str, Any]] = {}
+    for noise in options.noises:
+        generator = torch.Generator().manual_seed(SEED)
+        frames = rsv.SensorNoise(read_noise=noise).apply(clean, generator)
+        figures = {"raw": Peer(frames[0], 0.0, "")}
+        figures |= {method: run() for method, run in methods(frames, timing, truth, still, options).items()}
+        for method, figure in figures.items():
+            row = {"scene": name, "exposure_rows": exposure, "method": method, "psnr_db": {}, "seconds": {}, "told": {}}
+            row = results.setdefault(method, row)
+            row["psnr_db"][str(noise)] = quality(figure.restored, still[figure.rows] if figure.rows else still)
+            row["seconds"][str(noise)] = figure.seconds
+            row["told"][str(noise)] = figure.told
+    return list(results.values())
+
+
+def fft_round_trip(frame: Tensor) -> Tensor:
+    """The unit of time: there and back by ``torch.fft`` in float32."""
+    image: Tensor = torch.fft.irfft2(torch.fft.rfft2(frame), s=frame.shape)
+    return image
+
+
+def speed(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Seconds, FFT round trips and peak memory of our methods on one large frame."""
+    size = options.size
+    timing, truth = camera(20), vibration()
+    scene = city_and_fields(size + 2 * MARGIN, size + 2 * MARGIN, SEED)
+    noise, generator = rsv.SensorNoise(read_noise=TIMED_NOISE), torch.Generator().manual_seed(SEED)
+    frame = rsv.simulate_frames(scene, timing, truth, 1, frame_size=(size, size), noise=noise, generator=generator)
+    works: dict[str, Callable[[], Any]] = {"FFT round trip": lambda: fft_round_trip(frame[0])}
+    works |= {name: lambda m=name: rsv.restore(frame, timing, truth, method=m) for name in METHODS}
+    array = frame[0].numpy()
+    works["cv2.remap, Lanczos-4"] = lambda: remap_lanczos(array, timing, truth)
+    done = in_turns(works, options.runs)
+    unit = done["FFT round trip"][0]
+    return [
+        {
+            "method": name,
+            "seconds": seconds,
+            "round_trips": seconds / unit,
+            "frames_of_memory": peak_memory(name, size) if name in METHODS else None,
+        }
+        for name, (seconds, _) in done.items()
+    ]
+
+
+def peak_memory(method: str, size: int) -> float | None:
+    """Peak memory that restoring one frame adds, over that of the frame in complex64; in a process of its own."""
+    code = (
+        "import resource, sys, torch, rsvib_torch as rsv\n"
+        f"torch.set_num_threads({torch.get_num_threads()})\n"
+        f"timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows={max(size, 2048)})\n"
+        f"truth = rsv.Vibration({list(AMPLITUDE)}, {list(FREQUENCY)})\n"
+        "rsv.restore(torch.rand(1, 64, 64), timing, truth, method=sys.argv[1])\n"
+        f"frame = torch.rand(1, {size}, {size})\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "rsv.restore(frame, timing, truth, method=sys.argv[1])\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, method], capture_output=True, text=True, check=False)
+    unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss, in bytes
+    return int(done.stdout) * unit / (8.0 * size * size) if done.returncode == 0 else None
 
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Time and PSNR of each way to restore one frame; the loop is timed on a sample of rows."""
-    timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
-    generator = torch.Generator().manual_seed(SEED)
-    phase = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1) * math.pi
-    truth = rsv.Vibration([3.1, 5.2], [50.0, 30.0], phase)
-    scene = city_and_fields(options.size + 2 * MARGIN, options.size + 2 * MARGIN, SEED)
-    noise = rsv.SensorNoise(read_noise=NOISE)
-    size = (options.size, options.size)
-    frame = rsv.simulate_frames(scene, timing, truth, 1, frame_size=size, noise=noise, generator=generator)[0]
-    still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
-    height, runs, sample = options.size, options.runs, options.rows
-    safe = RIM + HALF_ROWS
-    generator = torch.Generator().manual_seed(SEED)
-    sampled = (torch.randperm(height - 2 * safe, generator=generator)[:sample] + safe).sort().values
-
-    def quality(restored: Tensor) -> float:
-        return float(rsv.psnr(restored[:, RIM:-RIM], still[sampled, RIM:-RIM], 1.0))
-
-    options: dict[str, dict[str, Any]] = {name: {"method": name} for name in METHODS}
-    options["banded, a slab for every row"] = {"method": "banded", "stride": 1}
-    works: dict[str, Callable[[], Any]] = {
-        name: lambda o=chosen: rsv.restore(frame[None], timing, truth, **o)[0, sampled]
-        for name, chosen in options.items()
-    }
-    middles, kernels = slab_kernels(sampled, timing, truth)
-    array = frame.numpy()
-
-    def loop(balance: float) -> Tensor:
-        return torch.from_numpy(restore_by_skimage(array, middles, kernels, balance))
-
-    balance = max(BALANCES, key=lambda b: quality(loop(b)))
-    done = in_turns(works | {PEER: lambda: loop(balance)}, runs)
-    results = [
-        {
-            "method": name,
-            "seconds": seconds * (height / len(sampled) if name == PEER else 1),
-            "psnr_db": quality(restored),
-        }
-        for name, (seconds, restored) in done.items()
+    """Quality of every method on every scene and exposure, then speed and memory."""
+    compared = [
+        row
+        for name, scene in scenes(options).items()
+        for exposure in options.exposures
+        for row in compare(name, scene, exposure, options)
     ]
-    return [{**result, "ratio": results[-1]["seconds"] / result["seconds"]} for result in results]
+    return [*({"part": "quality", **row} for row in compared), *({"part": "speed", **row} for row in speed(options))]
 
 
 def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
-    """The figures as a Markdown table."""
-    return [
-        "| restoration of one frame | seconds | loop / this | PSNR of the sampled rows (dB) |",
-        "|---|---|---|---|",
-        *(f"| {r['method']} | {r['seconds']:.3f} | {r['ratio']:.1f} | {r['psnr_db']:.2f} |" for r in results),
-        "",
-        f"The restoring loop ran on {options.rows} rows drawn at random; its time is scaled to {options.size} rows, and "
-        f"making its kernels is not counted. Times are medians of {options.runs} runs in turns.",
+    """The figures as Markdown tables."""
+    compared = [row for row in results if row["part"] == "quality"]
+    noises = [str(noise) for noise in options.noises]
+    timed = str(TIMED_NOISE) if str(TIMED_NOISE) in noises else noises[0]
+    text = [
+        f"PSNR in dB without a rim of {RIM} px, frames of {options.grid_size} x {options.grid_size} px, true vibration "
+        f"given; seconds at noise {timed}. Peers are told the best setting for the truth.",
     ]
+    for scene, exposure in dict.fromkeys((row["scene"], row["exposure_rows"]) for row in compared):
+        text += [
+            "",
+            f"| {scene}, exposure of {exposure} rows | {' | '.join(f'noise {noise}' for noise in noises)} | seconds |",
+            "|---" * (len(noises) + 2) + "|",
+        ]
+        here = [row for row in compared if (row["scene"], row["exposure_rows"]) == (scene, exposure)]
+        best = {noise: max(row["psnr_db"][noise] for row in here) for noise in noises}
+        for row in here:
+            cells = [f"{row['psnr_db'][n]:.2f}{'*' if row['psnr_db'][n] == best[n] else ''}" for n in noises]
+            text.append(f"| {row['method']} | {' | '.join(cells)} | {row['seconds'][timed]:.2f} |")
+    text += [
+        "",
+        f"| one frame of {options.size} x {options.size} px | seconds | FFT round trips | peak memory / frame |",
+        "|---|---|---|---|",
+    ]
+    for row in (row for row in results if row["part"] == "speed"):
+        memory = row["frames_of_memory"]
+        shown = "" if memory is None else f"{memory:.1f}"
+        text.append(f"| {row['method']} | {row['seconds']:.3f} | {row['round_trips']:.1f} | {shown} |")
+    text += [
+        "",
+        "The best of each column has a star. The row loop of skimage is run on some rows only: its time is scaled to "
+        f"all of them, its PSNR is that of those rows. Speed: medians of {options.runs} runs in turns; memory over "
+        "that of the frame in complex64.",
+    ]
+    return text

@@ -1,0 +1,109 @@
+"""What others would do: unwarping with OpenCV, and scikit-image's Wiener filter row by row."""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from skimage.restoration import wiener
+from torch import Tensor
+
+import rsvib_torch as rsv
+from rsvib_torch.imaging import rows_showing
+
+HALF_ROWS = 16  # of the slab that a row is deconvolved in
+SAMPLED_ROWS = 32
+BALANCES = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)  # of skimage.restoration.wiener
+
+
+@dataclass(frozen=True, eq=False)
+class Peer:
+    """What a method made of a frame.
+
+    Attributes:
+        restored: (H, W), or only some rows of it.
+        seconds: For the whole frame.
+        told: What was chosen for the truth.
+        rows: Which rows; None for all.
+    """
+
+    restored: Tensor
+    seconds: float
+    told: str
+    rows: list[int] | None = None
+
+
+def rows_and_displacements(scene_rows: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration) -> tuple[Tensor, Tensor]:
+    """Frame rows that show rows of the scene in frame 0, and their mean displacements (N, 2)."""
+    start = timing.frame_starts(1)[0]
+    shown_by = rows_showing(scene_rows.double(), start, timing, truth)
+    return shown_by, truth.mean_displacement(start + shown_by * timing.row_time, timing.exposure_time)
+
+
+def remap_lanczos(frame: np.ndarray, timing: rsv.SensorTiming, truth: rsv.Vibration) -> Peer:
+    """Every pixel fetched from where its row's mean displacement put it, by Lanczos-4."""
+    begin = time.perf_counter()
+    height, width = frame.shape
+    shown_by, mean = rows_and_displacements(torch.arange(height), timing, truth)
+    map_x = (np.arange(width)[None] + mean[:, :1].numpy()).astype(np.float32)
+    map_y = np.broadcast_to(shown_by[:, None].numpy().astype(np.float32), map_x.shape)
+    fetched = cv2.remap(frame, map_x, np.ascontiguousarray(map_y), cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT)
+    return Peer(torch.from_numpy(fetched), time.perf_counter() - begin, "")
+
+
+def slab_kernels(
+    scene_rows: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration
+) -> tuple[list[int], list[np.ndarray]]:
+    """Frame row in the middle of each row's slab, and the centred kernel of the whole slab (Eqs. 26-39)."""
+    start = timing.frame_starts(1)[0]
+    shown_by, _ = rows_and_displacements(scene_rows, timing, truth)
+    middles = shown_by.round().long()
+    psf = rsv.row_psf(truth, start + shown_by * timing.row_time, timing)
+    kernels, (left, top) = psf.dense()
+    padded = []
+    for kernel, moved in zip(kernels, (middles - scene_rows).tolist(), strict=True):
+        # centred on displacement (0, moved): the slab already follows its middle row
+        height, width = kernel.shape
+        y, x = top - moved, left
+        half = max(abs(y), abs(y + height - 1)), max(abs(x), abs(x + width - 1))
+        canvas = np.zeros((2 * half[0] + 1, 2 * half[1] + 1))
+        canvas[half[0] + y : half[0] + y + height, half[1] + x : half[1] + x + width] = kernel.numpy()
+        rows, columns = (np.flatnonzero(canvas.sum(axis)) for axis in (1, 0))
+        keep = [max(abs(int(i[0]) - h), abs(int(i[-1]) - h)) for i, h in zip((rows, columns), half, strict=True)]
+        inner = tuple(slice(h - k, h + k + 1) for h, k in zip(half, keep, strict=True))
+        padded.append(canvas[inner])
+    return middles.tolist(), padded
+
+
+def restore_rows(
+    frame: np.ndarray, middles: Sequence[int], kernels: Sequence[np.ndarray], balance: float
+) -> np.ndarray:
+    """Central rows of slabs deconvolved one after another."""
+    return np.stack(
+        [
+            wiener(frame[m - HALF_ROWS : m + HALF_ROWS + 1], kernel, balance, clip=False)[HALF_ROWS]
+            for m, kernel in zip(middles, kernels, strict=True)
+        ]
+    )
+
+
+def wiener_rows(frame: np.ndarray, timing: rsv.SensorTiming, truth: rsv.Vibration, still: Tensor, rim: int) -> Peer:
+    """Rows drawn at random and restored one by one, with the balance that is best for the truth."""
+    height = frame.shape[0]
+    safe = rim + HALF_ROWS
+    generator = torch.Generator().manual_seed(0)
+    sampled = (torch.randperm(height - 2 * safe, generator=generator)[:SAMPLED_ROWS] + safe).sort().values
+    middles, kernels = slab_kernels(sampled, timing, truth)
+    best, told, error = None, 0.0, math.inf
+    begin = time.perf_counter()
+    for balance in BALANCES:
+        found = torch.from_numpy(restore_rows(frame, middles, kernels, balance))
+        wrong = float((found - still[sampled])[:, rim:-rim].square().mean())
+        if wrong < error:
+            best, told, error = found, balance, wrong
+    seconds = (time.perf_counter() - begin) / len(BALANCES) * height / len(sampled)
+    assert best is not None
+    return Peer(best, seconds, f"balance {told:g}", sampled.tolist())
