@@ -2,20 +2,22 @@
 
 import math
 
-import torch
 from torch import Tensor
 
 __all__ = ["estimate_noise", "gradient_energy"]
 
 _BLOCK = 16
+_DIFFERENCES = 8
 _QUANTILE = 0.15
+_FEW = 8  # blocks have no quiet part
 
 
 def estimate_noise(frames: Tensor) -> Tensor:
     """Standard deviation of white noise in each image.
 
-    The outer product of two fourth differences leaves the corner of the spectrum, where optics pass least; of its
-    energy in blocks of 16 x 16 px only the quietest part is taken, where there is no texture.
+    The outer product of two eighth differences leaves the corner of the spectrum, where optics pass least; of its
+    energy in blocks of 16 x 16 px only the quietest part is taken, where there is no texture. A scene that has texture
+    up to the corner everywhere counts as noise.
 
     Args:
         frames: (..., H, W).
@@ -30,20 +32,29 @@ def estimate_noise(frames: Tensor) -> Tensor:
     """
     detail = frames
     for axis in (-2, -1):
-        for _ in range(min(4, frames.shape[axis] - 1)):
+        for _ in range(min(_DIFFERENCES, (frames.shape[axis] - 1) // 2 + 1, frames.shape[axis] - 1)):
             detail = detail.diff(dim=axis)
-    energy_of_mask = math.prod(math.comb(2 * (n := min(4, size - 1)), n) for size in frames.shape[-2:])
-    detail = detail.square() / energy_of_mask
+    orders = [whole - rest for whole, rest in zip(frames.shape[-2:], detail.shape[-2:], strict=True)]
+    detail = detail.square() / math.prod(math.comb(2 * order, order) for order in orders)
     block = min(_BLOCK, detail.shape[-2], detail.shape[-1])
     height, width = (size // block * block for size in detail.shape[-2:])
     blocks = detail[..., :height, :width].unflatten(-1, (-1, block)).unflatten(-3, (-1, block)).mean((-3, -1))
     energy = blocks.flatten(-2)
-    # means of pure noise scatter (6.9: neighbouring responses of the mask are correlated), so that their low
-    # quantile lies below the true mean
-    spread = 1.0364 * (2.0 * 6.9 / block**2) ** 0.5
-    quiet = energy.to(torch.float32).quantile(_QUANTILE, dim=-1).to(energy.dtype)
-    deviation: Tensor = (quiet / (1.0 - min(spread, 0.5))).sqrt()
+    # means of pure noise scatter (neighbouring responses of the mask are correlated), so that their low quantile lies
+    # below the true mean: by as much as a chi-squared variable's does (Wilson and Hilferty)
+    share = min(2.0 * math.prod(_correlation_area(order) for order in orders) / (9.0 * block**2), 0.2)
+    expected = (1.0 - share - 1.0364 * share**0.5) ** 3
+    quiet = energy.quantile(_QUANTILE, dim=-1)
+    if energy.shape[-1] < _FEW:
+        quiet, expected = energy.mean(-1), 1.0
+    deviation: Tensor = (quiet / expected).sqrt()
     return deviation
+
+
+def _correlation_area(order: int) -> float:
+    """Sum of the squared correlations of white noise that was differenced."""
+    total = math.comb(2 * order, order)
+    return sum((math.comb(2 * order, order + lag) / total) ** 2 for lag in range(-order, order + 1))
 
 
 def gradient_energy(frames: Tensor) -> Tensor:

@@ -8,12 +8,14 @@ from torch import Tensor
 
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.motion import FrameMotion
+from rsvib_torch.restoration.row_kernel import interpolation_error, kernel_response
 
-__all__ = ["RowPrior", "autoregressive_prior", "fit_prior"]
+__all__ = ["ORDER", "RowPrior", "autoregressive_prior", "fit_prior"]
 
-_SEGMENT = 64  # rows of the pieces whose spectra are averaged
-
-_SMOOTHING = 9  # neighbouring frequencies whose statistics are pooled
+ORDER = 2  # rows that a row is predicted from
+_PIECE = (64, 256)  # rows and columns of the pieces whose spectra are averaged
+_MOST_PIECES = 128  # of a frame
+_SMOOTHING = 3  # neighbouring frequencies whose statistics are pooled
 _ITERATIONS = 20
 # noise power over variance of e: above, the systems lose digits and nothing is gained; below, rows half a pixel apart
 # from the scene's lose them in single precision
@@ -23,44 +25,88 @@ _WEAKEST = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class RowPrior:
-    """For each horizontal frequency, how a scene row follows from the two rows before it.
+    """For each horizontal frequency, how the coefficients of a scene row follow from those of the rows before it.
 
-    ``f(s) = a_1 f(s - 1) + a_2 f(s - 2) + e(s)`` with white ``e``: a stationary autoregressive model of the scene
-    across rows, whose precision matrix is banded.
+    ``c(s) = - a_1 c(s - 1) - ... - a_p c(s - p) + e(s)`` with white ``e``: a stationary autoregressive model, whose
+    precision matrix is banded.
 
     Attributes:
-        power: (U,) variance of a row.
-        correlation: (U,) correlation of neighbouring rows.
-        partial: (U,) partial correlation of rows two apart.
+        power: (U,) variance of a coefficient.
+        reflections: (p, U) partial correlations, within -1 ... 1.
+        blind: (U,) power of what the kernel between rows cannot follow, which counts as noise.
     """
 
     power: Tensor
-    correlation: Tensor
-    partial: Tensor
+    reflections: Tensor
+    blind: Tensor
 
-    def whitening(self, noise_power: Tensor, frequencies: slice, count: int) -> Tensor:
-        """Filter that turns scene rows into white noise of the data's noise power.
+    @classmethod
+    def smooth(cls, u: Tensor) -> "RowPrior":
+        """Neighbouring rows are alike at all frequencies (U,), and the innovation has variance 1."""
+        reflections = torch.stack([torch.full_like(u, 0.9), torch.zeros_like(u)])
+        return cls(1 / (1 - reflections[0].square()), reflections, torch.zeros_like(u))
+
+    def filter(self) -> Tensor:
+        """Coefficients 1, a_1 ... a_p of the filter that whitens, (p + 1, U)."""
+        filter_ = torch.ones_like(self.power)[None]
+        for reflection in self.reflections:
+            padded = torch.cat([filter_, torch.zeros_like(filter_[:1])])
+            filter_ = padded - reflection * padded.flip(0)
+        return filter_
+
+    def innovation(self) -> Tensor:
+        """Variance (U,) of e."""
+        return self.power * (1 - self.reflections.square()).prod(0)
+
+    def resampled(self, count: int) -> "RowPrior":
+        """The prior at ``count`` frequencies spread over the same range."""
+        stacked = torch.cat([self.power.log()[None], self.blind.log()[None], self.reflections])
+        values = torch.nn.functional.interpolate(stacked[None], count, mode="linear", align_corners=True)[0]
+        return RowPrior(values[0].exp(), values[2:], values[1].exp())
+
+    def add_to(self, full: Tensor, frequencies: slice, noise_power: Tensor, strength: float) -> Tensor:
+        """Add the precision to bands of the data, in place.
 
         Args:
-            noise_power: Power of the noise, shape ().
+            full: (K + b, 2 b + 1, U'), complex.
             frequencies: Which of the U frequencies.
-            count: Number of scene rows K.
+            noise_power: Power of the noise of data of weight 1.
+            strength: Factor on the precision.
 
         Returns:
-            (K, 3, U') taps on rows s, s - 1 and s - 2; the first rows follow from fewer.
+            The bands.
         """
-        power, rho, partial = (part[frequencies] for part in (self.power, self.correlation, self.partial))
-        first, second = 1 - rho.square(), 1 - partial.square()
-        scales = [
-            (noise_power / p).clamp(_WEAKEST, _STRONGEST).sqrt() for p in (power, power * first, power * first * second)
-        ]
-        one, zero = torch.ones_like(rho), torch.zeros_like(rho)
-        rows = [
-            torch.stack([one, zero, zero]) * scales[0],
-            torch.stack([one, -rho, zero]) * scales[1],
-            torch.stack([one, -rho * (1 - partial), -partial]) * scales[2],
-        ]
-        return torch.cat([rows[0][None], rows[1][None], rows[2].expand(count - 2, *rows[2].shape)])
+        a = self.filter()[:, frequencies]
+        ratio = ((noise_power + self.blind) * strength / self.innovation()).clamp(_WEAKEST, _STRONGEST)[frequencies]
+        width = full.shape[1] // 2
+        count, order = len(full) - width, len(a) - 1
+        real = torch.view_as_real(full)[..., 0]
+        for d in range(order + 1):
+            products = a[: order + 1 - d] * a[d:] * ratio
+            middle = products.sum(0)
+            for side in {d, -d}:
+                real[max(0, -side) : count - max(0, side), width + side] += middle
+                for k in range(1, order + 1 - d):
+                    # the first and the last rows are predicted from fewer
+                    real[max(0, -side) : max(0, -side) + k, width + side] -= products[k]
+                    real[count - max(0, side) - k : count - max(0, side), width + side] -= products[k]
+        return full
+
+
+def _levinson(moments: Tensor) -> RowPrior:
+    """Autoregressive model of autocovariances (p + 1, U)."""
+    tiny = torch.finfo(moments.dtype).tiny
+    power = moments[0].clamp(min=tiny)
+    left, variance = torch.ones_like(power)[None], power
+    reflections = []
+    for lag in range(1, len(moments)):
+        reflection = (left * moments[1 : lag + 1].flip(0)).sum(0) / variance
+        reflection = reflection.clamp(-0.9995, 0.9995)
+        padded = torch.cat([left, torch.zeros_like(left[:1])])
+        left = padded - reflection * padded.flip(0)
+        variance = variance * (1 - reflection.square())
+        reflections.append(reflection)
+    return RowPrior(power, torch.stack(reflections), torch.zeros_like(power))
 
 
 def _smooth(moments: Tensor) -> Tensor:
@@ -72,7 +118,7 @@ def _smooth(moments: Tensor) -> Tensor:
     return pooled
 
 
-def autoregressive_prior(observed: Tensor, transfer: Tensor, noise_power: Tensor) -> RowPrior:
+def autoregressive_prior(observed: Tensor, transfer: Tensor, noise_power: Tensor, order: int = ORDER) -> RowPrior:
     """Fit the prior to the power spectrum of blurred, noisy frames by expectation maximisation.
 
     Each step adds what the blurred spectrum says about the scene's and what the noise leaves open, and fits the
@@ -82,36 +128,32 @@ def autoregressive_prior(observed: Tensor, transfer: Tensor, noise_power: Tensor
         observed: (U, V) power of the frames, horizontal frequencies by vertical ones.
         transfer: (U, V) power that the blur lets through.
         noise_power: Power of the noise in each value, shape (U, V) or ().
+        order: Rows that a row is predicted from.
 
     Returns:
         The prior.
     """
     v = torch.fft.fftfreq(observed.shape[-1], dtype=observed.dtype, device=observed.device)
-    lags = torch.arange(3, dtype=observed.dtype, device=observed.device)
-    waves = torch.cos(2 * torch.pi * v[:, None] * lags)
+    lags = torch.arange(order + 1, dtype=observed.dtype, device=observed.device)
+    angles = 2 * torch.pi * v[:, None] * lags
+    cosine, sine = torch.cos(angles), torch.sin(angles)
     scene = torch.maximum(observed - noise_power, 0.02 * noise_power) * transfer / (transfer.square() + 1e-2)
     for _ in range(_ITERATIONS):
-        moments = _smooth((scene @ waves).T / len(v))
-        power = moments[0].clamp(min=torch.finfo(observed.dtype).tiny)
-        first = (moments[1] / power).clamp(-0.9995, 0.9995)
-        partial = ((moments[2] / power - first.square()) / (1 - first.square())).clamp(-0.99, 0.99)
-        prior = RowPrior(power, first, partial)
-        whitener = 1 - torch.stack([first * (1 - partial), partial], -1).to(torch.complex128) @ torch.exp(
-            -2j * torch.pi * lags[1:, None] * v
-        ).to(torch.complex128)
-        variance = power * (1 - first.square()) * (1 - partial.square())
-        model = (variance[:, None] / whitener.abs().square()).to(observed.dtype)
+        prior = _levinson(_smooth((scene @ cosine).T / len(v)))
+        whitener = prior.filter().T
+        model = prior.innovation()[:, None] / ((whitener @ cosine.T).square() + (whitener @ sine.T).square())
         gain = model / (transfer * model + noise_power)
         scene = gain * noise_power + gain.square() * transfer * observed
-    return prior
+    blind = (model * interpolation_error(v)).mean(-1)
+    return RowPrior(prior.power, prior.reflections, blind.clamp(min=torch.finfo(blind.dtype).tiny))
 
 
 @torch.no_grad()
 def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, length: int) -> RowPrior:
     """Fit the prior to the frames of a stack.
 
-    Rows are moved back by their displacement, so that neighbours correlate as in the scene; spectra of short pieces
-    are averaged, each weighted by what its blur lets through and by the noise of its frame.
+    Rows are moved back by their displacement, so that neighbours correlate as in the scene; spectra of pieces are
+    averaged, each weighted by what its blur lets through and by the noise of its frame.
 
     Args:
         frames: (T, C, H, W) in row order.
@@ -123,34 +165,50 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     Returns:
         The prior for transforms of that length.
     """
-    H, W = frames.shape[-2:]
-    step = max(min(_SEGMENT, H) // 2, 1)
-    size = min(_SEGMENT, H)
-    window = torch.hann_window(W + 2, periodic=False, dtype=frames.dtype, device=frames.device)[1:-1]
-    window = window * (length / window.square().sum()).sqrt()
-    taper = torch.hann_window(size + 2, periodic=False, dtype=frames.dtype, device=frames.device)[1:-1]
-    taper = taper / taper.square().sum().sqrt()
-    u = torch.fft.rfftfreq(length, dtype=torch.float64, device=frames.device)
-    v = torch.fft.fftfreq(size, dtype=torch.float64, device=frames.device)
+    size = [min(piece, whole) for piece, whole in zip(_PIECE, frames.shape[-2:], strict=True)]
+    starts = _spread_pieces(frames.shape[-2:], size)
+    rows, columns = (begin[:, None] + torch.arange(extent) for begin, extent in zip(starts, size, strict=True))
+    rows, columns = rows.to(frames.device), columns.to(frames.device)
+    pieces = frames[:, :, rows[:, None, :, None], columns[None, :, None, :]]  # (T, C, pieces, pieces, rows, columns)
+    tapers = [
+        torch.hann_window(extent + 2, periodic=False, dtype=frames.dtype, device=frames.device)[1:-1] for extent in size
+    ]
+    tapers = [taper / taper.square().sum().sqrt() for taper in tapers]
+    u = torch.fft.rfftfreq(size[1], dtype=torch.float64, device=frames.device)
+    v = torch.fft.fftfreq(size[0], dtype=torch.float64, device=frames.device)
 
-    spectra = torch.fft.rfft((frames - frames.mean((-2, -1), keepdim=True)) * window, n=length)
-    rows = torch.arange(H, dtype=torch.float64, device=frames.device)
-    starts = motion.frame_starts[:, None] + rows * motion.timing.row_time
     vibration = motion.vibration[stack]
-    mean = vibration.mean_displacement(starts, motion.timing.exposure_time)[..., 0]
-    spectra = spectra * _ramps(mean, -u).to(spectra.dtype)[:, None]
-    power = torch.fft.fft(spectra.unfold(2, size, step) * taper).abs().square().mean(1)  # (T, pieces, U, V)
+    times = motion.frame_starts[:, None] + rows.flatten() * motion.timing.row_time
+    mean = vibration.mean_displacement(times, motion.timing.exposure_time)[..., 0]
+    back = _ramps(mean, -u).to(frames.dtype.to_complex()).unflatten(1, rows.shape)  # (T, pieces, rows, U)
+    spectra = torch.fft.rfft((pieces - frames.mean((-2, -1))[..., None, None, None, None]) * tapers[1])
+    spectra = spectra * back[:, None, :, None] * tapers[0][:, None]
+    power = torch.fft.fft(spectra, dim=-2).abs().square().mean((1, 3)).transpose(-2, -1)  # (T, pieces, U, V)
+    power = power.to(torch.float64) * length
 
-    middles = torch.arange(power.shape[1], device=frames.device) * step + size // 2
-    displacement, weights = exposure_trajectory(vibration, starts[:, middles], motion.timing, "gauss")
+    displacement, weights = exposure_trajectory(
+        vibration, times.unflatten(1, rows.shape)[..., size[0] // 2], motion.timing, "gauss"
+    )
     along = _ramps(displacement[..., 0], u) * weights[:, None]
     across = _ramps(displacement[..., 1], v)
-    transfer = (along.transpose(-2, -1).to(spectra.dtype) @ across.to(spectra.dtype)).abs().square()
-    weight = transfer / levels.square()[:, None, None, None]
-    total = weight.sum((0, 1)).clamp(min=torch.finfo(frames.dtype).tiny)
+    transfer = (along.transpose(-2, -1) @ across).abs().square() * kernel_response(v).square()
+    weight = transfer / levels.to(torch.float64).square()[:, None, None, None]
+    total = weight.sum((0, 1)).clamp(min=torch.finfo(torch.float32).tiny)
     observed = (weight * power).sum((0, 1)) / total
     noise_power = transfer.sum((0, 1)) / total * length
-    return autoregressive_prior(observed, (weight * transfer).sum((0, 1)) / total, noise_power)
+    prior = autoregressive_prior(observed, (weight * transfer).sum((0, 1)) / total, noise_power)
+    return prior.resampled(length // 2 + 1)
+
+
+def _spread_pieces(shape: torch.Size, size: list[int]) -> list[Tensor]:
+    """First rows and first columns of pieces spread evenly over the frame, overlapping by half if they are few."""
+    counts = [-(-2 * (whole - extent) // extent) + 1 for whole, extent in zip(shape, size, strict=True)]
+    excess = max(1.0, math.sqrt(counts[0] * counts[1] / _MOST_PIECES))
+    counts = [max(1, round(count / excess)) for count in counts]
+    return [
+        torch.linspace(0, whole - extent, count).round().to(torch.int64)
+        for whole, extent, count in zip(shape, size, counts, strict=True)
+    ]
 
 
 def _ramps(places: Tensor, frequencies: Tensor) -> Tensor:

@@ -1,0 +1,183 @@
+"""How the rows of frames see the scene, and the banded normal equations that follow, one system per frequency.
+
+A row that looked at N places (x_n, y_n) of the scene during its exposure has, at horizontal frequency u, the kernel
+``K(u) = sum_n w_n h(. - y_n) exp(-2 pi i u x_n)``. Relative to the middle of the row's own range the x_n are small, so
+that kernels and their products are smooth in u: they are worked out at a few Chebyshev nodes in double precision,
+and all frequencies follow by one product of matrices. The phase of the middle goes to the data.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.restoration.row_kernel import REACH, TAPS, kernel_weights
+
+__all__ = ["RowKernels", "SceneRows", "Smooth", "row_kernels", "smooth_band", "smooth_kernels"]
+
+_TABLE = 64  # frequencies that a phase is stepped through
+
+
+@dataclass(frozen=True)
+class SceneRows:
+    """The scene rows that the frames see.
+
+    Attributes:
+        top: Index of the first one, in frame coordinates.
+        count: How many there are.
+    """
+
+    top: int
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class RowKernels:
+    """How the rows of M frames see the coefficients of the scene.
+
+    Attributes:
+        first: (M, R) first scene row of each row's kernel.
+        taps: (M, R, J, N) weights of J scene rows at N nodes of the exposure, float64.
+        middle: (M, R) displacement along the row in px that the phase of the data is corrected by, float64.
+        along: (M, R, N) displacement along the row relative to the middle, float64.
+        weight: (M, R) how much each row counts, float64.
+    """
+
+    first: Tensor
+    taps: Tensor
+    middle: Tensor
+    along: Tensor
+    weight: Tensor
+
+    @property
+    def reach(self) -> float:
+        """Largest distance along the row from the middle in px."""
+        return float(self.along.detach().abs().amax())
+
+    def scene_rows(self, num_rows: int) -> SceneRows:
+        """All scene rows seen, and those that frames of ``num_rows`` rows need to be evaluated."""
+        top = min(int(self.first.amin()), 1 - REACH)
+        return SceneRows(top, max(int(self.first.amax()) + self.taps.shape[-2], num_rows + REACH - 1) - top)
+
+    def at(self, frequencies: Tensor) -> Tensor:
+        """Kernels (M, R, J, Q) without the phase of the middle."""
+        angle = (-2 * math.pi) * self.along[..., None] * frequencies
+        return torch.complex(self.taps @ angle.cos(), self.taps @ angle.sin())
+
+    def phases(self, length: int, frequencies: slice, dtype: torch.dtype) -> Tensor:
+        """``exp(2 pi i u x)`` of the middles (M, R, U) at frequencies ``u = k / length``, as products of two tables."""
+        start, stop = frequencies.start, frequencies.stop
+        coarse = torch.arange(start, stop, _TABLE, device=self.middle.device)
+        fine = torch.arange(_TABLE, device=self.middle.device)
+        tables = []
+        for steps in (coarse, fine):
+            turns = self.middle[..., None] * (steps.to(torch.float64) / length)
+            angle = (turns - turns.round()) * (2 * math.pi)
+            tables.append(torch.polar(torch.ones_like(angle), angle).to(dtype.to_complex()))
+        product = tables[0][..., :, None] * tables[1][..., None, :]
+        return product.flatten(-2)[..., : stop - start]
+
+
+def row_kernels(displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int, margin: int) -> RowKernels:
+    """Kernels of rows whose scene moved by ``displacement`` (M, R, N, 2).
+
+    Rows that look further than ``margin`` px beyond the ``num_rows`` rows of the frame do not count.
+    """
+    rows = torch.arange(displacement.shape[-3], dtype=displacement.dtype, device=displacement.device)
+    place = rows[:, None] - displacement[..., 1]
+    cell = place.detach().floor()
+    first = cell.amin(-1)
+    weights = kernel_weights(place - cell) * node_weights[:, None]
+    offset = (cell - first[..., None]).to(torch.int64)[..., None] + torch.arange(TAPS, device=place.device)
+    count = int(offset.amax()) + 1
+    taps = weights.new_zeros(*weights.shape[:-1], count).scatter(-1, offset, weights).transpose(-2, -1)
+    first = first.to(torch.int64) - (REACH - 1)
+    near = (first > -margin - count) & (first < num_rows + margin)
+    first = first.clamp(-margin - count, num_rows + margin)
+    x = displacement[..., 0]
+    middle = 0.5 * (x.detach().amin(-1) + x.detach().amax(-1))
+    return RowKernels(first, taps, middle, x - middle[..., None], weight[:, None].to(torch.float64) * near)
+
+
+def _interpolation(reach: float, u: Tensor, precision: float) -> tuple[Tensor, Tensor]:
+    """Nodes (Q,) in 0 ... 1/2 cycles per px, and the matrix (2 Q, 2 U) to frequencies ``u``.
+
+    It turns real and imaginary parts at the nodes of functions ``f(-u) = conj f(u)`` made of waves of up to ``reach``
+    px into interleaved real and imaginary parts at ``u`` (the former are even, the latter odd Chebyshev series).
+    """
+    half = math.pi * reach
+    degree, bound = 1, half
+    while bound > precision or degree < half:
+        degree += 1
+        bound *= 0.5 * half / degree if half else 0.0
+    count = degree // 2 + 1
+    k = torch.arange(count, dtype=torch.float64, device=u.device)
+    angles = math.pi * (2 * k + 1) / (4 * count)
+    at = torch.acos((2 * u).clamp(-1, 1))
+    matrix = u.new_zeros(2 * count, len(u), 2)
+    for odd in (0, 1):
+        order = 2 * k + odd
+        series = torch.cos(angles[:, None] * order) * (2 / count)
+        if not odd:
+            series[:, 0] *= 0.5
+        matrix[odd * count : (odd + 1) * count, :, odd] = series @ torch.cos(order[:, None] * at)
+    return 0.5 * torch.cos(angles), matrix.flatten(1)
+
+
+def _precision(dtype: torch.dtype) -> float:
+    return 1e-8 if dtype == torch.float32 else 1e-15
+
+
+def _stacked(values: Tensor) -> Tensor:
+    return torch.cat([values.real, values.imag], dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Smooth:
+    """Complex values of all frequencies as one product of matrices.
+
+    Attributes:
+        left: (..., 2 Q) real and imaginary parts at Q nodes, in the dtype of the frames.
+        reach: Distance along the rows in px that the waves reach to.
+    """
+
+    left: Tensor
+    reach: float
+
+    def at(self, u: Tensor) -> Tensor:
+        """Values (..., U) at frequencies in cycles per px."""
+        right = _interpolation(self.reach, u, _precision(self.left.dtype))[1].to(self.left.dtype)
+        return torch.view_as_complex((self.left @ right).unflatten(-1, (-1, 2)))
+
+
+def smooth_kernels(kernels: RowKernels, dtype: torch.dtype) -> Smooth:
+    """Kernels (M, R, J) of all rows, without the phase of their middles."""
+    nodes, _ = _interpolation(kernels.reach, kernels.middle.new_zeros(1), _precision(dtype))
+    return Smooth(_stacked(kernels.at(nodes)).to(dtype), kernels.reach)
+
+
+def smooth_band(kernels: RowKernels, rows: SceneRows, width: int, dtype: torch.dtype) -> Smooth:
+    """Normal matrices ``sum w K^H K`` of all frames of one scene, skewed bands (K + b, 2 b + 1).
+
+    Args:
+        kernels: How the frames see it.
+        rows: Its rows.
+        width: Half-width b of the band to be filled, at least the number of taps less 1.
+        dtype: Of the frames.
+    """
+    nodes, _ = _interpolation(2 * kernels.reach, kernels.middle.new_zeros(1), _precision(dtype))
+    seen = kernels.at(nodes)
+    weighted = seen * kernels.weight[..., None, None]
+    base = (kernels.first - rows.top).flatten()
+    sides: list[Tensor] = []
+    for d in range(seen.shape[-2]):
+        entries = seen.new_zeros(rows.count + width, len(nodes))
+        for i in range(seen.shape[-2] - d):
+            product = weighted[..., i, :].conj() * seen[..., i + d, :]
+            entries = entries.index_add(0, base + i, product.flatten(0, 1))
+        sides.append(entries)  # A[k, k + d]
+    absent = torch.zeros_like(sides[0])
+    right = [sides[d] if d < len(sides) else absent for d in range(width + 1)]
+    left = [torch.cat([absent[:d], right[d][: len(absent) - d].conj()]) for d in range(width, 0, -1)]
+    return Smooth(_stacked(torch.stack(left + right, dim=1)).to(dtype), 2 * kernels.reach)
