@@ -3,32 +3,32 @@
 import logging
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
 import torch
 import typer
-from torch import Tensor
 
 import rsvib_torch
 from rsvib_torch.config import Config, read_config
-from rsvib_torch.detection import DetectionResult, detect_vibration
+from rsvib_torch.detection import DetectionResult
 from rsvib_torch.imaging import simulate_frames
-from rsvib_torch.pictures import comparison_figure, offset_figure, save_figure
-from rsvib_torch.report import read_vibration, reliable_part, write_offsets, write_vibration
-from rsvib_torch.restoration import restore
-from rsvib_torch.stacks import (
-    StackInfo,
-    check_stack_target,
-    check_writable,
-    read_stack,
-    read_stack_info,
-    whole_folder,
-    write_stack,
-)
+from rsvib_torch.pictures import comparison_figure, save_figure
+from rsvib_torch.report import read_vibration
+from rsvib_torch.restoration.restore import METHODS
+from rsvib_torch.stacks import check_stack_target, check_writable, read_stack, whole_folder, write_stack
 from rsvib_torch.terminal import error_line, say, show_result, warnings_in_one_line, working
-from rsvib_torch.vibration import Vibration
+from rsvib_torch.workflow import (
+    DeviceName,
+    Stack,
+    Wishes,
+    chosen_device,
+    detect_frames,
+    load,
+    restore_and_judge,
+    save,
+    write_detection,
+)
 
 __all__ = ["main", "run_command"]
 
@@ -39,7 +39,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-DeviceName = Literal["auto", "cpu", "cuda"]
 ConfigOption = Annotated[Path, typer.Option("--config", help="TOML file that describes the camera.")]
 DeviceOption = Annotated[
     DeviceName, typer.Option("--device", help="Where to compute; auto takes a GPU if there is one.")
@@ -48,71 +47,22 @@ ScaleOption = Annotated[
     float | None,
     typer.Option("--full-scale", help="Count that means full scale, where neither file nor config says it right."),
 ]
+MethodOption = Annotated[
+    str | None, typer.Option("--method", help=f"How to restore: {', '.join(METHODS)}.", show_default="the config's")
+]
+JointOption = Annotated[
+    str | None,
+    typer.Option("--joint", help="Frames restored together: 'all' for one image, or a number of neighbours."),
+]
+PriorOption = Annotated[str | None, typer.Option("--prior", help="What scenes are expected to be like, see restore.")]
+SaturationOption = Annotated[
+    float | None,
+    typer.Option("--saturation", help="Level of the file from which pixels are saturated; full scale for integers."),
+]
+ForceOption = Annotated[
+    bool, typer.Option("--force", help="Write restored frames even where they are judged no better than raw.")
+]
 FramesArgument = Annotated[Path, typer.Argument(help="Stack of frames: TIFF, .npy, video, or a folder of PNG files.")]
-
-
-@dataclass(frozen=True)
-class _Stack:
-    """Frames in memory and how their file keeps them."""
-
-    frames: Tensor
-    info: StackInfo
-    full_scale: float | None
-
-
-def _device(name: DeviceName) -> torch.device:
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda: there is no CUDA device here; use auto or cpu")
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
-
-
-def _full_scale(path: Path, info: StackInfo, config: Config, option: float | None) -> float | None:
-    """Full scale of a stack: the option first, then what the file says or 8 bits mean, then the config."""
-    if option is not None or not info.is_integer:
-        return option
-    if info.full_scale is None:
-        return config.full_scale
-    if info.dtype != "uint8" and config.full_scale not in (None, info.full_scale):
-        raise ValueError(
-            f"{path} states full_scale={info.full_scale:g}, the config {config.full_scale:g}; say which: --full-scale"
-        )
-    return info.full_scale
-
-
-def _load(path: Path, config: Config, option: float | None, device: torch.device) -> _Stack:
-    info = read_stack_info(path)
-    scale = _full_scale(path, info, config, option)
-    with working(f"reading {path}"):
-        frames = read_stack(path, full_scale=scale)
-    # A video only estimates its length beforehand.
-    info = StackInfo(tuple(frames.shape), info.dtype, info.full_scale)
-    return _Stack(frames.to(device), info, scale)
-
-
-def _save(path: Path, frames: Tensor, stack: _Stack) -> None:
-    with working(f"writing {path.name}"):
-        write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale)
-
-
-def _detect(stack: _Stack, config: Config) -> DetectionResult:
-    with working("detecting the vibration"):
-        return detect_vibration(stack.frames, config.timing, **config.detection)
-
-
-def _restore(stack: _Stack, config: Config, vibration: Vibration, reliable: Any, reasons: Any) -> Tensor:
-    """Restored frames; an axis that is not reliable is left alone."""
-    for axis, name in enumerate("xy"):
-        if not bool(reliable[axis]):
-            say(f"{name} is left alone: its vibration is not reliable ({'; '.join(reasons[axis])})")
-    with working("restoring the frames"):
-        return restore(stack.frames, config.timing, reliable_part(vibration, reliable), **config.restoration)
-
-
-def _write_detection(folder: Path, result: DetectionResult, config: Config) -> None:
-    with working("drawing the offset curve"):
-        write_vibration(folder / "vibration.json", result, config.timing)
-        write_offsets(folder / "offsets.csv", result)
-        save_figure(offset_figure(result), folder / "offsets.png")
 
 
 @app.command()
@@ -129,7 +79,7 @@ def simulate(
     settings = read_config(config)
     if settings.simulation is None:
         raise ValueError(f"{config}: simulation: missing key; expected a table with vibration, num_frames, ...")
-    simulation, place = settings.simulation, _device(device)
+    simulation, place = settings.simulation, chosen_device(device)
     image = read_stack(scene, full_scale=full_scale)
     if len(image) != 1:
         raise ValueError(f"{scene}: a scene is one image, this file has {len(image)} frames")
@@ -153,6 +103,16 @@ def simulate(
     say(f"{frames}: {len(taken)} frames of {taken.shape[-2]} x {taken.shape[-1]} px, {dtype}")
 
 
+def _detected(
+    frames: Path, config: Path, out: Path, device: DeviceName, full_scale: float | None
+) -> tuple[Config, Stack, DetectionResult]:
+    """Read a stack and detect its vibration, after a look at whether ``out`` can be written."""
+    settings = read_config(config)
+    check_writable(out, folder=True)
+    stack = load(frames, settings, full_scale, chosen_device(device))
+    return settings, stack, detect_frames(stack, settings)
+
+
 @app.command()
 def detect(
     frames: FramesArgument,
@@ -163,12 +123,9 @@ def detect(
     full_scale: ScaleOption = None,
 ) -> None:
     """Detect the vibration in a stack of frames."""
-    settings = read_config(config)
-    check_writable(out, folder=True)
-    stack = _load(frames, settings, full_scale, _device(device))
-    result = _detect(stack, settings)
+    settings, _, result = _detected(frames, config, out, device, full_scale)
     with whole_folder(out) as folder:
-        _write_detection(folder, result, settings)
+        write_detection(folder, result, settings)
     show_result(result)
     say(f"{out}: vibration.json, offsets.csv, offsets.png")
 
@@ -180,17 +137,32 @@ def restore_command(
     *,
     config: ConfigOption,
     vibration: Annotated[Path, typer.Option(help="The vibration.json that detect wrote.")],
+    method: MethodOption = None,
+    joint: JointOption = None,
+    prior: PriorOption = None,
+    saturation: SaturationOption = None,
+    force: ForceOption = False,
+    report: Annotated[Path | None, typer.Option(help="JSON file to write: whether it helped, and why not.")] = None,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
 ) -> None:
-    """Restore a stack of frames with a detected vibration."""
+    """Restore a stack of frames with a detected vibration, and judge whether that helps.
+
+    Where restored frames are no better than the raw ones, the raw ones are written, unless forced.
+    """
     settings = read_config(config)
     detected = read_vibration(vibration, settings.timing)
-    stack = _load(frames, settings, full_scale, _device(device))
-    check_stack_target(restored, stack.info.shape, dtype=stack.info.dtype, full_scale=stack.full_scale)
-    clear = _restore(stack, settings, detected.vibration, detected.reliable, detected.reasons)
-    _save(restored, clear, stack)
-    say(f"{restored}: {len(clear)} frames restored, {stack.info.dtype}")
+    wishes = Wishes(method, joint, prior, saturation, force)
+    stack = load(frames, settings, full_scale, chosen_device(device))
+    shape = (1, *stack.info.shape[1:]) if joint == "all" else stack.info.shape
+    check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale)
+    if report is not None:
+        check_writable(report)
+    result = restore_and_judge(stack, settings, detected, wishes)
+    save(restored, result.frames, stack)
+    if report is not None:
+        result.write_report(report)
+    say(f"{restored}: {len(result.frames)} frames {'restored' if result.restored else 'as taken'}, {stack.info.dtype}")
 
 
 @app.command()
@@ -199,22 +171,31 @@ def run(
     out: Annotated[Path, typer.Argument(help="Folder for the restored frames, the vibration and the pictures.")],
     *,
     config: ConfigOption,
+    method: MethodOption = None,
+    joint: JointOption = None,
+    prior: PriorOption = None,
+    saturation: SaturationOption = None,
+    force: ForceOption = False,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
 ) -> None:
-    """Detect the vibration, restore the frames, and draw pictures of both."""
-    settings = read_config(config)
-    check_writable(out, folder=True)
-    stack = _load(frames, settings, full_scale, _device(device))
-    result = _detect(stack, settings)
-    show_result(result)
-    clear = _restore(stack, settings, result.vibration, result.reliable, result.reasons)
+    """Detect the vibration, restore the frames, judge whether that helps, and draw pictures.
+
+    Where restored frames are no better than the raw ones, the raw ones are written, unless forced.
+    """
+    settings, stack, detection = _detected(frames, config, out, device, full_scale)
+    show_result(detection)
+    result = restore_and_judge(stack, settings, detection, Wishes(method, joint, prior, saturation, force))
     with whole_folder(out) as folder:
-        _write_detection(folder, result, settings)
-        _save(folder / "restored.tif", clear, stack)
+        write_detection(folder, detection, settings)
+        result.write_report(folder / "restoration.json")
+        save(folder / "restored.tif", result.frames, stack)
         with working("drawing before and after"):
-            save_figure(comparison_figure(stack.frames[0], clear[0]), folder / "before_after.png")
-    say(f"{out}: restored.tif, vibration.json, offsets.csv, offsets.png, before_after.png")
+            shown = len(stack.frames) // 2 if len(result.frames) < len(stack.frames) else 0
+            names = ("as taken", "restored" if result.restored else "left as taken")
+            picture = comparison_figure(stack.frames[shown], result.frames[0], names=names)
+            save_figure(picture, folder / "before_after.png")
+    say(f"{out}: restored.tif, restoration.json, vibration.json, offsets.csv, offsets.png, before_after.png")
 
 
 def _show_version(wanted: bool) -> None:

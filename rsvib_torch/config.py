@@ -13,7 +13,7 @@ from rsvib_torch.checks import check_number, check_whole_number
 from rsvib_torch.detection import detect_vibration
 from rsvib_torch.imaging import SensorNoise, simulate_frames
 from rsvib_torch.restoration import restore
-from rsvib_torch.restoration.restore import METHODS
+from rsvib_torch.restoration.restore import MASKS, METHODS
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.validation import Section, checked, options_section, validate
 from rsvib_torch.vibration import Vibration
@@ -98,6 +98,7 @@ class VibrationSection(Section):
     frequency: list[float] | list[list[float]]
     phase: list[float] | list[list[float]] = Field(default_factory=lambda: [0.0, 0.0])
     image_motion: list[float] = Field(default_factory=lambda: [0.0, 0.0])
+    image_acceleration: list[float] = Field(default_factory=lambda: [0.0, 0.0])
 
     @model_validator(mode="after")
     def _check(self) -> "VibrationSection":
@@ -110,7 +111,7 @@ class VibrationSection(Section):
 
     def vibration(self) -> Vibration:
         """The vibration."""
-        return Vibration(self.amplitude, self.frequency, self.phase, self.image_motion)
+        return Vibration(self.amplitude, self.frequency, self.phase, self.image_motion, self.image_acceleration)
 
 
 _NoiseSection = options_section("_NoiseSection", SensorNoise)
@@ -141,23 +142,26 @@ class _SimulationSection(Section):
         return Simulation(self.vibration.vibration(), self.num_frames, size, noise, self.seed)
 
 
-_DetectionSection = options_section("_DetectionSection", detect_vibration, skip=("full_scale",))
+_DetectionSection = options_section(
+    "_DetectionSection", detect_vibration, skip=("full_scale", "ignore", "window", "window_step")
+)
 
 
 def _restoration_section(method: object) -> Any:
     """``[restoration]``: the keys are those of the method."""
     default = inspect.signature(restore).parameters["method"].default
     chosen = METHODS[method if isinstance(method, str) and method in METHODS else default]
-    return options_section("_RestorationSection", chosen, method=(Literal[*METHODS], default))
+    more = {"method": (Literal[*METHODS], default), "saturation": (float | None, None)}
+    return options_section("_RestorationSection", chosen, skip=MASKS, **more)
 
 
 def read_config(path: str | os.PathLike[str]) -> Config:
     """Read a config file.
 
     ``[sensor]`` holds the fields of ``SensorTiming`` and ``full_scale``; ``[detection]`` and ``[restoration]`` the
-    options of ``detect_vibration`` and ``restore``; ``[simulation]`` frames, size and seed, with
-    ``[simulation.vibration]`` (fields of ``Vibration``) and ``[simulation.noise]`` (fields of ``SensorNoise``). Only
-    ``[sensor]`` is required.
+    options of ``detect_vibration`` and ``restore``, with ``saturation`` in the unit of the file; ``[simulation]``
+    frames, size and seed, with ``[simulation.vibration]`` (fields of ``Vibration``) and ``[simulation.noise]`` (fields
+    of ``SensorNoise``). Only ``[sensor]`` is required.
 
     Args:
         path: The TOML file.

@@ -129,7 +129,9 @@ def detailed_places(image: Tensor, size: int, count: int) -> list[tuple[int, int
     return places
 
 
-def comparison_figure(raw: Tensor, restored: Tensor, *, count: int = 3, size: int = 160) -> Figure:
+def comparison_figure(
+    raw: Tensor, restored: Tensor, *, count: int = 3, size: int = 160, names: tuple[str, str] = ("as taken", "restored")
+) -> Figure:
     """Draw crops of a raw and a restored frame beneath each other, where detail is strongest.
 
     Args:
@@ -137,6 +139,7 @@ def comparison_figure(raw: Tensor, restored: Tensor, *, count: int = 3, size: in
         restored: The same shape.
         count: Crops.
         size: Side of the crops in px.
+        names: What the two are called.
     """
     raw, restored = (_picture(frame) for frame in (raw, restored))
     size = min(size, *raw.shape[:2])
@@ -149,7 +152,7 @@ def comparison_figure(raw: Tensor, restored: Tensor, *, count: int = 3, size: in
     for index, (row, column) in enumerate(places):
         crops = [frame[row : row + size, column : column + size] for frame in (raw, restored)]
         low, high = (float(torch.stack(crops).quantile(q)) for q in (0.002, 0.998))
-        for crop, panel, name in zip(crops, panels[:, index], ("as taken", "restored"), strict=True):
+        for crop, panel, name in zip(crops, panels[:, index], names, strict=True):
             shown = ((crop - low) / max(high - low, 1e-6)).clamp(0, 1)
             panel.imshow(
                 shown.expand(-1, -1, 3).numpy(),

@@ -1,24 +1,27 @@
-"""What a detection leaves on disk: ``vibration.json`` and ``offsets.csv``."""
+"""What a run leaves on disk: ``vibration.json``, ``offsets.csv`` and ``restoration.json``."""
 
 import csv
 import json
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from rsvib_torch.config import TimingSection, VibrationSection
-from rsvib_torch.detection import DetectionResult
+from rsvib_torch.detection import DetectionResult, VibrationStd
+from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.stacks import whole_file
 from rsvib_torch.validation import Section, validate
 from rsvib_torch.vibration import Vibration
 
-__all__ = ["DetectedVibration", "read_vibration", "reliable_part", "write_offsets", "write_vibration"]
+__all__ = ["DetectedVibration", "read_vibration", "write_offsets", "write_restoration", "write_vibration"]
 
 _FORMAT = "rsvib vibration"
 _UNITS = {
@@ -27,6 +30,7 @@ _UNITS = {
     "period": "s",
     "phase": "rad at the first row of frame 0",
     "image_motion": "px/s",
+    "image_acceleration": "px/s^2",
     "residual": "px",
     "gain": "px of offset per px of displacement",
 }
@@ -48,12 +52,31 @@ class _WholeVibration(VibrationSection):
     image_motion: list[float]
 
 
+def _unknown() -> _Numbers:
+    return [None, None]
+
+
 class _StdSection(Section):
     amplitude: list[_Numbers]
     frequency: list[_Numbers]
     period: list[_Numbers]
     phase: list[_Numbers]
     image_motion: _Numbers
+    image_acceleration: _Numbers = Field(default_factory=_unknown)
+
+    def std(self) -> VibrationStd:
+        """The standard deviations, infinite where not known."""
+        return VibrationStd(**{name: _known(getattr(self, name)) for name in VibrationStd.__dataclass_fields__})
+
+
+def _known(values: list[_Numbers] | _Numbers) -> Tensor:
+    return torch.tensor(
+        [
+            [math.inf if n is None else n for n in row] if isinstance(row, list) else math.inf if row is None else row
+            for row in values
+        ],
+        dtype=torch.float64,
+    )
 
 
 class _VibrationFile(Section):
@@ -78,12 +101,14 @@ class DetectedVibration:
 
     Attributes:
         vibration: The vibration in image axes.
+        std: Standard deviations of its parameters, infinite where not known.
         timing: The sensor it was detected with.
         reliable: Verdict for each axis (x, y).
         reasons: Why not, for each axis.
     """
 
     vibration: Vibration
+    std: VibrationStd
     timing: SensorTiming
     reliable: tuple[bool, bool]
     reasons: tuple[tuple[str, ...], tuple[str, ...]]
@@ -125,6 +150,11 @@ def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timin
         "reasons": [list(axis) for axis in result.reasons],
         "units": _UNITS,
     }
+    _write_json(path, content)
+
+
+def _write_json(path: str | os.PathLike[str], content: dict[str, Any]) -> None:
+    """Write a table with one line a key."""
     with whole_file(path) as part:
         lines = (f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
         part.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
@@ -169,7 +199,11 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming) -> Detect
         raise ValueError(f"{path}: the vibration of another camera: detected with {names}")
     x, y = (tuple(axis) for axis in content.reasons)
     return DetectedVibration(
-        content.vibration.vibration(), content.timing.timing(), (content.reliable[0], content.reliable[1]), (x, y)
+        content.vibration.vibration(),
+        content.std.std(),
+        content.timing.timing(),
+        (content.reliable[0], content.reliable[1]),
+        (x, y),
     )
 
 
@@ -179,23 +213,6 @@ def _same(theirs: Any, ours: Any) -> bool:
     if isinstance(theirs, float) and isinstance(ours, float):
         return math.isclose(theirs, ours, rel_tol=1e-9)
     return bool(theirs == ours)
-
-
-def reliable_part(vibration: Vibration, reliable: Tensor | tuple[bool, bool]) -> Vibration:
-    """The vibration with an axis that is not reliable taken as standing still.
-
-    Args:
-        vibration: One vibration (not a batch).
-        reliable: Verdict for each axis (x, y).
-
-    Example:
-        >>> reliable_part(Vibration([3.0, 2.0], [50.0, 30.0]), (True, False)).amplitude.flatten().tolist()
-        [3.0, 0.0]
-    """
-    keep = torch.as_tensor(reliable, dtype=torch.float64, device=vibration.device)
-    return Vibration(
-        vibration.amplitude * keep[:, None], vibration.frequency, vibration.phase, vibration.image_motion * keep
-    )
 
 
 def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None:
@@ -226,3 +243,40 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(zip(*values, strict=True))  # None is written as an empty cell
+
+
+def write_restoration(
+    path: str | os.PathLike[str],
+    verdict: RestorationVerdict | None,
+    *,
+    restored: bool,
+    options: dict[str, Any],
+    left_alone: Sequence[str],
+) -> None:
+    """Write what was restored, how, and whether it helped, as JSON.
+
+    Args:
+        path: The file to write.
+        verdict: What pairs of frames say; None where they could not be compared.
+        restored: Whether restored frames were written, or the raw ones as they are.
+        options: Options of ``restore``.
+        left_alone: A sentence for each axis whose vibration was not undone.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    content: dict[str, Any] = {
+        "format": "rsvib restoration",
+        "version": 1,
+        "frames": "restored" if restored else "as taken",
+        "options": options,
+        "left_alone": list(left_alone),
+        "outcome": None if verdict is None else verdict.overall,
+        "summary": None if verdict is None else verdict.summary,
+    }
+    if verdict is not None:
+        content["pairs"] = {
+            name: _plain(value) for name, value in vars(verdict).items() if isinstance(value, Tensor)
+        } | {"outcome": list(verdict.outcome), "reasons": list(verdict.reasons)}
+        content["units"] = {"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"}
+    _write_json(path, content)

@@ -21,6 +21,7 @@ FLOORS = (
     {"validation"},
     {"config", "pictures", "terminal"},
     {"report"},
+    {"workflow"},
     {"cli"},
 )
 

@@ -14,7 +14,8 @@ from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.result import VibrationStd
 from rsvib_torch.pictures import comparison_figure, detailed_places, offset_figure, save_figure
 from rsvib_torch.registration import OffsetCurve
-from rsvib_torch.report import read_vibration, reliable_part, write_offsets, write_vibration
+from rsvib_torch.report import read_vibration, write_offsets, write_restoration, write_vibration
+from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.terminal import show_result
 from rsvib_torch.vibration import Vibration
@@ -28,7 +29,11 @@ def draw_result() -> DetectionResult:
     vibration = Vibration(
         [[2.0, 0.5], [1.0, 0.0]], [[60.0, 145.0], [130.0, 0.0]], [[0.3, 2.0], [-1.0, 0.0]], [20.0, 0.0]
     )
-    std = VibrationStd(*(0.01 * torch.ones_like(vibration.amplitude) for _ in range(4)), 0.1 * torch.ones(2).double(), torch.zeros(2).double())
+    std = VibrationStd(
+        *(0.01 * torch.ones_like(vibration.amplitude) for _ in range(4)),
+        0.1 * torch.ones(2).double(),
+        torch.zeros(2).double(),
+    )
     std.period[1, 1] = math.inf
     rows = torch.arange(16, 480, 16).double()
     times = torch.arange(2)[:, None] * TIMING.frame_period + rows * TIMING.row_time
@@ -134,13 +139,34 @@ def test_files_that_are_no_vibration(tmp_path, text):
         read_vibration(tmp_path / "vibration.json", TIMING)
 
 
-def test_only_reliable_axes_are_kept(result):
-    kept = reliable_part(result.vibration, result.reliable)
-    assert kept.amplitude.tolist() == [[2.0, 0.5], [0.0, 0.0]]
-    assert kept.image_motion.tolist() == [20.0, 0.0]
-    other = reliable_part(result.vibration, (False, True))
-    assert other.amplitude.tolist() == [[0.0, 0.0], [1.0, 0.0]]
-    assert other.image_motion.tolist() == [0.0, 0.0]
+def test_standard_deviations_come_back(tmp_path, result):
+    write_vibration(tmp_path / "vibration.json", result, TIMING)
+    back = read_vibration(tmp_path / "vibration.json", TIMING)
+    for name in ("amplitude", "frequency", "period", "phase", "image_motion", "image_acceleration"):
+        torch.testing.assert_close(getattr(back.std, name), getattr(result.std, name), rtol=0, atol=0)
+    assert back.std.period[1, 1] == math.inf
+    vibration, notes = trusted_vibration(back, TIMING, 3, 512)
+    assert vibration.amplitude.tolist() == [[2.0, 0.5], [0.0, 0.0]]
+    assert notes == ("y is left alone: its vibration is not reliable (only one period is seen)",)
+
+
+def test_what_was_restored_is_plain_json(tmp_path):
+    pair = torch.tensor([[0.1, math.nan]], dtype=torch.float64)
+    one = torch.tensor([math.nan], dtype=torch.float64)
+    verdict = RestorationVerdict(one, one, pair, pair, pair, one, one, one, ("worse",), ("x: frames lie apart",))
+    options = {"method": "exact", "joint": True}
+    path = tmp_path / "restoration.json"
+    write_restoration(path, verdict, restored=False, options=options, left_alone=("y is left alone",))
+    data = json.loads(path.read_text())
+    assert data["frames"] == "as taken"
+    assert data["options"] == options
+    assert data["left_alone"] == ["y is left alone"]
+    assert data["outcome"] == "worse"
+    assert data["summary"] == "restored is no better than raw: x: frames lie apart"
+    assert data["pairs"]["misfit_before"] == [[0.1, None]]
+    assert data["pairs"]["reasons"] == ["x: frames lie apart"]
+    write_restoration(path, None, restored=True, options={}, left_alone=())
+    assert json.loads(path.read_text())["outcome"] is None
 
 
 def test_offsets_are_written_one_line_a_band(tmp_path, result):

@@ -179,6 +179,7 @@ def judge_restoration(
     joint: bool | int = False,
     full_scale: float | None = None,
     ignore: Tensor | None = None,
+    most_pairs: int | None = None,
 ) -> RestorationVerdict:
     """Judge without truth whether restored frames are better than raw ones.
 
@@ -196,6 +197,7 @@ def judge_restoration(
         joint: What ``restore`` was told.
         full_scale: As in ``restore``.
         ignore: As in ``restore``; local means take the place of what is ignored, and of NaN.
+        most_pairs: Compare no more pairs than these, evenly spread over the stack; None for all.
 
     Returns:
         Verdict on each pair of neighbouring frames; on each frame with the middle one where there is one image.
@@ -218,5 +220,5 @@ def judge_restoration(
     )
     rowwise = as_batch(vibration_to_row_order(vibration, timing).to(raw.device), 1)
     motion = frame_motion(rowwise, timing.in_row_order(), count, raw.shape[-2])
-    verdict = judge_frames(raw, restored, motion, pairs_to_judge(count, joint), shared=shared)
+    verdict = judge_frames(raw, restored, motion, pairs_to_judge(count, joint, most_pairs), shared=shared)
     return verdict.in_image_axes(timing)

@@ -28,19 +28,31 @@ from rsvib_torch.restoration.verdict import RestorationWarning, TooLittleInCommo
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
-__all__ = ["METHODS", "VibrationRestorer", "restore"]
+__all__ = ["MASKS", "METHODS", "VibrationRestorer", "method_options", "restore"]
 
+MASKS = ("ignore", "clipped")  # what a method is told of pixels; no options of the user's
 _JUDGED_PAIRS, _JUDGED_COLUMNS = 2, 160  # of every stack
 
 METHODS: dict[str, Callable[..., Tensor]] = {"exact": restore_exact, "banded": restore_banded, "dewarp": restore_dewarp}
 
 
+def method_options(method: str) -> tuple[str, ...]:
+    """Options of a restoration method.
+
+    Raises:
+        ValueError: If there is no such method.
+
+    Example:
+        >>> method_options("dewarp")
+        ('chunk_rows',)
+    """
+    check_choice("method", method, tuple(METHODS))
+    parameters = inspect.signature(METHODS[method]).parameters.values()
+    return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in MASKS)
+
+
 def _check_options(method: str, options: dict[str, Any]) -> None:
-    known = [
-        name
-        for name, parameter in inspect.signature(METHODS[method]).parameters.items()
-        if parameter.kind is inspect.Parameter.KEYWORD_ONLY and name not in ("ignore", "clipped")
-    ]
+    known = method_options(method)
     for name in options:
         if name not in known:
             raise TypeError(f"method={method!r} has no option {name!r}; its options are {', '.join(known)}")

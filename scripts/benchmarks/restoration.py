@@ -78,9 +78,11 @@ def scenes(options: argparse.Namespace) -> dict[str, Tensor]:
     return found
 
 
-def quality(restored: Tensor, still: Tensor) -> float:
+def quality(figure: Peer, still: Tensor) -> float:
     """PSNR in dB without the rim."""
-    return float(rsv.psnr(restored, still, 1.0, rim=RIM).mean())
+    rows = list(range(RIM, len(still) - RIM)) if figure.rows is None else figure.rows
+    restored = figure.restored[RIM:-RIM] if figure.rows is None else figure.restored
+    return float(rsv.psnr(restored[:, RIM:-RIM], still[rows, RIM:-RIM], 1.0))
 
 
 def methods(
@@ -120,7 +122,7 @@ def compare(name: str, scene: Tensor, exposure: int, options: argparse.Namespace
         for method, figure in figures.items():
             row = {"scene": name, "exposure_rows": exposure, "method": method, "psnr_db": {}, "seconds": {}, "told": {}}
             row = results.setdefault(method, row)
-            row["psnr_db"][str(noise)] = quality(figure.restored, still[figure.rows] if figure.rows else still)
+            row["psnr_db"][str(noise)] = quality(figure, still)
             row["seconds"][str(noise)] = figure.seconds
             row["told"][str(noise)] = figure.told
     return list(results.values())

@@ -1,0 +1,196 @@
+"""What the commands do with a stack: read it, detect, restore and judge, write."""
+
+import inspect
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.checks import check_number
+from rsvib_torch.config import Config
+from rsvib_torch.detection import DetectionResult, detect_vibration
+from rsvib_torch.pictures import offset_figure, save_figure
+from rsvib_torch.report import write_offsets, write_restoration, write_vibration
+from rsvib_torch.restoration import (
+    RestorationVerdict,
+    TooLittleInCommonError,
+    judge_restoration,
+    restore,
+    trusted_vibration,
+)
+from rsvib_torch.restoration.restore import method_options
+from rsvib_torch.restoration.trust import Detected
+from rsvib_torch.stacks import StackInfo, read_stack, read_stack_info, write_stack
+from rsvib_torch.terminal import error_line, say, working
+
+__all__ = [
+    "DeviceName",
+    "Restored",
+    "Stack",
+    "Wishes",
+    "chosen_device",
+    "detect_frames",
+    "load",
+    "restore_and_judge",
+    "save",
+    "write_detection",
+]
+
+DeviceName = Literal["auto", "cpu", "cuda"]
+_DEFAULT_METHOD = inspect.signature(restore).parameters["method"].default
+_JUDGED_PAIRS = 8  # of a stack, evenly spread
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Frames in memory and how their file keeps them."""
+
+    frames: Tensor
+    info: StackInfo
+    full_scale: float | None
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What the command line says about restoration; None leaves it to the config."""
+
+    method: str | None
+    joint: str | None
+    prior: str | None
+    saturation: float | None
+    force: bool
+
+
+@dataclass(frozen=True)
+class Restored:
+    """Frames to write, and what is known of them."""
+
+    frames: Tensor
+    restored: bool
+    options: dict[str, Any]
+    left_alone: tuple[str, ...]
+    verdict: RestorationVerdict | None
+
+    def write_report(self, path: Path) -> None:
+        """Write what was restored, how, and whether it helped."""
+        write_restoration(path, self.verdict, restored=self.restored, options=self.options, left_alone=self.left_alone)
+
+
+def chosen_device(name: DeviceName) -> torch.device:
+    """The device of that name; ``auto`` takes a GPU if there is one."""
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: there is no CUDA device here; use auto or cpu")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def _full_scale(path: Path, info: StackInfo, config: Config, option: float | None) -> float | None:
+    """Full scale of a stack: the option first, then what the file says or 8 bits mean, then the config."""
+    if option is not None or not info.is_integer:
+        return option
+    if info.full_scale is None:
+        return config.full_scale
+    if info.dtype != "uint8" and config.full_scale not in (None, info.full_scale):
+        raise ValueError(
+            f"{path} states full_scale={info.full_scale:g}, the config {config.full_scale:g}; say which: --full-scale"
+        )
+    return info.full_scale
+
+
+def load(path: Path, config: Config, option: float | None, device: torch.device) -> Stack:
+    """Read a stack; ``option`` is the full scale of the command line."""
+    info = read_stack_info(path)
+    scale = _full_scale(path, info, config, option)
+    with working(f"reading {path}"):
+        frames = read_stack(path, full_scale=scale)
+    # A video only estimates its length beforehand.
+    info = StackInfo(tuple(frames.shape), info.dtype, info.full_scale)
+    return Stack(frames.to(device), info, scale)
+
+
+def save(path: Path, frames: Tensor, stack: Stack) -> None:
+    """Write frames in the type and full scale of the stack they come from."""
+    with working(f"writing {path.name}"):
+        write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale)
+
+
+def detect_frames(stack: Stack, config: Config) -> DetectionResult:
+    """Detect the vibration as the config says."""
+    with working("detecting the vibration"):
+        return detect_vibration(stack.frames, config.timing, **config.detection)
+
+
+def _frames_together(text: str | None) -> bool | int | None:
+    """What ``--joint`` says: all frames, or how many neighbours."""
+    if text is None or text == "all":
+        return None if text is None else True
+    if not text.isdecimal() or int(text) < 1:
+        raise ValueError(f"--joint must be 'all' or a number of frames, got {text!r}")
+    return int(text)
+
+
+def _restoration_options(stack: Stack, config: Config, wishes: Wishes) -> dict[str, Any]:
+    """Options of ``restore``: the config's, and those of the command line before them."""
+    options = dict(config.restoration)
+    if wishes.method is not None and wishes.method != options.get("method", _DEFAULT_METHOD):
+        known = ("saturation", *method_options(wishes.method))  # the others were meant for the config's method
+        options = {name: value for name, value in options.items() if name in known}
+    given = {
+        "method": wishes.method,
+        "joint": _frames_together(wishes.joint),
+        "prior": wishes.prior,
+        "saturation": wishes.saturation,
+    }
+    options |= {name: value for name, value in given.items() if value is not None}
+    counts = stack.info.is_integer and stack.full_scale is not None
+    if options.get("saturation") is not None:
+        level = check_number("saturation", options["saturation"], above=0.0)
+        options["saturation"] = level / stack.full_scale if counts and stack.full_scale else level
+    elif counts:
+        options["saturation"] = 1.0
+    return options
+
+
+def restore_and_judge(stack: Stack, config: Config, detected: Detected, wishes: Wishes) -> Restored:
+    """Restore frames and judge the result; an axis that is not known well enough is left alone."""
+    options = _restoration_options(stack, config, wishes)
+    rows = stack.frames.shape[-1 if config.timing.scan_axis == -1 else -2]
+    vibration, left_alone = trusted_vibration(detected, config.timing, len(stack.frames), rows)
+    for note in left_alone:
+        say(note)
+    if not bool((vibration.amplitude > 0).any() | (vibration.image_motion != 0).any()):
+        error_line("there is no vibration to undo: frames are left as they are", "warning")
+        return Restored(stack.frames, False, options, left_alone, None)
+    with working("restoring the frames"):
+        clear = restore(stack.frames, config.timing, vibration, check=False, **options)
+    verdict = None
+    with working("judging the result"), suppress(TooLittleInCommonError):
+        if len(stack.frames) > 1:
+            verdict = judge_restoration(
+                stack.frames,
+                clear,
+                config.timing,
+                vibration,
+                joint=options.get("joint", False),
+                most_pairs=_JUDGED_PAIRS,
+            )
+    if verdict is None:
+        say("whether restoration helps cannot be told: no two frames show the same scene")
+        return Restored(clear, True, options, left_alone, None)
+    keep = verdict.overall != "worse" or wishes.force
+    if verdict.overall in ("partly", "worse"):
+        rest = "" if keep else "; frames are left as they are, --force restores them all the same"
+        error_line(verdict.summary + rest, "warning")
+    else:
+        say(verdict.summary)
+    return Restored(clear if keep else stack.frames, keep, options, left_alone, verdict)
+
+
+def write_detection(folder: Path, result: DetectionResult, config: Config) -> None:
+    """Write what was detected into a folder."""
+    with working("drawing the offset curve"):
+        write_vibration(folder / "vibration.json", result, config.timing)
+        write_offsets(folder / "offsets.csv", result)
+        save_figure(offset_figure(result), folder / "offsets.png")
