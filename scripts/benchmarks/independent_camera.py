@@ -1,8 +1,8 @@
 """Frames of a vibrating rolling-shutter camera, made without the package: NumPy, float64.
 
 The scene is a periodic, band-limited function. It is interpolated densely by Fourier transforms along both axes: a
-phase ramp along rows, and across rows zero padding to eight times as many, between which a polynomial of eight points is
-exact to 1e-6. An exposure is the mean over many moments.
+phase ramp along rows, and across rows zero padding to eight times as many, between which a polynomial of eight points
+is exact to 1e-6. An exposure is the mean over many moments.
 """
 
 from dataclasses import dataclass

@@ -1,0 +1,351 @@
+"""Detection held against the Cramér-Rao bound, and against goals on cases that it was not tuned on.
+
+Frames come from benchmarks/independent_camera.py, which shares no code with the package. Monte Carlo: pairs of many
+noise seeds, phases and scenes; errors over the bound for an unknown scene, and how often the 95 % intervals hold the
+truth. Cases: largest and root-mean-square error in per cent and π.
+
+On its own: cd scripts && python -m benchmarks.detection --out ../out/detection [--quick] [--cases]
+"""
+
+import argparse
+import itertools
+import json
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from benchmarks import detection_report
+from benchmarks.independent_camera import Array, Shake, closed, take_frames
+from benchmarks.measure import machine
+
+import rsvib_torch as rsv
+from rsvib_torch.evaluation import city_and_fields, cramer_rao_bound
+
+NOISES = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05)
+SEED = 11
+RIM = 24  # px over which a scene fades at its borders
+ROW_TIME, EXPOSURE_ROWS, FRAME_ROWS = 20.52e-6, 20.0, 2048  # of the camera; lower frames get slower rows
+NEAR = 0.05  # of the frequency: a tone found further off is not the one looked for
+NAMES = ("amplitude", "frequency", "phase")
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A vibration whose phases are drawn, one list of tones for each axis (x, y)."""
+
+    name: str
+    amplitude: tuple[tuple[float, ...], tuple[float, ...]]
+    frequency: tuple[tuple[float, ...], tuple[float, ...]]
+    image_motion: tuple[float, float] = (0.0, 0.0)
+
+    def shake(self, generator: np.random.Generator) -> Shake:
+        """The motion with random phases; an image motion goes either way along its axis."""
+        phase = generator.uniform(-math.pi, math.pi, np.shape(self.amplitude))
+        motion = np.array(self.image_motion) * generator.choice([-1.0, 1.0])
+        return Shake(np.array(self.amplitude), np.array(self.frequency), phase, motion)
+
+
+PAPER = Motion("3.1 px 50 Hz, 5.2 px 30 Hz", ((3.1,), (5.2,)), ((50.0,), (30.0,)))
+SMALL = Motion("0.2 px and 0.13 px 155 Hz", ((0.2,), (0.13,)), ((155.0,), (155.0,)))
+TWO_TONES = Motion("two tones an axis", ((1.5, 0.5), (1.1, 0.4)), ((41.0, 133.0), (67.0, 180.0)))
+
+
+@dataclass(frozen=True)
+class Case:
+    """A motion, its noise, and the largest errors allowed: period and amplitude in %, phase in π."""
+
+    motion: Motion
+    noise: float
+    goal: tuple[float, float, float]
+    num_frames: int = 2
+
+
+CASES = (
+    Case(PAPER, 0.005, (0.01, 0.15, 0.001)),
+    Case(PAPER, 0.02, (0.03, 0.6, 0.003)),
+    Case(SMALL, 0.005, (0.1, 1.0, 0.01)),
+    Case(
+        Motion("500 px/s along x, 1.2 px 83 Hz, 0.8 px 110 Hz", ((1.2,), (0.8,)), ((83.0,), (110.0,)), (500.0, 0.0)),
+        0.005,
+        (0.03, 0.2, 0.002),
+    ),
+    Case(
+        Motion("500 px/s along y, 1.2 px 83 Hz, 0.8 px 110 Hz", ((1.2,), (0.8,)), ((83.0,), (110.0,)), (0.0, 500.0)),
+        0.005,
+        (0.03, 0.2, 0.002),
+    ),
+    Case(TWO_TONES, 0.005, (0.02, 0.3, 0.002), 4),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """Frames without noise, and what is true of them."""
+
+    frames: Array
+    scene: Array
+    shake: Shake
+    timing: rsv.SensorTiming
+
+    @property
+    def truth(self) -> rsv.Vibration:
+        """The motion as the package has it."""
+        values = (self.shake.amplitude, self.shake.frequency, self.shake.phase, self.shake.image_motion)
+        return rsv.Vibration(*(torch.from_numpy(value) for value in values))
+
+    def bound(self, method: str, noise: float) -> dict[str, Array]:
+        """Bound of each parameter (2, K) for a noise."""
+        found = cramer_rao_bound(
+            torch.from_numpy(self.scene),
+            self.timing,
+            self.truth,
+            len(self.frames),
+            noise=noise,
+            frame_size=self.frames.shape[-2:],
+            method=method,
+        )
+        return {name: getattr(found, name).numpy() for name in NAMES}
+
+
+def camera(num_rows: int) -> rsv.SensorTiming:
+    """The camera with fewer and slower rows, so that frame period and exposure stay what they are."""
+    slower = FRAME_ROWS / num_rows
+    return rsv.SensorTiming(row_time=ROW_TIME * slower, exposure_rows=EXPOSURE_ROWS / slower, frame_rows=num_rows)
+
+
+def scene_of(source: int | Path, height: int, width: int) -> Array:
+    """A drawn scene of a seed, or the middle of an image file scaled to 0 ... 1 by its percentiles."""
+    if isinstance(source, int):
+        return city_and_fields(height, width, source).double().numpy()
+    image = rsv.read_stack(source, full_scale=1.0)
+    image = image.double().reshape(-1, *image.shape[-2:]).mean(0).numpy()
+    low, high = np.percentile(image, (0.5, 99.5))
+    image = np.clip((image - low) / (high - low), 0.0, 1.0)
+    missing = np.maximum(0, np.array((height, width)) - image.shape)
+    image = np.pad(image, [(0, missing[0]), (0, missing[1])], mode="reflect")
+    top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
+    return image[top : top + height, left : left + width]
+
+
+def take(motion: Motion, source: int | Path, size: tuple[int, int], num_frames: int, seed: int) -> Take:
+    """Frames of a motion with phases drawn from a seed."""
+    shake = motion.shake(np.random.default_rng(seed))
+    timing = camera(size[0])
+    reach = np.ceil(shake.reach((num_frames + 1) * timing.frame_period)).astype(int) + RIM + 8
+    scene = closed(scene_of(source, size[0] + 2 * int(reach[1]), size[1] + 2 * int(reach[0])), RIM)
+    frames = take_frames(
+        scene,
+        shake,
+        row_time=timing.row_time,
+        exposure_rows=timing.exposure_rows,
+        frame_rows=timing.frame_rows,
+        num_frames=num_frames,
+        size=size,
+    )
+    return Take(frames, scene, shake, timing)
+
+
+def errors_of(found: rsv.DetectionResult, shake: Shake) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Errors and their stated standard deviations of each true tone (2, K); NaN where it was not found."""
+    errors = {name: np.full(shake.amplitude.shape, np.nan) for name in NAMES}
+    stated = {name: np.full(shake.amplitude.shape, np.nan) for name in NAMES}
+    vibration, std = found.vibration, found.std
+    for axis, tone in np.ndindex(shake.amplitude.shape):
+        if shake.amplitude[axis, tone] == 0:
+            continue
+        present = vibration.amplitude[axis] > 0
+        miss = torch.where(present, (vibration.frequency[axis] - shake.frequency[axis, tone]).abs(), math.inf)
+        best = int(miss.argmin())
+        if float(miss[best]) > NEAR * shake.frequency[axis, tone]:
+            continue
+        for name in NAMES:
+            error = float(getattr(vibration, name)[axis, best]) - getattr(shake, name)[axis, tone]
+            errors[name][axis, tone] = math.remainder(error, 2 * math.pi) if name == "phase" else error
+            stated[name][axis, tone] = float(getattr(std, name)[axis, best])
+    return errors, stated
+
+
+def trial(taken: Take, noise: float, seed: int, method: str) -> dict[str, Any]:
+    """Detect in noisy frames: errors, and what they are in units of the stated standard deviation."""
+    generator = np.random.default_rng(seed)
+    frames = torch.from_numpy(taken.frames + noise * generator.standard_normal(taken.frames.shape)).float()
+    begin = time.perf_counter()
+    found = rsv.detect_vibration(frames, taken.timing, method=method)
+    seconds = time.perf_counter() - begin
+    errors, stated = errors_of(found, taken.shake)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        over_stated = {name: errors[name] / stated[name] for name in NAMES}
+        percent = {
+            "period": 100 * (taken.shake.frequency / (taken.shake.frequency + errors["frequency"]) - 1),
+            "amplitude": 100 * errors["amplitude"] / taken.shake.amplitude,
+            "phase": errors["phase"] / math.pi,
+        }
+    extra = int((found.vibration.amplitude > 0).sum()) - int((taken.shake.amplitude > 0).sum())
+    return {
+        "seconds": seconds,
+        "errors": errors,
+        "over_stated": over_stated,
+        "percent": percent,
+        "extra": extra,
+        "reliable": found.reliable.numpy(),
+    }
+
+
+def monte_carlo(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Errors over the bound, for every motion and noise and pooled over scenes, phases and seeds."""
+    size = tuple(options.detection_size)
+    sources = [SEED + i for i in range(options.detection_scenes)] + list(options.detection_images)
+    results = []
+    for motion in (PAPER, SMALL) if sources else ():
+        trials: dict[float, list[dict[str, Any]]] = {noise: [] for noise in options.detection_noises}
+        for (i, source), phase in itertools.product(enumerate(sources), range(options.detection_phases)):
+            taken = take(motion, source, size, 2, seed=1000 * i + phase)
+            # the bound for an unknown scene is proportional to the noise
+            unit = taken.bound("projection", 1.0)
+            for noise in options.detection_noises:
+                random = taken.bound("random", noise)
+                for repeat in range(options.detection_repeats):
+                    done = trial(taken, noise, hash_seed(i, phase, repeat, noise), options.detection_method)
+                    done["bound"] = {name: noise * unit[name] for name in NAMES}
+                    done["random"] = random
+                    done["truth"] = taken.shake
+                    trials[noise].append(done)
+        results += [
+            {"part": "monte carlo", "motion": motion.name, "noise": noise, "size": size, **pooled(done)}
+            for noise, done in trials.items()
+        ]
+    return results
+
+
+def hash_seed(*values: float) -> list[int]:
+    """A seed of its own for every trial."""
+    return [int(1e6 * value) for value in values]
+
+
+def _rms(values: Array) -> float:
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
+
+
+def pooled(trials: list[dict[str, Any]]) -> dict[str, Any]:
+    """Figures of many trials of one motion and noise, lists of (x, y) where they are for each axis."""
+    result: dict[str, Any] = {"trials": len(trials), "seconds": float(np.median([t["seconds"] for t in trials]))}
+    for name in NAMES:
+        ratio = np.array([t["errors"][name] / t["bound"][name] for t in trials])
+        stated = np.array([t["over_stated"][name] for t in trials])
+        random = np.array([t["random"][name] / t["bound"][name] for t in trials])
+        result[name] = {
+            "over_bound": [_rms(ratio[:, axis]) for axis in range(2)],
+            "over_stated": [_rms(stated[:, axis]) for axis in range(2)],
+            "random_over_bound": [_rms(random[:, axis]) for axis in range(2)],
+            "rms": [_rms(np.array([t["errors"][name][axis] for t in trials])) for axis in range(2)],
+            "bound": [_rms(np.array([t["bound"][name][axis] for t in trials])) for axis in range(2)],
+            "random": [_rms(np.array([t["random"][name][axis] for t in trials])) for axis in range(2)],
+        }
+    everything = np.array([[t["errors"][name] / t["bound"][name] for name in NAMES] for t in trials])
+    stated = np.array([[t["over_stated"][name] for name in NAMES] for t in trials])
+    known = np.isfinite(stated)
+    covered = float((np.abs(stated[known]) <= 1.96).mean()) if known.any() else math.nan
+    independent = max(known.sum() / len(NAMES), 1.0)  # the parameters of a tone err together
+    result["over_bound"] = _rms(everything)
+    result["coverage"] = covered
+    result["coverage_std"] = math.sqrt(max(covered * (1 - covered), 0.25 / independent) / independent)
+    result["lost"] = float(1 - known.mean())
+    result["extra_tones"] = float(np.mean([t["extra"] for t in trials]))
+    result["reliable"] = float(np.mean([t["reliable"] for t in trials]))
+    for name in ("period", "amplitude", "phase"):
+        values = np.array([t["percent"][name] for t in trials])
+        result[f"{name}_error"] = {
+            "rms": [_rms(values[:, axis]) for axis in range(2)],
+            "largest": float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else math.nan,
+            "all_rms": _rms(values),
+        }
+    return result
+
+
+def held_out_cases(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Largest and root-mean-square errors of the cases, over scenes and phases."""
+    size = tuple(options.case_size)
+    results = []
+    for number, case in enumerate(CASES):
+        done = []
+        for scene, phase in itertools.product(range(options.case_scenes), range(options.case_phases)):
+            taken = take(case.motion, SEED + 100 + scene, size, case.num_frames, seed=7000 + 100 * number + phase)
+            bound = taken.bound("gradients", case.noise)
+            result = trial(taken, case.noise, hash_seed(number, scene, phase), options.detection_method)
+            done.append({**result, "bound": bound, "random": bound})
+        results.append(
+            {
+                "part": "case",
+                "motion": case.motion.name,
+                "noise": case.noise,
+                "num_frames": case.num_frames,
+                "size": size,
+                "goal": case.goal,
+                **pooled(done),
+            }
+        )
+    return results
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this part."""
+    group = parser.add_argument_group("detection")
+    group.add_argument("--quick", action="store_true", help="few trials of small frames, few cases")
+    group.add_argument("--detection-method", default="direct", help="method of detect_vibration (default: direct)")
+    group.add_argument("--detection-size", type=int, nargs=2, default=(1024, 512), help="rows, columns of the trials")
+    group.add_argument("--detection-noises", type=float, nargs="+", default=NOISES, help="noise levels of full scale")
+    group.add_argument("--detection-scenes", type=int, default=2, help="drawn scenes (default: 2)")
+    group.add_argument("--detection-phases", type=int, default=4, help="draws of the phases (default: 4)")
+    group.add_argument("--detection-repeats", type=int, default=4, help="draws of the noise (default: 4)")
+    group.add_argument("--detection-images", type=Path, nargs="*", default=[], help="image files as further scenes")
+    group.add_argument("--cases", action="store_true", help="the held-out cases as well")
+    group.add_argument("--case-size", type=int, nargs=2, default=(2048, 1024), help="rows, columns of the cases")
+    group.add_argument("--case-scenes", type=int, default=2, help="scenes of each case (default: 2)")
+    group.add_argument("--case-phases", type=int, default=3, help="draws of the phases of each case (default: 3)")
+
+
+def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Monte Carlo, then the cases if they are asked for."""
+    if options.quick:
+        options = argparse.Namespace(**vars(options) | quick_options())
+    return monte_carlo(options) + (held_out_cases(options) if options.cases else [])
+
+
+def quick_options() -> dict[str, Any]:
+    """What ``--quick`` stands for."""
+    return {
+        "detection_noises": (0.002, 0.01, 0.05),
+        "detection_scenes": 1,
+        "detection_phases": 2,
+        "detection_repeats": 2,
+        "detection_images": [],
+        "case_scenes": 1,
+        "case_phases": 1,
+    }
+
+
+lines = detection_report.lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("out/detection"), help="folder for .md, .json and .png")
+    add_options(parser)
+    options = parser.parse_args()
+    results = rows(options)
+    options.out.mkdir(parents=True, exist_ok=True)
+    text = "\n".join(lines(results, options)) + "\n"
+    summary = {"machine": machine(), "detection": results}
+    (options.out / "detection.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    (options.out / "detection.md").write_text(text, encoding="utf-8")
+    detection_report.draw(results, options.out)
+    print(text, end="")
+
+
+if __name__ == "__main__":
+    main()
