@@ -4,7 +4,16 @@ from rsvib_torch.detection import DetectionResult, VibrationDetector, VibrationS
 from rsvib_torch.evaluation import offset_endpoint_error, psnr, ssim
 from rsvib_torch.imaging import RowVaryingBlur, SensorNoise, row_psf, simulate_frames
 from rsvib_torch.registration import OffsetCurve, register_bands
-from rsvib_torch.restoration import VibrationRestorer, restore
+from rsvib_torch.restoration import (
+    RestorationVerdict,
+    RestorationWarning,
+    VibrationRestorer,
+    judge_restoration,
+    predict_noise_gain,
+    restore,
+    trusted_vibration,
+    visible_pixels,
+)
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.stacks import StackInfo, read_stack, read_stack_info, write_stack
 from rsvib_torch.vibration import Vibration, blind_frequencies
@@ -12,6 +21,8 @@ from rsvib_torch.vibration import Vibration, blind_frequencies
 __all__ = [
     "DetectionResult",
     "OffsetCurve",
+    "RestorationVerdict",
+    "RestorationWarning",
     "RowVaryingBlur",
     "SensorNoise",
     "SensorTiming",
@@ -22,7 +33,9 @@ __all__ = [
     "VibrationStd",
     "blind_frequencies",
     "detect_vibration",
+    "judge_restoration",
     "offset_endpoint_error",
+    "predict_noise_gain",
     "psnr",
     "read_stack",
     "read_stack_info",
@@ -31,6 +44,8 @@ __all__ = [
     "row_psf",
     "simulate_frames",
     "ssim",
+    "trusted_vibration",
+    "visible_pixels",
     "write_stack",
 ]
 __version__ = "0.1.0"

@@ -71,8 +71,6 @@ def _without_lost_pixels(
     known = inspect.signature(METHODS[method]).parameters
     if clipped is not None and "clipped" in known:
         options = {**options, "clipped": clipped}
-    elif clipped is not None and "ignore" in known:
-        hidden = clipped if hidden is None else hidden | clipped
     if hidden is None:
         return images, options
     if "ignore" in known:
@@ -104,9 +102,10 @@ def restore(
     of that motion at the middle of the frame (``visible_pixels`` tells them); what a frame never exposed, a rim as
     wide as the displacement, is continued by mirroring (``visible_pixels`` tells which pixels those are).
 
-    Pixels without data (NaN, or ``ignore``) and saturated pixels do not count. Method ``"exact"`` finds what they
-    would have shown from all others, jointly from all frames where it is told to; ``"banded"`` and ``"dewarp"`` put
-    local means in place of pixels without data, and leave saturated pixels at their level.
+    Pixels without data (NaN, or ``ignore``) do not count, and saturated ones say only that they are no darker than
+    their level. Method ``"exact"`` finds what they would have shown from all others, jointly from all frames where it
+    is told to; ``"banded"`` and ``"dewarp"`` put local means in place of pixels without data, and take saturated
+    pixels at their level.
 
     Args:
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation.

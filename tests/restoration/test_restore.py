@@ -1,0 +1,289 @@
+"""The door to restoration: what it takes, what it leaves alone, and what it warns of."""
+
+import math
+import warnings
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from truth import Motion, crop, decibel, draw_scene, take_frames
+
+from rsvib_torch import SensorTiming, Vibration, detect_vibration
+from rsvib_torch.restoration import (
+    RestorationWarning,
+    VibrationRestorer,
+    displacement_uncertainty,
+    restore,
+    trusted_vibration,
+)
+from rsvib_torch.restoration.restore import METHODS
+
+TIMING = SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=448)
+MOTION = Motion((2.1, 3.2), (71.0, 113.0), (0.4, 1.3))
+NOISE = 0.005
+
+
+@pytest.fixture(scope="module")
+def taken():
+    """A scene, and two frames of it."""
+    scene = draw_scene(448 + 80, 192 + 80, seed=51)
+    return crop(scene), torch.from_numpy(take_frames(scene, TIMING, MOTION, 2, NOISE)).float()
+
+
+def detected(vibration, relative=1e-3, reliable=(True, True), reasons=((), ())):
+    """A detection with standard deviations of so much of the amplitude, 1e-3 rad and 0.01 Hz."""
+    std = SimpleNamespace(
+        amplitude=relative * vibration.amplitude,
+        frequency=torch.full_like(vibration.frequency, 0.01),
+        phase=torch.full_like(vibration.phase, 1e-3),
+        image_motion=torch.full_like(vibration.image_motion, 0.5),
+    )
+    return SimpleNamespace(vibration=vibration, std=std, reliable=torch.tensor(reliable), reasons=reasons)
+
+
+def restored_quietly(*args, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return restore(*args, **options)
+
+
+def test_a_detection_is_taken_as_it_is(taken):
+    truth, frames = taken
+    found = detect_vibration(frames, TIMING)
+    assert found.reliable.all()
+    from_detection = restored_quietly(frames, TIMING, found)
+    torch.testing.assert_close(from_detection, restored_quietly(frames, TIMING, found.vibration), rtol=0, atol=0)
+    known = restored_quietly(frames, TIMING, MOTION.vibration())
+    assert decibel(from_detection, truth) > decibel(known, truth) - 5  # so small a frame tells little
+    assert decibel(known, truth) > decibel(frames, truth) + 15
+    module = VibrationRestorer(TIMING)
+    torch.testing.assert_close(module(frames, found), from_detection, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_an_axis_that_is_not_reliable_is_left_alone(taken, axis):
+    _, frames = taken
+    reliable = [True, True]
+    reliable[axis] = False
+    reasons = [(), ()]
+    reasons[axis] = ("nearly blind", "too short")
+    doubtful = detected(MOTION.vibration(), reliable=reliable, reasons=tuple(reasons))
+    message = rf"{'xy'[axis]} is left alone: its vibration is not reliable \(nearly blind; too short\)"
+    with pytest.warns(RestorationWarning, match=message):
+        found = restore(frames, TIMING, doubtful, check=False)
+    kept = Vibration([a * r for a, r in zip(MOTION.amplitude, reliable, strict=True)], MOTION.frequency, MOTION.phase)
+    torch.testing.assert_close(found, restore(frames, TIMING, kept, check=False), rtol=0, atol=0)
+
+
+def test_image_motion_stays_where_it_was_measured():
+    vibration = Vibration([2.0, 1.0], [71.0, 113.0], 0.0, [500.0, 1.0])  # known to +- 0.5 px/s
+    trusted, notes = trusted_vibration(
+        detected(vibration, reliable=(False, False), reasons=(("a",), ("b",))), TIMING, 2, 448
+    )
+    assert trusted.amplitude.flatten().tolist() == [0.0, 0.0]
+    assert trusted.image_motion.tolist() == [500.0, 0.0]
+    assert len(notes) == 2
+    assert trusted_vibration(detected(vibration), TIMING, 2, 448)[0].image_motion.tolist() == [500.0, 1.0]
+
+
+def test_uncertainty_of_the_displacement_is_that_of_scattered_parameters():
+    generator = np.random.default_rng(3)
+    vibration = MOTION.vibration()
+    doubtful = detected(vibration, relative=0.05)
+    doubtful.std.frequency = torch.tensor([[0.8], [1.5]], dtype=torch.float64)
+    starts = TIMING.row_starts(2, 448).numpy()
+    middle = 0.5 * (starts.min() + starts.max())
+    # phases known to 0.03 rad in the middle of the record: there they do not hang together with the frequency
+    at_middle = 0.03
+    doubtful.std.phase = torch.sqrt(at_middle**2 + (2 * math.pi * middle * doubtful.std.frequency) ** 2)
+    error, size = displacement_uncertainty(vibration, doubtful.std, TIMING, 2, 448)
+    times = starts.ravel() + TIMING.exposure_time / 2
+    for axis in range(2):
+        amplitude, frequency, phase = MOTION.amplitude[axis], MOTION.frequency[axis], MOTION.phase[axis]
+        shrink = np.sinc(frequency * TIMING.exposure_time)
+        exact = amplitude * shrink * np.sin(2 * np.pi * frequency * times + phase)
+        wrong = []
+        for _ in range(400):
+            a, f, p = generator.standard_normal(3)
+            df = f * float(doubtful.std.frequency[axis, 0])
+            angle = 2 * np.pi * (frequency * times + df * (times - middle)) + phase + p * at_middle
+            wrong.append(amplitude * (1 + 0.05 * a) * shrink * np.sin(angle) - exact)
+        assert float(error[axis]) == pytest.approx(np.sqrt(np.mean(np.square(wrong))), rel=0.15)
+        assert float(size[axis]) == pytest.approx(np.sqrt(np.mean(exact**2)), rel=0.1)
+
+
+def test_an_axis_that_is_known_too_badly_is_left_alone(taken):
+    _, frames = taken
+    doubtful = detected(MOTION.vibration())
+    doubtful.std.phase = torch.tensor([[1.2], [0.1]], dtype=torch.float64)
+    with pytest.warns(
+        RestorationWarning, match=r"x is left alone: its displacement of 1\.5 px is only known to \+- 1\.8"
+    ):
+        found = restore(frames, TIMING, doubtful, check=False)
+    only_y = Vibration([0.0, 3.2], MOTION.frequency, MOTION.phase)
+    torch.testing.assert_close(found, restore(frames, TIMING, only_y, check=False), rtol=0, atol=0)
+    doubtful.std.amplitude = torch.full_like(doubtful.std.amplitude, math.inf)
+    assert trusted_vibration(doubtful, TIMING, 2, 448)[0].amplitude.sum() == 0
+
+
+def test_each_stack_of_a_batch_is_trusted_for_itself(taken):
+    _, frames = taken
+    both = Vibration(*(torch.stack([getattr(MOTION.vibration(), name)] * 2) for name in vars(MOTION.vibration())))
+    doubtful = detected(both, reliable=((True, True), (False, True)), reasons=(((), ()), (("blind",), ())))
+    with pytest.warns(RestorationWarning, match="stack 1: x is left alone"):
+        found = restore(torch.stack([frames, frames])[:, :, None], TIMING, doubtful, method="dewarp", check=False)
+    known = restore(frames, TIMING, MOTION.vibration(), method="dewarp", check=False)
+    only_y = restore(
+        frames, TIMING, Vibration([0.0, 3.2], MOTION.frequency, MOTION.phase), method="dewarp", check=False
+    )
+    torch.testing.assert_close(found[0, :, 0], known, rtol=0, atol=1e-6)
+    torch.testing.assert_close(found[1, :, 0], only_y, rtol=0, atol=1e-6)
+
+
+def test_wrong_vibrations_are_warned_of_and_right_ones_are_not(taken):
+    _, frames = taken
+    vibration = MOTION.vibration()
+    restored_quietly(frames, TIMING, vibration)
+    restored_quietly(frames, TIMING, vibration, joint=True)
+    restored_quietly(frames[:1], TIMING, MOTION.scaled(2.0).vibration())  # one frame cannot be judged
+    with pytest.warns(RestorationWarning, match="restoration helps in part only: x: frames lie .* px apart"):
+        restore(frames, TIMING, MOTION.scaled(0.5).vibration())
+    turned = Vibration(MOTION.amplitude, MOTION.frequency, [p + 3 for p in MOTION.phase])
+    with pytest.warns(RestorationWarning, match="restored is no better than raw"):
+        restore(frames, TIMING, turned)
+    with pytest.warns(RestorationWarning, match="stack 1: restored is no better than raw"):
+        restore(
+            torch.stack([frames, frames])[:, :, None],
+            TIMING,
+            Vibration(*(torch.stack([getattr(v, name) for v in (vibration, turned)]) for name in vars(vibration))),
+            method="dewarp",
+        )
+    restored_quietly(frames, TIMING, turned, check=False)
+    restored_quietly(torch.rand(2, 24, 24), TIMING, turned)  # too small to be judged
+    restored_quietly(frames, TIMING, Vibration.still())
+
+
+@pytest.mark.parametrize("method", ["exact", "banded", "dewarp"])
+def test_missing_pixels_spoil_nothing(taken, method):
+    truth, frames = taken
+    spoiled = frames.clone()
+    spoiled[0, 100:104, 60:64] = math.nan
+    spoiled[1, 300, 100] = math.nan
+    restored = restore(spoiled, TIMING, MOTION.vibration(), method=method)
+    whole = restore(frames, TIMING, MOTION.vibration(), method=method)
+    assert torch.isfinite(restored).all()
+    far = (restored - whole).abs()
+    far[0, 80:124, 40:84] = 0
+    far[1, 280:320, 80:120] = 0
+    assert far[:, 24:-24, 24:-24].max() < 0.02
+    zeroed = restore(spoiled.nan_to_num(0.0), TIMING, MOTION.vibration(), method=method)
+    hole = (0, slice(92, 112), slice(52, 72))
+    before, after = (np.square(r[hole].numpy() - truth[hole[1:]]).mean() for r in (zeroed, restored))
+    assert after < 0.3 * before
+    ignored = restore(spoiled.nan_to_num(7.0), TIMING, MOTION.vibration(), method=method, ignore=torch.isnan(spoiled))
+    torch.testing.assert_close(ignored, restored, rtol=0, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def lamps():
+    """A scene with lamps that the sensor cuts at 0.8, and its frames as 12-bit counts with that as full scale."""
+    scene = draw_scene(256 + 80, 192 + 80, seed=52, blur=1.0) * 0.7
+    rows, columns = np.mgrid[: scene.shape[0], : scene.shape[1]]
+    for row, column in ((120, 100), (220, 180)):
+        scene += 0.7 * np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / (2 * 2.0**2))
+    frames = torch.from_numpy(take_frames(scene, TIMING, MOTION, 2, 0.002)).float()
+    counts = (frames.clamp(max=0.8) * (4095 / 0.8)).round().clamp(0, 4095).to(torch.int32)
+    assert 20 < int((counts == 4095).sum()) < 400
+    return crop(scene), counts
+
+
+def test_saturated_counts_do_no_harm(lamps):
+    truth, counts = lamps
+    near = np.zeros(truth.shape, dtype=bool)
+    for row, column in ((80, 60), (180, 140)):
+        near[row - 20 : row + 21, column - 20 : column + 21] = True
+    near &= truth < 0.75  # around the lamps: what they would ring into
+    common = {"timing": TIMING, "vibration": MOTION.vibration(), "full_scale": 4095}
+    known, unknown = (0.8 * restore(counts, saturation=level, **common).numpy() for level in ("auto", None))
+    rms = [np.sqrt(np.mean(np.square(image - truth)[:, near])) for image in (known, unknown)]
+    assert rms[0] < 1.02 * rms[1]
+    assert rms[0] < 0.005
+    assert (known[:, truth > 0.9] > 0.75).all()  # no holes where it was too bright
+
+
+@pytest.mark.parametrize("scan_axis", [-2, -1])
+def test_saturated_pixels_are_told_to_the_method(lamps, monkeypatch, scan_axis):
+    counts, told = lamps[1], []
+
+    def method(frames, motion, *, ignore=None, clipped=None):
+        told.append((ignore, clipped))
+        return frames
+
+    monkeypatch.setitem(METHODS, "exact", method)
+    timing, vibration = replace(TIMING, scan_axis=scan_axis), MOTION.vibration()
+    expected = counts == 4095 if scan_axis == -2 else (counts == 4095).transpose(-2, -1)
+
+    def masks(frames, **options):
+        restore(frames, timing, vibration, check=False, **options)
+        return told.pop()
+
+    ignore, clipped = masks(counts, full_scale=4095)
+    assert ignore is None
+    assert clipped.shape == (1, 2, 1, *expected.shape[1:])
+    assert (clipped[0, :, 0] == expected).all()
+    assert (masks(counts, full_scale=4095, saturation=4095)[1] == clipped).all()
+    assert (masks(counts / 4095, saturation=1.0)[1] == clipped).all()
+    eight = (counts // 16).to(torch.uint8)
+    assert (masks(eight)[1].sum() == (eight == 255).sum()).all()
+    assert masks(counts, full_scale=4095, saturation=None) == (None, None)
+    assert masks(counts / 4095) == (None, None)  # floats do not say where they were cut
+    assert masks(counts, full_scale=5000) == (None, None)
+    spoiled = counts / 4095
+    spoiled[0, 3, 5] = math.nan
+    assert masks(spoiled)[0].nonzero().tolist() == [[0, 0, 0, 3, 5] if scan_axis == -2 else [0, 0, 0, 5, 3]]
+
+
+@pytest.mark.parametrize("method", ["dewarp", "banded"])
+def test_methods_that_take_saturated_pixels_at_their_level(lamps, method):
+    counts = lamps[1]
+    kept = restore(counts, TIMING, MOTION.vibration(), method=method, full_scale=4095)
+    floats = restore(counts / 4095, TIMING, MOTION.vibration(), method=method)
+    torch.testing.assert_close(kept, floats, rtol=0, atol=1e-6)
+    back = (kept * 4095).round()
+    assert 0.9 * 4095 < back.max() < 1.2 * 4095  # counts stay counts of the camera
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"vibration": 3.0}, TypeError, "vibration must be a Vibration or a detection, got float"),
+        ({"saturation": -1.0}, ValueError, "saturation must be larger than 0, got -1"),
+        ({"saturation": "high"}, TypeError, "saturation must be a number, got 'high'"),
+        ({"frames": torch.ones(2, 16, 16), "saturation": 1.0}, ValueError, "every pixel is saturated"),
+        ({"frames": torch.full((2, 16, 16), math.nan)}, ValueError, "ignore leaves no pixel"),
+        ({"frames": torch.full((2, 16, 16), math.inf)}, ValueError, "frames must be finite"),
+        ({"ignore": torch.zeros(2, 16, 8, dtype=torch.bool)}, ValueError, "ignore must be a boolean mask of shape"),
+        ({"frames": "frames.tif"}, TypeError, "frames must be a tensor or array of numbers, got str"),
+        ({"clipped": True}, TypeError, "method='exact' has no option 'clipped'"),
+    ],
+)
+def test_bad_input(change, error, message):
+    arguments = {"frames": torch.rand(2, 16, 16), "timing": TIMING, "vibration": Vibration(1.0, 50.0)}
+    with pytest.raises(error, match=message):
+        restore(**{**arguments, **change})
+
+
+def test_arrays_and_turned_sensors(taken):
+    _, frames = taken
+    plain = restore(frames, TIMING, MOTION.vibration(), method="dewarp")
+    torch.testing.assert_close(restore(frames.numpy(), TIMING, MOTION.vibration(), method="dewarp"), plain)
+    turned = replace(TIMING, scan_axis=-1)
+    half = detected(Vibration(MOTION.amplitude[::-1], MOTION.frequency[::-1], MOTION.phase[::-1]))
+    half.reliable, half.reasons = torch.tensor([True, False]), ((), ("blind",))
+    with pytest.warns(RestorationWarning, match="y is left alone"):
+        found = restore(frames.transpose(-2, -1), turned, half, method="dewarp", check=False)
+    only_y = Vibration([0.0, 3.2], MOTION.frequency, MOTION.phase)
+    expected = restore(frames, TIMING, only_y, method="dewarp", check=False)
+    torch.testing.assert_close(found.transpose(-2, -1), expected, rtol=0, atol=1e-6)
