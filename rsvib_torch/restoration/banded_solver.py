@@ -17,9 +17,11 @@ class BandedFactor:
     Attributes:
         skewed: (K + b, 2 b + 1, S). Entry ``[j, b]`` of the first K rows is the diagonal of D, entries right of it
             are row j of ``L^H``, entries ``[j + i, b - i]`` column j of ``L D``; the rest has no meaning.
+        inverse: (K, S), the diagonal of the inverse of D.
     """
 
     skewed: Tensor
+    inverse: Tensor
 
     @property
     def width(self) -> int:
@@ -27,64 +29,89 @@ class BandedFactor:
         return self.skewed.shape[1] // 2
 
     @property
-    def count(self) -> int:
-        """The number K of rows."""
-        return len(self.skewed) - self.width
-
-    @property
     def pivots(self) -> Tensor:
         """(K, S), the real diagonal of D."""
-        diagonal = self.skewed[: self.count, self.width]
+        diagonal = self.skewed[: len(self.inverse), self.width]
         return diagonal.real if diagonal.is_complex() else diagonal
 
     def solve(self, right_side: Tensor) -> Tensor:
         """Solve ``A x = right_side`` for right sides (K, M, S), M of them per matrix."""
-        width, count, full = self.width, self.count, self.skewed
-        x = torch.cat([right_side, right_side.new_zeros(width, *right_side.shape[1:])])
-        pivots, below, above = full[:count, width].unbind(), self._columns(below=True), self._columns(below=False)
-        values, step = x.unbind(), x.stride()
-        windows = x.as_strided((count, width, *x.shape[1:]), (step[0], *step), x.storage_offset()).unbind()
-        for j in range(count):
-            values[j].div_(pivots[j])
-            if width and j + 1 < count:
-                windows[j + 1].addcmul_(below[j], values[j], value=-1)
-        for j in range(count - 1, 0, -1):
-            if j >= width > 0:
-                windows[j - width].addcmul_(above[j - width], values[j], value=-1)
-            elif width:
-                x[:j].addcmul_(torch.stack([full[k, width + j - k] for k in range(j)])[:, None], values[j], value=-1)
+        x = _with_rows(right_side, self.width)
+        columns, windows = _columns(self.skewed, below=True), _windows(x, self.width)
+        for j, (value, inverse) in enumerate(zip(x[: len(self.inverse)].unbind(), self.inverse.unbind(), strict=True)):
+            value.mul_(inverse)
+            if columns:
+                windows[j + 1].addcmul_(columns[j], value, value=-1)
+        return self.substitute(x)
+
+    def substitute(self, x: Tensor) -> Tensor:
+        """Solve ``L^H x' = x`` in place for right sides (K + b, M, S); returns the first K rows."""
+        count, width = len(self.inverse), self.width
+        columns, windows, values = _columns(self.skewed, below=False), _windows(x, width), x.unbind()
+        for j in range(count - 1, 0 if columns else count, -1):
+            if j >= width:
+                windows[j - width].addcmul_(columns[j - width], values[j], value=-1)
+            else:
+                column = torch.stack([self.skewed[k, width + j - k] for k in range(j)])
+                x[:j].addcmul_(column[:, None], values[j], value=-1)
         return x[:count]
 
-    def _columns(self, *, below: bool) -> tuple[Tensor, ...]:
-        """For every row j < K, what column j holds below, or column j + b above, the diagonal, (b, 1, S)."""
-        line, entry = self.skewed.stride(0), self.skewed.stride(1)
-        first = self.skewed.storage_offset() + (line + (self.width - 1) * entry if below else 2 * self.width * entry)
-        shape = (self.count, self.width, 1, self.skewed.shape[2])
-        if self.width == 0:
-            return ()
-        return self.skewed.as_strided(shape, (line, line - entry, entry, 1), first).unbind()
+
+def _with_rows(values: Tensor, count: int) -> Tensor:
+    return torch.cat([values, values.new_zeros(count, *values.shape[1:])])
 
 
-def factor_skewed(full: Tensor) -> BandedFactor:
-    """Factor a contiguous skewed band (K + b, 2 b + 1, S), of which both sides are filled, in its own memory."""
-    factor = BandedFactor(full)
-    width, count = factor.width, factor.count
+def _windows(x: Tensor, width: int) -> tuple[Tensor, ...]:
+    """Every run of ``width`` rows of x (K + b, M, S)."""
+    step = x.stride()
+    shape = (len(x) - width + 1, width, *x.shape[1:])
+    return x.as_strided(shape, (step[0], *step), x.storage_offset()).unbind() if width else ()
+
+
+def _columns(full: Tensor, *, below: bool) -> tuple[Tensor, ...]:
+    """For every row j < K, what column j holds below, or column j + b above, the diagonal, (b, 1, S)."""
+    width = full.shape[1] // 2
     if width == 0:
-        return factor
+        return ()
     line, entry = full.stride(0), full.stride(1)
-    shape = (count, width, width, full.shape[2])
+    first = full.storage_offset() + (line + (width - 1) * entry if below else 2 * width * entry)
+    shape = (len(full) - width, width, 1, full.shape[2])
+    return full.as_strided(shape, (line, line - entry, entry, 1), first).unbind()
+
+
+def factor_skewed(full: Tensor, right_side: Tensor | None = None) -> BandedFactor:
+    """Factor Hermitian positive definite matrices in their own memory.
+
+    Args:
+        full: (K + b, 2 b + 1, S) as from ``skew_band``, contiguous; overwritten.
+        right_side: (K + b, M, S) whose last b rows are 0; overwritten with ``(L D)^-1`` times it.
+
+    Returns:
+        The factors.
+    """
+    width, size = full.shape[1] // 2, full.shape[2]
+    count = len(full) - width
+    pivots = full[:count, width]
+    if width == 0:
+        inverse = pivots.reciprocal()
+        if right_side is not None:
+            right_side.mul_(inverse[:, None])
+        return BandedFactor(full, inverse)
+    inverse = torch.empty_like(pivots)
+    line, entry = full.stride(0), full.stride(1)
     # the trailing window of every step: skewed, so that it is one strided view
     first = full.storage_offset() + line + width * entry
-    windows = full.as_strided(shape, (line, line - entry, entry, 1), first).unbind()
-    pivots, rows, columns = (
-        full[:count, width].unbind(),
-        full[:count, width + 1 :].unbind(),
-        factor._columns(below=True),
-    )
-    for j in range(count):
-        rows[j].div_(pivots[j])
-        windows[j].addcmul_(columns[j], rows[j], value=-1)
-    return factor
+    trailing = full.as_strided((count, width, width, size), (line, line - entry, entry, 1), first).unbind()
+    rows, columns, inverses = full[:count, width + 1 :].unbind(), _columns(full, below=True), inverse.unbind()
+    values = () if right_side is None else right_side.unbind()
+    windows = () if right_side is None else _windows(right_side, width)
+    for j, pivot in enumerate(pivots.unbind()):
+        torch.reciprocal(pivot, out=inverses[j])
+        row = rows[j].mul_(inverses[j])
+        trailing[j].addcmul_(columns[j], row, value=-1)
+        if values:
+            windows[j + 1].addcmul_(columns[j], values[j].mul_(inverses[j]), value=-1)
+    return BandedFactor(full, inverse)
 
 
 def skew_band(band: Tensor) -> Tensor:
@@ -121,20 +148,21 @@ class _Solve(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, full: Tensor, right_side: Tensor) -> Tensor:
-        factor = factor_skewed(full.clone() if ctx.needs_input_grad[0] else full)
-        solution = factor.solve(right_side)
-        ctx.save_for_backward(factor.skewed, solution)
+        x = _with_rows(right_side, full.shape[1] // 2)
+        factor = factor_skewed(full.clone() if ctx.needs_input_grad[0] else full, x)
+        solution = factor.substitute(x)
+        ctx.save_for_backward(factor.skewed, factor.inverse, solution)
         return solution
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor]:
-        skewed, x = ctx.saved_tensors
-        factor = BandedFactor(skewed)
+        skewed, inverse, x = ctx.saved_tensors
+        factor = BandedFactor(skewed, inverse)
         adjoint = factor.solve(gradient)
         if not ctx.needs_input_grad[0]:
             return None, adjoint
-        width, count = factor.width, factor.count
+        width, count = factor.width, len(inverse)
         full = torch.zeros_like(skewed)
         for d in range(-min(width, count - 1), min(width, count - 1) + 1):
             rows = slice(max(0, -d), min(count, count - d))

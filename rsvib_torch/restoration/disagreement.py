@@ -9,7 +9,7 @@ from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.banded_solver import BandedFactor, factor_skewed
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.noise import estimate_noise
-from rsvib_torch.restoration.prior import RowPrior
+from rsvib_torch.restoration.prior import ORDER, RowPrior
 from rsvib_torch.restoration.row_system import row_kernels, smooth_band, smooth_kernels
 
 __all__ = ["noise_levels"]
@@ -89,20 +89,20 @@ def _residual_power(images: Tensor, motion: FrameMotion, stack: int, first: Tens
     turns = kernels.middle[..., None] * u
     spectra = spectra * torch.polar(torch.ones_like(turns), 2 * torch.pi * turns).to(spectra.dtype)[:, :, None]
 
-    seen = smooth_kernels(kernels, images.dtype).at(u)
-    places = (kernels.first - scene.top)[..., None] + torch.arange(seen.shape[2], device=u.device)
+    used = kernels.weight.to(images.dtype).flatten()[:, None, None]
+    spectra = (spectra * used.unflatten(0, (2, count))).flatten(0, 1)
+    taps = [tap[:, None] for tap in smooth_kernels(kernels, images.dtype).taps(u)]
+    base = (kernels.first - scene.top).flatten()
     right = spectra.new_zeros(scene.count, channels, len(u))
-    used = kernels.weight.to(images.dtype)[..., None, None]
-    products = (seen.conj() * used)[:, :, :, None] * spectra[:, :, None]
-    right = right.index_add(0, places.flatten(), products.flatten(0, 2))
-    bare = smooth_band(kernels, scene, max(seen.shape[2] - 1, 2), images.dtype).at(u)
-    prior = RowPrior.smooth(u)
+    for i, tap in enumerate(taps):
+        right.index_add_(0, base + i, tap.conj() * spectra)
+    normal = smooth_band(kernels, scene, max(len(taps) - 1, ORDER), ORDER, images.dtype)
     factors = [
-        factor_skewed(prior.add_to(bare.clone(), slice(None), u.new_ones(()), strength))
+        factor_skewed(normal.at(u, RowPrior.smooth(u).precision(u.new_ones(()), strength)))
         for strength in (_WEAK, _STEP * _WEAK)
     ]
     fitted = factors[0].solve(right)
-    residual = (spectra - (seen[:, :, :, None] * fitted[places]).sum(2)) * used
+    residual = (spectra - sum(tap * fitted[base + i] for i, tap in enumerate(taps))) * used
     free = used.sum() * len(u) - _degrees_of_freedom(factors)
     return residual.abs().square().sum() / (channels * free * taper.square().sum())
 

@@ -75,44 +75,45 @@ def _restore_group(data: Tensor, valid: Tensor | None, problem: _Problem, chunk:
     kernels = problem.kernels
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=data.device)
     rows = kernels.scene_rows(num_rows)
-    reach = kernels.taps.shape[-2]
-    width = max(reach - 1, ORDER)
+    width = max(kernels.taps.shape[-2] - 1, ORDER)
     parts = [slice(begin, min(begin + chunk, len(u))) for begin in range(0, len(u), chunk)]
     seen = smooth_kernels(kernels, data.dtype)
     base = (kernels.first - rows.top).flatten()
+    precision = problem.prior.precision(problem.noise_power, problem.strength)
 
     def solve(values: Tensor, weight: Tensor) -> list[Tensor]:
         spectra = torch.fft.rfft(values)
-        normal = smooth_band(replace(kernels, weight=weight), rows, width, data.dtype)
+        normal = smooth_band(replace(kernels, weight=weight), rows, width, ORDER, data.dtype)
+        memory = normal.memory(chunk)
         solutions = []
         for part in parts:
-            full = problem.prior.add_to(normal.at(u[part]), part, problem.noise_power, problem.strength)
-            back = (seen.at(u[part]).conj() * weight.to(data.dtype)[..., None, None]).flatten(0, 1)
             turned = spectra[..., part] * kernels.phases(length, part, data.dtype)[:, None]
-            turned = turned.transpose(1, 2).flatten(0, 1)
+            turned = (turned * weight.to(data.dtype)[:, None, :, None]).transpose(1, 2).flatten(0, 1).conj()
             right = turned.new_zeros(rows.count, *turned.shape[1:])
-            for i in range(reach):
-                right = right.index_add_(0, base + i, back[:, i, None] * turned)
-            solutions.append(solve_skewed(full, right))
+            for i, kernel in enumerate(seen.taps(u[part])):
+                right = right.index_add_(0, base + i, kernel[:, None] * turned)
+            full = normal.at(u[part], precision[..., part], memory)
+            solutions.append(solve_skewed(full, right.conj().resolve_conj()))
         return solutions
 
-    def predict(coefficients: list[Tensor], member: int) -> Tensor:
+    def predict(coefficients: list[Tensor]) -> Tensor:
         spectra = []
-        places = (kernels.first[member] - rows.top)[:, None] + torch.arange(reach, device=u.device)
         for part, values in zip(parts, coefficients, strict=True):
-            kernel = seen.at(u[part])[member]
-            phases = kernels.phases(length, part, data.dtype)[member].conj()
-            spectra.append((kernel[:, :, None] * values[places]).sum(1) * phases[:, None])
-        image: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1).movedim(0, 1), n=length)
-        return image
+            seen_rows = sum(
+                (kernel[:, None] * values[base + i] for i, kernel in enumerate(seen.taps(u[part]))),
+                start=values.new_zeros(()),
+            )
+            phases = kernels.phases(length, part, data.dtype).conj()
+            spectra.append(seen_rows.unflatten(0, phases.shape[:2]) * phases[:, :, None])
+        images: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1).transpose(1, 2), n=length)
+        return images
 
     if valid is None:
         coefficients = solve(data, kernels.weight)
     else:
         coefficients = solve(data, _of_whole_frames(kernels, valid).weight)
         for _ in range(_FILL_ITERATIONS):
-            filled = [torch.where(valid[m], data[m], predict(coefficients, m)) for m in range(len(data))]
-            coefficients = solve(torch.stack(filled), kernels.weight)
+            coefficients = solve(torch.where(valid, data, predict(coefficients)), kernels.weight)
     spectra = torch.cat([_evaluate(values, 1 - REACH - rows.top, num_rows) for values in coefficients], dim=-1)
     scene: Tensor = torch.fft.irfft(spectra, n=length)
     return scene

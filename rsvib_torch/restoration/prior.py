@@ -64,33 +64,23 @@ class RowPrior:
         values = torch.nn.functional.interpolate(stacked[None], count, mode="linear", align_corners=True)[0]
         return RowPrior(values[0].exp(), values[2:], values[1].exp())
 
-    def add_to(self, full: Tensor, frequencies: slice, noise_power: Tensor, strength: float) -> Tensor:
-        """Add the precision to bands of the data, in place.
+    def precision(self, noise_power: Tensor, strength: float) -> Tensor:
+        """Products ``a_k a_(k + d)`` of the filter in units of the data's noise, (p + 1, p + 1, U), 0 for k + d > p.
+
+        The precision of interior rows d apart is the sum over k; the first and the last rows are predicted from
+        fewer, and of row j only the first j + 1 products count.
 
         Args:
-            full: (K + b, 2 b + 1, U'), complex.
-            frequencies: Which of the U frequencies.
             noise_power: Power of the noise of data of weight 1.
             strength: Factor on the precision.
-
-        Returns:
-            The bands.
         """
-        a = self.filter()[:, frequencies]
-        ratio = ((noise_power + self.blind) * strength / self.innovation()).clamp(_WEAKEST, _STRONGEST)[frequencies]
-        width = full.shape[1] // 2
-        count, order = len(full) - width, len(a) - 1
-        real = torch.view_as_real(full)[..., 0]
-        for d in range(order + 1):
-            products = a[: order + 1 - d] * a[d:] * ratio
-            middle = products.sum(0)
-            for side in {d, -d}:
-                real[max(0, -side) : count - max(0, side), width + side] += middle
-                for k in range(1, order + 1 - d):
-                    # the first and the last rows are predicted from fewer
-                    real[max(0, -side) : max(0, -side) + k, width + side] -= products[k]
-                    real[count - max(0, side) - k : count - max(0, side), width + side] -= products[k]
-        return full
+        a = self.filter()
+        ratio = ((noise_power + self.blind) * strength / self.innovation()).clamp(_WEAKEST, _STRONGEST)
+        count = len(a)
+        products = a.new_zeros(count, count, a.shape[1])
+        for d in range(count):
+            products[d, : count - d] = a[: count - d] * a[d:] * ratio
+        return products
 
 
 def _levinson(moments: Tensor) -> RowPrior:

@@ -7,6 +7,7 @@ and all frequencies follow by one product of matrices. The phase of the middle g
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from rsvib_torch.restoration.row_kernel import REACH, TAPS, kernel_weights
 
-__all__ = ["RowKernels", "SceneRows", "Smooth", "row_kernels", "smooth_band", "smooth_kernels"]
+__all__ = ["RowKernels", "SceneRows", "SmoothBand", "SmoothKernels", "row_kernels", "smooth_band", "smooth_kernels"]
 
 _TABLE = 64  # frequencies that a phase is stepped through
 
@@ -134,36 +135,91 @@ def _stacked(values: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Smooth:
-    """Complex values of all frequencies as one product of matrices.
+class SmoothKernels:
+    """Kernels of all frequencies as one product of matrices.
 
     Attributes:
-        left: (..., 2 Q) real and imaginary parts at Q nodes, in the dtype of the frames.
-        reach: Distance along the rows in px that the waves reach to.
+        left: (J, M R, 2 Q) real and imaginary parts at Q nodes of every tap of every row.
+        reach: Distance along the rows in px that the kernels reach to.
     """
 
     left: Tensor
     reach: float
 
-    def at(self, u: Tensor) -> Tensor:
-        """Values (..., U) at frequencies in cycles per px."""
+    def taps(self, u: Tensor) -> Iterator[Tensor]:
+        """Kernels (M R, U), complex, without the phase of their middles, one tap after the other."""
         right = _interpolation(self.reach, u, _precision(self.left.dtype))[1].to(self.left.dtype)
-        return torch.view_as_complex((self.left @ right).unflatten(-1, (-1, 2)))
+        for tap in self.left:
+            yield torch.view_as_complex((tap @ right).unflatten(-1, (-1, 2)))
 
 
-def smooth_kernels(kernels: RowKernels, dtype: torch.dtype) -> Smooth:
-    """Kernels (M, R, J) of all rows, without the phase of their middles."""
+def smooth_kernels(kernels: RowKernels, dtype: torch.dtype) -> SmoothKernels:
+    """Kernels of all rows in a form from which those at any frequency follow quickly."""
     nodes, _ = _interpolation(kernels.reach, kernels.middle.new_zeros(1), _precision(dtype))
-    return Smooth(_stacked(kernels.at(nodes)).to(dtype), kernels.reach)
+    return SmoothKernels(
+        _stacked(kernels.at(nodes)).to(dtype).flatten(0, 1).transpose(0, 1).contiguous(), kernels.reach
+    )
 
 
-def smooth_band(kernels: RowKernels, rows: SceneRows, width: int, dtype: torch.dtype) -> Smooth:
-    """Normal matrices ``sum w K^H K`` of all frames of one scene, skewed bands (K + b, 2 b + 1).
+@dataclass(frozen=True, eq=False)
+class SmoothBand:
+    """Normal matrices of all frequencies, prior included, as one product of matrices.
+
+    Attributes:
+        left: (K + b, 2 b + 1, 2 Q + p + 1) real and imaginary parts at Q nodes, and where each lag of the prior goes.
+        reach: Distance along the rows in px that the products of kernels reach to.
+        order: Order p of the prior.
+    """
+
+    left: Tensor
+    reach: float
+    order: int
+
+    def memory(self, most: int) -> Tensor | None:
+        """Memory for bands of up to that many frequencies, to be used again and again; None where gradients need them.
+
+        Fresh memory costs as much time as the product that fills it.
+        """
+        if torch.is_grad_enabled() and self.left.requires_grad:
+            return None
+        return self.left.new_empty(self.left.shape[0] * self.left.shape[1] * 2 * most)
+
+    def at(self, u: Tensor, precision: Tensor, memory: Tensor | None = None) -> Tensor:
+        """Skewed bands (K + b, 2 b + 1, U), complex.
+
+        Args:
+            u: Frequencies in cycles per px.
+            precision: Products (p + 1, p + 1, U) of the prior there.
+            memory: As from ``memory``.
+        """
+        lags = torch.stack([precision.sum(1), torch.zeros_like(precision[:, 0])], dim=-1).flatten(1)
+        right = torch.cat([_interpolation(self.reach, u, _precision(self.left.dtype))[1], lags]).to(self.left.dtype)
+        rows = self.left.flatten(0, 1)
+        if memory is None:
+            product = rows @ right
+        else:
+            product = torch.mm(rows, right, out=memory[: len(rows) * right.shape[1]].view(len(rows), -1))
+        bands = product.view(*self.left.shape[:2], -1, 2)
+        width, real = self.left.shape[1] // 2, bands[..., 0]
+        count = len(self.left) - width
+        for d in range(self.order + 1):
+            for side in {d, -d}:
+                for k in range(1, self.order + 1 - d):
+                    top = max(0, -side)
+                    real[top : top + k, width + side] -= precision[d, k]
+                    bottom = count - max(0, side)
+                    real[bottom - k : bottom, width + side] -= precision[d, k]
+        return torch.view_as_complex(bands)
+
+
+def smooth_band(kernels: RowKernels, rows: SceneRows, width: int, order: int, dtype: torch.dtype) -> SmoothBand:
+    """Normal matrices ``sum w K^H K`` of all frames of one scene, to which a prior can be added.
 
     Args:
         kernels: How the frames see it.
         rows: Its rows.
-        width: Half-width b of the band to be filled, at least the number of taps less 1.
+        width: Half-width b of the band, at least the number of taps less 1 and the order of the prior.
+        order: Order of the prior.
         dtype: Of the frames.
     """
     nodes, _ = _interpolation(2 * kernels.reach, kernels.middle.new_zeros(1), _precision(dtype))
@@ -180,4 +236,9 @@ def smooth_band(kernels: RowKernels, rows: SceneRows, width: int, dtype: torch.d
     absent = torch.zeros_like(sides[0])
     right = [sides[d] if d < len(sides) else absent for d in range(width + 1)]
     left = [torch.cat([absent[:d], right[d][: len(absent) - d].conj()]) for d in range(width, 0, -1)]
-    return Smooth(_stacked(torch.stack(left + right, dim=1)).to(dtype), 2 * kernels.reach)
+    lags = kernels.middle.new_zeros(len(absent), 2 * width + 1, order + 1)
+    for d in range(order + 1):
+        lags[: rows.count - d, width + d, d] = 1
+        lags[d : rows.count, width - d, d] = 1
+    matrix = torch.cat([_stacked(torch.stack(left + right, dim=1)), lags], dim=-1)
+    return SmoothBand(matrix.to(dtype), 2 * kernels.reach, order)
