@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from benchmarks.restoration_peers import Peer
 from pylops import LinearOperator
-from pylops.optimization.basic import cgls
+from pylops.optimization.cls_basic import CGLS
 from pylops.signalprocessing import NonStationaryConvolve2D
 from torch import Tensor
 
@@ -20,8 +20,8 @@ import rsvib_torch as rsv
 
 ROWS_PER_KERNEL = 8
 SAMPLES = 64  # of the exposure
-ITERATIONS = 30
-DAMPINGS = (1e-3, 1e-2, 3e-2, 1e-1, 3e-1)
+ITERATIONS, PATIENCE = 40, 4  # at most, and without a better result
+DAMPINGS = (1e-3, 1e-2, 5e-2, 0.15, 0.4)
 
 
 def lanczos(place: np.ndarray) -> np.ndarray:
@@ -66,20 +66,17 @@ def cgls_restore(frame: np.ndarray, timing: rsv.SensorTiming, truth: rsv.Vibrati
     truth_inside = still.numpy()[rim:-rim, rim:-rim]
     best, told, error, seconds = frame, "", math.inf, 0.0
     for damping in DAMPINGS:
-        steps: list[tuple[np.ndarray, float]] = []
+        solver, spent, since_best = CGLS(operator), 0.0, 0
         begin = time.perf_counter()
-        cgls(
-            operator,
-            data,
-            x0=np.zeros_like(data),
-            niter=ITERATIONS,
-            damp=damping,
-            tol=0.0,
-            callback=lambda x, s=steps, b=begin: s.append((x.copy(), time.perf_counter() - b)),
-        )
-        for number, (values, passed) in enumerate(steps):
-            wrong = float(np.square(values.reshape(frame.shape)[rim:-rim, rim:-rim] + mean - truth_inside).mean())
+        x = solver.setup(data, damp=damping, tol=0.0)
+        while solver.iiter < ITERATIONS and since_best < PATIENCE:
+            x = solver.step(x)
+            spent += time.perf_counter() - begin
+            restored = x.reshape(frame.shape) + mean
+            wrong = float(np.square(restored[rim:-rim, rim:-rim] - truth_inside).mean())
+            since_best += 1
             if wrong < error:
-                best, error, seconds = values.reshape(frame.shape) + mean, wrong, passed
-                told = f"damping {damping:g}, {number + 1} iterations"
+                best, error, seconds, since_best = restored, wrong, spent, 0
+                told = f"damping {damping:g}, {solver.iiter} iterations"
+            begin = time.perf_counter()
     return Peer(torch.from_numpy(best), seconds, told)

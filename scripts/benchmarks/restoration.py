@@ -2,7 +2,8 @@
 
 Peers: unwarping by ``cv2.remap`` (Lanczos-4), a loop of ``skimage.restoration.wiener`` over the rows, and CGLS on
 ``pylops.signalprocessing.NonStationaryConvolve2D`` where pylops is installed (extra ``compare``). What a peer has to be
-told (balance, damping, iterations) is the best of several for the truth; ours chooses for itself.
+told (balance, damping, iterations) is the best of several for the truth; ours chooses for itself. Frames come from a
+camera made without the package.
 """
 
 import argparse
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from benchmarks.independent_camera import Shake, closed, take_frames
 from benchmarks.measure import in_turns
 from benchmarks.restoration_peers import Peer, remap_lanczos, wiener_rows
 from torch import Tensor
@@ -29,7 +31,7 @@ except ImportError:  # pylops or numba is not installed
     cgls_restore = None
 
 SEED = 7
-RIM, MARGIN = 32, 48
+RIM, MARGIN, FADE = 32, 48, 24  # px
 AMPLITUDE, FREQUENCY = (3.1, 5.2), (50.0, 30.0)
 NOISES = (0.0, 0.005, 0.02)
 EXPOSURES = (20, 100, 400)
@@ -111,7 +113,18 @@ def methods(
 def compare(name: str, scene: Tensor, exposure: int, options: argparse.Namespace) -> list[dict[str, Any]]:
     """PSNR of all methods on one scene with one exposure, for every noise."""
     timing, truth, size = camera(exposure), vibration(), (options.grid_size, options.grid_size)
-    clean = rsv.simulate_frames(scene, timing, truth, 2, frame_size=size)
+    shake = Shake(*(values.numpy() for values in (truth.amplitude, truth.frequency, truth.phase, truth.image_motion)))
+    clean = torch.from_numpy(
+        take_frames(
+            closed(scene.double().numpy(), FADE),
+            shake,
+            row_time=timing.row_time,
+            exposure_rows=exposure,
+            frame_rows=timing.frame_rows,
+            num_frames=2,
+            size=size,
+        )
+    ).float()
     still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
     results: dict[str, dict[str, Any]] = {}
     for noise in options.noises:
