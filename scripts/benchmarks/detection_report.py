@@ -97,10 +97,17 @@ def draw(results: Results, out: Path) -> None:
                 curves = {key: [r[name][key][axis] for r in own] for key in ("rms", "bound", "random")}
                 panel.loglog(noise, curves["bound"], color=colour, linewidth=1.2, label=f"{label}: bound")
                 panel.loglog(
-                    noise, curves["random"], color=colour, linewidth=1.0, linestyle=":", label=f"{label}: random"
+                    noise,
+                    curves["random"],
+                    color=colour,
+                    linewidth=1.0,
+                    linestyle=":",
+                    label=f"{label}: bound, random scene",
                 )
                 panel.loglog(noise, curves["rms"], color=colour, marker="o", linewidth=0, label=f"{label}: error")
             panel.set_title(name, fontsize=10)
+            panel.set_xticks(noise, [f"{value:g}" for value in noise])
+            panel.set_xticks([], minor=True)
             panel.set_xlabel("noise (fraction of full scale)")
             panel.set_ylabel(f"root-mean-square error ({unit})")
             panel.grid(color="#d9d9d9", linewidth=0.6, which="both")

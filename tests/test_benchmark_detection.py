@@ -1,0 +1,87 @@
+"""The benchmark of detection: its own camera against waves by hand, and one small run of it all."""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import rsvib_torch as rsv
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+
+
+@pytest.fixture
+def scripts(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    yield
+    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
+        monkeypatch.delitem(sys.modules, name)
+
+
+@pytest.mark.usefixtures("scripts")
+@pytest.mark.parametrize("wave", [(7, 0), (0, 9), (-11, 20)])
+def test_camera_takes_waves_as_they_are(wave):
+    from benchmarks.independent_camera import Shake, take_frames
+
+    height, width, size = 96, 80, (48, 40)
+    y, x = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
+    turn = 2 * np.pi * np.array([wave[0] / width, wave[1] / height])
+    scene = 0.5 + 0.3 * np.cos(turn[0] * x + turn[1] * y)
+    tones = ([[1.3, 0.4], [2.1, 0.0]], [[50.0, 120.0], [30.0, 0.0]], [[0.4, 1.0], [1.3, 0.0]])
+    shake = Shake(*(np.array(values) for values in tones), np.array([40.0, -30.0]))
+    frames = take_frames(scene, shake, row_time=2e-4, exposure_rows=4.0, frame_rows=60, num_frames=2, size=size)
+    rows, columns = np.arange(size[0]), np.arange(size[1])
+    for p in range(2):
+        times = (p * 60 + rows[:, None] + (np.arange(400) + 0.5) / 400 * 4.0) * 2e-4
+        moved = [v * times for v in (40.0, -30.0)]
+        for axis in range(2):
+            for a, f, phase in zip(*(values[axis] for values in tones), strict=True):
+                moved[axis] = moved[axis] + a * np.sin(2 * np.pi * f * times + phase)
+        angle = (turn[1] * (rows[:, None] + 24 - moved[1]) - turn[0] * moved[0])[:, None, :]
+        angle = angle + (turn[0] * (columns + 20))[None, :, None]
+        wanted = 0.5 + 0.3 * np.cos(angle).mean(-1)
+        np.testing.assert_allclose(frames[p], wanted, rtol=0, atol=2e-5)
+
+
+@pytest.mark.usefixtures("scripts")
+def test_errors_are_those_of_the_tone_that_is_meant():
+    from benchmarks.detection import errors_of
+    from benchmarks.independent_camera import Shake
+
+    shake = Shake(
+        np.array([[1.0, 0.5], [0.8, 0.0]]),
+        np.array([[40.0, 90.0], [60.0, 0.0]]),
+        np.array([[3.1, 0.2], [1.0, 0.0]]),
+        np.zeros(2),
+    )
+    found = rsv.Vibration([[0.9, 0.6], [0.7, 0.0]], [[90.1, 40.2], [75.0, 0.0]], [[0.3, -3.1], [1.0, 0.0]])
+    result = argparse.Namespace(vibration=found, std=rsv.Vibration([[0.1, 0.2], [0.3, 0.0]], 1.0, 1.0))
+    errors, _ = errors_of(result, shake)
+    np.testing.assert_allclose(errors["amplitude"][0], [-0.4, 0.4])
+    np.testing.assert_allclose(errors["frequency"][0], [0.2, 0.1])
+    np.testing.assert_allclose(errors["phase"][0], [2 * np.pi - 6.2, 0.1])
+    assert np.isnan(errors["amplitude"][1]).all()  # too far off: lost
+
+
+@pytest.mark.usefixtures("scripts")
+@pytest.mark.slow
+def test_a_small_run(tmp_path):
+    from benchmarks import detection, detection_report
+
+    parser = argparse.ArgumentParser()
+    detection.add_options(parser)
+    options = parser.parse_args(["--detection-size", "512", "256", "--detection-noises", "0.01"])
+    options.detection_scenes, options.detection_phases, options.detection_repeats = 1, 1, 2
+    results = detection.rows(options)
+    assert [r["trials"] for r in results] == [2, 2]
+    for result in results:
+        assert result["lost"] == 0
+        assert 0.1 < result["over_bound"] < 4
+    text = detection.lines(results, options)
+    assert sum(line.startswith("| 0.01 |") for line in text) == 2
+    detection_report.draw(results, tmp_path)
+    assert len(list(tmp_path.glob("*.png"))) == 2
+    assert torch.get_default_dtype() == torch.float32
