@@ -12,7 +12,7 @@ from rsvib_torch.detection.fit import fit_tones
 from rsvib_torch.detection.inversion import vibration_of_fit
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import OtherMotion
-from rsvib_torch.detection.selection import find_tones, residual_of, robust_fit
+from rsvib_torch.detection.selection import find_tones, residual_of, robust_fit, significant_only, strongest_only
 from rsvib_torch.detection.tones import ToneFit
 from rsvib_torch.imaging.coupling import rows_showing
 from rsvib_torch.registration.gradients import MARGIN, RowGradients, RowSpectra, row_gradients, row_shifts
@@ -25,6 +25,7 @@ _BLOCK = 8  # rows that give one measurement: tones up to 1 / (16 T_row) are tol
 _LAGS = 4  # blocks over which residuals may be correlated
 LARGEST_GROUP = 8  # of a group that shares one mean scene
 _LEAST_OVERLAP = 0.5  # of the frame that the frames of a group share
+_MAJORITY = 0.7  # of the rows: clouds and things that move by themselves may cover the others
 _SLANT_ROWS = 64  # rows whose halves are compared
 _NEAR = 0.05  # px: gradients of frames that were warped this well need not be taken again
 _CONDITION = 1e-4  # least share of the product of the diagonal that a block's determinant must keep
@@ -221,43 +222,54 @@ def refine_directly(
         before, around = fit, motion
         if step == 1:
             # the first round removed the error of the bands: now weak tones show
-            fit = find_tones(measurements, interval, tones, model, _LEAST_GAIN)
+            left = residual_of(measurements, fit)
+            careful = replace(measurements, independent=independent_fraction(measurements, left))
+            fit = find_tones(careful, interval, tones, model, _LEAST_GAIN, strongest_only(fit))
         else:
-            fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, 1)
+            fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model)
         motion, _ = vibration_of_fit(fit)
         if step > 1 and _settled(before, fit):
             break
         change = measurements.relative(_displacements(measurements, motion) - _displacements(measurements, around))
-        if float(change.abs().amax()) > _NEAR:
+        if step + 1 < iterations and float(change.abs().amax()) > _NEAR:
             gradients = [None] * len(groups)
     residual = residual_of(measurements, fit)
     weighed = measurements.reweighted(residual)
     honest = replace(weighed, independent=independent_fraction(weighed, residual))
     fit = fit_tones(honest, fit.frequencies, fit.active, model)
-    apart = OtherMotion(_unexplained(measurements, honest, residual), _slant([g for g in gradients if g is not None]))
+    if tones is None:
+        fit = significant_only(honest, fit)
+    apart = OtherMotion(_unexplained(measurements, residual), _slant([g for g in gradients if g is not None]))
     return DirectFit(honest, fit, apart)
 
 
 def _standardised(frames: Tensor, valid: Tensor | None) -> Tensor:
-    """Frames of mean 0 and variance 1: brightness and contrast may differ from frame to frame."""
+    """Frames of mean 0 and variance 1 without the mean of each column.
+
+    Brightness and contrast may differ from frame to frame. What all rows and frames have in common in a column belongs
+    to the sensor: it would pull the displacements to zero. The scene hardly misses its share of it, which stands in for
+    one of as many numbers as there are rows.
+    """
     weight = torch.ones_like(frames) if valid is None else valid.to(frames.dtype)
     count = weight.sum((-2, -1), keepdim=True)
     centred = frames - (frames * weight).sum((-2, -1), keepdim=True) / count
     variance = (centred.square() * weight).sum((-2, -1), keepdim=True) / count
-    return centred * variance.rsqrt()
+    scaled = centred * variance.rsqrt()
+    columns = (scaled * weight).sum((1, 2), keepdim=True) / weight.sum((1, 2), keepdim=True).clamp(min=1.0)
+    return scaled - columns
 
 
-def _unexplained(measured: Measurements, weighed: Measurements, residual: Tensor) -> Tensor:
-    """(B, 2) px, rms of residuals beyond their noise, over the blocks that count."""
-    counts = (weighed.weights > 0) & (measured.differences[..., None] > 0)
-    expected = measured.differences[..., None] / measured.weights.clamp(min=1e-300)
-    excess = torch.where(counts, residual.square().sum(2) - expected, 0.0).sum(1)
-    return (excess / (counts * measured.differences[..., None]).sum(1).clamp(min=1.0)).clamp(min=0.0).sqrt()
+def _unexplained(measured: Measurements, residual: Tensor) -> Tensor:
+    """(B, 2) px, rms of residuals beyond their noise."""
+    counts = (measured.weights > 0) & (measured.differences[..., None] > 0)
+    spare = measured.differences[..., None].clamp(min=1.0)
+    excess = residual.square().sum(2) / spare - 1 / measured.weights.clamp(min=1e-300)
+    return trimmed_mean(torch.where(counts, excess, torch.nan)).clamp(min=0.0).sqrt()
 
 
 def _slant(gradients: list[RowGradients]) -> Tensor:
     """(B, 2) px, rms difference between what the halves of the rows miss, beyond its noise."""
-    squares, counts = [], []
+    excesses = []
     for known in gradients:
         rows = known.halves.shape[1] // _SLANT_ROWS * _SLANT_ROWS
         weight = torch.where(known.variance > 0, 1 / known.variance.clamp(min=1e-300), 0.0)[:, :rows, None, None]
@@ -269,7 +281,14 @@ def _slant(gradients: list[RowGradients]) -> Tensor:
         noise = 2 * torch.stack([hyy, hxx], -1) / safe[..., None]  # of a difference of two frames
         both = usable.all(-1)[..., None]
         excess = (missed[:, :, 1] - missed[:, :, 0]).square() - noise.sum(2)
-        squares.append(torch.where(both, excess, 0.0).sum(1))
-        counts.append(both.sum(1))
-    total = torch.stack(squares).sum(0) / torch.stack(counts).sum(0).clamp(min=1)
-    return total.clamp(min=0.0).sqrt()
+        excesses.append(torch.where(both, excess, torch.nan))
+    return trimmed_mean(torch.cat(excesses, 1)).clamp(min=0.0).sqrt()
+
+
+def trimmed_mean(values: Tensor) -> Tensor:
+    """Mean (B, A) of the smaller ones of values (B, N, A), NaN left out: a few rows are not held against all."""
+    ordered = values.sort(dim=1).values  # NaN come last
+    count = ((~torch.isnan(values)).sum(1, keepdim=True) * _MAJORITY).ceil()
+    place = torch.arange(values.shape[1], device=values.device)[None, :, None]
+    counted = place < count
+    return torch.where(counted, ordered, 0.0).sum(1) / count[:, 0].clamp(min=1)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones import MotionModel, ToneFit, drift_response, tone_response
+from rsvib_torch.detection.tones import MotionModel, ToneFit, drift_response, tone_response_and_slope
 
 __all__ = ["fit_tones"]
 
@@ -97,7 +97,7 @@ class _State:
 
 def _evaluate(measurements: Measurements, unknowns: _Unknowns, drift_columns: Tensor, values: Tensor) -> _State:
     coefficients, hertz, drift = unknowns.unpack(values)
-    response, derivative = tone_response(measurements, hertz)
+    response, derivative = tone_response_and_slope(measurements, hertz)
     predicted = (coefficients[:, None, None] * response).real.sum(-1)
     predicted = predicted + torch.einsum("bngj,baj->bnga", drift_columns, drift)
     residual = measurements.relative(measurements.displacements - predicted)

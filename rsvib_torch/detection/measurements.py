@@ -7,6 +7,7 @@ from torch import Tensor
 
 __all__ = ["Measurements"]
 
+_SMALL = 0.1  # of the median residual: below it, sizes count as equal
 _TUNING = 4.685  # of Tukey's biweight: 95 % efficient for Gaussian errors
 
 
@@ -85,6 +86,19 @@ class Measurements:
         """(B, 2) number of independent measurements of each axis."""
         return ((self.weights > 0) * self.differences[..., None]).sum(1) * self.independent
 
+    def repeated(self, count: int) -> "Measurements":
+        """Every stack ``count`` times in a row."""
+        tensors = (self.moments, self.displacements, self.seen, self.information)
+        moments, displacements, seen, information = (t.repeat_interleave(count, dim=0) for t in tensors)
+        return replace(self, moments=moments, displacements=displacements, seen=seen, information=information)
+
+    def __getitem__(self, stacks: slice) -> "Measurements":
+        """Some of the stacks."""
+        moments, displacements, seen, information = (
+            t[stacks] for t in (self.moments, self.displacements, self.seen, self.information)
+        )
+        return replace(self, moments=moments, displacements=displacements, seen=seen, information=information)
+
     def relative(self, values: Tensor) -> Tensor:
         """Values (B, N, G, ...) of every frame less their mean over the frames that see the row, 0 where unseen."""
         seen = self.seen.reshape(*self.seen.shape, *(1,) * (values.ndim - 3))
@@ -95,13 +109,26 @@ class Measurements:
         """(B, 2) weighted sum of squares of residuals (B, N, G, 2), each axis with its share of the cross terms."""
         return torch.einsum("bnga,bnac,bngc->ba", residual, self.information, residual)
 
-    def reweighted(self, residual: Tensor) -> "Measurements":
-        """The measurements with outliers weighed down by Tukey's biweight of their residual, axis by axis."""
+    def sizes(self, residual: Tensor) -> Tensor:
+        """(B, N, 2) size of residuals (B, N, G, 2) in units of their information; NaN where unknown."""
         known = (self.weights > 0) & (self.differences[..., None] > 0)
         square = residual.square().sum(2) / self.differences[..., None].clamp(min=1.0)
-        size = torch.where(known, (square * self.weights).sqrt(), torch.nan)
-        spread = 1.4826 * size.nanmedian(dim=1, keepdim=True).values
-        spread = spread.nan_to_num(1.0).clamp(min=1e-9)
-        ratio = torch.where(known, size / (_TUNING * spread), 1.0)
-        root = (1 - ratio.square()).clamp(min=0.0)  # the square root of the biweight
+        return torch.where(known, (square * self.weights).sqrt(), torch.nan)
+
+    def scaled(self, factor: Tensor) -> "Measurements":
+        """The measurements with their information multiplied by factors (B, N, 2) of each axis."""
+        root = factor.sqrt()
         return replace(self, information=self.information * root[..., :, None] * root[..., None, :])
+
+    def for_least_absolute(self, residual: Tensor) -> "Measurements":
+        """Weights that turn a sum of squares into a sum of sizes of the residual: outliers have little pull."""
+        size = self.sizes(residual)
+        floor = _SMALL * size.nanmedian(dim=1, keepdim=True).values.nan_to_num(1.0) + 1e-12
+        return self.scaled(1 / torch.maximum(size.nan_to_num(0.0), floor))
+
+    def reweighted(self, residual: Tensor) -> "Measurements":
+        """The measurements with outliers weighed down by Tukey's biweight of their residual, axis by axis."""
+        size = self.sizes(residual)
+        spread = 1.4826 * size.nanmedian(dim=1, keepdim=True).values
+        ratio = size / (_TUNING * spread.nan_to_num(1.0).clamp(min=1e-9))
+        return self.scaled((1 - ratio.nan_to_num(1.0).square()).clamp(min=0.0).square())

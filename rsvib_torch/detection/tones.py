@@ -8,7 +8,14 @@ from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
 
-__all__ = ["MotionModel", "ToneFit", "drift_response", "model_displacements", "tone_response"]
+__all__ = [
+    "MotionModel",
+    "ToneFit",
+    "drift_response",
+    "model_displacements",
+    "tone_response",
+    "tone_response_and_slope",
+]
 
 
 @dataclass(frozen=True)
@@ -48,8 +55,8 @@ class ToneFit:
     model: MotionModel
 
 
-def tone_response(measurements: Measurements, frequencies: Tensor) -> tuple[Tensor, Tensor]:
-    """What the measurements see of unit tones, and its derivative by frequency.
+def tone_response(measurements: Measurements, frequencies: Tensor) -> Tensor:
+    """What the measurements see of unit tones.
 
     ``S(f) exp(2 pi i f (t - centre))`` at the mid-exposures t of the matched rows, less the mean over the group, with
     ``S(f) = sinc(f T_e) sinc(f h T_row)``: exposure (Eq. 2), gain (Eq. 4) and band average in one, and the coupling of
@@ -60,20 +67,36 @@ def tone_response(measurements: Measurements, frequencies: Tensor) -> tuple[Tens
         frequencies: (B, 2, K) Hz.
 
     Returns:
-        Two complex128 tensors (B, N, G, 2, K).
+        complex128 (B, N, G, 2, K).
     """
-    middle = 0.5 * measurements.exposure_time - measurements.centre
-    f = frequencies[:, None, None]
-    time = (measurements.moments + middle[:, None, None])[..., None, None]
-    angle = 2 * math.pi * f * time
-    turn = torch.polar(torch.ones_like(angle), angle)
-    average = torch.tensor(measurements.average_times, dtype=f.dtype, device=f.device)[:, None]
-    exposure, exposure_slope = _sinc(f * measurements.exposure_time)
-    band, band_slope = _sinc(f * average)
-    attenuation = exposure * band
-    slope = exposure_slope * measurements.exposure_time * band + exposure * band_slope * average
-    derivative = torch.complex(slope.expand_as(angle), attenuation * 2 * math.pi * time) * turn
+    turn, _ = _turn(measurements, frequencies)
+    average = _average_times(measurements, frequencies)
+    attenuation = torch.sinc(frequencies * measurements.exposure_time) * torch.sinc(frequencies * average)
+    return measurements.relative(attenuation[:, None, None] * turn)
+
+
+def tone_response_and_slope(measurements: Measurements, frequencies: Tensor) -> tuple[Tensor, Tensor]:
+    """``tone_response`` and its derivative by frequency, (B, N, G, 2, K) each."""
+    turn, time = _turn(measurements, frequencies)
+    average = _average_times(measurements, frequencies)
+    exposure, exposure_slope = _sinc(frequencies * measurements.exposure_time)
+    band, band_slope = _sinc(frequencies * average)
+    attenuation = (exposure * band)[:, None, None]
+    slope = (exposure_slope * measurements.exposure_time * band + exposure * band_slope * average)[:, None, None]
+    derivative = torch.complex(slope.expand(turn.shape), attenuation * 2 * math.pi * time) * turn
     return measurements.relative(attenuation * turn), measurements.relative(derivative)
+
+
+def _turn(measurements: Measurements, frequencies: Tensor) -> tuple[Tensor, Tensor]:
+    """exp(2 pi i f s) (B, N, G, 2, K) at the mid-exposures s (B, N, G, 1, 1) from the centre of the record."""
+    middle = 0.5 * measurements.exposure_time - measurements.centre
+    time = (measurements.moments + middle[:, None, None])[..., None, None]
+    angle = 2 * math.pi * frequencies[:, None, None] * time
+    return torch.polar(torch.ones_like(angle), angle), time
+
+
+def _average_times(measurements: Measurements, like: Tensor) -> Tensor:
+    return torch.tensor(measurements.average_times, dtype=like.dtype, device=like.device)[:, None]
 
 
 def _sinc(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -94,7 +117,7 @@ def drift_response(measurements: Measurements, order: int) -> Tensor:
 def model_displacements(measurements: Measurements, fit: ToneFit) -> Tensor:
     """Displacements (B, N, G, 2) in px that the fitted motion predicts at the measurements."""
     turn = 2 * math.pi * fit.frequencies * (measurements.centre - fit.centre)[:, None, None]
-    response, _ = tone_response(measurements, fit.frequencies)
+    response = tone_response(measurements, fit.frequencies)
     tones = (fit.coefficients * torch.polar(torch.ones_like(turn), turn))[:, None, None] * response
     # powers of another centre differ by lower powers and a constant, which the group does not see
     moved = fit.drift.clone()

@@ -1,5 +1,7 @@
 """Whether a detected vibration can be trusted, and why not."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -13,6 +15,7 @@ _LEAST_GAIN = 0.1  # |gain| below this multiplies noise more than tenfold
 _LEAST_SIGNIFICANCE = 4.0  # amplitude over its standard deviation
 _LARGEST_UNCERTAINTY = 0.1  # of a frequency
 _LEAST_GOOD = 0.5  # of the bands
+_MAJORITY = 0.75  # of the bands: things that move by themselves may cover the others
 _LARGEST_MISFIT = 0.3  # mean absolute residual over mean absolute offset about its mean
 _SMALLEST_MISFIT = 0.05  # px, residuals below this are never held against a fit
 _SMALLEST_OTHER = 0.03  # px, other motion below this is never held against a fit
@@ -61,7 +64,8 @@ def judge(
             found.extend(_against_tone(vibration, std, axis, k, float(gain[axis, k]), duration, timing))
         if bool(good.any()):
             values, model = offsets[good, axis], fitted[good, axis]
-            misfit = float((values - model).abs().mean())
+            misfits = (values - model).abs().sort().values
+            misfit = float(misfits[: math.ceil(_MAJORITY * len(misfits))].mean())
             swing = float((values - values.mean()).abs().mean())
             if misfit > max(_SMALLEST_MISFIT, _LARGEST_MISFIT * swing):
                 found.append(f"fit does not explain the curve: residual {misfit:.3g} px of {swing:.3g} px")
