@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from benchmarks.independent_camera import Shake, closed, take_frames
 from benchmarks.measure import in_turns
@@ -66,13 +67,22 @@ def vibration() -> rsv.Vibration:
     return rsv.Vibration(AMPLITUDE, FREQUENCY, phase)
 
 
+def read_picture(path: Path) -> Tensor:
+    """A grey picture (H, W) whose values fill the range from 0.05 to 0.95, whatever its counts are."""
+    info = rsv.read_stack_info(path)
+    largest = np.iinfo(info.dtype).max if info.is_integer and info.full_scale is None else None
+    image = rsv.read_stack(path, full_scale=largest)[0]
+    image = image if image.ndim == 2 else image.mean(0)
+    low, high = np.percentile(image.numpy(), (0.1, 99.9))
+    return (0.05 + 0.9 * (image - low) / (high - low)).clamp(0.0, 1.0)
+
+
 def scenes(options: argparse.Namespace) -> dict[str, Tensor]:
     """Scenes to compare on, a margin larger than the frames."""
     size = options.grid_size + 2 * MARGIN
     found = {name: SCENES[name](size, size, SEED) for name in options.scenes}
     for path in options.images:
-        image = rsv.read_stack(path)[0]
-        image = image if image.ndim == 2 else image.mean(0)
+        image = read_picture(path)
         if min(image.shape) < size:
             raise SystemExit(f"{path}: at least {size} x {size} px are needed, got {tuple(image.shape)}")
         top, left = ((side - size) // 2 for side in image.shape)
