@@ -106,8 +106,8 @@ def cramer_rao_bound(
         frame_size: (height, width) of the frames, as in ``simulate_frames``.
         method: ``"projection"``, exact for an unknown deterministic scene; ``"gradients"``, its closed approximation
             row by row, several times faster; or ``"random"``, the same for a random Gaussian scene with the power
-            spectrum of this one. The last one is larger where the noise hides part of the spectrum, and more than
-            an estimate can reach there that does not know the scene.
+            spectrum of this one: larger where the noise hides part of the spectrum, since an estimate has to learn
+            the scene from the same frames.
         acceleration: Whether the image acceleration is unknown as well (else it is known).
 
     Returns:

@@ -191,6 +191,28 @@ def test_a_blind_tone_is_infinite_and_its_neighbour_is_not(method):
     assert (bound.amplitude[1] == 0).all()  # tones that are not there
 
 
+@pytest.mark.parametrize("method", ["projection", "gradients"])
+def test_uneven_frame_times_open_a_blind_frequency(method):
+    scene = torch.from_numpy(smooth_scene(332, 80))
+    period = TIMING.frame_period
+    uneven = rsv.SensorTiming(
+        row_time=TIMING.row_time, exposure_rows=3, frame_rows=300, frame_start_times=(0.0, 1.5 * period)
+    )
+    bounds = [
+        cramer_rao_bound(
+            scene,
+            timing,
+            rsv.Vibration([1.0, 0.0], [1 / period, 0.0]),
+            noise=0.01,
+            frame_size=(280, 32),
+            method=method,
+        )
+        for timing in (TIMING, uneven)
+    ]
+    assert torch.isinf(bounds[0].amplitude[0, 0])
+    assert float(bounds[1].amplitude[0, 0]) < 0.02
+
+
 def test_random_scene_with_a_flat_spectrum():
     # per frequency S^2 / (N (2 S + N)) instead of S / (2 N), and S the same all over the disc
     highest, noise = 0.3, 0.3
