@@ -54,7 +54,9 @@ JointOption = Annotated[
     str | None,
     typer.Option("--joint", help="Frames restored together: 'all' for one image, or a number of neighbours."),
 ]
-PriorOption = Annotated[str | None, typer.Option("--prior", help="What scenes are expected to be like, see restore.")]
+PriorOption = Annotated[
+    str | None, typer.Option("--prior", help="What scenes are expected to be like, for methods that have the option.")
+]
 SaturationOption = Annotated[
     float | None,
     typer.Option("--saturation", help="Level of the file from which pixels are saturated; full scale for integers."),

@@ -40,7 +40,7 @@ def test_shipped_configs(name, amplitude, frequency, image_motion, num_frames):
     assert simulation.noise.read_noise == 0.003
     assert simulation.vibration.gain(config.timing.frame_period).abs().min() > 0.5
     assert set(config.detection) <= {"method", "registration", "tones", "band_rows", "band_step", "search"}
-    assert config.restoration == {"method": "banded"}
+    assert config.restoration == {"method": "exact"}
 
 
 def test_every_shipped_config_has_a_test():

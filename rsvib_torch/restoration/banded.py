@@ -117,7 +117,8 @@ def restore_banded(
     row all over, deconvolved by the Wiener filter ``H* / (|H|^2 + w (4 sin^2 pi u + 4 sin^2 pi v))`` and only its
     central rows are kept. The whole pixels of the displacement move the slab, so that it need not be tall; the prior
     is shaped like image gradients, so that the mean is conserved. Rows are transformed once per frame, and the filter
-    is evaluated at the central row only. Rows are extended smoothly at their ends and mirrored above and below.
+    is evaluated at the central row only. Rows are extended smoothly at their ends and mirrored above and below. All
+    pixels count: ``restore`` puts local means in place of those without data, and saturated ones count at their level.
 
     Args:
         frames: (B, T, C, H, W) in row order.
@@ -131,6 +132,10 @@ def restore_banded(
 
     Returns:
         Restored frames of the same shape.
+
+    Raises:
+        TypeError: If an option has the wrong type.
+        ValueError: If an option is out of range.
     """
     half_rows = check_whole_number("half_rows", half_rows, at_least=1)
     stride = check_whole_number("stride", stride, at_least=1)
