@@ -104,7 +104,8 @@ def _residual_power(images: Tensor, motion: FrameMotion, stack: int, first: Tens
     fitted = factors[0].solve(right)
     residual = (spectra - sum(tap * fitted[base + i] for i, tap in enumerate(taps))) * used
     free = used.sum() * len(u) - _degrees_of_freedom(factors)
-    return residual.abs().square().sum() / (channels * free * taper.square().sum())
+    power: Tensor = residual.abs().square().sum() / (channels * free * taper.square().sum())
+    return power
 
 
 def _degrees_of_freedom(factors: list[BandedFactor]) -> Tensor:

@@ -8,14 +8,13 @@ from torch import Tensor
 
 from rsvib_torch.checks import check_number, check_whole_number
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.restoration.banded_solver import solve_skewed
 from rsvib_torch.restoration.disagreement import noise_levels
 from rsvib_torch.restoration.missing import fill_roughly, measured_values
 from rsvib_torch.restoration.motion import FrameMotion
-from rsvib_torch.restoration.prior import ORDER, RowPrior, fit_prior
-from rsvib_torch.restoration.row_kernel import REACH, kernel_samples
-from rsvib_torch.restoration.row_system import RowKernels, row_kernels, smooth_band, smooth_kernels
+from rsvib_torch.restoration.prior import fit_prior
+from rsvib_torch.restoration.row_system import RowKernels, row_kernels
 from rsvib_torch.restoration.rows import continue_rows
+from rsvib_torch.restoration.scene_solver import SceneSolver
 from rsvib_torch.spectral import fast_length
 
 __all__ = ["restore_exact"]
@@ -36,96 +35,76 @@ def _groups(count: int, joint: bool | int) -> list[tuple[list[int], int]]:
     return [(list(range(first, first + size)), frame) for frame, first in enumerate(starts)]
 
 
-def _of_whole_frames(kernels: RowKernels, valid: Tensor) -> RowKernels:
-    """Let only those frames count of which most is of the scene: what the others lack can be filled from them."""
-    share = valid.flatten(1).to(kernels.weight.dtype).mean(1)
-    return replace(kernels, weight=kernels.weight * (share >= _MOSTLY * share.amax())[:, None])
-
-
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """One scene, seen by M frames.
 
     Attributes:
+        data: (M, C, R, L) rows continued to a period.
         kernels: How the frames see it.
-        prior: What it is like.
-        noise_power: Power of the noise of a frame of weight 1 in the spectra of its rows.
-        strength: Factor on the prior.
+        precision: What it is like, products as from ``RowPrior.precision``.
+        chunk: Frequencies solved at a time.
     """
 
+    data: Tensor
     kernels: RowKernels
-    prior: RowPrior
-    noise_power: Tensor
-    strength: float
+    precision: Tensor
+    chunk: int
+
+    def solver(self, weight: Tensor | None = None, *, keep: bool = False) -> SceneSolver:
+        """The fast solver, if all data had been measured."""
+        size = (self.data.shape[-2], self.data.shape[-1])
+        return SceneSolver(self.kernels, self.precision, size, self.data.dtype, self.chunk, weight=weight, keep=keep)
 
 
-def _restore_group(data: Tensor, valid: Tensor | None, problem: _Problem, chunk: int) -> Tensor:
-    """Restore one scene from M frames.
+def _fill(problem: _Problem, measured: Tensor, floor: Tensor | None) -> Tensor:
+    """Data with what was not measured replaced by what the solution for all other data predicts.
+
+    Solved by conjugate gradients for the values that are missing, each step of which is one fast solution: what the
+    solution for filled data leaves unexplained has to vanish where the filling is.
 
     Args:
-        data: (M, C, R, L) rows continued to a period.
-        valid: Which values were measured, or None for all; the rest is filled with what the solution predicts.
         problem: The scene.
-        chunk: Frequencies solved at a time.
-
-    Returns:
-        (C, R, L) scene rows.
+        measured: (M, C, R, L) which values count.
+        floor: (M, C, R, L) least value of what was not measured (saturated), or None.
     """
-    num_rows, length = data.shape[-2:]
-    kernels = problem.kernels
-    u = torch.fft.rfftfreq(length, dtype=torch.float64, device=data.device)
-    rows = kernels.scene_rows(num_rows)
-    width = max(kernels.taps.shape[-2] - 1, ORDER)
-    parts = [slice(begin, min(begin + chunk, len(u))) for begin in range(0, len(u), chunk)]
-    seen = smooth_kernels(kernels, data.dtype)
-    base = (kernels.first - rows.top).flatten()
-    precision = problem.prior.precision(problem.noise_power, problem.strength)
+    data, weight = problem.data, problem.kernels.weight
+    share = measured.flatten(1).to(weight.dtype).mean(1)
+    whole = weight * (share >= _MOSTLY * share.amax())[:, None]
+    start = problem.solver(whole)
+    data = torch.where(measured, data, start.predict(start.fit(data)))
+    solver = problem.solver(keep=True)
+    scale = weight.to(data.dtype)[:, None, :, None]
+    rounds = 1 if floor is None else 2
+    for _ in range(rounds):
+        if floor is not None:
+            low = ~measured & (data < floor)
+            data, measured = torch.where(low, floor, data), measured | low
+        missing = ~measured
 
-    def solve(values: Tensor, weight: Tensor) -> list[Tensor]:
-        spectra = torch.fft.rfft(values)
-        normal = smooth_band(replace(kernels, weight=weight), rows, width, ORDER, data.dtype)
-        memory = normal.memory(chunk)
-        solutions = []
-        for part in parts:
-            turned = spectra[..., part] * kernels.phases(length, part, data.dtype)[:, None]
-            turned = (turned * weight.to(data.dtype)[:, None, :, None]).transpose(1, 2).flatten(0, 1).conj()
-            right = turned.new_zeros(rows.count, *turned.shape[1:])
-            for i, kernel in enumerate(seen.taps(u[part])):
-                right = right.index_add_(0, base + i, kernel[:, None] * turned)
-            full = normal.at(u[part], precision[..., part], memory)
-            solutions.append(solve_skewed(full, right.conj().resolve_conj()))
-        return solutions
+        def unexplained(values: Tensor, missing: Tensor = missing) -> Tensor:
+            return torch.where(missing, values - solver.predict(solver.fit(values)), 0.0)
 
-    def predict(coefficients: list[Tensor]) -> Tensor:
-        spectra = []
-        for part, values in zip(parts, coefficients, strict=True):
-            seen_rows = sum(
-                (kernel[:, None] * values[base + i] for i, kernel in enumerate(seen.taps(u[part]))),
-                start=values.new_zeros(()),
-            )
-            phases = kernels.phases(length, part, data.dtype).conj()
-            spectra.append(seen_rows.unflatten(0, phases.shape[:2]) * phases[:, :, None])
-        images: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1).transpose(1, 2), n=length)
-        return images
-
-    if valid is None:
-        coefficients = solve(data, kernels.weight)
-    else:
-        coefficients = solve(data, _of_whole_frames(kernels, valid).weight)
-        for _ in range(_FILL_ITERATIONS):
-            coefficients = solve(torch.where(valid, data, predict(coefficients)), kernels.weight)
-    spectra = torch.cat([_evaluate(values, 1 - REACH - rows.top, num_rows) for values in coefficients], dim=-1)
-    scene: Tensor = torch.fft.irfft(spectra, n=length)
-    return scene
+        residual = -unexplained(data)
+        step, energy = residual, (scale * residual.square()).sum()
+        for _ in range(_FILL_ITERATIONS // rounds):
+            if not bool(energy > 0):
+                break
+            image = unexplained(step)
+            length = energy / (scale * step * image).sum()
+            data = data + length * step
+            residual = residual - length * image
+            before, energy = energy, (scale * residual.square()).sum()
+            step = residual + energy / before * step
+    return data
 
 
-def _evaluate(coefficients: Tensor, first: int, count: int) -> Tensor:
-    """Spectra (C, count, U) of scene rows from coefficients (K, C, U)."""
-    rows = sum(
-        (weight * coefficients[first + k : first + k + count] for k, weight in enumerate(kernel_samples())),
-        start=coefficients.new_zeros(()),
-    )
-    return rows.movedim(1, 0)
+def _restore_group(problem: _Problem, measured: Tensor | None, floor: Tensor | None) -> Tensor:
+    """Restore one scene (C, R, L) from M frames."""
+    if measured is not None:
+        problem = replace(problem, data=_fill(problem, measured, floor))
+    solver = problem.solver()
+    return solver.scene(solver.fit(problem.data))
 
 
 def restore_exact(
@@ -136,6 +115,7 @@ def restore_exact(
     noise: float | Literal["auto"] = "auto",
     regularisation: float = 1.0,
     ignore: Tensor | None = None,
+    clipped: Tensor | None = None,
     chunk_frequencies: int | None = None,
 ) -> Tensor:
     """Restore frames with all rows coupled: the most probable scene for its frames and a prior.
@@ -154,8 +134,9 @@ def restore_exact(
             motion moves frames, only what they have in common with the restored one is joined.
         noise: Standard deviation of the noise (full scale 1); ``"auto"`` estimates it for every frame.
         regularisation: Factor on the prior; 1 is what the frames ask for.
-        ignore: Boolean mask shaped like the frames of pixels that do not count (no data, saturated); they may hold
-            anything, and are filled with what the others say.
+        ignore: Boolean mask shaped like the frames of pixels that do not count; they may hold anything, and are filled
+            with what the others say.
+        clipped: Boolean mask of saturated pixels: what they would have shown is at least what they hold.
         chunk_frequencies: Frequencies solved at a time; bounds the memory, does not change the result.
 
     Returns:
@@ -170,6 +151,7 @@ def restore_exact(
     chunk = check_whole_number("chunk_frequencies", chunk_frequencies, at_least=1)
     if ignore is not None:
         frames = fill_roughly(frames, ignore)
+    lost = ignore if clipped is None else clipped if ignore is None else ignore | clipped
     levels = _noise_levels(frames, motion, noise)
     mean = frames.mean((1, 3, 4), keepdim=True)  # the prior is for deviations from it
     data = continue_rows(frames - mean, length)
@@ -185,10 +167,15 @@ def restore_exact(
             moved = displacement[stack, members] - motion.shift[stack, reference]
             kernels = row_kernels(moved, node_weights, weights[members], H, _MARGIN)
             along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
-            hidden = None if ignore is None else ignore[stack, members]
-            valid = measured_values(along, hidden, data[stack, members].shape, W)
-            problem = _Problem(kernels, prior, typical * length, factor)
-            restored.append(_restore_group(data[stack, members], valid, problem, chunk))
+            problem = _Problem(data[stack, members], kernels, prior.precision(typical * length, factor), chunk)
+            hidden = None if lost is None else lost[stack, members]
+            measured = measured_values(along, hidden, problem.data.shape, W)
+            floor = None
+            if clipped is not None:
+                bottomless = torch.full_like(problem.data, -torch.inf)
+                bottomless[..., :W] = torch.where(clipped[stack, members], problem.data[..., :W], -torch.inf)
+                floor = bottomless
+            restored.append(_restore_group(problem, measured, floor))
     stacked: Tensor = torch.stack(restored).unflatten(0, (B, len(groups)))[..., :W]
     return stacked + mean
 

@@ -10,11 +10,13 @@ __all__ = ["fill_roughly", "measured_values"]
 
 def measured_values(along: Tensor, hidden: Tensor | None, shape: torch.Size, width: int) -> Tensor | None:
     """Which values (M, C, R, L) of the frames, moved ``along`` px to the restored one, count; None for all."""
-    if hidden is None and not bool(along.any()):
+    moved = bool(along.any())
+    if hidden is None and not moved:
         return None
     columns = torch.arange(shape[-1], device=along.device)
     scene = columns - along[:, None]
-    seen = (columns < width) & (scene >= 0) & (scene < width)
+    # what rows are continued with beyond their ends is right only for frames that show the same columns
+    seen = (columns < width) & (scene >= 0) & (scene < width) | (not moved)
     valid = seen[:, None, None].expand(shape).clone()
     if hidden is not None:
         valid[..., :width] &= ~hidden

@@ -26,6 +26,7 @@ def estimate_noise(frames: Tensor) -> Tensor:
         Standard deviation, shape (...).
 
     Example:
+        >>> import torch
         >>> noise = torch.randn(200, 300, generator=torch.Generator().manual_seed(0))
         >>> round(estimate_noise(0.1 * noise).item(), 2)
         0.1
