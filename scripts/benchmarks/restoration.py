@@ -181,22 +181,31 @@ def speed(options: argparse.Namespace) -> list[dict[str, Any]]:
     ]
 
 
+MEMORY_PROBE = """
+import re, sys, torch, rsvib_torch as rsv
+from pathlib import Path
+
+def memory(name):
+    return 1024 * int(re.search(name + r":\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1])
+
+method, size, threads = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+torch.set_num_threads(threads)
+timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=max(size, 2048))
+truth = rsv.Vibration([3.1, 5.2], [50.0, 30.0])
+rsv.restore(torch.rand(1, 64, 64), timing, truth, method=method)
+frame = torch.rand(1, size, size)
+Path("/proc/self/clear_refs").write_text("5")  # forgets the peak so far
+before = memory("VmRSS")
+rsv.restore(frame, timing, truth, method=method)
+print((memory("VmHWM") - before) / (8 * size * size))
+"""
+
+
 def peak_memory(method: str, size: int) -> float | None:
-    """Peak memory that restoring one frame adds, over that of the frame in complex64; in a process of its own."""
-    code = (
-        "import resource, sys, torch, rsvib_torch as rsv\n"
-        f"torch.set_num_threads({torch.get_num_threads()})\n"
-        f"timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows={max(size, 2048)})\n"
-        f"truth = rsv.Vibration({list(AMPLITUDE)}, {list(FREQUENCY)})\n"
-        "rsv.restore(torch.rand(1, 64, 64), timing, truth, method=sys.argv[1])\n"
-        f"frame = torch.rand(1, {size}, {size})\n"
-        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-        "rsv.restore(frame, timing, truth, method=sys.argv[1])\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code, method], capture_output=True, text=True, check=False)
-    unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss, in bytes
-    return int(done.stdout) * unit / (8.0 * size * size) if done.returncode == 0 else None
+    """Peak memory that restoring one frame adds, over that of the frame in complex64; None where it is not told."""
+    arguments = [sys.executable, "-c", MEMORY_PROBE, method, str(size), str(torch.get_num_threads())]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    return float(done.stdout) if done.returncode == 0 else None
 
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
