@@ -245,6 +245,9 @@ def _detect(frames: Tensor, valid: Tensor | None, timing: SensorTiming, options:
     fitted = (predicted[:, :, 1] - predicted[:, :, 0]).unflatten(1, curve.quality.shape[1:])
     difference = (curve.offsets - fitted).abs().nanmean(dim=(1, 2))
 
+    # bands that an image motion has carried out of the later frame cannot be found there
+    later = curve.rows + fitted[..., 1]
+    shown = (later >= 0.5 * options.band_rows) & (later <= frames.shape[-2] - 1 - 0.5 * options.band_rows)
     duration = float(curve.later_times.max() - curve.times.min()) + options.band_rows * timing.row_time
     starts = in_rows.frame_starts(frames.shape[1], frames.device)
     baselines = 1 if options.method == "bands" else min(len(starts), LARGEST_GROUP) - 1
@@ -255,6 +258,7 @@ def _detect(frames: Tensor, valid: Tensor | None, timing: SensorTiming, options:
             std[index],
             offsets=curve.offsets[index].flatten(0, 1),
             fitted=fitted[index].flatten(0, 1),
+            shown=shown[index].flatten(),
             intervals=intervals,
             duration=duration,
             timing=in_rows,

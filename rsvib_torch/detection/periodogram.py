@@ -182,10 +182,12 @@ def _of_families(total: Tensor, grid: Tensor, harmonics: int) -> Tensor:
     """
     if harmonics == 1:
         return total
-    place = torch.arange(grid.shape[-1], device=grid.device) + _OVERSAMPLING // 2
+    step = (grid[..., -1:] - grid[..., :1]).amax() / max(1, grid.shape[-1] - 1)
+    first = round(float(grid.amin() / step)) if grid.shape[-1] > 1 else 1
+    place = torch.arange(grid.shape[-1], device=grid.device) + first
     family = total.clone()
     for harmonic in range(2, harmonics + 1):
-        index = harmonic * place - _OVERSAMPLING // 2
+        index = harmonic * place - first
         inside = index < grid.shape[-1]
         family[..., inside] += total[..., index[inside]]
     near = family >= _FUNDAMENTAL * family.amax(-1, keepdim=True)

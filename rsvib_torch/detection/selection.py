@@ -186,6 +186,7 @@ def strongest_only(fit: ToneFit) -> ToneFit:
     family = size.sum(-1).argmax(-1)[..., None, None].expand(-1, -1, 1, harmonics)
 
     def pick(values: Tensor) -> Tensor:
-        return values.unflatten(-1, (-1, harmonics)).gather(2, family)[:, :, 0]
+        picked: Tensor = values.unflatten(-1, (-1, harmonics)).gather(2, family)[:, :, 0]
+        return picked
 
     return replace(fit, coefficients=pick(fit.coefficients), frequencies=pick(fit.frequencies), active=pick(fit.active))

@@ -14,6 +14,7 @@ __all__ = ["judge"]
 _LEAST_GAIN = 0.1  # |gain| below this multiplies noise more than tenfold
 _LEAST_SIGNIFICANCE = 4.0  # amplitude over its standard deviation
 _LARGEST_UNCERTAINTY = 0.1  # of a frequency
+_LEAST_SWING = 0.01  # px, offsets that a tone makes: less may be left over from interpolation
 _LEAST_GOOD = 0.5  # of the bands
 _MAJORITY = 0.75  # of the bands: things that move by themselves may cover the others
 _LARGEST_MISFIT = 0.3  # mean absolute residual over mean absolute offset about its mean
@@ -29,6 +30,7 @@ def judge(
     *,
     offsets: Tensor,
     fitted: Tensor,
+    shown: Tensor,
     intervals: Tensor,
     duration: float,
     timing: SensorTiming,
@@ -41,6 +43,7 @@ def judge(
         std: Its standard deviations.
         offsets: (M, 2) px measured offsets, NaN where unknown.
         fitted: (M, 2) px, what the result predicts.
+        shown: (M,) bool, bands that both frames show.
         intervals: Times between the frames compared, s.
         duration: Length of the record in seconds.
         timing: The sensor.
@@ -50,14 +53,16 @@ def judge(
         (2,) bool and the reasons against each axis.
     """
     reasons: tuple[list[str], list[str]] = ([], [])
-    good = torch.isfinite(offsets).all(-1)
-    share = float(good.double().mean())
-    within_row = vibration.displacement_within_row_time(timing.row_time).tolist()
+    good = torch.isfinite(offsets).all(-1) & shown
+    share = float(good.double().sum() / shown.double().sum().clamp(min=1))
+    # a uniform motion is smeared exactly at any speed: condition (24) is for what changes within a row time
+    of_tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
+    within_row = of_tones.displacement_within_row_time(timing.row_time).tolist()
     gain = torch.stack([vibration.gain(float(t)).abs() for t in intervals]).amax(0)
     for axis, found in enumerate(reasons):
         amplitude = vibration.amplitude[axis]
         if share < _LEAST_GOOD:
-            found.append(f"too few good bands: {share:.0%} of {len(good)}")
+            found.append(f"too few good bands: {share:.0%} of {int(shown.sum())}")
         if not bool((amplitude > 0).any()):
             found.append("no significant tone")
         for k in amplitude.nonzero()[:, 0].tolist():
@@ -93,6 +98,8 @@ def _against_tone(
     found = []
     if size < _LEAST_SIGNIFICANCE * size_std:
         found.append(f"{name} not significant: amplitude {size:.3g} +- {size_std:.2g} px")
+    elif size * gain < _LEAST_SWING:
+        found.append(f"{name} too small: offsets of {size * gain:.2g} px, below {_LEAST_SWING} px")
     elif hertz_std > _LARGEST_UNCERTAINTY * hertz:
         found.append(f"{name} not known well enough: frequency {hertz:.4g} +- {hertz_std:.2g} Hz")
     if gain < _LEAST_GAIN:

@@ -1,11 +1,13 @@
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from truth import Motion, draw_scene, take_frames
 
-from rsvib_torch import detect_vibration, register_bands
+from rsvib_torch import SensorTiming, detect_vibration, register_bands
 from rsvib_torch.registration.gradients import RowSpectra, row_gradients, row_shifts
 
 MARGIN = 40
@@ -121,6 +123,269 @@ def test_rows_tell_a_known_shift(remaining, num_frames):
     assert shifts[:, 1].abs().max() < 0.02 * abs(remaining) + 1e-5
     # what is taken out beforehand does not remain
     assert told(expected[None, :, None].expand(1, -1, 96).double()).abs().max() < 1e-3
+
+
+@dataclass(frozen=True)
+class Tones:
+    """Tones of both axes (2, K), with a drift that may speed up."""
+
+    amplitude: tuple
+    frequency: tuple
+    phase: tuple
+    image_motion: tuple = (0.0, 0.0)
+    image_acceleration: tuple = (0.0, 0.0)
+
+    def displacement(self, times):
+        rows = zip(self.amplitude, self.frequency, self.phase, self.image_motion, self.image_acceleration, strict=True)
+        return np.stack(
+            [
+                sum(a * np.sin(2 * np.pi * f * times + p) for a, f, p in zip(*tones, strict=True))
+                + v * times
+                + b * times**2 / 2
+                for *tones, v, b in rows
+            ],
+            axis=-1,
+        )
+
+
+MIDDLING = Motion((1.2, 0.8), (83.0, 110.0), (2.7, 0.2))
+SMALL = Motion((0.2, 0.13), (155.0, 155.0), (0.8, -2.6))
+
+
+def other_contrast(frames, random):
+    return np.stack([frames[0], 1.2 * frames[1] - 0.1]), None
+
+
+def vignetting(frames, random):
+    y, x = (np.linspace(-1, 1, size) for size in frames.shape[-2:])
+    return frames * (1 - 0.25 * (y[:, None] ** 2 + x**2)), None
+
+
+def pattern_of_columns(frames, random):
+    return frames + 0.005 * random.standard_normal(frames.shape[-1]), None
+
+
+def missing_pixels(frames, random):
+    frames = frames.copy()
+    frames[:, random.random(frames.shape[-2:]) < 0.01] = np.nan
+    frames[:, 500:502] = np.nan
+    frames[:, :, 130] = np.nan
+    return frames, None
+
+
+def ignored_pixels(frames, random):
+    bad = random.random(frames.shape[-2:]) < 0.02
+    return np.where(bad, 1.0, frames), torch.from_numpy(bad)
+
+
+def clipped_highlights(frames, random):
+    return np.minimum(frames, np.quantile(frames, 0.95)), None
+
+
+def something_that_moves(frames, random):
+    """A fifth of the rows shows another scene, which moves on its own."""
+    frames, tall = frames.copy(), frames.shape[-2] // 5
+    other = draw_scene(tall + 20, frames.shape[-1] + 20, 99)
+    frames[0, 700 : 700 + tall] = other[5 : 5 + tall, 9:-11]
+    frames[1, 700 : 700 + tall] = other[2 : 2 + tall, 4:-16]
+    return frames, None
+
+
+def weak_detail(frames, random):
+    """A third of the rows shows next to nothing."""
+    clean = np.ones(frames.shape[-2])
+    clean[900:1500] = 0.01
+    return 0.5 + (frames - 0.5) * clean[:, None], None
+
+
+DISTURBANCES = (
+    other_contrast,
+    vignetting,
+    pattern_of_columns,
+    missing_pixels,
+    ignored_pixels,
+    clipped_highlights,
+    something_that_moves,
+    weak_detail,
+)
+
+
+@pytest.fixture(scope="module")
+def clean_pairs(paper_camera):
+    return {
+        motion: take_frames(draw_scene(2128, 400, seed), paper_camera, motion, 2, samples=8)
+        for motion, seed in ((MIDDLING, 51), (SMALL, 52))
+    }
+
+
+@pytest.mark.parametrize("motion", [MIDDLING, SMALL], ids=["middling", "small"])
+@pytest.mark.parametrize("disturb", DISTURBANCES, ids=lambda disturb: disturb.__name__)
+def test_disturbed_frames(clean_pairs, paper_camera, disturb, motion):
+    random = np.random.default_rng(60)
+    frames, ignore = disturb(clean_pairs[motion], random)
+    frames = torch.from_numpy(frames + 0.003 * random.standard_normal(frames.shape)).float()
+    result = detect_vibration(frames, paper_camera, ignore=ignore)
+    assert result.reliable.tolist() == [True, True], result.reasons
+    assert result.vibration.amplitude.shape == (2, 1)
+    period, amplitude, phase = errors(result.vibration, motion)
+    assert float(period.max()) < 0.1
+    assert float(amplitude.max()) < 1.0
+    assert float(phase.max()) < 0.01
+
+
+def test_image_motion_of_almost_half_a_frame():
+    """Only what both frames show counts; short exposures keep the smear of the motion itself small."""
+    camera = SensorTiming(20.52e-6, 10, 1100)
+    period = camera.frame_period
+    for move in ((0.45 * 700 / period, 0.0), (-0.2 * 700 / period, -0.45 * 1000 / period)):
+        motion = Motion((1.2, 0.9), (310.0, 260.0), (0.4, -1.0), move)
+        margin = 640
+        scene = draw_scene(1000 + 2 * margin, 700 + 2 * margin, 53)
+        frames = torch.from_numpy(take_frames(scene, camera, motion, 2, 0.003, seed=3, margin=margin, samples=6))
+        result = detect_vibration(frames.float(), camera)
+        assert result.reliable.all(), result.reasons
+        period_error, amplitude, phase = errors(result.vibration, motion)
+        assert float(period_error.max()) < 0.1
+        assert float(amplitude.max()) < 1.0
+        assert float(phase.max()) < 0.01
+        torch.testing.assert_close(result.vibration.image_motion, torch.tensor(move).double(), rtol=0, atol=0.5)
+
+
+def test_uneven_frames_see_what_even_ones_are_blind_to(paper_camera):
+    blind = 1 / paper_camera.frame_period
+    motion = Motion((2.0, 1.0), (blind, 90.0), (0.4, 1.0))
+    scene = draw_scene(2128, 336, 54)
+    starts = [0.0, paper_camera.frame_period, 2.37 * paper_camera.frame_period]
+    uneven = replace(paper_camera, frame_start_times=starts)
+    frames = np.concatenate(
+        [
+            take_frames(scene, replace(paper_camera, frame_rows=s / paper_camera.row_time), motion, 2)[1:]
+            for s in starts[1:]
+        ]
+    )
+    frames = np.concatenate([take_frames(scene, paper_camera, motion, 1), frames])
+    frames = torch.from_numpy(frames + 0.003 * np.random.default_rng(4).standard_normal(frames.shape)).float()
+    result = detect_vibration(frames, uneven)
+    assert result.reliable.all(), result.reasons
+    period, amplitude, phase = errors(result.vibration, motion)
+    assert float(period.max()) < 0.02
+    assert float(amplitude.max()) < 0.3
+    assert float(phase.max()) < 0.002
+
+
+def test_harmonics_share_a_frequency(paper_camera):
+    base = 37.0
+    motion = Tones(
+        ((2.0, 0.5, 0.2), (1.0, 0.3, 0.1)),
+        ((base, 2 * base, 3 * base), (61.0, 122.0, 183.0)),
+        ((0.1, 0.2, 0.3), (1.0, 2.0, 3.0)),
+    )
+    frames = pair_of(paper_camera, motion, 55, 0.005, columns=256, num_frames=3)
+    tied = detect_vibration(frames, paper_camera, harmonics=3)
+    free = detect_vibration(frames, paper_camera)
+    for result in (tied, free):
+        found = result.vibration
+        assert found.amplitude.shape == (2, 3)
+        assert (found.frequency / torch.tensor(motion.frequency) - 1).abs().max() < 5e-4
+        assert (found.amplitude / torch.tensor(motion.amplitude) - 1).abs().max() < 0.02
+    multiples = tied.vibration.frequency / tied.vibration.frequency[:, :1]
+    torch.testing.assert_close(multiples, torch.tensor([[1.0, 2.0, 3.0]] * 2).double(), rtol=1e-12, atol=0)
+    # what is tied is known better
+    assert bool((tied.std.frequency[:, 1:] < 0.5 * free.std.frequency[:, 1:]).all())
+
+
+def test_image_motion_that_speeds_up(paper_camera):
+    motion = Tones(((3.1,), (5.2,)), ((50.0,), (30.0,)), ((0.7,), (2.1,)), (200.0, -300.0), (900.0, -1500.0))
+    scene = draw_scene(2048 + 200, 256 + 200, 56)
+    frames = take_frames(scene, paper_camera, motion, 4, 0.005, seed=6, margin=100, samples=6)
+    frames = torch.from_numpy(frames).float()
+    result = detect_vibration(frames, paper_camera, image_acceleration=True)
+    assert result.reliable.all(), result.reasons
+    found = result.vibration
+    torch.testing.assert_close(found.image_acceleration, torch.tensor([900.0, -1500.0]).double(), rtol=0, atol=5.0)
+    torch.testing.assert_close(found.image_motion, torch.tensor([200.0, -300.0]).double(), rtol=0, atol=0.5)
+    assert (found.amplitude[:, 0] / torch.tensor([3.1, 5.2]) - 1).abs().max() < 0.005
+    uniform = detect_vibration(frames, paper_camera)
+    assert not bool(uniform.reliable.any())
+
+
+def test_windows_follow_a_vibration_that_changes(paper_camera):
+    """Amplitude grows and frequency falls along the stack."""
+
+    class Changing:
+        def displacement(self, times):
+            x = (1.0 + 2.0 * times) * np.sin(2 * np.pi * (95.0 * times - 10.0 * times**2) + 0.3)
+            return np.stack([x, 0.8 * np.sin(2 * np.pi * 64.0 * times)], axis=-1)
+
+    frames = pair_of(paper_camera, Changing(), 57, 0.003, columns=192, num_frames=7)
+    result = detect_vibration(frames, paper_camera, window=3, window_step=2, tones=1)
+    assert result.vibration.amplitude.shape == (3, 2, 1)
+    assert len(result.reasons) == 3
+    assert result.offsets.times.shape[0] == 3
+    for index in range(3):
+        middle = (2 * index + 1.5) * paper_camera.frame_period
+        found = result[index].vibration
+        assert found.frequency[0, 0].item() == pytest.approx(95.0 - 20.0 * middle, rel=3e-3)
+        assert found.amplitude[0, 0].item() == pytest.approx(1.0 + 2.0 * middle, rel=0.02)
+        assert found.frequency[1, 0].item() == pytest.approx(64.0, rel=2e-3)
+    # phases count from the time origin of the whole stack
+    late = result[2].vibration
+    times = torch.linspace(4, 6.5, 50).double() * paper_camera.frame_period
+    torch.testing.assert_close(
+        late.displacement(times)[:, 1], 0.8 * torch.sin(2 * math.pi * 64.0 * times), rtol=0, atol=0.02
+    )
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.02])
+def test_drift_alone_is_no_vibration(paper_camera, noise):
+    frames = pair_of(paper_camera, Motion((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (300.0, -200.0)), 58, noise, columns=256)
+    result = detect_vibration(frames, paper_camera)
+    assert not bool(result.reliable.any())
+    torch.testing.assert_close(result.vibration.image_motion, torch.tensor([300.0, -200.0]).double(), rtol=0, atol=1.0)
+
+
+def test_rotation_is_not_taken_for_a_vibration(paper_camera):
+    """A camera that rolls between the frames: halves of the rows move apart."""
+    scene = draw_scene(2128, 336, 59)
+    frames = take_frames(scene, paper_camera, Motion((1.0, 1.0), (80.0, 80.0), (0.0, 1.0)), 2)
+    rows = np.arange(frames.shape[1])[:, None]
+    tilt = 0.002 * (np.arange(frames.shape[2]) - frames.shape[2] / 2)
+    frames[1] = ndimage.map_coordinates(
+        frames[1], [rows - tilt, np.broadcast_to(np.arange(frames.shape[2]), frames[1].shape)], order=5, mode="mirror"
+    )
+    frames = torch.from_numpy(frames + 0.003 * np.random.default_rng(5).standard_normal(frames.shape)).float()
+    result = detect_vibration(frames, paper_camera)
+    assert not bool(result.reliable[1])
+    assert any("move apart" in reason for reason in result.reasons[1])
+
+
+def test_batch_of_stacks_is_a_loop_of_singles(paper_camera):
+    stacks = torch.stack(
+        [pair_of(paper_camera, motion, 61 + i, 0.003, columns=192) for i, motion in enumerate((MIDDLING, Motion()))]
+    )
+    together = detect_vibration(stacks[:, :, None], paper_camera)
+    for index in range(2):
+        alone = detect_vibration(stacks[index], paper_camera).vibration
+        one = together[index].vibration
+        torch.testing.assert_close(one.amplitude, alone.amplitude, rtol=2e-5, atol=0)
+        torch.testing.assert_close(one.frequency, alone.frequency, rtol=2e-6, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"window": 1}, ValueError, "window must be at least 2, got 1"),
+        ({"window": 5}, ValueError, "window of 5 frames is longer than the stack of 3"),
+        ({"window": 2, "window_step": 0}, ValueError, "window_step must be at least 1, got 0"),
+        ({"harmonics": 0}, ValueError, "harmonics must be at least 1, got 0"),
+        ({"ignore": torch.zeros(5, 5, dtype=torch.bool)}, ValueError, r"ignore \(5, 5\) does not fit"),
+        ({"ignore": torch.zeros(256, 256)}, TypeError, "ignore must be a bool tensor"),
+        ({"ignore": torch.ones(256, 256, dtype=torch.bool)}, ValueError, "frame 0 has only 0.0% of pixels"),
+    ],
+)
+def test_bad_options(paper_camera, options, error, message):
+    with pytest.raises(error, match=message):
+        detect_vibration(torch.rand(3, 256, 256), paper_camera, **options)
 
 
 def test_direct_refuses_what_bands_refuse(paper_camera):
