@@ -47,7 +47,7 @@ def lines(results: Results, options: argparse.Namespace) -> list[str]:
                 f"{r['noise']:g}",
                 *(_pair(r[f"{name}_error"]["rms"]) for name in ("period", "amplitude", "phase")),
                 *over,
-                f"**{r['over_bound']:.2f}**",
+                f"**{r['over_bound']:.2f}** ± {r['over_bound_std']:.2f}",
                 f"{(sum(v * v for v in stated) / len(stated)) ** 0.5:.2f}",
                 f"{100 * r['coverage']:.0f} ± {100 * r['coverage_std']:.0f} %",
                 f"{100 * r['lost']:.0f} %",
