@@ -104,7 +104,7 @@ def scene_of(source: int | Path, height: int, width: int) -> Array:
     """A drawn scene of a seed, or the middle of an image file scaled to 0 ... 1 by its percentiles."""
     if isinstance(source, int):
         return city_and_fields(height, width, source).double().numpy()
-    image = rsv.read_stack(source, full_scale=1.0)
+    image = rsv.read_stack(source, full_scale=65535.0)
     image = image.double().reshape(-1, *image.shape[-2:]).mean(0).numpy()
     low, high = np.percentile(image, (0.5, 99.5))
     image = np.clip((image - low) / (high - low), 0.0, 1.0)
