@@ -21,6 +21,7 @@ __all__ = ["restore_exact"]
 
 _MARGIN = 16  # px beyond what the motion shows, more than the reach of a deconvolution filter
 _FILL_ITERATIONS = 8  # of filling values that were not measured
+_LONG = 1.0  # px along the row either way: beyond, ends of rows are worth being continued by what the blur demands
 _MOSTLY = 0.9  # frames with at least this part of the most complete one start the filling
 _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
 _CHUNK_ELEMENTS = {"cpu": 3 << 18, "cuda": 1 << 26}  # rows times frequencies solved at a time
@@ -169,7 +170,8 @@ def restore_exact(
             along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
             problem = _Problem(data[stack, members], kernels, prior.precision(typical * length, factor), chunk)
             hidden = None if lost is None else lost[stack, members]
-            measured = measured_values(along, hidden, problem.data.shape, W)
+            ends = kernels.reach > _LONG
+            measured = measured_values(along, hidden, problem.data.shape, W, ends=ends)
             floor = None
             if clipped is not None:
                 bottomless = torch.full_like(problem.data, -torch.inf)

@@ -8,9 +8,14 @@ from rsvib_torch.missing import fill_roughly
 __all__ = ["fill_roughly", "measured_values"]
 
 
-def measured_values(along: Tensor, hidden: Tensor | None, shape: torch.Size, width: int) -> Tensor | None:
-    """Which values (M, C, R, L) of the frames, moved ``along`` px to the restored one, count; None for all."""
-    moved = bool(along.any())
+def measured_values(
+    along: Tensor, hidden: Tensor | None, shape: torch.Size, width: int, *, ends: bool = False
+) -> Tensor | None:
+    """Which values (M, C, R, L) of the frames, moved ``along`` px to the restored one, count; None for all.
+
+    What rows are continued with beyond their ends counts as measured unless ``ends`` are to be filled as well.
+    """
+    moved = ends or bool(along.any())
     if hidden is None and not moved:
         return None
     columns = torch.arange(shape[-1], device=along.device)

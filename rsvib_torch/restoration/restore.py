@@ -23,6 +23,7 @@ from rsvib_torch.restoration.missing import fill_roughly
 from rsvib_torch.restoration.motion import as_batch, frame_motion
 from rsvib_torch.restoration.pairs import pairs_to_judge
 from rsvib_torch.restoration.pixels import Saturation, hidden_pixels, saturated_pixels
+from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
 from rsvib_torch.restoration.trust import Detected, trusted_vibration
 from rsvib_torch.restoration.verdict import RestorationWarning, TooLittleInCommonError
 from rsvib_torch.sensor import SensorTiming
@@ -33,7 +34,12 @@ __all__ = ["MASKS", "METHODS", "VibrationRestorer", "method_options", "restore"]
 MASKS = ("ignore", "clipped")  # what a method is told of pixels; no options of the user's
 _JUDGED_PAIRS, _JUDGED_COLUMNS = 2, 160  # of every stack
 
-METHODS: dict[str, Callable[..., Tensor]] = {"exact": restore_exact, "banded": restore_banded, "dewarp": restore_dewarp}
+METHODS: dict[str, Callable[..., Tensor]] = {
+    "exact": restore_exact,
+    "banded": restore_banded,
+    "dewarp": restore_dewarp,
+    "richardson-lucy": restore_richardson_lucy,
+}
 
 
 def method_options(method: str) -> tuple[str, ...]:
