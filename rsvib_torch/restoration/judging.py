@@ -45,6 +45,7 @@ def _outcome(
     after: list[float],
     resolution: list[float],
     moves: tuple[bool, bool],
+    offset: list[float],
     gain: float,
     difference: tuple[float, float],
 ) -> tuple[Outcome, str]:
@@ -55,6 +56,7 @@ def _outcome(
         after: Misfit that remains.
         resolution: Misfits that are not told from 0.
         moves: Which axes the vibration moves.
+        offset: Displacement between the frames that the vibration predicts, px.
         gain: Estimated gain in dB.
         difference: Root-mean-square difference of the raw and of the restored frames; the latter NaN for one image.
     """
@@ -72,7 +74,7 @@ def _outcome(
             found.append(("partly" if outweighed else "worse", apart))
         elif after[axis] > max(_EXPLAINED * before[axis], least):
             found.append(("partly", apart))
-        elif before[axis] <= least:
+        elif max(before[axis], offset[axis]) <= least:
             found.append(("unknown", f"{name}: frames lie less than {least:.2g} px apart, all are displaced alike"))
         else:
             found.append(("helps", ""))
@@ -112,6 +114,7 @@ def _judge_pair(pair: FramePair, moves: tuple[bool, bool], shared: int) -> Resto
         misfit_after.tolist(),
         resolution.tolist(),
         moves,
+        pair.offset.tolist(),
         float(gain),
         (float(before), float(after)),
     )

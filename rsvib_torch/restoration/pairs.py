@@ -29,6 +29,7 @@ class FramePair:
         restored_later: Of the later one; None where there is one image.
         predicted: The later raw frame, from ``restored``.
         changed_later: What the motion of the later frame does to its restored one.
+        offset: (2,) px, root-mean-square displacement between the two that the motion predicts, axes (x, y).
     """
 
     earlier: Tensor
@@ -37,6 +38,7 @@ class FramePair:
     restored_later: Tensor | None
     predicted: Tensor
     changed_later: Tensor
+    offset: Tensor
 
 
 def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> list[tuple[int, int]]:
@@ -69,7 +71,8 @@ def shared_part(
     earlier, later = frames
     x, y = (int(step) for step in (motion.shift[0, later] - motion.shift[0, earlier]).tolist())
     height, width = (size - abs(step) for size, step in zip(raw.shape[-2:], (y, x), strict=True))
-    rim_x, rim_y = _rim(motion, frames, raw.shape[-2])
+    moved = _moved(motion, frames, raw.shape[-2])
+    rim_x, rim_y = (math.ceil(reach) + _MARGIN for reach in moved.abs().amax((0, 1)).tolist())
     if min(height - 2 * rim_y, width - 2 * rim_x) < 2 * RIM + 3:
         raise TooLittleInCommonError(
             f"frames {earlier} and {later} have nothing in common, or too little: they lie ({x}, {y}) px apart"
@@ -88,7 +91,13 @@ def shared_part(
     formed = reblur(torch.cat([scene, other]), motion, later, first_row=max(y, 0))
     predicted, formed_later = (part[cut] for part in formed.chunk(2))
     return FramePair(
-        first[cut], second[cut], scene[cut], None if single else other[cut], predicted, formed_later - other[cut]
+        first[cut],
+        second[cut],
+        scene[cut],
+        None if single else other[cut],
+        predicted,
+        formed_later - other[cut],
+        (moved[1] - moved[0]).square().mean(0).sqrt(),
     )
 
 
@@ -97,13 +106,12 @@ def _same_scene(step: tuple[int, int], size: Sequence[int]) -> tuple[Any, ...]:
     return (..., *(slice(max(-s, 0), n - max(s, 0)) for s, n in zip(step, size, strict=True)))
 
 
-def _rim(motion: FrameMotion, frames: Sequence[int], num_rows: int) -> tuple[int, int]:
-    """Rim (x, y) of these frames in which content may come from outside, in whole px."""
+def _moved(motion: FrameMotion, frames: Sequence[int], num_rows: int) -> Tensor:
+    """Mean displacement (2, R, 2) of the rows of two frames beyond their shifts, in px."""
     rows = torch.arange(num_rows, dtype=torch.float64, device=motion.frame_starts.device)
     starts = motion.frame_starts[list(frames), None] + rows * motion.timing.row_time
     moved = motion.vibration.mean_displacement(starts[None], motion.timing.exposure_time)
-    x, y = (moved - motion.shift[:, list(frames), None]).abs().amax((0, 1, 2)).tolist()
-    return math.ceil(x) + _MARGIN, math.ceil(y) + _MARGIN
+    return (moved - motion.shift[:, list(frames), None])[0]
 
 
 def _best_columns(image: Tensor, count: int) -> slice:

@@ -174,7 +174,7 @@ def restore(
     images, chosen = _without_lost_pixels(images, hidden, clipped, method, options)
     restored = METHODS[method](images, frame_motion(motion, rowwise, T, H), **chosen)
     if check:
-        raw = images if hidden is None or method != "exact" else fill_roughly(images, hidden)
+        raw = images if hidden is None else fill_roughly(images, hidden)
         _warn_if_worse(raw.detach(), restored.detach(), motion, timing, options.get("joint", False))
     restored = frames_from_row_order(restored, timing)
     return _without_added_axes(restored, given.ndim).to(dtype)
