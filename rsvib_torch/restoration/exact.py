@@ -6,9 +6,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks import check_number, check_whole_number
+from rsvib_torch.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.disagreement import noise_levels
+from rsvib_torch.restoration.edges import STAGES, expectation, expectation_precision
 from rsvib_torch.restoration.missing import fill_roughly, measured_values
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.prior import fit_prior
@@ -17,12 +18,15 @@ from rsvib_torch.restoration.rows import continue_rows
 from rsvib_torch.restoration.scene_solver import SceneSolver
 from rsvib_torch.spectral import fast_length
 
-__all__ = ["restore_exact"]
+__all__ = ["ScenePrior", "restore_exact"]
+
+ScenePrior = Literal["gaussian", "edges"]
 
 _MARGIN = 16  # px beyond what the motion shows, more than the reach of a deconvolution filter
 _FILL_ITERATIONS = 8  # of filling values that were not measured
 _LONG = 1.0  # px along the row either way: beyond, ends of rows are worth being continued by what the blur demands
 _MOSTLY = 0.9  # frames with at least this part of the most complete one start the filling
+_LOOSE, _REST = 0.1, 0.1  # parts of the quadratic prior that patches start from and keep
 _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
 _CHUNK_ELEMENTS = {"cpu": 3 << 18, "cuda": 1 << 26}  # rows times frequencies solved at a time
 
@@ -44,12 +48,14 @@ class _Problem:
         data: (M, C, R, L) rows continued to a period.
         kernels: How the frames see it.
         precision: What it is like, products as from ``RowPrior.precision``.
+        level: Standard deviation of the noise of data of weight 1.
         chunk: Frequencies solved at a time.
     """
 
     data: Tensor
     kernels: RowKernels
     precision: Tensor
+    level: Tensor
     chunk: int
 
     def solver(self, weight: Tensor | None = None, *, keep: bool = False) -> SceneSolver:
@@ -100,10 +106,29 @@ def _fill(problem: _Problem, measured: Tensor, floor: Tensor | None) -> Tensor:
     return data
 
 
-def _restore_group(problem: _Problem, measured: Tensor | None, floor: Tensor | None) -> Tensor:
+def _with_edges(problem: _Problem, factor: float) -> Tensor:
+    """Restore one scene (C, R, L) with a prior of few cosines in every patch, by half-quadratic splitting."""
+    weak = replace(problem, precision=_LOOSE * problem.precision).solver()
+    coefficients = weak.fit(problem.data)
+    solver, weight = weak, float(problem.kernels.weight.detach().mean(-1).sum())
+    for strength, level in STAGES:
+        pull = strength * weight * factor
+        frequencies = problem.precision.shape[-1]
+        precision = expectation_precision(pull, frequencies, problem.precision)
+        order = problem.precision.shape[0]
+        precision[:order, :order] += _REST * problem.precision
+        target = expectation(solver, coefficients, level * factor**0.5 * problem.level / weight**0.5, pull)
+        solver = replace(problem, precision=precision).solver()
+        coefficients = solver.fit(problem.data, target)
+    return solver.scene(coefficients)
+
+
+def _restore_group(problem: _Problem, measured: Tensor | None, floor: Tensor | None, edges: float | None) -> Tensor:
     """Restore one scene (C, R, L) from M frames."""
     if measured is not None:
         problem = replace(problem, data=_fill(problem, measured, floor))
+    if edges is not None:
+        return _with_edges(problem, edges)
     solver = problem.solver()
     return solver.scene(solver.fit(problem.data))
 
@@ -113,6 +138,7 @@ def restore_exact(
     motion: FrameMotion,
     *,
     joint: bool | int = False,
+    prior: ScenePrior = "gaussian",
     noise: float | Literal["auto"] = "auto",
     regularisation: float = 1.0,
     ignore: Tensor | None = None,
@@ -133,6 +159,8 @@ def restore_exact(
         joint: ``True``: one image from all frames, in the coordinates of the middle one (the time axis keeps length
             1); a number K: every frame from K neighbouring ones; ``False``: every frame from itself. Where image
             motion moves frames, only what they have in common with the restored one is joined.
+        prior: ``"gaussian"``: rows predict their neighbours, one fast solution; ``"edges"``: moreover, every patch of
+            8 x 8 px is made of few cosines, which keeps edges and flat ground apart from noise; several times slower.
         noise: Standard deviation of the noise (full scale 1); ``"auto"`` estimates it for every frame.
         regularisation: Factor on the prior; 1 is what the frames ask for.
         ignore: Boolean mask shaped like the frames of pixels that do not count; they may hold anything, and are filled
@@ -145,6 +173,7 @@ def restore_exact(
     """
     B, T, _, H, W = frames.shape
     factor = check_number("regularisation", regularisation, above=0.0)
+    check_choice("prior", prior, ("gaussian", "edges"))
     groups = _groups(T, joint)
     length = fast_length(W + 4 * (_MARGIN + motion.reach(H)))
     if chunk_frequencies is None:
@@ -163,12 +192,13 @@ def restore_exact(
         weights = levels[stack].square().reciprocal()
         typical = weights.mean().reciprocal()
         weights = weights * typical
-        prior = fit_prior(frames[stack], motion, stack, levels[stack], length)
+        row_prior = fit_prior(frames[stack], motion, stack, levels[stack], length)
         for members, reference in groups:
             moved = displacement[stack, members] - motion.shift[stack, reference]
             kernels = row_kernels(moved, node_weights, weights[members], H, _MARGIN)
             along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
-            problem = _Problem(data[stack, members], kernels, prior.precision(typical * length, factor), chunk)
+            precision = row_prior.precision(typical * length, factor)
+            problem = _Problem(data[stack, members], kernels, precision, typical.sqrt(), chunk)
             hidden = None if lost is None else lost[stack, members]
             ends = kernels.reach > _LONG
             measured = measured_values(along, hidden, problem.data.shape, W, ends=ends)
@@ -177,7 +207,7 @@ def restore_exact(
                 bottomless = torch.full_like(problem.data, -torch.inf)
                 bottomless[..., :W] = torch.where(clipped[stack, members], problem.data[..., :W], -torch.inf)
                 floor = bottomless
-            restored.append(_restore_group(problem, measured, floor))
+            restored.append(_restore_group(problem, measured, floor, factor if prior == "edges" else None))
     stacked: Tensor = torch.stack(restored).unflatten(0, (B, len(groups)))[..., :W]
     return stacked + mean
 

@@ -1,0 +1,83 @@
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from scipy import fft, ndimage
+from truth import Motion, crop, decibel, draw_scene, take_frames
+
+from rsvib_torch import SensorTiming, Vibration
+from rsvib_torch.restoration import restore as restore_by_any_method
+from rsvib_torch.restoration.edges import shrink_patches
+
+restore = partial(restore_by_any_method, method="exact", check=False)
+TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+
+
+def test_patches_agree_with_a_loop():
+    image = np.random.default_rng(0).standard_normal((11, 13))
+    padded = np.pad(image, 7, mode="edge")
+    total, weights = np.zeros_like(padded), np.zeros_like(padded)
+    for row in range(padded.shape[0] - 7):
+        for column in range(padded.shape[1] - 7):
+            patch = fft.dctn(padded[row : row + 8, column : column + 8], norm="ortho")
+            strong = abs(patch) > 2.0 * 0.6
+            strong[0, 0] = True
+            total[row : row + 8, column : column + 8] += fft.idctn(patch * strong, norm="ortho") / strong.sum()
+            weights[row : row + 8, column : column + 8] += 1 / strong.sum()
+    found = shrink_patches(torch.from_numpy(image)[None], 0.6)[0].numpy()
+    np.testing.assert_allclose(found, (total / weights)[7:-7, 7:-7], rtol=0, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def town():
+    scene = draw_scene(272, 240, seed=41)
+    frames = torch.from_numpy(take_frames(scene, TIMING, Motion(), 2, 0.02)).float()
+    return crop(scene), frames
+
+
+@pytest.fixture(scope="module", params=["upright", "lying"])
+def step(request):
+    scene = np.full((256, 256), 0.25)
+    scene[:, 128:] = 0.75
+    scene = ndimage.gaussian_filter(scene if request.param == "upright" else scene.T, 0.8)
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=100, frame_rows=2048)
+    frames = torch.from_numpy(take_frames(scene, timing, Motion(), 2, 0.02, samples=32)).float()
+    return crop(scene), frames, timing, 0 if request.param == "upright" else 1
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_better_than_the_quadratic_prior(town, joint):
+    truth, frames = town
+    plain = restore(frames, TIMING, Motion().vibration(), joint=joint)
+    kept = restore(frames, TIMING, Motion().vibration(), joint=joint, prior="edges")
+    assert kept.shape == plain.shape
+    assert decibel(kept, truth) > decibel(plain, truth) + 0.15
+
+
+def test_steps_ring_less_and_are_far_less_noisy(step):
+    truth, frames, timing, along = step
+    plain, kept = (
+        restore(frames[:1], timing, Motion().vibration(), prior=prior)[0].numpy() for prior in ("gaussian", "edges")
+    )
+    overshoots = []
+    for image in (plain, kept):
+        profile = image[32:-32, 32:-32].mean(along)
+        overshoots.append(max(profile.max() - 0.75, 0.25 - profile.min()))
+    assert overshoots[1] < overshoots[0]
+    assert decibel(kept, truth) > decibel(plain, truth) + 4
+
+
+def test_gradients_to_frames_and_flat_scenes():
+    flat = torch.full((1, 48, 40), 0.37, dtype=torch.float64)
+    kept = restore(flat, TIMING, Vibration(1.0, 50.0), prior="edges", noise=0.05)
+    assert (kept - 0.37).abs().max() < 1e-9
+    frames = torch.rand(1, 24, 20, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    restore(frames, TIMING, Vibration(1.0, 50.0), prior="edges", noise=0.05).square().sum().backward()
+    assert torch.isfinite(frames.grad).all()
+    assert frames.grad.abs().min() > 0
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="prior must be one of"):
+        restore(torch.zeros(1, 16, 16), TIMING, Vibration(1.0, 50.0), prior="tv")

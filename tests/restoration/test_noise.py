@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+import torch
+from truth import Motion, draw_scene, take_frames
+
+from rsvib_torch import SensorTiming
+from rsvib_torch.restoration.disagreement import noise_levels
+from rsvib_torch.restoration.motion import as_batch, frame_motion
+from rsvib_torch.restoration.noise import estimate_noise
+from rsvib_torch.restoration.row_kernel import interpolation_error, kernel_response, kernel_weights
+
+TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+
+
+def levels(frames, motion):
+    rowwise = frame_motion(as_batch(motion.vibration(), 1), TIMING, len(frames), frames.shape[-2])
+    return noise_levels(torch.as_tensor(frames)[:, None], rowwise, 0)
+
+
+@pytest.mark.parametrize("shape", [(512, 512), (300, 64), (64, 64)])
+def test_white_noise_is_measured(shape):
+    noise = 0.03 * torch.randn(16, *shape, generator=torch.Generator().manual_seed(0))
+    assert estimate_noise(noise).square().mean().sqrt().item() == pytest.approx(0.03, rel=0.08)
+
+
+@pytest.mark.parametrize("image_motion", [(0.0, 0.0), (600.0, -400.0)])
+def test_two_frames_tell_texture_from_noise(image_motion):
+    motion = Motion(image_motion=image_motion)
+    margin = 90
+    scene = draw_scene(300 + 2 * margin, 260 + 2 * margin, seed=4, blur=0.5)
+    frames = take_frames(scene, TIMING, motion, 2, margin=margin)
+    noise = np.random.default_rng(1).standard_normal(frames.shape) * np.array([0.004, 0.008])[:, None, None]
+    alone = estimate_noise(torch.from_numpy(frames + noise))
+    assert alone[0] > 1.8 * 0.004
+    found = levels(frames + noise, motion)
+    assert found[0].item() == pytest.approx(0.004, rel=0.3)
+    assert found[1].item() == pytest.approx(0.008, rel=0.15)
+    assert levels(frames[:1] + noise[:1], motion)[0] == alone[0]
+
+
+def test_a_changed_scene_is_not_taken_for_more_noise_than_a_frame_has():
+    scene = draw_scene(336, 288, seed=12)
+    frames = take_frames(scene, TIMING, Motion(), 2, 0.005)
+    frames[1] = frames[1][::-1]
+    found = levels(frames, Motion())
+    assert found.max().item() == pytest.approx(0.005, rel=0.1)
+
+
+def test_kernel_between_rows():
+    weights = kernel_weights(torch.linspace(0, 1, 21, dtype=torch.float64))
+    assert (weights.sum(-1) - 1).abs().max() < 3e-4
+    frequencies = torch.tensor([0.05, 0.2, 0.35], dtype=torch.float64)
+    rows = np.arange(-40, 41)
+    for frequency, response, alias in zip(
+        frequencies, kernel_response(frequencies), interpolation_error(frequencies), strict=True
+    ):
+        wave = np.exp(2j * np.pi * frequency.item() * rows)
+        fractions = (np.arange(400) + 0.5) / 400
+        taps = kernel_weights(torch.from_numpy(fractions)).numpy()
+        seen = taps @ wave[38:44] * np.exp(-2j * np.pi * frequency.item() * fractions)
+        assert abs(seen - seen.mean()).std() ** 2 <= alias.item() * 1.01 + 1e-12
+        assert (abs(seen - seen.mean()) ** 2).mean() == pytest.approx(alias.item(), rel=0.02)
+        assert kernel_weights(torch.zeros(1, dtype=torch.float64))[0].numpy() @ wave[38:44] == pytest.approx(
+            response.item(), abs=1e-9
+        )
