@@ -43,8 +43,11 @@ class FrameMotion:
     def reach(self, num_rows: int) -> int:
         """Bound on the displacement along a row of ``num_rows`` rows, beyond the shift, in whole px."""
         half = 0.5 * (num_rows * self.timing.row_time + self.timing.exposure_time)
-        swing = self.vibration.amplitude.detach().sum(-1) + self.vibration.image_motion.detach().abs() * half
-        return math.ceil(float(swing[..., 0].amax()) + 0.5)
+        swing = self.vibration.amplitude.detach().sum(-1)[:, None]
+        acceleration = self.vibration.image_acceleration.detach()[:, None]
+        speed = self.vibration.image_motion.detach()[:, None] + acceleration * (self.frame_starts + half)[:, None]
+        bound = swing + speed.abs() * half + 0.5 * acceleration.abs() * half**2
+        return math.ceil(float(bound[..., 0].amax()) + 0.5)
 
     def row_starts(self, frame_rows: Tensor) -> Tensor:
         """Exposure starts of frame rows (B, T, S) in seconds."""
@@ -56,14 +59,15 @@ def as_batch(vibration: Vibration, size: int) -> Vibration:
     amplitude, frequency, phase = (
         tones.expand(size, *tones.shape) for tones in (vibration.amplitude, vibration.frequency, vibration.phase)
     )
-    return Vibration(amplitude, frequency, phase, vibration.image_motion.expand(size, 2))
+    motion, acceleration = vibration.image_motion.expand(size, 2), vibration.image_acceleration.expand(size, 2)
+    return Vibration(amplitude, frequency, phase, motion, acceleration)
 
 
 def frame_motion(vibration: Vibration, timing: SensorTiming, num_frames: int, num_rows: int) -> FrameMotion:
     """Motion of ``num_frames`` frames of ``num_rows`` rows for a vibration of batch shape (B,) in row order."""
     starts = timing.frame_starts(num_frames, vibration.device)
     middle = starts + 0.5 * ((num_rows - 1) * timing.row_time + timing.exposure_time)
-    shift = (vibration.image_motion[:, None, :].detach() * middle[:, None]).round()
+    shift = vibration.drift(middle.expand(len(vibration.amplitude), -1)).detach().round()
     return FrameMotion(vibration, timing, starts, shift)
 
 
