@@ -77,3 +77,15 @@ def test_bad_input():
         dewarp(torch.zeros(1, 16, 16), TIMING, Vibration(1.0, 50.0), chunk_rows=0)
     with pytest.raises(TypeError, match="method='dewarp' has no option 'noise'"):
         dewarp(torch.zeros(1, 16, 16), TIMING, Vibration(1.0, 50.0), noise=0.1)
+
+
+def test_gradients_to_frames_and_vibration():
+    timing = SensorTiming(row_time=1e-3, exposure_rows=2, frame_rows=8)
+    frames = torch.rand(1, 6, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def run(images, amplitude, frequency, phase, image_motion):
+        return dewarp(images, timing, Vibration(amplitude, frequency, phase, image_motion))
+
+    vibration = Vibration([0.8, 0.6], [20.0, 30.0], [0.3, 1.0], [3.0, -2.0])
+    inputs = (frames, vibration.amplitude, vibration.frequency, vibration.phase, vibration.image_motion)
+    assert torch.autograd.gradcheck(run, tuple(value.clone().requires_grad_() for value in inputs))

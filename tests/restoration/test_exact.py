@@ -3,6 +3,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch.restoration.exact as exact_module
@@ -180,16 +181,40 @@ def test_ignored_pixels_are_filled_from_the_others(short):
     assert decibel(blind, truth) < decibel(single, truth) - 10
 
 
+def test_dead_rows_and_pixels_harm_no_others(short):
+    truth, frames, motion = short
+    frames = noisy(frames, 0.005)[:1]
+    ignore = torch.rand(frames.shape, generator=torch.Generator().manual_seed(3)) < 0.01
+    ignore[0, 120:122] = True
+    starts = torch.arange(frames.shape[1]) * TIMING.row_time
+    x, y = motion.vibration().mean_displacement(starts, TIMING.exposure_time).round().long().T
+    rows, columns = ignore[0].nonzero().T
+    harmed = np.zeros(truth.shape, dtype=bool)
+    place = (rows - y[rows]).clamp(0, truth.shape[0] - 1), (columns - x[rows]).clamp(0, truth.shape[1] - 1)
+    harmed[place] = True
+    harmed = ndimage.binary_dilation(harmed, np.ones((5, 5)))
+    clean, filled = (
+        np.where(harmed, truth, image[0].numpy())
+        for image in (
+            restore(frames, TIMING, motion.vibration()),
+            restore(frames.masked_fill(ignore, 0.9), TIMING, motion.vibration(), ignore=ignore),
+        )
+    )
+    assert decibel(filled, truth) > decibel(clean, truth) - 0.2
+    blind = restore(frames.masked_fill(ignore, 0.9), TIMING, motion.vibration())[0].numpy()
+    assert decibel(np.where(harmed, truth, blind), truth) < decibel(clean, truth) - 3
+
+
 def test_gradients_to_frames_and_vibration(prior_fitted_once):
     generator = torch.Generator().manual_seed(0)
     timing = SensorTiming(row_time=1e-3, exposure_rows=2, frame_rows=8)
     frames = torch.rand(1, 6, 5, generator=generator, dtype=torch.float64)
     vibration = Vibration([0.8, 0.6], [20.0, 30.0], [0.3, 1.0])
 
-    def run(images, amplitude, frequency, phase):
-        return restore(images, timing, Vibration(amplitude, frequency, phase), noise=0.05)
+    def run(images, amplitude, frequency, phase, image_motion):
+        return restore(images, timing, Vibration(amplitude, frequency, phase, image_motion), noise=0.05)
 
-    inputs = (frames, vibration.amplitude, vibration.frequency, vibration.phase)
+    inputs = (frames, vibration.amplitude, vibration.frequency, vibration.phase, vibration.image_motion)
     assert torch.autograd.gradcheck(run, tuple(value.clone().requires_grad_() for value in inputs))
 
 
