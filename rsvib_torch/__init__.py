@@ -1,7 +1,7 @@
 """See and undo the vibration of a rolling-shutter camera."""
 
 from rsvib_torch.detection import DetectionResult, VibrationDetector, VibrationStd, detect_vibration
-from rsvib_torch.evaluation import offset_endpoint_error, psnr, ssim
+from rsvib_torch.evaluation import MtfCurve, offset_endpoint_error, psnr, slanted_edge_mtf, ssim
 from rsvib_torch.imaging import RowVaryingBlur, SensorNoise, row_psf, simulate_frames
 from rsvib_torch.registration import OffsetCurve, register_bands
 from rsvib_torch.restoration import (
@@ -20,6 +20,7 @@ from rsvib_torch.vibration import Vibration, blind_frequencies
 
 __all__ = [
     "DetectionResult",
+    "MtfCurve",
     "OffsetCurve",
     "RestorationVerdict",
     "RestorationWarning",
@@ -43,6 +44,7 @@ __all__ = [
     "restore",
     "row_psf",
     "simulate_frames",
+    "slanted_edge_mtf",
     "ssim",
     "trusted_vibration",
     "visible_pixels",

@@ -1,7 +1,17 @@
-"""How good a result is, and how good it can be: image quality, offset errors, the Cramér-Rao bound, test targets."""
+"""How good a result is, and how good it can be: image quality, MTF, offset errors, Cramér-Rao bound, test targets."""
 
 from rsvib_torch.evaluation.bound import cramer_rao_bound
 from rsvib_torch.evaluation.quality import offset_endpoint_error, psnr, ssim
+from rsvib_torch.evaluation.slanted_edge import MtfCurve, slanted_edge_mtf
 from rsvib_torch.evaluation.targets import city_and_fields, resolution_chart
 
-__all__ = ["city_and_fields", "cramer_rao_bound", "offset_endpoint_error", "psnr", "resolution_chart", "ssim"]
+__all__ = [
+    "MtfCurve",
+    "city_and_fields",
+    "cramer_rao_bound",
+    "offset_endpoint_error",
+    "psnr",
+    "resolution_chart",
+    "slanted_edge_mtf",
+    "ssim",
+]

@@ -1,0 +1,112 @@
+"""What cannot be measured is refused, with the value found and what was expected."""
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.evaluation.slanted_edge.geometry import EdgeFit, Scatter, fit_edge, linearised
+
+__all__ = ["check_edge", "check_roi"]
+
+_SMALLEST = 16  # px
+_ANGLES = (2.0, 40.0)  # degrees
+_EXPLAINED = 0.5  # of the variance, by one straight edge
+_ROOM = (4.0, 3.0)  # px, and standard deviations of the line spread function, beside the edge
+_CLIPPED_SHARE = 0.1  # of the pixels of a side at one value
+_NOISY = 1e-3  # of the contrast
+_OVERSHOOT = 0.02  # of the contrast: how far a clipped side would have gone on
+
+
+def check_roi(roi: object) -> Tensor:
+    """Return a ROI in float64 after looking at its type, shape and values."""
+    if not isinstance(roi, Tensor) or roi.dtype == torch.bool or roi.dtype.is_complex:
+        found = f"a tensor of {roi.dtype}" if isinstance(roi, Tensor) else type(roi).__name__
+        raise TypeError(f"roi must be a tensor of real numbers, got {found}")
+    if roi.ndim != 2:
+        raise ValueError(f"roi must be one grey image (h, w), got shape {tuple(roi.shape)}")
+    if min(roi.shape) < _SMALLEST:
+        raise ValueError(f"roi must be at least {_SMALLEST} x {_SMALLEST} px, got {roi.shape[0]} x {roi.shape[1]}")
+    values = roi.detach().to(torch.float64)
+    broken = int((~torch.isfinite(values)).sum())
+    if broken:
+        raise ValueError(f"roi must be finite, got {broken} pixels that are NaN or infinite")
+    if float(values.max() - values.min()) <= 1e-9 * float(values.abs().max()):
+        raise ValueError(f"roi shows no edge: all pixels are {float(values[0, 0]):g}")
+    return values
+
+
+def check_edge(fit: EdgeFit, scatter: Scatter, columns: int, limits: tuple[float, float]) -> float:
+    """Refuse what is no measurable slanted edge; return the px beside the edge that the ROI leaves.
+
+    Args:
+        fit: Of the edge.
+        scatter: The pixels.
+        columns: Of the turned ROI.
+        limits: Lowest and highest value that a pixel can have.
+    """
+    model, _, distance = linearised(fit, scatter)
+    residual = scatter.value - model
+    explained = 1 - float(residual.var() / scatter.value.var())
+    if not explained >= _EXPLAINED or not float(fit.contrast) > 0:
+        raise ValueError(
+            f"roi shows no edge: a straight edge explains {100 * max(explained, 0.0):.0f} % of the variance, "
+            f"expected at least {100 * _EXPLAINED:.0f} %"
+        )
+    slope = abs(float(fit.slope(scatter)))
+    angle = math.degrees(math.atan(slope))
+    if not _ANGLES[0] <= angle <= _ANGLES[1]:
+        problem = "hardly slanted" if angle < _ANGLES[0] else "too near to 45 degrees"
+        raise ValueError(
+            f"the edge is {problem}: {angle:.2f} degrees from the nearest image axis, expected "
+            f"{_ANGLES[0]:g} ... {_ANGLES[1]:g}"
+        )
+    rows = len(scatter.value) // columns
+    if slope * rows < 1:
+        raise ValueError(
+            f"the edge crosses {slope * rows:.2f} px over {rows} px of length, expected at least 1: "
+            "take a longer roi or a steeper angle"
+        )
+    rays = distance.view(rows, columns)
+    room = float(torch.minimum(-rays[:, 0].max(), rays[:, -1].min()))
+    wanted = max(_ROOM[0], _ROOM[1] * float(fit.width))
+    if room < wanted:
+        raise ValueError(
+            f"the edge comes within {max(room, 0.0):.1f} px of the border of the roi, expected at least {wanted:.1f} px"
+        )
+    _refuse_clipped(fit, scatter, distance, limits)
+    return room
+
+
+def _refuse_clipped(fit: EdgeFit, scatter: Scatter, distance: Tensor, limits: tuple[float, float]) -> None:
+    """Refuse sides that stop at one value where noise, or the rise of the edge, says that they would go on."""
+    far = distance.abs() > 4 * fit.width
+    sides = [scatter.value[(distance < 0) & far], scatter.value[(distance > 0) & far]]
+    if min(len(side) for side in sides) == 0:
+        return
+    extremes = [float(scatter.value.min()), float(scatter.value.max())]
+    shares = [float((side == value).double().mean()) for side, value in zip(sides, extremes, strict=True)]
+    for index, name in enumerate(("dark", "bright")):
+        value, share, other = extremes[index], shares[index], sides[1 - index]
+        if share < _CLIPPED_SHARE:
+            continue
+        if value <= limits[0] if index == 0 else value >= limits[1]:
+            noisy = float((sides[index] - value).square().mean().sqrt()) > _NOISY * float(fit.contrast)
+            clipped = noisy or _goes_on(fit, scatter, index, extremes)
+        else:
+            clipped = shares[1 - index] < 0.1 * share and float(other.std()) > _NOISY * float(fit.contrast)
+        if clipped:
+            raise ValueError(
+                f"the {name} side of the edge is clipped: {100 * share:.0f} % of its pixels are exactly {value:g}"
+            )
+
+
+def _goes_on(fit: EdgeFit, scatter: Scatter, side: int, extremes: list[float]) -> bool:
+    """Whether the other pixels say that the side would have gone on beyond the value that it stops at."""
+    free = (scatter.value != extremes[0]) & (scatter.value != extremes[1])
+    inner = Scatter(scatter.value[free], scatter.x[free], scatter.y[free], scatter.half)
+    # a wider start: what was clipped looks sharper than it is
+    level = float(fit_edge(inner, replace(fit, sigma=fit.sigma + 0.5 * fit.width)).sides[side, 0])
+    beyond = extremes[0] - level if side == 0 else level - extremes[1]
+    return beyond > _OVERSHOOT * float(fit.contrast)

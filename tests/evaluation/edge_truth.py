@@ -1,0 +1,54 @@
+"""Slanted edges integrated exactly over square pixels, and their MTF, in NumPy and SciPy alone."""
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
+from scipy.special import ndtr
+
+
+def draw_edge(angle, sigma, size=(120, 80), levels=(0.1, 0.9), offset=(0.3, -0.2)):
+    """Edge through Gaussian optics, ``angle`` degrees from the vertical, in the second of the two levels right.
+
+    Over the width of a pixel the integral is taken in closed form, over its height by 24 Gauss-Legendre nodes.
+    """
+    cosine, sine = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+    y, x = (np.arange(n) - (n - 1) / 2 - o for n, o in zip(size, offset[::-1], strict=True))
+
+    def integral(d):
+        return d * ndtr(d / sigma) + sigma * np.exp(-0.5 * (d / sigma) ** 2) / np.sqrt(2 * np.pi)
+
+    bright = np.zeros(size)
+    for node, weight in zip(*np.polynomial.legendre.leggauss(24), strict=True):
+        distance = x * cosine + (y[:, None] + 0.5 * node) * sine
+        bright += 0.5 * weight * (integral(distance + 0.5 * cosine) - integral(distance - 0.5 * cosine)) / cosine
+    return levels[0] + (levels[1] - levels[0]) * bright
+
+
+def gaussian(sigma):
+    return lambda f: np.exp(-2 * (np.pi * sigma * np.asarray(f)) ** 2)
+
+
+def through_pixels(optics, angle):
+    """MTF along the normal of an edge, of optics and square pixels."""
+    cosine, sine = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+    return lambda f: np.abs(optics(np.asarray(f))) * np.sinc(np.asarray(f) * cosine) * np.sinc(np.asarray(f) * sine)
+
+
+def mtf50_of(mtf):
+    grid = np.linspace(0.001, 1, 4000)
+    first = np.argmax(mtf(grid) < 0.5)
+    return brentq(lambda f: mtf(f) - 0.5, grid[first - 1], grid[first], xtol=1e-14)
+
+
+def draw_edge_of(optics, angle, size=(120, 80), levels=(0.1, 0.9), offset=(0.3, 0.1)):
+    """Edge through optics of any transfer function, from the Fourier integral of its line spread function."""
+    step, count = 1 / 64, 2**17
+    frequency = np.fft.rfftfreq(count, step)
+    cosine, sine = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+    spectrum = optics(frequency) * np.sinc(frequency * cosine) * np.sinc(frequency * sine)
+    lsf = np.fft.fftshift(np.fft.irfft(spectrum, count)) / step
+    position = (np.arange(count) - count // 2) * step
+    esf = CubicSpline(position, lsf).antiderivative()
+    y, x = (np.arange(n) - (n - 1) / 2 - o for n, o in zip(size, offset[::-1], strict=True))
+    bright = esf(x * cosine + y[:, None] * sine) / esf(position[-1])
+    return levels[0] + (levels[1] - levels[0]) * bright

@@ -1,0 +1,208 @@
+"""Slanted-edge MTF against the analytic MTF of optics and square pixels."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from edge_truth import draw_edge, draw_edge_of, gaussian, mtf50_of, through_pixels
+from scipy.integrate import dblquad
+from scipy.special import ndtr
+
+import rsvib_torch as rsv
+
+FREQUENCIES = torch.linspace(0.1, 0.5, 41, dtype=torch.float64)
+
+
+def measure(image):
+    return rsv.slanted_edge_mtf(torch.from_numpy(np.ascontiguousarray(image)))
+
+
+def worst_error(curve, mtf):
+    return np.abs(curve.at(FREQUENCIES).numpy() - mtf(FREQUENCIES.numpy())).max()
+
+
+def test_the_drawn_truth_is_the_integral_over_the_pixel():
+    image, angle = draw_edge(5.3, 0.5, (9, 9), (0.0, 1.0), (0.2, 0.1)), np.deg2rad(5.3)
+    for row, column in ((4, 4), (2, 5), (7, 3)):
+        x, y = column - 4.2, row - 4.1
+        exact = dblquad(
+            lambda v, u: ndtr((u * np.cos(angle) + v * np.sin(angle)) / 0.5), x - 0.5, x + 0.5, y - 0.5, y + 0.5
+        )[0]
+        assert image[row, column] == pytest.approx(exact, abs=1e-9)
+    np.testing.assert_allclose(
+        draw_edge_of(gaussian(0.5), 5.3, (99, 60), offset=(0.2, 0.1)),
+        draw_edge(5.3, 0.5, (99, 60), offset=(0.2, 0.1)),
+        atol=1e-8,
+    )
+
+
+@pytest.mark.parametrize("sigma", [0.5, 0.8])
+@pytest.mark.parametrize(
+    ("angle", "turned", "levels"),
+    [
+        (4.0, False, (0.1, 0.9)),
+        (-5.0, False, (0.9, 0.1)),
+        (5.71, True, (0.1, 0.9)),
+        (-7.0, True, (0.9, 0.1)),
+        (20.0, False, (0.2, 0.6)),
+    ],
+)
+def test_gaussian_optics_without_noise(sigma, angle, turned, levels):
+    image = draw_edge(angle, sigma, levels=levels)
+    curve = measure((image.T if turned else image).astype(np.float32))
+    truth = through_pixels(gaussian(sigma), angle)
+    assert worst_error(curve, truth) < 2e-6
+    assert float(curve.mtf50) == pytest.approx(mtf50_of(truth), rel=2e-6)
+    assert float(curve.at(float(curve.mtf50))) == pytest.approx(0.5, abs=1e-9)
+    assert abs(curve.angle) == pytest.approx(abs(angle), abs=1e-4)
+    assert curve.near_vertical is not turned
+    assert curve.levels.tolist() == pytest.approx(sorted(levels), abs=1e-6)
+    torch.testing.assert_close(curve.at(curve.frequency), curve.mtf, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("sigma", [0.5, 0.8])
+def test_noise_of_one_percent(sigma):
+    errors, predicted, pulls = [], [], []
+    for seed in range(12):
+        generator = np.random.default_rng(seed)
+        angle = generator.uniform(4, 7) * generator.choice([-1, 1])
+        truth = through_pixels(gaussian(sigma), angle)
+        image = draw_edge(angle, sigma, offset=generator.uniform(-0.5, 0.5, 2))
+        curve = measure(image + 0.008 * generator.standard_normal(image.shape))
+        errors.append(float(curve.mtf50) / mtf50_of(truth) - 1)
+        predicted.append(float(curve.mtf50_std / curve.mtf50))
+        pulls.append((curve.at(0.25) - truth(0.25)) / np.interp(0.25, curve.frequency, curve.std))
+        assert float(curve.noise) == pytest.approx(0.008, rel=0.04)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.0045
+    # a fit of the true model, with blur, edge and levels unknown, cannot do better than 0.32 and 0.27 %
+    assert 0.0024 < np.sqrt(np.mean(np.square(predicted))) < 0.0040
+    assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.7
+
+
+OTHER_OPTICS = {
+    "motion of 3 px": lambda f: np.sinc(3 * f) * gaussian(0.4)(f),
+    "sharpened": lambda f: gaussian(0.6)(f) * (2 - gaussian(1.2)(f)),
+    "halo": lambda f: 0.85 * gaussian(0.5)(f) + 0.15 * gaussian(3.0)(f),
+    "one-sided": lambda f: gaussian(0.5)(f) / (1 + 2j * np.pi * f * 0.6),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_OPTICS)
+def test_optics_of_any_shape(name):
+    truth = through_pixels(OTHER_OPTICS[name], 5.2)
+    image = draw_edge_of(OTHER_OPTICS[name], 5.2)
+    curve = measure(image)
+    assert worst_error(curve, truth) < 3e-4
+    assert float(curve.mtf50) == pytest.approx(mtf50_of(truth), rel=3e-4)
+    noisy = measure(image + 0.008 * np.random.default_rng(1).standard_normal(image.shape))
+    assert worst_error(noisy, truth) < 0.015
+    assert float(noisy.mtf50) == pytest.approx(mtf50_of(truth), rel=0.02)
+
+
+def test_turning_mirroring_and_inverting_change_nothing():
+    image = draw_edge(5.2, 0.6) + 0.008 * np.random.default_rng(5).standard_normal((120, 80))
+    curve = measure(image)
+    turned = {
+        "quarter turn": np.rot90(image),
+        "half turn": np.rot90(image, 2),
+        "mirrored": image[:, ::-1],
+        "transposed": image.T,
+        "inverted": 1.0 - image,
+        "scaled": 40.0 * image + 3.0,
+    }
+    for name, other in turned.items():
+        found = measure(other)
+        torch.testing.assert_close(found.mtf, curve.mtf, rtol=0, atol=1e-9, msg=name)
+        torch.testing.assert_close(found.mtf50, curve.mtf50, rtol=0, atol=1e-9, msg=name)
+        torch.testing.assert_close(found.std, curve.std, rtol=1e-5, atol=1e-9, msg=name)
+
+
+def test_the_angle_is_positive_clockwise():
+    upright = draw_edge(-5.0, 0.6)  # leans to the right, going up, where it rises to the right
+    top, bottom = (np.abs(upright[row] - 0.5).argmin() for row in (5, -5))
+    curve = measure(upright)
+    assert math.copysign(1, curve.angle) == math.copysign(1, top - bottom)
+    assert measure(np.rot90(upright, -1)).angle == pytest.approx(curve.angle, abs=1e-6)
+    assert measure(upright[:, ::-1]).angle == pytest.approx(-curve.angle, abs=1e-6)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.005])
+def test_shading_does_not_pass_for_blur(noise):
+    y, x = np.mgrid[-1:1:120j, -1:1:80j]
+    image = draw_edge(5.0, 0.8) * (1 + 0.15 * x + 0.1 * y)
+    curve = measure(image + noise * np.random.default_rng(2).standard_normal(image.shape))
+    assert float(curve.mtf50) == pytest.approx(mtf50_of(through_pixels(gaussian(0.8), 5.0)), rel=1e-5 + noise)
+
+
+def test_a_curved_edge_is_followed():
+    y, x = np.mgrid[:120, :80].astype(float)
+    radius = 900.0  # bends by 2 px over the ROI
+    distance = radius - np.hypot(x - 40 - radius * np.cos(0.09), y - 60 - radius * np.sin(0.09))
+    curve = measure(ndtr(distance / 0.8))
+    truth = gaussian(0.8)
+    assert worst_error(curve, truth) < 1e-3
+    assert float(curve.mtf50) == pytest.approx(mtf50_of(truth), rel=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32])
+def test_integers_are_counts(dtype):
+    counts = 200 * (draw_edge(5.0, 0.8) + 0.008 * np.random.default_rng(3).standard_normal((120, 80)))
+    curve = measure(counts.round().astype(dtype))
+    torch.testing.assert_close(curve.mtf, measure(counts).mtf, rtol=0, atol=2e-3)
+    assert curve.levels.tolist() == pytest.approx([20.0, 180.0], abs=0.2)
+
+
+def test_full_contrast_is_not_clipped():
+    for dtype in (np.float32, np.float64):
+        curve = measure(draw_edge(5.0, 0.5, levels=(0.0, 1.0)).astype(dtype))
+        assert float(curve.mtf50) == pytest.approx(mtf50_of(through_pixels(gaussian(0.5), 5.0)), rel=1e-5)
+
+
+def test_a_curve_that_stays_above_half_has_no_mtf50():
+    sharp = draw_edge_of(lambda f: np.exp(-((f / 1.5) ** 8)) / np.maximum(np.sinc(f), 0.1), 5.2)
+    curve = measure(sharp)
+    assert math.isnan(float(curve.mtf50))
+    assert math.isnan(float(curve.mtf50_std))
+
+
+NOISE = 0.008 * np.random.default_rng(0).standard_normal((120, 80))
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (NOISE, r"no edge: a straight edge explains 0 % of the variance, expected at least 50 %"),
+        (np.full((120, 80), 0.5), r"no edge: all pixels are 0\.5"),
+        (draw_edge(1.5, 0.5), r"hardly slanted: 1\.50 degrees .* expected 2 \.\.\. 40"),
+        (draw_edge(0.0, 0.5) + NOISE, "hardly slanted"),
+        (draw_edge(43.0, 0.5, (90, 90)), r"too near to 45 degrees: 43\.00"),
+        (draw_edge(5.0, 0.5, (15, 80)), "at least 16 x 16 px, got 15 x 80"),
+        (draw_edge(2.5, 0.5, (18, 80)), r"crosses 0\.79 px over 18 px of length"),
+        (draw_edge(5.0, 0.5, offset=(33.0, 0.0)), r"within 1\.\d px of the border of the roi, expected at least 4\.0"),
+        (draw_edge(5.0, 15.0), "border of the roi, expected at least 45"),
+        (draw_edge(5.0, 0.5) - draw_edge(5.0, 0.5, offset=(12.0, 0.0)), "no edge"),
+        (np.clip(draw_edge(5.0, 0.5, levels=(-0.2, 1.2)), 0, 1), "dark side of the edge is clipped: 100 %"),
+        (np.clip(draw_edge(5.0, 0.5, levels=(0.1, 1.1)), 0, 1), "bright side .* exactly 1"),
+        (np.clip(draw_edge(5.0, 0.5, levels=(0.1, 1.0)) + NOISE, 0, 1), "bright side .* clipped: 5. %"),
+        (np.clip(draw_edge(5.0, 0.5) + NOISE, 0, 0.7), r"bright side .* exactly 0\.7"),
+        ((255 * draw_edge(5.0, 0.5, levels=(0.1, 1.2))).clip(0, 255).astype(np.uint8), "bright side .* exactly 255"),
+        (np.where(np.arange(80) == 3, np.nan, draw_edge(5.0, 0.5)), "must be finite, got 120 pixels"),
+        (draw_edge(5.0, 0.5)[None], r"one grey image \(h, w\), got shape \(1, 120, 80\)"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(image, message):
+    with pytest.raises(ValueError, match=message):
+        measure(image)
+
+
+def test_only_tensors_of_numbers():
+    with pytest.raises(TypeError, match="real numbers, got ndarray"):
+        rsv.slanted_edge_mtf(draw_edge(5.0, 0.5))
+    with pytest.raises(TypeError, match=r"real numbers, got a tensor of torch\.bool"):
+        measure(draw_edge(5.0, 0.5) > 0.5)
+    curve = measure(draw_edge(5.0, 0.5))
+    with pytest.raises(ValueError, match="frequency must be at most 1"):
+        curve.at(1.2)
+    with pytest.raises(ValueError, match=r"within 0 \.\.\. 1 cycles/px"):
+        curve.at(torch.tensor([0.2, -0.1]))
