@@ -16,6 +16,7 @@ from rsvib_torch.detection.selection import find_tones, residual_of, robust_fit,
 from rsvib_torch.detection.tones import ToneFit
 from rsvib_torch.imaging.coupling import rows_showing
 from rsvib_torch.registration.gradients import MARGIN, RowGradients, RowSpectra, row_gradients, row_shifts
+from rsvib_torch.registration.pattern import column_pattern
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
@@ -27,6 +28,7 @@ LARGEST_GROUP = 8  # of a group that shares one mean scene
 _LEAST_OVERLAP = 0.5  # of the frame that the frames of a group share
 _MAJORITY = 0.7  # of the rows: clouds and things that move by themselves may cover the others
 _SLANT_ROWS = 64  # rows whose halves are compared
+_CLEANINGS = 2  # rounds of taking out what is fixed to the sensor
 _NEAR = 0.05  # px: gradients of frames that were warped this well need not be taken again
 _CONDITION = 1e-4  # least share of the product of the diagonal that a block's determinant must keep
 _LEAST_GAIN = 0.02  # of the residual that a further tone must explain: the rows' noise is nearly white
@@ -68,6 +70,12 @@ def _frames_in_group(motion: Vibration, starts: Tensor, size: tuple[int, int]) -
     extent = torch.tensor([size[1], size[0]], dtype=moved.dtype, device=moved.device)
     fraction = float((moved / extent).amax())
     return int(max(2, min(LARGEST_GROUP, 1 + (1 - _LEAST_OVERLAP) // max(fraction, 1e-9))))
+
+
+def _warp(group: _Group, timing: SensorTiming, motion: Vibration) -> tuple[RowSpectra, Tensor, Tensor, Tensor]:
+    """A group with what warps its frames back by a motion."""
+    rows, shift, seen, _ = _place(group, timing, motion)
+    return group.spectra, rows, shift, seen
 
 
 def _place(group: _Group, timing: SensorTiming, motion: Vibration) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -182,7 +190,7 @@ def refine_directly(
     timing: SensorTiming,
     start: ToneFit,
     tones: int | None,
-    iterations: int = 6,
+    iterations: int = 10,
 ) -> DirectFit:
     """Refine a detected motion on the images themselves.
 
@@ -214,24 +222,34 @@ def refine_directly(
         for m in members
     ]
     gradients: list[RowGradients | None] = [None] * len(groups)
+    cleanings = _CLEANINGS
+    search_at = 1  # the first round removes the error of the bands: then weak tones show
     interval = max(_BLOCK * timing.row_time, 0.5 * timing.exposure_time)  # the exposure averages out what is faster
     for step in range(iterations):
         measured = [measure_group(group, timing, motion, known) for group, known in zip(groups, gradients, strict=True)]
         gradients = [known for _, known in measured]
         measurements = _join([part for part, _ in measured])
         before, around = fit, motion
-        if step == 1:
-            # the first round removed the error of the bands: now weak tones show
+        if step == search_at:
             left = residual_of(measurements, fit)
             careful = replace(measurements, independent=independent_fraction(measurements, left))
             fit = find_tones(careful, interval, tones, model, _LEAST_GAIN, strongest_only(fit))
         else:
             fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model)
         motion, _ = vibration_of_fit(fit)
-        if step > 1 and _settled(before, fit):
+        if step == iterations - 1:
             break
+        if step > search_at and _settled(before, fit):
+            pattern = column_pattern([_warp(group, timing, motion) for group in groups]) if cleanings else None
+            if pattern is None:
+                break
+            cleanings, search_at = cleanings - 1, step + 1
+            for group in groups:
+                group.spectra.subtract(pattern)
+            gradients = [None] * len(groups)
+            continue
         change = measurements.relative(_displacements(measurements, motion) - _displacements(measurements, around))
-        if step + 1 < iterations and float(change.abs().amax()) > _NEAR:
+        if float(change.abs().amax()) > _NEAR:
             gradients = [None] * len(groups)
     residual = residual_of(measurements, fit)
     weighed = measurements.reweighted(residual)
@@ -244,19 +262,12 @@ def refine_directly(
 
 
 def _standardised(frames: Tensor, valid: Tensor | None) -> Tensor:
-    """Frames of mean 0 and variance 1 without the mean of each column.
-
-    Brightness and contrast may differ from frame to frame. What all rows and frames have in common in a column belongs
-    to the sensor: it would pull the displacements to zero. The scene hardly misses its share of it, which stands in for
-    one of as many numbers as there are rows.
-    """
+    """Frames of mean 0 and variance 1: brightness and contrast may differ from frame to frame."""
     weight = torch.ones_like(frames) if valid is None else valid.to(frames.dtype)
     count = weight.sum((-2, -1), keepdim=True)
     centred = frames - (frames * weight).sum((-2, -1), keepdim=True) / count
     variance = (centred.square() * weight).sum((-2, -1), keepdim=True) / count
-    scaled = centred * variance.rsqrt()
-    columns = (scaled * weight).sum((1, 2), keepdim=True) / weight.sum((1, 2), keepdim=True).clamp(min=1.0)
-    return scaled - columns
+    return centred * variance.rsqrt()
 
 
 def _unexplained(measured: Measurements, residual: Tensor) -> Tensor:

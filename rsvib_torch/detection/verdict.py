@@ -20,7 +20,7 @@ _MAJORITY = 0.75  # of the bands: things that move by themselves may cover the o
 _LARGEST_MISFIT = 0.3  # mean absolute residual over mean absolute offset about its mean
 _SMALLEST_MISFIT = 0.05  # px, residuals below this are never held against a fit
 _SMALLEST_OTHER = 0.03  # px, other motion below this is never held against a fit
-_LARGEST_OTHER = 0.15  # of the rms offset that the tones make
+_LARGEST_OTHER = 0.05  # of the rms offset that the tones make
 _ROW_MOTION = 0.1  # px within a row time, condition (24)
 
 

@@ -17,7 +17,7 @@ from torch.nn import functional
 from rsvib_torch.spectral import extend_rows, fast_length
 from rsvib_torch.splines import bspline_coefficients, bspline_weights
 
-__all__ = ["DEGREE", "MARGIN", "RowGradients", "RowSpectra", "row_gradients", "row_shifts"]
+__all__ = ["DEGREE", "MARGIN", "RowGradients", "RowSpectra", "mean_over_frames", "row_gradients", "row_shifts"]
 
 DEGREE = 7  # of the spline across rows: what it smooths, and the noise it colours, lie above the pass band
 MARGIN = 8  # px from the ends of rows and columns that do not count
@@ -66,9 +66,9 @@ class RowSpectra:
             index.flatten(0, 2), flat, per_sample_weights=weights.flatten(0, 2), mode="sum"
         )
         result: Tensor = torch.view_as_complex(picked.unflatten(-1, (-1, 2))).unflatten(0, rows.shape)
-        return result * self._ramp(shift)
+        return result * self.ramp(shift)
 
-    def _ramp(self, shift: Tensor) -> Tensor:
+    def ramp(self, shift: Tensor) -> Tensor:
         """exp(2 pi i u shift) for all frequencies u (..., U), as products of few powers of one turn."""
         turn = 2 * math.pi * shift[..., None] / self.length
         coarse = torch.arange(0, len(self.frequencies), _POWERS, dtype=torch.float64, device=shift.device)
@@ -78,6 +78,10 @@ class RowSpectra:
         )
         ramp: Tensor = (first[..., None] * second[..., None, :]).flatten(-2)[..., : len(self.frequencies)]
         return ramp
+
+    def subtract(self, pattern: Tensor) -> None:
+        """Take a pattern (B, U) out of every row of every frame."""
+        self.values = self.values - pattern[:, None, None].to(self.values.dtype)
 
     def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None:
         """(B, S, W) bool, pixels of the scene that count in all frames; None for all."""
@@ -154,7 +158,7 @@ def row_gradients(spectra: RowSpectra, rows: Tensor, shift: Tensor, seen: Tensor
         The gradients.
     """
     warped = spectra.warped(rows, shift)
-    mean = _mean_over_frames(warped, seen)
+    mean = mean_over_frames(warped, seen)
     frames = seen.sum(1)
     spare = (frames - 1).clamp(min=0.0)
     # the difference of the outer frames has twice the noise of a frame
@@ -195,7 +199,7 @@ def row_gradients(spectra: RowSpectra, rows: Tensor, shift: Tensor, seen: Tensor
     )
 
 
-def _mean_over_frames(warped: Tensor, seen: Tensor) -> Tensor:
+def mean_over_frames(warped: Tensor, seen: Tensor) -> Tensor:
     """Mean (B, S, U) over the frames that see a row."""
     share = (seen / seen.sum(1, keepdim=True).clamp(min=1.0)).to(warped.real.dtype)
     parts = torch.view_as_real(warped)

@@ -1,0 +1,48 @@
+"""A pattern of columns that is fixed to the sensor.
+
+It stays where it is while the scene moves, and would pull displacements to zero.
+"""
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from rsvib_torch.registration.gradients import RowSpectra, mean_over_frames
+
+__all__ = ["column_pattern"]
+
+_ROW_STEP = 4  # every so many rows are asked
+_NEIGHBOURS = 17  # frequencies judged together
+_SIGNIFICANT = 2.0  # power over what noise gives
+
+
+def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor]]) -> Tensor | None:
+    """Spectrum of what every row of every frame has added at the same columns.
+
+    In frames warped back by the motion, a pattern p shows as ``p(x + shift)`` while the scene stands still: what the
+    frames differ by is regressed on that, frequency by frequency, so that the scene has no part in it.
+
+    Args:
+        groups: Spectra of each group of frames with the rows (B, G, S), shifts (B, G, S) and visibility (B, G, S) that
+            warp it.
+
+    Returns:
+        (B, U) spectrum of the pattern, shrunk by its noise; None where none stands above it.
+    """
+    found, power, noise, count = (torch.zeros(()) for _ in range(4))
+    for spectra, *places in groups:
+        rows, shift, seen = (values[..., ::_ROW_STEP] for values in places)
+        visible = (seen * (seen.sum(1, keepdim=True) > 1)).to(spectra.values.real.dtype)[..., None]
+        warped, ramp = spectra.warped(rows, shift), spectra.ramp(shift)
+        difference = (warped - mean_over_frames(warped, seen)[:, None]) * visible
+        moved = (ramp - mean_over_frames(ramp, seen)[:, None]) * visible
+        found = found + (moved.conj() * difference).sum((1, 2))
+        power = power + moved.abs().square().sum((1, 2))
+        noise = noise + difference.abs().square().sum((1, 2))
+        count = count + (visible.sum((1, 2, 3)) - (visible.sum(1) > 0).sum((1, 2)))[:, None]
+    pattern = found / power.clamp(min=1e-6)
+    strength = pattern.abs().square() * power / (noise / count.clamp(min=1.0)).clamp(min=1e-30)
+    half = _NEIGHBOURS // 2
+    strength = functional.avg_pool1d(functional.pad(strength[:, None], (half, half), mode="replicate"), _NEIGHBOURS, 1)
+    share = torch.where(strength[:, 0] > _SIGNIFICANT, 1 - 1 / strength[:, 0].clamp(min=1.0), 0.0)
+    return pattern * share if bool((share > 0).any()) else None
