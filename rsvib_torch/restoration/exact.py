@@ -111,13 +111,13 @@ def _with_edges(problem: _Problem, factor: float) -> Tensor:
     weak = replace(problem, precision=_LOOSE * problem.precision).solver()
     coefficients = weak.fit(problem.data)
     solver, weight = weak, float(problem.kernels.weight.detach().mean(-1).sum())
-    for strength, level in STAGES:
+    for strength, level, step in STAGES:
         pull = strength * weight * factor
         frequencies = problem.precision.shape[-1]
         precision = expectation_precision(pull, frequencies, problem.precision)
         order = problem.precision.shape[0]
         precision[:order, :order] += _REST * problem.precision
-        target = expectation(solver, coefficients, level * factor**0.5 * problem.level / weight**0.5, pull)
+        target = expectation(solver, coefficients, level * factor**0.5 * problem.level / weight**0.5, pull, step)
         solver = replace(problem, precision=precision).solver()
         coefficients = solver.fit(problem.data, target)
     return solver.scene(coefficients)
