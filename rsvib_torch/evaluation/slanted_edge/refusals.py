@@ -16,6 +16,7 @@ _EXPLAINED = 0.5  # of the variance, by one straight edge
 _ROOM = (4.0, 3.0)  # px, and standard deviations of the line spread function, beside the edge
 _CLIPPED_SHARE = 0.1  # of the pixels of a side at one value
 _NOISY = 1e-3  # of the contrast
+_BETTER = 0.6  # parts of the misfit that remain where clipping explains it
 _OVERSHOOT = 0.02  # of the contrast: how far a clipped side would have gone on
 
 
@@ -91,11 +92,13 @@ def _refuse_clipped(fit: EdgeFit, scatter: Scatter, distance: Tensor, limits: tu
         value, share, other = extremes[index], shares[index], sides[1 - index]
         if share < _CLIPPED_SHARE:
             continue
-        if value <= limits[0] if index == 0 else value >= limits[1]:
+        # black without light has no noise either: that one side is flat says something of the bright side only
+        at_limit = value <= limits[0] if index == 0 else value >= limits[1]
+        lone = shares[1 - index] < 0.1 * share and float(other.std()) > _NOISY * float(fit.contrast)
+        clipped = lone and (index == 1 or not at_limit)
+        if at_limit and not clipped:
             noisy = float((sides[index] - value).square().mean().sqrt()) > _NOISY * float(fit.contrast)
             clipped = noisy or _goes_on(fit, scatter, index, extremes)
-        else:
-            clipped = shares[1 - index] < 0.1 * share and float(other.std()) > _NOISY * float(fit.contrast)
         if clipped:
             raise ValueError(
                 f"the {name} side of the edge is clipped: {100 * share:.0f} % of its pixels are exactly {value:g}"
@@ -107,6 +110,9 @@ def _goes_on(fit: EdgeFit, scatter: Scatter, side: int, extremes: list[float]) -
     free = (scatter.value != extremes[0]) & (scatter.value != extremes[1])
     inner = Scatter(scatter.value[free], scatter.x[free], scatter.y[free], scatter.half)
     # a wider start: what was clipped looks sharper than it is
-    level = float(fit_edge(inner, replace(fit, sigma=fit.sigma + 0.5 * fit.width)).sides[side, 0])
+    wider = fit_edge(inner, replace(fit, sigma=fit.sigma + 0.5 * fit.width))
+    level = float(wider.sides[side, 0])
     beyond = extremes[0] - level if side == 0 else level - extremes[1]
-    return beyond > _OVERSHOOT * float(fit.contrast)
+    near = (linearised(fit, inner)[2].abs() < 2 * fit.width).to(inner.value.dtype)
+    misfit, misfit_wider = (float(near @ (inner.value - linearised(f, inner)[0]).square()) for f in (fit, wider))
+    return beyond > _OVERSHOOT * float(fit.contrast) and misfit_wider < _BETTER * misfit
