@@ -17,7 +17,16 @@ from torch.nn import functional
 from rsvib_torch.spectral import extend_rows, fast_length
 from rsvib_torch.splines import bspline_coefficients, bspline_weights
 
-__all__ = ["DEGREE", "MARGIN", "RowGradients", "RowSpectra", "mean_over_frames", "row_gradients", "row_shifts"]
+__all__ = [
+    "DEGREE",
+    "MARGIN",
+    "RowGradients",
+    "RowSpectra",
+    "inner_columns",
+    "mean_over_frames",
+    "row_gradients",
+    "row_shifts",
+]
 
 DEGREE = 7  # of the spline across rows: what it smooths, and the noise it colours, lie above the pass band
 MARGIN = 8  # px from the ends of rows and columns that do not count
@@ -26,7 +35,7 @@ _EXTENSION = 32  # px that rows are continued by, so that their Fourier transfor
 _PASS_ROWS = (0.24, 0.34)  # cycles/px across rows: full weight below, none above
 _PASS_COLUMNS = (0.40, 0.48)  # along rows, where interpolation is exact but detail near the limit may be aliased
 _SLOWEST = 1 / 64  # cycles/px: shading and vignetting live below
-_SMOOTH = 8  # values of the spectra that are averaged along each axis
+_SMOOTH = 16  # values of the spectra that are averaged along each axis
 _BLOCK = 16  # px, side of the blocks that are judged together
 _LARGEST_NOISE = 9.0  # mean square of a block over the typical one before it loses weight
 _LARGEST_SHIFT = 0.15  # px, part of a block's residual that the gradient excuses
@@ -176,7 +185,7 @@ def row_gradients(spectra: RowSpectra, rows: Tensor, shift: Tensor, seen: Tensor
     residual = torch.fft.irfft(difference, n=spectra.length)[..., : spectra.width]  # (B, S, G, W)
     residual = residual * seen.transpose(1, 2)[..., None].to(residual.dtype)
 
-    weight = _columns(spectra.width, shift, images) * (spare > 0)[..., None].to(images.dtype)  # (B, S, W)
+    weight = inner_columns(spectra.width, shift, images) * (spare > 0)[..., None].to(images.dtype)  # (B, S, W)
     valid = spectra.warped_valid(rows, shift)
     if valid is not None:
         weight = weight * valid
@@ -219,7 +228,7 @@ def _outer_difference(warped: Tensor, seen: Tensor) -> Tensor:
     return (pick[1] - pick[0]) * (last > first)[..., None]
 
 
-def _columns(width: int, shift: Tensor, like: Tensor) -> Tensor:
+def inner_columns(width: int, shift: Tensor, like: Tensor) -> Tensor:
     """(1, 1, W) weight of columns that all frames of the group show, falling to 0 over a few px."""
     edge = math.ceil(float(shift.abs().amax())) + MARGIN
     place = torch.arange(width, dtype=like.dtype, device=like.device)

@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.registration.gradients import RowSpectra, mean_over_frames
+from rsvib_torch.registration.gradients import RowSpectra, inner_columns, mean_over_frames
 
 __all__ = ["column_pattern"]
 
 _ROW_STEP = 4  # every so many rows are asked
 _NEIGHBOURS = 17  # frequencies judged together
-_SIGNIFICANT = 2.0  # power over what noise gives
+_SIGNIFICANT = 3.0  # power over what noise gives
 
 
 def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor]]) -> Tensor | None:
@@ -35,6 +35,10 @@ def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor]]) -> T
         visible = (seen * (seen.sum(1, keepdim=True) > 1)).to(spectra.values.real.dtype)[..., None]
         warped, ramp = spectra.warped(rows, shift), spectra.ramp(shift)
         difference = (warped - mean_over_frames(warped, seen)[:, None]) * visible
+        # the ends of the rows stay where they are as well, but are no pattern
+        pixels = torch.fft.irfft(difference, n=spectra.length)
+        inner = inner_columns(spectra.width, shift, pixels)[0]
+        difference = torch.fft.rfft(pixels[..., : spectra.width] * inner, n=spectra.length)
         moved = (ramp - mean_over_frames(ramp, seen)[:, None]) * visible
         found = found + (moved.conj() * difference).sum((1, 2))
         power = power + moved.abs().square().sum((1, 2))
