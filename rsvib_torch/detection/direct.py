@@ -116,8 +116,9 @@ def measure_group(
     The motion's own displacement is added to what remains, so that the measurements do not depend on it to first order.
     """
     rows, shift, seen, moments = _place(group, timing, motion)
-    gradients = gradients or row_gradients(group.spectra, rows, shift, seen)
-    matrix, right = row_shifts(group.spectra, gradients, rows, shift, seen)
+    warped = group.spectra.warped(rows, shift)
+    gradients = gradients or row_gradients(group.spectra, warped, rows, shift, seen)
+    matrix, right = row_shifts(warped, gradients, seen)
     matrix = _blocks(matrix[:, None]).sum(3)[:, 0]  # (B, N, 2, 2)
     right = _blocks(right).sum(3)  # (B, G, N, 2)
     determinant = matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1].square()
@@ -240,7 +241,11 @@ def refine_directly(
         if step == iterations - 1:
             break
         if step > search_at and _settled(before, fit):
-            pattern = column_pattern([_warp(group, timing, motion) for group in groups]) if cleanings else None
+            pattern = None
+            if cleanings:
+                leaves = [known.variance for known in gradients if known is not None]
+                warps = [_warp(group, timing, motion) for group in groups]
+                pattern = column_pattern([(*warp, left) for warp, left in zip(warps, leaves, strict=True)])
             if pattern is None:
                 break
             cleanings, search_at = cleanings - 1, step + 1
@@ -263,7 +268,10 @@ def refine_directly(
 
 def _standardised(frames: Tensor, valid: Tensor | None) -> Tensor:
     """Frames of mean 0 and variance 1: brightness and contrast may differ from frame to frame."""
-    weight = torch.ones_like(frames) if valid is None else valid.to(frames.dtype)
+    if valid is None:
+        spread, mean = torch.var_mean(frames, dim=(-2, -1), keepdim=True)
+        return (frames - mean) * spread.rsqrt()
+    weight = valid.to(frames.dtype)
     count = weight.sum((-2, -1), keepdim=True)
     centred = frames - (frames * weight).sum((-2, -1), keepdim=True) / count
     variance = (centred.square() * weight).sum((-2, -1), keepdim=True) / count

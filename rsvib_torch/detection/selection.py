@@ -56,7 +56,12 @@ def _of_majority(measurements: Measurements, frequencies: Tensor, active: Tensor
 
 
 def _best_fit(
-    measurements: Measurements, frequencies: Tensor, active: Tensor, candidates: Tensor, model: MotionModel
+    measurements: Measurements,
+    frequencies: Tensor,
+    active: Tensor,
+    candidates: Tensor,
+    model: MotionModel,
+    reckon: bool,
 ) -> tuple[ToneFit, Measurements]:
     """The robust fit with the one of several candidates (B, 2, C, H) for a further tone that explains most."""
     batch, _, count, harmonics = candidates.shape
@@ -64,14 +69,19 @@ def _best_fit(
     known = frequencies.repeat_interleave(count, dim=0)
     further = candidates.transpose(1, 2).flatten(0, 1)
     actives = active.repeat_interleave(count, dim=0)
-    fit = _of_majority(several, torch.cat([known, further], -1), actives, model)
+    start = torch.cat([known, further], -1)
+    fit = (
+        _of_majority(several, start, actives, model)
+        if reckon
+        else fit_tones(several, start, actives, model, _FEW_ITERATIONS)
+    )
     left = several.sizes(residual_of(several, fit)).nanquantile(MAJORITY, dim=1).nan_to_num(0.0)  # (B C, 2)
     sighted = _sighted(several, fit.frequencies[..., -harmonics:])
     worst = left.unflatten(0, (batch, count)).amax(1, keepdim=True)
     score = (worst - left.unflatten(0, (batch, count))) * sighted.unflatten(0, (batch, count))
     best = score.argmax(1)[:, None, :, None]  # each axis for itself
     chosen = fit.frequencies.unflatten(0, (batch, count)).gather(1, best.expand(-1, -1, -1, fit.frequencies.shape[-1]))
-    return robust_fit(measurements, chosen[:, 0], active, model, reckon=True)
+    return robust_fit(measurements, chosen[:, 0], active, model, reckon)
 
 
 def _sighted(measurements: Measurements, frequencies: Tensor) -> Tensor:
@@ -133,7 +143,7 @@ def find_tones(
         candidates = torch.cat(found, -1)[..., None] * multiples
         frequencies = fit.frequencies[..., : keep.shape[-1]]
         active = torch.cat([keep, going[..., None].expand_as(none)], -1)
-        trial, trial_weighed = _best_fit(measurements, frequencies, active, candidates, model)
+        trial, trial_weighed = _best_fit(measurements, frequencies, active, candidates, model, start is None)
         if tones is None:
             # both fits are judged with the weights of the richer one
             before = trial_weighed.square(residual_of(measurements, fit))

@@ -111,19 +111,17 @@ class RowGradients:
     """Gradients of the scene as seen by the rows of a group of frames, ready to weigh residuals.
 
     Attributes:
-        spectra: (B, S, 3, U) transforms of weight times gradient along x, along y, and detail of the scene.
+        spectra: (B, S, 3, U) one-sided transforms of weight times gradient along x, along y, and detail of the scene.
         products: (B, S, 3, 3) float64 sums of their products; detail takes out changes of contrast.
         variance: (B, S) float64, noise variance of a pixel in a frame.
         halves: (B, S, 2, 5) float64, sums gx gx, gx gy, gy gy, gx e and gy e over the left and the right half of each
             row, with e what is left between the outer frames: halves that move apart are no vibration.
-        length: Length of the transforms.
     """
 
     spectra: Tensor
     products: Tensor
     variance: Tensor
     halves: Tensor
-    length: int
 
 
 def _pass(frequency: Tensor, limits: tuple[float, float]) -> Tensor:
@@ -154,11 +152,12 @@ def _wiener(mean: Tensor, noise: Tensor, u: Tensor, v: Tensor) -> Tensor:
     return share * band.to(share.dtype)
 
 
-def row_gradients(spectra: RowSpectra, rows: Tensor, shift: Tensor, seen: Tensor) -> RowGradients:
+def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tensor, seen: Tensor) -> RowGradients:
     """Gradients of the scene, its noise, and the weight of every pixel, from frames warped by a motion.
 
     Args:
         spectra: The frames of a group.
+        warped: (B, G, S, U) their rows warped to the scene, from ``RowSpectra.warped``.
         rows: (B, G, S) frame rows that show the S scene rows, in each frame.
         shift: (B, G, S) px, displacement along the rows to be taken out of each.
         seen: (B, G, S) float64, 1 where a frame sees the row.
@@ -166,7 +165,6 @@ def row_gradients(spectra: RowSpectra, rows: Tensor, shift: Tensor, seen: Tensor
     Returns:
         The gradients.
     """
-    warped = spectra.warped(rows, shift)
     mean = mean_over_frames(warped, seen)
     frames = seen.sum(1)
     spare = (frames - 1).clamp(min=0.0)
@@ -179,8 +177,8 @@ def row_gradients(spectra: RowSpectra, rows: Tensor, shift: Tensor, seen: Tensor
     along, across = (2j * math.pi * u).to(scene.dtype), (2j * math.pi * v).to(scene.dtype)[:, None]
     detail = torch.fft.ifft(torch.stack([scene, scene * across], dim=2), dim=1)  # (B, S, 2, U)
     detail = torch.stack([detail[:, :, 0] * along, detail[:, :, 1], detail[:, :, 0]], dim=2)
-    images: Tensor = torch.fft.irfft(detail, n=spectra.length)[..., : spectra.width]
-    images = torch.cat([images, torch.ones_like(images[:, :, :1])], dim=2)  # (B, S, 4, W), brightness last
+    images = mean.real.new_ones(*mean.shape[:2], 4, spectra.width)  # brightness last
+    images[:, :, :3] = torch.fft.irfft(detail, n=spectra.length)[..., : spectra.width]
     difference = (warped - mean[:, None]).transpose(1, 2)
     residual = torch.fft.irfft(difference, n=spectra.length)[..., : spectra.width]  # (B, S, G, W)
     residual = residual * seen.transpose(1, 2)[..., None].to(residual.dtype)
@@ -200,11 +198,10 @@ def row_gradients(spectra: RowSpectra, rows: Tensor, shift: Tensor, seen: Tensor
     mean_images = products[..., :3, 3:] / products[..., 3:, 3:].clamp(min=1e-6)
     centred = weighted[:, :, :3] - weight[:, :, None] * mean_images.to(weight.dtype)
     return RowGradients(
-        spectra=torch.fft.rfft(centred, n=spectra.length),
+        spectra=torch.fft.rfft(centred, n=spectra.length) * _one_sided(spectra.length, centred),
         products=products[..., :3, :3] - mean_images * products[..., 3:, :3],
         variance=variance,
         halves=_halves(weighted, images, left, seen),
-        length=spectra.length,
     )
 
 
@@ -293,16 +290,21 @@ def _halves(weighted: Tensor, images: Tensor, left: Tensor, seen: Tensor) -> Ten
     return torch.stack(sums, dim=-2).double() * both[..., None]
 
 
-def row_shifts(
-    spectra: RowSpectra, gradients: RowGradients, rows: Tensor, shift: Tensor, seen: Tensor
-) -> tuple[Tensor, Tensor]:
+def _one_sided(length: int, like: Tensor) -> Tensor:
+    """Weights (U,) that make a sum of products over the frequencies of ``rfft`` that over the pixels (Parseval)."""
+    weight = torch.full((length // 2 + 1,), 2.0 / length, dtype=like.dtype, device=like.device)
+    weight[0] *= 0.5
+    if length % 2 == 0:
+        weight[-1] *= 0.5
+    return weight
+
+
+def row_shifts(warped: Tensor, gradients: RowGradients, seen: Tensor) -> tuple[Tensor, Tensor]:
     """Normal equations of the displacement that every row still misses in each frame.
 
     Args:
-        spectra: The frames of a group.
+        warped: (B, G, S, U) rows of a group of frames warped to the scene, from ``RowSpectra.warped``.
         gradients: Gradients of the scene, from this motion or one near to it.
-        rows: (B, G, S) frame rows that show the S scene rows, in each frame.
-        shift: (B, G, S) px, displacement along the rows to be taken out of each.
         seen: (B, G, S) float64, 1 where a frame sees the row.
 
     Returns:
@@ -310,13 +312,7 @@ def row_shifts(
         in px relative to the mean over the group, the matrix its inverse covariance in one frame. Both are 0 for rows
         that fewer than two frames see or that have no detail.
     """
-    warped = spectra.warped(rows, shift)
-    # the sum over pixels as a sum over frequencies (Parseval); negative ones are the conjugates
-    twice = torch.full(warped.shape[-1:], 2.0 / spectra.length, dtype=warped.real.dtype, device=rows.device)
-    twice[0] *= 0.5
-    if spectra.length % 2 == 0:
-        twice[-1] *= 0.5
-    weighted = torch.view_as_real(gradients.spectra * twice).flatten(-2)
+    weighted = torch.view_as_real(gradients.spectra).flatten(-2)
     seen_by = torch.matmul(torch.view_as_real(warped).flatten(-2).transpose(1, 2), weighted.transpose(-2, -1))
     right = seen_by.transpose(1, 2).double()  # (B, G, S, 3)
     share = (seen / seen.sum(1, keepdim=True).clamp(min=1.0))[..., None]

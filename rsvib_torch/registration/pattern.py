@@ -12,11 +12,12 @@ from rsvib_torch.registration.gradients import RowSpectra, inner_columns, mean_o
 __all__ = ["column_pattern"]
 
 _ROW_STEP = 4  # every so many rows are asked
+_LARGEST = 3.0  # variance of a row over the typical one
 _NEIGHBOURS = 17  # frequencies judged together
 _SIGNIFICANT = 3.0  # power over what noise gives
 
 
-def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor]]) -> Tensor | None:
+def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor]]) -> Tensor | None:
     """Spectrum of what every row of every frame has added at the same columns.
 
     In frames warped back by the motion, a pattern p shows as ``p(x + shift)`` while the scene stands still: what the
@@ -24,14 +25,17 @@ def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor]]) -> T
 
     Args:
         groups: Spectra of each group of frames with the rows (B, G, S), shifts (B, G, S) and visibility (B, G, S) that
-            warp it.
+            warp it, and the variance (B, S) that its rows leave: rows that leave far more than others show something
+            else and are not asked.
 
     Returns:
         (B, U) spectrum of the pattern, shrunk by its noise; None where none stands above it.
     """
     found, power, noise, count = (torch.zeros(()) for _ in range(4))
     for spectra, *places in groups:
-        rows, shift, seen = (values[..., ::_ROW_STEP] for values in places)
+        rows, shift, seen, variance = (values[..., ::_ROW_STEP] for values in places)
+        typical = torch.where(variance > 0, variance, torch.nan).nanmedian(dim=-1, keepdim=True).values
+        seen = seen * ((variance > 0) & (variance < _LARGEST * typical))[:, None]
         visible = (seen * (seen.sum(1, keepdim=True) > 1)).to(spectra.values.real.dtype)[..., None]
         warped, ramp = spectra.warped(rows, shift), spectra.ramp(shift)
         difference = (warped - mean_over_frames(warped, seen)[:, None]) * visible

@@ -108,11 +108,11 @@ def test_rows_tell_a_known_shift(remaining, num_frames):
     rows = torch.arange(96, dtype=torch.float64).expand(1, num_frames, 96)
     seen = ((rows >= 8) & (rows <= 87)).double()
     none = torch.zeros_like(rows)
-    gradients = row_gradients(spectra, rows, none, seen)
+    gradients = row_gradients(spectra, spectra.warped(rows, none), rows, none, seen)
     expected = remaining * (torch.arange(num_frames) - (num_frames - 1) / 2)
 
     def told(shift):
-        matrix, right = row_shifts(spectra, gradients, rows, shift, seen)
+        matrix, right = row_shifts(spectra.warped(rows, shift), gradients, seen)
         known = matrix[0, :, 0, 0] > 0
         assert known.tolist() == seen[0, 0].bool().tolist()
         total, sums = matrix[0].sum(0), right[0].sum(1)
