@@ -31,6 +31,8 @@ __all__ = ["DetectionMethod", "VibrationDetector", "detect_vibration"]
 DetectionMethod = Literal["direct", "bands"]
 
 _LEAST_VALID = 0.5  # of the pixels of a band
+_ENOUGH_COLUMNS = 1024  # px for a start
+_LEAST_START = 0.8  # of the bands
 _LEAST_FRAME = 0.1  # of the pixels of a frame
 
 
@@ -229,14 +231,7 @@ def _windows(num_frames: int, window: int, step: int | None, timing: SensorTimin
 def _detect(frames: Tensor, valid: Tensor | None, timing: SensorTiming, options: _Options) -> DetectionResult:
     """``detect_vibration`` of grey frames (B, T, H, W) in row order; the result is a batch in image axes."""
     in_rows = timing.in_row_order()
-    curve = register_rows(
-        frames[:, :, None],
-        in_rows,
-        method=options.registration,
-        band_rows=options.band_rows,
-        band_step=options.band_step,
-        search=options.search,
-    )
+    curve = _register(frames, in_rows, options)
     if valid is not None:
         curve = _without_spoilt_bands(curve, valid)
     fit, other_motion = _METHODS[options.method](curve, frames, valid, in_rows, options)
@@ -284,6 +279,30 @@ def _detect(frames: Tensor, valid: Tensor | None, timing: SensorTiming, options:
         reliable=reliable.flip(-1) if swap else reliable,
         reasons=reasons,
     )
+
+
+def _register(frames: Tensor, timing: SensorTiming, options: _Options) -> OffsetCurve:
+    """Offsets of the bands of frames (B, T, H, W).
+
+    As a mere start the columns in the middle of wide frames do, if they show enough.
+    """
+
+    def offsets_of(columns: Tensor) -> OffsetCurve:
+        return register_rows(
+            columns[:, :, None],
+            timing,
+            method=options.registration,
+            band_rows=options.band_rows,
+            band_step=options.band_step,
+            search=options.search,
+        )
+
+    width = frames.shape[-1]
+    if options.method == "bands" or width <= _ENOUGH_COLUMNS:
+        return offsets_of(frames)
+    first = (width - _ENOUGH_COLUMNS) // 2
+    curve = offsets_of(frames[..., first : first + _ENOUGH_COLUMNS])
+    return curve if float(curve.good.double().mean((1, 2)).amin()) > _LEAST_START else offsets_of(frames)
 
 
 def _without_spoilt_bands(curve: OffsetCurve, valid: Tensor) -> OffsetCurve:
