@@ -1,7 +1,15 @@
 """See and undo the vibration of a rolling-shutter camera."""
 
 from rsvib_torch.detection import DetectionResult, VibrationDetector, VibrationStd, detect_vibration
-from rsvib_torch.evaluation import MtfCurve, offset_endpoint_error, psnr, slanted_edge_mtf, ssim
+from rsvib_torch.evaluation import (
+    MtfCurve,
+    SlantedEdge,
+    find_slanted_edges,
+    offset_endpoint_error,
+    psnr,
+    slanted_edge_mtf,
+    ssim,
+)
 from rsvib_torch.imaging import RowVaryingBlur, SensorNoise, row_psf, simulate_frames
 from rsvib_torch.registration import OffsetCurve, register_bands
 from rsvib_torch.restoration import (
@@ -27,6 +35,7 @@ __all__ = [
     "RowVaryingBlur",
     "SensorNoise",
     "SensorTiming",
+    "SlantedEdge",
     "StackInfo",
     "Vibration",
     "VibrationDetector",
@@ -34,6 +43,7 @@ __all__ = [
     "VibrationStd",
     "blind_frequencies",
     "detect_vibration",
+    "find_slanted_edges",
     "judge_restoration",
     "offset_endpoint_error",
     "predict_noise_gain",

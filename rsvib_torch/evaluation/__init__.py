@@ -2,13 +2,15 @@
 
 from rsvib_torch.evaluation.bound import cramer_rao_bound
 from rsvib_torch.evaluation.quality import offset_endpoint_error, psnr, ssim
-from rsvib_torch.evaluation.slanted_edge import MtfCurve, slanted_edge_mtf
+from rsvib_torch.evaluation.slanted_edge import MtfCurve, SlantedEdge, find_slanted_edges, slanted_edge_mtf
 from rsvib_torch.evaluation.targets import city_and_fields, resolution_chart
 
 __all__ = [
     "MtfCurve",
+    "SlantedEdge",
     "city_and_fields",
     "cramer_rao_bound",
+    "find_slanted_edges",
     "offset_endpoint_error",
     "psnr",
     "resolution_chart",

@@ -8,16 +8,18 @@ from torch import Tensor
 
 from rsvib_torch.evaluation.slanted_edge.geometry import EdgeFit, Scatter, fit_edge, linearised
 
-__all__ = ["check_edge", "check_roi"]
+__all__ = ["check_edge", "check_roi", "uneven_patches"]
 
 _SMALLEST = 16  # px
 _ANGLES = (2.0, 40.0)  # degrees
 _EXPLAINED = 0.5  # of the variance, by one straight edge
 _ROOM = (4.0, 3.0)  # px, and standard deviations of the line spread function, beside the edge
+PATCH = 5  # px, of the sides that are looked at together
+_COMPANY = 0.1  # of the contrast, that a patch of a side may differ from a plane
 _CLIPPED_SHARE = 0.1  # of the pixels of a side at one value
 _NOISY = 1e-3  # of the contrast
 _BETTER = 0.6  # parts of the misfit that remain where clipping explains it
-_OVERSHOOT = 0.02  # of the contrast: how far a clipped side would have gone on
+_OVERSHOOT = 0.05  # of the contrast: how far a clipped side would have gone on
 
 
 def check_roi(roi: object) -> Tensor:
@@ -77,7 +79,26 @@ def check_edge(fit: EdgeFit, scatter: Scatter, columns: int, limits: tuple[float
             f"the edge comes within {max(room, 0.0):.1f} px of the border of the roi, expected at least {wanted:.1f} px"
         )
     _refuse_clipped(fit, scatter, distance, limits)
+    patches, noise = uneven_patches(fit, scatter, columns)
+    worst, contrast = float(patches.max()), float(fit.contrast)
+    if worst > _COMPANY * contrast + 6 * noise:
+        row, column = divmod(int(patches.argmax()), patches.shape[1])
+        raise ValueError(
+            f"roi shows more than one edge: {100 * worst / contrast:.0f} % of its contrast near "
+            f"{row + PATCH // 2} px along and {column + PATCH // 2} px across the edge, expected even sides"
+        )
     return room
+
+
+def uneven_patches(fit: EdgeFit, scatter: Scatter, columns: int) -> tuple[Tensor, float]:
+    """Means over small patches of what the fit leaves of the sides, without sign, and what noise makes of them."""
+    model, _, distance = linearised(fit, scatter)
+    beside = distance.abs() > 4 * fit.width + 2
+    left = torch.where(beside, scatter.value - model, 0.0).view(-1, columns)
+    patches = torch.nn.functional.avg_pool2d(left[None, None], PATCH, stride=1)[0, 0].abs()
+    steps = (scatter.value - model).view(-1, columns).diff(dim=1).abs()
+    # 0.954: median of the difference of two normal numbers, without sign
+    return patches, float(steps.median()) / 0.954 / PATCH
 
 
 def _refuse_clipped(fit: EdgeFit, scatter: Scatter, distance: Tensor, limits: tuple[float, float]) -> None:
