@@ -10,7 +10,7 @@ from rsvib_torch.evaluation import (
     slanted_edge_mtf,
     ssim,
 )
-from rsvib_torch.imaging import RowVaryingBlur, SensorNoise, row_psf, simulate_frames
+from rsvib_torch.imaging import Optics, RowVaryingBlur, SensorNoise, row_psf, simulate_frames
 from rsvib_torch.registration import OffsetCurve, register_bands
 from rsvib_torch.restoration import (
     RestorationVerdict,
@@ -30,6 +30,7 @@ __all__ = [
     "DetectionResult",
     "MtfCurve",
     "OffsetCurve",
+    "Optics",
     "RestorationVerdict",
     "RestorationWarning",
     "RowVaryingBlur",

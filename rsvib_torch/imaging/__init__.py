@@ -3,11 +3,13 @@
 from rsvib_torch.imaging.blur import RowVaryingBlur, blur_rows, blur_rows_adjoint
 from rsvib_torch.imaging.coupling import rows_showing
 from rsvib_torch.imaging.noise import SensorNoise
+from rsvib_torch.imaging.optics import Optics
 from rsvib_torch.imaging.psf import RowPSF, row_psf
 from rsvib_torch.imaging.simulate import simulate_frames
 from rsvib_torch.imaging.trajectory import exposure_nodes, exposure_trajectory
 
 __all__ = [
+    "Optics",
     "RowPSF",
     "RowVaryingBlur",
     "SensorNoise",
