@@ -47,8 +47,9 @@ class Vibration:
     """Sinusoidal displacement of the image on the sensor, with an image motion.
 
     ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t + a t^2 / 2`` per axis (Eq. 1 of Liu et al. 2023, several tones,
-    Sec. 2.3; the paper's image motion is uniform, a = 0): scene content at ``s`` appears at ``s + D(t)``. Axes are ordered (x, y). Tones are kept sorted by amplitude,
-    largest first; an axis with fewer tones than the other has amplitude 0 in the rest.
+    Sec. 2.3; the paper's image motion is uniform, a = 0): scene content at ``s`` appears at ``s + D(t)``. Axes are
+    ordered (x, y). Tones are kept sorted by amplitude, largest first; an axis with fewer tones than the other has
+    amplitude 0 in the rest.
 
     Args:
         amplitude: A >= 0 in px: a float, ``(2,)`` (one tone an axis), ``(2, K)`` or ``(..., 2, K)`` for a batch.
