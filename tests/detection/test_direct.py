@@ -314,7 +314,7 @@ def test_windows_follow_a_vibration_that_changes(paper_camera):
 
     class Changing:
         def displacement(self, times):
-            x = (1.0 + 2.0 * times) * np.sin(2 * np.pi * (95.0 * times - 3.0 * times**2) + 0.3)
+            x = (1.0 + 2.0 * times) * np.sin(2 * np.pi * (84.0 * times - 3.0 * times**2) + 0.3)
             return np.stack([x, 0.8 * np.sin(2 * np.pi * 64.0 * times)], axis=-1)
 
     frames = pair_of(paper_camera, Changing(), 57, 0.003, columns=192, num_frames=7)
@@ -325,7 +325,7 @@ def test_windows_follow_a_vibration_that_changes(paper_camera):
     for index in range(3):
         middle = (2 * index + 1.5) * paper_camera.frame_period
         found = result[index].vibration
-        assert found.frequency[0, 0].item() == pytest.approx(95.0 - 6.0 * middle, abs=0.15)
+        assert found.frequency[0, 0].item() == pytest.approx(84.0 - 6.0 * middle, abs=0.15)
         assert found.amplitude[0, 0].item() == pytest.approx(1.0 + 2.0 * middle, rel=0.02)
         assert found.frequency[1, 0].item() == pytest.approx(64.0, rel=2e-3)
     # phases count from the time origin of the whole stack
