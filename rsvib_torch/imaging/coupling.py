@@ -10,7 +10,7 @@ __all__ = ["rows_showing"]
 
 
 def rows_showing(
-    scene_rows: Tensor, frame_start: Tensor, timing: SensorTiming, vibration: Vibration, iterations: int = 5
+    scene_rows: Tensor, frame_start: Tensor, timing: SensorTiming, vibration: Vibration, iterations: int = 8
 ) -> Tensor:
     """Frame rows r(s) that show scene rows s: the solution of ``r = s + Y(t(r))``.
 
