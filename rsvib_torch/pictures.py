@@ -38,14 +38,22 @@ def _plain_axes(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
+def _measured(value: Tensor, std: Tensor, digits: int) -> str:
+    """A value with its standard deviation, to as many digits as the latter needs to show."""
+    deviation = float(std)
+    if math.isfinite(deviation) and deviation > 0:
+        digits = min(6, max(digits, -math.floor(math.log10(deviation))))
+    return f"{float(value):.{digits}f} ± {deviation:.{digits}f}"
+
+
 def _tone_text(result: DetectionResult, axis: int) -> str:
     """The tones of an axis in words, or why there are none to trust."""
     vibration, std = result.vibration, result.std
     if not bool(result.reliable[axis]):
         return "not reliable: " + "; ".join(str(reason) for reason in result.reasons[axis])
     parts = [
-        f"{vibration.amplitude[axis, k]:.3f} ± {std.amplitude[axis, k]:.3f} px at "
-        f"{vibration.frequency[axis, k]:.2f} ± {std.frequency[axis, k]:.2f} Hz"
+        f"{_measured(vibration.amplitude[axis, k], std.amplitude[axis, k], 3)} px at "
+        f"{_measured(vibration.frequency[axis, k], std.frequency[axis, k], 2)} Hz"
         for k in range(vibration.amplitude.shape[-1])
         if float(vibration.amplitude[axis, k]) > 0
     ]
