@@ -1,13 +1,15 @@
 """Tables from files checked against types: one line a mistake, naming the key, the value and what was expected."""
 
 import inspect
+import json
 import types
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
-__all__ = ["Section", "checked", "options_section", "validate"]
+__all__ = ["Section", "checked", "options_section", "read_json", "validate"]
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _Result = TypeVar("_Result")
@@ -123,3 +125,27 @@ def _words(annotation: Any) -> str:
         else:
             words.append(_WORDS.get(kind, str(kind)))
     return " or ".join(dict.fromkeys(words))
+
+
+def read_json(path: Path, what: str) -> dict[str, Any]:
+    """A table from a JSON file.
+
+    Args:
+        path: The file.
+        what: What it should be, for the messages.
+
+    Raises:
+        OSError: If the file cannot be opened.
+        ValueError: If it is not JSON, or not a table.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not a {what}: {error}") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{path}: not a {what}: expected a table, got {type(data).__name__}")
+    return data
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is no JSON number")

@@ -10,7 +10,7 @@ import rsvib_torch
 PACKAGE = Path(rsvib_torch.__file__).parent
 # from the ground up; what shares a floor may not know each other
 FLOORS = (
-    {"checks", "splines", "spectral", "missing"},
+    {"checks", "splines", "spectral", "missing", "validation"},
     {"sensor"},
     {"vibration"},
     {"orientation"},
@@ -18,7 +18,6 @@ FLOORS = (
     {"detection", "restoration"},
     {"evaluation", "augmentation"},
     {"stacks"},
-    {"validation"},
     {"config", "pictures", "terminal"},
     {"report"},
     {"workflow"},

@@ -1,15 +1,16 @@
-"""Stacks in NumPy ``.npy`` files."""
+"""Stacks in NumPy ``.npy`` files, memory-mapped."""
 
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rsvib_torch.stacks.formats import StackFormat, register_format
 from rsvib_torch.stacks.info import StackInfo
+from rsvib_torch.stacks.placed import ArrayReader, PlacedReader, PlacedWriter, check_frames_held
 from rsvib_torch.stacks.scale import check_dtype, known_full_scale
 
-__all__ = ["read_array", "read_array_info", "write_array"]
+__all__ = ["create_array", "open_array"]
 
 
 def _stack_shape(shape: tuple[int, ...], path: Path) -> tuple[int, ...]:
@@ -22,38 +23,48 @@ def _stack_shape(shape: tuple[int, ...], path: Path) -> tuple[int, ...]:
     return shape
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and dtype, with the file's size checked against them before anything is allocated."""
+def _read_header(file: BinaryIO, path: Path) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
+    """Shape, whether the first axis runs fastest, dtype, and where the pixels begin."""
     try:
         version = np.lib.format.read_magic(file)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(file)
+        shape, columns_first, dtype = read(file)
         check_dtype(dtype)
+        if any(not isinstance(size, int) or size < 0 for size in shape):
+            raise ValueError(f"its shape is {shape}")
     except Exception as error:  # a damaged header can fail anywhere in its parser
         raise ValueError(f"{path}: not a readable .npy file ({' '.join(str(error).split())})") from error
-    needed = dtype.itemsize
-    for size in shape:
-        needed *= size
-    held = path.stat().st_size - file.tell()
-    if held < needed:
-        raise ValueError(f"{path}: truncated: the header promises {needed} bytes of pixels, the file holds {held}")
-    return shape, dtype
+    return shape, columns_first, dtype, file.tell()
 
 
-def read_array_info(path: Path) -> StackInfo:
-    """What the header of a ``.npy`` file says."""
+def open_array(path: Path) -> ArrayReader | PlacedReader:
+    """Open a ``.npy`` file: (H, W), (T, H, W) or (T, C, H, W). Pickled objects are refused."""
     with path.open("rb") as file:
-        shape, dtype = _read_header(file, path)
-    return StackInfo(_stack_shape(shape, path), dtype.name, known_full_scale(dtype))
+        shape, columns_first, dtype, offset = _read_header(file, path)
+    info = StackInfo(_stack_shape(shape, path), dtype.name, known_full_scale(dtype))
+    try:
+        if not columns_first:
+            return PlacedReader(path, info, offset, dtype)
+        check_frames_held(info, offset, path.stat().st_size)
+        return ArrayReader(info, np.load(path, mmap_mode="r", allow_pickle=False).reshape(info.shape))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
-def read_array(path: Path) -> tuple[NDArray[Any], StackInfo]:
-    """Pixels as stored, (T, H, W) or (T, C, H, W). Pickled objects are refused."""
-    info = read_array_info(path)
-    pixels: NDArray[Any] = np.load(path, allow_pickle=False)
-    return pixels.reshape(info.shape), info
+def create_array(path: Path, info: StackInfo, fresh: bool) -> PlacedWriter:
+    """Make a ``.npy`` file, or go on with one; it has no room for the full scale."""
+    if fresh:
+        header = {"descr": np.lib.format.dtype_to_descr(np.dtype(info.dtype)), "fortran_order": False}
+        with path.open("wb") as file:
+            np.lib.format.write_array_header_1_0(file, {**header, "shape": info.shape})
+            return PlacedWriter(path, info, file.tell()).reserve()
+    with path.open("rb") as file:
+        return PlacedWriter(path, info, _read_header(file, path)[3])
 
 
-def write_array(path: Path, pixels: NDArray[Any], full_scale: float | None) -> None:
-    """Write pixels as they are; a ``.npy`` file has no room for the full scale."""
-    np.save(path, pixels, allow_pickle=False)
+def _check(path: Path, info: StackInfo) -> None:
+    if len(info.shape) == 4 and info.shape[-1] <= 4 < info.shape[1]:
+        raise ValueError(f"{path}: array of shape {info.shape} would be taken for one with channels last")
+
+
+register_format(StackFormat("npy", (".npy",), open_array, create_array, check=_check))

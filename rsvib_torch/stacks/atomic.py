@@ -6,8 +6,9 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
-__all__ = ["check_writable", "whole_file", "whole_folder"]
+__all__ = ["check_writable", "place", "whole_file", "whole_folder", "workplace"]
 
 
 def _nearest_folder(path: Path) -> Path:
@@ -19,7 +20,7 @@ def _nearest_folder(path: Path) -> Path:
 
 
 @contextmanager
-def _workplace(path: Path) -> Iterator[Path]:
+def workplace(path: Path) -> Iterator[Path]:
     """A temporary folder on the file system of ``path``, gone afterwards."""
     parent = _nearest_folder(path)
     try:
@@ -54,7 +55,7 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
         folder: Whether it will be a folder.
     """
     (_check_folder_place if folder else _check_file_place)(path)
-    with _workplace(path):
+    with workplace(path):
         pass
 
 
@@ -73,7 +74,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     _check_file_place(target)
-    with _workplace(target) as work:
+    with workplace(target) as work:
         part = work / target.name
         yield part
         os.replace(part, target)
@@ -96,7 +97,7 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     _check_folder_place(target)
-    with _workplace(target) as work:
+    with workplace(target) as work:
         part = work / "new"
         part.mkdir()
         yield part
@@ -106,3 +107,34 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         target.mkdir(parents=True, exist_ok=True)
         for file in files:
             os.replace(file, target / file.name)
+
+
+def place(
+    part: Path, target: Path, kind: Literal["file", "folder", "tree"] = "file", companions: tuple[str, ...] = ()
+) -> None:
+    """Give what was written under a temporary name its own; may be called again after it was broken off.
+
+    Args:
+        part: What was written; a name on the file system of ``target``.
+        target: Where it belongs. A file or tree there is replaced, a folder keeps its other files.
+        kind: As in ``StackFormat``.
+        companions: As in ``StackFormat``.
+    """
+    for ending in companions:
+        beside = part.with_name(part.name + ending)
+        if beside.exists():
+            os.replace(beside, target.with_name(target.name + ending))
+    if kind == "folder" and target.is_dir():
+        for file in sorted(part.iterdir()):
+            _check_file_place(target / file.name, parent_exists=False)
+        for file in sorted(part.iterdir()):
+            os.replace(file, target / file.name)
+        part.rmdir()
+        return
+    if kind == "tree" and target.is_dir():
+        old = part.with_name(f"{part.name}.old")
+        os.replace(target, old)
+        os.replace(part, target)
+        shutil.rmtree(old)
+        return
+    os.replace(part, target)
