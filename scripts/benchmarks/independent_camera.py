@@ -47,15 +47,15 @@ def closed(scene: Array, rim: int) -> Array:
     return faded + scene.mean()
 
 
-def fine_rows(scene: Array) -> NDArray[np.complex128]:
-    """Spectra along rows (``FINER`` times H, U) of the scene, interpolated across rows."""
+def fine_rows(scene: Array, finer: int = FINER) -> NDArray[np.complex128]:
+    """Spectra along rows (``finer`` times H, U) of the scene, interpolated across rows."""
     along = np.fft.rfft(scene, axis=1)
     spectrum = np.fft.fftshift(np.fft.fft(along, axis=0), axes=0)
     height = len(scene)
-    padded = np.zeros((FINER * height, along.shape[1]), dtype=complex)
-    first = (FINER * height) // 2 - height // 2
+    padded = np.zeros((finer * height, along.shape[1]), dtype=complex)
+    first = (finer * height) // 2 - height // 2
     padded[first : first + height] = spectrum
-    return np.fft.ifft(np.fft.ifftshift(padded, axes=0), axis=0) * FINER
+    return np.fft.ifft(np.fft.ifftshift(padded, axes=0), axis=0) * finer
 
 
 def polynomial_weights(fraction: Array) -> Array:

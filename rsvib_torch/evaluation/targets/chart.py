@@ -22,11 +22,10 @@ __all__ = ["resolution_chart"]
 
 _INK, _PAPER = 0.07, 0.86
 _SLANT = math.radians(5.0)
-_CELL = 230.0  # px, wanted size of a field of the chart
 _Centre = tuple[float, float]
 
 
-def resolution_chart(height: int, width: int, *, sigma: float = 0.6, seed: int = 0) -> Tensor:
+def resolution_chart(height: int, width: int, *, sigma: float = 0.6, seed: int = 0, field: float = 230.0) -> Tensor:
     """Draw a resolution chart: slanted edges, hyperbolic wedges, bar groups, stars, rings and grey fields.
 
     A star in the middle, wedges along both axes that end at Nyquist, slanted squares on the diagonals,
@@ -38,13 +37,14 @@ def resolution_chart(height: int, width: int, *, sigma: float = 0.6, seed: int =
         width: Columns, at least 64.
         sigma: Blur of the optics in px (Gaussian, pixel area included).
         seed: Seed of the grain and texture.
+        field: px, wanted size of a field of the chart, at least 32.
 
     Returns:
         float32 tensor (height, width) with values in 0 ... 1.
 
     Raises:
         TypeError: If a size is not a whole number.
-        ValueError: If the chart is too small or the blur too narrow to be sampled (below 0.4 px).
+        ValueError: If the chart or its fields are too small, or the blur is too narrow to be sampled (below 0.4 px).
 
     Example:
         >>> chart = resolution_chart(256, 320)
@@ -54,13 +54,14 @@ def resolution_chart(height: int, width: int, *, sigma: float = 0.6, seed: int =
     height = check_whole_number("height", height, at_least=64)
     width = check_whole_number("width", width, at_least=64)
     sigma = check_number("sigma", sigma, at_least=0.4)
+    field = check_number("field", field, at_least=32.0)
     generator = torch.Generator().manual_seed(seed)
     grain = fractal_texture(height, width, generator, exponent=0.5, longest=64.0, sigma=sigma)
     texture = fractal_texture(height, width, generator, exponent=1.2, longest=40.0, sigma=sigma)
     canvas = Canvas(torch.full((height, width), _PAPER), sigma)
 
     rim = max(10.0, 0.014 * min(height, width))
-    rows, columns = (max(3, 2 * round((size - 4 * rim) / (2 * _CELL) - 0.5) + 1) for size in (height, width))
+    rows, columns = (max(3, 2 * round((size - 4 * rim) / (2 * field) - 0.5) + 1) for size in (height, width))
     pitch = ((width - 4 * rim) / columns, (height - 4 * rim) / rows)
     size = min(pitch)
     relief = torch.full((2, height, width), 0.02)  # how strongly grain and texture show

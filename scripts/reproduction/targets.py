@@ -1,0 +1,77 @@
+"""The two targets: a resolution chart in the manner of ISO 12233, and a landscape seen from above."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from benchmarks.independent_camera import Array, Shake
+from reproduction.camera import PITCH, Scene, margins
+from reproduction.paper import AMPLITUDE, AXES, FRAME_ROWS, FREQUENCY, ROW_TIME, Target
+from torch import Tensor
+
+import rsvib_torch as rsv
+from rsvib_torch.evaluation import city_and_fields, resolution_chart
+
+OPTICS = 0.5  # px, Gaussian; square pixels come on top
+SEED = 2023
+_FIELD = 230.0  # px of the camera, fields of the chart
+_DRAWN: dict[Target, Callable[[int, int, float], Tensor]] = {
+    "chart": lambda height, width, sigma: resolution_chart(
+        height, width, sigma=sigma, seed=SEED, field=min(_FIELD * PITCH, 0.2 * min(height, width))
+    ),
+    "landscape": lambda height, width, sigma: city_and_fields(height, width, SEED, sigma=sigma),
+}
+
+
+def shake_of(seed: int, image_motion: Sequence[float] = (0.0, 0.0)) -> Shake:
+    """The paper's vibration with phases drawn from a seed."""
+    amplitude, frequency = (np.array([[values[axis]] for axis in AXES]) for values in (AMPLITUDE, FREQUENCY))
+    phase = np.random.default_rng(seed).uniform(-math.pi, math.pi, (2, 1))
+    return Shake(amplitude, frequency, phase, np.array(image_motion))
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """A slanted edge of the still chart, found in it.
+
+    Attributes:
+        axis: Axis that it measures: a near-vertical edge measures x.
+        roi: Where it lies, with the room that a displaced edge needs.
+    """
+
+    axis: str
+    roi: rsv.SlantedEdge
+
+    def crop(self, image: Array) -> Array:
+        """The ROI of an image, turned so that its edge is near the vertical."""
+        roi: Array = self.roi.crop(image)  # type: ignore[arg-type, assignment]
+        return roi if self.axis == "x" else roi.T
+
+
+def draw(target: Target, size: tuple[int, int], image_motion: Sequence[float] = (0.0, 0.0)) -> Scene:
+    """A target around frames of a size in px, with room for two frames of the paper's vibration."""
+    margin = margins(shake_of(0, image_motion), (FRAME_ROWS + size[0]) * ROW_TIME)
+    height, width = (PITCH * (s + 2 * m) for s, m in zip(size, margin, strict=True))
+    sigma = PITCH * math.sqrt(OPTICS**2 + 1 / 12)  # a pixel blurs about as a Gaussian of 1/12 px^2
+    return Scene.around(_DRAWN[target](height, width, sigma).double().numpy(), margin)
+
+
+def edges_of(still: Array, count: int) -> list[Edge]:
+    """The strongest slanted edges of a still chart, so many for each axis, far from its border."""
+    found = rsv.find_slanted_edges(torch.from_numpy(still))
+    return [
+        Edge(axis, roi)
+        for axis in AXES
+        for roi in [edge for edge in found if edge.near_vertical == (axis == "x") and _inside(edge, still)][:count]
+    ]
+
+
+def _inside(edge: rsv.SlantedEdge, still: Array, rim: int = 40) -> bool:
+    height, width = still.shape
+    return (
+        min(edge.top, edge.left) >= rim
+        and edge.top + edge.height <= height - rim
+        and edge.left + edge.width <= width - rim
+    )

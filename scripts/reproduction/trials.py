@@ -1,0 +1,126 @@
+"""One trial: frames of a target, detection and restoration by the paper's methods and by the default ones."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from benchmarks.independent_camera import Array, Shake
+from reproduction.camera import Scene, take_frames, with_noise
+from reproduction.esfr import crossing, straight_edge_mtf
+from reproduction.paper import AXES, EXPOSURE_ROWS, FRAME_ROWS, ROW_TIME
+from reproduction.targets import Edge
+from torch import Tensor
+
+import rsvib_torch as rsv
+
+TIMING = rsv.SensorTiming(row_time=ROW_TIME, exposure_rows=EXPOSURE_ROWS, frame_rows=FRAME_ROWS)
+BITS = 12
+RIM = 32  # px at the border of a frame that no figure counts: the camera did not see all of them
+FREQUENCY = np.linspace(0.0, 0.5, 51)  # cycles/px, of MTF curves
+METHODS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # options of detection and restoration
+    "paper": ({"method": "bands", "registration": "projection"}, {"method": "banded"}),
+    "default": ({}, {}),
+}
+_PER_AXIS = ("period", "amplitude", "phase")
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """What a trial leaves for pictures, with the values it measured."""
+
+    values: dict[str, Any]
+    frames: Array
+    restored: dict[str, Array] = field(default_factory=dict)
+    detections: dict[str, rsv.DetectionResult] = field(default_factory=dict)
+
+
+def clean_frames(scene: Scene, shake: Shake) -> Array:
+    """Two frames of the paper's camera without noise."""
+    return take_frames(
+        scene,
+        shake,
+        row_time=TIMING.row_time,
+        exposure_time=TIMING.exposure_time,
+        frame_period=TIMING.frame_period,
+        num_frames=2,
+    )
+
+
+def detection_values(result: rsv.DetectionResult, shake: Shake) -> dict[str, dict[str, Any]]:
+    """Detected period (ms), amplitude (px), phase (π) of each axis, with errors in %, % and π."""
+    truth = {"period": 1e3 / shake.frequency, "amplitude": shake.amplitude, "phase": shake.phase / np.pi}
+    scale = {"period": 1e3, "amplitude": 1.0, "phase": 1 / np.pi}
+    values: dict[str, dict[str, Any]] = {}
+    for axis, name in enumerate(AXES):
+        values[name] = {"reliable": bool(result.reliable[axis])}
+        for quantity in _PER_AXIS:
+            found, true = scale[quantity] * float(getattr(result.vibration, quantity)[axis, 0]), truth[quantity][axis, 0]
+            apart = (found - true + 1) % 2 - 1 if quantity == "phase" else 100 * (found / true - 1)
+            values[name] |= {quantity: found, f"{quantity}_error": float(apart)}
+    return values
+
+
+def mtf_values(image: Array, edges: Sequence[Edge]) -> dict[str, Any]:
+    """Mean MTF over the edges of each axis: by a straight line as ISO 12233 prints it, and along the edge as it is."""
+    values: dict[str, Any] = {}
+    for axis in sorted({edge.axis for edge in edges}):
+        straight, along, refused = [], [], []
+        for edge in edges:
+            if edge.axis == axis:
+                crop = np.ascontiguousarray(edge.crop(image))
+                straight.append(straight_edge_mtf(crop, FREQUENCY))
+                try:
+                    curve = rsv.slanted_edge_mtf(torch.from_numpy(crop))
+                    along.append(curve.at(torch.from_numpy(FREQUENCY)).numpy())
+                except ValueError as error:
+                    refused.append(str(error))
+        values[axis] = {"refused": refused} | {
+            name: {"curve": mean.tolist(), "nyquist": float(mean[-1]), "mtf50": crossing(FREQUENCY, mean)}
+            for name, curves in (("straight", straight), ("along", along))
+            if curves
+            for mean in [np.mean(curves, axis=0)]
+        }
+    return values
+
+
+def quality(images: Array, still: Array, edges: Sequence[Edge]) -> dict[str, Any]:
+    """PSNR, SSIM and MTF of frames, one entry a frame."""
+    frames, truth = torch.from_numpy(images), torch.from_numpy(still)
+    return {
+        "psnr": rsv.psnr(frames, truth, 1.0, rim=RIM).tolist(),
+        "ssim": rsv.ssim(frames, truth, 1.0, rim=RIM).tolist(),
+        "mtf": [mtf_values(image, edges) for image in images] if edges else [],
+    }
+
+
+def as_frames(images: Array) -> Tensor:
+    """Frames as a user has them."""
+    return torch.from_numpy(images).float()
+
+
+def run_trial(
+    scene: Scene, shake: Shake, clean: Array, noise: float, seed: int, edges: Sequence[Edge] = (), *, restore: bool = True
+) -> Images:
+    """Add noise, detect, restore, and measure against the still scene."""
+    taken = with_noise(clean, noise, BITS, np.random.default_rng([seed, round(1e6 * noise)]))
+    values: dict[str, Any] = {"seed": seed, "noise": noise, "detection": {}, "restoration": {}}
+    images = Images(values, taken)
+    if restore:
+        values["degraded"] = quality(taken, scene.still, edges)
+    for name, (detecting, restoring) in METHODS.items():
+        result = rsv.detect_vibration(as_frames(taken), TIMING, **detecting)
+        values["detection"][name] = detection_values(result, shake)
+        images.detections[name] = result
+        if restore:
+            restored = rsv.restore(as_frames(taken), TIMING, result.vibration, check=False, **restoring)
+            images.restored[name] = restored.double().numpy()
+            values["restoration"][name] = quality(images.restored[name], scene.still, edges)
+    return images
+
+
+def still_values(scene: Scene, noise: float, edges: Sequence[Edge]) -> dict[str, Any]:
+    """What a still camera with this noise has."""
+    taken = with_noise(scene.still[None], noise, BITS, np.random.default_rng(round(1e6 * noise)))
+    return quality(taken, scene.still, edges)
