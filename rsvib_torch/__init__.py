@@ -1,5 +1,6 @@
 """See and undo the vibration of a rolling-shutter camera."""
 
+from rsvib_torch.calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
 from rsvib_torch.detection import DetectionResult, VibrationDetector, VibrationStd, detect_vibration
 from rsvib_torch.evaluation import (
     MtfCurve,
@@ -33,6 +34,7 @@ __all__ = [
     "Optics",
     "RestorationVerdict",
     "RestorationWarning",
+    "RowTimeCalibration",
     "RowVaryingBlur",
     "SensorNoise",
     "SensorTiming",
@@ -43,6 +45,8 @@ __all__ = [
     "VibrationRestorer",
     "VibrationStd",
     "blind_frequencies",
+    "calibrate_row_time",
+    "calibrate_row_time_by_exposure",
     "detect_vibration",
     "find_slanted_edges",
     "judge_restoration",

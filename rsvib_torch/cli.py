@@ -10,6 +10,7 @@ import torch
 import typer
 
 import rsvib_torch
+from rsvib_torch.calibrate_command import calibrate
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.imaging import simulate_frames
@@ -204,6 +205,9 @@ def _show_version(wanted: bool) -> None:
     if wanted:
         say(f"rsvib {rsvib_torch.__version__}")
         raise typer.Exit
+
+
+app.command()(calibrate)
 
 
 @app.callback()

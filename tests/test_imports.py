@@ -14,13 +14,13 @@ FLOORS = (
     {"sensor"},
     {"vibration"},
     {"orientation"},
-    {"registration", "imaging"},
+    {"registration", "imaging", "calibration"},
     {"detection", "restoration"},
     {"evaluation", "augmentation"},
     {"stacks"},
     {"config", "pictures", "terminal"},
     {"report"},
-    {"workflow"},
+    {"workflow", "calibrate_command"},
     {"cli"},
 )
 

@@ -1,0 +1,5 @@
+"""What a camera does not say of itself, from frames of flickering light."""
+
+from rsvib_torch.calibration.calibrate import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
+
+__all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_exposure"]

@@ -1,0 +1,307 @@
+"""Row time, readout direction and exposure of a camera from frames of flickering light."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.calibration.period import BandFit
+from rsvib_torch.calibration.profiles import Profiles, row_profiles
+from rsvib_torch.calibration.search import find_bands
+from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
+from rsvib_torch.checks import check_choice, check_number
+
+__all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_exposure"]
+
+ScanAxis = Literal[-2, -1, "y", "x"]
+
+_AXES: dict[object, int] = {-2: -2, "y": -2, -1: -1, "x": -1}
+_CLOCKS = 1e-4  # relative error of frame rate and flicker frequency together, in the comparison of frames
+_CLEAR_TURNS = 0.03  # from a whole or half number, that a light must turn from frame to frame
+_CLEAR, _CLEAR_MISFIT = 4.0, 0.01  # by which one readout direction must fit better than the other
+_TURNS_ALIKE = 0.1  # misfit of bands that move as they should
+_TEXTURE_PRICE = {2: 0.3, 3: 0.03}  # of a pattern that stays, which two frames cannot tell from one that moves
+_GOOD_SHAPE = 0.3  # misfit over brightness up to which bands count as those of a light that is on and off
+_MOST_CLIPPED = 0.02  # of the pixels, for the shape of bands
+
+
+@dataclass(frozen=True)
+class RowTimeCalibration:
+    """What frames of flickering light tell of a camera; what they do not tell is None, and ``notes`` says why.
+
+    Attributes:
+        row_time: T_row in seconds.
+        row_time_std: Its standard deviation, without that of the flicker frequency.
+        period_rows: Period of the bands in rows.
+        contrast: Amplitude of the bands' fundamental over their mean, at most 2.
+        flicker_frequency: In Hz, as given or found.
+        frame_rows: Row times from one frame to the next, where the frame rate is known.
+        readout_direction: ``"forward"`` or ``"reverse"``, from bands that move between frames.
+        exposure_time: T_e in seconds.
+        exposure_time_std: Its standard deviation.
+        notes: What could not be found, and why; what to be careful about.
+    """
+
+    row_time: float
+    row_time_std: float
+    period_rows: float
+    contrast: float
+    flicker_frequency: float
+    frame_rows: float | None
+    readout_direction: Literal["forward", "reverse"] | None
+    exposure_time: float | None
+    exposure_time_std: float | None
+    notes: tuple[str, ...]
+
+
+def calibrate_row_time(
+    frames: Tensor,
+    flicker_frequency: float,
+    *,
+    frame_rate: float | None = None,
+    on_fraction: float | None = None,
+    light_contrast: float | None = None,
+    scan_axis: ScanAxis = -2,
+    gamma: float = 1.0,
+    full_scale: float | None = None,
+) -> RowTimeCalibration:
+    """Row time from frames of a light that flickers at a known frequency: ``T_row = 1 / (f P)``, bands of P rows.
+
+    The brightness of the rows is fitted as that of the scene times a waveform that repeats every P rows, with as many
+    harmonics as pay. Shading along the rows is part of the fit, texture drops out where several frames of a still
+    scene are given whose bands lie at different rows.
+
+    With a frame rate the bands' phase from frame to frame, ``f / frame_rate`` turns, tells the readout direction,
+    where it is clearly neither a whole nor a half number of turns. The exposure follows from the shape of the bands
+    of a light that is on for a known fraction of time, or from the contrast of the bands of a light whose own
+    contrast is known: ``sinc(f T_e)`` of it.
+
+    Args:
+        frames: (T, H, W) or (T, C, H, W); floats of full scale 1, or integers.
+        flicker_frequency: f in Hz. Mains light flickers at twice the frequency of the mains.
+        frame_rate: Frames per second, T >= 2 consecutive ones.
+        on_fraction: Fraction of time that an on-off light is on (0.5 for a square wave).
+        light_contrast: Amplitude over mean of the light's own fundamental, for a light that swings like a sine.
+        scan_axis: Axis along which rows follow each other, as in ``SensorTiming``.
+        gamma: Pixels are raised to this power to make them proportional to light (about 2.2 for photographs). The
+            row time does not depend on it, the exposure does.
+        full_scale: Count that means 1.0, for integers other than 8 bit.
+
+    Returns:
+        Row time with its standard deviation, and what else could be found.
+
+    Raises:
+        TypeError: If an argument is not a number.
+        ValueError: If there is no flicker in the frames, it is too fast or too slow for the camera, or the frames are
+            black or saturated.
+
+    Example:
+        >>> rows = torch.arange(512)
+        >>> light = 0.4 + 0.2 * torch.cos(2 * torch.pi * rows / 64)
+        >>> found = calibrate_row_time(light[None, :, None].expand(1, 512, 16), 1000.0)
+        >>> round(1e6 * found.row_time, 3)
+        15.625
+    """
+    frequency = check_number("flicker_frequency", flicker_frequency, above=0.0)
+    if frame_rate is not None:
+        frame_rate = check_number("frame_rate", frame_rate, above=0.0)
+        if frequency < 1.5 * frame_rate:
+            raise ValueError(
+                f"flicker_frequency={frequency:g} Hz is slower than a frame of {frame_rate:g} per second: fewer than "
+                "1.5 periods fit into one; take a faster flicker"
+            )
+    if on_fraction is not None:
+        check_number("on_fraction", on_fraction, above=0.0, at_most=0.999)
+    if light_contrast is not None:
+        check_number("light_contrast", light_contrast, above=0.0, at_most=2.0)
+    if on_fraction is not None and light_contrast is not None:
+        raise ValueError(
+            "give on_fraction for a light that is on and off, or light_contrast for one that swings, not both"
+        )
+    profiles = row_profiles(frames, _axis(scan_axis), full_scale, gamma)
+    bands, scene = find_bands(profiles)
+    height = profiles.rows.shape[1]
+    row_time = 1 / (frequency * bands.period)
+    notes: list[str] = []
+    if frame_rate is not None:
+        _check_readout(row_time, frequency, height, frame_rate)
+    if scene == "smooth" and len(profiles.rows) > 1:
+        notes.append("the bands lie at the same rows in all frames, or the scene moves: texture does not drop out")
+    direction, contrast, why = _direction(bands, frequency, frame_rate)
+    notes += [f"readout direction unknown: {why}"] if why else []
+    exposure, exposure_std, why = _exposure(profiles, bands, contrast, row_time, on_fraction, light_contrast)
+    notes += [f"exposure unknown: {why}"] if why else []
+    return RowTimeCalibration(
+        row_time=row_time,
+        row_time_std=row_time * bands.period_std / bands.period,
+        period_rows=bands.period,
+        contrast=contrast,
+        flicker_frequency=frequency,
+        frame_rows=None if frame_rate is None else 1 / (frame_rate * row_time),
+        readout_direction=direction,
+        exposure_time=exposure,
+        exposure_time_std=exposure_std,
+        notes=tuple(notes),
+    )
+
+
+def calibrate_row_time_by_exposure(
+    frames: Tensor,
+    exposure_times: Sequence[float],
+    *,
+    scan_axis: ScanAxis = -2,
+    gamma: float = 1.0,
+    full_scale: float | None = None,
+) -> RowTimeCalibration:
+    """Row time from frames of a strobe of unknown frequency taken with different known exposures.
+
+    A row is lit if its exposure meets the pulse: bright bands are as tall as pulse and exposure together, so that a
+    longer exposure makes them taller by ``(T_e2 - T_e1) / T_row`` rows. The overlap of pulse and exposure is fitted to
+    the brightness of the rows of all frames, with pulse, period and row time in common.
+
+    Args:
+        frames: (T, H, W) or (T, C, H, W), T >= 2.
+        exposure_times: Exposure of each frame in seconds, not all the same.
+        scan_axis: As in ``calibrate_row_time``.
+        gamma: As in ``calibrate_row_time``; it matters here.
+        full_scale: Count that means 1.0, for integers other than 8 bit.
+
+    Returns:
+        Row time with its standard deviation, and the frequency of the strobe.
+
+    Raises:
+        TypeError: If an argument is not a number.
+        ValueError: If there are no bands, exposures do not fit the frames or are all the same.
+    """
+    exposures = [check_number("exposure_times", value, above=0.0, at_most=10.0) for value in exposure_times]
+    profiles = row_profiles(frames, _axis(scan_axis), full_scale, gamma)
+    if len(exposures) != len(profiles.rows):
+        raise ValueError(f"{len(exposures)} exposure times do not fit {len(profiles.rows)} frames; one a frame")
+    if max(exposures) < 1.05 * min(exposures):
+        raise ValueError(f"exposure_times {exposures} must differ: the row time is in the difference of the bands")
+    # frames of other exposures are other waveforms: nothing drops out between them
+    singles = [
+        find_bands(Profiles(r[None], p[None], 0.0))[0] for r, p in zip(profiles.rows, profiles.parts, strict=True)
+    ]
+    period = sum(s.period / s.period_std**2 for s in singles) / sum(1 / s.period_std**2 for s in singles)
+    phases = [float(s.coefficients[0, 0].angle()) for s in singles]
+    fit = fit_strobe(profiles.rows, period, phases, exposures=exposures)
+    if fit.misfit > _GOOD_SHAPE:
+        raise ValueError(
+            f"the bands do not have the shape of a light that is on and off (misfit {fit.misfit:.0%} of the mean)"
+        )
+    row_time = max(exposures) / float(fit.exposure_rows.max())
+    shortest = min(range(len(exposures)), key=exposures.__getitem__)
+    return RowTimeCalibration(
+        row_time=row_time,
+        row_time_std=fit.std["row_time"],
+        period_rows=fit.period,
+        contrast=float(singles[shortest].coefficients[0, 0].abs()),
+        flicker_frequency=1 / (fit.period * row_time),
+        frame_rows=None,
+        readout_direction=None,
+        exposure_time=exposures[shortest],
+        exposure_time_std=0.0,
+        notes=("readout direction unknown: it takes the flicker frequency and the frame rate",),
+    )
+
+
+def _axis(scan_axis: ScanAxis) -> int:
+    check_choice("scan_axis", scan_axis, tuple(_AXES))
+    return _AXES[scan_axis]
+
+
+def _check_readout(row_time: float, frequency: float, height: int, frame_rate: float) -> None:
+    """Refuse where the rows do not fit into a frame, or another row time would show the same bands."""
+    longest = 1 / (frame_rate * height)
+    if row_time > 1.001 * longest:
+        raise ValueError(
+            f"a row time of {1e6 * row_time:.3f} us does not fit: {height} rows would take longer than a frame at "
+            f"frame_rate={frame_rate:g} per second; check flicker_frequency={frequency:g} Hz"
+        )
+    others = [
+        turns / frequency + sign * row_time
+        for turns in range(1, math.ceil(longest * frequency) + 2)
+        for sign in (-1, 1)
+    ]
+    possible = sorted(time for time in (row_time, *others) if time <= longest)
+    if len(possible) > 1:
+        listed = ", ".join(f"{1e6 * time:.3f}" for time in possible[:5])
+        raise ValueError(
+            f"flicker_frequency={frequency:g} Hz is faster than rows may sample: row times of {listed} us show the "
+            f"same bands; stay below {0.5 / longest:.0f} Hz"
+        )
+
+
+def _direction(
+    bands: BandFit, frequency: float, frame_rate: float | None
+) -> tuple[Literal["forward", "reverse"] | None, float, str]:
+    """Readout direction from consecutive frames, contrast of the light, and why the direction cannot be told.
+
+    From frame to frame the light turns by ``f / frame_rate``, the scene's own pattern stays: the fundamental of frame
+    p is ``d + a exp(-2 pi j p f / frame_rate)`` where rows run forward, and has the other sign where they do not.
+    """
+    first = bands.coefficients[:, 0]
+    contrast = float(first.abs().mean())
+    if len(first) < 2:
+        return None, contrast, "it takes two consecutive frames"
+    if frame_rate is None:
+        return None, contrast, "it takes the frame rate"
+    turns = frequency / frame_rate
+    if abs(_wrapped(2 * turns)) / 2 < _CLEAR_TURNS + turns * _CLOCKS * (len(first) - 1):
+        return None, contrast, f"the light makes {turns:.3f} turns a frame, too near to a whole or half number"
+    misfits, amplitudes = zip(*(_turning(first, sign * turns) for sign in (-1, 1)), strict=True)
+    good, bad = min(misfits), max(misfits)
+    if good > _TURNS_ALIKE:
+        why = "the bands do not move as flicker frequency and frame rate say (29.97 is not 30)"
+        return None, contrast, f"{why}: {turns % 1:.3f} turns a frame"
+    if bad < _CLEAR * good + _CLEAR_MISFIT:
+        return None, contrast, "texture of the scene hides how the bands move; take more frames, or a plain scene"
+    forward = misfits[0] < misfits[1]
+    return ("forward" if forward else "reverse"), amplitudes[0 if forward else 1], ""
+
+
+def _turning(values: Tensor, turns: float) -> tuple[float, float]:
+    """Misfit of ``d + a exp(2 pi j p turns)`` to values (T,) over their power, d being held small, and |a|."""
+    count = len(values)
+    angle = 2 * math.pi * turns * torch.arange(count, dtype=torch.float64)
+    columns = torch.stack([torch.ones(count, dtype=values.dtype), torch.polar(torch.ones_like(angle), angle)], 1)
+    small = _TEXTURE_PRICE[min(count, 3)]
+    gram = columns.mH @ columns + torch.diag(torch.tensor([small, 0.0])).to(values.dtype)
+    found = torch.linalg.solve(gram, columns.mH @ values)
+    cost = (values - columns @ found).abs().square().sum() + small * found[0].abs().square()
+    return float(cost / values.abs().square().sum()), float(found[1].abs())
+
+
+def _wrapped(turns: float) -> float:
+    return (turns + 0.5) % 1.0 - 0.5
+
+
+def _exposure(
+    profiles: Profiles,
+    bands: BandFit,
+    contrast: float,
+    row_time: float,
+    on_fraction: float | None,
+    light_contrast: float | None,
+) -> tuple[float | None, float | None, str]:
+    """Exposure in seconds with its standard deviation, or why it cannot be told."""
+    if on_fraction is None and light_contrast is None:
+        return None, None, "it takes on_fraction of an on-off light, or light_contrast of one that swings"
+    if profiles.clipped > _MOST_CLIPPED:
+        return None, None, f"{profiles.clipped:.0%} of the pixels are saturated, which changes the shape of the bands"
+    if light_contrast is not None:
+        noise = float((bands.coefficients[:, 0].abs().square().sum() / max(bands.certainty, 1e-9)).sqrt())
+        exposure = exposure_from_contrast(contrast, light_contrast, bands.period * row_time)
+        less = max(contrast - noise / math.sqrt(2), 1e-6)
+        further = exposure_from_contrast(less, light_contrast, bands.period * row_time)
+        return exposure, abs(further - exposure), ""
+    phases = [float(value.angle()) for value in bands.coefficients[:, 0]]
+    even = profiles.rows / (bands.scene / bands.scene.mean(1, keepdim=True))
+    fit = fit_strobe(even, bands.period, phases, on_fraction=on_fraction)
+    if fit.misfit > _GOOD_SHAPE:
+        return None, None, f"the bands do not have the shape of a light that is on and off (misfit {fit.misfit:.0%})"
+    return float(fit.exposure_rows[0]) * row_time, fit.std["exposure_rows"] * row_time, ""
