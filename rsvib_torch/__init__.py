@@ -24,7 +24,16 @@ from rsvib_torch.restoration import (
     visible_pixels,
 )
 from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.stacks import StackInfo, read_stack, read_stack_info, write_stack
+from rsvib_torch.stacks import (
+    StackInfo,
+    StackReport,
+    iterate_stack,
+    open_stack,
+    process_stack,
+    read_stack,
+    read_stack_info,
+    write_stack,
+)
 from rsvib_torch.vibration import Vibration, blind_frequencies
 
 __all__ = [
@@ -40,6 +49,7 @@ __all__ = [
     "SensorTiming",
     "SlantedEdge",
     "StackInfo",
+    "StackReport",
     "Vibration",
     "VibrationDetector",
     "VibrationRestorer",
@@ -49,9 +59,12 @@ __all__ = [
     "calibrate_row_time_by_exposure",
     "detect_vibration",
     "find_slanted_edges",
+    "iterate_stack",
     "judge_restoration",
     "offset_endpoint_error",
+    "open_stack",
     "predict_noise_gain",
+    "process_stack",
     "psnr",
     "read_stack",
     "read_stack_info",

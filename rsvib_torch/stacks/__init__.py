@@ -4,16 +4,30 @@ from rsvib_torch.stacks.atomic import check_writable, whole_file, whole_folder
 from rsvib_torch.stacks.files import check_stack_target, open_stack, read_stack, read_stack_info, write_stack
 from rsvib_torch.stacks.formats import FrameReader, FrameWriter, StackFormat, register_format
 from rsvib_torch.stacks.info import FrameError, StackInfo
+from rsvib_torch.stacks.job import BadFrames, WindowResult
+from rsvib_torch.stacks.manifest import StackManifest, read_manifest
+from rsvib_torch.stacks.process import DEFAULT_WINDOW, StackReport, iterate_stack, process_stack
+from rsvib_torch.stacks.windows import Window, cut_windows
 
 __all__ = [
+    "DEFAULT_WINDOW",
+    "BadFrames",
     "FrameError",
     "FrameReader",
     "FrameWriter",
     "StackFormat",
     "StackInfo",
+    "StackManifest",
+    "StackReport",
+    "Window",
+    "WindowResult",
     "check_stack_target",
     "check_writable",
+    "cut_windows",
+    "iterate_stack",
     "open_stack",
+    "process_stack",
+    "read_manifest",
     "read_stack",
     "read_stack_info",
     "register_format",

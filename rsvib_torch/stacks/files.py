@@ -89,7 +89,9 @@ def read_stack(path: PathLike, *, full_scale: float | None = None) -> Tensor:
     return counts_to_frames(pixels, info.full_scale if full_scale is None else full_scale, str(path))
 
 
-def check_info_target(path: Path, info: StackInfo, compression: str | None = None) -> StackFormat:
+def check_info_target(
+    path: Path, info: StackInfo, compression: str | None = None, *, make_folders: bool = False
+) -> StackFormat:
     """The format that ``path`` is written in; raises what would be raised on writing."""
     form = target_format(path)
     if not form.writable:
@@ -106,7 +108,7 @@ def check_info_target(path: Path, info: StackInfo, compression: str | None = Non
         form.check(path, info)
     if form.kind == "tree" and path.exists() and not (path / "zarr.json").is_file():
         raise FileExistsError(f"cannot write {path}: something else of that name is there")
-    check_writable(path, folder=form.kind != "file")
+    check_writable(path, folder=form.kind != "file", parent_exists=not make_folders)
     return form
 
 

@@ -1,7 +1,6 @@
 """Stacks whose frames lie one after another in a file: read and written at their place."""
 
 import errno
-import mmap
 import os
 from pathlib import Path
 from typing import Any
@@ -68,7 +67,7 @@ class ArrayReader:
 
 
 class PlacedReader:
-    """Frames at equal distances in a file, mapped into memory one at a time.
+    """Frames at equal distances in a file, read one at a time.
 
     Args:
         path: The file.
@@ -91,10 +90,14 @@ class PlacedReader:
         start = self._offset + index * self._bytes
         if start + self._bytes > os.fstat(self._file.fileno()).st_size:
             raise FrameError(f"{self._name}: truncated: frame {index} lies beyond the end of the file")
-        # The map is let go with each frame: a long one would count as the process's own memory.
-        begin = start - start % mmap.ALLOCATIONGRANULARITY
-        with mmap.mmap(self._file.fileno(), start + self._bytes - begin, access=mmap.ACCESS_READ, offset=begin) as view:
-            pixels = np.frombuffer(view[start - begin :], dtype=self._dtype).reshape(self._shape)
+        pixels = np.empty(self._shape, self._dtype)
+        view, done = memoryview(pixels.data).cast("B"), 0
+        while done < len(view):
+            # read, not mapped: a file that shrinks meanwhile is an error then, not the end of the process
+            count = os.preadv(self._file.fileno(), [view[done:]], start + done)
+            if count == 0:
+                raise FrameError(f"{self._name}: truncated: frame {index} lies beyond the end of the file")
+            done += count
         frame = frame_from_file_order(pixels, self.info)
         return frame.astype(frame.dtype.newbyteorder("="), copy=False)
 

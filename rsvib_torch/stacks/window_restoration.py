@@ -1,0 +1,78 @@
+"""Frames of one window restored with what was detected in them, and judged."""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from rsvib_torch.restoration import (
+    RestorationVerdict,
+    TooLittleInCommonError,
+    judge_restoration,
+    restore,
+    trusted_vibration,
+)
+from rsvib_torch.restoration.trust import Detected
+from rsvib_torch.sensor import SensorTiming
+
+__all__ = ["RestoredFrames", "restore_trusted"]
+
+
+@dataclass(frozen=True, eq=False)
+class RestoredFrames:
+    """Frames to write, and what is known of them.
+
+    Attributes:
+        frames: Restored, or as taken.
+        restored: Which of the two.
+        left_alone: A sentence for each axis whose vibration was not undone.
+        verdict: Whether restoration helps; None where frames could not be compared.
+        moves: Whether there was a vibration to undo.
+    """
+
+    frames: Tensor
+    restored: bool
+    left_alone: tuple[str, ...]
+    verdict: RestorationVerdict | None
+    moves: bool
+
+
+def restore_trusted(
+    frames: Tensor,
+    timing: SensorTiming,
+    detected: Detected,
+    options: Mapping[str, Any],
+    *,
+    force: bool = False,
+    first_frames: int | None = None,
+    most_pairs: int | None = None,
+) -> RestoredFrames:
+    """Restore frames with the part of a detection that is known well enough, and judge whether that helps.
+
+    Args:
+        frames: Stack (T, H, W) or (T, C, H, W) whose full scale is 1.
+        timing: The sensor.
+        detected: What was detected in them.
+        options: Options of ``restore``.
+        force: Keep restored frames even where they are judged no better than raw.
+        first_frames: Restore no more than these.
+        most_pairs: Compare no more pairs of frames.
+
+    Returns:
+        Restored frames, or those that came in where there is nothing to undo, or undoing it does not help.
+    """
+    rows = frames.shape[-1 if timing.scan_axis == -1 else -2]
+    vibration, left_alone = trusted_vibration(detected, timing, len(frames), rows)
+    frames = frames if first_frames is None else frames[:first_frames]
+    if not bool((vibration.amplitude > 0).any() | (vibration.image_motion != 0).any()):
+        return RestoredFrames(frames, False, left_alone, None, False)
+    clear = restore(frames, timing, vibration, check=False, **options)
+    verdict = None
+    with suppress(TooLittleInCommonError):
+        if len(frames) > 1:
+            joint = options.get("joint", False)
+            verdict = judge_restoration(frames, clear, timing, vibration, joint=joint, most_pairs=most_pairs)
+    keep = verdict is None or verdict.overall != "worse" or force
+    return RestoredFrames(clear if keep else frames, keep, left_alone, verdict, True)
