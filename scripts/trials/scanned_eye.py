@@ -1,0 +1,101 @@
+#!/usr/bin/env python
+"""Registration on a scanned video of a moving eye, whose vignette stays with the sensor.
+
+The recordings are not part of this project: FOLDER holds tslo-dark.avi and tslo-stim.avi of
+github.com/lowvisionresearch/ReVAS (512 rows, 30 frames a second). Printed: correlation of consecutive frames before
+and after moving every row by its offset, of the frames as they are and without vignette (local mean and contrast
+taken out); how well offsets p to p + 1 and p + 1 to p + 2 add up to p to p + 2; the verdict of detection.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+
+import rsvib_torch as rsv
+from rsvib_torch.registration import Registration
+
+FILES = ("tslo-dark.avi", "tslo-stim.avi")
+PERIOD, ROWS, RIM = 1 / 30, 512, 32
+
+Array = NDArray[np.float64]
+
+
+def offsets(frames: torch.Tensor, first: int, second: int, method: Registration) -> tuple[Array, Array]:
+    """Rows and offsets (N, 2) between two frames, bands that were not found left out."""
+    timing = rsv.SensorTiming(PERIOD / ROWS, 1, ROWS, frame_start_times=[first * PERIOD, second * PERIOD])
+    curve = rsv.register_bands(frames[[first, second]], timing, method=method)
+    found = curve.offsets[0].numpy()
+    good = np.isfinite(found).all(1)
+    return curve.rows.numpy()[good], found[good]
+
+
+def at(rows: Array, place: Array, values: Array) -> Array:
+    return np.stack([np.interp(rows, place, values[:, axis]) for axis in range(2)], axis=-1)
+
+
+def evened(frame: Array) -> Array:
+    """A frame without what changes slowly over it."""
+    low = ndimage.gaussian_filter(frame, 12.0)
+    spread = np.sqrt(ndimage.gaussian_filter((frame - low) ** 2, 12.0))
+    return np.asarray((ndimage.gaussian_filter(frame, 1.0) - low) / (spread + 1e-3))
+
+
+def correlation(one: Array, other: Array) -> float:
+    inside = (slice(RIM, -RIM), slice(RIM, -RIM))
+    return float(np.corrcoef(one[inside].ravel(), other[inside].ravel())[0, 1])
+
+
+def report(path: Path, method: Registration) -> str:
+    frames = rsv.read_stack(path).mean(1)
+    pictures = frames.double().numpy()
+    down, across = np.mgrid[: frames.shape[-2], : frames.shape[-1]].astype(float)
+    told: list[list[float]] = []
+    misfits, sizes = [], []
+    for p in range(len(frames) - 1):
+        rows, found = offsets(frames, p, p + 1, method)
+        moved = at(np.arange(frames.shape[-2]), rows, found)
+        sizes.append(np.abs(moved).mean(0))
+        place = [down + moved[:, 1:], across + moved[:, :1]]
+        values = []
+        for one, other in ((pictures[p], pictures[p + 1]), (evened(pictures[p]), evened(pictures[p + 1]))):
+            back = ndimage.map_coordinates(other, place, order=3, mode="nearest")
+            values += [correlation(one, other), correlation(one, back)]
+        told.append(values)
+        if p + 2 < len(frames):
+            next_rows, step = offsets(frames, p + 1, p + 2, method)
+            both_rows, both = offsets(frames, p, p + 2, method)
+            misfits.append(np.abs(found + at(rows + found[:, 1], next_rows, step) - at(rows, both_rows, both)))
+    raw, after, even, even_after = np.mean(told, axis=0)
+    apart = np.median(np.concatenate(misfits), axis=0)
+    size = np.mean(sizes, axis=0)
+    return (
+        f"{path.name} {method:>5}: offsets {size[0]:.2f}, {size[1]:.2f} px; correlation {raw:.3f} -> {after:.3f}, "
+        f"without vignette {even:.3f} -> {even_after:.3f}; add up to {apart[0]:.3f}, {apart[1]:.3f} px (median x, y)"
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    folder = parser.parse_args().folder
+    missing = [name for name in FILES if not (folder / name).is_file()]
+    if missing:
+        print(f"{folder}: {', '.join(missing)} not there", file=sys.stderr)
+        return 2
+    for name in FILES:
+        for method in ("ncc", "phase"):
+            print(report(folder / name, method))
+        timing = rsv.SensorTiming(PERIOD / ROWS, 1, ROWS)
+        found = rsv.detect_vibration(rsv.read_stack(folder / name), timing)
+        for axis, reasons in zip("xy", found.reasons, strict=True):
+            print(f"    {axis}: {'reliable' if not reasons else 'not reliable: ' + '; '.join(reasons)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
