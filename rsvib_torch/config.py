@@ -15,6 +15,7 @@ from rsvib_torch.imaging import SensorNoise, simulate_frames
 from rsvib_torch.restoration import restore
 from rsvib_torch.restoration.restore import MASKS, METHODS
 from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.stacks import DEFAULT_WINDOW, BadFrames
 from rsvib_torch.validation import Section, checked, options_section, validate
 from rsvib_torch.vibration import Vibration
 
@@ -50,6 +51,7 @@ class Config:
         detection: Options for ``detect_vibration``; those not in the file are not here either.
         restoration: Options for ``restore``, likewise.
         simulation: What to simulate; None where the file does not say.
+        stack: How long stacks are cut, ``window`` and ``bad_frames``, likewise.
     """
 
     timing: SensorTiming
@@ -57,6 +59,7 @@ class Config:
     detection: dict[str, Any]
     restoration: dict[str, Any]
     simulation: Simulation | None
+    stack: dict[str, Any]
 
 
 class TimingSection(Section):
@@ -147,6 +150,13 @@ _DetectionSection = options_section(
 )
 
 
+class _StackSection(Section):
+    """``[stack]``: how long stacks are gone through."""
+
+    window: int = Field(default=DEFAULT_WINDOW, ge=2)
+    bad_frames: BadFrames = "pass"
+
+
 def _restoration_section(method: object) -> Any:
     """``[restoration]``: the keys are those of the method."""
     default = inspect.signature(restore).parameters["method"].default
@@ -161,7 +171,8 @@ def read_config(path: str | os.PathLike[str]) -> Config:
     ``[sensor]`` holds the fields of ``SensorTiming`` and ``full_scale``; ``[detection]`` and ``[restoration]`` the
     options of ``detect_vibration`` and ``restore``, with ``saturation`` in the unit of the file; ``[simulation]``
     frames, size and seed, with ``[simulation.vibration]`` (fields of ``Vibration``) and ``[simulation.noise]`` (fields
-    of ``SensorNoise``). Only ``[sensor]`` is required.
+    of ``SensorNoise``); ``[stack]`` ``window`` and ``bad_frames`` of
+    ``process_stack``. Only ``[sensor]`` is required.
 
     Args:
         path: The TOML file.
@@ -185,6 +196,7 @@ def read_config(path: str | os.PathLike[str]) -> Config:
         detection=(_DetectionSection | None, None),
         restoration=(_restoration_section(method) | None, None),
         simulation=(_SimulationSection | None, None),
+        stack=(_StackSection | None, None),
     )
     checked_data = validate(root, data, str(path))
     sensor, simulation = checked_data.sensor, checked_data.simulation
@@ -194,6 +206,7 @@ def read_config(path: str | os.PathLike[str]) -> Config:
         detection=_given(checked_data.detection),
         restoration=_given(checked_data.restoration),
         simulation=None if simulation is None else simulation.simulation(),
+        stack=_given(checked_data.stack),
     )
 
 

@@ -2,19 +2,29 @@
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 from rich.text import Text
 
 from rsvib_torch.detection import DetectionResult
 
-__all__ = ["error_line", "say", "show_result", "warnings_in_one_line", "working"]
+__all__ = ["counting", "error_line", "say", "show_result", "warnings_in_one_line", "working"]
 
 
 def say(message: str) -> None:
@@ -54,6 +64,47 @@ def working(what: str) -> Iterator[None]:
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         progress.add_task(what, total=None)
         yield
+
+
+class _RateColumn(ProgressColumn):
+    """Frames a second."""
+
+    def render(self, task: Task) -> Text:
+        """The rate, once it is known."""
+        rate = task.finished_speed or task.speed
+        return Text("" if rate is None else f"{rate:.2f} frames/s")
+
+
+@contextmanager
+def counting(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Show how many frames are done, their rate and the time that is left; on a terminal only, and gone afterwards.
+
+    Yields:
+        A function to call with the number of frames that are done, and of all.
+    """
+    console = Console(stderr=True)
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=30),
+        MofNCompleteColumn(),
+        _RateColumn(),
+        TimeRemainingColumn(),
+    )
+    shown = Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal, speed_estimate_period=300.0
+    )
+    with shown as progress:
+        task: Any = None
+
+        def show(done: int, total: int) -> None:
+            nonlocal task
+            if task is None:  # frames of an earlier run do not count for the rate
+                task = progress.add_task(what, total=total, completed=done)
+            else:
+                progress.update(task, completed=done)
+
+        yield show
 
 
 def _number(value: float, digits: int) -> str:

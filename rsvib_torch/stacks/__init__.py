@@ -5,8 +5,9 @@ from rsvib_torch.stacks.files import check_stack_target, open_stack, read_stack,
 from rsvib_torch.stacks.formats import FrameReader, FrameWriter, StackFormat, register_format
 from rsvib_torch.stacks.info import FrameError, StackInfo
 from rsvib_torch.stacks.job import BadFrames, WindowResult
-from rsvib_torch.stacks.manifest import StackManifest, read_manifest
-from rsvib_torch.stacks.process import DEFAULT_WINDOW, StackReport, iterate_stack, process_stack
+from rsvib_torch.stacks.manifest import StackManifest, read_manifest, timing_keys
+from rsvib_torch.stacks.process import DEFAULT_WINDOW, StackReport, detect_stack, iterate_stack, process_stack
+from rsvib_torch.stacks.window_restoration import RestoredFrames, restore_trusted
 from rsvib_torch.stacks.windows import Window, cut_windows
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "FrameError",
     "FrameReader",
     "FrameWriter",
+    "RestoredFrames",
     "StackFormat",
     "StackInfo",
     "StackManifest",
@@ -24,6 +26,7 @@ __all__ = [
     "check_stack_target",
     "check_writable",
     "cut_windows",
+    "detect_stack",
     "iterate_stack",
     "open_stack",
     "process_stack",
@@ -31,6 +34,8 @@ __all__ = [
     "read_stack",
     "read_stack_info",
     "register_format",
+    "restore_trusted",
+    "timing_keys",
     "whole_file",
     "whole_folder",
     "write_stack",

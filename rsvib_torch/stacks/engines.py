@@ -21,13 +21,13 @@ _RETRIES = 3
 _AHEAD = 2  # windows a Dask worker is given beyond the one that it works on
 
 
-def _alone(windows: Sequence[Window]) -> bool:
-    """Whether every window is computed on one thread: where there are several.
+def _several(windows: Sequence[Window]) -> bool:
+    """Whether every window is to be computed on one thread: where there are several.
 
     Sums of floats depend on how many threads share them: with one, a window comes out the same however many others
     are worked on at once.
     """
-    return bool(windows) and windows[-1].index > 0
+    return not all(window.alone for window in windows)
 
 
 def compute_here(
@@ -52,7 +52,7 @@ def compute_here(
     before = torch.get_num_threads()
 
     def set_threads() -> None:
-        torch.set_num_threads(1 if _alone(windows) else before)
+        torch.set_num_threads(1 if _several(windows) else before)
 
     reading = ThreadPoolExecutor(1, "rsvib-read")
     computing = ThreadPoolExecutor(at_once, "rsvib-compute", initializer=set_threads)
@@ -81,10 +81,10 @@ def compute_here(
         reader.close()
 
 
-def _compute_there(job: StackJob, window: Window, alone: bool) -> StoredWindow:
+def _compute_there(job: StackJob, window: Window, several: bool) -> StoredWindow:
     """Read, compute and store one window, on a Dask worker."""
     threads = torch.get_num_threads()
-    if alone:
+    if several:
         torch.set_num_threads(1)
     try:
         if job.device.startswith("cuda"):
@@ -144,7 +144,7 @@ def compute_with_dask(
         Frames to store, in the order of the windows.
     """
     job = replace(job, source=job.source.absolute())
-    alone = _alone(windows)
+    several = _several(windows)
     with _dask_client(scheduler, workers) as client:
         shared = client.scatter(job, broadcast=False, hash=False) if windows else None
         waiting: deque[Any] = deque()
@@ -153,7 +153,7 @@ def compute_with_dask(
             while True:
                 room = max(1, _AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"])))
                 while len(waiting) < room and (window := next(left, None)) is not None:
-                    waiting.append(client.submit(_compute_there, shared, window, alone, retries=_RETRIES, pure=False))
+                    waiting.append(client.submit(_compute_there, shared, window, several, retries=_RETRIES, pure=False))
                 if not waiting:
                     break
                 yield waiting.popleft().result()

@@ -25,7 +25,7 @@ __all__ = ["BadFrames", "StackJob", "StoredWindow", "WindowFrames", "WindowReade
 
 BadFrames = Literal["pass", "skip"]
 WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why there are none
-_JUDGED_PAIRS = 8  # of a window, evenly spread
+_JUDGED_PAIRS, _JUDGED_PAIRS_ALONE = 2, 8  # of a window, evenly spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ class StackJob:
                 self.restoration,
                 force=self.force,
                 first_frames=fewer,
-                most_pairs=_JUDGED_PAIRS,
+                most_pairs=_JUDGED_PAIRS_ALONE if window.alone else _JUDGED_PAIRS,
             )
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             message = " ".join(str(error).split())

@@ -2,8 +2,6 @@
 
 import os
 import re
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -12,11 +10,9 @@ from rsvib_torch.stacks.info import StackInfo
 __all__ = ["available_memory", "parse_memory", "windows_at_once"]
 
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "MI": 2**20, "GI": 2**30, "TI": 2**40}
-# Bytes a pixel of a window's frames (and channel), peaks measured with scripts/benchmarks/streaming.py; the process
-# itself, with its libraries, comes on top.
-_PROCESS = 500 * 10**6
-_DETECTION = {"direct": 60.0, "bands": 40.0}
-_RESTORATION = {"exact": 60.0, "banded": 60.0, "dewarp": 30.0, "richardson-lucy": 60.0}
+# Peaks measured on windows of 8 frames of 1024 x 1024 px, rounded up: the process with its libraries, and bytes a
+# pixel (and channel) of a window that is detected, restored and judged.
+_PROCESS, _PIXEL = 450 * 10**6, 75
 
 
 def parse_memory(text: str | float) -> int:
@@ -44,51 +40,30 @@ def available_memory() -> int | None:
         return None
 
 
-def window_bytes(
-    info: StackInfo, window: int, detection: Mapping[str, Any], restoration: Mapping[str, Any] | None
-) -> tuple[int, int]:
-    """Peak memory of one window that is worked on, and of one that waits."""
-    pixels = min(window, info.shape[0]) * int(np.prod(info.shape[1:], dtype=object))
-    waiting = pixels * np.dtype(info.dtype).itemsize
-    factor = _DETECTION.get(str(detection.get("method", "direct")), max(_DETECTION.values()))
-    if restoration is not None:
-        most = max(_RESTORATION.values())
-        factor = max(factor, _RESTORATION.get(str(restoration.get("method", "exact")), most))
-    return int(pixels * factor) + 2 * waiting, waiting
-
-
-def windows_at_once(
-    info: StackInfo,
-    window: int,
-    detection: Mapping[str, Any],
-    restoration: Mapping[str, Any] | None,
-    *,
-    memory: int | None,
-    most: int,
-) -> int:
+def windows_at_once(info: StackInfo, window: int, *, memory: int | None, most: int) -> int:
     """Windows to work on at once, so that the process keeps to its memory.
 
     Args:
         info: The stack.
         window: Frames of a window.
-        detection: Options of detection.
-        restoration: Options of restoration.
         memory: Bytes for the whole process; None for four fifths of what is free.
         most: Windows that there are processors for.
 
     Raises:
         ValueError: If not even one window fits into the memory that was stated.
     """
-    busy, waiting = window_bytes(info, window, detection, restoration)
+    pixels = min(window, info.shape[0]) * int(np.prod(info.shape[1:], dtype=object))
+    waiting = 2 * pixels * np.dtype(info.dtype).itemsize  # read ahead, and to be written
+    busy = pixels * _PIXEL + waiting
     limit = memory
     if limit is None:
         free = available_memory()
         limit = None if free is None else int(0.8 * free)
     if limit is None:
         return most
-    count = (limit - _PROCESS - 2 * waiting) // (busy + 2 * waiting)
+    count = (limit - _PROCESS - waiting) // busy
     if count < 1 and memory is not None:
-        needed = _PROCESS + busy + 4 * waiting
+        needed = _PROCESS + waiting + busy
         raise ValueError(
             f"memory of {memory / 1e9:.2g} GB is too little: a window of {min(window, info.shape[0])} frames of "
             f"{info.shape[-2]} x {info.shape[-1]} px takes about {needed / 1e9:.2g} GB; allow more, or smaller windows"

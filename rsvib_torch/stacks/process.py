@@ -14,6 +14,7 @@ import torch
 
 from rsvib_torch.checks import check_choice, check_whole_number
 from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.stacks.atomic import whole_file
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.files import PathLike, check_info_target, open_stack
 from rsvib_torch.stacks.fingerprint import fingerprint
@@ -26,7 +27,7 @@ from rsvib_torch.stacks.scale import check_full_scale
 from rsvib_torch.stacks.sink import Sink
 from rsvib_torch.stacks.windows import Window, cut_windows
 
-__all__ = ["DEFAULT_WINDOW", "StackReport", "iterate_stack", "process_stack"]
+__all__ = ["DEFAULT_WINDOW", "StackReport", "detect_stack", "iterate_stack", "process_stack"]
 
 DEFAULT_WINDOW = 8  # frames
 _HOPELESS = 8  # windows that fail one after another from the start before the run gives up
@@ -117,7 +118,7 @@ def _make_job(
 def _workers(job: StackJob, window: int, memory: str | float | None, workers: int | None) -> int:
     most = check_whole_number("workers", workers, at_least=1) if workers is not None else _processors(job.device)
     limit = None if memory is None else parse_memory(memory)
-    return windows_at_once(job.info, window, job.detection, job.restoration, memory=limit, most=most)
+    return windows_at_once(job.info, window, memory=limit, most=most)
 
 
 def _processors(device: str) -> int:
@@ -178,6 +179,67 @@ def iterate_stack(
     windows = cut_windows(job.info.shape[0], window)
     at_once = _workers(job, window, memory, workers)
     yield from compute_here(job, windows, lambda result, _: result, at_once=at_once)
+
+
+def detect_stack(
+    source: PathLike,
+    manifest: PathLike,
+    timing: SensorTiming,
+    *,
+    window: int = DEFAULT_WINDOW,
+    detection: Mapping[str, Any] | None = None,
+    full_scale: float | None = None,
+    memory: str | float | None = None,
+    workers: int | None = None,
+    device: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Detect the vibration in every window of a stack of any length.
+
+    Args:
+        source: As in ``iterate_stack``.
+        manifest: The ``manifest.json`` to write, see ``read_manifest``; ``process_stack(given=...)`` restores with it.
+        timing: As in ``iterate_stack``.
+        window: As in ``iterate_stack``.
+        detection: As in ``iterate_stack``.
+        full_scale: As in ``iterate_stack``.
+        memory: As in ``iterate_stack``.
+        workers: As in ``iterate_stack``.
+        device: As in ``iterate_stack``.
+        progress: As in ``process_stack``.
+
+    Raises:
+        OSError: If the stack cannot be read, or the manifest not be written.
+        TypeError: If an option is not known.
+        ValueError: If a value is out of range, the stack is not readable, or nothing in it can be detected.
+    """
+    job = _make_job(
+        source,
+        timing,
+        detection=detection,
+        restoration=None,
+        given=None,
+        full_scale=full_scale,
+        bad_frames="pass",
+        force=False,
+        device=device,
+    )
+    windows = cut_windows(job.info.shape[0], window)
+    at_once = _workers(job, window, memory, workers)
+    header = manifest_header(job, window, None, None, fingerprint(job.source))
+    errors: list[str] = []
+
+    def records() -> Iterator[dict[str, Any]]:
+        for record in compute_here(job, windows, lambda result, _: job.record(result, 0), at_once=at_once):
+            errors.extend([record["error"]] if record["error"] is not None else [])
+            if len(errors) == min(_HOPELESS, len(windows)) == record["window"] + 1:
+                raise ValueError(errors[0])
+            if progress is not None:
+                progress(record["last"] + 1, job.info.shape[0])
+            yield record
+
+    with whole_file(manifest) as part:
+        write_manifest(part, header, records())
 
 
 def process_stack(

@@ -36,6 +36,11 @@ class Window:
         return range(self.first, self.last + 1)
 
     @property
+    def alone(self) -> bool:
+        """Whether it is the whole stack."""
+        return self.index == 0 and self.kept == len(self.frames)
+
+    @property
     def written(self) -> range:
         """The frames that it writes."""
         return range(self.first, self.first + self.kept)
