@@ -1,4 +1,4 @@
-"""The ``rsvib`` command: simulate, detect, restore, and all of it in one run."""
+"""The ``rsvib`` command: simulate, detect, restore, all of it in one run, and a page about it."""
 
 import logging
 import sys
@@ -14,6 +14,7 @@ from rsvib_torch.calibrate_command import calibrate
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.imaging import simulate_frames
+from rsvib_torch.pages import Box, Report, write_report_page
 from rsvib_torch.pictures import comparison_figure, save_figure
 from rsvib_torch.report import read_vibration
 from rsvib_torch.restoration.restore import METHODS
@@ -199,6 +200,59 @@ def run(
             picture = comparison_figure(stack.frames[shown], result.frames[0], names=names)
             save_figure(picture, folder / "before_after.png")
     say(f"{out}: restored.tif, restoration.json, vibration.json, offsets.csv, offsets.png, before_after.png")
+
+
+def _boxes(texts: list[str]) -> list[Box] | None:
+    """Places of slanted edges; None where none is given."""
+    boxes: list[Box] = []
+    for text in texts:
+        numbers = [part.strip() for part in text.split(",")]
+        if len(numbers) != 4 or not all(number.isdecimal() for number in numbers):
+            raise ValueError(f"--edge must be TOP,LEFT,HEIGHT,WIDTH in px, got {text!r}")
+        top, left, height, width = map(int, numbers)
+        boxes.append((top, left, height, width))
+    return boxes or None
+
+
+@app.command()
+def report(
+    frames: FramesArgument,
+    out: Annotated[Path, typer.Argument(help="Folder for report.html and its figures.")],
+    *,
+    config: ConfigOption,
+    edge: Annotated[
+        list[str] | None,
+        typer.Option(help="Slanted edge to measure, TOP,LEFT,HEIGHT,WIDTH; may be repeated. By default found."),
+    ] = None,
+    method: MethodOption = None,
+    joint: JointOption = None,
+    prior: PriorOption = None,
+    saturation: SaturationOption = None,
+    force: ForceOption = False,
+    device: DeviceOption = "auto",
+    full_scale: ScaleOption = None,
+) -> None:
+    """Detect, restore and judge, and write a page about it that needs no network, and its figures as PNG files."""
+    boxes = _boxes(edge or [])
+    settings, stack, detection = _detected(frames, config, out, device, full_scale)
+    show_result(detection)
+    result = restore_and_judge(stack, settings, detection, Wishes(method, joint, prior, saturation, force))
+    content = Report(
+        title=f"Vibration in {frames.name}",
+        subtitle=f"{frames}, camera of {config}",
+        frames=stack.frames,
+        restored=result.frames,
+        was_restored=result.restored,
+        timing=settings.timing,
+        detection=detection,
+        verdict=result.verdict,
+        left_alone=result.left_alone,
+        options=result.options,
+        version=rsvib_torch.__version__,
+    )
+    with whole_folder(out) as folder, working("writing the page"):
+        files = write_report_page(folder, content, boxes)
+    say(f"{out}: {', '.join(files)}")
 
 
 def _show_version(wanted: bool) -> None:

@@ -18,7 +18,15 @@ from torch.nn import functional
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.stacks import whole_file
 
-__all__ = ["comparison_figure", "detailed_places", "offset_figure", "save_figure"]
+__all__ = [
+    "axis_offset_figure",
+    "comparison_figure",
+    "detailed_places",
+    "measured_text",
+    "offset_figure",
+    "plain_axes",
+    "save_figure",
+]
 
 _INK, _FAINT, _LINE, _FAILED = "#222222", "#d9d9d9", "#c8102e", "#8a8a8a"
 _COLOURS = LinearSegmentedColormap.from_list("quality", ["#f0a030", "#9cc3e0", "#14487a"])  # poor ... good
@@ -30,7 +38,8 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150)
         FigureCanvasAgg(figure).print_figure(str(part), dpi=dpi, facecolor="white")
 
 
-def _plain_axes(axes: Axes) -> None:
+def plain_axes(axes: Axes) -> None:
+    """Take away what an axes does not need."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(_INK)
     axes.tick_params(colors=_INK, labelsize=9)
@@ -38,7 +47,7 @@ def _plain_axes(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
-def _measured(value: Tensor, std: Tensor, digits: int) -> str:
+def measured_text(value: Tensor, std: Tensor, digits: int) -> str:
     """A value with its standard deviation, to as many digits as the latter needs to show."""
     deviation = float(std)
     if math.isfinite(deviation) and deviation > 0:
@@ -52,12 +61,54 @@ def _tone_text(result: DetectionResult, axis: int) -> str:
     if not bool(result.reliable[axis]):
         return "not reliable: " + "; ".join(str(reason) for reason in result.reasons[axis])
     parts = [
-        f"{_measured(vibration.amplitude[axis, k], std.amplitude[axis, k], 3)} px at "
-        f"{_measured(vibration.frequency[axis, k], std.frequency[axis, k], 2)} Hz"
+        f"{measured_text(vibration.amplitude[axis, k], std.amplitude[axis, k], 3)} px at "
+        f"{measured_text(vibration.frequency[axis, k], std.frequency[axis, k], 2)} Hz"
         for k in range(vibration.amplitude.shape[-1])
         if float(vibration.amplitude[axis, k]) > 0
     ]
     return ",  ".join(parts)
+
+
+def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) -> Any:
+    """Draw the offsets along an axis with their fit, and the residuals beneath; returns the coloured points."""
+    curve = result.offsets
+    times = curve.times.cpu().numpy() * 1e3
+    offsets, fitted, quality = (t.detach().cpu().numpy() for t in (curve.offsets, result.fitted, curve.quality))
+    measured, expected = offsets[..., axis], fitted[..., axis]
+    good = np.isfinite(measured)
+    residual = (measured - expected)[good]
+    style = {"c": quality[good], "cmap": _COLOURS, "vmin": 0.0, "vmax": 1.0, "linewidths": 0, "zorder": 2}
+    size = max(4.0, min(22.0, 4000.0 / max(1, measured.size)))
+    points = upper.scatter(times[good], measured[good], s=size, **style)
+    for pair in range(len(times)):
+        upper.plot(times[pair], expected[pair], color=_LINE, linewidth=1.3, zorder=3)
+    failed = times[~good]
+    edge = upper.get_xaxis_transform()
+    upper.scatter(failed, np.full_like(failed, 0.02), s=18, marker="x", color=_FAILED, transform=edge, zorder=4)
+    lower.scatter(times[good], residual, s=0.6 * size, **style)
+    lower.axhline(0.0, color=_LINE, linewidth=1.0, zorder=3)
+    spread = 1.15 * float(np.quantile(np.abs(residual), 0.99)) if residual.size else 1.0
+    lower.set_ylim(-max(spread, 1e-3), max(spread, 1e-3))
+    lower.set_title(f"mean |residual| {float(result.residual[axis]):.4f} px", loc="left", fontsize=9.5, color=_INK)
+    lower.set_xlabel("exposure start of the band in the earlier frame (ms)", color=_INK)
+    upper.set_ylabel("offset (px)", color=_INK)
+    lower.set_ylabel("residual (px)", color=_INK)
+    plain_axes(upper)
+    plain_axes(lower)
+    return points
+
+
+def _finish_offsets(figure: Figure, panels: Any, points: Any, *, columns: int) -> None:
+    """Add the legend and the colour bar."""
+    keys = [
+        Line2D([], [], color=_COLOURS(1.0), marker="o", markersize=5, linewidth=0, label="measured band"),
+        Line2D([], [], color=_LINE, linewidth=1.3, label="detected vibration"),
+        Line2D([], [], color=_FAILED, marker="x", markersize=5, linewidth=0, label="band that failed"),
+    ]
+    figure.legend(handles=keys, loc="outside lower center", ncols=columns, fontsize=9.5, frameon=False)
+    bar = figure.colorbar(points, ax=panels, fraction=0.025, pad=0.01)
+    bar.set_label("quality of the band (correlation)", color=_INK)
+    bar.outline.set_visible(False)
 
 
 def offset_figure(result: DetectionResult) -> Figure:
@@ -69,48 +120,30 @@ def offset_figure(result: DetectionResult) -> Figure:
     Args:
         result: A detection (not a batch).
     """
-    curve = result.offsets
-    times = curve.times.cpu().numpy() * 1e3
-    offsets, fitted, quality = (t.detach().cpu().numpy() for t in (curve.offsets, result.fitted, curve.quality))
     figure = Figure(figsize=(13, 6.4), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, height_ratios=(3, 1), squeeze=False)
     points: Any = None
     for axis, name in enumerate("xy"):
         upper, lower = panels[0, axis], panels[1, axis]
-        measured, expected = offsets[..., axis], fitted[..., axis]
-        good = np.isfinite(measured)
-        residual = (measured - expected)[good]
-        style = {"c": quality[good], "cmap": _COLOURS, "vmin": 0.0, "vmax": 1.0, "linewidths": 0, "zorder": 2}
-        size = max(4.0, min(22.0, 4000.0 / max(1, measured.size)))
-        points = upper.scatter(times[good], measured[good], s=size, **style)
-        for pair in range(len(times)):
-            upper.plot(times[pair], expected[pair], color=_LINE, linewidth=1.3, zorder=3)
-        failed = times[~good]
-        edge = upper.get_xaxis_transform()
-        upper.scatter(failed, np.full_like(failed, 0.02), s=18, marker="x", color=_FAILED, transform=edge, zorder=4)
-        lower.scatter(times[good], residual, s=0.6 * size, **style)
-        lower.axhline(0.0, color=_LINE, linewidth=1.0, zorder=3)
-        spread = 1.15 * float(np.quantile(np.abs(residual), 0.99)) if residual.size else 1.0
-        lower.set_ylim(-max(spread, 1e-3), max(spread, 1e-3))
+        points = _draw_offsets(upper, lower, result, axis)
         upper.set_title(f"Offset along {name}", loc="left", fontsize=12, fontweight="bold", color=_INK, pad=36)
         words = "\n".join(textwrap.wrap(_tone_text(result, axis), 76, max_lines=2, placeholder=" …"))
         note = upper.annotate(words, (0, 1), (0, 32), "axes fraction", "offset points", va="top", fontsize=9.5)
         note.set_in_layout(False)  # a long text must not squeeze the panels
-        lower.set_title(f"mean |residual| {float(result.residual[axis]):.4f} px", loc="left", fontsize=9.5, color=_INK)
-        lower.set_xlabel("exposure start of the band in the earlier frame (ms)", color=_INK)
-        upper.set_ylabel("offset (px)", color=_INK)
-        lower.set_ylabel("residual (px)", color=_INK)
-        _plain_axes(upper)
-        _plain_axes(lower)
-    keys = [
-        Line2D([], [], color=_COLOURS(1.0), marker="o", markersize=5, linewidth=0, label="measured band"),
-        Line2D([], [], color=_LINE, linewidth=1.3, label="detected vibration"),
-        Line2D([], [], color=_FAILED, marker="x", markersize=5, linewidth=0, label="band that failed"),
-    ]
-    figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=9.5, frameon=False)
-    bar = figure.colorbar(points, ax=panels, fraction=0.025, pad=0.01)
-    bar.set_label("quality of the band (correlation)", color=_INK)
-    bar.outline.set_visible(False)
+    _finish_offsets(figure, panels, points, columns=3)
+    return figure
+
+
+def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
+    """Draw the offset curve of one axis, small enough for a narrow page.
+
+    Args:
+        result: A detection (not a batch).
+        axis: 0 for x, 1 for y.
+    """
+    figure = Figure(figsize=(5.6, 4.4), layout="constrained")
+    panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    _finish_offsets(figure, panels, _draw_offsets(panels[0], panels[1], result, axis), columns=3)
     return figure
 
 

@@ -19,7 +19,7 @@ FLOORS = (
     {"evaluation", "augmentation"},
     {"stacks"},
     {"config", "pictures", "terminal"},
-    {"report"},
+    {"report", "pages"},
     {"workflow", "calibrate_command"},
     {"cli"},
 )

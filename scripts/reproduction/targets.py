@@ -52,7 +52,7 @@ class Edge:
 
 def draw(target: Target, size: tuple[int, int], image_motion: Sequence[float] = (0.0, 0.0)) -> Scene:
     """A target around frames of a size in px, with room for two frames of the paper's vibration."""
-    margin = margins(shake_of(0, image_motion), (FRAME_ROWS + size[0]) * ROW_TIME)
+    margin = margins(shake_of(0, image_motion), 2 * FRAME_ROWS * ROW_TIME)
     height, width = (PITCH * (s + 2 * m) for s, m in zip(size, margin, strict=True))
     sigma = PITCH * math.sqrt(OPTICS**2 + 1 / 12)  # a pixel blurs about as a Gaussian of 1/12 px^2
     return Scene.around(_DRAWN[target](height, width, sigma).double().numpy(), margin)

@@ -11,11 +11,11 @@ from reproduction.camera import Scene, take_frames, with_noise
 from reproduction.esfr import crossing, straight_edge_mtf
 from reproduction.paper import AXES, EXPOSURE_ROWS, FRAME_ROWS, ROW_TIME
 from reproduction.targets import Edge
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
 import rsvib_torch as rsv
 
-TIMING = rsv.SensorTiming(row_time=ROW_TIME, exposure_rows=EXPOSURE_ROWS, frame_rows=FRAME_ROWS)
 BITS = 12
 RIM = 32  # px at the border of a frame that no figure counts: the camera did not see all of them
 FREQUENCY = np.linspace(0.0, 0.5, 51)  # cycles/px, of MTF curves
@@ -36,14 +36,21 @@ class Images:
     detections: dict[str, rsv.DetectionResult] = field(default_factory=dict)
 
 
+def camera(rows: int) -> rsv.SensorTiming:
+    """The paper's camera; with fewer rows, slower ones, so that frame period and exposure time stay what they are."""
+    slower = FRAME_ROWS / rows
+    return rsv.SensorTiming(row_time=ROW_TIME * slower, exposure_rows=EXPOSURE_ROWS / slower, frame_rows=rows)
+
+
 def clean_frames(scene: Scene, shake: Shake) -> Array:
     """Two frames of the paper's camera without noise."""
+    timing = camera(len(scene.still))
     return take_frames(
         scene,
         shake,
-        row_time=TIMING.row_time,
-        exposure_time=TIMING.exposure_time,
-        frame_period=TIMING.frame_period,
+        row_time=timing.row_time,
+        exposure_time=timing.exposure_time,
+        frame_period=timing.frame_period,
         num_frames=2,
     )
 
@@ -56,7 +63,10 @@ def detection_values(result: rsv.DetectionResult, shake: Shake) -> dict[str, dic
     for axis, name in enumerate(AXES):
         values[name] = {"reliable": bool(result.reliable[axis])}
         for quantity in _PER_AXIS:
-            found, true = scale[quantity] * float(getattr(result.vibration, quantity)[axis, 0]), truth[quantity][axis, 0]
+            found, true = (
+                scale[quantity] * float(getattr(result.vibration, quantity)[axis, 0]),
+                truth[quantity][axis, 0],
+            )
             apart = (found - true + 1) % 2 - 1 if quantity == "phase" else 100 * (found / true - 1)
             values[name] |= {quantity: found, f"{quantity}_error": float(apart)}
     return values
@@ -86,11 +96,13 @@ def mtf_values(image: Array, edges: Sequence[Edge]) -> dict[str, Any]:
 
 
 def quality(images: Array, still: Array, edges: Sequence[Edge]) -> dict[str, Any]:
-    """PSNR, SSIM and MTF of frames, one entry a frame."""
-    frames, truth = torch.from_numpy(images), torch.from_numpy(still)
+    """PSNR and SSIM (scikit-image's) and MTF of frames, one entry a frame."""
+    inner = (slice(RIM, -RIM), slice(RIM, -RIM))
+    pairs = [(still[inner].astype(np.float32), image[inner].astype(np.float32)) for image in images]
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     return {
-        "psnr": rsv.psnr(frames, truth, 1.0, rim=RIM).tolist(),
-        "ssim": rsv.ssim(frames, truth, 1.0, rim=RIM).tolist(),
+        "psnr": [float(peak_signal_noise_ratio(*pair, data_range=1.0)) for pair in pairs],
+        "ssim": [float(structural_similarity(*pair, data_range=1.0, **window)) for pair in pairs],
         "mtf": [mtf_values(image, edges) for image in images] if edges else [],
     }
 
@@ -101,20 +113,27 @@ def as_frames(images: Array) -> Tensor:
 
 
 def run_trial(
-    scene: Scene, shake: Shake, clean: Array, noise: float, seed: int, edges: Sequence[Edge] = (), *, restore: bool = True
+    scene: Scene,
+    shake: Shake,
+    clean: Array,
+    noise: float,
+    seed: int,
+    edges: Sequence[Edge] = (),
+    *,
+    restore: bool = True,
 ) -> Images:
     """Add noise, detect, restore, and measure against the still scene."""
     taken = with_noise(clean, noise, BITS, np.random.default_rng([seed, round(1e6 * noise)]))
     values: dict[str, Any] = {"seed": seed, "noise": noise, "detection": {}, "restoration": {}}
-    images = Images(values, taken)
+    images, timing = Images(values, taken), camera(len(scene.still))
     if restore:
         values["degraded"] = quality(taken, scene.still, edges)
     for name, (detecting, restoring) in METHODS.items():
-        result = rsv.detect_vibration(as_frames(taken), TIMING, **detecting)
+        result = rsv.detect_vibration(as_frames(taken), timing, **detecting)
         values["detection"][name] = detection_values(result, shake)
         images.detections[name] = result
         if restore:
-            restored = rsv.restore(as_frames(taken), TIMING, result.vibration, check=False, **restoring)
+            restored = rsv.restore(as_frames(taken), timing, result.vibration, check=False, **restoring)
             images.restored[name] = restored.double().numpy()
             values["restoration"][name] = quality(images.restored[name], scene.still, edges)
     return images
