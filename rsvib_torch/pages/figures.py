@@ -20,7 +20,7 @@ COLOURS = {"x": "#14487a", "y": "#c8102e"}
 _BLIND = "#b8bcc0"
 _POINTS = 2000  # of a curve
 _CELLS = (3, 8)  # of the film, down and across
-_FINER = 3  # PSF cells are at least so many px wide around the centre
+_LEAST_REACH = 2  # px around the centre of a cell of the film
 _WEAKEST = 0.1  # gain below which a frame pair is refused
 
 
@@ -72,7 +72,7 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     if kept:
         upper.legend(list(kept.values()), list(kept), fontsize=9, frameon=False, loc="upper right", ncols=2)
     upper.set_ylim(0, 2.4)
-    lower.set_ylim(bottom=0)
+    lower.set_ylim(0, 1.15 * lower.get_ylim()[1])
     upper.set_xlim(0, highest)
     upper.set_ylabel("gain (px per px)")
     lower.set_ylabel("amplitude (px)")
@@ -143,7 +143,7 @@ def psf_film(vibration: Vibration, timing: SensorTiming, num_rows: int) -> Figur
     path = vibration.displacement(starts[:, None] + times) - centre[:, None]
     first = psf.first_tap - centre
     size = torch.tensor(psf.weights.shape[:-3:-1])
-    reach = max(_FINER, int(torch.maximum(first.abs(), (first + size - 1).abs()).max()) + 1)
+    reach = max(_LEAST_REACH, int(torch.maximum(first.abs(), (first + size - 1).abs()).max()))
     cells = np.zeros((count, 2 * reach + 1, 2 * reach + 1))
     for index in range(count):
         left, top = (int(value) + reach for value in first[index].tolist())

@@ -20,6 +20,7 @@ from rsvib_torch.sensor import SensorTiming
 __all__ = ["Report", "write_report_page"]
 
 _CROP, _CROPS, _RIM = 96, 6, 16  # px
+_OVERVIEW = 1180  # px, longest side
 _MTF_HEAD = ("edge", "sharpness", "angle", "MTF50 as taken (cycles/px)", "MTF50 restored")
 
 
@@ -93,7 +94,7 @@ def _drawings(report: Report) -> dict[str, list[Drawing]]:
         )
         for axis, name in enumerate("xy")
     ]
-    tones = [
+    vibration = [
         drawing(
             figures.gain_figure(result, timing),
             "gain",
@@ -101,9 +102,7 @@ def _drawings(report: Report) -> dict[str, list[Drawing]]:
             "Above, px of offset for every px of vibration; dashed: blind frequencies, at which every frame is "
             "displaced alike or the exposure averages the tone out. Below, the tones with error "
             "bars of two standard deviations.",
-        )
-    ]
-    rows = [
+        ),
         drawing(
             figures.rows_figure(undone, timing, num_rows),
             "rows",
@@ -118,7 +117,7 @@ def _drawings(report: Report) -> dict[str, list[Drawing]]:
             "displacement; the line is the path of the image during the exposure.",
         ),
     ]
-    return {"offsets": offsets, "tone_figures": tones, "row_figures": rows}
+    return {"offsets": offsets, "tone_figures": vibration}
 
 
 def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None = None) -> list[str]:
@@ -166,7 +165,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
             left_alone=report.left_alone,
             verdict=report.verdict,
         ),
-        "overview": before_after(before, after, names=names, caption=f"Frame {index}."),
+        "overview": before_after(before, after, names=names, caption=f"Frame {index}.", longest=_OVERVIEW),
         "details": _details(report),
         "tones_head": in_words.TONE_HEAD,
         "tones": in_words.tone_rows(report.detection),

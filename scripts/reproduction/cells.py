@@ -110,10 +110,11 @@ def restoration_cells(target: Target, trials: Trials, still: dict[str, Any]) -> 
                 for m, found in after.items()
             }
             reached = metric(still, name, 0)
+            possible = float(np.mean([100 * (reached / b - 1) for b in before]))
             head = ("Table 4", target)
             cells += [
                 Cell(*head, f"{label}, restored", column, unit, digits, printed.restored[frame], values, True, reached),
-                Cell(*head, f"{label}, improvement", column, "%", 1, printed.improvement[frame], gains, True),
+                Cell(*head, f"{label}, improvement", column, "%", 1, printed.improvement[frame], gains, True, possible),
             ]
     return cells
 
