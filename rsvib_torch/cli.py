@@ -11,14 +11,33 @@ import typer
 
 import rsvib_torch
 from rsvib_torch.calibrate_command import calibrate
+from rsvib_torch.command_options import (
+    ConfigOption,
+    DeviceOption,
+    ForceOption,
+    FramesArgument,
+    JointOption,
+    MemoryOption,
+    MethodOption,
+    PriorOption,
+    SaturationOption,
+    ScaleOption,
+    WorkersOption,
+)
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.imaging import simulate_frames
 from rsvib_torch.pages import Box, Report, write_report_page
-from rsvib_torch.pictures import comparison_figure, save_figure
 from rsvib_torch.report import read_vibration
-from rsvib_torch.restoration.restore import METHODS
-from rsvib_torch.stacks import check_stack_target, check_writable, read_stack, whole_folder, write_stack
+from rsvib_torch.stack_commands import detect_windows, restore_windows, run, window_of
+from rsvib_torch.stacks import (
+    check_stack_target,
+    check_writable,
+    read_manifest,
+    read_stack,
+    whole_folder,
+    write_stack,
+)
 from rsvib_torch.terminal import error_line, say, show_result, warnings_in_one_line, working
 from rsvib_torch.workflow import (
     DeviceName,
@@ -40,33 +59,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-
-ConfigOption = Annotated[Path, typer.Option("--config", help="TOML file that describes the camera.")]
-DeviceOption = Annotated[
-    DeviceName, typer.Option("--device", help="Where to compute; auto takes a GPU if there is one.")
-]
-ScaleOption = Annotated[
-    float | None,
-    typer.Option("--full-scale", help="Count that means full scale, where neither file nor config says it right."),
-]
-MethodOption = Annotated[
-    str | None, typer.Option("--method", help=f"How to restore: {', '.join(METHODS)}.", show_default="the config's")
-]
-JointOption = Annotated[
-    str | None,
-    typer.Option("--joint", help="Frames restored together: 'all' for one image, or a number of neighbours."),
-]
-PriorOption = Annotated[
-    str | None, typer.Option("--prior", help="What scenes are expected to be like, for methods that have the option.")
-]
-SaturationOption = Annotated[
-    float | None,
-    typer.Option("--saturation", help="Level of the file from which pixels are saturated; full scale for integers."),
-]
-ForceOption = Annotated[
-    bool, typer.Option("--force", help="Write restored frames even where they are judged no better than raw.")
-]
-FramesArgument = Annotated[Path, typer.Argument(help="Stack of frames: TIFF, .npy, video, or a folder of PNG files.")]
 
 
 @app.command()
@@ -123,15 +115,37 @@ def detect(
     *,
     config: ConfigOption,
     out: Annotated[Path, typer.Option(help="Folder for vibration.json, offsets.csv and offsets.png.")],
+    window: Annotated[
+        int | None,
+        typer.Option(
+            help="Detect in windows of at most so many frames: writes manifest.json and windows.csv instead.",
+            show_default="the config's, or one result from all frames",
+        ),
+    ] = None,
+    memory: MemoryOption = None,
+    workers: WorkersOption = None,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
 ) -> None:
     """Detect the vibration in a stack of frames."""
+    settings = read_config(config)
+    if window is not None or "window" in settings.stack:
+        size = window_of(settings, window)
+        detect_windows(
+            frames, settings, out, size, device=device, full_scale=full_scale, memory=memory, workers=workers
+        )
+        return
     settings, _, result = _detected(frames, config, out, device, full_scale)
     with whole_folder(out) as folder:
         write_detection(folder, result, settings)
     show_result(result)
     say(f"{out}: vibration.json, offsets.csv, offsets.png")
+
+
+def _is_manifest(path: Path) -> bool:
+    """Whether a file is the manifest of a stack in windows, rather than one vibration."""
+    with path.open("rb") as file:
+        return b'"rsvib stack"' in file.read(200)
 
 
 @app.command(name="restore")
@@ -140,7 +154,9 @@ def restore_command(
     restored: Annotated[Path, typer.Argument(help="Stack to write, in the type and full scale of the frames.")],
     *,
     config: ConfigOption,
-    vibration: Annotated[Path, typer.Option(help="The vibration.json that detect wrote.")],
+    vibration: Annotated[
+        Path, typer.Option(help="The vibration.json, or manifest.json of windows, that detect or run wrote.")
+    ],
     method: MethodOption = None,
     joint: JointOption = None,
     prior: PriorOption = None,
@@ -155,8 +171,14 @@ def restore_command(
     Where restored frames are no better than the raw ones, the raw ones are written, unless forced.
     """
     settings = read_config(config)
-    detected = read_vibration(vibration, settings.timing)
     wishes = Wishes(method, joint, prior, saturation, force)
+    if _is_manifest(vibration):
+        if report is not None:
+            raise ValueError("--report is for vibration.json; a stack in windows is judged in its own manifest.json")
+        manifest = read_manifest(vibration)
+        restore_windows(frames, restored, settings, manifest, wishes, device=device, full_scale=full_scale)
+        return
+    detected = read_vibration(vibration, settings.timing)
     stack = load(frames, settings, full_scale, chosen_device(device))
     shape = (1, *stack.info.shape[1:]) if joint == "all" else stack.info.shape
     check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale)
@@ -167,39 +189,6 @@ def restore_command(
     if report is not None:
         result.write_report(report)
     say(f"{restored}: {len(result.frames)} frames {'restored' if result.restored else 'as taken'}, {stack.info.dtype}")
-
-
-@app.command()
-def run(
-    frames: FramesArgument,
-    out: Annotated[Path, typer.Argument(help="Folder for the restored frames, the vibration and the pictures.")],
-    *,
-    config: ConfigOption,
-    method: MethodOption = None,
-    joint: JointOption = None,
-    prior: PriorOption = None,
-    saturation: SaturationOption = None,
-    force: ForceOption = False,
-    device: DeviceOption = "auto",
-    full_scale: ScaleOption = None,
-) -> None:
-    """Detect the vibration, restore the frames, judge whether that helps, and draw pictures.
-
-    Where restored frames are no better than the raw ones, the raw ones are written, unless forced.
-    """
-    settings, stack, detection = _detected(frames, config, out, device, full_scale)
-    show_result(detection)
-    result = restore_and_judge(stack, settings, detection, Wishes(method, joint, prior, saturation, force))
-    with whole_folder(out) as folder:
-        write_detection(folder, detection, settings)
-        result.write_report(folder / "restoration.json")
-        save(folder / "restored.tif", result.frames, stack)
-        with working("drawing before and after"):
-            shown = len(stack.frames) // 2 if len(result.frames) < len(stack.frames) else 0
-            names = ("as taken", "restored" if result.restored else "left as taken")
-            picture = comparison_figure(stack.frames[shown], result.frames[0], names=names)
-            save_figure(picture, folder / "before_after.png")
-    say(f"{out}: restored.tif, restoration.json, vibration.json, offsets.csv, offsets.png, before_after.png")
 
 
 def _boxes(texts: list[str]) -> list[Box] | None:
@@ -262,6 +251,7 @@ def _show_version(wanted: bool) -> None:
 
 
 app.command()(calibrate)
+app.command()(run)
 
 
 @app.callback()
@@ -283,7 +273,7 @@ def run_command(arguments: Sequence[str]) -> int:
     """Run ``rsvib`` with these arguments.
 
     Returns:
-        Exit code: 0, or 2 after an error of the user's, which is one line on standard error.
+        Exit code: 0, 2 after an error of the user's, which is one line on standard error, or 130 after Ctrl-C.
     """
     logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what matters becomes an error of our own
     command = typer.main.get_command(app)
@@ -291,8 +281,11 @@ def run_command(arguments: Sequence[str]) -> int:
         with warnings_in_one_line():
             code = command.main(args=list(arguments) or ["--help"], prog_name="rsvib", standalone_mode=False)
         return code if isinstance(code, int) else 0
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, ModuleNotFoundError) as error:
         error_line(_one_line(error))
+    except (KeyboardInterrupt, typer.Abort):
+        error_line("stopped; what is done of a run is kept, --resume goes on with it")
+        return 130
     except Exception as error:
         if hasattr(error, "format_message"):  # a mistake in the arguments, whichever library typer parses them with
             error_line(error.format_message())

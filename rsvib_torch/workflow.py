@@ -1,7 +1,6 @@
 """What the commands do with a stack: read it, detect, restore and judge, write."""
 
 import inspect
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,16 +13,10 @@ from rsvib_torch.config import Config
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.pictures import offset_figure, save_figure
 from rsvib_torch.report import write_offsets, write_restoration, write_vibration
-from rsvib_torch.restoration import (
-    RestorationVerdict,
-    TooLittleInCommonError,
-    judge_restoration,
-    restore,
-    trusted_vibration,
-)
+from rsvib_torch.restoration import RestorationVerdict, restore
 from rsvib_torch.restoration.restore import method_options
 from rsvib_torch.restoration.trust import Detected
-from rsvib_torch.stacks import StackInfo, read_stack, read_stack_info, write_stack
+from rsvib_torch.stacks import RestoredFrames, StackInfo, read_stack, read_stack_info, restore_trusted, write_stack
 from rsvib_torch.terminal import error_line, say, working
 
 __all__ = [
@@ -33,9 +26,12 @@ __all__ = [
     "Wishes",
     "chosen_device",
     "detect_frames",
+    "full_scale_of",
     "load",
+    "restoration_options",
     "restore_and_judge",
     "save",
+    "tell_restoration",
     "write_detection",
 ]
 
@@ -86,7 +82,7 @@ def chosen_device(name: DeviceName) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-def _full_scale(path: Path, info: StackInfo, config: Config, option: float | None) -> float | None:
+def full_scale_of(path: Path, info: StackInfo, config: Config, option: float | None) -> float | None:
     """Full scale of a stack: the option first, then what the file says or 8 bits mean, then the config."""
     if option is not None or not info.is_integer:
         return option
@@ -102,7 +98,7 @@ def _full_scale(path: Path, info: StackInfo, config: Config, option: float | Non
 def load(path: Path, config: Config, option: float | None, device: torch.device) -> Stack:
     """Read a stack; ``option`` is the full scale of the command line."""
     info = read_stack_info(path)
-    scale = _full_scale(path, info, config, option)
+    scale = full_scale_of(path, info, config, option)
     with working(f"reading {path}"):
         frames = read_stack(path, full_scale=scale)
     # A video only estimates its length beforehand.
@@ -131,7 +127,7 @@ def _frames_together(text: str | None) -> bool | int | None:
     return int(text)
 
 
-def _restoration_options(stack: Stack, config: Config, wishes: Wishes) -> dict[str, Any]:
+def restoration_options(info: StackInfo, full_scale: float | None, config: Config, wishes: Wishes) -> dict[str, Any]:
     """Options of ``restore``: the config's, and those of the command line before them."""
     options = dict(config.restoration)
     if wishes.method is not None and wishes.method != options.get("method", _DEFAULT_METHOD):
@@ -144,10 +140,10 @@ def _restoration_options(stack: Stack, config: Config, wishes: Wishes) -> dict[s
         "saturation": wishes.saturation,
     }
     options |= {name: value for name, value in given.items() if value is not None}
-    counts = stack.info.is_integer and stack.full_scale is not None
+    counts = info.is_integer and full_scale is not None
     if options.get("saturation") is not None:
         level = check_number("saturation", options["saturation"], above=0.0)
-        options["saturation"] = level / stack.full_scale if counts and stack.full_scale else level
+        options["saturation"] = level / full_scale if counts and full_scale else level
     elif counts:
         options["saturation"] = 1.0
     return options
@@ -155,37 +151,28 @@ def _restoration_options(stack: Stack, config: Config, wishes: Wishes) -> dict[s
 
 def restore_and_judge(stack: Stack, config: Config, detected: Detected, wishes: Wishes) -> Restored:
     """Restore frames and judge the result; an axis that is not known well enough is left alone."""
-    options = _restoration_options(stack, config, wishes)
-    rows = stack.frames.shape[-1 if config.timing.scan_axis == -1 else -2]
-    vibration, left_alone = trusted_vibration(detected, config.timing, len(stack.frames), rows)
-    for note in left_alone:
+    options = restoration_options(stack.info, stack.full_scale, config, wishes)
+    with working("restoring the frames and judging the result"):
+        result = restore_trusted(
+            stack.frames, config.timing, detected, options, force=wishes.force, most_pairs=_JUDGED_PAIRS
+        )
+    tell_restoration(result)
+    return Restored(result.frames, result.restored, options, result.left_alone, result.verdict)
+
+
+def tell_restoration(result: RestoredFrames) -> None:
+    """Say which axes were left alone, and whether restoration helped."""
+    for note in result.left_alone:
         say(note)
-    if not bool((vibration.amplitude > 0).any() | (vibration.image_motion != 0).any()):
+    if not result.moves:
         error_line("there is no vibration to undo: frames are left as they are", "warning")
-        return Restored(stack.frames, False, options, left_alone, None)
-    with working("restoring the frames"):
-        clear = restore(stack.frames, config.timing, vibration, check=False, **options)
-    verdict = None
-    with working("judging the result"), suppress(TooLittleInCommonError):
-        if len(stack.frames) > 1:
-            verdict = judge_restoration(
-                stack.frames,
-                clear,
-                config.timing,
-                vibration,
-                joint=options.get("joint", False),
-                most_pairs=_JUDGED_PAIRS,
-            )
-    if verdict is None:
+    elif result.verdict is None:
         say("whether restoration helps cannot be told: no two frames show the same scene")
-        return Restored(clear, True, options, left_alone, None)
-    keep = verdict.overall != "worse" or wishes.force
-    if verdict.overall in ("partly", "worse"):
-        rest = "" if keep else "; frames are left as they are, --force restores them all the same"
-        error_line(verdict.summary + rest, "warning")
+    elif result.verdict.overall in ("partly", "worse"):
+        rest = "" if result.restored else "; frames are left as they are, --force restores them all the same"
+        error_line(result.verdict.summary + rest, "warning")
     else:
-        say(verdict.summary)
-    return Restored(clear if keep else stack.frames, keep, options, left_alone, verdict)
+        say(result.verdict.summary)
 
 
 def write_detection(folder: Path, result: DetectionResult, config: Config) -> None:

@@ -121,7 +121,7 @@ def test_run_does_all_of_it_and_again(place, tmp_path):
     out = tmp_path / "out"
     for _ in range(2):
         assert run("run", place / "frames.tif", out, "--config", place / "camera.toml") == 0
-    names = ["before_after.png", "offsets.csv", "offsets.png", "restoration.json", "restored.tif", "vibration.json"]
+    names = ["before_after.png", "manifest.json", "offsets.csv", "offsets.png", "restoration.json", "restored.tif", "vibration.json"]
     assert sorted(path.name for path in out.iterdir()) == names
     check_detection(out)
     assert min(psnr(read_stack(out / "restored.tif"), still_frame(place))) > 38
@@ -509,7 +509,7 @@ def test_warnings_are_one_line(place, tmp_path, capsys, monkeypatch):
         warnings.warn("the displacement within a row time\nis large", UserWarning, stacklevel=1)
         raise ValueError("stopped here")
 
-    monkeypatch.setattr("rsvib_torch.workflow.detect_vibration", warn)
+    monkeypatch.setattr("rsvib_torch.stacks.job.detect_vibration", warn)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         assert run("run", place / "frames.tif", tmp_path / "out", "--config", place / "camera.toml") == 2

@@ -13,6 +13,7 @@ FLOORS = (
     {"checks", "splines", "spectral", "missing", "validation"},
     {"sensor"},
     {"vibration"},
+    {"free_motion"},
     {"orientation"},
     {"registration", "imaging", "calibration"},
     {"detection", "restoration"},
@@ -21,6 +22,8 @@ FLOORS = (
     {"config", "pictures", "terminal"},
     {"report", "pages"},
     {"workflow", "calibrate_command"},
+    {"command_options"},
+    {"stack_commands"},
     {"cli"},
 )
 
