@@ -131,6 +131,8 @@ def all_cells(trials: dict[Target, Trials], still: dict[Target, Trials], noise: 
 
 def mtf_against_still(trials: Trials, still: dict[str, Any], method: str, axis: str, kind: str) -> np.ndarray:
     """MTF of restored frames over that of the still camera, (trials and frames, F)."""
+    if kind not in still["mtf"][0][axis]:
+        return np.empty((0, 0))
     reference = np.array(still["mtf"][0][axis][kind]["curve"])
     return np.array(
         [

@@ -41,7 +41,7 @@ def write_reproduction_page(path: Path, found: Found, plan: Plan, pictures: Gall
         "sections": [_section(*part) for part in sections(found, plan)],
         "marks": _MARKS,
         "footer": f"rsvib_torch {rsvib_torch.__version__}, scripts/reproduce.py. H. Liu, H. Lv, C. Han, Y. Zhao: "
-        "Vibration Detection and Degraded Image Restoration of Space Camera Based on Correlation Imaging of Rolling-Shutter "
-        "CMOS. Sensors 2023, 23, 5953.",
+        "Vibration Detection and Degraded Image Restoration of Space Camera Based on Correlation Imaging of Rolling-"
+        "Shutter CMOS. Sensors 2023, 23, 5953.",
     }
     write_page(path, "reproduction.html", content, _TEMPLATES)

@@ -25,7 +25,7 @@ _BAND = 32  # rows
 
 
 def _show(panel: Axes, image: Array, title: str, **options: Any) -> None:
-    panel.imshow(image, cmap="gray", interpolation="nearest", **{"vmin": 0.0, "vmax": 1.0, **options})
+    panel.imshow(image, cmap="gray", **{"interpolation": "nearest", "vmin": 0.0, "vmax": 1.0, **options})
     panel.set_title(title, loc="left", fontsize=10)
     panel.set_xticks([])
     panel.set_yticks([])

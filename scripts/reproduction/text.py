@@ -33,6 +33,11 @@ def _spread(found: Spread, cell: Cell) -> str:
     return f"{_number(found.mean, cell.digits)} ({_number(found.worst, cell.digits)})"
 
 
+def _range(values: Sequence[float]) -> str:
+    known = [value for value in values if np.isfinite(value)]
+    return f"{np.mean(known):.4f} ({min(known):.4f} … {max(known):.4f})" if known else "–"
+
+
 def cells_table(cells: Sequence[Cell], *, column: str) -> list[str]:
     """The paper's value, ours both ways as mean (worst), and whether the worst trial is ahead."""
     rows = []
@@ -124,7 +129,7 @@ def mtf_table(found: Found, plan: Plan) -> list[str]:
                     [c["nyquist"] for c in curves],
                     [c["mtf50"] for c in curves],
                 ]
-                means = [f"{np.nanmean(v):.4f} ({np.nanmin(v):.4f} … {np.nanmax(v):.4f})" for v in values]
+                means = [_range(v) for v in values]
                 rows.append([AXIS_NAMES[axis], words, name, *means])
     return table(["axis", "measured", "", "MTF at 0.25 cycles/px", "MTF at Nyquist", "MTF50 (cycles/px)"], rows)
 
@@ -138,6 +143,8 @@ def closing_values(found: Found, noise: float) -> list[dict[str, Any]]:
         for axis in AXES:
             for kind in ("straight", "along"):
                 share = mtf_against_still(trials, still, method, axis, kind)
+                if not len(share):
+                    continue
                 mean = share.mean(0)
                 values.append(
                     {
