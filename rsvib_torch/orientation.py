@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks import check_number
+from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
@@ -45,20 +46,22 @@ def _mirror_rows(vibration: Vibration, timing: SensorTiming) -> Vibration:
         turn > 0, torch.remainder(vibration.phase + turn + math.pi, 2 * math.pi) - math.pi, vibration.phase
     )
     motion, acceleration = vibration.image_motion * sign, vibration.image_acceleration * sign
-    return Vibration(vibration.amplitude, vibration.frequency, phase, motion, acceleration)
+    tones = Vibration(vibration.amplitude, vibration.frequency, phase, motion, acceleration)
+    return vibration.with_tones(tones, (1.0, -1.0)) if isinstance(vibration, FreeMotion) else tones
 
 
 def _swap_axes(vibration: Vibration, timing: SensorTiming) -> Vibration:
     """The vibration seen in transposed frames (its own inverse)."""
     if timing.scan_axis == -2:
         return vibration
-    return Vibration(
+    tones = Vibration(
         vibration.amplitude.flip(-2),
         vibration.frequency.flip(-2),
         vibration.phase.flip(-2),
         vibration.image_motion.flip(-1),
         vibration.image_acceleration.flip(-1),
     )
+    return vibration.with_tones(tones, swap=True) if isinstance(vibration, FreeMotion) else tones
 
 
 def vibration_to_row_order(vibration: Vibration, timing: SensorTiming) -> Vibration:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks import check_choice
+from rsvib_torch.free_motion import rest_path
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
@@ -25,7 +26,7 @@ def gauss_node_count(vibration: Vibration, exposure_time: float) -> int:
     frequency = vibration.frequency.detach()
     cycles = frequency * exposure_time
     swing = vibration.amplitude.detach() * torch.where(cycles < 0.5, 2 * torch.sin(math.pi * cycles), 4 * cycles)
-    path = swing.sum(-1) + vibration.image_motion.detach().abs() * exposure_time
+    path = swing.sum(-1) + vibration.image_motion.detach().abs() * exposure_time + rest_path(vibration, exposure_time)
     seen_cycles = torch.where(vibration.amplitude.detach() > 1e-4, cycles, torch.zeros_like(cycles))
     return 3 + math.ceil(2.0 * float(path.amax())) + math.ceil(4.0 * float(seen_cycles.amax()))
 

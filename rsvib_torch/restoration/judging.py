@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks import check_whole_number
+from rsvib_torch.free_motion import rest_reach
 from rsvib_torch.orientation import as_float_frames, frames_to_row_order, time_axis, vibration_to_row_order
 from rsvib_torch.restoration.misfit import misfit
 from rsvib_torch.restoration.missing import fill_roughly
@@ -36,6 +37,7 @@ def _mean_square(difference: Tensor) -> Tensor:
 def _moves(motion: FrameMotion) -> tuple[bool, bool]:
     """Whether the vibration claims to move the image along x, y."""
     swing = motion.vibration.amplitude.detach().sum(-1)[0] + motion.vibration.image_motion.detach()[0].abs()
+    swing = swing + rest_reach(motion.vibration)[0]
     x, y = (swing > 0).tolist()
     return x, y
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks import check_whole_number
+from rsvib_torch.free_motion import FreeMotion, rest_reach
 from rsvib_torch.imaging.coupling import rows_showing
 from rsvib_torch.orientation import frames_from_row_order, offsets_from_row_order, vibration_to_row_order
 from rsvib_torch.sensor import SensorTiming
@@ -43,7 +44,7 @@ class FrameMotion:
     def reach(self, num_rows: int) -> int:
         """Bound on the displacement along a row of ``num_rows`` rows, beyond the shift, in whole px."""
         half = 0.5 * (num_rows * self.timing.row_time + self.timing.exposure_time)
-        swing = self.vibration.amplitude.detach().sum(-1)[:, None]
+        swing = (self.vibration.amplitude.detach().sum(-1) + rest_reach(self.vibration))[:, None]
         acceleration = self.vibration.image_acceleration.detach()[:, None]
         speed = self.vibration.image_motion.detach()[:, None] + acceleration * (self.frame_starts + half)[:, None]
         bound = swing + speed.abs() * half + 0.5 * acceleration.abs() * half**2
@@ -56,6 +57,8 @@ class FrameMotion:
 
 def as_batch(vibration: Vibration, size: int) -> Vibration:
     """A vibration without batch dimensions as a batch of ``size`` equal ones."""
+    if isinstance(vibration, FreeMotion):
+        return vibration.expanded(size)
     amplitude, frequency, phase = (
         tones.expand(size, *tones.shape) for tones in (vibration.amplitude, vibration.frequency, vibration.phase)
     )

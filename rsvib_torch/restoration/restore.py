@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from rsvib_torch.checks import check_choice
+from rsvib_torch.free_motion import detached, rest_reach
 from rsvib_torch.orientation import (
     as_float_frames,
     frames_from_row_order,
@@ -207,8 +208,8 @@ def _warn_if_worse(raw: Tensor, restored: Tensor, motion: Vibration, timing: Sen
     pairs = pairs_to_judge(count, joint, _JUDGED_PAIRS)
     shared = count if joint is True else max(int(joint), 1)
     for stack in range(len(raw)):
-        still = Vibration(*(getattr(motion[stack], name).detach() for name in motion.__dataclass_fields__))
-        if not bool((still.amplitude > 0).any()):
+        still = detached(motion[stack])
+        if not bool((still.amplitude > 0).any() | (rest_reach(still) > 0).any()):
             continue
         moved = frame_motion(as_batch(still, 1), timing.in_row_order(), count, raw.shape[-2])
         try:
