@@ -12,7 +12,7 @@ import rsvib_torch
 from rsvib_torch.pages import write_page
 
 _TEMPLATES = Path(__file__).parent / "templates"
-_MARKS = {"worst trial": "good", "mean only": "doubt", "no": "bad", "yes": "good"}
+_MARKS = {"in every trial": "good", "on average": "doubt", "no": "bad", "yes": "good"}
 
 
 def _cells(line: str) -> list[str]:

@@ -43,7 +43,7 @@ def cells_table(cells: Sequence[Cell], *, column: str) -> list[str]:
     rows = []
     for cell in cells:
         unit = f" ({cell.unit})" if cell.unit else ""
-        ahead = "worst trial" if cell.better("default") else "mean only" if cell.better("default", "mean") else "no"
+        ahead = "in every trial" if cell.better("default") else "on average" if cell.better("default", "mean") else "no"
         rows.append(
             [f"{cell.row}{unit}", cell.column, f"{cell.paper:g}"]
             + [_spread(cell.ours[method], cell) for method in METHODS]
@@ -113,7 +113,7 @@ def mtf_table(found: Found, plan: Plan) -> list[str]:
     """MTF of degraded and restored frames, and of the still camera: value at Nyquist, at 0.25 cycles/px, and MTF50."""
     noise = plan.noises[0]
     trials, still = at_noise(found.trials["chart"], noise), at_noise(found.still["chart"], noise)[0]
-    quarter = int(np.argmin(np.abs(MTF_FREQUENCY - 0.25)))
+    places = [int(np.argmin(np.abs(MTF_FREQUENCY - wanted))) for wanted in (0.25, GOAL_FREQUENCY)]
     rows = []
     for axis in AXES:
         for kind, words in (("straight", "straight line, ISO 12233"), ("along", "along the edge as it is")):
@@ -125,13 +125,13 @@ def mtf_table(found: Found, plan: Plan) -> list[str]:
             for name, frames in kinds.items():
                 curves = [frame[axis][kind] for pair in frames for frame in pair if kind in frame[axis]]
                 values = [
-                    [c["curve"][quarter] for c in curves],
+                    *([c["curve"][place] for c in curves] for place in places),
                     [c["nyquist"] for c in curves],
                     [c["mtf50"] for c in curves],
                 ]
                 means = [_range(v) for v in values]
                 rows.append([AXIS_NAMES[axis], words, name, *means])
-    return table(["axis", "measured", "", "MTF at 0.25 cycles/px", "MTF at Nyquist", "MTF50 (cycles/px)"], rows)
+    return table(["axis", "measured", "", "at 0.25 cycles/px", "at 0.4", "at Nyquist", "MTF50 (cycles/px)"], rows)
 
 
 def closing_values(found: Found, noise: float) -> list[dict[str, Any]]:
