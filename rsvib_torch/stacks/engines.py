@@ -1,5 +1,6 @@
 """Who works on the windows: threads of this process, or Dask workers."""
 
+import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -119,7 +120,7 @@ def _dask_client(scheduler: str, workers: int) -> Iterator[Any]:
         with client:
             yield client
         return
-    options = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None}
+    options = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.ERROR}
     with (
         distributed.LocalCluster(**options, processes=True, memory_limit=0) as cluster,
         distributed.Client(cluster, set_as_default=False) as client,

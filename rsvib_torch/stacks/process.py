@@ -19,7 +19,7 @@ from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.files import PathLike, check_info_target, open_stack
 from rsvib_torch.stacks.fingerprint import fingerprint
 from rsvib_torch.stacks.job import BadFrames, StackJob, StoredWindow, WindowFrames, WindowResult
-from rsvib_torch.stacks.journal import Journal
+from rsvib_torch.stacks.journal import Journal, describe_difference
 from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_manifest
 from rsvib_torch.stacks.memory import parse_memory, windows_at_once
 from rsvib_torch.stacks.records import DetectedWindow
@@ -337,7 +337,8 @@ def process_stack(
     run = _Run(job, windows, at_once, scheduler, progress)
     journal = Journal(sink)
     try:
-        if resume and not journal.has_lines and sink.exists() and _same_header(target, header):
+        if resume and not journal.has_lines and sink.exists() and target.exists():
+            _check_same(sink, read_manifest(target).header(), header)
             return run.report(_records(target), len(windows), start, target)
         fresh = not journal.open(header, resume=resume)
         resumed = journal.count
@@ -358,11 +359,11 @@ def process_stack(
         journal.close()
 
 
-def _same_header(manifest: Path, header: Mapping[str, Any]) -> bool:
-    try:
-        return read_manifest(manifest).header() == header
-    except (OSError, ValueError):
-        return False
+def _check_same(sink: Path, old: Mapping[str, Any], new: Mapping[str, Any]) -> None:
+    """Raise a ``ValueError`` unless a complete output came from what is to be done now."""
+    difference = describe_difference(old, new)
+    if difference:
+        raise ValueError(f"{sink}: cannot resume: {difference}; without resume it is done again and replaced")
 
 
 def _records(manifest: Path) -> Iterator[dict[str, Any]]:

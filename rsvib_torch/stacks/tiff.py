@@ -234,7 +234,7 @@ def _written_layout(info: StackInfo) -> tuple[StackInfo, dict[str, Any]]:
     """How a stack is laid out in the file: three or four channels go last, as other programs expect."""
     colour = info.axes == "TCHW" and info.shape[1] in (3, 4)
     stored = StackInfo(info.shape, info.dtype, info.full_scale, info.frame_times, info.resolution, colour)
-    axes = "TYX" if info.axes == "THW" else "TYXS" if colour else "TSYX"
+    axes = "TYX" if info.axes == "THW" else "TYXS" if colour else "TSYX" if info.shape[1] > 1 else "TCYX"
     metadata: dict[str, object] = {"axes": axes}
     if info.full_scale is not None:
         metadata["full_scale"] = info.full_scale
