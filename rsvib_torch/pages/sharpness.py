@@ -39,16 +39,19 @@ class EdgePair:
         """Which sharpness it tells of."""
         return _AXES[self.after.near_vertical]
 
+    @property
+    def place(self) -> str:
+        """Rows and columns."""
+        top, left, height, width = self.box
+        return f"rows {top} … {top + height - 1}, columns {left} … {left + width - 1}"
+
     def row(self) -> list[str]:
         """Cells of a table: place, axis, angle, MTF50 before and after."""
-        top, left, height, width = self.box
         return [
-            f"rows {top} … {top + height - 1}, columns {left} … {left + width - 1}",
+            self.place,
             self.axis,
             f"{self.after.angle:.1f}°",
-            measured_text(self.before.mtf50, self.before.mtf50_std, 3)
-            if self.before
-            else f"not measured: {self.why_not}",
+            measured_text(self.before.mtf50, self.before.mtf50_std, 3) if self.before else "not measured",
             measured_text(self.after.mtf50, self.after.mtf50_std, 3),
         ]
 
@@ -84,7 +87,7 @@ def measure_edges(
         given: Where edges are; by default they are looked for in the restored frame.
 
     Returns:
-        The edges that could be measured in the restored frame, and a note on each given one that could not.
+        The edges that could be measured in the restored frame, and notes on what could not be measured.
 
     Raises:
         ValueError: If a given box does not lie in the frame.
@@ -105,6 +108,8 @@ def measure_edges(
         except ValueError as error:
             why_not = str(error)
         pairs.append(EdgePair((top, left, height, width), raw, restored, why_not))
+        if why_not:
+            notes.append(f"The edge at {pairs[-1].place} could not be measured as taken: {why_not}.")
     return pairs, notes
 
 

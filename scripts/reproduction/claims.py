@@ -22,7 +22,7 @@ def push_scan_trial(scene: Scene, speed: float, noise: float, seed: int) -> dict
     """Detection with an image motion along the rows, either way."""
     shake = shake_of(seed, (speed * (-1) ** seed, 0.0))
     values = run_trial(scene, shake, clean_frames(scene, shake), noise, seed, restore=False).values
-    return {"speed": speed, **values}
+    return {"speed": speed, "detection": values["detection"]}
 
 
 def global_shutter(scene: Scene, seed: int) -> dict[str, Any]:

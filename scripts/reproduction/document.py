@@ -43,6 +43,8 @@ def remarks(found: Found, plan: Plan) -> list[str]:
         "PSNR and SSIM are taken against the still scene without noise. A still camera with this noise is given beside "
         "ours: where the paper's value lies above it, the paper's frames had less noise or less detail, which it does "
         "not state.",
+        "The paper's Table 3 has its two columns of relative errors exchanged; here each stands with the values "
+        "that it follows from.",
         f"The paper's vibration moves the image by at most {max(smear.values()):.2f} px during an exposure. "
         f"That lowers the MTF at Nyquist by a factor of {1 + loss:.3f} at most: improvements beyond {100 * loss:.0f} % "
         "are bends that were straightened, or contrast that the still camera would not have had.",

@@ -94,6 +94,10 @@ def run(plan: Plan, say: Any = print) -> Found:
             if images is not None:
                 found.images[target] = images
     for speed in plan.speeds:
+        if speed == 0:  # the trials of the table
+            still = [t for t in found.trials["landscape"] if t["noise"] == plan.noises[0]]
+            found.push_scan += [{"speed": speed, "detection": t["detection"]} for t in still]
+            continue
         say(f"push-scan: {speed:g} px/s")
         _scene = draw("landscape", plan.size, (speed, 0.0))
         found.push_scan += list(_shared(_push_scan_task, [(speed, seed) for seed in range(plan.seeds)]))
