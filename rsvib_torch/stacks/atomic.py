@@ -47,18 +47,14 @@ def _check_folder_place(path: Path) -> None:
         raise PermissionError(f"cannot write into folder {path}: it is not writable")
 
 
-def check_writable(path: Path, *, folder: bool = False, parent_exists: bool = True) -> None:
+def check_writable(path: Path, *, folder: bool = False) -> None:
     """Raise an ``OSError`` that says why if ``path`` could not be written; leaves nothing behind.
 
     Args:
         path: File, or folder, to be written later.
         folder: Whether it will be a folder.
-        parent_exists: Whether the folder of a file must be there already.
     """
-    if folder:
-        _check_folder_place(path)
-    else:
-        _check_file_place(path, parent_exists=parent_exists)
+    (_check_folder_place if folder else _check_file_place)(path)
     with workplace(path):
         pass
 

@@ -90,9 +90,16 @@ def read_stack(path: PathLike, *, full_scale: float | None = None) -> Tensor:
 
 
 def check_info_target(
-    path: Path, info: StackInfo, compression: str | None = None, *, make_folders: bool = False
+    path: Path, info: StackInfo, compression: str | None = None, *, try_folder: bool = True
 ) -> StackFormat:
-    """The format that ``path`` is written in; raises what would be raised on writing."""
+    """The format that ``path`` is written in; raises what would be raised on writing.
+
+    Args:
+        path: The stack to write.
+        info: What it is to hold.
+        compression: As in ``write_stack``.
+        try_folder: Whether to see if its folder is there and can be written to.
+    """
     form = target_format(path)
     if not form.writable:
         raise ValueError(f"{path}: {form.name}s are only read; write .tif, .png, .npy or a folder of PNG files")
@@ -108,7 +115,10 @@ def check_info_target(
         form.check(path, info)
     if form.kind == "tree" and path.exists() and not (path / "zarr.json").is_file():
         raise FileExistsError(f"cannot write {path}: something else of that name is there")
-    check_writable(path, folder=form.kind != "file", parent_exists=not make_folders)
+    if try_folder:
+        check_writable(path, folder=form.kind != "file")
+    elif form.kind == "file" and path.is_dir():
+        raise IsADirectoryError(f"cannot write {path}: it is a folder")
     return form
 
 

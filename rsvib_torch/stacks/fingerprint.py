@@ -13,7 +13,8 @@ _FILES = 32  # of a folder
 
 def _spread(count: int, most: int) -> list[int]:
     """At most ``most`` numbers below ``count``, the first and the last among them."""
-    return sorted({round(i * (count - 1) / max(1, most - 1)) for i in range(min(count, most))}) if count else []
+    steps = min(count, most)
+    return sorted({round(i * (count - 1) / max(1, steps - 1)) for i in range(steps)})
 
 
 def _add_file(digest: Any, path: Path) -> None:

@@ -53,7 +53,12 @@ class Journal:
             self._made = sink.absolute().parent
             while not self._made.parent.is_dir():
                 self._made = self._made.parent
-        self.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OSError(
+                f"cannot write {sink}: folder {sink.parent} cannot be written to ({error.strerror})"
+            ) from error
         self._lock = os.open(self.folder / _LOCK, os.O_CREAT | os.O_RDWR)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

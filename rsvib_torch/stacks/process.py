@@ -328,7 +328,7 @@ def process_stack(
         full_scale=job.full_scale,
         frame_times=job.info.frame_times if count == job.info.shape[0] else None,
     )
-    form = check_info_target(sink, out, compression, make_folders=True)
+    form = check_info_target(sink, out, compression, try_folder=False)
     target = sink.with_name(sink.name + ".manifest.json") if manifest is None else Path(manifest)
     if Path(source).exists() and sink.exists() and os.path.samefile(source, sink):
         raise ValueError(f"{sink}: a stack cannot be written over itself")

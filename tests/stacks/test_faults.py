@@ -1,0 +1,294 @@
+"""Runs that are broken off: nothing lost, nothing doubled, nothing half-written."""
+
+import itertools
+import json
+import multiprocessing
+import os
+import random
+import resource
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+from small_stack import FRAMES, OPTIONS, WINDOWS, process_small, write_small
+
+from rsvib_torch.stacks import read_manifest
+from rsvib_torch.stacks.journal import work_folder
+
+_FILE_CALLS = ("write", "pwrite", "replace", "fsync", "fdatasync", "ftruncate", "unlink", "mkdir", "rmdir", "rename")
+
+
+@pytest.fixture(scope="module", name="forks")
+def start_fork_server():
+    """Processes that start at once: the libraries are loaded only for the first."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["rsvib_torch.stacks", "small_stack"])
+    return context
+
+
+@pytest.fixture(scope="module", name="whole")
+def process_whole(tmp_path_factory):
+    """A stack and what an unbroken run makes of it."""
+    folder = tmp_path_factory.mktemp("whole")
+    write_small(folder / "frames.tif")
+    for name in ("out.tif", "out.npy", "out.zarr"):
+        process_small(folder / "frames.tif", folder / name)
+    return folder
+
+
+def _count_file_calls(die_at):
+    """Kill this process with SIGKILL at its n-th call that changes a file; count them."""
+    count = itertools.count()
+    lock = threading.Lock()
+    done = [0]
+
+    def wrap(real):
+        def call(*args, **kwargs):
+            with lock:
+                done[0] = next(count) + 1
+                if done[0] == die_at:
+                    os.kill(os.getpid(), signal.SIGKILL)
+            return real(*args, **kwargs)
+
+        return call
+
+    for name in _FILE_CALLS:
+        setattr(os, name, wrap(getattr(os, name)))
+    return done
+
+
+def _run(source, sink, options, die_at, counted):
+    torch.set_num_threads(1)
+    done = _count_file_calls(die_at)
+    process_small(source, sink, **options)
+    if counted is not None:
+        counted.value = done[0]
+
+
+def run_apart(forks, source, sink, *, die_at=0, seconds=None, counted=None, **options):
+    """Process the stack in a process of its own, which dies at some file call or after some time."""
+    process = forks.Process(target=_run, args=(source, sink, options, die_at, counted))
+    process.start()
+    process.join(timeout=seconds)
+    if seconds is not None and process.exitcode is None:
+        process.kill()
+    process.join(timeout=60)
+    return process.exitcode
+
+
+def content(path):
+    """All bytes below a path."""
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    return {str(file.relative_to(path.parent)): file.read_bytes() for file in files}
+
+
+def check_whole(whole, folder, name):
+    """The result is that of the unbroken run to the byte, and nothing else is left."""
+    assert content(folder / name) == content(whole / name)
+    manifest = f"{name}.manifest.json"
+    assert json.loads((folder / manifest).read_text()) == json.loads((whole / manifest).read_text())
+    assert {path.name for path in folder.iterdir()} == {name, manifest}
+
+
+def check_broken(whole, folder, name):
+    """What a killed run left: no output, or the whole one."""
+    if (folder / name).exists():
+        assert content(folder / name) == content(whole / name)
+    if (folder / f"{name}.manifest.json").exists():
+        assert (folder / name).exists()
+
+
+def kill_and_resume(forks, whole, folder, name, **how):
+    folder.mkdir()
+    code = run_apart(forks, whole / "frames.tif", folder / name, **how)
+    assert code in (-signal.SIGKILL, 0)
+    check_broken(whole, folder, name)
+    options = {key: value for key, value in how.items() if key not in ("die_at", "seconds")}
+    report = process_small(whole / "frames.tif", folder / name, resume=True, **options)
+    assert (report.frames, report.windows) == (FRAMES, WINDOWS)
+    check_whole(whole, folder, name)
+    return report.resumed
+
+
+def test_killed_runs_resume_to_the_same_bytes(forks, whole, tmp_path):
+    counted = forks.Value("i", 0)
+    (tmp_path / "count").mkdir()
+    assert run_apart(forks, whole / "frames.tif", tmp_path / "count" / "out.tif", counted=counted) == 0
+    total = counted.value
+    assert total > 5 * WINDOWS
+    resumed = [
+        kill_and_resume(forks, whole, tmp_path / str(die_at), "out.tif", die_at=die_at)
+        for die_at in (2, total // 2, total - 4)
+    ]
+    assert resumed[0] == 0
+    assert 1 < resumed[1] < WINDOWS
+    assert resumed[2] == WINDOWS
+
+
+@pytest.mark.slow
+def test_kill_at_twenty_random_moments(forks, whole, tmp_path):
+    start = time.perf_counter()
+    (tmp_path / "timed").mkdir()
+    assert run_apart(forks, whole / "frames.tif", tmp_path / "timed" / "out.tif") == 0
+    duration = time.perf_counter() - start
+    choice = random.Random(6)
+    resumed = []
+    for trial in range(20):
+        name = ("out.tif", "out.npy", "out.zarr")[trial % 3]
+        moment = choice.uniform(0.05, 1.0) * duration
+        resumed.append(kill_and_resume(forks, whole, tmp_path / f"{trial}", name, seconds=moment, workers=2))
+    assert len(set(resumed)) > 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["out.tif", "out.zarr", "skip.npy"])
+def test_kill_at_every_kind_of_file_call(forks, whole, tmp_path, name):
+    options = {}
+    if name == "skip.npy":  # kept window by window, then put together
+        name, options = "out.npy", {"bad_frames": "skip"}
+        process_small(whole / "frames.tif", whole / "skip" / "out.npy", **options)
+        whole = whole / "skip"
+        write_small(whole / "frames.tif")
+        (whole / "out.npy").unlink()
+        process_small(whole / "frames.tif", whole / "out.npy", **options)
+    counted = forks.Value("i", 0)
+    (tmp_path / "count").mkdir()
+    assert run_apart(forks, whole / "frames.tif", tmp_path / "count" / name, counted=counted, **options) == 0
+    for die_at in {*range(1, 12), *range(12, counted.value, 7), *range(counted.value - 12, counted.value + 1)}:
+        kill_and_resume(forks, whole, tmp_path / f"{die_at}", name, die_at=die_at, **options)
+
+
+@pytest.fixture(name="broken")
+def break_a_run(forks, whole, tmp_path):
+    """A run killed half way."""
+    write_small(tmp_path / "frames.tif")
+    assert run_apart(forks, tmp_path / "frames.tif", tmp_path / "out.tif", die_at=30) == -signal.SIGKILL
+    assert work_folder(tmp_path / "out.tif").is_dir()
+    return tmp_path
+
+
+def test_a_broken_run_is_neither_overwritten_nor_mixed(broken):
+    with pytest.raises(FileExistsError, match=r"a run was broken off here after \d+ windows; resume it"):
+        process_small(broken / "frames.tif", broken / "out.tif")
+    for options, message in (
+        ({"window": 4}, "settings.window was 3, now it is 4"),
+        ({"detection": {**OPTIONS["detection"], "search": 7}}, "settings.detection.search was 6, now it is 7"),
+        ({"restoration": {"method": "exact"}}, 'settings.restoration.method was "dewarp", now it is "exact"'),
+        ({"force": True}, "settings.force was false, now it is true"),
+    ):
+        with pytest.raises(ValueError, match=f"cannot resume: {message}"):
+            process_small(broken / "frames.tif", broken / "out.tif", resume=True, **options)
+    counts = tifffile.imread(broken / "frames.tif")
+    counts[10, 5, 5] ^= 1
+    tifffile.imwrite(broken / "frames.tif", counts, photometric="minisblack", metadata=None)
+    with pytest.raises(ValueError, match=r"cannot resume: input\.sha256_of_samples was"):
+        process_small(broken / "frames.tif", broken / "out.tif", resume=True)
+    assert not (broken / "out.tif").exists()
+
+
+def test_damaged_journal_is_refused_and_a_torn_line_done_again(whole, broken):
+    lines = work_folder(broken / "out.tif") / "journal.jsonl"
+    good = lines.read_bytes()
+    lines.write_bytes(b'{"window": 7}\n' + good)
+    with pytest.raises(ValueError, match="line 1 is damaged; delete"):
+        process_small(broken / "frames.tif", broken / "out.tif", resume=True)
+    lines.write_bytes(good[:-30])
+    report = process_small(broken / "frames.tif", broken / "out.tif", resume=True)
+    assert report.resumed == good.count(b"\n") - 1
+    assert (broken / "out.tif").read_bytes() == (whole / "out.tif").read_bytes()
+
+
+def test_two_runs_do_not_write_the_same(forks, whole, tmp_path):
+    started = forks.Process(target=_run, args=(whole / "frames.tif", tmp_path / "out.tif", {}, 0, None))
+    started.start()
+    while not (work_folder(tmp_path / "out.tif") / "journal.jsonl").exists():
+        assert started.is_alive()
+        time.sleep(0.01)
+    with pytest.raises(BlockingIOError, match="another run is writing it"):
+        process_small(whole / "frames.tif", tmp_path / "out.tif", resume=True)
+    started.join(timeout=60)
+    check_whole(whole, tmp_path, "out.tif")
+
+
+def test_complete_run_is_left_as_it_is(whole, tmp_path):
+    process_small(whole / "frames.tif", tmp_path / "out.npy")
+    before = (tmp_path / "out.npy").stat().st_mtime_ns
+    report = process_small(whole / "frames.tif", tmp_path / "out.npy", resume=True)
+    assert (report.resumed, report.frames) == (WINDOWS, FRAMES)
+    with pytest.raises(ValueError, match=r"cannot resume: settings\.window was 3, now it is 5"):
+        process_small(whole / "frames.tif", tmp_path / "out.npy", resume=True, window=5)
+    assert (tmp_path / "out.npy").stat().st_mtime_ns == before
+
+
+def _run_with_small_disk(source, sink, limit, said, options):
+    torch.set_num_threads(1)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    try:
+        process_small(source, sink, **options)
+    except OSError as error:
+        said.put(str(error))
+    else:
+        said.put("done")
+
+
+def run_on_small_disk(forks, source, sink, limit, **options):
+    said = forks.SimpleQueue()
+    process = forks.Process(target=_run_with_small_disk, args=(source, sink, limit, said, options))
+    process.start()
+    process.join(timeout=60)
+    assert process.exitcode == 0
+    return said.get()
+
+
+def test_full_disk_is_noticed_before_the_work(forks, whole, tmp_path):
+    said = run_on_small_disk(forks, whole / "frames.tif", tmp_path / "new" / "out.npy", 100_000)
+    assert "File too large" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_disk_that_fills_up_on_the_way_keeps_what_is_done(forks, whole, tmp_path):
+    # frames in files of their own fit, the stack that is made of them in the end does not
+    said = run_on_small_disk(forks, whole / "frames.tif", tmp_path / "out.npy", 100_000, bad_frames="skip")
+    assert f"File too large; {WINDOWS} windows are kept, resume goes on with them" in said
+    assert not (tmp_path / "out.npy").exists()
+    report = process_small(whole / "frames.tif", tmp_path / "out.npy", bad_frames="skip", resume=True)
+    assert report.resumed == WINDOWS
+    assert (tmp_path / "out.npy").read_bytes() == (whole / "out.npy").read_bytes()
+
+
+def test_interrupt_keeps_what_is_done(whole, tmp_path):
+    def stop(done, total):
+        if done > FRAMES // 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        process_small(whole / "frames.tif", tmp_path / "out.tif", progress=stop, workers=2)
+    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("rsvib")]
+    assert not (tmp_path / "out.tif").exists()
+    report = process_small(whole / "frames.tif", tmp_path / "out.tif", resume=True)
+    assert 2 < report.resumed < WINDOWS
+    check_whole(whole, tmp_path, "out.tif")
+
+
+def test_input_that_vanishes_stops_the_run_and_can_come_back(whole, tmp_path):
+    frames = tifffile.imread(whole / "frames.tif")
+    for index, frame in enumerate(frames):
+        (tmp_path / "in").mkdir(exist_ok=True)
+        tifffile.imwrite(tmp_path / "in" / f"{index:02d}.tif", frame, photometric="minisblack", metadata=None)
+
+    def vanish(done, total):
+        if done == 4:
+            (tmp_path / "in" / "12.tif").rename(tmp_path / "gone.tif")
+
+    with pytest.raises(FileNotFoundError, match=r"12\.tif"):
+        process_small(tmp_path / "in", tmp_path / "out.npy", progress=vanish)
+    assert not (tmp_path / "out.npy").exists()
+    (tmp_path / "gone.tif").rename(tmp_path / "in" / "12.tif")
+    report = process_small(tmp_path / "in", tmp_path / "out.npy", resume=True)
+    assert report.resumed > 1
+    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), tifffile.imread(whole / "out.tif"))
+    assert read_manifest(report.manifest).bad_frames == {}

@@ -1,0 +1,265 @@
+"""Stacks of any length: right, and the same however they are gone through."""
+
+import itertools
+import json
+import threading
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+from small_stack import FRAMES, HEIGHT, MOTION, OPTIONS, STILL, TIMING, WIDTH, WINDOWS, process_small, write_small
+from truth import decibel
+
+import rsvib_torch as rsv
+from rsvib_torch.stacks import cut_windows, detect_stack, open_stack, read_manifest, write_stack
+from rsvib_torch.stacks.memory import parse_memory, windows_at_once
+
+
+@pytest.fixture(scope="module", name="place")
+def make_place(tmp_path_factory):
+    """A folder with a stack and what an unbroken run makes of it."""
+    folder = tmp_path_factory.mktemp("stack")
+    write_small(folder / "frames.tif")
+    report = process_small(folder / "frames.tif", folder / "restored.tif")
+    assert (report.frames, report.windows, report.restored) == (FRAMES, WINDOWS, WINDOWS)
+    return folder
+
+
+@pytest.mark.parametrize(("frames", "window"), [(1, 2), (2, 2), (9, 8), (25, 3), (100, 8), (101, 8), (7, 100)])
+def test_windows_see_every_pair_once_and_write_every_frame_once(frames, window):
+    windows = cut_windows(frames, window)
+    pairs = [pair for w in windows for pair in itertools.pairwise(w.frames)]
+    assert pairs == list(itertools.pairwise(range(frames)))
+    assert [frame for w in windows for frame in w.written] == list(range(frames))
+    sizes = [len(w.frames) for w in windows]
+    assert max(sizes) <= window
+    assert max(sizes) - min(sizes) <= 1
+    assert [w.alone for w in windows] == [len(windows) == 1] * len(windows)
+
+
+def test_long_stack_is_restored_everywhere(place):
+    raw, restored = (tifffile.imread(place / name) / 4095 for name in ("frames.tif", "restored.tif"))
+    assert restored.shape == (FRAMES, HEIGHT, WIDTH)
+    before, after = ([decibel(frame, STILL, 12) for frame in stack] for stack in (raw, restored))
+    assert max(before) < 27
+    assert min(after) > 30
+    assert np.median(np.subtract(after, before)) > 16
+    manifest = read_manifest(place / "restored.tif.manifest.json")
+    for record in manifest.windows:
+        found = record.detection.vibration
+        assert found.amplitude[0][0] == pytest.approx(MOTION.amplitude[0], rel=0.06)
+        assert found.frequency[1][0] == pytest.approx(MOTION.frequency[1], rel=0.03)
+        # the phase belongs to the window's own time
+        turn = 2 * np.pi * MOTION.frequency[0] * record.start_time + MOTION.phase[0] - found.phase[0][0]
+        assert abs(np.angle(np.exp(1j * turn))) < 0.2
+    assert sorted(path.name for path in place.iterdir()) == ["frames.tif", "restored.tif", "restored.tif.manifest.json"]
+
+
+def test_window_is_what_the_functions_make_of_its_frames(place):
+    frames = rsv.read_stack(place / "frames.tif", full_scale=4095)[8:11]
+    found = rsv.detect_vibration(frames, TIMING, **OPTIONS["detection"])
+    expected = rsv.restore(frames[:2], TIMING, found.vibration, method="dewarp", check=False)
+    restored = rsv.read_stack(place / "restored.tif")
+    torch.testing.assert_close(restored[8:10], expected.clamp(0, 1), atol=0.6 / 4095, rtol=0)
+
+
+@pytest.mark.parametrize("options", [{"workers": 3}, {"memory": "900MB", "workers": 8}, {"bad_frames": "skip"}])
+def test_result_depends_on_neither_workers_nor_memory_nor_staging(place, tmp_path, options):
+    threads = torch.get_num_threads()
+    process_small(place / "frames.tif", tmp_path / "restored.tif", **options)
+    assert (tmp_path / "restored.tif").read_bytes() == (place / "restored.tif").read_bytes()
+    old, new = (read_manifest(folder / "restored.tif.manifest.json") for folder in (place, tmp_path))
+    assert new.windows == old.windows
+    assert torch.get_num_threads() == threads
+
+
+@pytest.mark.parametrize("ending", [".npy", ".raw", ".h5", ".zarr", ""])
+def test_every_format_holds_the_same(place, tmp_path, ending):
+    sink = tmp_path / f"restored{ending}"
+    process_small(place / "frames.tif", sink)
+    reader = open_stack(sink)
+    frames = np.stack([reader.frame(index) for index in range(FRAMES)])
+    np.testing.assert_array_equal(frames, tifffile.imread(place / "restored.tif"))
+    assert reader.info.full_scale == (None if ending == ".npy" else 4095)
+    reader.close()
+    expected = {sink.name, f"{sink.name}.manifest.json"} | ({"restored.raw.json"} if ending == ".raw" else set())
+    assert {path.name for path in tmp_path.iterdir()} == expected
+
+
+def test_compressed_tiff(place, tmp_path):
+    process_small(place / "frames.tif", tmp_path / "restored.tif", compression="zlib")
+    with tifffile.TiffFile(tmp_path / "restored.tif") as tif:
+        assert tif.pages[0].compression.name == "ADOBE_DEFLATE"
+    np.testing.assert_array_equal(*(tifffile.imread(folder / "restored.tif") for folder in (place, tmp_path)))
+    with pytest.raises(ValueError, match="compression is a choice for TIFF files only"):
+        process_small(place / "frames.tif", tmp_path / "restored.npy", compression="zlib")
+
+
+def test_iterator_gives_windows_as_they_come(place):
+    options = {name: OPTIONS[name] for name in ("window", "detection", "restoration", "workers")}
+    windows = rsv.iterate_stack(place / "frames.tif", TIMING, full_scale=4095, **options)
+    first = next(windows)
+    assert first.indices == (0, 1)
+    restored = rsv.read_stack(place / "restored.tif")
+    torch.testing.assert_close(first.frames.clamp(0, 1), restored[:2], atol=0.6 / 4095, rtol=0)
+    assert sum(len(result.indices) for result in windows) == FRAMES - 2
+    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("rsvib")]
+
+
+def test_one_image_from_every_window(place, tmp_path):
+    report = process_small(place / "frames.tif", tmp_path / "joint.npy", restoration={"joint": True}, window=5)
+    assert report.frames == report.windows == 4
+    joint = np.load(tmp_path / "joint.npy") / 4095
+    assert joint.shape == (4, HEIGHT, WIDTH)
+    assert min(decibel(image, STILL, 12) for image in joint) > 28
+
+
+def test_detections_of_windows_restore_another_time(place, tmp_path):
+    shared = {name: OPTIONS[name] for name in ("window", "detection", "workers")}
+    detect_stack(place / "frames.tif", tmp_path / "manifest.json", TIMING, full_scale=4095, **shared)
+    manifest = read_manifest(tmp_path / "manifest.json")
+    assert all(record.written == 0 and record.detection for record in manifest.windows)
+    process_small(place / "frames.tif", tmp_path / "restored.tif", given=manifest.detections(), detection=None)
+    assert (tmp_path / "restored.tif").read_bytes() == (place / "restored.tif").read_bytes()
+    with pytest.raises(ValueError, match="8 detections for 6 windows of at most 4 frames"):
+        process_small(place / "frames.tif", tmp_path / "other.tif", given=manifest.detections(), window=4)
+
+
+@pytest.mark.parametrize("choice", ["pass", "skip"])
+def test_bad_frames_are_flagged_and_the_others_restored(place, tmp_path, choice):
+    counts = tifffile.imread(place / "frames.tif").astype(np.float32) / 4095
+    counts[5] = 0.5  # constant
+    counts[12, 3, 4] = np.inf
+    counts[14] = np.nan
+    np.save(tmp_path / "frames.npy", counts)
+    with (tmp_path / "frames.npy").open("r+b") as file:
+        file.truncate((tmp_path / "frames.npy").stat().st_size - 100)  # the last frame
+    report = process_small(tmp_path / "frames.npy", tmp_path / "out.npy", bad_frames=choice, window=9)
+    manifest = read_manifest(report.manifest)
+    assert list(manifest.bad_frames) == ["5", "12", "14", "16"]
+    assert "constant" in manifest.bad_frames["5"]
+    assert "pixel (12, 3, 4) is inf" in manifest.bad_frames["12"]
+    assert "0.0% of pixels" in manifest.bad_frames["14"]
+    assert "frame 16 lies beyond the end of the file" in manifest.bad_frames["16"]
+    out = np.load(tmp_path / "out.npy")
+    good = [index for index in range(FRAMES) if str(index) not in manifest.bad_frames]
+    if choice == "skip":
+        assert len(out) == report.frames == FRAMES - 4
+        restored = out
+    else:
+        np.testing.assert_array_equal(out[[5, 12, 14]], counts[[5, 12, 14]])
+        assert np.isnan(out[16]).all()
+        restored = out[good]
+    assert report.bad_frames == 4
+    assert report.failed == 0
+    assert min(decibel(frame, STILL, 12) for frame in restored) > 28
+
+
+def test_window_without_two_good_frames_passes_as_taken(place, tmp_path):
+    counts = tifffile.imread(place / "frames.tif")
+    counts[5:8] = 7
+    np.save(tmp_path / "frames.npy", counts)
+    report = process_small(tmp_path / "frames.npy", tmp_path / "out.npy")
+    assert report.failed == 2
+    out = np.load(tmp_path / "out.npy")
+    np.testing.assert_array_equal(out[4:8], counts[4:8])
+    assert (out[:4] != counts[:4]).any()
+    records = read_manifest(report.manifest).windows
+    assert [record.frames for record in records].index("as taken") == 2
+    for record, frame in zip(records[2:4], (5, 6), strict=True):
+        assert (record.frames, record.detection) == ("as taken", None)
+        assert record.error.startswith(f"frame {frame} is constant")
+
+
+def test_stack_in_which_nothing_can_be_detected_leaves_nothing(tmp_path):
+    np.save(tmp_path / "frames.npy", np.full((40, 64, 64), 9, np.uint8))
+    with pytest.raises(ValueError, match="frame 0 is constant"):
+        rsv.process_stack(tmp_path / "frames.npy", tmp_path / "new" / "deep" / "out.npy", TIMING, window=3)
+    assert [path.name for path in tmp_path.iterdir()] == ["frames.npy"]
+
+
+def test_frame_times_of_the_file_are_used_and_kept(place, tmp_path):
+    counts = tifffile.imread(place / "frames.tif")
+    kept = [index for index in range(FRAMES) if index not in (3, 10, 11)]  # dropped frames
+    times = [index * TIMING.frame_period for index in kept]
+    (tmp_path / "frames.raw").write_bytes(counts[kept].astype(">u2").tobytes())
+    sidecar = {
+        "format": "rsvib raw",
+        "version": 1,
+        "shape": [len(kept), HEIGHT, WIDTH],
+        "axes": "THW",
+        "dtype": "uint16",
+        "byte_order": "big",
+        "full_scale": 4095,
+        "frame_times": times,
+        "resolution": [100.0, 50.0, "centimeter"],
+    }
+    (tmp_path / "frames.raw.json").write_text(json.dumps(sidecar))
+    for name in ("out.h5", "out.tif"):
+        report = process_small(tmp_path / "frames.raw", tmp_path / name)
+        info = rsv.read_stack_info(tmp_path / name)
+        assert info.frame_times == pytest.approx(times)
+        assert info.resolution == pytest.approx((100.0, 50.0), abs=1e-3) or info.resolution[2] == "centimeter"
+    records = read_manifest(report.manifest).windows
+    assert [r.start_time for r in records] == pytest.approx([times[r.first] for r in records])
+    restored = rsv.read_stack(tmp_path / "out.tif").numpy()
+    assert sorted(decibel(frame, STILL, 12) for frame in restored)[1] > 38  # frames next to the gaps, too
+    for record in records:
+        found = record.detection.vibration
+        turn = 2 * np.pi * MOTION.frequency[0] * record.start_time + MOTION.phase[0] - found.phase[0][0]
+        assert abs(np.angle(np.exp(1j * turn))) < 0.2
+        assert found.amplitude[0][0] == pytest.approx(MOTION.amplitude[0], rel=0.1)
+
+
+def test_memory_is_read_and_kept_to():
+    info = rsv.StackInfo((1000, 1024, 1024), "uint16", 4095.0)
+    assert [windows_at_once(info, 8, memory=parse_memory(text), most=16) for text in ("1.2GB", "2GB", "8 GB")] == [
+        1,
+        2,
+        11,
+    ]
+    with pytest.raises(ValueError, match=r"memory of 0.5 GB is too little: a window of 8 frames of 1024 x 1024 px"):
+        windows_at_once(info, 8, memory=parse_memory("500MB"), most=16)
+    for text in ("much", "-1GB", "0", "2 GBB", ""):
+        with pytest.raises(ValueError, match="memory must be like '2GB'"):
+            parse_memory(text)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"window": 1}, ValueError, "window must be at least 2, got 1"),
+        ({"workers": 0}, ValueError, "workers must be at least 1, got 0"),
+        ({"bad_frames": "drop"}, ValueError, "bad_frames must be one of 'pass', 'skip'"),
+        ({"device": "tpu"}, ValueError, "device must be one of"),
+        ({"detection": {"window": 4}}, TypeError, "a stack is cut into windows by window="),
+        ({"detection": {"bands": 4}}, TypeError, "bands"),
+        ({"restoration": {"method": "magic"}}, ValueError, "method must be one of"),
+        ({"memory": "1KB"}, ValueError, "is too little"),
+    ],
+)
+def test_wrong_options_leave_nothing(place, tmp_path, options, error, message):
+    with pytest.raises(error, match=message):
+        process_small(place / "frames.tif", tmp_path / "out.tif", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_stack_is_not_written_over_itself(place):
+    with pytest.raises(ValueError, match="a stack cannot be written over itself"):
+        process_small(place / "frames.tif", place / "frames.tif")
+
+
+def test_colour_and_axis_order_are_kept(place, tmp_path):
+    grey = tifffile.imread(place / "frames.tif")[:5]
+    colour = np.stack([grey, grey // 2, grey // 4], axis=-1)
+    tifffile.imwrite(tmp_path / "colour.tif", colour, photometric="rgb", metadata=None, resolution=(300, 300))
+    process_small(tmp_path / "colour.tif", tmp_path / "out.tif")
+    process_small(tmp_path / "colour.tif", tmp_path / "out.zarr")
+    out = tifffile.imread(tmp_path / "out.tif")
+    assert out.shape == colour.shape
+    reader = open_stack(tmp_path / "out.zarr")
+    assert reader.info.stored_axes == "THWC"
+    np.testing.assert_array_equal(np.moveaxis(out[3], -1, 0), reader.frame(3))
+    write_stack(tmp_path / "one.tif", torch.rand(2, 1, 8, 9), dtype="float32")
+    assert tifffile.imread(tmp_path / "one.tif").size == 144
