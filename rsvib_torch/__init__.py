@@ -1,7 +1,14 @@
 """See and undo the vibration of a rolling-shutter camera."""
 
 from rsvib_torch.calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
-from rsvib_torch.detection import DetectionResult, VibrationDetector, VibrationStd, detect_vibration
+from rsvib_torch.detection import (
+    DetectionResult,
+    MotionDetection,
+    VibrationDetector,
+    VibrationStd,
+    detect_motion,
+    detect_vibration,
+)
 from rsvib_torch.evaluation import (
     MtfCurve,
     SlantedEdge,
@@ -11,6 +18,7 @@ from rsvib_torch.evaluation import (
     slanted_edge_mtf,
     ssim,
 )
+from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.imaging import Optics, RowVaryingBlur, SensorNoise, row_psf, simulate_frames
 from rsvib_torch.registration import OffsetCurve, register_bands
 from rsvib_torch.restoration import (
@@ -38,6 +46,8 @@ from rsvib_torch.vibration import Vibration, blind_frequencies
 
 __all__ = [
     "DetectionResult",
+    "FreeMotion",
+    "MotionDetection",
     "MtfCurve",
     "OffsetCurve",
     "Optics",
@@ -57,6 +67,7 @@ __all__ = [
     "blind_frequencies",
     "calibrate_row_time",
     "calibrate_row_time_by_exposure",
+    "detect_motion",
     "detect_vibration",
     "find_slanted_edges",
     "iterate_stack",

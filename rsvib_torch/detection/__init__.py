@@ -1,6 +1,15 @@
 """From offsets to a vibration."""
 
 from rsvib_torch.detection.detect import DetectionMethod, VibrationDetector, detect_vibration
+from rsvib_torch.detection.freeform import MotionDetection, detect_motion
 from rsvib_torch.detection.result import DetectionResult, VibrationStd
 
-__all__ = ["DetectionMethod", "DetectionResult", "VibrationDetector", "VibrationStd", "detect_vibration"]
+__all__ = [
+    "DetectionMethod",
+    "DetectionResult",
+    "MotionDetection",
+    "VibrationDetector",
+    "VibrationStd",
+    "detect_motion",
+    "detect_vibration",
+]

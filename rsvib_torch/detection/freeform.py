@@ -1,0 +1,231 @@
+"""Motion of any shape from consecutive frames, with what cannot be known of it."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.checks import check_whole_number
+from rsvib_torch.detection.detect import measurements_of_curve
+from rsvib_torch.detection.direct import (
+    _frames_in_group,
+    _Group,
+    _join,
+    _standardised,
+    _unexplained,
+    groups_of,
+    independent_fraction,
+    measure_group,
+)
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.spline_fit import SplineFit, fit_spline
+from rsvib_torch.free_motion import FreeMotion
+from rsvib_torch.orientation import (
+    as_float_frames,
+    frames_to_row_order,
+    offsets_from_row_order,
+    vibration_from_row_order,
+)
+from rsvib_torch.registration import Registration
+from rsvib_torch.registration.gradients import RowSpectra  # type: ignore[attr-defined, unused-ignore]
+from rsvib_torch.registration.register import register_rows
+from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.vibration import Vibration
+
+__all__ = ["MotionDetection", "detect_motion"]
+
+_MOST_KNOTS = 3000
+_LOOKS = 32  # rows of a frame at which the motion is reported
+_EXPLAINED = 0.15  # of the motion that rows may show beyond the fit
+_FINEST = 0.03  # px, that never matters
+_SURE = 0.3  # px
+_FAR = 0.25  # of the frame, from where on a steady motion is that of the image
+
+
+@dataclass(frozen=True, eq=False)
+class MotionDetection:
+    """A motion of any shape, and how well it is known.
+
+    Rows tell how far they moved between frames. What repeats in every frame they do not tell: there
+    smoothness decides, and ``std`` is larger than ``std_seen``. The mean over the record is never known, nor counted.
+
+    Attributes:
+        motion: The motion in image axes.
+        times: (T, R) s, mid-exposures of rows spread over the frames.
+        displacement: (T, R, 2) px, the motion there, less its mean over the record.
+        std: (T, R, 2) px, standard deviation of that.
+        std_seen: (2,) px, root mean square of the standard deviation of what rows tell: the displacement less its
+            mean over the frames, row by row.
+        unseen: (2,) px, root mean square of the standard deviation of what repeats in every frame.
+        unexplained: (2,) px, rms displacement of rows that the motion does not explain, beyond their noise.
+        reliable: (2,) bool, whether the motion explains what the rows show.
+        reasons: Why not, for each axis (x, y).
+    """
+
+    motion: FreeMotion
+    times: Tensor
+    displacement: Tensor
+    std: Tensor
+    std_seen: Tensor
+    unseen: Tensor
+    unexplained: Tensor
+    reliable: Tensor
+    reasons: tuple[tuple[str, ...], tuple[str, ...]]
+
+
+def detect_motion(
+    frames: Tensor,
+    timing: SensorTiming,
+    *,
+    registration: Registration = "ncc",
+    knot_rows: int = 24,
+    iterations: int = 4,
+    band_rows: int = 32,
+    band_step: int = 16,
+    search: int = 16,
+    full_scale: float | None = None,
+) -> MotionDetection:
+    """Detect a motion of any shape from consecutive frames: the free model.
+
+    Row bands are registered between frames for a start. Then the frames are warped to the scene with the motion found
+    so far, every block of rows tells what it still misses in each frame, and a spline in time is fitted to all
+    of them, its smoothness chosen by the data.
+
+    Args:
+        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames; floats, or integers of known full scale.
+        timing: The sensor.
+        registration: ``"ncc"``, ``"phase"`` or ``"projection"``, for the start.
+        knot_rows: Rows read from one knot of the spline to the next: tones up to ``1 / (2 knot_rows T_row)`` fit in.
+            Long stacks take more, so that there are 3000 knots at most.
+        iterations: Rounds of measuring and fitting.
+        band_rows: Rows of a band of the start.
+        band_step: Rows from one band to the next.
+        search: Search range of the start in px around the whole-frame offset.
+        full_scale: Count that means 1.0, for integer frames.
+
+    Returns:
+        The motion in image axes with its uncertainty over time.
+
+    Raises:
+        TypeError: If frames are not numbers.
+        ValueError: If there are fewer than two frames, they are a batch, a frame is constant, the motion is beyond the
+            search range, or an option is out of range.
+    """
+    images = as_float_frames(frames, full_scale, minimum_frames=2)
+    if images.ndim == 5:
+        raise ValueError(f"detect_motion takes one stack, got a batch of shape {tuple(images.shape)}")
+    check_whole_number("knot_rows", knot_rows, at_least=4)
+    check_whole_number("iterations", iterations, at_least=1)
+    images = frames_to_row_order(images, timing)
+    grey = (images.mean(-3) if images.ndim == 4 else images)[None]
+    flat = grey[0].flatten(1).std(-1) <= 1e-7 * grey[0].flatten(1).abs().amax(-1)
+    if bool(flat.any()):
+        raise ValueError(f"frame {int(flat.nonzero()[0])} is constant: without detail there is nothing to register")
+    rowwise = timing.in_row_order()
+    rowwise.check_rows(grey.shape[-2])
+    curve = register_rows(
+        grey[:, :, None], rowwise, method=registration, band_rows=band_rows, band_step=band_step, search=search
+    )
+    found = float(curve.good.double().mean())
+    if found < 0.25:
+        raise ValueError(
+            f"only {found:.0%} of the row bands are found in the next frame: the motion is beyond search={search} px "
+            "within a frame, or the frames show different scenes"
+        )
+    starts = rowwise.frame_starts(grey.shape[1], grey.device)
+    record = (float(starts[0]), float(starts[-1]) + grey.shape[-2] * rowwise.row_time + rowwise.exposure_time)
+    spacing = max(knot_rows * rowwise.row_time, (record[1] - record[0]) / _MOST_KNOTS)
+    size = (grey.shape[-2], grey.shape[-1])
+    measured = measurements_of_curve(curve, rowwise, band_step)
+    fit = fit_spline(measured, max(spacing, 0.5 * band_rows * rowwise.row_time), record)
+    motion = _motion(fit, size, 0.0)
+    even = _standardised(grey, None)
+    members = groups_of(grey.shape[1], _frames_in_group(motion, starts[None], size))
+    groups = [_Group(RowSpectra(even[:, m.start : m.stop]), starts[None, m.start : m.stop]) for m in members]
+    for step in range(iterations):
+        measured = _join([measure_group(group, rowwise, motion, None)[0] for group in groups])
+        if step:  # blocks that show something that moves by itself have less say
+            measured = measured.reweighted(_left(measured, motion))
+        fit = fit_spline(measured, spacing, record)
+        motion = _motion(fit, size, 0.0)  # groups follow the image as it moves on
+    left = _left(measured, motion)
+    honest = 1 / math.sqrt(independent_fraction(measured, left))
+    return _report(_motion(fit, size, _FAR), fit, measured, left, honest, timing, starts, size[0])
+
+
+def _left(measured: Measurements, motion: FreeMotion) -> Tensor:
+    """What a motion leaves of the displacements (1, N, G, 2)."""
+    one = FreeMotion(motion.coefficients[0], motion.start, motion.spacing, motion.tones[0])
+    predicted = one.mean_displacement(measured.moments, measured.exposure_time)
+    return measured.relative(measured.displacements - predicted)
+
+
+def _motion(fit: SplineFit, size: tuple[int, int], far: float) -> FreeMotion:
+    """The spline as a motion that is a batch of one; an image motion of ``far`` frames in the record is told apart."""
+    knots = fit.knots
+    apart = knots - knots.mean()
+    speed = (fit.coefficients * apart).sum(-1) / apart.square().sum()
+    extent = torch.tensor([size[1], size[0]], dtype=torch.float64, device=knots.device)
+    speed = torch.where(speed.abs() * float(knots[-1] - knots[0]) > far * extent, speed, 0.0)
+    drift = Vibration(torch.zeros_like(speed)[None, :, None], 0.0, 0.0, speed[None])
+    return FreeMotion((fit.coefficients - speed[:, None] * knots)[None], fit.start, fit.spacing, drift)
+
+
+def _report(
+    motion: FreeMotion,
+    fit: SplineFit,
+    measured: Measurements,
+    left: Tensor,
+    honest: float,
+    timing: SensorTiming,
+    starts: Tensor,
+    num_rows: int,
+) -> MotionDetection:
+    """The motion in image axes and how well it is known at some rows of every frame."""
+    rows = torch.linspace(0, num_rows - 1, min(_LOOKS, num_rows), dtype=torch.float64, device=starts.device)
+    times = starts[:, None] + rows * timing.row_time + 0.5 * timing.exposure_time
+    stds, seen, unseen = [], [], []
+    for axis in range(2):
+        columns = fit.columns(times.flatten()).unflatten(0, times.shape)
+        centred = columns - columns.mean((0, 1))
+        apart = columns - columns.mean(0)
+        variance, variance_seen = (
+            honest**2 * torch.einsum("trp,pq,trq->tr", c, fit.covariance[axis], c).clamp(min=0.0)
+            for c in (centred, apart)
+        )
+        stds.append(variance.sqrt())
+        seen.append(variance_seen.mean().sqrt())
+        common = centred.mean(0)
+        unseen.append(honest * torch.einsum("rp,pq,rq->r", common, fit.covariance[axis], common).mean().sqrt())
+    unexplained = _unexplained(measured, left)[0]
+    value = motion[0].displacement(times)
+    value = value - value.mean((0, 1))
+    relative = (value - value.mean(0)).square().mean((0, 1)).sqrt()
+    reasons = []
+    for axis in range(2):
+        much, sure, moved = float(unexplained[axis]), float(seen[axis]), float(relative[axis])
+        found = []
+        if much > max(_EXPLAINED * moved, _FINEST):
+            found.append(f"rows move by {much:.3g} px that no smooth motion explains")
+        if sure > _SURE:
+            found.append(f"rows tell the motion to {sure:.3g} px only: they may show different scenes")
+        reasons.append(tuple(found))
+    reliable = torch.tensor([not found for found in reasons], device=unexplained.device)
+    turned = vibration_from_row_order(motion[0], timing)
+    assert isinstance(turned, FreeMotion)
+    swap = timing.scan_axis == -1
+    per_axis = [torch.stack(values, -1) for values in (stds, seen, unseen)]
+    per_axis += [unexplained, reliable]
+    spread, seen_std, unseen_std, rest, good = ((v.flip(-1) if swap else v) for v in per_axis)
+    return MotionDetection(
+        motion=turned,
+        times=times,
+        displacement=offsets_from_row_order(value, timing),
+        std=spread,
+        std_seen=seen_std,
+        unseen=unseen_std,
+        unexplained=rest,
+        reliable=good,
+        reasons=(reasons[1], reasons[0]) if swap else (reasons[0], reasons[1]),
+    )

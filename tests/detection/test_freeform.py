@@ -1,0 +1,153 @@
+"""Motion of any shape from frames of an independent simulator: what can be seen is found, what cannot is said."""
+
+import numpy as np
+import pytest
+import torch
+from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
+
+import rsvib_torch as rsv
+from rsvib_torch.free_motion import FreeMotion
+
+HEIGHT, WIDTH, FRAMES = 256, 160, 9
+TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=270)
+SPAN = FRAMES * TIMING.frame_period
+
+
+class Jitter(Motion):
+    """A settling step along x, a chirp over a drift along y: no sum of sinusoids."""
+
+    def displacement(self, times):
+        place = times / SPAN
+        x = 4 * np.exp(-3 * place) * np.sin(2 * np.pi * 6.1 * place**0.9 + 0.3) + 3 * np.tanh(8 * (place - 0.6))
+        y = 12 * place - 9 * place**2 + 1.5 * np.sin(2 * np.pi * (2 * place + 2.2 * place**2))
+        return np.stack([x, y], axis=-1)
+
+
+def seen(values):
+    """Displacements (T, R, 2) less their mean over the frames, row by row."""
+    return values - values.mean(0)
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values), axis=(0, 1)))
+
+
+@pytest.fixture(scope="module", name="scene")
+def make_scene():
+    return draw_scene(HEIGHT + 2 * MARGIN, WIDTH + 2 * MARGIN, 6)
+
+
+@pytest.fixture(scope="module", name="frames")
+def make_frames(scene):
+    return torch.from_numpy(take_frames(scene, TIMING, Jitter(), FRAMES, 0.005)).float()
+
+
+@pytest.fixture(scope="module", name="found")
+def make_found(frames):
+    return rsv.detect_motion(frames, TIMING)
+
+
+def test_what_can_be_seen_is_found(found):
+    error = found.displacement.numpy() - Jitter().displacement(found.times.numpy())
+    assert (rms(seen(Jitter().displacement(found.times.numpy()))) > 1.0).all()
+    assert (rms(seen(error)) < 0.05).all()
+    assert (rms(error - error.mean((0, 1))) < 0.4).all()
+    assert found.reliable.all()
+    assert found.reasons == ((), ())
+
+
+def test_error_bars_are_honest(found):
+    error = found.displacement.numpy() - Jitter().displacement(found.times.numpy())
+    assert (rms(seen(error)) < 2.5 * found.std_seen.numpy()).all()
+    assert (found.std_seen.numpy() < 0.1).all()
+    assert (rms(error - error.mean((0, 1))) < 2.5 * rms(found.std.numpy())).all()
+    assert (found.unseen > found.std_seen).all()
+    assert found.std.shape == (FRAMES, 32, 2)
+    assert torch.allclose(found.displacement.mean((0, 1)), torch.zeros(2, dtype=torch.float64), atol=1e-9)
+
+
+def test_restoration_comes_within_half_a_decibel_of_the_truth(scene, frames, found):
+    times = (TIMING.row_starts(FRAMES, HEIGHT) + 0.5 * TIMING.exposure_time).numpy()
+    truth = Jitter().displacement(times)
+    error = found.motion.displacement(torch.from_numpy(times)).numpy() - truth
+    common = truth + seen(error)  # what repeats in every frame cannot be seen
+    best, here = (
+        decibel(
+            rsv.restore(frames, TIMING, FreeMotion.from_samples(times.ravel(), d.reshape(-1, 2))).numpy(), crop(scene)
+        )
+        for d in (truth, common)
+    )
+    assert here > best - 0.5
+    assert decibel(frames.numpy(), crop(scene)) < best - 15
+
+
+def test_colour_and_scan_along_columns(scene, found):
+    timing = rsv.SensorTiming(TIMING.row_time, 20, TIMING.frame_rows, scan_axis=-1, readout_direction="reverse")
+    frames = torch.from_numpy(take_frames(scene, TIMING, Jitter(), FRAMES, 0.005)).float()
+    turned = frames.flip(-2).transpose(-2, -1)
+    other = rsv.detect_motion(turned[:, None].expand(-1, 3, -1, -1), timing)
+    expected = found.displacement.flip(-1) * torch.tensor([-1.0, 1.0])
+    assert (other.displacement - expected).abs().amax() < 1e-3
+    assert torch.allclose(other.std, found.std.flip(-1), rtol=1e-3)
+
+
+def test_image_motion_is_told_apart(scene):
+    wide = draw_scene(HEIGHT + 2 * MARGIN + 160, WIDTH + 2 * MARGIN + 160, 6)
+
+    class Scan(Motion):
+        def displacement(self, times):
+            wave = 1.5 * np.sin(2 * np.pi * 5.3 * times / SPAN)
+            return np.stack([wave, -500.0 * (times - 0.5 * SPAN)], axis=-1)
+
+    frames = take_frames(wide, TIMING, Scan(), FRAMES, 0.005, margin=MARGIN + 80)
+    found = rsv.detect_motion(torch.from_numpy(frames).float(), TIMING)
+    assert found.motion.image_motion[1] == pytest.approx(-500.0, rel=5e-3)
+    error = found.displacement.numpy() - Scan().displacement(found.times.numpy())
+    assert (rms(seen(error - error.mean((0, 1)))) < 0.1).all()
+
+
+def test_one_pair_is_enough_for_a_slow_motion(scene):
+    class Slow(Motion):
+        def displacement(self, times):
+            return np.stack([30.0 * times, 2 * np.sin(20 * times)], axis=-1)
+
+    frames = take_frames(scene, TIMING, Slow(), 2, 0.002)
+    found = rsv.detect_motion(torch.from_numpy(frames).float(), TIMING)
+    error = found.displacement.numpy() - Slow().displacement(found.times.numpy())
+    assert (rms(seen(error - error.mean((0, 1)))) < 0.02).all()
+
+
+def test_a_scene_that_changes_is_not_reliable():
+    frames = np.stack([draw_scene(HEIGHT, WIDTH, seed) for seed in range(4)])
+    try:
+        found = rsv.detect_motion(torch.from_numpy(frames).float(), TIMING)
+    except ValueError as error:
+        assert "row bands are found" in str(error)  # noqa: PT017
+    else:
+        assert not found.reliable.any()
+
+
+@pytest.mark.parametrize(
+    ("frames", "options", "message"),
+    [
+        (torch.rand(1, 64, 64), {}, "at least 2 frames"),
+        (torch.rand(2, 2, 1, 64, 64), {}, "takes one stack"),
+        (torch.rand(2, 64, 64), {"knot_rows": 1}, "knot_rows"),
+        (torch.rand(2, 64, 64), {"iterations": 0}, "iterations"),
+        (torch.full((2, 64, 64), 0.5), {}, "frame 0 is constant"),
+        (torch.rand(2, 300, 64), {}, "frame_rows=270"),
+    ],
+)
+def test_bad_input_is_named(frames, options, message):
+    with pytest.raises(ValueError, match=message):
+        rsv.detect_motion(frames, TIMING, **options)
+
+
+def test_motion_beyond_the_search_range_is_named(scene):
+    class Far(Motion):
+        def displacement(self, times):
+            return np.stack([30 * np.sin(2 * np.pi * times / TIMING.frame_period * 0.7), 0 * times], axis=-1)
+
+    frames = take_frames(scene, TIMING, Far(), 3, 0.005)
+    with pytest.raises(ValueError, match="search=4 px"):
+        rsv.detect_motion(torch.from_numpy(frames).float(), TIMING, search=4)
