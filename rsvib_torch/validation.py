@@ -82,6 +82,8 @@ def _describe(model: type[BaseModel], data: Any, mistake: Any) -> tuple[str, str
     for step in mistake["loc"]:
         if isinstance(value, Mapping) and isinstance(step, str):
             known = _table(expected)
+            if step not in value and step not in known:
+                break  # it names a member of a union
             path = f"{path}.{step}" if path else step
             if step not in value:
                 return path, f"missing key; expected {_words(known[step])}"

@@ -121,7 +121,15 @@ def test_run_does_all_of_it_and_again(place, tmp_path):
     out = tmp_path / "out"
     for _ in range(2):
         assert run("run", place / "frames.tif", out, "--config", place / "camera.toml") == 0
-    names = ["before_after.png", "manifest.json", "offsets.csv", "offsets.png", "restoration.json", "restored.tif", "vibration.json"]
+    names = [
+        "before_after.png",
+        "manifest.json",
+        "offsets.csv",
+        "offsets.png",
+        "restoration.json",
+        "restored.tif",
+        "vibration.json",
+    ]
     assert sorted(path.name for path in out.iterdir()) == names
     check_detection(out)
     assert min(psnr(read_stack(out / "restored.tif"), still_frame(place))) > 38

@@ -96,6 +96,7 @@ VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
         (SENSOR + "frame_start_times = [0, 'a']", "sensor.frame_start_times[1]: expected a number, got 'a'"),
         (SENSOR + "[detection]\nband_rows = 32.5", "detection.band_rows: expected a whole number, got 32.5"),
         (SENSOR + "[detection]\ntones = 'few'", "detection.tones: expected"),
+        (SENSOR + "[detection.tones]\nx = 2", "detection.tones: expected"),
         (SENSOR + "[detection]\nregistration = 'sift'", "detection.registration: expected 'projection' or 'ncc' or"),
         (SENSOR + "[detection]\nfull_scale = 9", "detection.full_scale: unknown key; expected one of method,"),
         (SENSOR + "[restoration]\nmethod = 'magic'", "restoration.method: expected '"),
