@@ -2,10 +2,12 @@
 
 from rsvib_torch.calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
 from rsvib_torch.detection import (
+    ClockAlignment,
     DetectionResult,
     MotionDetection,
     VibrationDetector,
     VibrationStd,
+    align_motion,
     detect_motion,
     detect_vibration,
 )
@@ -20,6 +22,7 @@ from rsvib_torch.evaluation import (
 )
 from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.imaging import Optics, RowVaryingBlur, SensorNoise, row_psf, simulate_frames
+from rsvib_torch.motion_file import read_motion
 from rsvib_torch.registration import OffsetCurve, register_bands
 from rsvib_torch.restoration import (
     RestorationVerdict,
@@ -40,11 +43,13 @@ from rsvib_torch.stacks import (
     process_stack,
     read_stack,
     read_stack_info,
+    restore_block,
     write_stack,
 )
 from rsvib_torch.vibration import Vibration, blind_frequencies
 
 __all__ = [
+    "ClockAlignment",
     "DetectionResult",
     "FreeMotion",
     "MotionDetection",
@@ -64,6 +69,7 @@ __all__ = [
     "VibrationDetector",
     "VibrationRestorer",
     "VibrationStd",
+    "align_motion",
     "blind_frequencies",
     "calibrate_row_time",
     "calibrate_row_time_by_exposure",
@@ -77,10 +83,12 @@ __all__ = [
     "predict_noise_gain",
     "process_stack",
     "psnr",
+    "read_motion",
     "read_stack",
     "read_stack_info",
     "register_bands",
     "restore",
+    "restore_block",
     "row_psf",
     "simulate_frames",
     "slanted_edge_mtf",

@@ -1,6 +1,7 @@
 """Stacks of frames in files: TIFF, PNG, NumPy, Zarr, HDF5, raw and video."""
 
 from rsvib_torch.stacks.atomic import check_writable, whole_file, whole_folder
+from rsvib_torch.stacks.blocks import restore_block
 from rsvib_torch.stacks.files import check_stack_target, open_stack, read_stack, read_stack_info, write_stack
 from rsvib_torch.stacks.formats import FrameReader, FrameWriter, StackFormat, register_format
 from rsvib_torch.stacks.info import FrameError, StackInfo
@@ -34,6 +35,7 @@ __all__ = [
     "read_stack",
     "read_stack_info",
     "register_format",
+    "restore_block",
     "restore_trusted",
     "timing_keys",
     "whole_file",

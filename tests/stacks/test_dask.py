@@ -1,0 +1,122 @@
+"""Dask as the engine: the same bytes as here, lost workers replaced; and blocks of Dask arrays."""
+
+import os
+import signal
+import sys
+
+import dask.array
+import distributed
+import numpy as np
+import pytest
+import tifffile
+from small_stack import FRAMES, OPTIONS, STILL, TIMING, process_small, write_small
+from truth import decibel
+
+import rsvib_torch as rsv
+from rsvib_torch.stacks import read_manifest
+
+
+@pytest.fixture(scope="module", name="place")
+def make_place(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stack")
+    write_small(folder / "frames.tif")
+    process_small(folder / "frames.tif", folder / "out.tif")
+    return folder
+
+
+def check_same(place, folder):
+    assert (folder / "out.tif").read_bytes() == (place / "out.tif").read_bytes()
+    ours, theirs = (read_manifest(path / "out.tif.manifest.json") for path in (place, folder))
+    assert theirs == ours
+
+
+def test_dask_workers_give_the_same_bytes(place, tmp_path):
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, protocol="inproc"
+    ) as cluster:
+        process_small(place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address)
+    check_same(place, tmp_path)
+
+
+def test_run_of_threads_resumes_with_dask(place, tmp_path):
+    def stop(done, total):
+        if done > FRAMES // 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        process_small(place / "frames.tif", tmp_path / "out.tif", progress=stop)
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, protocol="inproc"
+    ) as cluster:
+        report = process_small(
+            place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address, resume=True
+        )
+    assert report.resumed > 2
+    check_same(place, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_local_processes_and_a_worker_that_is_killed(place, tmp_path):
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        pids = [worker.pid for worker in cluster.workers.values()]
+        seen = []
+
+        def kill(done, total):
+            seen.append(done)
+            if len(seen) == 2:
+                with distributed.Client(cluster, set_as_default=False) as client:
+                    os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
+
+        process_small(place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address, progress=kill)
+        assert len(pids) == 2
+    check_same(place, tmp_path)
+
+
+@pytest.mark.slow
+def test_local_scheduler_starts_workers_of_its_own(place, tmp_path):
+    process_small(place / "frames.tif", tmp_path / "out.tif", scheduler="local", workers=2)
+    check_same(place, tmp_path)
+
+
+def test_scheduler_that_is_not_there_and_package_that_is_missing(place, tmp_path, monkeypatch):
+    with pytest.raises(OSError, match="no Dask scheduler answers at nonsense://x"):
+        process_small(place / "frames.tif", tmp_path / "out.tif", scheduler="nonsense://x")
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ModuleNotFoundError, match=r"needs the package distributed; install rsvib_torch\[distributed\]"):
+        process_small(place / "frames.tif", tmp_path / "out.tif", scheduler="local")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_blocks_of_a_dask_array(place):
+    counts = tifffile.imread(place / "frames.tif")
+    array = dask.array.from_array(counts, chunks=(6, -1, -1))
+    options = {name: OPTIONS[name] for name in ("detection", "restoration")}
+    restored = array.map_overlap(
+        rsv.restore_block,
+        depth={0: 1},
+        boundary="none",
+        dtype=array.dtype,
+        meta=array._meta,
+        timing=TIMING,
+        full_scale=4095,
+        **options,
+    )
+    frames = restored.compute(scheduler="synchronous")
+    assert (frames.shape, frames.dtype) == (counts.shape, counts.dtype)
+    assert min(decibel(frame / 4095, STILL, 12) for frame in frames) > 34
+    block = counts[5:13]  # what map_overlap hands on
+    np.testing.assert_array_equal(rsv.restore_block(block, TIMING, full_scale=4095, **options)[1:-1], frames[6:12])
+
+
+def test_blocks_that_cannot_be_restored(place):
+    counts = tifffile.imread(place / "frames.tif")[:3]
+    for block in (counts[:1], np.zeros_like(counts)):
+        assert rsv.restore_block(block, TIMING, full_scale=4095) is block
+    with pytest.raises(ValueError, match="joint=True makes one image of a block"):
+        rsv.restore_block(counts, TIMING, full_scale=4095, restoration={"joint": True})
+    uneven = rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 0.1, 0.3])
+    with pytest.raises(ValueError, match="must not have frame_start_times"):
+        rsv.restore_block(counts, uneven, full_scale=4095)
+    with pytest.raises(ValueError, match="do not say their full scale"):
+        rsv.restore_block(counts, TIMING)
