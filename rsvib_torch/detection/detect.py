@@ -177,14 +177,15 @@ def detect_vibration(
             where = (share < _LEAST_FRAME).nonzero()[0].tolist()
             raise ValueError(f"frame {where[-1]} has only {share[*where]:.1%} of pixels that count")
         frames = fill_roughly(frames, ~valid[:, :, None].expand(frames.shape))
-    flat = frames.flatten(-3).std(-1) <= 1e-7 * frames.flatten(-3).abs().amax(-1)
+    low, high = frames.amin((-3, -2, -1)), frames.amax((-3, -2, -1))
+    flat = high - low <= 1e-6 * torch.maximum(low.abs(), high.abs())
     if bool(flat.any()):
         where = flat.nonzero()[0].tolist()
         raise ValueError(f"frame {where[-1]} is constant: without detail there is nothing to register")
     count = None if tones == "auto" else tones
     model = MotionModel(harmonics, 2 if image_acceleration else 1)
     options = _Options(method, registration, count, model, band_rows, band_step, search)
-    grey = frames.mean(-3)
+    grey = frames.mean(-3) if frames.shape[-3] > 1 else frames[:, :, 0]
     if window is None:
         result = _detect(grey, valid, timing, options)
         return result if batched else result[0]

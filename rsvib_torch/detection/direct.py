@@ -15,8 +15,9 @@ from rsvib_torch.detection.result import OtherMotion
 from rsvib_torch.detection.selection import find_tones, residual_of, robust_fit, significant_only, strongest_only
 from rsvib_torch.detection.tones import ToneFit
 from rsvib_torch.imaging.coupling import rows_showing
-from rsvib_torch.registration.gradients import MARGIN, RowGradients, RowSpectra, row_gradients, row_shifts
+from rsvib_torch.registration.gradients import RowGradients, row_gradients, row_shifts
 from rsvib_torch.registration.pattern import column_pattern
+from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
@@ -258,7 +259,8 @@ def refine_directly(
             gradients = [None] * len(groups)
     residual = residual_of(measurements, fit)
     weighed = measurements.reweighted(residual)
-    honest = replace(weighed, independent=independent_fraction(weighed, residual))
+    share = independent_fraction(weighed, residual) * measurements.share_counted(residual)
+    honest = replace(weighed, independent=share)
     fit = fit_tones(honest, fit.frequencies, fit.active, model)
     if tones is None:
         fit = significant_only(honest, fit)
@@ -269,8 +271,9 @@ def refine_directly(
 def _standardised(frames: Tensor, valid: Tensor | None) -> Tensor:
     """Frames of mean 0 and variance 1: brightness and contrast may differ from frame to frame."""
     if valid is None:
-        spread, mean = torch.var_mean(frames, dim=(-2, -1), keepdim=True)
-        return (frames - mean) * spread.rsqrt()
+        centred = frames - frames.mean((-2, -1), keepdim=True)
+        size = torch.linalg.vector_norm(centred, dim=(-2, -1), keepdim=True)
+        return centred.mul_(math.sqrt(frames[0, 0].numel()) / size)
     weight = valid.to(frames.dtype)
     count = weight.sum((-2, -1), keepdim=True)
     centred = frames - (frames * weight).sum((-2, -1), keepdim=True) / count

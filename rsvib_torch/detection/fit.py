@@ -1,12 +1,12 @@
 """Weighted fit of tones and an image motion to measured displacements (Eqs. 5-8, generalised)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones import MotionModel, ToneFit, drift_response, tone_response_and_slope
+from rsvib_torch.detection.tones import MotionModel, ToneFit, drift_response, model_displacements, tone_columns
 
 __all__ = ["fit_tones"]
 
@@ -76,42 +76,64 @@ def _tie(model: MotionModel, tones: int, device: torch.device) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Parameters with what they leave: cost (B,), normal matrix (B, M, M), right-hand side (B, M), residual."""
+    """Parameters with what they leave: cost (B,), normal matrix (B, M, M) and right-hand side (B, M)."""
 
     values: Tensor
     cost: Tensor
     matrix: Tensor
     right: Tensor
-    residual: Tensor
 
-    def improved(self, trial: "_State") -> tuple["_State", Tensor]:
-        """The better of two states, stack by stack, and where it is the trial."""
-        better = trial.cost <= self.cost
+    def replaced(self, where: Tensor, other: "_State") -> "_State":
+        """This state, but the other's for the stacks (B,) where that is told."""
 
         def pick(name: str) -> Tensor:
-            new, old = getattr(trial, name), getattr(self, name)
-            return torch.where(better.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
+            new, old = getattr(other, name), getattr(self, name)
+            return torch.where(where.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
 
-        return _State(*(pick(name) for name in self.__dataclass_fields__)), better
+        return _State(*(pick(name) for name in self.__dataclass_fields__))
 
 
-def _evaluate(measurements: Measurements, unknowns: _Unknowns, drift_columns: Tensor, values: Tensor) -> _State:
-    coefficients, hertz, drift = unknowns.unpack(values)
-    response, derivative = tone_response_and_slope(measurements, hertz)
-    predicted = (coefficients[:, None, None] * response).real.sum(-1)
-    predicted = predicted + torch.einsum("bngj,baj->bnga", drift_columns, drift)
-    residual = measurements.relative(measurements.displacements - predicted)
-    slope = (coefficients[:, None, None] * derivative).real
-    columns = torch.stack([response.real, -response.imag, slope], dim=-1).flatten(-2)
-    drifts = drift_columns[..., None, :].expand(*columns.shape[:-1], drift.shape[-1])
-    jacobian = torch.cat([columns, drifts], dim=-1)
-    # one matrix weighs both axes of a row: (B, N, G, axis, axis and parameter)
-    information = measurements.information[:, :, None, :, :, None]
-    weighted = (jacobian[:, :, :, None] * information).flatten(4)
-    matrix = torch.einsum("bngcp,bngcj->bpcj", weighted, jacobian).flatten(2)
-    right = torch.einsum("bngcp,bngc->bp", weighted, residual)
-    cost = measurements.square(residual).sum(-1)
-    return _State(values, cost, unknowns.tie.T @ matrix @ unknowns.tie, right @ unknowns.tie, residual)
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Measurements as least squares of unit variance.
+
+    Attributes:
+        measurements: The displacements.
+        drift_columns: (B, N, G, J), what they see of unit drifts.
+        root: (B, N, 1, 2, 2), upper triangle U with U^T U the information of a row.
+        target: (B, 2 N G) U times the displacements.
+    """
+
+    measurements: Measurements
+    drift_columns: Tensor
+    root: Tensor
+    target: Tensor
+
+    @classmethod
+    def of(cls, measurements: Measurements, model: MotionModel) -> "_Problem":
+        """The problem that measurements pose."""
+        first, both, second = (measurements.information[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        size = first.clamp(min=0.0).sqrt()
+        slant = torch.where(size > 0, both / torch.where(size > 0, size, 1.0), 0.0)
+        rest = (second - slant.square()).clamp(min=0.0).sqrt()
+        root = torch.stack([size, slant, torch.zeros_like(size), rest], -1).unflatten(-1, (2, 2))[:, :, None]
+        target = (root @ measurements.displacements[..., None])[..., 0].flatten(1)
+        return cls(measurements, drift_response(measurements, model.drift_order), root, target)
+
+    def evaluate(self, unknowns: _Unknowns, values: Tensor) -> _State:
+        """The state at parameters ``values`` (B, 2, 3 K + J)."""
+        coefficients, hertz, drift = unknowns.unpack(values)
+        columns = self.measurements.relative(tone_columns(self.measurements, coefficients, hertz).flatten(-2))
+        drifts = self.drift_columns[..., None, :].expand(*columns.shape[:-1], drift.shape[-1])
+        jacobian = torch.cat([columns, drifts], dim=-1)  # (B, N, G, axis, parameter of the axis)
+        whole = (self.root[..., None] * jacobian[..., None, :, :]).flatten(-2)  # (B, N, G, 2, parameter of any axis)
+        whole = whole.flatten(1, 3)
+        linear = torch.where(unknowns.is_frequency, 0.0, values).flatten(1)
+        residual = self.target - (whole @ linear[..., None])[..., 0]
+        tied = whole @ unknowns.tie
+        transposed = tied.transpose(-2, -1)
+        matrix, right = transposed @ tied, (transposed @ residual[..., None])[..., 0]
+        return _State(values, residual.square().sum(-1), matrix, right)
 
 
 def _step(state: _State, keep: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
@@ -149,28 +171,32 @@ def fit_tones(
     """
     model = model or MotionModel()
     unknowns = _Unknowns.of(active, model)
-    drift_columns = drift_response(measurements, model.drift_order)
+    problem = _Problem.of(measurements, model)
     values = frequencies.new_zeros(len(frequencies), 2, len(unknowns.is_frequency))
     values[..., unknowns.is_frequency] = torch.where(active, frequencies, 0.0)
 
-    state = _evaluate(measurements, unknowns, drift_columns, values)
+    state = problem.evaluate(unknowns, values)
     none = torch.zeros_like(state.cost)
     step, _ = _step(state, unknowns.linear, none)
-    state = _evaluate(measurements, unknowns, drift_columns, unknowns.moved(values, step))
+    state = problem.evaluate(unknowns, unknowns.moved(values, step))
     damping = torch.full_like(state.cost, 1e-3)
+    done = torch.zeros_like(state.cost, dtype=torch.bool)  # each stack stops by itself, whatever it is in a batch with
     for _ in range(iterations):
         step, _ = _step(state, unknowns.free, damping)
-        done = (step * state.right).sum(-1) <= _TOLERANCE * state.cost  # what the step promises
-        trial = _evaluate(measurements, unknowns, drift_columns, unknowns.moved(state.values, step))
-        state, better = state.improved(trial)
-        damping = torch.where(better, damping * 0.1, damping * 10.0).clamp(1e-12, 1e6)
+        done = done | ((step * state.right).sum(-1) <= _TOLERANCE * state.cost)  # what the step promises
         if bool(done.all()):
             break
+        trial = problem.evaluate(unknowns, unknowns.moved(state.values, step))
+        better = trial.cost <= state.cost
+        state = state.replaced(better & ~done, trial)
+        damping = torch.where(better, damping * 0.1, damping * 10.0).clamp(1e-12, 1e6)
     _, inverse = _step(state, unknowns.free, none)
     spent = unknowns.free.unflatten(1, (2, -1)).sum(-1)
+    coefficients, hertz, drift = unknowns.unpack(state.values)
+    fit = ToneFit(coefficients, hertz, active, drift, inverse, measurements.centre, model)
+    residual = measurements.displacements - model_displacements(measurements, fit)
     # overlapping bands repeat themselves: the information is that of the independent ones
-    variance = measurements.square(state.residual).clamp(min=0.0) / (measurements.known - spent).clamp(min=1.0)
+    variance = measurements.square(residual).clamp(min=0.0) / (measurements.known - spent).clamp(min=1.0)
     deviation = variance.sqrt().repeat_interleave(values.shape[-1], dim=1)
     covariance = (unknowns.tie @ inverse @ unknowns.tie.T) * deviation[:, :, None] * deviation[:, None]
-    coefficients, hertz, drift = unknowns.unpack(state.values)
-    return ToneFit(coefficients, hertz, active, drift, covariance, measurements.centre, model)
+    return replace(fit, covariance=covariance)

@@ -1,6 +1,7 @@
 """What registration tells the fit: displacements of scene rows between frames, with no image left."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -8,7 +9,7 @@ from torch import Tensor
 __all__ = ["Measurements"]
 
 _SMALL = 0.1  # of the median residual: below it, sizes count as equal
-_TUNING = 4.685  # of Tukey's biweight: 95 % efficient for Gaussian errors
+_TUNING = 6.0  # of Tukey's biweight: 98 % efficient for Gaussian errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,12 @@ class Measurements:
             independent,
         )
 
-    @property
+    @cached_property
+    def _share(self) -> Tensor:
+        """(B, N, G) weights of the mean over the frames that see a row."""
+        return self.seen / self.seen.sum(2, keepdim=True).clamp(min=1.0)
+
+    @cached_property
     def centre(self) -> Tensor:
         """(B,) mid-time of the record in seconds: phases are fitted there, where they depend least on frequency."""
         return 0.5 * (self.moments.amin((1, 2)) + self.moments.amax((1, 2)) + self.exposure_time)
@@ -92,6 +98,17 @@ class Measurements:
         moments, displacements, seen, information = (t.repeat_interleave(count, dim=0) for t in tensors)
         return replace(self, moments=moments, displacements=displacements, seen=seen, information=information)
 
+    def in_segments(self, count: int) -> "Measurements":
+        """The record cut into ``count`` pieces of equal length, as a batch (B count, N / count, ...)."""
+        rows = self.moments.shape[1] // count * count
+        tensors = (self.moments, self.displacements, self.seen, self.information)
+        cut = (t[:, :rows].unflatten(1, (count, -1)).flatten(0, 1) for t in tensors)
+        return replace(self, **dict(zip(("moments", "displacements", "seen", "information"), cut, strict=True)))
+
+    def only(self, counts: Tensor) -> "Measurements":
+        """The rows that count (B, N), the others known no more."""
+        return replace(self, information=self.information * counts[..., None, None])
+
     def __getitem__(self, stacks: slice) -> "Measurements":
         """Some of the stacks."""
         moments, displacements, seen, information = (
@@ -101,9 +118,9 @@ class Measurements:
 
     def relative(self, values: Tensor) -> Tensor:
         """Values (B, N, G, ...) of every frame less their mean over the frames that see the row, 0 where unseen."""
-        seen = self.seen.reshape(*self.seen.shape, *(1,) * (values.ndim - 3))
-        mean = (seen * values).sum(2, keepdim=True) / seen.sum(2, keepdim=True).clamp(min=1.0)
-        return seen * (values - mean)
+        ones = (1,) * (values.ndim - 3)
+        mean = (self._share.reshape(*self.seen.shape, *ones) * values).sum(2, keepdim=True)
+        return self.seen.reshape(*self.seen.shape, *ones) * (values - mean)
 
     def square(self, residual: Tensor) -> Tensor:
         """(B, 2) weighted sum of squares of residuals (B, N, G, 2), each axis with its share of the cross terms."""
@@ -128,7 +145,24 @@ class Measurements:
 
     def reweighted(self, residual: Tensor) -> "Measurements":
         """The measurements with outliers weighed down by Tukey's biweight of their residual, axis by axis."""
+        return self.scaled((1 - self._reach(residual).square()).square())
+
+    def share_counted(self, residual: Tensor) -> float:
+        """What the rows of ``reweighted`` count for in the variance of a fit, against rows of fixed weight.
+
+        A row that is weighed by its own residual makes the residual look smaller than the error is: the variance of
+        an M-estimator is ``E psi^2 / (E psi')^2`` with ``psi = w z``, not ``E w z^2 / E w`` (Huber 1981, ch. 6).
+        """
+        reach = self._reach(residual)
+        weight = (1 - reach.square()).square()
+        slope = (1 - reach.square()) * (1 - 5 * reach.square())
+        counted, weights, slopes = (reach < 1).sum(), weight.sum(), slope.sum()
+        apparent = (weight * reach.square()).sum() / (weights * counted).clamp(min=1e-300)
+        actual = (weight * reach).square().sum() / slopes.square().clamp(min=1e-300)
+        return min(1.0, float(apparent / actual.clamp(min=1e-300)))
+
+    def _reach(self, residual: Tensor) -> Tensor:
+        """(B, N, 2) size of residuals over the largest that counts, 1 from there on and where nothing is known."""
         size = self.sizes(residual)
         spread = 1.4826 * size.nanmedian(dim=1, keepdim=True).values
-        ratio = size / (_TUNING * spread.nan_to_num(1.0).clamp(min=1e-9))
-        return self.scaled((1 - ratio.nan_to_num(1.0).square()).clamp(min=0.0).square())
+        return (size / (_TUNING * spread.nan_to_num(1.0).clamp(min=1e-9))).nan_to_num(1.0).clamp(max=1.0)

@@ -17,13 +17,20 @@ _F_THRESHOLD = 14.0  # of chi-square gained per parameter over noise: chance ove
 _LEAST_GAIN = 0.2  # of the residual chi-square that a further tone must explain
 _LEAST_APART = 0.7  # of one over the record: tones nearer than this are one that the noise has split
 _CANDIDATES = 4  # peaks of the periodogram that are tried: outliers may raise a wrong one
-_ABSOLUTE_STEPS = 8
+_LEFT_OUT = 0.35  # of the record, the length of a stretch that is left out
+_STRETCHES = 7  # that are left out one at a time, each overlapping the next by half
+_ABSOLUTE_STEPS = 3  # rounds of reweighting towards least absolute residuals
+_FEW_CANDIDATES = 2  # for each stretch
 _FEW_ITERATIONS = 5
 _ROBUST_STEPS = 2
 
 
 def robust_fit(
-    measurements: Measurements, frequencies: Tensor, active: Tensor, model: MotionModel, reckon: bool = False
+    measurements: Measurements,
+    frequencies: Tensor,
+    active: Tensor,
+    model: MotionModel,
+    residual: Tensor | None = None,
 ) -> tuple[ToneFit, Measurements]:
     """Fit, weigh outliers down, fit again; the fit and the weights it was made with.
 
@@ -32,56 +39,79 @@ def robust_fit(
         frequencies: (B, 2, K) Hz to start from.
         active: (B, 2, K) bool.
         model: What is fitted beside the tones.
-        reckon: Reckon with long stretches of outliers: find the motion of the majority first.
+        residual: (B, N, G, 2) what an earlier fit leaves; None for none.
     """
-    fit = _of_majority(measurements, frequencies, active, model) if reckon else None
-    fit = fit or fit_tones(measurements, frequencies, active, model)
-    weighed = measurements
+    if residual is None:
+        fit = fit_tones(measurements, frequencies, active, model)
+        frequencies, residual = fit.frequencies, residual_of(measurements, fit)
     for _ in range(_ROBUST_STEPS):
-        weighed = measurements.reweighted(residual_of(measurements, fit))
-        fit = fit_tones(weighed, fit.frequencies, active, model)
+        weighed = measurements.reweighted(residual)
+        fit = fit_tones(weighed, frequencies, active, model)
+        frequencies, residual = fit.frequencies, residual_of(measurements, fit)
     return fit, weighed
-
-
-def _of_majority(measurements: Measurements, frequencies: Tensor, active: Tensor, model: MotionModel) -> ToneFit:
-    """Least absolute residuals: the motion of the majority, whatever the others do.
-
-    Frequencies stay where they are until the outliers have lost their pull.
-    """
-    fit = fit_tones(measurements, frequencies, active, model, 0)
-    for step in range(_ABSOLUTE_STEPS):
-        weighed = measurements.for_least_absolute(residual_of(measurements, fit))
-        fit = fit_tones(weighed, fit.frequencies, active, model, 0 if step < _ABSOLUTE_STEPS // 2 else _FEW_ITERATIONS)
-    return fit
 
 
 def _best_fit(
     measurements: Measurements,
-    frequencies: Tensor,
+    weighed: Measurements,
+    before: ToneFit,
     active: Tensor,
-    candidates: Tensor,
-    model: MotionModel,
+    sample_interval: float,
     reckon: bool,
 ) -> tuple[ToneFit, Measurements]:
-    """The robust fit with the one of several candidates (B, 2, C, H) for a further tone that explains most."""
-    batch, _, count, harmonics = candidates.shape
-    several = measurements.repeated(count)
-    known = frequencies.repeat_interleave(count, dim=0)
-    further = candidates.transpose(1, 2).flatten(0, 1)
-    actives = active.repeat_interleave(count, dim=0)
-    start = torch.cat([known, further], -1)
-    fit = (
-        _of_majority(several, start, actives, model)
-        if reckon
-        else fit_tones(several, start, actives, model, _FEW_ITERATIONS)
+    """The robust fit with one more tone (or family) an axis, the one that leaves the majority of rows least.
+
+    Candidates come from the periodogram of what ``before`` leaves. To ``reckon`` with clouds and with things that move
+    by themselves, which cover stretches of rows, every stretch of the record is left out once: where all that pulls
+    the fit away is left out, the others fall in line.
+    """
+    model, harmonics = before.model, before.model.harmonics
+    left = replace(measurements, displacements=residual_of(measurements, before))
+    parts, weights = measurements, weighed.weights[:, None]
+    if reckon:
+        counts = _stretches(measurements)
+        parts = measurements.repeated(len(counts)).only(counts.repeat(len(measurements.moments), 1))
+        without = counts[1:, :, None] * measurements.weights[:, None]
+        weights = torch.cat([weights, without], 1)
+    number = _FEW_CANDIDATES if reckon else _CANDIDATES
+    peaks = strongest_frequencies(left, sample_interval, harmonics, number, weights).flatten(0, 1)
+    multiples = torch.arange(1, harmonics + 1, dtype=torch.float64, device=peaks.device)
+    further = (peaks[..., None] * multiples).transpose(1, 2).flatten(0, 1)  # (B C, 2, H)
+    count = len(further) // len(measurements.moments)
+    known = before.frequencies[..., : active.shape[-1] - harmonics].repeat_interleave(count, 0)
+    fit = fit_tones(
+        parts.repeated(peaks.shape[-1]),
+        torch.cat([known, further], -1),
+        active.repeat_interleave(count, 0),
+        model,
+        _FEW_ITERATIONS,
     )
-    left = several.sizes(residual_of(several, fit)).nanquantile(MAJORITY, dim=1).nan_to_num(0.0)  # (B C, 2)
-    sighted = _sighted(several, fit.frequencies[..., -harmonics:])
-    worst = left.unflatten(0, (batch, count)).amax(1, keepdim=True)
-    score = (worst - left.unflatten(0, (batch, count))) * sighted.unflatten(0, (batch, count))
-    best = score.argmax(1)[:, None, :, None]  # each axis for itself
-    chosen = fit.frequencies.unflatten(0, (batch, count)).gather(1, best.expand(-1, -1, -1, fit.frequencies.shape[-1]))
-    return robust_fit(measurements, chosen[:, 0], active, model, reckon)
+    several = measurements.repeated(count)
+    residual = residual_of(several, fit)
+    size = several.sizes(residual).nanquantile(MAJORITY, dim=1).nan_to_num(0.0).unflatten(0, (-1, count))
+    sighted = _sighted(several, fit.frequencies[..., -harmonics:]).unflatten(0, (-1, count))
+    best = ((size.amax(1, keepdim=True) - size) * sighted).argmax(1)  # each axis for itself
+
+    def chosen(values: Tensor, axis: int) -> Tensor:
+        each = values.unflatten(0, (-1, count)).movedim(axis + 1, 2)  # (B, C, 2, ...)
+        place = best.reshape(-1, 1, 2, *(1,) * (each.ndim - 3)).expand(-1, 1, -1, *each.shape[3:])
+        picked: Tensor = each.gather(1, place)[:, 0].movedim(1, axis)
+        return picked
+
+    frequencies, residual = chosen(fit.frequencies, 1), chosen(residual, 3)
+    for _ in range(_ABSOLUTE_STEPS if reckon else 0):
+        nearer = fit_tones(measurements.for_least_absolute(residual), frequencies, active, model, _FEW_ITERATIONS)
+        frequencies, residual = nearer.frequencies, residual_of(measurements, nearer)
+    return robust_fit(measurements, frequencies, active, model, residual)
+
+
+def _stretches(measurements: Measurements) -> Tensor:
+    """(S, N) bool, rows that count: all of them first, then all but a stretch, one stretch after the other."""
+    rows = measurements.moments.shape[1]
+    place = (torch.arange(rows, dtype=torch.float64, device=measurements.moments.device) + 0.5) / rows
+    first = torch.linspace(0, 1 - _LEFT_OUT, _STRETCHES, dtype=torch.float64, device=place.device)[:, None]
+    counts = (place < first) | (place > first + _LEFT_OUT)
+    return torch.cat([torch.ones_like(counts[:1]), counts])
 
 
 def _sighted(measurements: Measurements, frequencies: Tensor) -> Tensor:
@@ -124,26 +154,17 @@ def find_tones(
     model = model or MotionModel()
     batch = len(measurements.moments)
     device = measurements.moments.device
-    multiples = torch.arange(1, model.harmonics + 1, dtype=torch.float64, device=device)
     none = torch.zeros(batch, 2, model.harmonics, dtype=torch.bool, device=device)
     keep = none[..., :0] if start is None else start.active
     first = none if start is None else start.active
     known = none.double() if start is None else start.frequencies
-    fit, weighed = robust_fit(measurements, known, first, model, reckon=start is None)
+    reckon = start is None
+    fit, weighed = robust_fit(measurements, known, first, model)
     parameters = 2 * model.harmonics + 1
     going = torch.ones_like(none[..., 0])  # an axis that stopped stays stopped
     for _ in range(keep.shape[-1] // model.harmonics, MAX_TONES if tones is None else tones):
-        left = replace(weighed, displacements=residual_of(measurements, fit))
-        found = [strongest_frequencies(left, sample_interval, model.harmonics, _CANDIDATES)]
-        if keep.shape[-1] == 0:
-            unweighed = replace(measurements, displacements=left.displacements)
-            found.append(
-                strongest_frequencies(unweighed, sample_interval, model.harmonics, _CANDIDATES, _ABSOLUTE_STEPS)
-            )
-        candidates = torch.cat(found, -1)[..., None] * multiples
-        frequencies = fit.frequencies[..., : keep.shape[-1]]
         active = torch.cat([keep, going[..., None].expand_as(none)], -1)
-        trial, trial_weighed = _best_fit(measurements, frequencies, active, candidates, model, start is None)
+        trial, trial_weighed = _best_fit(measurements, weighed, fit, active, sample_interval, reckon)
         if tones is None:
             # both fits are judged with the weights of the richer one
             before = trial_weighed.square(residual_of(measurements, fit))

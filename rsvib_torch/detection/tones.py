@@ -13,8 +13,8 @@ __all__ = [
     "ToneFit",
     "drift_response",
     "model_displacements",
+    "tone_columns",
     "tone_response",
-    "tone_response_and_slope",
 ]
 
 
@@ -69,30 +69,39 @@ def tone_response(measurements: Measurements, frequencies: Tensor) -> Tensor:
     Returns:
         complex128 (B, N, G, 2, K).
     """
-    turn, _ = _turn(measurements, frequencies)
     average = _average_times(measurements, frequencies)
     attenuation = torch.sinc(frequencies * measurements.exposure_time) * torch.sinc(frequencies * average)
-    return measurements.relative(attenuation[:, None, None] * turn)
+    angle = 2 * math.pi * frequencies[:, None, None] * _time(measurements)
+    return measurements.relative(torch.polar(attenuation[:, None, None].expand_as(angle), angle))
 
 
-def tone_response_and_slope(measurements: Measurements, frequencies: Tensor) -> tuple[Tensor, Tensor]:
-    """``tone_response`` and its derivative by frequency, (B, N, G, 2, K) each."""
-    turn, time = _turn(measurements, frequencies)
+def tone_columns(measurements: Measurements, coefficients: Tensor, frequencies: Tensor) -> Tensor:
+    """Derivatives (B, N, G, 2, K, 3) of what the measurements see of tones by the real part, the imaginary part and f.
+
+    The tones are ``Re C S(f) exp(2 pi i f (t - centre))`` with C and f (B, 2, K), as in ``tone_response``; the mean
+    over the group is still in.
+    """
     average = _average_times(measurements, frequencies)
     exposure, exposure_slope = _sinc(frequencies * measurements.exposure_time)
     band, band_slope = _sinc(frequencies * average)
-    attenuation = (exposure * band)[:, None, None]
-    slope = (exposure_slope * measurements.exposure_time * band + exposure * band_slope * average)[:, None, None]
-    derivative = torch.complex(slope.expand(turn.shape), attenuation * 2 * math.pi * time) * turn
-    return measurements.relative(attenuation * turn), measurements.relative(derivative)
-
-
-def _turn(measurements: Measurements, frequencies: Tensor) -> tuple[Tensor, Tensor]:
-    """exp(2 pi i f s) (B, N, G, 2, K) at the mid-exposures s (B, N, G, 1, 1) from the centre of the record."""
-    middle = 0.5 * measurements.exposure_time - measurements.centre
-    time = (measurements.moments + middle[:, None, None])[..., None, None]
+    attenuation = exposure * band
+    slope = exposure_slope * measurements.exposure_time * band + exposure * band_slope * average
+    time = _time(measurements)
     angle = 2 * math.pi * frequencies[:, None, None] * time
-    return torch.polar(torch.ones_like(angle), angle), time
+    cosine, sine = torch.cos(angle), torch.sin(angle)
+    real, imaginary = coefficients.real, coefficients.imag
+    turn = 2 * math.pi * attenuation
+    along = (slope * real)[:, None, None] - time * (turn * imaginary)[:, None, None]
+    across = (slope * imaginary)[:, None, None] + time * (turn * real)[:, None, None]
+    by_frequency = along * cosine - across * sine
+    attenuation = attenuation[:, None, None]
+    return torch.stack([attenuation * cosine, -attenuation * sine, by_frequency], dim=-1)
+
+
+def _time(measurements: Measurements) -> Tensor:
+    """Mid-exposures (B, N, G, 1, 1) in seconds from the centre of the record."""
+    middle = 0.5 * measurements.exposure_time - measurements.centre
+    return (measurements.moments + middle[:, None, None])[..., None, None]
 
 
 def _average_times(measurements: Measurements, like: Tensor) -> Tensor:
@@ -109,7 +118,7 @@ def _sinc(x: Tensor) -> tuple[Tensor, Tensor]:
 
 def drift_response(measurements: Measurements, order: int) -> Tensor:
     """What the measurements see of unit drifts s^j / j!, averaged over the exposure, (B, N, G, J)."""
-    time = measurements.moments + (0.5 * measurements.exposure_time - measurements.centre)[:, None, None]
+    time = _time(measurements)[..., 0, 0]
     powers = [time, 0.5 * time.square() + measurements.exposure_time**2 / 24.0]
     return measurements.relative(torch.stack(powers[:order], dim=-1))
 

@@ -8,30 +8,16 @@ Cramer-Rao bound.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.spectral import extend_rows, fast_length
-from rsvib_torch.splines import bspline_coefficients, bspline_weights
+from rsvib_torch.registration.row_spectra import RowSpectra, combined, inner_columns, mean_over_frames, row_chunks
 
-__all__ = [
-    "DEGREE",
-    "MARGIN",
-    "RowGradients",
-    "RowSpectra",
-    "inner_columns",
-    "mean_over_frames",
-    "row_gradients",
-    "row_shifts",
-]
+__all__ = ["RowGradients", "row_gradients", "row_shifts"]
 
-DEGREE = 7  # of the spline across rows: what it smooths, and the noise it colours, lie above the pass band
-MARGIN = 8  # px from the ends of rows and columns that do not count
-_POWERS = 32  # of a turn, computed one by one
-_EXTENSION = 32  # px that rows are continued by, so that their Fourier transform closes smoothly
 _PASS_ROWS = (0.24, 0.34)  # cycles/px across rows: full weight below, none above
 _PASS_COLUMNS = (0.40, 0.48)  # along rows, where interpolation is exact but detail near the limit may be aliased
 _SLOWEST = 1 / 64  # cycles/px: shading and vignetting live below
@@ -39,71 +25,6 @@ _SMOOTH = 16  # values of the spectra that are averaged along each axis
 _BLOCK = 16  # px, side of the blocks that are judged together
 _LARGEST_NOISE = 9.0  # mean square of a block over the typical one before it loses weight
 _LARGEST_SHIFT = 0.15  # px, part of a block's residual that the gradient excuses
-
-
-class RowSpectra:
-    """Fourier transforms along the rows of frames, of spline coefficients across rows.
-
-    Args:
-        frames: (B, T, H, W) in row order.
-        valid: (B, T, H, W) bool, pixels that count; None for all.
-    """
-
-    def __init__(self, frames: Tensor, valid: Tensor | None = None) -> None:
-        self.height, self.width = frames.shape[-2:]
-        self.length = fast_length(self.width + 2 * _EXTENSION)
-        coefficients = bspline_coefficients(frames, DEGREE, -2)
-        self.values = torch.fft.rfft(extend_rows(coefficients, self.length))
-        self.frequencies = torch.fft.rfftfreq(self.length, dtype=torch.float64, device=frames.device)
-        self.valid = None
-        if valid is not None and not bool(valid.all()):
-            # what interpolation takes from a bad pixel does not count either
-            spoilt = functional.max_pool2d((~valid).to(frames.dtype), 2 * (DEGREE // 2) + 1, 1, DEGREE // 2)
-            self.valid = spoilt == 0
-
-    def warped(self, rows: Tensor, shift: Tensor) -> Tensor:
-        """Spectra (B, T, S, U) of frame rows at fractional places ``rows``, moved back by ``shift``, both (B, T, S)."""
-        values = self.values
-        cell = rows.floor()
-        weights = bspline_weights(rows - cell, DEGREE).to(values.real.dtype)
-        first = cell.to(torch.int64) - DEGREE // 2
-        taps = torch.arange(DEGREE + 1, device=rows.device)
-        frame = torch.arange(values[..., 0, 0].numel(), device=rows.device).reshape(values.shape[:2])
-        index = frame[..., None, None] * self.height + (first[..., None] + taps).clamp(0, self.height - 1)
-        flat = torch.view_as_real(values).reshape(-1, 2 * values.shape[-1])
-        picked = functional.embedding_bag(
-            index.flatten(0, 2), flat, per_sample_weights=weights.flatten(0, 2), mode="sum"
-        )
-        result: Tensor = torch.view_as_complex(picked.unflatten(-1, (-1, 2))).unflatten(0, rows.shape)
-        return result * self.ramp(shift)
-
-    def ramp(self, shift: Tensor) -> Tensor:
-        """exp(2 pi i u shift) for all frequencies u (..., U), as products of few powers of one turn."""
-        turn = 2 * math.pi * shift[..., None] / self.length
-        coarse = torch.arange(0, len(self.frequencies), _POWERS, dtype=torch.float64, device=shift.device)
-        fine = torch.arange(_POWERS, dtype=torch.float64, device=shift.device)
-        first, second = (
-            torch.polar(torch.ones_like(angle), angle).to(self.values.dtype) for angle in (turn * coarse, turn * fine)
-        )
-        ramp: Tensor = (first[..., None] * second[..., None, :]).flatten(-2)[..., : len(self.frequencies)]
-        return ramp
-
-    def subtract(self, pattern: Tensor) -> None:
-        """Take a pattern (B, U) out of every row of every frame."""
-        self.values = self.values - pattern[:, None, None].to(self.values.dtype)
-
-    def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None:
-        """(B, S, W) bool, pixels of the scene that count in all frames; None for all."""
-        if self.valid is None:
-            return None
-        place = rows.round().to(torch.int64).clamp(0, self.height - 1)
-        columns = torch.arange(self.width, device=rows.device)
-        result = torch.ones(1, dtype=torch.bool, device=rows.device)
-        for frame in range(rows.shape[1]):  # one at a time: indices take eight times the memory of the flags
-            picked = self.valid[:, frame].gather(1, place[:, frame, :, None].expand(-1, -1, self.width))
-            column = (columns + shift[:, frame, :, None].round().to(torch.int64)).clamp(0, self.width - 1)
-            result = result & picked.gather(2, column)
-        return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,15 +62,55 @@ def _wiener(mean: Tensor, noise: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """
 
     def smooth(spectrum: Tensor) -> Tensor:
-        power = torch.view_as_real(spectrum).square().sum(-1)
-        return functional.avg_pool2d(power[:, None], _SMOOTH, ceil_mode=True)
+        parts = torch.view_as_real(spectrum).flatten(-2)
+        return functional.avg_pool2d(parts.square()[:, None], (_SMOOTH, 2 * _SMOOTH), ceil_mode=True)
 
     total, noise_power = smooth(mean), smooth(noise)
     share = (1 - noise_power / total.clamp(min=torch.finfo(total.dtype).tiny)).clamp(min=0.0)
     share = functional.interpolate(share, scale_factor=_SMOOTH, mode="nearest")[:, 0, : len(v), : len(u)]
-    radius = u.square() + v[:, None].square()
-    band = _pass(u, _PASS_COLUMNS) * _pass(v, _PASS_ROWS)[:, None] * (1 - torch.exp(-radius / _SLOWEST**2))
-    return share * band.to(share.dtype)
+    # all but the slowest, 1 - exp(-(u^2 + v^2) / slowest^2), within the pass band
+    along, across = _pass(u, _PASS_COLUMNS), _pass(v, _PASS_ROWS)
+    slow = torch.outer(across * torch.exp(-((v / _SLOWEST) ** 2)), along * torch.exp(-((u / _SLOWEST) ** 2)))
+    return share * (torch.outer(across, along) - slow).to(share.dtype)
+
+
+def _scene(warped: Tensor, mean: Tensor, seen: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Detail of the scene and its gradient across rows, (B, S, U) each, from the mean of the frames."""
+    v = torch.fft.fftfreq(mean.shape[-2], dtype=torch.float64, device=u.device)
+    whole = torch.fft.fft(mean, dim=-2)
+    share = _wiener(whole, torch.fft.fft(_noise_of_mean(warped, seen), dim=-2), u, v)
+    torch.view_as_real(whole).mul_(share[..., None])
+    detail = torch.fft.ifft(whole, dim=-2)
+    whole *= (2j * math.pi * v).to(whole.dtype)[:, None]
+    return detail, torch.fft.ifft(whole, dim=-2)
+
+
+def _noise_of_mean(warped: Tensor, seen: Tensor) -> Tensor:
+    """Difference (B, S, U) of the outer frames that see a row, with the noise of their mean; 0 where one alone does."""
+    count = seen.shape[1]
+    order = torch.arange(count, device=seen.device)[:, None]
+    first = torch.where(seen > 0, order, count).amin(1, keepdim=True)
+    last = torch.where(seen > 0, order, -1).amax(1, keepdim=True)
+    sign = ((order == last).double() - (order == first).double()) * (last > first)
+    # the difference of two frames has twice the noise of a frame
+    return combined(warped, sign * (0.5 / seen.sum(1, keepdim=True).clamp(min=1.0)).sqrt())
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Some rows of the scene as pixels.
+
+    Attributes:
+        images: (B, s, 4, L) gradients along x and y, detail, ones.
+        residual: (B, s, G, L) what the frames differ by from their mean.
+        weight: (B, s, L) of the pixels.
+        seen: (B, G, s), 1 where a frame sees the row.
+    """
+
+    images: Tensor
+    residual: Tensor
+    weight: Tensor
+    seen: Tensor
 
 
 def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tensor, seen: Tensor) -> RowGradients:
@@ -165,72 +126,60 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
     Returns:
         The gradients.
     """
+    length, width = spectra.length, spectra.width
     mean = mean_over_frames(warped, seen)
-    frames = seen.sum(1)
-    spare = (frames - 1).clamp(min=0.0)
-    # the difference of the outer frames has twice the noise of a frame
-    outer = _outer_difference(warped, seen) * (0.5 / frames.clamp(min=1.0)).sqrt().to(warped.real.dtype)[..., None]
-    u = spectra.frequencies
-    v = torch.fft.fftfreq(rows.shape[-1], dtype=torch.float64, device=u.device)
-    whole = torch.fft.fft(mean, dim=-2)
-    scene = whole * _wiener(whole, torch.fft.fft(outer, dim=-2), u, v)
-    along, across = (2j * math.pi * u).to(scene.dtype), (2j * math.pi * v).to(scene.dtype)[:, None]
-    detail = torch.fft.ifft(torch.stack([scene, scene * across], dim=2), dim=1)  # (B, S, 2, U)
-    detail = torch.stack([detail[:, :, 0] * along, detail[:, :, 1], detail[:, :, 0]], dim=2)
-    images = mean.real.new_ones(*mean.shape[:2], 4, spectra.width)  # brightness last
-    images[:, :, :3] = torch.fft.irfft(detail, n=spectra.length)[..., : spectra.width]
-    difference = (warped - mean[:, None]).transpose(1, 2)
-    residual = torch.fft.irfft(difference, n=spectra.length)[..., : spectra.width]  # (B, S, G, W)
-    residual = residual * seen.transpose(1, 2)[..., None].to(residual.dtype)
-
-    weight = inner_columns(spectra.width, shift, images) * (spare > 0)[..., None].to(images.dtype)  # (B, S, W)
+    detail, across = _scene(warped, mean, seen, spectra.frequencies)
+    along = (2j * math.pi * spectra.frequencies).to(mean.dtype)
+    inner = functional.pad(inner_columns(width, shift, mean.real), (0, length - width))
     valid = spectra.warped_valid(rows, shift)
-    if valid is not None:
-        weight = weight * valid
-    weighted, left, products = _explain(images, residual, weight)
-    energy = left.square().sum(2) / spare.clamp(min=1.0)[..., None].to(left.dtype)
-    trust = _trust(energy, images[:, :, :2].square().sum(2), weight)
-    if bool((trust < 1).any()):
-        weight = weight * trust
-        weighted, left, products = _explain(images, residual, weight)
-    square = (left.square() * weight[:, :, None]).sum((2, 3), dtype=torch.float64)
-    variance = square / ((products[..., 3, 3] - 4).clamp(min=1.0) * spare.clamp(min=1.0))
+
+    def pixels(part: slice) -> _Rows:
+        own = detail[:, part]
+        images = mean.real.new_ones(*own.shape[:2], 4, length)
+        images[:, :, :3] = torch.fft.irfft(torch.stack([own * along, across[:, part], own], dim=2), n=length)
+        visible = seen[:, :, part]
+        difference = (warped[:, :, part] - mean[:, None, part]).transpose(1, 2)
+        residual = torch.fft.irfft(difference, n=length)
+        residual *= visible.transpose(1, 2)[..., None].to(residual.dtype)
+        weight = inner * (visible.sum(1) > 1)[..., None].to(inner.dtype)
+        if valid is not None:
+            weight = weight * functional.pad(valid[:, part], (0, length - width))
+        return _Rows(images, residual, weight, visible)
+
+    parts = row_chunks(rows.shape[-1], 4 * length * len(rows) * (8 + 2 * rows.shape[1]), _BLOCK, rows.device)
+    results, energies = [], []
+    for part in parts:
+        some = pixels(part)
+        found, energy = _explained_rows(some, spectra)
+        results.append(found)
+        energies.append(_blocks_of(some, energy))
+    trust = _trust(*(torch.cat(values, 1) for values in zip(*energies, strict=True)))
+    for place, part in enumerate(parts):
+        own = trust[:, part.start // _BLOCK : -(-part.stop // _BLOCK)]
+        if bool((own < 1).any()):
+            some = pixels(part)
+            spread = own.repeat_interleave(_BLOCK, 1).repeat_interleave(_BLOCK, 2)
+            weight = some.weight * spread[:, : some.weight.shape[1], :length]
+            results[place], _ = _explained_rows(replace(some, weight=weight), spectra)
+    return RowGradients(*(torch.cat([getattr(r, f.name) for r in results], 1) for f in fields(RowGradients)))
+
+
+def _explained_rows(rows: _Rows, spectra: RowSpectra) -> tuple[RowGradients, Tensor]:
+    """Gradients of some rows, and the energy (B, s, L) that brightness, contrast and a shift of them leave."""
+    weighted, left, products = _explain(rows.images, rows.residual, rows.weight)
+    spare = (rows.seen.sum(1) - 1).clamp(min=1.0)
+    energy = left.square().sum(2)
+    square = (energy * rows.weight).sum(-1).double()
+    variance = square / ((products[..., 3, 3] - 4).clamp(min=1.0) * spare)
     mean_images = products[..., :3, 3:] / products[..., 3:, 3:].clamp(min=1e-6)
-    centred = weighted[:, :, :3] - weight[:, :, None] * mean_images.to(weight.dtype)
-    return RowGradients(
-        spectra=torch.fft.rfft(centred, n=spectra.length) * _one_sided(spectra.length, centred),
+    centred = weighted[:, :, :3] - rows.weight[:, :, None] * mean_images.to(rows.weight.dtype)
+    gradients = RowGradients(
+        spectra=torch.fft.rfft(centred) * _one_sided(spectra.length, centred),
         products=products[..., :3, :3] - mean_images * products[..., 3:, :3],
         variance=variance,
-        halves=_halves(weighted, images, left, seen),
+        halves=_halves(weighted, rows.images, left, rows.seen, spectra.width // 2),
     )
-
-
-def mean_over_frames(warped: Tensor, seen: Tensor) -> Tensor:
-    """Mean (B, S, U) over the frames that see a row."""
-    share = (seen / seen.sum(1, keepdim=True).clamp(min=1.0)).to(warped.real.dtype)
-    parts = torch.view_as_real(warped)
-    mean = parts[:, 0] * share[:, 0, :, None, None]
-    for frame in range(1, warped.shape[1]):
-        mean = torch.addcmul(mean, parts[:, frame], share[:, frame, :, None, None])
-    return torch.view_as_complex(mean)
-
-
-def _outer_difference(warped: Tensor, seen: Tensor) -> Tensor:
-    """Last less first frame (B, S, U) that see a row; 0 where fewer than two do."""
-    count = seen.shape[1]
-    order = torch.arange(count, device=seen.device)[:, None]
-    first = torch.where(seen > 0, order, count).amin(1).clamp(max=count - 1)
-    last = torch.where(seen > 0, order, -1).amax(1).clamp(min=0)
-    pick = [warped.gather(1, i[:, None, :, None].expand(-1, 1, -1, warped.shape[-1]))[:, 0] for i in (first, last)]
-    return (pick[1] - pick[0]) * (last > first)[..., None]
-
-
-def inner_columns(width: int, shift: Tensor, like: Tensor) -> Tensor:
-    """(1, 1, W) weight of columns that all frames of the group show, falling to 0 over a few px."""
-    edge = math.ceil(float(shift.abs().amax())) + MARGIN
-    place = torch.arange(width, dtype=like.dtype, device=like.device)
-    inside = torch.minimum(place, width - 1 - place) - edge
-    return (inside / MARGIN).clamp(0.0, 1.0)[None, None]
+    return gradients, energy / spare[..., None].to(energy.dtype)
 
 
 def _explain(images: Tensor, residual: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -256,32 +205,31 @@ def _explain(images: Tensor, residual: Tensor, weight: Tensor) -> tuple[Tensor, 
     return weighted, residual - torch.matmul(solution, images), products
 
 
-def _trust(energy: Tensor, gradient: Tensor, weight: Tensor) -> Tensor:
-    """Weight (B, S, W) in 0 ... 1 of blocks whose residual neither noise nor a small shift explains.
+def _blocks_of(rows: _Rows, energy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Means over blocks of what is left of some rows, of the square of their gradient, and of what counts."""
+    used = (rows.weight > 0).to(energy.dtype)
+    slope = rows.images[:, :, :2].square().sum(2)
+    values = torch.stack([energy * used, slope * used, used], dim=1)
+    mean, slope, share = functional.avg_pool2d(values, _BLOCK, ceil_mode=True).unbind(1)
+    return mean, slope, share
+
+
+def _trust(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
+    """Weight in 0 ... 1 of blocks whose residual neither noise nor a small shift explains.
 
     Things that move by themselves, clouds and parallax leave such blocks.
     """
-    rows, columns = energy.shape[-2:]
-
-    def blocks(values: Tensor) -> Tensor:
-        return functional.avg_pool2d((values * (weight > 0))[:, None], _BLOCK, ceil_mode=True)[:, 0]
-
-    share = functional.avg_pool2d((weight > 0).to(energy.dtype).expand_as(energy)[:, None], _BLOCK, ceil_mode=True)[
-        :, 0
-    ]
     used = share > 0
-    mean, slope = blocks(energy) / share.clamp(min=1e-6), blocks(gradient) / share.clamp(min=1e-6)
+    mean, slope = energy / share.clamp(min=1e-6), slope / share.clamp(min=1e-6)
     typical = torch.where(used, mean, torch.nan).flatten(1).nanmedian(1).values[:, None, None]
     ratio = mean / (_LARGEST_NOISE * typical + _LARGEST_SHIFT**2 * slope).clamp(min=1e-30)
-    trust = 1 / (1 + (ratio - 1).clamp(min=0.0).square())
-    return functional.interpolate(trust[:, None], scale_factor=_BLOCK, mode="nearest")[:, 0, :rows, :columns]
+    return 1 / (1 + (ratio - 1).clamp(min=0.0).square())
 
 
-def _halves(weighted: Tensor, images: Tensor, left: Tensor, seen: Tensor) -> Tensor:
+def _halves(weighted: Tensor, images: Tensor, left: Tensor, seen: Tensor, middle: int) -> Tensor:
     """Sums over the halves of each row, as in ``RowGradients.halves``."""
     both = (seen[:, 0] * seen[:, -1])[..., None]
     change = left[:, :, -1:] - left[:, :, :1]
-    middle = left.shape[-1] // 2
     sums = []
     for half in (slice(None, middle), slice(middle, None)):
         own = weighted[:, :, :2, half]

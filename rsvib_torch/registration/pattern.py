@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.registration.gradients import RowSpectra, inner_columns, mean_over_frames
+from rsvib_torch.registration.row_spectra import RowSpectra, inner_columns, mean_over_frames
 
 __all__ = ["column_pattern"]
 

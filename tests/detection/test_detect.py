@@ -292,7 +292,7 @@ def test_error_bars_agree_with_scatter():
 
 
 def test_error_bars_of_frames_are_honest(paper_camera):
-    """Error over its standard deviation, over noise seeds, scenes and phases, is of order one."""
+    """Error over its standard deviation, over noise seeds, scenes and phases, is of order one, rather below it."""
     ratios = []
     for seed in range(20, 26):
         motion = Motion(phase=random_phase(seed))
@@ -302,7 +302,7 @@ def test_error_bars_of_frames_are_honest(paper_camera):
             error = getattr(found, name)[:, 0].numpy() - np.array(getattr(motion, name))
             ratios.append(error / getattr(std, name)[:, 0].numpy())
     spread = np.sqrt(np.mean(np.square(ratios)))
-    assert 1 / 3 < spread < 3
+    assert 0.25 < spread < 2
 
 
 def test_dropped_frame_times(paper_camera):

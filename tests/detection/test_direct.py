@@ -8,7 +8,8 @@ from scipy import ndimage
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, detect_vibration, register_bands
-from rsvib_torch.registration.gradients import RowSpectra, row_gradients, row_shifts
+from rsvib_torch.registration.gradients import row_gradients, row_shifts
+from rsvib_torch.registration.row_spectra import RowSpectra
 
 MARGIN = 40
 
@@ -229,6 +230,25 @@ def test_disturbed_frames(clean_pairs, paper_camera, disturb, motion):
     assert result.vibration.amplitude.shape == (2, 1)
     period, amplitude, phase = errors(result.vibration, motion)
     assert float(period.max()) < 0.1
+    assert float(amplitude.max()) < 1.0
+    assert float(phase.max()) < 0.01
+
+
+@pytest.mark.parametrize(("top", "move"), [(120, (-4, -6)), (700, (5, 0)), (1610, (2, 7))])
+def test_a_cloud_over_a_fifth_of_the_rows(paper_camera, top, move):
+    """Wherever it is and however it moves, slow tones are those of the other rows."""
+    motion = Motion((3.1, 5.2), (50.0, 30.0), (0.7, 2.1))
+    frames = take_frames(draw_scene(2128, 336, 61), paper_camera, motion, 2, samples=8)
+    tall, wide = frames.shape[-2] // 5, frames.shape[-1]
+    cloud = draw_scene(tall + 20, wide + 20, 62)
+    frames[0, top : top + tall] = cloud[10 : 10 + tall, 10 : 10 + wide]
+    frames[1, top : top + tall] = cloud[10 - move[1] : 10 - move[1] + tall, 10 - move[0] : 10 - move[0] + wide]
+    frames = frames + 0.005 * np.random.default_rng(63).standard_normal(frames.shape)
+    result = detect_vibration(torch.from_numpy(frames).float(), paper_camera)
+    assert result.reliable.tolist() == [True, True], result.reasons
+    assert result.vibration.amplitude.shape == (2, 1)
+    period, amplitude, phase = errors(result.vibration, motion)
+    assert float(period.max()) < 0.05
     assert float(amplitude.max()) < 1.0
     assert float(phase.max()) < 0.01
 

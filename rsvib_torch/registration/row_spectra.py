@@ -1,0 +1,115 @@
+"""Fourier transforms along the rows of frames, and the frames warped by a motion in them."""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from rsvib_torch.spectral import extend_rows, fast_length
+from rsvib_torch.splines import bspline_coefficients, bspline_weights
+
+__all__ = ["DEGREE", "MARGIN", "RowSpectra", "combined", "inner_columns", "mean_over_frames", "row_chunks"]
+
+DEGREE = 7  # of the spline across rows: what it smooths, and the noise it colours, lie above the pass band
+MARGIN = 8  # px from the ends of rows and columns that do not count
+_POWERS = 32  # of a turn, computed one by one
+_EXTENSION = 32  # px that rows are continued by, so that their Fourier transform closes smoothly
+_CHUNK = {"cpu": 2**23}  # bytes that stay in a cache
+_LARGE_CHUNK = 2**30  # bytes at a time elsewhere
+
+
+def row_chunks(num_rows: int, bytes_per_row: int, multiple: int, device: torch.device) -> list[slice]:
+    """Slices of consecutive rows, a multiple of ``multiple`` each, that are worked on at a time."""
+    size = max(1, _CHUNK.get(device.type, _LARGE_CHUNK) // (bytes_per_row * multiple)) * multiple
+    return [slice(first, min(first + size, num_rows)) for first in range(0, num_rows, size)]
+
+
+class RowSpectra:
+    """Fourier transforms along the rows of frames, of spline coefficients across rows.
+
+    Args:
+        frames: (B, T, H, W) in row order.
+        valid: (B, T, H, W) bool, pixels that count; None for all.
+    """
+
+    def __init__(self, frames: Tensor, valid: Tensor | None = None) -> None:
+        self.height, self.width = frames.shape[-2:]
+        self.length = fast_length(self.width + 2 * _EXTENSION)
+        coefficients = bspline_coefficients(frames, DEGREE, -2)
+        self.values = torch.fft.rfft(extend_rows(coefficients, self.length))
+        self.frequencies = torch.fft.rfftfreq(self.length, dtype=torch.float64, device=frames.device)
+        self.valid = None
+        if valid is not None and not bool(valid.all()):
+            # what interpolation takes from a bad pixel does not count either
+            spoilt = functional.max_pool2d((~valid).to(frames.dtype), 2 * (DEGREE // 2) + 1, 1, DEGREE // 2)
+            self.valid = spoilt == 0
+
+    def warped(self, rows: Tensor, shift: Tensor) -> Tensor:
+        """Spectra (B, T, S, U) of frame rows at fractional places ``rows``, moved back by ``shift``, both (B, T, S)."""
+        values = self.values
+        cell = rows.floor()
+        weights = bspline_weights(rows - cell, DEGREE).to(values.real.dtype)
+        first = cell.to(torch.int64) - DEGREE // 2
+        taps = torch.arange(DEGREE + 1, device=rows.device)
+        frame = torch.arange(values[..., 0, 0].numel(), device=rows.device).reshape(values.shape[:2])
+        index = frame[..., None, None] * self.height + (first[..., None] + taps).clamp(0, self.height - 1)
+        flat = torch.view_as_real(values).reshape(-1, 2 * values.shape[-1])
+        picked = functional.embedding_bag(
+            index.flatten(0, 2), flat, per_sample_weights=weights.flatten(0, 2), mode="sum"
+        )
+        result: Tensor = torch.view_as_complex(picked.unflatten(-1, (-1, 2))).unflatten(0, rows.shape)
+        for part in row_chunks(rows.shape[-1], 8 * result[..., 0, :].numel(), 1, rows.device):
+            result[..., part, :] *= self.ramp(shift[..., part])
+        return result
+
+    def ramp(self, shift: Tensor) -> Tensor:
+        """exp(2 pi i u shift) for all frequencies u (..., U), as products of few powers of one turn."""
+        turn = 2 * math.pi * shift[..., None] / self.length
+        coarse = torch.arange(0, len(self.frequencies), _POWERS, dtype=torch.float64, device=shift.device)
+        fine = torch.arange(_POWERS, dtype=torch.float64, device=shift.device)
+        first, second = (
+            torch.polar(torch.ones_like(angle), angle).to(self.values.dtype) for angle in (turn * coarse, turn * fine)
+        )
+        ramp: Tensor = (first[..., None] * second[..., None, :]).flatten(-2)[..., : len(self.frequencies)]
+        return ramp
+
+    def subtract(self, pattern: Tensor) -> None:
+        """Take a pattern (B, U) out of every row of every frame."""
+        self.values = self.values - pattern[:, None, None].to(self.values.dtype)
+
+    def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None:
+        """(B, S, W) bool, pixels of the scene that count in all frames; None for all."""
+        if self.valid is None:
+            return None
+        place = rows.round().to(torch.int64).clamp(0, self.height - 1)
+        columns = torch.arange(self.width, device=rows.device)
+        result = torch.ones(1, dtype=torch.bool, device=rows.device)
+        for frame in range(rows.shape[1]):  # one at a time: indices take eight times the memory of the flags
+            picked = self.valid[:, frame].gather(1, place[:, frame, :, None].expand(-1, -1, self.width))
+            column = (columns + shift[:, frame, :, None].round().to(torch.int64)).clamp(0, self.width - 1)
+            result = result & picked.gather(2, column)
+        return result
+
+
+def combined(spectra: Tensor, factors: Tensor) -> Tensor:
+    """Sum (B, S, U) over the frames of spectra (B, G, S, U), each row with its factor (B, G, S)."""
+    parts = torch.view_as_real(spectra)
+    factors = factors.to(parts.dtype)[..., None, None]
+    total = parts[:, 0] * factors[:, 0]
+    for frame in range(1, spectra.shape[1]):
+        total.addcmul_(parts[:, frame], factors[:, frame])
+    return torch.view_as_complex(total)
+
+
+def mean_over_frames(spectra: Tensor, seen: Tensor) -> Tensor:
+    """Mean (B, S, U) of spectra (B, G, S, U) over the frames that see a row."""
+    return combined(spectra, seen / seen.sum(1, keepdim=True).clamp(min=1.0))
+
+
+def inner_columns(width: int, shift: Tensor, like: Tensor) -> Tensor:
+    """(1, 1, W) weight of columns that all frames of the group show, falling to 0 over a few px."""
+    edge = math.ceil(float(shift.abs().amax())) + MARGIN
+    place = torch.arange(width, dtype=like.dtype, device=like.device)
+    inside = torch.minimum(place, width - 1 - place) - edge
+    return (inside / MARGIN).clamp(0.0, 1.0)[None, None]
