@@ -152,6 +152,28 @@ class FreeMotion(Vibration):
         rest = self.coefficients * self.coefficients.new_tensor(signs)[:, None]
         return FreeMotion(rest.flip(-2) if swap else rest, self.start, self.spacing, tones)
 
+    def retimed(self, offset: float, scale: float = 1.0, gain: tuple[float, float] = (1.0, 1.0)) -> "FreeMotion":
+        """The motion of another clock: ``gain D(scale t + offset)`` at time t.
+
+        Args:
+            offset: Reading of this motion's clock at time 0, in seconds.
+            scale: Seconds that pass on it in one second.
+            gain: Factor of each axis (x, y), not negative where there are tones.
+        """
+        check_number("offset", offset)
+        check_number("scale", scale, above=0.0)
+        size = self.coefficients.new_tensor(gain)
+        tones = Vibration(
+            self.amplitude * size[:, None],
+            self.frequency * scale,
+            self.phase + 2 * math.pi * self.frequency * offset,
+            size * (self.image_motion + self.image_acceleration * offset) * scale,
+            size * self.image_acceleration * scale**2,
+        )
+        moved = self.image_motion * offset + 0.5 * self.image_acceleration * offset**2
+        rest = (self.coefficients + moved[..., None]) * size[:, None]
+        return FreeMotion(rest, (self.start - offset) / scale, self.spacing / scale, tones)
+
     def _taps(self, times: Tensor) -> tuple[Tensor, Tensor]:
         """The four coefficients (S, 2, 4) about times S, and the fraction (S,) of a knot spacing."""
         batch = self.batch_shape

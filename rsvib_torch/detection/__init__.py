@@ -1,15 +1,18 @@
 """From offsets to a vibration."""
 
+from rsvib_torch.detection.alignment import ClockAlignment, align_motion
 from rsvib_torch.detection.detect import DetectionMethod, VibrationDetector, detect_vibration
 from rsvib_torch.detection.freeform import MotionDetection, detect_motion
 from rsvib_torch.detection.result import DetectionResult, VibrationStd
 
 __all__ = [
+    "ClockAlignment",
     "DetectionMethod",
     "DetectionResult",
     "MotionDetection",
     "VibrationDetector",
     "VibrationStd",
+    "align_motion",
     "detect_motion",
     "detect_vibration",
 ]

@@ -27,19 +27,20 @@ from rsvib_torch.orientation import (
     offsets_from_row_order,
     vibration_from_row_order,
 )
-from rsvib_torch.registration import Registration
+from rsvib_torch.registration import OffsetCurve, Registration
 from rsvib_torch.registration.gradients import RowSpectra  # type: ignore[attr-defined, unused-ignore]
 from rsvib_torch.registration.register import register_rows
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
-__all__ = ["MotionDetection", "detect_motion"]
+__all__ = ["MotionDetection", "detect_motion", "groups_of_frames", "start_curve"]
 
 _MOST_KNOTS = 3000
 _LOOKS = 32  # rows of a frame at which the motion is reported
 _EXPLAINED = 0.15  # of the motion that rows may show beyond the fit
 _FINEST = 0.03  # px, that never matters
 _SURE = 0.3  # px
+_LEAST_FOUND = 0.25  # of the row bands
 _FAR = 0.25  # of the frame, from where on a steady motion is that of the image
 
 
@@ -112,11 +113,46 @@ def detect_motion(
         ValueError: If there are fewer than two frames, they are a batch, a frame is constant, the motion is beyond the
             search range, or an option is out of range.
     """
-    images = as_float_frames(frames, full_scale, minimum_frames=2)
-    if images.ndim == 5:
-        raise ValueError(f"detect_motion takes one stack, got a batch of shape {tuple(images.shape)}")
     check_whole_number("knot_rows", knot_rows, at_least=4)
     check_whole_number("iterations", iterations, at_least=1)
+    grey, rowwise, curve = start_curve(frames, timing, full_scale, registration, band_rows, band_step, search)
+    starts = rowwise.frame_starts(grey.shape[1], grey.device)
+    record = (float(starts[0]), float(starts[-1]) + grey.shape[-2] * rowwise.row_time + rowwise.exposure_time)
+    spacing = max(knot_rows * rowwise.row_time, (record[1] - record[0]) / _MOST_KNOTS)
+    size = (grey.shape[-2], grey.shape[-1])
+    measured = measurements_of_curve(curve, rowwise, band_step)
+    fit = fit_spline(measured, max(spacing, 0.5 * band_rows * rowwise.row_time), record)
+    motion = _motion(fit, size, 0.0)
+    groups = groups_of_frames(grey, starts, motion)
+    for step in range(iterations):
+        measured = _join([measure_group(group, rowwise, motion, None)[0] for group in groups])
+        if step:  # blocks that show something that moves by itself have less say
+            measured = measured.reweighted(_left(measured, motion))
+        fit = fit_spline(measured, spacing, record)
+        motion = _motion(fit, size, 0.0)  # groups follow the image as it moves on
+    left = _left(measured, motion)
+    honest = 1 / math.sqrt(independent_fraction(measured, left))
+    return _report(_motion(fit, size, _FAR), fit, measured, left, honest, timing, starts, size[0])
+
+
+def start_curve(
+    frames: Tensor,
+    timing: SensorTiming,
+    full_scale: float | None,
+    registration: Registration,
+    band_rows: int,
+    band_step: int,
+    search: int,
+) -> tuple[Tensor, SensorTiming, OffsetCurve]:
+    """Grey frames (1, T, H, W) and timing in row order, and the offsets of their row bands.
+
+    Raises:
+        TypeError: If frames are not numbers.
+        ValueError: If they are no stack of two frames or more, a frame is constant, or hardly a band is found.
+    """
+    images = as_float_frames(frames, full_scale, minimum_frames=2)
+    if images.ndim == 5:
+        raise ValueError(f"this takes one stack, got a batch of shape {tuple(images.shape)}")
     images = frames_to_row_order(images, timing)
     grey = (images.mean(-3) if images.ndim == 4 else images)[None]
     flat = grey[0].flatten(1).std(-1) <= 1e-7 * grey[0].flatten(1).abs().amax(-1)
@@ -128,30 +164,19 @@ def detect_motion(
         grey[:, :, None], rowwise, method=registration, band_rows=band_rows, band_step=band_step, search=search
     )
     found = float(curve.good.double().mean())
-    if found < 0.25:
+    if found < _LEAST_FOUND:
         raise ValueError(
             f"only {found:.0%} of the row bands are found in the next frame: the motion is beyond search={search} px "
             "within a frame, or the frames show different scenes"
         )
-    starts = rowwise.frame_starts(grey.shape[1], grey.device)
-    record = (float(starts[0]), float(starts[-1]) + grey.shape[-2] * rowwise.row_time + rowwise.exposure_time)
-    spacing = max(knot_rows * rowwise.row_time, (record[1] - record[0]) / _MOST_KNOTS)
-    size = (grey.shape[-2], grey.shape[-1])
-    measured = measurements_of_curve(curve, rowwise, band_step)
-    fit = fit_spline(measured, max(spacing, 0.5 * band_rows * rowwise.row_time), record)
-    motion = _motion(fit, size, 0.0)
+    return grey, rowwise, curve
+
+
+def groups_of_frames(grey: Tensor, starts: Tensor, motion: FreeMotion) -> list[_Group]:
+    """Frames (1, T, H, W), taken from ``starts`` (T,) on, in groups that share a scene; the motion is a batch of 1."""
     even = _standardised(grey, None)
-    members = groups_of(grey.shape[1], _frames_in_group(motion, starts[None], size))
-    groups = [_Group(RowSpectra(even[:, m.start : m.stop]), starts[None, m.start : m.stop]) for m in members]
-    for step in range(iterations):
-        measured = _join([measure_group(group, rowwise, motion, None)[0] for group in groups])
-        if step:  # blocks that show something that moves by itself have less say
-            measured = measured.reweighted(_left(measured, motion))
-        fit = fit_spline(measured, spacing, record)
-        motion = _motion(fit, size, 0.0)  # groups follow the image as it moves on
-    left = _left(measured, motion)
-    honest = 1 / math.sqrt(independent_fraction(measured, left))
-    return _report(_motion(fit, size, _FAR), fit, measured, left, honest, timing, starts, size[0])
+    members = groups_of(grey.shape[1], _frames_in_group(motion, starts[None], (grey.shape[-2], grey.shape[-1])))
+    return [_Group(RowSpectra(even[:, m.start : m.stop]), starts[None, m.start : m.stop]) for m in members]
 
 
 def _left(measured: Measurements, motion: FreeMotion) -> Tensor:

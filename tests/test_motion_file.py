@@ -1,0 +1,87 @@
+"""Recorded motion from CSV files, and a clear line for every mistake."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from rsvib_torch import read_motion
+
+CLOCK = np.arange(0.0, 1.0, 0.005)
+
+
+def write(path, columns, names="time,x,y"):
+    rows = [",".join(f"{value:.12g}" for value in row) for row in np.stack(columns, -1)]
+    path.write_text("\n".join([names, *rows]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(("unit", "size"), [("rad", 1.0), ("mrad", 1e-3), ("urad", 1e-6), ("deg", math.pi / 180)])
+def test_angles_become_pixels(tmp_path, unit, size):
+    x, y = 0.01 * np.sin(9 * CLOCK), 0.02 * np.cos(5 * CLOCK)
+    path = write(tmp_path / "a.csv", (CLOCK, x / size, y / size))
+    motion = read_motion(path, unit=unit, focal_length=1000.0, signs=(1, -1))
+    expected = 1000 * np.tan(np.stack([x - x.mean(), y - y.mean()], -1))
+    expected = (expected - expected.mean(0)) * [1, -1]
+    assert np.allclose(motion.displacement(torch.from_numpy(CLOCK)).numpy(), expected, atol=1e-3)
+
+
+def test_rates_are_summed_up_and_times_scaled(tmp_path):
+    x, y = 0.01 * np.sin(9 * CLOCK), 0.02 * np.cos(5 * CLOCK)
+    rates = np.degrees(0.09 * np.cos(9 * CLOCK)), np.degrees(-0.1 * np.sin(5 * CLOCK))
+    path = write(tmp_path / "a.csv", (1e3 * CLOCK, CLOCK, *rates), " Time , other, X, y")
+    motion = read_motion(path, unit="deg/s", focal_length=1000.0, time_unit="ms")
+    found = motion.displacement(torch.from_numpy(CLOCK)).numpy()
+    assert np.allclose(found[:, 0] - found[:, 0].mean(), 1000 * (x - x.mean()), atol=0.02)
+    assert np.allclose(found[:, 1] - found[:, 1].mean(), 1000 * (y - y.mean()), atol=0.02)
+
+
+def test_pixels_are_taken_as_they_are(tmp_path):
+    path = write(tmp_path / "a.csv", (CLOCK, np.sin(9 * CLOCK), CLOCK))
+    found = read_motion(path, unit="px").displacement(torch.from_numpy(CLOCK)).numpy()
+    assert np.allclose(found[:, 1], CLOCK - CLOCK.mean(), atol=1e-6)
+
+
+def changed(place, time):
+    clock = CLOCK.copy()
+    clock[place] = time
+    return clock
+
+
+@pytest.mark.parametrize(
+    ("clock", "values", "options", "message"),
+    [
+        (changed(7, 0.001), CLOCK, {}, "times must increase, but sample 8"),
+        (changed(7, CLOCK[6]), CLOCK, {}, "times must increase"),
+        (np.concatenate([CLOCK[:50], CLOCK[60:]]), CLOCK[10:], {}, r"gap of 0\.055 s after 0\.245 s"),
+        (CLOCK, changed(4, np.nan), {}, "line 6: x must be a number"),
+        (1e3 * CLOCK, CLOCK, {}, "really in s"),
+        (CLOCK, CLOCK, {"time_unit": "ns"}, "really in ns"),
+        (CLOCK, 20 * CLOCK, {"unit": "rad", "focal_length": 1000}, "really in rad"),
+        (CLOCK, 300 * CLOCK, {"unit": "rad/s", "focal_length": 1000}, "really in rad/s"),
+        (CLOCK, CLOCK, {"unit": "rad"}, "needs a focal_length"),
+        (CLOCK, CLOCK, {"focal_length": 1000}, "needs none"),
+        (CLOCK, CLOCK, {"unit": "rad", "focal_length": -1}, "focal_length must be larger"),
+        (CLOCK, CLOCK, {"unit": "feet"}, "unit must be one of"),
+        (CLOCK, CLOCK, {"signs": (2, 1)}, "signs"),
+        (CLOCK[:3], CLOCK[:3], {}, "3 samples"),
+    ],
+)
+def test_mistakes_are_named(tmp_path, clock, values, options, message):
+    path = write(tmp_path / "a.csv", (clock, values, values))
+    with pytest.raises(ValueError, match=message):
+        read_motion(path, **{"unit": "px", **options})
+
+
+def test_files_that_are_none(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        read_motion(tmp_path / "none.csv", unit="px")
+    with pytest.raises(ValueError, match="column 'y' is missing; the first line has time, x"):
+        read_motion(write(tmp_path / "a.csv", (CLOCK, CLOCK), "time,x"), unit="px")
+    (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00 picture")
+    with pytest.raises(ValueError, match=r"b\.csv"):
+        read_motion(tmp_path / "b.csv", unit="px")
+    (tmp_path / "c.csv").write_text("")
+    with pytest.raises(ValueError, match="first line has nothing"):
+        read_motion(tmp_path / "c.csv", unit="px")
