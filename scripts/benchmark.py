@@ -3,7 +3,7 @@
 
 Registration: all bands of a pair of frames, against skimage.registration.phase_cross_correlation band by band.
 Cost: detection in FFT round trips. Detection: errors against the Cramer-Rao bound, and whether error bars cover.
-Restoration: one frame, see benchmarks/restoration.py.
+Restoration: one frame, see benchmarks/restoration.py. Streaming: long stacks, see benchmarks/streaming.py.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from typing import Any
 
 import skimage
 import torch
-from benchmarks import detection, detection_cost, detection_report, registration, restoration
+from benchmarks import detection, detection_cost, detection_report, registration, restoration, streaming
 from benchmarks.measure import machine
 
 PARTS: dict[str, tuple[Callable[..., list[dict[str, Any]]], Callable[..., list[str]]]] = {
@@ -23,6 +23,7 @@ PARTS: dict[str, tuple[Callable[..., list[dict[str, Any]]], Callable[..., list[s
     "cost": (detection_cost.rows, detection_cost.lines),
     "detection": (detection.rows, detection.lines),
     "restoration": (restoration.rows, restoration.lines),
+    "streaming": (streaming.rows, streaming.lines),
 }
 
 
@@ -42,6 +43,7 @@ def main() -> None:
     parser.add_argument("--only", choices=PARTS, nargs="+", default=PARTS, help="parts to run (default: all)")
     restoration.add_options(parser)
     detection.add_options(parser)
+    streaming.add_options(parser)
     options = parser.parse_args()
     torch.set_num_threads(os.cpu_count() or 1)
     summary: dict[str, Any] = {

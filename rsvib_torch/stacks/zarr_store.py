@@ -128,6 +128,8 @@ def create_zarr(path: Path, info: StackInfo, fresh: bool) -> ZarrWriter:
     """Make a Zarr v3 array, or go on with one."""
     zarr = _zarr()
     if not fresh:
+        for torn in path.rglob("*.partial"):  # what the store leaves of a chunk when the process is killed
+            torn.unlink()
         return ZarrWriter(zarr.open_array(store=str(path), mode="r+", zarr_format=3), info)
     array = zarr.create_array(
         store=str(path),

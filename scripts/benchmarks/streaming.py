@@ -1,0 +1,178 @@
+"""Long stacks: memory and time a frame against the number of frames, overlap of reading and writing, Dask's cost.
+
+Frames are written over and over from a few simulated ones, so that long stacks cost no time to make. Every run is a
+process of its own, so that its peak of memory is its own.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import rsvib_torch as rsv
+from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.stacks import process_stack
+from rsvib_torch.stacks.job import StackJob
+from rsvib_torch.stacks.windows import cut_windows
+
+_DRAWN, WINDOW = 15, 8  # a period of 14 frames: windows of 7 new frames see whole ones
+DETECTION = {"method": "bands", "tones": 1, "band_step": 32, "search": 8}
+RESTORATION = {"method": "dewarp"}
+_RUN = """
+import json, sys
+import torch
+torch.set_num_threads(1)
+from benchmarks import streaming
+print(json.dumps(streaming.one_run(**json.loads(sys.argv[1]))))
+"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this part."""
+    parser.add_argument("--frames", type=int, nargs="+", default=[100, 1000], help="streaming: lengths of the stacks")
+    parser.add_argument("--frame-size", type=int, default=1024, help="streaming: rows and columns (default: 1024)")
+    parser.add_argument("--memory", default="2GB", help="streaming: memory of the process (default: 2GB)")
+
+
+def timing_of(size: int) -> rsv.SensorTiming:
+    """A camera whose frames have as many rows, and some blanking."""
+    return rsv.SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=size + 32)
+
+
+def write_long(path: Path, count: int, size: int) -> None:
+    """A stack of 16-bit frames, written piece by piece."""
+    scene = city_and_fields(size + 80, size + 80, seed=3)
+    vibration = rsv.Vibration([1.6, 1.1], [71.0, 113.0], [0.6, -1.2])
+    taken = rsv.simulate_frames(scene, timing_of(size), vibration, min(_DRAWN, count), frame_size=(size, size))
+    noise = np.random.default_rng(1)
+    drawn = [np.clip(np.round(frame * 4095 + noise.normal(0, 8, frame.shape)), 0, 4095) for frame in taken.numpy()]
+    stack = np.lib.format.open_memmap(path, "w+", "u2", (count, size, size))
+    turn = [*range(len(drawn)), *range(len(drawn) - 2, 0, -1)]
+    for index in range(count):
+        stack[index] = drawn[turn[index % len(turn)]]
+    stack.flush()
+
+
+def peak_memory() -> float:
+    """Peak of this process in bytes: what the kernel counts since it began, not its parent's."""
+    for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
+        if line.startswith("VmHWM:"):
+            return 1024.0 * int(line.split()[1])
+    raise OSError("the kernel does not tell the peak of memory")
+
+
+def one_run(source: str, sink: str, size: int, memory: str | None, workers: int | None, scheduler: str | None) -> Any:
+    """Process a stack in this process."""
+    import resource  # noqa: PLC0415 - where there is none, there is no streaming benchmark
+
+    begin = time.perf_counter()
+    report = process_stack(
+        source,
+        sink,
+        timing_of(size),
+        window=WINDOW,
+        detection=DETECTION,
+        restoration=RESTORATION,
+        full_scale=4095,
+        memory=memory,
+        workers=workers,
+        scheduler=scheduler,
+    )
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    seconds = time.perf_counter() - begin
+    return {
+        "frames": report.frames,
+        "restored_windows": report.restored,
+        "windows": report.windows,
+        "seconds": seconds,
+        "seconds_a_frame": seconds / report.frames,
+        "cpu_seconds_a_frame": (used.ru_utime + used.ru_stime) / report.frames,
+        "peak_memory_gb": peak_memory() / 1e9,
+    }
+
+
+def _apart(**arguments: Any) -> dict[str, Any]:
+    done = subprocess.run(
+        [sys.executable, "-c", _RUN, json.dumps(arguments)],
+        cwd=Path(__file__).parents[1],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return result
+
+
+def _computing_alone(source: Path, size: int, windows: int) -> float:
+    """Seconds a frame of computing alone: frames are in memory, and nothing is written; one thread."""
+    reader = rsv.open_stack(source)
+    job = StackJob(source, reader.info, timing_of(size), 4095.0, DETECTION, RESTORATION)
+    cut = cut_windows(reader.info.shape[0], WINDOW)[:windows]
+    pixels = [[reader.frame(index) for index in window.frames] for window in cut]
+    reader.close()
+    job.compute(cut[0], list(pixels[0]))
+    begin = time.perf_counter()
+    for window, frames in zip(cut, pixels, strict=True):
+        job.compute(window, list(frames))
+    return (time.perf_counter() - begin) / sum(window.kept for window in cut)
+
+
+def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Runs of each length; then one worker with and without reading and writing in turns, and Dask."""
+    import torch  # noqa: PLC0415
+
+    results: list[dict[str, Any]] = []
+    size = options.frame_size
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        sink = folder / "out.tif"
+        for count in options.frames:
+            source = folder / "frames.npy"
+            write_long(source, count, size)
+            common = {"source": str(source), "sink": str(sink), "size": size, "scheduler": None}
+            run = _apart(**common, memory=options.memory, workers=None)
+            results.append({"name": f"{count} frames, memory {options.memory}", **run})
+        few = 5 * (WINDOW - 1) + 1
+        write_long(folder / "few.npy", few, size)
+        torch.set_num_threads(1)
+        common |= {"source": str(folder / "few.npy"), "memory": None}
+        alone, streamed = [], []
+        for _ in range(max(2, options.runs - 2)):
+            alone.append(_computing_alone(folder / "few.npy", size, 5))
+            streamed.append(_apart(**common, workers=1))
+        best = min(alone)
+        results.append({"name": "computing alone, one thread", "seconds_a_frame": best})
+        run = min(streamed, key=lambda run: float(run["seconds_a_frame"]))
+        results.append({"name": "read, computed, written, one worker", **run, "rate": best / run["seconds_a_frame"]})
+        for workers in (1, 2):
+            run = _apart(**{**common, "scheduler": "local"}, workers=workers)
+            results.append({"name": f"Dask, {workers} local workers", **run})
+    return results
+
+
+def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+    """The table in words."""
+    table = [
+        f"Stacks of {options.frame_size} x {options.frame_size} 16-bit frames, windows of {WINDOW}, bands and dewarp.",
+        "",
+        "| run | s a frame | CPU s a frame | peak memory (GB) |",
+        "|---|---|---|---|",
+    ]
+    for row in results:
+        cpu, peak = row.get("cpu_seconds_a_frame"), row.get("peak_memory_gb")
+        cells = ["" if value is None else f"{value:.3f}" for value in (row["seconds_a_frame"], cpu, peak)]
+        table.append(f"| {row['name']} | {' | '.join(cells)} |")
+    runs = [row for row in results if "memory" in row["name"]]
+    if len(runs) > 1:
+        ratios = [
+            runs[-1][name] / runs[0][name] for name in ("peak_memory_gb", "seconds_a_frame", "cpu_seconds_a_frame")
+        ]
+        table += ["", "Longest over shortest: memory {:.3f}, time a frame {:.3f}, CPU time {:.3f}.".format(*ratios)]
+    rate = next(row["rate"] for row in results if "rate" in row)
+    return [*table, "", f"Reading and writing on the side: {100 * rate:.0f} % of the rate of computing alone."]
