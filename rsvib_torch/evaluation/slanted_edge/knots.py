@@ -1,10 +1,15 @@
-"""Smooth departures from a model of the edge: a cubic B-spline along the normal with Gaussian-process priors."""
+"""Smooth departures from a model of the edge: a cubic B-spline along the normal with Gaussian-process priors.
+
+Where they fade slowly, a tail goes on beyond the ROI: light scattered so far lowers the contrast that the ROI shows.
+"""
 
 import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from rsvib_torch.evaluation.slanted_edge.curve import Tail
 
 __all__ = ["Knots", "lay_knots", "prior_roots"]
 
@@ -14,6 +19,7 @@ _MOST_KNOTS = 220
 _CLEAR = 2  # knots that stay clear of the ROI's borders
 _SMOOTHNESS = (0.4, 0.8, 1.8)  # px, correlation lengths of the departures
 _DECAY = ((1.0, 2), (2.5, 2), (6.0, 2), (2.0, 1))  # px from the edge and power with which they fade
+_ABSENT = 1e-12  # variance of the tail where departures fade faster
 
 
 @dataclass(frozen=True)
@@ -24,11 +30,13 @@ class Knots:
         place: (K,) values of u.
         step: Between them.
         stretch: px.
+        tail: What goes on beyond them.
     """
 
     place: Tensor
     step: float
     stretch: float
+    tail: Tail
 
     @property
     def distance(self) -> Tensor:
@@ -49,10 +57,13 @@ class Knots:
         return index.clamp(0, len(self.place) - 1), value * inside, slope * inside * squeeze[:, None]
 
     def matrices(self, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """Values and derivatives per px of all splines, (N, K)."""
+        """Values and derivatives per px of all splines and of the tail, (N, K + 1)."""
         index, *taps = self.taps(distance)
         empty = distance.new_zeros(len(distance), len(self.place))
-        value, slope = (empty.scatter_add(1, index, tap) for tap in taps)
+        value, slope = (
+            torch.cat([empty.scatter_add(1, index, tap), beyond[:, None]], dim=1)
+            for tap, beyond in zip(taps, (self.tail.esf(distance), self.tail.lsf(distance)), strict=True)
+        )
         return value, slope
 
 
@@ -62,11 +73,12 @@ def lay_knots(room: float, width: float, like: Tensor) -> Knots:
     reach = stretch * math.asinh(room / stretch)
     step = max(_KNOT, 2 * reach / _MOST_KNOTS)
     half = max(int(reach / step) - _CLEAR, 2)
-    return Knots(step * torch.arange(-half, half + 1, dtype=like.dtype, device=like.device), step, stretch)
+    place = step * torch.arange(-half, half + 1, dtype=like.dtype, device=like.device)
+    return Knots(place, step, stretch, Tail(_DECAY[-1][0] * max(1.0, width)))
 
 
 def prior_roots(knots: Knots, width: float) -> Tensor:
-    """Square roots (P, K, K) of prior covariances of the coefficients, at strength 1 in the middle."""
+    """Square roots (P, K + 1, K + 1) of prior covariances of splines and tail, at strength 1 in the middle."""
     scale = max(1.0, width)
     distance = knots.distance.abs()
     apart = (knots.place[:, None] - knots.place).square()
@@ -74,5 +86,8 @@ def prior_roots(knots: Knots, width: float) -> Tensor:
     fade = torch.stack([(1 + (distance / (scale * reach)).square()) ** (-0.5 * power) for reach, power in _DECAY])
     prior = (smooth[:, None] * fade[:, :, None] * fade[:, None, :]).flatten(0, 1)
     prior.diagonal(dim1=-2, dim2=-1).add_(1e-9)
+    prior = torch.nn.functional.pad(prior, (0, 1, 0, 1))
+    slow = [1.0 if power == 1 else _ABSENT for _ in _SMOOTHNESS for _, power in _DECAY]
+    prior[:, -1, -1] = prior.new_tensor(slow)
     roots: Tensor = torch.linalg.cholesky(prior)
     return roots

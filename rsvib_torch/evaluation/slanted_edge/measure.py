@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from rsvib_torch.evaluation.slanted_edge.curve import FREQUENCIES, MtfCurve, first_crossing, transfer
+from rsvib_torch.evaluation.slanted_edge.curve import FREQUENCIES, MtfCurve, first_crossing
 from rsvib_torch.evaluation.slanted_edge.geometry import fit_edge, start_edge, straighten
 from rsvib_torch.evaluation.slanted_edge.refusals import check_edge, check_roi
 from rsvib_torch.evaluation.slanted_edge.spread import fit_spread
@@ -55,9 +55,9 @@ def slanted_edge_mtf(roi: Tensor) -> MtfCurve:
     spread = fit_spread(fit, scatter, room)
 
     frequency = torch.linspace(0, 1, FREQUENCIES, dtype=torch.float64, device=roi.device)
-    mtf = transfer(spread.position, spread.lsf, frequency).abs()
-    mtf50 = first_crossing(spread.position, spread.lsf, frequency, mtf, 0.5)
-    beside = transfer(spread.position, spread.lsf, torch.stack([mtf50 - _STEP, mtf50 + _STEP])).abs()
+    mtf = spread.mtf(frequency)
+    mtf50 = first_crossing(spread.mtf, frequency, mtf, 0.5)
+    beside = spread.mtf(torch.stack([mtf50 - _STEP, mtf50 + _STEP]))
     mtf50_std = spread.std(mtf50[None])[0] * 2 * _STEP / (beside[1] - beside[0]).abs()
     turn = math.degrees(math.atan(float(spread.fit.slope(scatter))))
     return MtfCurve(
@@ -71,6 +71,8 @@ def slanted_edge_mtf(roi: Tensor) -> MtfCurve:
         position=spread.position,
         esf=spread.esf,
         lsf=spread.lsf,
+        tail=spread.tail,
+        far=spread.far,
         levels=spread.fit.sides[:, 0],
         noise=spread.noise,
     )

@@ -15,7 +15,7 @@ _NEGLIGIBLE = 1e-3  # weight of a prior beside the best one
 
 @dataclass(frozen=True)
 class Equations:
-    """Normal equations of weighted least squares: free parameters, then slopes, then the spline's coefficients.
+    """Normal equations of weighted least squares: free parameters, slopes, then the K coefficients of the departure.
 
     Attributes:
         matrix: (F + 2 + K, F + 2 + K).
@@ -29,7 +29,7 @@ class Equations:
 
     @classmethod
     def of(cls, dense: Tensor, index: Tensor, taps: Tensor, count: int, residual: Tensor) -> "Equations":
-        """Equations of ``residual = dense @ first + sum of taps of the other ``count`` coefficients``."""
+        """Equations of ``residual = dense @ first + sum of taps of ``count`` coefficients + dense[:, -1] last``."""
         columns = dense.shape[1]
         matrix = dense.new_zeros(columns + count, columns + count)
         matrix[:columns, :columns] = dense.T @ dense
@@ -41,7 +41,9 @@ class Equations:
             mixed.index_add_(0, index[:, tap], dense * taps[:, tap, None])
             right.index_add_(0, index[:, tap], residual * taps[:, tap])
         matrix[columns:, :columns], matrix[:columns, columns:] = mixed, mixed.T
-        return cls(matrix, torch.cat([dense.T @ residual, right]), columns - SLOPES)
+        order = [*range(columns - 1), *range(columns, columns + count), columns - 1]
+        right = torch.cat([dense.T @ residual, right])[order]
+        return cls(matrix[order][:, order], right, columns - 1 - SLOPES)
 
     def solution(self) -> Tensor:
         """Least-squares solution, all parameters free but for a trace of damping."""
@@ -82,7 +84,7 @@ def posterior(equations: Equations, roots: Tensor, contrast: Tensor) -> Posterio
 
     Args:
         equations: Of all parameters.
-        roots: (P, K, K) square roots of the prior covariances of the spline's coefficients at strength 1.
+        roots: (P, K, K) square roots of the prior covariances of the departure's coefficients at strength 1.
         contrast: () of the edge.
     """
     free = equations.free

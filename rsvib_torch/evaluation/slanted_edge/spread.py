@@ -1,9 +1,9 @@
 """Edge spread function of any shape: Gaussian optics and square pixels, plus what the pixels say beyond that.
 
 The departure from the Gaussian model is a smooth random function of the distance from the edge (a cubic B-spline with
-a Gaussian-process prior) whose strength, smoothness and reach are weighted by how well each explains the pixels
-(restricted likelihood). Where the pixels agree with the model, it shrinks to nothing and costs no noise; where they do
-not, it follows them.
+a Gaussian-process prior, and a tail beyond the ROI) whose strength, smoothness and reach are weighted by how well each
+explains the pixels (restricted likelihood). Where the pixels agree with the model, it shrinks to nothing and costs no
+noise; where they do not, it follows them.
 """
 
 import math
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rsvib_torch.evaluation.slanted_edge.curve import transfer
+from rsvib_torch.evaluation.slanted_edge.curve import Tail
 from rsvib_torch.evaluation.slanted_edge.geometry import EdgeFit, Scatter, linearised, moved
 from rsvib_torch.evaluation.slanted_edge.knots import Knots, lay_knots, prior_roots
 from rsvib_torch.evaluation.slanted_edge.model import edge_spread
@@ -37,7 +37,10 @@ class Spread:
         position: (N,) px.
         esf: (N,) edge spread function.
         lsf: (N,) its derivative.
+        tail: Shape of what lies beyond ``position``.
+        far: () how much of the tail there is in ``esf`` and ``lsf``.
         alternatives: (A, N) line spread functions by prior.
+        alternative_far: (A,) how much of the tail there is in each.
         weights: (A,) of the alternatives.
         basis: (N, R) derivatives of the line spread function by what is uncertain.
         roots: (A, R, S) square roots of the covariance of what is uncertain, by prior.
@@ -48,19 +51,27 @@ class Spread:
     position: Tensor
     esf: Tensor
     lsf: Tensor
+    tail: Tail
+    far: Tensor
     alternatives: Tensor
+    alternative_far: Tensor
     weights: Tensor
     basis: Tensor
     roots: Tensor
     noise: Tensor
 
+    def mtf(self, frequency: Tensor) -> Tensor:
+        """MTF at frequencies (F,)."""
+        return self.tail.transfer(self.position, self.lsf, self.far, frequency).abs()
+
     def std(self, frequency: Tensor) -> Tensor:
         """Standard deviation of the MTF at frequencies (F,)."""
-        mean = transfer(self.position, self.lsf, frequency)
+        mean = self.tail.transfer(self.position, self.lsf, self.far, frequency)
         mtf, phase = mean.abs(), mean.angle()
         ramps = torch.cos(2 * math.pi * frequency[:, None] * self.position + phase[:, None]) / self.lsf.sum()
         within = (ramps @ self.basis @ self.roots).square().sum(-1)
-        between = (transfer(self.position, self.alternatives, frequency).abs() - mtf).square()
+        others = self.tail.transfer(self.position, self.alternatives, self.alternative_far, frequency)
+        between = (others.abs() - mtf).square()
         return (self.weights @ (within + between)).sqrt()
 
 
@@ -90,14 +101,17 @@ def fit_spread(fit: EdgeFit, scatter: Scatter, room: float) -> Spread:
         contrast = sides[:, 1] - sides[:, 0]
         index, values, slopes = knots.taps(distance)
         if found is not None:
-            steeper = (slopes * found.mean[SLOPES:][index]).sum(1)
+            steeper = (slopes * found.mean[SLOPES:][index]).sum(1) + knots.tail.lsf(distance) * found.mean[-1]
             jacobian[:, :4] += (contrast * steeper)[:, None] * fit.distance(scatter)[1]
-        dense, taps = jacobian[:, _FIXED + _RANDOM], contrast[:, None] * values
+        beyond = contrast * knots.tail.esf(distance)
+        dense = torch.cat([jacobian[:, _FIXED + _RANDOM], beyond[:, None]], dim=1)
+        taps = contrast[:, None] * values
         # slopes have a prior around zero: all of them is to be explained
         residual = scatter.value - model + jacobian[:, _RANDOM] @ fit.sides[:, 1]
         if count == 0:
             plain = Equations.of(dense, index, taps, len(knots.place), residual).solution()
-            left = residual - dense @ plain[: dense.shape[1]] - (taps * plain[dense.shape[1] :][index]).sum(1)
+            front = dense.shape[1] - 1
+            left = residual - dense @ torch.cat([plain[:front], plain[-1:]]) - (taps * plain[front:][index]).sum(1)
             bright = ((model - sides[:, 0]) / contrast).clamp(0.0, 1.0)
             floor = max(_FLOOR * float(fit.contrast), _quantisation(scatter.value))
             noise = _noise(left, bright, len(plain), floor)
@@ -151,7 +165,10 @@ def _sampled(fit: EdgeFit, found: Posterior, knots: Knots, scatter: Scatter, noi
         position,
         esf + shrink * (blur * esf_by_blur + values @ mean[SLOPES:]),
         lsf + shrink * (blur * by_blur + slopes @ mean[SLOPES:]),
+        knots.tail,
+        shrink * mean[-1],
         alternatives,
+        shrink * found.coefficients[:, -1],
         found.weights,
         shrink * torch.cat([basis, by_blur[:, None]], dim=1),
         roots,
