@@ -133,6 +133,12 @@ class FreeMotion(Vibration):
         """Time of the last knot in seconds."""
         return self.start + (self.coefficients.shape[-1] - 3) * self.spacing
 
+    @property
+    def knots(self) -> Tensor:
+        """(N,) s, times that the coefficients belong to."""
+        count = self.coefficients.shape[-1]
+        return self.start + self.spacing * (torch.arange(count, dtype=torch.float64, device=self.device) - 1.0)
+
     def to(self, device: torch.device | str) -> "FreeMotion":
         """The same motion on another device."""
         return FreeMotion(self.coefficients.to(device), self.start, self.spacing, self.tones.to(device))

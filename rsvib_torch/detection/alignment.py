@@ -15,7 +15,6 @@ from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.orientation import vibration_to_row_order
 from rsvib_torch.registration import Registration
 from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.vibration import Vibration
 
 __all__ = ["ClockAlignment", "align_motion"]
 
@@ -76,12 +75,9 @@ class _Clock:
     def motion(self, recorded: FreeMotion) -> FreeMotion:
         """The recorded motion on the clock of the frames."""
         moved = recorded.retimed(self.offset, self.scale, self.gain)
-        tones = moved.tones
-        drift = tones.image_motion.new_tensor(self.drift)
-        whole = Vibration(
-            tones.amplitude, tones.frequency, tones.phase, tones.image_motion + drift, tones.image_acceleration
-        )
-        return FreeMotion(moved.coefficients, moved.start, moved.spacing, whole)
+        knots = moved.knots - self.middle
+        drift = knots.new_tensor(self.drift)[:, None] * knots
+        return FreeMotion(moved.coefficients + drift, moved.start, moved.spacing, moved.tones)
 
 
 def align_motion(

@@ -28,8 +28,8 @@ from rsvib_torch.orientation import (
     vibration_from_row_order,
 )
 from rsvib_torch.registration import OffsetCurve, Registration
-from rsvib_torch.registration.gradients import RowSpectra  # type: ignore[attr-defined, unused-ignore]
 from rsvib_torch.registration.register import register_rows
+from rsvib_torch.registration.row_spectra import RowSpectra
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 

@@ -1,0 +1,157 @@
+"""Motion recorded on another clock: found again in the frames of an independent simulator."""
+
+import numpy as np
+import pytest
+import torch
+from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
+
+import rsvib_torch as rsv
+from rsvib_torch.cli import run_command
+
+HEIGHT, WIDTH, FRAMES = 224, 160, 4
+TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=300)
+FOCAL_LENGTH = 900.0  # px
+CLOCK, SPEED, DRIFT = 812.3456, 1.0004, (9.0, -4.0)
+CONFIG = "[sensor]\nrow_time = 6e-5\nexposure_rows = 20\nframe_rows = 300\n"
+
+
+def angles(clock):
+    """A shaking hand: angles in rad on the clock of the gyroscope."""
+    t = clock - 812.0
+    x = 3e-3 * np.sin(2 * np.pi * 11.3 * t + 6 * np.sin(2.1 * t)) + 1e-3 * np.sin(2 * np.pi * 37.7 * t)
+    y = 2e-3 * np.sin(2 * np.pi * 8.9 * t + 5 * np.sin(3.3 * t)) + 0.5e-3 * np.cos(2 * np.pi * 29.1 * t)
+    return np.stack([x, y], axis=-1)
+
+
+class Shaken(Motion):
+    def displacement(self, times):
+        return FOCAL_LENGTH * np.tan(angles(SPEED * times + CLOCK)) + np.asarray(DRIFT) * times[..., None]
+
+
+@pytest.fixture(scope="module", name="scene")
+def make_scene():
+    return draw_scene(HEIGHT + 2 * MARGIN, WIDTH + 2 * MARGIN, 7)
+
+
+@pytest.fixture(scope="module", name="frames")
+def make_frames(scene):
+    return torch.from_numpy(take_frames(scene, TIMING, Shaken(), FRAMES, 0.005)).float()
+
+
+def log(path, clock, values, header="time,x,y"):
+    rows = [f"{t:.9f},{x:.12g},{y:.12g}" for t, (x, y) in zip(clock, values, strict=True)]
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module", name="gyroscope")
+def make_gyroscope(tmp_path_factory):
+    """Rates of one kilohertz over a second and a half, by differences of the angles."""
+    clock = np.arange(811.9, 813.4, 1e-3)
+    rates = (angles(clock + 1e-5) - angles(clock - 1e-5)) / 2e-5
+    return log(tmp_path_factory.mktemp("gyroscope") / "rates.csv", clock, rates)
+
+
+def test_clock_and_drift_are_found_and_frames_restored(scene, frames, gyroscope):
+    recorded = rsv.read_motion(gyroscope, unit="rad/s", focal_length=FOCAL_LENGTH)
+    found = rsv.align_motion(frames, TIMING, recorded)
+    assert found.reliable
+    assert found.offset == pytest.approx(CLOCK, abs=5e-5)
+    assert abs(found.offset - CLOCK) < 4 * found.offset_std
+    assert found.scale == pytest.approx(SPEED, abs=1e-3)
+    assert abs(found.scale - SPEED) < 4 * found.scale_std
+    assert found.drift.tolist() == pytest.approx(DRIFT, abs=0.5)
+    times = TIMING.row_starts(FRAMES, HEIGHT) + 0.5 * TIMING.exposure_time
+    error = found.motion.displacement(times).numpy() - Shaken().displacement(times.numpy())
+    assert np.abs(error - error.mean((0, 1))).max() < 0.05
+    shift = torch.from_numpy(error.mean((0, 1)))[:, None]
+    placed = rsv.FreeMotion(
+        found.motion.coefficients - shift, found.motion.start, found.motion.spacing, found.motion.tones
+    )
+    truth = rsv.FreeMotion.from_samples(
+        times.flatten(), torch.from_numpy(Shaken().displacement(times.flatten().numpy()))
+    )
+    best, here = (decibel(rsv.restore(frames, TIMING, m).numpy(), crop(scene)) for m in (truth, placed))
+    assert here > best - 0.3
+    assert decibel(frames.numpy(), crop(scene)) < best - 12
+
+
+def test_a_wrong_focal_length_is_found(frames, gyroscope):
+    recorded = rsv.read_motion(gyroscope, unit="rad/s", focal_length=1.1 * FOCAL_LENGTH)
+    found = rsv.align_motion(frames, TIMING, recorded, fit_gain=True)
+    assert found.gain == pytest.approx((1 / 1.1, 1 / 1.1), rel=3e-3)
+    assert found.offset == pytest.approx(CLOCK, abs=5e-5)
+
+
+def test_columns_read_one_after_another(scene, gyroscope, tmp_path):
+    timing = rsv.SensorTiming(6e-5, 20, 300, scan_axis=-1, readout_direction="reverse")
+    frames = torch.from_numpy(take_frames(scene, TIMING, Shaken(), FRAMES, 0.005)).float().flip(-2).transpose(-2, -1)
+    clock = np.arange(811.9, 813.4, 1e-3)
+    path = log(tmp_path / "angles.csv", clock, np.degrees(angles(clock)[:, ::-1]))
+    recorded = rsv.read_motion(path, unit="deg", focal_length=FOCAL_LENGTH, signs=(-1, 1))
+    found = rsv.align_motion(frames, timing, recorded)
+    assert found.offset == pytest.approx(CLOCK, abs=5e-5)
+    assert found.drift.tolist() == pytest.approx((-DRIFT[1], DRIFT[0]), abs=0.5)
+    assert found.reliable
+
+
+def test_a_recording_of_something_else_is_not_reliable(frames, tmp_path):
+    clock = np.arange(0.0, 1.0, 1e-3)
+    path = log(tmp_path / "other.csv", clock, 3 * np.stack([np.sin(170 * clock), np.cos(230 * clock**1.3)], -1))
+    found = rsv.align_motion(frames, TIMING, rsv.read_motion(path, unit="px"))
+    assert not found.reliable
+    assert any("does not explain" in reason for reason in found.reasons)
+
+
+def test_a_motion_that_repeats_has_more_than_one_offset(tmp_path, scene):
+    class Sine(Motion):
+        def displacement(self, times):
+            return np.stack([3 * np.sin(2 * np.pi * 31 * times), 2 * np.cos(2 * np.pi * 31 * times)], -1)
+
+    clock = np.arange(0.0, 0.4, 1e-3)
+    path = log(tmp_path / "sine.csv", clock, Sine().displacement(clock))
+    frames = torch.from_numpy(take_frames(scene, TIMING, Sine(), 3, 0.005)).float()
+    found = rsv.align_motion(frames, TIMING, rsv.read_motion(path, unit="px"))
+    assert any("the motion repeats" in reason for reason in found.reasons)
+    near = rsv.align_motion(frames, TIMING, rsv.read_motion(path, unit="px"), offsets=(0.0, 0.015))
+    assert near.reliable
+    assert near.offset == pytest.approx(0.0, abs=1e-4)
+
+
+def test_offsets_that_the_recording_does_not_cover_are_named(frames, tmp_path):
+    clock = np.arange(5.0, 6.0, 1e-3)
+    recorded = rsv.read_motion(log(tmp_path / "a.csv", clock, angles(clock)), unit="rad", focal_length=900)
+    with pytest.raises(ValueError, match="covers the frames from 5"):
+        rsv.align_motion(frames, TIMING, recorded, offsets=(7.0, 8.0))
+    short = rsv.read_motion(log(tmp_path / "b.csv", clock[:20], angles(clock[:20])), unit="rad", focal_length=900)
+    with pytest.raises(ValueError, match="shorter than the frames"):
+        rsv.align_motion(frames, TIMING, short)
+
+
+def test_command(frames, gyroscope, tmp_path, capsys):
+    (tmp_path / "camera.toml").write_text(CONFIG)
+    rsv.write_stack(tmp_path / "frames.tif", frames)
+    arguments = [
+        "known",
+        str(tmp_path / "frames.tif"),
+        str(tmp_path / "out.tif"),
+        "--config",
+        str(tmp_path / "camera.toml"),
+    ]
+    arguments += ["--motion", str(gyroscope), "--unit", "rad/s"]
+    assert run_command([*arguments, "--focal-length", "900"]) == 0
+    assert "clock 812.34" in capsys.readouterr().out
+    first = rsv.read_stack(tmp_path / "out.tif")
+    assert first.shape == frames.shape
+    assert run_command([*arguments, "--focal-length", "900", "--offset", str(CLOCK)]) == 0
+    assert (rsv.read_stack(tmp_path / "out.tif") - first).square().mean() < 0.01
+    for more, message in (
+        (["--focal-length", "900", "--offset", "813.35"], "the frames need"),
+        ([], "needs a focal_length"),
+        (["--focal-length", "900", "--time-unit", "us"], "really in us"),
+    ):
+        capsys.readouterr()
+        assert run_command([*arguments, *more]) == 2
+        errors = capsys.readouterr().err.strip().splitlines()
+        assert len(errors) == 1
+        assert message in errors[0]
