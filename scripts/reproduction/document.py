@@ -35,11 +35,17 @@ def losses(cells: list[Cell]) -> list[str]:
 
 def remarks(found: Found, plan: Plan) -> list[str]:
     """What has to be known to read the comparison."""
+    behind = [cell for cell in all_cells(found.trials, found.still, plan.noises[0]) if not cell.better("default")]
+    beyond = sum(cell.still is not None and cell.still < cell.paper for cell in behind)
+    limit = (
+        f"In {beyond} of the {len(behind)} cells behind, the paper's value lies beyond what a still camera has here."
+    )
     smear = {
         axis: 2 * AMPLITUDE[axis] * math.sin(math.pi * FREQUENCY[axis] * EXPOSURE_ROWS * ROW_TIME) for axis in AXES
     }
     loss = max(1 / float(np.sinc(0.5 * value)) - 1 for value in smear.values())
     return [
+        *([limit] if beyond else []),
         "PSNR and SSIM are taken against the still scene without noise. A still camera with this noise is given beside "
         "ours: where the paper's value lies above it, the paper's frames had less noise or less detail, which it does "
         "not state.",

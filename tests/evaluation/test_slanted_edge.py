@@ -88,6 +88,20 @@ OTHER_OPTICS = {
 }
 
 
+@pytest.mark.parametrize("cutoff", [0.6, 1.2])
+def test_light_beyond_the_roi_is_not_taken_for_contrast(cutoff):
+    def diffraction(f):
+        s = np.clip(np.abs(f) / cutoff, 0, 1)
+        return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
+
+    truth = through_pixels(diffraction, 5.2)
+    curve = measure(draw_edge_of(diffraction, 5.2))
+    assert worst_error(curve, truth) < 2e-4
+    assert float(curve.mtf50) == pytest.approx(mtf50_of(truth), rel=2e-4)
+    # its far light is a straight fall from 1 at frequency 0, which no window of this width shows
+    np.testing.assert_allclose(curve.at(torch.tensor([0.002, 0.005])), truth(np.array([0.002, 0.005])), atol=2e-4)
+
+
 @pytest.mark.parametrize("name", OTHER_OPTICS)
 def test_optics_of_any_shape(name):
     truth = through_pixels(OTHER_OPTICS[name], 5.2)
