@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks import check_choice, check_number
+from rsvib_torch.checks import check_choice, check_number, check_whole_number
 
 __all__ = ["SensorTiming"]
 
@@ -88,6 +88,39 @@ class SensorTiming:
             if any(later <= earlier for earlier, later in itertools.pairwise(starts)):
                 raise ValueError("frame_start_times must be strictly increasing (seconds)")
             object.__setattr__(self, "frame_start_times", starts)
+
+    @classmethod
+    def line_sensors(
+        cls, line_time: float, delays: Sequence[float], num_lines: int, exposure_lines: float = 1.0
+    ) -> "SensorTiming":
+        """Timing of images that several lines of a push-broom sensor (or its bands) take of the same ground.
+
+        Every image is taken line by line while the ground moves on; the lines see the same ground one after another.
+        Registered to the ground, their images are frames whose rows are read at the same pace, each begun its delay
+        later: parallax pairs tell the jitter of the platform as frames of a rolling shutter do, and are blind to
+        frequencies that are multiples of one over all delays.
+
+        Args:
+            line_time: Time between lines, in seconds.
+            delays: Time from when the first line sees the ground until each of the lines does, in seconds, increasing;
+                0 for the first.
+            num_lines: Lines of the images.
+            exposure_lines: Exposure in line times; stages of time-delayed integration count.
+
+        Example:
+            >>> pair = SensorTiming.line_sensors(line_time=1e-4, delays=[0.0, 0.04], num_lines=5000)
+            >>> pair.frame_starts(2).tolist()
+            [0.0, 0.04]
+        """
+        lines = check_whole_number("num_lines", num_lines, at_least=1)
+        if len(delays) < 2:
+            raise ValueError(f"delays must name two lines or more, got {list(delays)}")
+        return cls(
+            row_time=line_time,
+            exposure_rows=exposure_lines,
+            frame_rows=max(lines, exposure_lines),
+            frame_start_times=tuple(delays),
+        )
 
     @property
     def exposure_time(self) -> float:

@@ -1,0 +1,65 @@
+"""Push-broom parallax pairs: two lines see the same ground, a delay shorter than the image apart."""
+
+import numpy as np
+import pytest
+import torch
+from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
+
+import rsvib_torch as rsv
+
+LINES, WIDTH, LINE_TIME = 900, 192, 1e-4
+JITTER = Motion(amplitude=(1.4, 0.9), frequency=(31.0, 44.0), phase=(0.4, 1.3))
+
+
+def images(scene, delay_lines, motion=JITTER, noise=0.005):
+    """Images of lines that see the ground ``delay_lines`` apart; the simulator counts those as its frame period."""
+    lines = rsv.SensorTiming(row_time=LINE_TIME, exposure_rows=4, frame_rows=delay_lines)
+    return torch.from_numpy(take_frames(scene, lines, motion, 2, noise)).float()
+
+
+@pytest.fixture(scope="module", name="ground")
+def make_ground():
+    return draw_scene(LINES + 2 * MARGIN, WIDTH + 2 * MARGIN, 9)
+
+
+@pytest.mark.parametrize("delay_lines", [73, 260])
+def test_jitter_is_found_and_undone(ground, delay_lines):
+    timing = rsv.SensorTiming.line_sensors(LINE_TIME, [0.0, delay_lines * LINE_TIME], LINES, 4)
+    taken = images(ground, delay_lines)
+    found = rsv.detect_vibration(taken, timing)
+    assert found.reliable.all()
+    assert found.vibration.frequency[:, 0].tolist() == pytest.approx(JITTER.frequency, rel=3e-3)
+    assert found.vibration.amplitude[:, 0].tolist() == pytest.approx(JITTER.amplitude, rel=0.03)
+    assert found.vibration.phase[:, 0].tolist() == pytest.approx(JITTER.phase, abs=0.06)
+    restored = rsv.restore(taken, timing, found, joint=True)
+    assert decibel(restored.numpy(), crop(ground)) > decibel(taken.numpy(), crop(ground)) + 12
+
+
+def test_jitter_that_is_no_sine(ground):
+    class Settling(Motion):
+        def displacement(self, times):
+            x = 4 * np.exp(-times / 0.03) * np.cos(2 * np.pi * 40 * times)
+            return np.stack([x, 1.5 * np.tanh((times - 0.05) / 0.01)], -1)
+
+    timing = rsv.SensorTiming.line_sensors(LINE_TIME, [0.0, 100 * LINE_TIME], LINES, 4)
+    found = rsv.detect_motion(images(ground, 100, Settling()), timing)
+    error = found.displacement.numpy() - Settling().displacement(found.times.numpy())
+    error -= error.mean((0, 1))
+    assert np.sqrt(np.mean(np.square(error[1] - error[0]), axis=0)).max() < 0.05
+    assert found.reliable.all()
+
+
+def test_a_delay_that_is_a_period_is_blind(ground):
+    delay = 1 / 31.0
+    timing = rsv.SensorTiming.line_sensors(LINE_TIME, [0.0, delay], LINES, 4)
+    found = rsv.detect_vibration(images(ground, delay / LINE_TIME), timing)
+    assert not found.reliable[0]
+
+
+def test_bad_values_are_named():
+    with pytest.raises(ValueError, match="two lines or more"):
+        rsv.SensorTiming.line_sensors(1e-4, [0.0], 900)
+    with pytest.raises(ValueError, match="strictly increasing"):
+        rsv.SensorTiming.line_sensors(1e-4, [0.0, 0.0], 900)
+    with pytest.raises(ValueError, match="longer than 10 ms"):
+        rsv.SensorTiming.line_sensors(0.1, [0.0, 1.0], 900)
