@@ -1,23 +1,20 @@
 """Noise told from texture by what two frames of one scene do not have in common."""
 
-import math
-
 import torch
 from torch import Tensor
 
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.restoration.banded_solver import BandedFactor, factor_skewed
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.noise import estimate_noise
-from rsvib_torch.restoration.prior import ORDER, RowPrior
-from rsvib_torch.restoration.row_system import row_kernels, smooth_band, smooth_kernels
+from rsvib_torch.restoration.prior import RowPrior
+from rsvib_torch.restoration.row_system import row_kernels
+from rsvib_torch.restoration.sampled_rows import sample_rows
 
 __all__ = ["noise_levels"]
 
 _ROWS = 512  # at most, from the middle of the frame
 _SMALLEST = 64  # rows and columns that two frames have to share
 _FREQUENCIES = 24  # spread over the upper half, where scenes are weakest
-_STEP = 1.2  # in the strength of the prior, for a derivative
 _WEAK = 1e-4  # of the prior that bridges what no frame saw, relative to the data
 
 
@@ -41,8 +38,11 @@ def noise_levels(frames: Tensor, motion: FrameMotion, stack: int) -> Tensor:
         if pair is not None:
             images, rows, members = pair
             noise = _residual_power(images, motion, stack, rows, members)
-            texture = (estimate_noise(images).square().mean() - noise).clamp(min=0.0)
-            power = torch.maximum(power - texture, 0.5 * torch.minimum(power, noise))
+            alone = estimate_noise(images).square().mean(-1)
+            texture = (alone.mean() - noise).clamp(min=0.0)
+            # neither of two frames has more noise than both; blur may leave one of them more texture than the other
+            most = 2.0 * noise + (power - alone.amax()).clamp(min=0.0)
+            power = torch.maximum(power - texture, 0.5 * torch.minimum(power, noise)).minimum(most)
     return power.sqrt()
 
 
@@ -69,46 +69,14 @@ def _shared_part(frames: Tensor, motion: FrameMotion, stack: int) -> tuple[Tenso
 @torch.no_grad()
 def _residual_power(images: Tensor, motion: FrameMotion, stack: int, first: Tensor, members: list[int]) -> Tensor:
     """Power of the noise that is left of two images when the scene that explains them best is taken away."""
-    channels, count, width = images.shape[1:]
-    taper = torch.hann_window(width + 2, periodic=False, dtype=images.dtype, device=images.device)[1:-1]
+    count, width = images.shape[-2:]
     rows = first[:, None] + torch.arange(count, device=images.device)
     starts = motion.frame_starts[members][:, None] + rows * motion.timing.row_time
     displacement, node_weights = exposure_trajectory(motion.vibration[stack], starts, motion.timing, "gauss")
     displacement = displacement - motion.shift[stack, members][:, None, None]
     kernels = row_kernels(displacement, node_weights, images.new_ones(2), count, 4 * _SMALLEST)
-    scene = kernels.scene_rows(count)
     chosen = torch.linspace(width // 4, width // 2, min(_FREQUENCIES, width // 4), device=images.device).long()
-    u = chosen / width
-
-    angle = (-2 * torch.pi) * (torch.arange(width, device=u.device)[:, None] * chosen % width) / width
-    waves = torch.polar(torch.ones_like(angle, dtype=torch.float64), angle.to(torch.float64)).to(
-        images.dtype.to_complex()
-    )
-    mean = images.mean((-2, -1), keepdim=True)
-    spectra = (((images - mean) * taper).to(waves.dtype) @ waves).transpose(1, 2)  # (2, R, C, U)
-    turns = kernels.middle[..., None] * u
-    spectra = spectra * torch.polar(torch.ones_like(turns), 2 * torch.pi * turns).to(spectra.dtype)[:, :, None]
-
-    used = kernels.weight.to(images.dtype).flatten()[:, None, None]
-    spectra = (spectra * used.unflatten(0, (2, count))).flatten(0, 1)
-    taps = [tap[:, None] for tap in smooth_kernels(kernels, images.dtype).taps(u)]
-    base = (kernels.first - scene.top).flatten()
-    right = spectra.new_zeros(scene.count, channels, len(u))
-    for i, tap in enumerate(taps):
-        right.index_add_(0, base + i, tap.conj() * spectra)
-    normal = smooth_band(kernels, scene, max(len(taps) - 1, ORDER), ORDER, images.dtype)
-    factors = [
-        factor_skewed(normal.at(u, RowPrior.smooth(u).precision(u.new_ones(()), strength)))
-        for strength in (_WEAK, _STEP * _WEAK)
-    ]
-    fitted = factors[0].solve(right)
-    residual = (spectra - sum(tap * fitted[base + i] for i, tap in enumerate(taps))) * used
-    free = used.sum() * len(u) - _degrees_of_freedom(factors)
-    power: Tensor = residual.abs().square().sum() / (channels * free * taper.square().sum())
-    return power
-
-
-def _degrees_of_freedom(factors: list[BandedFactor]) -> Tensor:
-    """How many values the fit follows, from the determinants for a prior and one that is _STEP times as strong."""
-    growth = factors[1].pivots.log().to(torch.float64).sum() - factors[0].pivots.log().to(torch.float64).sum()
-    return factors[0].pivots.numel() - growth / math.log(_STEP)
+    sample = sample_rows(images, kernels, chosen)
+    explained = sample.explain([RowPrior.smooth(sample.u).precision(sample.u.new_ones(()), _WEAK)])
+    power: Tensor = explained.power.sum() / (explained.count * len(chosen) - explained.freedom.sum())
+    return power.to(images.dtype)

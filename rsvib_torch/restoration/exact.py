@@ -16,6 +16,7 @@ from rsvib_torch.restoration.prior import fit_prior
 from rsvib_torch.restoration.row_system import RowKernels, row_kernels
 from rsvib_torch.restoration.rows import continue_rows
 from rsvib_torch.restoration.scene_solver import SceneSolver
+from rsvib_torch.restoration.strength import prior_strength
 from rsvib_torch.spectral import fast_length
 
 __all__ = ["ScenePrior", "restore_exact"]
@@ -38,6 +39,17 @@ def _groups(count: int, joint: bool | int) -> list[tuple[list[int], int]]:
     size = 1 if joint is False else min(check_whole_number("joint", joint, at_least=1), count)
     starts = [min(max(frame - (size - 1) // 2, 0), count - size) for frame in range(count)]
     return [(list(range(first, first + size)), frame) for frame, first in enumerate(starts)]
+
+
+def _chosen_by(groups: list[tuple[list[int], int]], shift: Tensor) -> tuple[list[int], int]:
+    """Frames that the strength of the prior is chosen by, and in whose coordinates.
+
+    Args:
+        groups: As from ``_groups``.
+        shift: (T, 2) reference shifts of the frames: those that lie apart do not show the same columns.
+    """
+    members, reference = groups[len(groups) // 2]
+    return [frame for frame in members if torch.equal(shift[frame], shift[reference])], reference
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,11 +205,19 @@ def restore_exact(
         typical = weights.mean().reciprocal()
         weights = weights * typical
         row_prior = fit_prior(frames[stack], motion, stack, levels[stack], length)
-        for members, reference in groups:
+
+        def system(members: list[int], reference: int, stack: int = stack, weights: Tensor = weights) -> RowKernels:
             moved = displacement[stack, members] - motion.shift[stack, reference]
-            kernels = row_kernels(moved, node_weights, weights[members], H, _MARGIN)
+            return row_kernels(moved, node_weights, weights[members], H, _MARGIN)
+
+        members, reference = _chosen_by(groups, motion.shift[stack])
+        certain = noise != "auto" or T > 1
+        chosen = system(members, reference)
+        strength = prior_strength(frames[stack, members], chosen, row_prior, typical * length, certain=certain)
+        precision = row_prior.precision(typical * length, factor * strength)
+        for members, reference in groups:
+            kernels = system(members, reference)
             along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
-            precision = row_prior.precision(typical * length, factor)
             problem = _Problem(data[stack, members], kernels, precision, typical.sqrt(), chunk)
             hidden = None if lost is None else lost[stack, members]
             ends = kernels.reach > _LONG

@@ -61,6 +61,17 @@ class RowKernels:
         top = min(int(self.first.amin()), 1 - REACH)
         return SceneRows(top, max(int(self.first.amax()) + self.taps.shape[-2], num_rows + REACH - 1) - top)
 
+    def rows(self, top: int, count: int) -> "RowKernels":
+        """Kernels of ``count`` rows from row ``top`` on, counted from there."""
+        part = slice(top, top + count)
+        return RowKernels(
+            self.first[:, part] - top,
+            self.taps[:, part],
+            self.middle[:, part],
+            self.along[:, part],
+            self.weight[:, part],
+        )
+
     def at(self, frequencies: Tensor) -> Tensor:
         """Kernels (M, R, J, Q) without the phase of the middle."""
         angle = (-2 * math.pi) * self.along[..., None] * frequencies

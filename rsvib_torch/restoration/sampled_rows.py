@@ -1,0 +1,107 @@
+"""How a scene that is fitted to frames explains them, at a sample of their rows and frequencies."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.restoration.banded_solver import BandedFactor, factor_skewed
+from rsvib_torch.restoration.prior import ORDER
+from rsvib_torch.restoration.row_system import RowKernels, SmoothBand, smooth_band, smooth_kernels
+
+__all__ = ["Explained", "SampledRows", "sample_rows"]
+
+_STEP = 1.2  # in the strength of a prior, for a derivative
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """What fits with n priors leave of the rows, frequency by frequency.
+
+    Attributes:
+        power: (n, F) squared residuals of all rows, mean over channels, in units of the noise of one pixel.
+        freedom: (n, F) how many values the fit follows.
+        count: Rows that count.
+    """
+
+    power: Tensor
+    freedom: Tensor
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class SampledRows:
+    """Rows of M images at F frequencies, and the scene coefficients that they see.
+
+    Attributes:
+        u: (F,) frequencies in cycles per px.
+        spectra: (M R, C, F), the phase of each row's middle taken off.
+        taps: Kernels (M R, 1, F), one tap after the other.
+        base: (M R,) first coefficient of each row's kernel.
+        weight: (M R, 1, 1) how much each row counts.
+        normal: Their normal matrices.
+        energy: Of the taper and of all channels, that powers are divided by.
+    """
+
+    u: Tensor
+    spectra: Tensor
+    taps: list[Tensor]
+    base: Tensor
+    weight: Tensor
+    normal: SmoothBand
+    energy: Tensor
+
+    def explain(self, precisions: Sequence[Tensor]) -> Explained:
+        """Fit the scene with each of n priors, products (p + 1, p + 1, F) as from ``RowPrior.precision``."""
+        number, many = len(precisions), len(precisions) * len(self.u)
+        # each prior once as it is and once a little stronger, all in one batch
+        products = torch.cat([*precisions, *(_STEP * products for products in precisions)], dim=-1)
+        factor = factor_skewed(self.normal.at(self.u.repeat(2 * number), products))
+        logs = factor.pivots.log().to(torch.float64).sum(0)
+        growth = (logs[many:] - logs[:many]) / math.log(_STEP)
+        width = factor.width
+        right = self.spectra.new_zeros(len(factor.inverse), *self.spectra.shape[1:])
+        for i, tap in enumerate(self.taps):
+            right.index_add_(0, self.base + i, tap.conj() * self.spectra * self.weight)
+        first = BandedFactor(factor.skewed[..., :many], factor.inverse[:, :many])
+        fitted = first.solve(right.repeat(1, 1, number)).unflatten(-1, (number, -1))
+        residual = self.spectra[..., None, :] - sum(
+            tap[..., None, :] * fitted[self.base + i] for i, tap in enumerate(self.taps)
+        )
+        power = (self.weight[..., None] * residual.abs().square()).sum((0, 1)).to(torch.float64) / self.energy
+        freedom = (len(factor.skewed) - width - growth).unflatten(-1, (number, -1))
+        return Explained(power, freedom, int((self.weight > 0).sum()))
+
+
+def sample_rows(images: Tensor, kernels: RowKernels, chosen: Tensor) -> SampledRows:
+    """Take the spectra of tapered rows at a few frequencies.
+
+    Args:
+        images: (M, C, R, W).
+        kernels: How their rows see the scene.
+        chosen: (F,) whole numbers of cycles in W px.
+    """
+    count, width = images.shape[-2:]
+    taper = torch.hann_window(width + 2, periodic=False, dtype=images.dtype, device=images.device)[1:-1]
+    u = chosen / width
+    angle = (-2 * torch.pi) * (torch.arange(width, device=u.device)[:, None] * chosen % width) / width
+    waves = torch.polar(torch.ones_like(angle, dtype=torch.float64), angle.to(torch.float64))
+    waves = waves.to(images.dtype.to_complex())
+    mean = images.mean((-2, -1), keepdim=True)
+    spectra = (((images - mean) * taper).to(waves.dtype) @ waves).transpose(1, 2)  # (M, R, C, F)
+    turns = kernels.middle[..., None] * u
+    spectra = spectra * torch.polar(torch.ones_like(turns), 2 * torch.pi * turns).to(spectra.dtype)[:, :, None]
+    scene = kernels.scene_rows(count)
+    taps = [tap[:, None] for tap in smooth_kernels(kernels, images.dtype).taps(u)]
+    normal = smooth_band(kernels, scene, max(len(taps) - 1, ORDER), ORDER, images.dtype)
+    return SampledRows(
+        u,
+        spectra.flatten(0, 1),
+        taps,
+        (kernels.first - scene.top).flatten(),
+        kernels.weight.to(images.dtype).flatten()[:, None, None],
+        normal,
+        images.shape[1] * taper.square().sum().to(torch.float64),
+    )

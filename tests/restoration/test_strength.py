@@ -1,0 +1,67 @@
+"""Regularisation from the data, against the best of several weights by hand."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+from truth import Motion, crop, decibel, draw_scene, take_frames
+
+from rsvib_torch import SensorTiming
+from rsvib_torch.restoration import exact
+from rsvib_torch.restoration import restore as restore_by_any_method
+
+restore = partial(restore_by_any_method, method="exact", check=False)
+MOTION = Motion()
+SIZE = 300
+
+
+def texture(blur):
+    noise = ndimage.gaussian_filter(np.random.default_rng(1).standard_normal((SIZE, SIZE)), blur, mode="wrap")
+    return np.clip(0.5 + 0.15 * noise / noise.std(), 0, 1)
+
+
+SCENES = {
+    "buildings": partial(draw_scene, SIZE, SIZE, 14),
+    "soft": partial(draw_scene, SIZE, SIZE, 5, blur=2.5),
+    "dense texture": partial(texture, 0.7),
+}
+
+
+@pytest.fixture
+def without_choice(monkeypatch):
+    """Restores with the prior as strong as the noise asks for, times a factor."""
+
+    def run(frames, timing, **options):
+        with monkeypatch.context() as patch:
+            patch.setattr(exact, "prior_strength", lambda *arguments, **named: 1.0)
+            return restore(frames, timing, MOTION.vibration(), **options)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "noise", "joint", "least"),
+    [
+        ("buildings", 20, 0.02, False, -0.1),
+        ("buildings", 100, 0.001, True, -0.1),
+        ("soft", 20, 0.005, True, 0.2),
+        ("soft", 100, 0.05, True, 1.0),
+        ("dense texture", 100, 0.001, False, 0.6),
+        ("dense texture", 20, 0.001, True, -0.1),
+    ],
+)
+def test_weight_from_the_data_is_near_the_best_by_hand(without_choice, name, rows, noise, joint, least):
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
+    scene = SCENES[name]()
+    clean = take_frames(scene, timing, MOTION, 2, samples=16)
+    frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()
+    found = decibel(restore(frames, timing, MOTION.vibration(), joint=joint)[0], crop(scene))
+    by_hand = {
+        factor: decibel(without_choice(frames, timing, joint=joint, regularisation=factor)[0], crop(scene))
+        for factor in (0.03, 0.1, 0.3, 1.0, 3.0)
+    }
+    assert found > max(by_hand.values()) - 0.3
+    assert found > by_hand[1.0] + least
+    assert max(by_hand.values()) - min(by_hand.values()) > 0.5
