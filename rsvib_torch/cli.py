@@ -27,7 +27,7 @@ from rsvib_torch.command_options import (
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.imaging import simulate_frames
-from rsvib_torch.motion_command import known
+from rsvib_torch.motion_command import known, motion
 from rsvib_torch.pages import Box, Report, write_report_page
 from rsvib_torch.report import read_vibration
 from rsvib_torch.stack_commands import detect_windows, restore_windows, run, window_of
@@ -252,6 +252,7 @@ def _show_version(wanted: bool) -> None:
 
 
 app.command()(calibrate)
+app.command()(motion)
 app.command()(known)
 app.command()(run)
 

@@ -1,18 +1,77 @@
-"""``rsvib known``: restore frames with a motion that another instrument recorded."""
+"""``rsvib motion`` and ``rsvib known``: motion of any shape from frames, and frames restored with a recorded one."""
 
+import csv
+import math
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
+import torch
 import typer
 
 from rsvib_torch.config import read_config
-from rsvib_torch.detection import align_motion
+from rsvib_torch.detection import MotionDetection, align_motion, detect_motion
 from rsvib_torch.motion_file import MotionUnit, TimeUnit, read_motion
 from rsvib_torch.restoration import restore
-from rsvib_torch.stacks import check_stack_target, read_stack, read_stack_info, write_stack
+from rsvib_torch.stacks import (
+    check_stack_target,
+    check_writable,
+    read_stack,
+    read_stack_info,
+    whole_file,
+    write_stack,
+)
 from rsvib_torch.terminal import error_line, say, working
 
-__all__ = ["known"]
+__all__ = ["known", "motion"]
+
+
+def motion(
+    frames: Annotated[Path, typer.Argument(help="Stack of frames.")],
+    *,
+    config: Annotated[Path, typer.Option("--config", help="TOML file that describes the camera.")],
+    out: Annotated[Path, typer.Option(help="CSV file to write: time, x, y and their standard deviations.")],
+    knot_rows: Annotated[int, typer.Option(help="Rows from one knot of the motion to the next.")] = 24,
+    search: Annotated[int, typer.Option(help="Search range in px around the whole-frame offset.")] = 16,
+    full_scale: Annotated[float | None, typer.Option(help="Count that means full scale.")] = None,
+) -> None:
+    """Detect a motion of any shape, no sum of tones, in a stack of frames.
+
+    The CSV file goes into rsvib known, with --unit px --offset 0.
+    """
+    settings = read_config(config)
+    check_writable(out)
+    info = read_stack_info(frames)
+    scale = full_scale if full_scale is not None or not info.is_integer else info.full_scale or settings.full_scale
+    with working(f"reading {frames}"):
+        stack = read_stack(frames, full_scale=scale)
+    with working("detecting the motion"):
+        found = detect_motion(stack, settings.timing, knot_rows=knot_rows, search=search)
+    with whole_file(out) as file:
+        _write_motion(file, found, settings.timing.exposure_time)
+    for axis, name in enumerate("xy"):
+        size = float(found.displacement[..., axis].square().mean().sqrt())
+        line = (
+            f"{name}: moves by {size:.3f} px rms; known to {float(found.std_seen[axis]):.3f} px between frames, what "
+            f"repeats in every frame to {float(found.unseen[axis]):.3f} px; "
+        )
+        say(line + ("reliable" if bool(found.reliable[axis]) else f"not reliable: {'; '.join(found.reasons[axis])}"))
+    say(f"{out}: time, x, y, std_x, std_y")
+
+
+def _write_motion(path: Path, found: MotionDetection, exposure_time: float) -> None:
+    """A table of the motion at even times that cover all frames."""
+    step = 0.5 * found.motion.spacing
+    first, last = found.motion.start, max(found.motion.end, float(found.times.max()) + exposure_time)
+    times = np.linspace(first, last, math.ceil((last - first) / step) + 1)
+    values = found.motion.displacement(torch.from_numpy(times).to(found.motion.device)).cpu().numpy()
+    known_at, stds = found.times.flatten().cpu().numpy(), found.std.flatten(0, 1).cpu().numpy()
+    spread = np.stack([np.interp(times, known_at, stds[:, axis]) for axis in range(2)], -1)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time", "x", "y", "std_x", "std_y"])
+        for time, value, std in zip(times, values, spread, strict=True):
+            writer.writerow([f"{time:.9f}", *(f"{v:.5f}" for v in (*value, *std))])
 
 
 def known(

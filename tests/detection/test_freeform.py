@@ -6,6 +6,7 @@ import torch
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
+from rsvib_torch.cli import run_command
 from rsvib_torch.free_motion import FreeMotion
 
 HEIGHT, WIDTH, FRAMES = 256, 160, 9
@@ -125,6 +126,22 @@ def test_a_scene_that_changes_is_not_reliable():
         assert "row bands are found" in str(error)  # noqa: PT017
     else:
         assert not found.reliable.any()
+
+
+def test_command(scene, frames, tmp_path, capsys):
+    (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 6e-5\nexposure_rows = 20\nframe_rows = 270\n")
+    rsv.write_stack(tmp_path / "frames.tif", frames)
+    config = ["--config", str(tmp_path / "camera.toml")]
+    assert run_command(["motion", str(tmp_path / "frames.tif"), *config, "--out", str(tmp_path / "motion.csv")]) == 0
+    assert capsys.readouterr().out.count("reliable") == 2
+    table = np.loadtxt(tmp_path / "motion.csv", delimiter=",", skiprows=1)
+    error = table[:, 1:3] - Jitter().displacement(table[:, 0])
+    assert (error - error.mean(0)).std(0).max() < 0.4
+    known = ["known", str(tmp_path / "frames.tif"), str(tmp_path / "out.tif"), *config, "--unit", "px", "--offset", "0"]
+    assert run_command([*known, "--motion", str(tmp_path / "motion.csv")]) == 0
+    restored = rsv.read_stack(tmp_path / "out.tif")
+    apart = (restored[1:] - restored[:-1])[:, 32:-32, 32:-32].std()
+    assert apart < 0.3 * (frames[1:] - frames[:-1])[:, 32:-32, 32:-32].std()
 
 
 @pytest.mark.parametrize(
