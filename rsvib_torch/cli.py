@@ -272,6 +272,9 @@ def _one_line(error: BaseException) -> str:
     return str(error) or type(error).__name__
 
 
+_INTERRUPTED = 130  # what typer makes of Ctrl-C; older ones raise Abort
+
+
 def run_command(arguments: Sequence[str]) -> int:
     """Run ``rsvib`` with these arguments.
 
@@ -282,13 +285,15 @@ def run_command(arguments: Sequence[str]) -> int:
     command = typer.main.get_command(app)
     try:
         with warnings_in_one_line():
-            code = command.main(args=list(arguments) or ["--help"], prog_name="rsvib", standalone_mode=False)
+            try:
+                code = command.main(args=list(arguments) or ["--help"], prog_name="rsvib", standalone_mode=False)
+            except typer.Abort:
+                code = _INTERRUPTED
+        if code == _INTERRUPTED:
+            error_line("stopped; what is done of a run is kept, --resume goes on with it")
         return code if isinstance(code, int) else 0
     except (ValueError, TypeError, OSError, ModuleNotFoundError) as error:
         error_line(_one_line(error))
-    except (KeyboardInterrupt, typer.Abort):
-        error_line("stopped; what is done of a run is kept, --resume goes on with it")
-        return 130
     except Exception as error:
         if hasattr(error, "format_message"):  # a mistake in the arguments, whichever library typer parses them with
             error_line(error.format_message())
