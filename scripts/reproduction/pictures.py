@@ -62,12 +62,12 @@ def restored_figure(found: Found, target: Any) -> Figure:
     row, column = (place + rim for place in detailed_places(inner, _WINDOW, 1)[0])
     detail = (slice(row, row + _WINDOW), slice(column, column + _WINDOW))
     shown = {"frame p": images.frames[0], **{NAMES[m]: images.restored[m][0] for m in METHODS}}
-    figure = Figure(figsize=(9.6, 6.6), layout="constrained")
+    figure = Figure(figsize=(9.6, 5.6), layout="constrained")
     panels = figure.subplots(2, 4)
     for panel_pair, (name, image) in zip(panels.T, {"still scene": still, **shown}.items(), strict=True):
         _show(panel_pair[0], image[detail], name)
         error = image - still
-        _show(panel_pair[1], error[detail], "minus the still scene", vmin=-0.2, vmax=0.2)
+        _show(panel_pair[1], error[detail], "minus the still scene", vmin=-0.05, vmax=0.05)
         rms = float(np.sqrt(np.mean(error[rim:-rim, rim:-rim] ** 2)))
         panel_pair[1].set_xlabel(f"whole frame: rms {rms:.4f}", fontsize=9)
     return figure
@@ -145,7 +145,7 @@ def sampling_figure(found: Found) -> Figure:
     panel.plot(1e3 * times, values, "o", color="#222222", markersize=4, label="displacement of each frame")
     panel.set_xlabel("time (ms)")
     panel.set_ylabel("displacement along x (px)")
-    panel.set_ylim(top=1.6 * np.abs(true).max())
+    panel.set_ylim(true.min() - 0.3, true.max() + 0.45 * np.ptp(true))
     panel.legend(fontsize=9, frameon=False, loc="upper right")
     plain_axes(panel)
     return figure
@@ -208,7 +208,7 @@ def gallery(found: Found, plan: Plan) -> Gallery:
             f"figure_{number}",
             lambda target=target: restored_figure(found, target),
             f"As Figure {number}",
-            f"A detail of the {TARGETS[target]} target before and after restoration, and what differs from the still "
+            f"A detail of the {TARGETS[target]} target before and after restoration, and, twenty times stronger, what differs from "
             "scene.",
         )
     for axis in AXES:
