@@ -208,8 +208,8 @@ def gallery(found: Found, plan: Plan) -> Gallery:
             f"figure_{number}",
             lambda target=target: restored_figure(found, target),
             f"As Figure {number}",
-            f"A detail of the {TARGETS[target]} target before and after restoration, and, twenty times stronger, what differs from "
-            "scene.",
+            f"A detail of the {TARGETS[target]} target before and after restoration; below, ten times stronger, "
+            "what differs from the still scene.",
         )
     for axis in AXES:
         add(

@@ -25,7 +25,8 @@ def slanted_edge_mtf(roi: Tensor) -> MtfCurve:
     neither binning nor window nor finite difference to correct for.
 
     Grey values must be linear in light: undo a gamma first. Their scale does not matter; integers are taken as
-    counts. Light that is scattered farther than the ROI reaches counts as level of the sides.
+    counts. Light that is scattered farther than the ROI reaches is inferred where it falls off as diffraction's does,
+    and counts as level of the sides otherwise.
 
     Args:
         roi: (h, w), at least 16 x 16 px, with one straight edge 2 ... 40 degrees from the vertical or horizontal
