@@ -7,7 +7,15 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-__all__ = ["BandedFactor", "factor_banded", "factor_skewed", "skew_band", "solve_banded", "solve_skewed"]
+__all__ = [
+    "BandedFactor",
+    "factor_banded",
+    "factor_skewed",
+    "skew_band",
+    "solve_banded",
+    "solve_factored",
+    "solve_skewed",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +177,26 @@ class _Solve(torch.autograd.Function):
             columns = slice(max(0, d), min(count, count + d))
             full[rows, width + d] = -(adjoint[rows] * x[columns].conj()).sum(1)
         return full, adjoint
+
+
+class _SolveAgain(torch.autograd.Function):
+    """Solve with factors at hand, that have no gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, skewed: Tensor, inverse: Tensor, right_side: Tensor) -> Tensor:
+        ctx.save_for_backward(skewed, inverse)
+        return BandedFactor(skewed, inverse).solve(right_side)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, None, Tensor]:
+        return None, None, BandedFactor(*ctx.saved_tensors).solve(gradient)
+
+
+def solve_factored(factor: BandedFactor, right_side: Tensor) -> Tensor:
+    """Solve ``A x = right_side`` (K, M, S) with the factors of A, differentiably in the right sides."""
+    solution: Tensor = _SolveAgain.apply(factor.skewed, factor.inverse, right_side)  # type: ignore[no-untyped-call]
+    return solution
 
 
 def solve_skewed(full: Tensor, right_side: Tensor) -> Tensor:

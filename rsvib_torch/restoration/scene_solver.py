@@ -6,9 +6,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.restoration.banded_solver import BandedFactor, factor_skewed, solve_skewed
+from rsvib_torch.restoration.banded_solver import BandedFactor, factor_skewed, solve_factored, solve_skewed
 from rsvib_torch.restoration.row_kernel import REACH, kernel_samples
 from rsvib_torch.restoration.row_system import RowKernels, smooth_band, smooth_kernels
+from rsvib_torch.restoration.segments import Segments
 
 __all__ = ["Coefficients", "SceneSolver"]
 
@@ -28,6 +29,7 @@ class SceneSolver:
         chunk: Frequencies solved at a time.
         weight: (M, R) of the rows, by default that of the kernels.
         keep: Keep the factors, for solving again and again.
+        segments: Number of overlapping segments of rows that are solved side by side.
     """
 
     def __init__(
@@ -40,6 +42,7 @@ class SceneSolver:
         *,
         weight: Tensor | None = None,
         keep: bool = False,
+        segments: int = 1,
     ) -> None:
         self.kernels = kernels if weight is None else replace(kernels, weight=weight)
         self.num_rows, self.length = size
@@ -52,9 +55,13 @@ class SceneSolver:
         self._normal = smooth_band(self.kernels, self.rows, max(kernels.taps.shape[-2] - 1, order), order, dtype)
         self._seen = smooth_kernels(kernels, dtype)
         self._base = (kernels.first - self.rows.top).flatten()
+        self._segments = Segments(self.rows.count, segments)
         self._factors: list[BandedFactor] | None = None
         if keep and not (torch.is_grad_enabled() and self._normal.left.requires_grad):
-            self._factors = [factor_skewed(self._normal.at(self.u[part], precision[..., part])) for part in self.parts]
+            self._factors = [
+                factor_skewed(self._segments.split_band(self._normal.at(self.u[part], precision[..., part])))
+                for part in self.parts
+            ]
 
     def _rights(self, data: Tensor) -> Iterator[Tensor]:
         """``K^H W g`` of data (M, C, R, L), chunk by chunk."""
@@ -81,9 +88,10 @@ class SceneSolver:
             wanted = right if pull is None else right + pull[k]
             if self._factors is None:
                 full = self._normal.at(self.u[part], self.precision[..., part], memory)
-                solutions.append(solve_skewed(full, wanted))
+                solved = solve_skewed(self._segments.split_band(full), self._segments.split(wanted))
             else:
-                solutions.append(self._factors[k].solve(wanted))
+                solved = solve_factored(self._factors[k], self._segments.split(wanted))
+            solutions.append(self._segments.join(solved))
         return solutions
 
     def predict(self, coefficients: Coefficients) -> Tensor:

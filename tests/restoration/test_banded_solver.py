@@ -3,7 +3,8 @@ import pytest
 import torch
 from scipy.linalg import solveh_banded
 
-from rsvib_torch.restoration.banded_solver import factor_banded, solve_banded
+from rsvib_torch.restoration.banded_solver import factor_banded, skew_band, solve_banded, solve_skewed
+from rsvib_torch.restoration.segments import Segments
 
 
 def random_system(count, width, *, dtype=torch.complex128, batch=(3,), columns=2, seed=0):
@@ -57,3 +58,26 @@ def test_gradients(dtype):
         return solve_banded(hermitian, columns)
 
     assert torch.autograd.gradcheck(solve, (band.requires_grad_(), right_side.requires_grad_()))
+
+
+@pytest.mark.parametrize("count", [2, 3, 7])
+def test_overlapping_segments_agree_with_scipy(count):
+    rows, width = 211, 3
+    band, right_side = random_system(rows, width)
+    segments = Segments(rows, count, overlap=24)
+    assert not segments.whole
+    full = segments.split_band(skew_band(band))
+    found = segments.join(solve_skewed(full, segments.split(right_side)))
+    for index in range(3):
+        expected = solveh_banded(band[..., index].numpy().T.copy(), right_side[..., index].numpy(), lower=True)
+        np.testing.assert_allclose(found[..., index].numpy(), expected, rtol=0, atol=1e-8)
+    short = Segments(rows, count, overlap=1)
+    wrong = short.join(solve_skewed(short.split_band(skew_band(band)), short.split(right_side)))
+    assert (wrong - found).abs().max() > 1e-6
+
+
+def test_segments_that_overlap_everywhere_are_one():
+    assert Segments(100, 1).whole
+    assert Segments(100, 4).whole
+    values = torch.rand(100, 2, 3)
+    assert Segments(100, 4).join(Segments(100, 4).split(values)) is values

@@ -7,9 +7,11 @@ from scipy import ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch.restoration.exact as exact_module
+import rsvib_torch.restoration.scene_solver as solver_module
 from rsvib_torch import SensorTiming, Vibration
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
+from rsvib_torch.restoration.segments import Segments
 
 restore = partial(restore_by_any_method, method="exact")
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -227,6 +229,7 @@ def test_gradients_to_frames_and_vibration(prior_fitted_once):
         ({"noise": "low"}, TypeError, "noise must be a number, got 'low'"),
         ({"regularisation": 0.0}, ValueError, "regularisation must be larger than 0"),
         ({"chunk_frequencies": 0}, ValueError, "chunk_frequencies must be at least 1"),
+        ({"segments": 0}, ValueError, "segments must be at least 1"),
         ({"ignore": torch.zeros(3)}, ValueError, r"ignore must be a boolean mask of shape \(2, 16, 16\)"),
         ({"ignore": torch.ones(2, 16, 16, dtype=torch.bool)}, ValueError, "ignore leaves no pixel"),
         ({"half_rows": 3}, TypeError, "method='exact' has no option 'half_rows'"),
@@ -235,3 +238,20 @@ def test_gradients_to_frames_and_vibration(prior_fitted_once):
 def test_bad_input(options, error, message):
     with pytest.raises(error, match=message):
         restore(torch.zeros(2, 16, 16), TIMING, Vibration(1.0, 50.0), **options)
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_segments_of_rows_change_nothing(short, joint, monkeypatch):
+    _, frames, motion = short
+    frames = noisy(frames, 0.02)[..., :64]
+    frames = torch.cat([frames, frames.flip(-2)], dim=-2).requires_grad_()
+    frames.data[:, 100:102, 40:42] = float("nan")
+    whole, split = (
+        restore(frames, TIMING, motion.vibration(), segments=segments, check=False, joint=joint) for segments in (1, 3)
+    )
+    torch.testing.assert_close(split, whole, rtol=0, atol=2e-5)
+    gradients = [torch.autograd.grad(image[..., 150:, :].square().sum(), frames)[0] for image in (whole, split)]
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=0, atol=2e-4)
+    monkeypatch.setattr(solver_module, "Segments", partial(Segments, overlap=2))
+    careless = restore(frames, TIMING, motion.vibration(), segments=3, check=False, joint=joint)
+    assert (careless - whole).abs().max() > 1e-3
