@@ -61,4 +61,5 @@ def row_profiles(frames: Tensor, scan_axis: int, full_scale: float | None, gamma
         raise ValueError(f"{share:.0%} of the pixels are saturated: take less light or a shorter exposure")
     linear = images.double().clamp(min=0.0) ** gamma
     parts = torch.stack([part.mean(-1) for part in linear.tensor_split(min(_PARTS, linear.shape[-1]), dim=-1)], 1)
-    return Profiles(linear.mean(-1), parts, share)
+    # what is left are curves of a thousand numbers, fitted one after another: no work for a GPU
+    return Profiles(linear.mean(-1).cpu(), parts.cpu(), share)
