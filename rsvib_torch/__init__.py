@@ -5,10 +5,12 @@ from rsvib_torch.detection import (
     ClockAlignment,
     DetectionResult,
     MotionDetection,
+    SweptTone,
     VibrationDetector,
     VibrationStd,
     align_motion,
     detect_motion,
+    detect_swept_tone,
     detect_vibration,
 )
 from rsvib_torch.evaluation import (
@@ -64,6 +66,7 @@ __all__ = [
     "SensorTiming",
     "SlantedEdge",
     "StackInfo",
+    "SweptTone",
     "StackReport",
     "Vibration",
     "VibrationDetector",
@@ -74,6 +77,7 @@ __all__ = [
     "calibrate_row_time",
     "calibrate_row_time_by_exposure",
     "detect_motion",
+    "detect_swept_tone",
     "detect_vibration",
     "find_slanted_edges",
     "iterate_stack",

@@ -4,15 +4,18 @@ from rsvib_torch.detection.alignment import ClockAlignment, align_motion
 from rsvib_torch.detection.detect import DetectionMethod, VibrationDetector, detect_vibration
 from rsvib_torch.detection.freeform import MotionDetection, detect_motion
 from rsvib_torch.detection.result import DetectionResult, VibrationStd
+from rsvib_torch.detection.swept import SweptTone, detect_swept_tone
 
 __all__ = [
     "ClockAlignment",
     "DetectionMethod",
     "DetectionResult",
     "MotionDetection",
+    "SweptTone",
     "VibrationDetector",
     "VibrationStd",
     "align_motion",
     "detect_motion",
+    "detect_swept_tone",
     "detect_vibration",
 ]

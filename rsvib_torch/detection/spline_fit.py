@@ -10,7 +10,7 @@ from torch import Tensor
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.splines import bspline_weights
 
-__all__ = ["SplineFit", "fit_spline", "spline_basis"]
+__all__ = ["SplineFit", "fit_spline", "precision_of_axis", "spline_basis"]
 
 _CHUNK = 128  # scene rows taken together
 _SMOOTHNESS = tuple(10.0**power for power in range(-8, 5))  # over the mean information
@@ -95,7 +95,7 @@ def _design(measurements: Measurements, shape: SplineFit, axis: int, part: slice
 def _fit_axis(measurements: Measurements, shape: SplineFit, axis: int) -> tuple[Tensor, Tensor]:
     """Coefficients (N,) of one axis and their covariance (N, N)."""
     values = (measurements.displacements[..., axis] * measurements.seen)[0]
-    weight = _precision(measurements.information[0], axis)
+    weight = precision_of_axis(measurements.information[0], axis)
     count = shape.coefficients.shape[-1]
     gram = torch.zeros(count, count, dtype=torch.float64, device=values.device)
     right = torch.zeros(count, dtype=torch.float64, device=values.device)
@@ -129,7 +129,7 @@ def _fit_axis(measurements: Measurements, shape: SplineFit, axis: int) -> tuple[
     return found, noise * torch.cholesky_inverse(factor)
 
 
-def _precision(information: Tensor, axis: int) -> Tensor:
+def precision_of_axis(information: Tensor, axis: int) -> Tensor:
     """(N,) inverse variance of one axis from information (N, 2, 2), the other axis being unknown too."""
     other = information[:, 1 - axis, 1 - axis]
     own = information[:, axis, axis]

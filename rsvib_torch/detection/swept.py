@@ -1,0 +1,309 @@
+"""Tones that fade or change their frequency: one of them an axis, from all frames of a stack."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rsvib_torch.checks import check_whole_number
+from rsvib_torch.detection.detect import measurements_of_curve
+from rsvib_torch.detection.direct import _join, _unexplained, independent_fraction, measure_group
+from rsvib_torch.detection.freeform import groups_of_frames, start_curve
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.spline_fit import precision_of_axis
+from rsvib_torch.free_motion import FreeMotion
+from rsvib_torch.orientation import vibration_from_row_order
+from rsvib_torch.registration import Registration
+from rsvib_torch.sensor import SensorTiming
+
+__all__ = ["SweptTone", "detect_swept_tone"]
+
+_DECAYS = (-4.0, 0.0, 4.0, 10.0, 20.0)  # e-folds in the record
+_MOST_SWEEP = 1.5  # of the frequency in the middle, over the record
+_STARTS = 6
+_CHUNK = 32  # candidates tried together
+_ROUNDS = 25
+_SIGNIFICANT = 14.0  # of chi-square per parameter, as for tones that stay
+_EXPLAINED, _FINEST = 0.15, 0.03  # of the motion, and px, that may be left
+_NODES = 4  # in an exposure or band
+_SAMPLES = 24  # of the motion in the shortest period
+_NAMES = ("amplitude", "frequency", "decay", "chirp", "phase")
+
+
+@dataclass(frozen=True, eq=False)
+class SweptTone:
+    """One tone an axis that fades and sweeps: ``A exp(-g t) sin(2 pi (f t + c t^2 / 2) + phi) + v t``.
+
+    All values are those at the time origin, in image axes (x, y); an axis without a significant tone has amplitude 0.
+
+    Attributes:
+        amplitude: (2,) px A.
+        frequency: (2,) Hz f.
+        decay: (2,) 1/s g; negative where the tone grows.
+        chirp: (2,) Hz/s c.
+        phase: (2,) rad phi.
+        image_motion: (2,) px/s v.
+        std: Standard deviations of amplitude, frequency, decay, chirp and phase by name, (2,) each.
+        motion: The motion, as ``restore`` and ``simulate_frames`` take it.
+        unexplained: (2,) px, rms displacement of rows that it does not explain, beyond their noise.
+        reliable: (2,) bool.
+        reasons: Why not, for each axis.
+    """
+
+    amplitude: Tensor
+    frequency: Tensor
+    decay: Tensor
+    chirp: Tensor
+    phase: Tensor
+    image_motion: Tensor
+    std: dict[str, Tensor]
+    motion: FreeMotion
+    unexplained: Tensor
+    reliable: Tensor
+    reasons: tuple[tuple[str, ...], tuple[str, ...]]
+
+
+def detect_swept_tone(
+    frames: Tensor,
+    timing: SensorTiming,
+    *,
+    registration: Registration = "ncc",
+    iterations: int = 3,
+    band_rows: int = 32,
+    band_step: int = 16,
+    search: int = 16,
+    full_scale: float | None = None,
+) -> SweptTone:
+    """Detect one tone an axis whose amplitude decays or grows and whose frequency changes steadily.
+
+    Start values come from the offsets of row bands, over a grid of frequencies, sweeps and decays; then the fit is
+    repeated on displacements measured around it on the images, row by row.
+
+    Args:
+        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames.
+        timing: The sensor.
+        registration: ``"ncc"``, ``"phase"`` or ``"projection"``, for the start.
+        iterations: Rounds of measuring and fitting.
+        band_rows: Rows of a band of the start.
+        band_step: Rows from one band to the next.
+        search: Search range of the start in px around the whole-frame offset.
+        full_scale: Count that means 1.0, for integer frames.
+
+    Raises:
+        TypeError: If frames are not numbers.
+        ValueError: If they cannot be registered, see ``detect_motion``, or an option is out of range.
+    """
+    check_whole_number("iterations", iterations, at_least=1)
+    grey, rowwise, curve = start_curve(frames, timing, full_scale, registration, band_rows, band_step, search)
+    starts = rowwise.frame_starts(grey.shape[1], grey.device)
+    record = (float(starts[0]), float(starts[-1]) + grey.shape[-2] * rowwise.row_time + rowwise.exposure_time)
+    measured = measurements_of_curve(curve, rowwise, band_step)
+    highest = 0.5 / (band_rows * rowwise.row_time)
+    fits = [_start(measured, axis, record, highest) for axis in range(2)]
+    for _ in range(iterations):
+        motion = _motion(fits, record, rowwise)
+        groups = groups_of_frames(grey, starts, motion)
+        measured = _join([measure_group(group, rowwise, motion, None)[0] for group in groups])
+        weighed = measured.reweighted(_left(measured, motion))
+        fits = [_settle(weighed, axis, record, fit)[0] for axis, fit in enumerate(fits)]
+    solved = [_settle(weighed, axis, record, fit) for axis, fit in enumerate(fits)]
+    fits, covariances = [fit for fit, _, _ in solved], [covariance for _, covariance, _ in solved]
+    fits = [fit if gain > _SIGNIFICANT else _still(fit) for fit, _, gain in solved]
+    motion = _motion(fits, record, rowwise)
+    left = _left(measured, motion)
+    honest = independent_fraction(measured, left)
+    return _report(fits, covariances, honest, motion, _unexplained(measured, left)[0], measured, record, timing)
+
+
+def _still(fit: Tensor) -> Tensor:
+    return fit * fit.new_tensor([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
+
+
+def _waves(times: Tensor, fits: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine and sine part at times S from the middle, of [a, b, f, g, c, v] (..., 6) broadcast against S."""
+    envelope = torch.exp(-fits[..., 3] * times)
+    angle = 2 * math.pi * (fits[..., 2] * times + 0.5 * fits[..., 4] * times.square())
+    return envelope * angle.cos(), envelope * angle.sin()
+
+
+def _value(times: Tensor, fit: Tensor) -> Tensor:
+    cosine, sine = _waves(times, fit)
+    return fit[0] * cosine + fit[1] * sine + fit[5] * times
+
+
+def _columns(times: Tensor, fit: Tensor) -> Tensor:
+    """Derivatives (S, 6) of the displacement by the parameters."""
+    cosine, sine = _waves(times, fit)
+    tone, quarter = fit[0] * cosine + fit[1] * sine, fit[1] * cosine - fit[0] * sine
+    turn = 2 * math.pi * times
+    return torch.stack([cosine, sine, turn * quarter, -times * tone, 0.5 * turn * times * quarter, times], -1)
+
+
+def _averaged(measured: Measurements, axis: int, middle: float) -> tuple[list[Tensor], list[float]]:
+    """Times (N, G) from the middle of the record over which a measured displacement is a mean, and their weights."""
+    duration = measured.exposure_time + measured.average_times[axis]
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    centre = measured.moments[0] + 0.5 * measured.exposure_time - middle
+    return [centre + 0.5 * duration * node for node in nodes.tolist()], (0.5 * weights).tolist()
+
+
+def _relative(measured: Measurements, values: Tensor) -> Tensor:
+    """Values (N, G, P) less their mean over the frames that see the row."""
+    return measured.relative(values[None])[0]
+
+
+def _start(measured: Measurements, axis: int, record: tuple[float, float], highest: float) -> Tensor:
+    """Parameters (6,) from a grid of frequencies, sweeps and decays, the best of a few settled ones."""
+    middle, span = 0.5 * (record[0] + record[1]), record[1] - record[0]
+    device = measured.moments.device
+    grid = []
+    for frequency in torch.arange(0.5 / span, highest, 0.5 / span).tolist():
+        sweep = _MOST_SWEEP * frequency / span
+        steps = max(1, round(sweep * span**2 / 2.0))
+        grid += [
+            (0.0, 0.0, frequency, decay / span, sweep * step / steps, 0.0)
+            for step in range(-steps, steps + 1)
+            for decay in _DECAYS
+        ]
+    fits = torch.tensor(grid, dtype=torch.float64, device=device)
+    weight = precision_of_axis(measured.information[0], axis)
+    values = (measured.displacements[0, ..., axis] * measured.seen[0])[..., None]
+    times = measured.moments[0] + 0.5 * measured.exposure_time - middle
+    drift = _relative(measured, times[..., None])[..., 0]
+    gains = []
+    for part in fits.split(_CHUNK):
+        cosine, sine = _waves(times[..., None], part)
+        columns = [_relative(measured, wave) for wave in (cosine, sine)] + [drift[..., None].expand_as(cosine)]
+        design = torch.stack(columns, -1)  # (N, G, C, 3)
+        gram = torch.einsum("ngcp,n,ngcq->cpq", design, weight, design)
+        right = torch.einsum("ngcp,n,ng->cp", design, weight, values[..., 0])
+        ridge = torch.diag_embed(1e-9 * gram.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300))
+        gains.append((right * torch.linalg.solve(gram + ridge, right[..., None])[..., 0]).sum(-1))
+    best = torch.cat(gains).argsort(descending=True)
+    chosen: list[Tensor] = []
+    for place in best.tolist():
+        if all(abs(float(fits[place, 2] - other[2])) > 0.6 / span for other in chosen):
+            chosen.append(fits[place])
+        if len(chosen) == _STARTS:
+            break
+    settled = [_settle(measured, axis, record, fit) for fit in chosen]
+    return max(settled, key=lambda item: item[2])[0]
+
+
+def _settle(
+    measured: Measurements, axis: int, record: tuple[float, float], fit: Tensor
+) -> tuple[Tensor, Tensor, float]:
+    """Levenberg-Marquardt: parameters, their covariance, and chi-square that the tone gains per parameter."""
+    middle = 0.5 * (record[0] + record[1])
+    weight = precision_of_axis(measured.information[0], axis)
+    values = measured.displacements[0, ..., axis] * measured.seen[0]
+    times, shares = _averaged(measured, axis, middle)
+    known = max(float((measured.differences[0] * (weight > 0)).sum()) * measured.independent, 7.0)
+
+    def left_of(at: Tensor) -> Tensor:
+        model = sum(share * _value(time, at) for time, share in zip(times, shares, strict=True))
+        return values - _relative(measured, torch.as_tensor(model)[..., None])[..., 0]
+
+    def cost_of(left: Tensor) -> float:
+        return float((weight[:, None] * left.square()).sum())
+
+    left = left_of(fit)
+    cost, damping = cost_of(left), 1e-3
+    gram = torch.eye(6, dtype=torch.float64, device=values.device)
+    for _ in range(_ROUNDS):
+        slopes = sum(share * _columns(time, fit) for time, share in zip(times, shares, strict=True))
+        design = _relative(measured, torch.as_tensor(slopes))
+        gram = torch.einsum("ngp,n,ngq->pq", design, weight, design)
+        right = torch.einsum("ngp,n,ng->p", design, weight, left)
+        size = torch.where(gram.diagonal() > 0, gram.diagonal(), 1.0)
+        change = torch.linalg.solve(gram + torch.diag(damping * size), right)
+        tried = fit + change
+        further = left_of(tried)
+        if cost_of(further) < cost:
+            gained = cost - cost_of(further)
+            fit, left, cost, damping = tried, further, cost_of(further), max(0.1 * damping, 1e-12)
+            if gained < 1e-9 * cost:
+                break
+        else:
+            damping *= 10
+            if damping > 1e8:
+                break
+    without = left_of(_still(fit))
+    drift = _relative(measured, times[0][..., None])[..., 0]
+    norm = float((weight[:, None] * drift.square()).sum()) + 1e-300
+    alone = cost_of(without) - float((weight[:, None] * drift * without).sum()) ** 2 / norm
+    noise = cost / known
+    scale = torch.where(gram.diagonal() > 0, gram.diagonal(), 1.0).sqrt()
+    inverse = torch.linalg.pinv(gram / scale / scale[:, None], rtol=1e-12, hermitian=True) / scale / scale[:, None]
+    return fit, noise * inverse, (alone - cost) / (5 * noise + 1e-300)
+
+
+def _motion(fits: list[Tensor], record: tuple[float, float], timing: SensorTiming) -> FreeMotion:
+    """Both axes as one motion, sampled finely, as a batch of one."""
+    middle, span = 0.5 * (record[0] + record[1]), record[1] - record[0]
+    fastest = max(float(fit[2].abs() + 0.5 * fit[4].abs() * span) for fit in fits)
+    step = max(min(1 / (_SAMPLES * fastest + 1e-9), span / 64), timing.row_time)
+    times = torch.linspace(*record, math.ceil(span / step) + 1, dtype=torch.float64, device=fits[0].device)
+    return FreeMotion.through(times, torch.stack([_value(times - middle, fit) for fit in fits], -1)).expanded(1)
+
+
+def _left(measured: Measurements, motion: FreeMotion) -> Tensor:
+    predicted = motion[0].mean_displacement(measured.moments, measured.exposure_time)
+    return measured.relative(measured.displacements - predicted)
+
+
+def _at_origin(fit: Tensor, middle: float) -> Tensor:
+    """[A, f, g, c, phi] at time 0 of parameters (6,) about the middle."""
+    a, b, frequency, decay, chirp, _ = fit.unbind()
+    phase = torch.atan2(a, b) - 2 * math.pi * (frequency * middle - 0.5 * chirp * middle**2)
+    amplitude = torch.hypot(a, b) * torch.exp(decay * middle)
+    return torch.stack([amplitude, frequency - chirp * middle, decay, chirp, phase])
+
+
+def _report(
+    fits: list[Tensor],
+    covariances: list[Tensor],
+    honest: float,
+    motion: FreeMotion,
+    unexplained: Tensor,
+    measured: Measurements,
+    record: tuple[float, float],
+    timing: SensorTiming,
+) -> SweptTone:
+    """Parameters at the time origin and in image axes, with standard deviations and verdict."""
+    middle = 0.5 * (record[0] + record[1])
+    values, stds, reasons = [], [], []
+    moved = measured.relative(motion[0].mean_displacement(measured.moments, measured.exposure_time))[0]
+    size = moved.square().sum(1).div(measured.differences[0].clamp(min=1.0)[:, None]).mean(0).sqrt()
+    for axis, (fit, covariance) in enumerate(zip(fits, covariances, strict=True)):
+        present = bool(fit[:2].abs().sum() > 0)
+        value = _at_origin(fit, middle)
+        slope = torch.autograd.functional.jacobian(lambda p: _at_origin(p, middle), fit)
+        std = (slope @ covariance @ slope.mT / honest).diagonal().clamp(min=0.0).sqrt()
+        value[4] = torch.remainder(value[4] + math.pi, 2 * math.pi) - math.pi
+        values.append(value if present else 0 * value)
+        stds.append(std if present else 0 * std)
+        found = [] if present else ["no tone stands out"]
+        if float(unexplained[axis]) > max(_EXPLAINED * float(size[axis]), _FINEST):
+            found.append(f"rows move by {float(unexplained[axis]):.3g} px that no swept tone explains")
+        reasons.append(tuple(found))
+    if timing.readout_direction == "reverse":
+        values[1][4] = torch.remainder(values[1][4], 2 * math.pi) - (math.pi if values[1][0] > 0 else 0.0)
+    drift = [fits[0][5], -fits[1][5] if timing.readout_direction == "reverse" else fits[1][5]]
+    order = [1, 0] if timing.scan_axis == -1 else [0, 1]
+    whole, spread = torch.stack(values)[order], torch.stack(stds)[order]
+    reasons = [reasons[axis] for axis in order]
+    turned = vibration_from_row_order(motion[0], timing)
+    assert isinstance(turned, FreeMotion)
+    named = dict(zip(_NAMES, whole.unbind(-1), strict=True))
+    return SweptTone(
+        **named,
+        image_motion=torch.stack(drift)[order],
+        std=dict(zip(_NAMES, spread.unbind(-1), strict=True)),
+        motion=turned,
+        unexplained=unexplained[order],
+        reliable=torch.tensor([not found for found in reasons], device=unexplained.device),
+        reasons=(reasons[0], reasons[1]),
+    )

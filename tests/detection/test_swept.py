@@ -1,0 +1,95 @@
+"""Tones that fade or sweep, from frames of an independent simulator."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
+
+import rsvib_torch as rsv
+
+HEIGHT, WIDTH, FRAMES = 256, 160, 5
+TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=270)
+AMPLITUDE, FREQUENCY, DECAY, CHIRP, PHASE = (3.2, 1.1), (83.0, 30.0), (25.0, 0.0), (0.0, 520.0), (0.6, -1.1)
+
+
+class Swept(Motion):
+    def displacement(self, times):
+        axes = zip(AMPLITUDE, FREQUENCY, DECAY, CHIRP, PHASE, strict=True)
+        return np.stack(
+            [a * np.exp(-g * times) * np.sin(2 * np.pi * (f * times + c * times**2 / 2) + p) for a, f, g, c, p in axes],
+            axis=-1,
+        )
+
+
+@pytest.fixture(scope="module", name="scene")
+def make_scene():
+    return draw_scene(HEIGHT + 2 * MARGIN, WIDTH + 2 * MARGIN, 6)
+
+
+@pytest.fixture(scope="module", name="frames")
+def make_frames(scene):
+    return torch.from_numpy(take_frames(scene, TIMING, Swept(), FRAMES, 0.005)).float()
+
+
+@pytest.fixture(scope="module", name="found")
+def make_found(frames):
+    return rsv.detect_swept_tone(frames, TIMING)
+
+
+def test_decay_and_chirp_are_found(found):
+    assert found.amplitude.tolist() == pytest.approx(AMPLITUDE, rel=0.02)
+    assert found.frequency.tolist() == pytest.approx(FREQUENCY, rel=0.01)
+    assert found.decay.tolist() == pytest.approx(DECAY, abs=0.6)
+    assert found.chirp.tolist() == pytest.approx(CHIRP, abs=12.0)
+    assert found.phase.tolist() == pytest.approx(PHASE, abs=0.03)
+    assert found.reliable.all()
+    times = TIMING.row_starts(FRAMES, HEIGHT)
+    error = found.motion.displacement(times).numpy() - Swept().displacement(times.numpy())
+    assert (error - error.mean((0, 1))).std() < 0.015
+
+
+@pytest.mark.parametrize(
+    ("name", "truth"),
+    [("amplitude", AMPLITUDE), ("frequency", FREQUENCY), ("decay", DECAY), ("chirp", CHIRP), ("phase", PHASE)],
+)
+def test_error_bars_are_honest(found, name, truth):
+    off = np.abs(getattr(found, name).numpy() - truth)
+    assert (off < 4 * found.std[name].numpy()).all()
+    assert (found.std[name] > 0).all()
+
+
+def test_frames_are_restored(scene, frames, found):
+    restored = rsv.restore(frames, TIMING, found.motion, joint=True)
+    assert decibel(restored.numpy(), crop(scene)) > decibel(frames.numpy(), crop(scene)) + 15
+
+
+def test_columns_read_in_reverse(frames, found):
+    timing = rsv.SensorTiming(6e-5, 20, 270, scan_axis=-1, readout_direction="reverse")
+    other = rsv.detect_swept_tone(frames.flip(-2).transpose(-2, -1), timing)
+    assert torch.allclose(other.frequency, found.frequency.flip(0), rtol=1e-6)
+    assert torch.allclose(other.amplitude, found.amplitude.flip(0), rtol=1e-6)
+    turned = torch.stack([found.phase[1] + math.pi, found.phase[0]])
+    apart = torch.remainder(other.phase - turned + math.pi, 2 * math.pi) - math.pi
+    assert apart.abs().max() < 1e-6
+    assert other.phase.abs().max() <= math.pi
+
+
+def test_a_still_axis_has_no_tone(scene):
+    class Along(Motion):
+        def displacement(self, times):
+            return np.stack([2 * np.exp(-10 * times) * np.sin(2 * np.pi * 45 * times), 0 * times], -1)
+
+    frames = torch.from_numpy(take_frames(scene, TIMING, Along(), 3, 0.005)).float()
+    found = rsv.detect_swept_tone(frames, TIMING)
+    assert found.amplitude[1] == 0
+    assert found.reasons[1] == ("no tone stands out",)
+    assert found.frequency[0].item() == pytest.approx(45.0, rel=0.02)
+
+
+def test_bad_values_are_named():
+    with pytest.raises(ValueError, match="iterations"):
+        rsv.detect_swept_tone(torch.rand(2, 64, 64), TIMING, iterations=0)
+    with pytest.raises(ValueError, match="at least 2 frames"):
+        rsv.detect_swept_tone(torch.rand(1, 64, 64), TIMING)
