@@ -103,6 +103,10 @@ def _drawings(report: Report) -> dict[str, list[Drawing]]:
             "displaced alike or the exposure averages the tone out. Below, the tones with error "
             "bars of two standard deviations.",
         ),
+    ]
+    if not bool((undone.amplitude > 0).any() | (undone.image_motion != 0).any()):
+        return {"offsets": offsets, "tone_figures": vibration}
+    rows = [
         drawing(
             figures.rows_figure(undone, timing, num_rows),
             "rows",
@@ -117,7 +121,7 @@ def _drawings(report: Report) -> dict[str, list[Drawing]]:
             "displacement; the line is the path of the image during the exposure.",
         ),
     ]
-    return {"offsets": offsets, "tone_figures": vibration}
+    return {"offsets": offsets, "tone_figures": vibration + rows}
 
 
 def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None = None) -> list[str]:
@@ -151,7 +155,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     ]
     num_rows = report.frames.shape[int(report.timing.scan_axis)]
     undone, _ = trusted_vibration(report.detection, report.timing, len(report.frames), num_rows)
-    options = ", ".join(f"{name} = {value}" for name, value in report.options.items())
+    options = ", ".join(f"{name} = {value}" for name, value in report.options.items() if report.was_restored)
     content |= {
         "title": report.title,
         "subtitle": report.subtitle,

@@ -22,6 +22,8 @@ _NEAR = 3.0  # Hz from a blind frequency, worth a word
 
 def mood_of(result: DetectionResult, verdict: RestorationVerdict | None, restored: bool) -> Mood:
     """How good the news is."""
+    if not restored and verdict is None:
+        return "doubt"  # nothing was found that could be undone
     if not bool(result.reliable.any()) or not restored or (verdict is not None and verdict.overall == "worse"):
         return "bad"
     certain = bool(result.reliable.all()) and verdict is not None and verdict.overall == "helps"
@@ -74,8 +76,10 @@ def _blind_words(result: DetectionResult, timing: SensorTiming) -> list[str]:
 def _first_words(mood: Mood, restored: bool, verdict: RestorationVerdict | None) -> str:
     if mood == "good":
         return "The camera shook, the vibration was measured, and undoing it helps."
+    if not restored and verdict is None:
+        return "No vibration was found that could be undone; the frames are left as they were taken."
     if not restored:
-        return "The frames are left as they were taken."
+        return "Undoing the vibration does not help; the frames are left as they were taken."
     if mood == "bad":
         return "What was found cannot be relied on; do not use the restored frames without a look."
     if verdict is None or verdict.overall == "unknown":
@@ -116,9 +120,9 @@ def verdict_words(
         )
     words += _blind_words(result, timing)
     words += [f"{note[0].upper()}{note[1:]}." for note in left_alone if bool(torch.as_tensor(result.reliable).all())]
-    if verdict is None:
+    if verdict is None and restored:
         words.append("No two frames show enough of the same scene to judge the restoration by.")
-    else:
+    if verdict is not None:
         words.append(f"{verdict.summary[0].upper()}{verdict.summary[1:]}.")
     return words
 

@@ -251,7 +251,14 @@ def test_edges_are_measured_in_both():
         ((True, False), verdict_of("partly", "y: apart"), True, "doubt", "undone in part"),
         ((True, True), verdict_of("unknown", "alike"), True, "doubt", "cannot be told"),
         ((True, True), None, True, "doubt", "cannot be told"),
-        ((True, True), verdict_of("worse", "x: apart"), False, "bad", "left as they were taken"),
+        (
+            (True, True),
+            verdict_of("worse", "x: apart"),
+            False,
+            "bad",
+            "does not help; the frames are left as they were",
+        ),
+        ((False, False), None, False, "doubt", "No vibration was found that could be undone"),
         ((False, False), verdict_of("helps"), True, "bad", "cannot be relied on"),
     ],
 )
@@ -272,6 +279,19 @@ def test_words_name_a_blind_frequency():
     words = verdict_words(result_of(near), near, TIMING, 256, restored=True, left_alone=(), verdict=None)
     (line,) = [line for line in words if "cannot see" in line]
     assert "along x is 1.5 Hz from 48.8 Hz" in line
+
+
+def test_a_still_camera_gets_a_page_too(tmp_path):
+    still = Vibration([0.0, 0.0], [0.0, 0.0])
+    reasons = (("no significant tone",),) * 2
+    report = report_of(detection=result_of(still, (False, False), reasons), verdict=None, was_restored=False)
+    files = write_report_page(tmp_path, replace(report, restored=report.frames), [(0, 0, 30, 30)])
+    text = "".join(read(tmp_path / "report.html").text)
+    assert "No vibration was found that could be undone" in text
+    assert "No tone was found." in text
+    assert "No two frames" not in text
+    assert "restored with" not in text
+    assert "psf_film.png" not in files
 
 
 @pytest.fixture(scope="module", name="place")
