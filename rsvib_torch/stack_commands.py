@@ -110,7 +110,7 @@ def run(
     """Detect the vibration, restore the frames, judge whether that helps, and draw pictures.
 
     Stacks may be of any length: they are gone through in windows. Where restored frames are no better than the raw
-    ones, the raw ones are written, unless forced. Ctrl-C stops at once and keeps what is done for --resume.
+    ones, the raw ones are written, unless forced. Ctrl-C stops when the windows at work are done; --resume goes on.
     """
     settings = read_config(config)
     if Path(output).name != output or output in ("", ".", ".."):

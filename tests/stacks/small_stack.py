@@ -1,5 +1,7 @@
 """A small vibrating stack, taken by the independent camera of tests/truth.py, and how tests process it."""
 
+import multiprocessing
+
 import numpy as np
 import tifffile
 from scipy import ndimage
@@ -20,6 +22,14 @@ WINDOWS = 8
 _TEXTURE = ndimage.gaussian_filter(np.random.default_rng(4).standard_normal((HEIGHT + 80, WIDTH + 80)), 1.1)
 SCENE = np.clip(0.5 + 0.15 * _TEXTURE / _TEXTURE.std(), 0.0, 1.0)
 STILL = crop(SCENE)
+
+
+def fork_server():
+    """Where processes start at once: the libraries are loaded once, for all of them."""
+    context = multiprocessing.get_context("forkserver")
+    libraries = ["rsvib_torch.stacks", "scipy.ndimage", "scipy.interpolate", "h5py", "zarr", "pytest", "_pytest.config"]
+    context.set_forkserver_preload(libraries)
+    return context
 
 
 def draw_counts(frames=FRAMES):

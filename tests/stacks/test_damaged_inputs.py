@@ -1,6 +1,5 @@
 """Damaged inputs: a clear error or a result every time, never a traceback, a hang or a half-written output."""
 
-import multiprocessing
 import resource
 import shutil
 
@@ -8,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from mutations import damage, try_damaged, write_originals
-from small_stack import process_small, write_small
+from small_stack import fork_server, process_small, write_small
 
 from rsvib_torch.cli import run_command
 from rsvib_torch.stacks import read_stack_info
@@ -24,8 +23,7 @@ def _try(folder, seeds, found):
 
 @pytest.mark.parametrize("seeds", [range(200), pytest.param(range(200, 5000), marks=pytest.mark.slow)])
 def test_damaged_files_are_refused_in_a_line_or_read(tmp_path, seeds):
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["mutations"])
+    context = fork_server()
     found = context.SimpleQueue()
     write_small(tmp_path / "good.tif", 3)
     process = context.Process(target=_try, args=(tmp_path, seeds, found))  # a crash of a library is seen here

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import multiprocessing
 import os
 import random
 import resource
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from small_stack import FRAMES, OPTIONS, WINDOWS, process_small, write_small
+from small_stack import FRAMES, OPTIONS, WINDOWS, fork_server, process_small, write_small
 
 from rsvib_torch.stacks import read_manifest
 from rsvib_torch.stacks.journal import work_folder
@@ -24,10 +23,7 @@ _FILE_CALLS = ("write", "pwrite", "replace", "fsync", "fdatasync", "ftruncate", 
 
 @pytest.fixture(scope="module", name="forks")
 def start_fork_server():
-    """Processes that start at once: the libraries are loaded only for the first."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["rsvib_torch.stacks", "small_stack"])
-    return context
+    return fork_server()
 
 
 @pytest.fixture(scope="module", name="whole")
@@ -35,9 +31,16 @@ def process_whole(tmp_path_factory):
     """A stack and what an unbroken run makes of it."""
     folder = tmp_path_factory.mktemp("whole")
     write_small(folder / "frames.tif")
-    for name in ("out.tif", "out.npy", "out.zarr"):
+    for name in ("out.tif", "out.npy"):
         process_small(folder / "frames.tif", folder / name)
     return folder
+
+
+@pytest.fixture(scope="module", name="whole_zarr")
+def process_whole_zarr(whole):
+    """The same, with what an unbroken run writes as Zarr."""
+    process_small(whole / "frames.tif", whole / "out.zarr")
+    return whole
 
 
 def _count_file_calls(die_at):
@@ -122,15 +125,15 @@ def test_killed_runs_resume_to_the_same_bytes(forks, whole, tmp_path):
     assert total > 5 * WINDOWS
     resumed = [
         kill_and_resume(forks, whole, tmp_path / str(die_at), "out.tif", die_at=die_at)
-        for die_at in (2, total // 2, total - 4)
+        for die_at in (total // 2, total - 4)
     ]
-    assert resumed[0] == 0
-    assert 1 < resumed[1] < WINDOWS
-    assert resumed[2] == WINDOWS
+    assert 1 < resumed[0] < WINDOWS
+    assert resumed[1] == WINDOWS
 
 
 @pytest.mark.slow
-def test_kill_at_twenty_random_moments(forks, whole, tmp_path):
+def test_kill_at_twenty_random_moments(forks, whole_zarr, tmp_path):
+    whole = whole_zarr
     start = time.perf_counter()
     (tmp_path / "timed").mkdir()
     assert run_apart(forks, whole / "frames.tif", tmp_path / "timed" / "out.tif") == 0
@@ -146,7 +149,8 @@ def test_kill_at_twenty_random_moments(forks, whole, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["out.tif", "out.zarr", "skip.npy"])
-def test_kill_at_every_kind_of_file_call(forks, whole, tmp_path, name):
+def test_kill_at_every_kind_of_file_call(forks, whole_zarr, tmp_path, name):
+    whole = whole_zarr
     options = {}
     if name == "skip.npy":  # kept window by window, then put together
         name, options = "out.npy", {"bad_frames": "skip"}
