@@ -1,5 +1,6 @@
 """See and undo the vibration of a rolling-shutter camera."""
 
+from rsvib_torch.augmentation import RollingShutterVibration
 from rsvib_torch.calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
 from rsvib_torch.detection import (
     ClockAlignment,
@@ -60,6 +61,7 @@ __all__ = [
     "Optics",
     "RestorationVerdict",
     "RestorationWarning",
+    "RollingShutterVibration",
     "RowTimeCalibration",
     "RowVaryingBlur",
     "SensorNoise",

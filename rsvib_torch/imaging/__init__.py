@@ -4,9 +4,9 @@ from rsvib_torch.imaging.blur import RowVaryingBlur, blur_rows, blur_rows_adjoin
 from rsvib_torch.imaging.coupling import rows_showing
 from rsvib_torch.imaging.noise import SensorNoise
 from rsvib_torch.imaging.optics import Optics
-from rsvib_torch.imaging.psf import RowPSF, row_psf
+from rsvib_torch.imaging.psf import RowPSF, row_psf, trajectory_psf
 from rsvib_torch.imaging.simulate import simulate_frames
-from rsvib_torch.imaging.trajectory import exposure_nodes, exposure_trajectory
+from rsvib_torch.imaging.trajectory import exposure_nodes, exposure_trajectory, gauss_node_count
 
 __all__ = [
     "Optics",
@@ -17,7 +17,9 @@ __all__ = [
     "blur_rows_adjoint",
     "exposure_nodes",
     "exposure_trajectory",
+    "gauss_node_count",
     "row_psf",
     "rows_showing",
     "simulate_frames",
+    "trajectory_psf",
 ]

@@ -12,7 +12,7 @@ from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.splines import bspline_weights
 from rsvib_torch.vibration import Vibration
 
-__all__ = ["Interpolation", "RowPSF", "row_psf"]
+__all__ = ["Interpolation", "RowPSF", "row_psf", "trajectory_psf"]
 
 Interpolation = Literal["linear", "cubic"]
 SPLINE_DEGREES: dict[str, int] = {"linear": 1, "cubic": 3}
@@ -105,9 +105,23 @@ def row_psf(
         >>> psf.weights.shape[:2]
         torch.Size([2, 512])
     """
+    displacement, node_weights = exposure_trajectory(vibration, starts, timing, quadrature, num_nodes)
+    return trajectory_psf(displacement, node_weights, interpolation=interpolation)
+
+
+def trajectory_psf(displacement: Tensor, node_weights: Tensor, *, interpolation: Interpolation = "linear") -> RowPSF:
+    """Point spread function of every row from the displacement at the nodes of its exposure (Eqs. 26-39).
+
+    Args:
+        displacement: (..., R, N, 2) px, axes (x, y).
+        node_weights: (N,), sums to 1.
+        interpolation: As in ``row_psf``.
+
+    Returns:
+        The kernels of all rows.
+    """
     check_choice("interpolation", interpolation, tuple(SPLINE_DEGREES))
     degree = SPLINE_DEGREES[interpolation]
-    displacement, node_weights = exposure_trajectory(vibration, starts, timing, quadrature, num_nodes)
     first_x, weights_x = _axis_weights(displacement[..., 0], degree)
     first_y, weights_y = _axis_weights(displacement[..., 1], degree)
     weights = (weights_y * node_weights[:, None]).transpose(-2, -1) @ weights_x

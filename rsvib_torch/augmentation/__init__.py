@@ -1,0 +1,5 @@
+"""Training data: still images as a vibrating rolling-shutter camera takes them."""
+
+from rsvib_torch.augmentation.rolling_shutter import RollingShutterVibration
+
+__all__ = ["RollingShutterVibration"]

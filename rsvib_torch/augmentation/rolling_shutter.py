@@ -1,0 +1,242 @@
+"""The Kornia augmentation that takes still images with a vibrating rolling-shutter camera."""
+
+import math
+from typing import Any
+
+import torch
+from kornia.augmentation import GeometricAugmentationBase2D
+from kornia.geometry.boxes import Boxes
+from kornia.geometry.keypoints import Keypoints
+from torch import Tensor
+
+from rsvib_torch.augmentation.motion import ImageMotion
+from rsvib_torch.augmentation.moving import move_boxes, move_images, move_masks
+from rsvib_torch.augmentation.ranges import Range, axis_ranges, draw
+from rsvib_torch.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.imaging.psf import Interpolation
+from rsvib_torch.orientation import frames_from_row_order, frames_to_row_order, vibration_to_row_order
+from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.vibration import Vibration
+
+__all__ = ["RollingShutterVibration"]
+
+Parameters = dict[str, Tensor]
+_DRAWN = ("amplitude", "frequency", "phase", "image_motion", "exposure_rows")
+
+
+class RollingShutterVibration(GeometricAugmentationBase2D):
+    """Take images of a still scene with a vibrating rolling-shutter camera (Eq. 9 of Liu et al. 2023).
+
+    ``g(x, y) = 1/T_e int f[x - X(t), y - Y(t)] dt`` for every row over its own exposure, with random vibration, image
+    motion and exposure. Images are bent and blurred; keypoints go where the mean displacement of the row that shows
+    them puts them, masks likewise to the nearest pixel, and boxes become the smallest straight ones around their bent
+    contents. Past its edges an image (and its mask) is mirrored.
+
+    An image is frame 0 of a recording. In ``VideoSequential`` the frames of a clip that share one draw
+    (``same_on_frame=True``, Kornia's default) are consecutive frames of one recording, ``frame_rows`` apart.
+
+    A range is one number, ``(low, high)``, or ``((low, high), (low, high))`` for x and y; every axis draws its own
+    value, evenly.
+
+    Args:
+        timing: The sensor; its ``frame_rows`` must not be less than the rows of the images.
+        amplitude: Range of A in px.
+        frequency: Range of f in Hz.
+        phase: Range of phi in rad.
+        image_motion: Range of v in px/s.
+        exposure_rows: Exposure in row times, a number or ``(low, high)``; by default that of the sensor.
+        tones: Number of tones of each axis.
+        interpolation: ``"cubic"``, or ``"linear"``, which blurs a little beyond the exposure.
+        p: Probability that an image is taken so.
+        same_on_batch: Whether all images share one draw.
+        keepdim: Whether the output keeps the rank of the input.
+
+    Raises:
+        TypeError: If an argument has the wrong type.
+        ValueError: If a range is out of bounds.
+
+    Example:
+        >>> timing = SensorTiming(row_time=20e-6, exposure_rows=20, frame_rows=1080)
+        >>> augmentation = RollingShutterVibration(timing, amplitude=(0.5, 3.0), frequency=(40.0, 200.0))
+        >>> augmentation(torch.rand(4, 3, 64, 48)).shape
+        torch.Size([4, 3, 64, 48])
+        >>> augmentation.drawn_vibration().amplitude.shape
+        torch.Size([4, 2, 1])
+    """
+
+    def __init__(
+        self,
+        timing: SensorTiming,
+        *,
+        amplitude: Range = (0.5, 4.0),
+        frequency: Range = (20.0, 200.0),
+        phase: Range = (-math.pi, math.pi),
+        image_motion: Range = 0.0,
+        exposure_rows: float | tuple[float, float] | None = None,
+        tones: int = 1,
+        interpolation: Interpolation = "cubic",
+        p: float = 1.0,
+        same_on_batch: bool = False,
+        keepdim: bool = False,
+    ) -> None:
+        if not isinstance(timing, SensorTiming):
+            raise TypeError(f"timing must be a SensorTiming, got {type(timing).__name__}")
+        check_choice("interpolation", interpolation, ("linear", "cubic"))
+        check_number("p", p, at_least=0.0, at_most=1.0)
+        super().__init__(p=p, p_batch=1.0, same_on_batch=same_on_batch, keepdim=keepdim)
+        self.timing = timing
+        self.tones = check_whole_number("tones", tones, at_least=1)
+        exposures = axis_ranges("exposure_rows", timing.exposure_rows if exposure_rows is None else exposure_rows)[0]
+        for value in exposures:
+            check_number("exposure_rows", value, above=0.0, at_most=timing.frame_rows)
+        self.flags = {
+            "amplitude": axis_ranges("amplitude", amplitude, at_least=0.0),
+            "frequency": axis_ranges("frequency", frequency, at_least=0.0),
+            "phase": axis_ranges("phase", phase),
+            "image_motion": axis_ranges("image_motion", image_motion),
+            "exposure_rows": exposures,
+            "interpolation": interpolation,
+        }
+
+    def generate_parameters(self, batch_shape: tuple[int, ...]) -> Parameters:
+        """Draw one motion an image: amplitude, frequency, phase (B, 2, K), image_motion (B, 2), exposure_rows (B,)."""
+        draws = 1 if self.same_on_batch else batch_shape[0]
+        drawn = {
+            name: draw(self.flags[name], (draws, self.tones), self.device, self.dtype).mT
+            for name in ("amplitude", "frequency", "phase")
+        }
+        drawn["image_motion"] = draw(self.flags["image_motion"], (draws,), self.device, self.dtype)
+        drawn["exposure_rows"] = draw((self.flags["exposure_rows"],), (draws,), self.device, self.dtype)[:, 0]
+        return {
+            name: value.repeat(batch_shape[0] // max(draws, 1), *[1] * (value.ndim - 1))
+            for name, value in drawn.items()
+        }
+
+    def drawn_vibration(self, params: Parameters | None = None) -> Vibration:
+        """The vibration of every image of the last call, in image axes: the truth that a network may learn.
+
+        Images that were left alone (``p`` below 1) have amplitude and image motion 0.
+
+        Args:
+            params: Parameters of another call (``augmentation._params`` of that time).
+
+        Raises:
+            ValueError: If nothing was drawn yet.
+        """
+        params = self._params if params is None else params
+        if "amplitude" not in params:
+            raise ValueError("no vibration has been drawn yet: call the augmentation first")
+        taken = self._gate(params).to(torch.float64)
+        return Vibration(
+            params["amplitude"] * taken[:, None, None],
+            params["frequency"],
+            params["phase"],
+            params["image_motion"] * taken[:, None],
+        )
+
+    def compute_transformation(self, input: Tensor, params: Parameters, flags: dict[str, Any]) -> Tensor:
+        """Return identities (B, 3, 3): no matrix describes rows that move apart."""
+        return self.identity_matrix(input)
+
+    def apply_transform(
+        self, input: Tensor, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Tensor:
+        """Bend and blur images (B, C, H, W)."""
+        if input.numel() == 0:
+            return input
+        images = frames_to_row_order(input, self.timing)
+        moved = move_images(images, self._motion(params, images), flags["interpolation"])
+        return frames_from_row_order(moved, self.timing)
+
+    def apply_transform_mask(
+        self, input: Tensor, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Tensor:
+        """Move masks (B, C, H, W) to the nearest pixel."""
+        if input.numel() == 0:
+            return input
+        masks = frames_to_row_order(input, self.timing)
+        return frames_from_row_order(move_masks(masks, self._motion(params, masks)), self.timing)
+
+    def apply_transform_keypoint(
+        self, input: Keypoints, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Keypoints:
+        """Move keypoints to where the frame shows them."""
+        output = input.clone()
+        points = input.data.to(torch.float64)
+        if points.numel():
+            motion = self._motion(params, points)
+            rowwise = self._points(points.reshape(len(motion.starts), -1, 2), params)
+            moved = self._points_back(motion.move(rowwise), params)
+            output._data = moved.reshape(points.shape).to(input.data.dtype)
+        return output
+
+    def apply_transform_box(
+        self, input: Boxes, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Boxes:
+        """Put the smallest straight boxes around what the boxes held."""
+        output = input.clone()
+        corners = input.data.to(torch.float64)
+        if corners.numel():
+            motion = self._motion(params, corners)
+            rowwise = self._points(corners.reshape(len(motion.starts), -1, 4, 2), params)
+            moved = self._points_back(move_boxes(rowwise, motion), params)
+            output._data = moved.reshape(corners.shape).to(input.data.dtype)
+        return output
+
+    def _motion(self, params: Parameters, like: Tensor) -> ImageMotion:
+        """The drawn motion of a batch in row order."""
+        drawn = {name: params[name].to(dtype=torch.float64, device=like.device) for name in _DRAWN}
+        exposure_rows = drawn.pop("exposure_rows")
+        count = len(exposure_rows)
+        vibration = vibration_to_row_order(Vibration(**drawn), self.timing)
+        self.timing.check_rows(self._num_rows(params))
+        return ImageMotion(
+            vibration=vibration,
+            starts=self._frame_starts(params, count).to(like.device),
+            exposure_time=exposure_rows * self.timing.row_time,
+            timing=self.timing.in_row_order(),
+        )
+
+    def _frame_starts(self, params: Parameters, count: int) -> Tensor:
+        """When each image begins: at 0, or in its turn where a clip shares one draw."""
+        clips = params.get("video_batch_size")
+        length = 1 if clips is None else count // max(int(clips), 1)
+        shared = all(bool((clip := params[name].unflatten(0, (-1, length))).eq(clip[:, :1]).all()) for name in _DRAWN)
+        if length == 1 or not shared:
+            return torch.zeros(count, dtype=torch.float64)
+        return self.timing.frame_starts(length).repeat(count // length)
+
+    def _points(self, points: Tensor, params: Parameters) -> Tensor:
+        """Points (..., 2) of images as points of images in row order."""
+        points = points.flip(-1) if self.timing.scan_axis == -1 else points
+        return self._mirrored(points, params)
+
+    def _points_back(self, points: Tensor, params: Parameters) -> Tensor:
+        points = self._mirrored(points, params)
+        return points.flip(-1) if self.timing.scan_axis == -1 else points
+
+    def _mirrored(self, points: Tensor, params: Parameters) -> Tensor:
+        if self.timing.readout_direction == "forward":
+            return points
+        return torch.stack([points[..., 0], self._num_rows(params) - 1 - points[..., 1]], dim=-1)
+
+    def _num_rows(self, params: Parameters) -> int:
+        height, width = params["forward_input_shape"].tolist()[-2:]
+        return int(height if self.timing.scan_axis == -2 else width)
+
+    def inverse_transform(
+        self, input: Tensor, flags: dict[str, Any], transform: Tensor | None = None, size: tuple[int, int] | None = None
+    ) -> Tensor:
+        """Refuse: blur takes a restoration to undo."""
+        raise NotImplementedError(_NO_INVERSE)
+
+    def inverse_boxes(self, input: Boxes, *args: Any, **kwargs: Any) -> Boxes:
+        """Refuse, as ``inverse_transform`` does."""
+        raise NotImplementedError(_NO_INVERSE)
+
+    def inverse_keypoints(self, input: Keypoints, *args: Any, **kwargs: Any) -> Keypoints:
+        """Refuse, as ``inverse_transform`` does."""
+        raise NotImplementedError(_NO_INVERSE)
+
+
+_NO_INVERSE = "RollingShutterVibration has no inverse; restore(frames, timing, vibration) undoes a known vibration"
