@@ -2,17 +2,22 @@
 
 import csv
 import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 import typer
+from numpy.typing import NDArray
+from torch import Tensor
 
 from rsvib_torch.config import read_config
-from rsvib_torch.detection import MotionDetection, align_motion, detect_motion
+from rsvib_torch.detection import align_motion, detect_motion, detect_swept_tone
+from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.motion_file import MotionUnit, TimeUnit, read_motion
 from rsvib_torch.restoration import restore
+from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.stacks import (
     check_stack_target,
     check_writable,
@@ -25,17 +30,23 @@ from rsvib_torch.terminal import error_line, say, working
 
 __all__ = ["known", "motion"]
 
+Array = NDArray[np.float64]
+
 
 def motion(
     frames: Annotated[Path, typer.Argument(help="Stack of frames.")],
     *,
     config: Annotated[Path, typer.Option("--config", help="TOML file that describes the camera.")],
-    out: Annotated[Path, typer.Option(help="CSV file to write: time, x, y and their standard deviations.")],
-    knot_rows: Annotated[int, typer.Option(help="Rows from one knot of the motion to the next.")] = 24,
+    out: Annotated[Path, typer.Option(help="CSV file to write: time, x, y; and std_x, std_y of a free motion.")],
+    model: Annotated[
+        Literal["free", "swept"],
+        typer.Option(help="A smooth curve of any shape, or one tone an axis that decays or grows and sweeps."),
+    ] = "free",
+    knot_rows: Annotated[int, typer.Option(help="Rows from one knot of a free motion to the next.")] = 24,
     search: Annotated[int, typer.Option(help="Search range in px around the whole-frame offset.")] = 16,
     full_scale: Annotated[float | None, typer.Option(help="Count that means full scale.")] = None,
 ) -> None:
-    """Detect a motion of any shape, no sum of tones, in a stack of frames.
+    """Detect a motion that is no steady vibration in a stack of frames.
 
     The CSV file goes into rsvib known, with --unit px --offset 0.
     """
@@ -46,32 +57,68 @@ def motion(
     with working(f"reading {frames}"):
         stack = read_stack(frames, full_scale=scale)
     with working("detecting the motion"):
-        found = detect_motion(stack, settings.timing, knot_rows=knot_rows, search=search)
-    with whole_file(out) as file:
-        _write_motion(file, found, settings.timing.exposure_time)
+        lines, table = _MODELS[model](stack, settings.timing, knot_rows, search)
+    with whole_file(out) as file, file.open("w", newline="", encoding="utf-8") as text:
+        csv.writer(text).writerows(table)
+    for line in lines:
+        say(line)
+    say(f"{out}: {', '.join(table[0])}")
+
+
+_Table = list[list[str]]
+
+
+def _free(stack: Tensor, timing: SensorTiming, knot_rows: int, search: int) -> tuple[list[str], _Table]:
+    """A free motion in words, and as a table at even times with standard deviations."""
+    found = detect_motion(stack, timing, knot_rows=knot_rows, search=search)
+    lines = []
     for axis, name in enumerate("xy"):
         size = float(found.displacement[..., axis].square().mean().sqrt())
-        line = (
+        lines.append(
             f"{name}: moves by {size:.3f} px rms; known to {float(found.std_seen[axis]):.3f} px between frames, what "
-            f"repeats in every frame to {float(found.unseen[axis]):.3f} px; "
+            f"repeats in every frame to {float(found.unseen[axis]):.3f} px; {_verdict(found.reasons[axis])}"
         )
-        say(line + ("reliable" if bool(found.reliable[axis]) else f"not reliable: {'; '.join(found.reasons[axis])}"))
-    say(f"{out}: time, x, y, std_x, std_y")
-
-
-def _write_motion(path: Path, found: MotionDetection, exposure_time: float) -> None:
-    """A table of the motion at even times that cover all frames."""
-    step = 0.5 * found.motion.spacing
-    first, last = found.motion.start, max(found.motion.end, float(found.times.max()) + exposure_time)
-    times = np.linspace(first, last, math.ceil((last - first) / step) + 1)
-    values = found.motion.displacement(torch.from_numpy(times).to(found.motion.device)).cpu().numpy()
+    times, values = _sampled(found.motion, float(found.times.max()) + timing.exposure_time, 0.5)
     known_at, stds = found.times.flatten().cpu().numpy(), found.std.flatten(0, 1).cpu().numpy()
     spread = np.stack([np.interp(times, known_at, stds[:, axis]) for axis in range(2)], -1)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["time", "x", "y", "std_x", "std_y"])
-        for time, value, std in zip(times, values, spread, strict=True):
-            writer.writerow([f"{time:.9f}", *(f"{v:.5f}" for v in (*value, *std))])
+    return lines, _table(("time", "x", "y", "std_x", "std_y"), times, np.concatenate([values, spread], -1))
+
+
+def _swept(stack: Tensor, timing: SensorTiming, knot_rows: int, search: int) -> tuple[list[str], _Table]:
+    """Swept tones in words, and their motion as a table at even times."""
+    found = detect_swept_tone(stack, timing, search=search)
+    units = {"amplitude": "px", "frequency": "Hz", "decay": "/s", "chirp": "Hz/s", "phase": "rad"}
+    lines = []
+    for axis, name in enumerate("xy"):
+        told = [
+            f"{what} {float(getattr(found, what)[axis]):.4g} ± {float(found.std[what][axis]):.2g} {unit}"
+            for what, unit in units.items()
+        ]
+        lines.append(f"{name}: {', '.join(told)}; {_verdict(found.reasons[axis])}")
+    times, values = _sampled(found.motion, found.motion.end, 1.0)
+    return lines, _table(("time", "x", "y"), times, values)
+
+
+def _verdict(reasons: tuple[str, ...]) -> str:
+    return f"not reliable: {'; '.join(reasons)}" if reasons else "reliable"
+
+
+def _sampled(motion: FreeMotion, last: float, steps: float) -> tuple[Array, Array]:
+    """A motion (N, 2) at even times (N,) up to the last, ``steps`` knots apart."""
+    end = max(motion.end, last)
+    times = np.linspace(motion.start, end, math.ceil((end - motion.start) / (steps * motion.spacing)) + 1)
+    return times, motion.displacement(torch.from_numpy(times).to(motion.device)).cpu().numpy()
+
+
+def _table(names: tuple[str, ...], times: Array, values: Array) -> _Table:
+    rows = ([f"{time:.9f}", *(f"{v:.5f}" for v in row)] for time, row in zip(times, values, strict=True))
+    return [list(names), *rows]
+
+
+_MODELS: dict[str, Callable[[Tensor, SensorTiming, int, int], tuple[list[str], _Table]]] = {
+    "free": _free,
+    "swept": _swept,
+}
 
 
 def known(

@@ -1,6 +1,7 @@
 """Tones that fade or sweep, from frames of an independent simulator."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
+from rsvib_torch.cli import run_command
 
 HEIGHT, WIDTH, FRAMES = 256, 160, 5
 TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=270)
@@ -86,6 +88,20 @@ def test_a_still_axis_has_no_tone(scene):
     assert found.amplitude[1] == 0
     assert found.reasons[1] == ("no tone stands out",)
     assert found.frequency[0].item() == pytest.approx(45.0, rel=0.02)
+
+
+def test_command(frames, tmp_path, capsys):
+    (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 6e-5\nexposure_rows = 20\nframe_rows = 270\n")
+    rsv.write_stack(tmp_path / "frames.tif", frames)
+    config = ["--config", str(tmp_path / "camera.toml"), "--model", "swept", "--out", str(tmp_path / "motion.csv")]
+    assert run_command(["motion", str(tmp_path / "frames.tif"), *config]) == 0
+    said = capsys.readouterr().out
+    assert float(re.search(r"chirp (\S+) ± \S+ Hz/s, .*\ny: .*", said).group(1)) == pytest.approx(0, abs=12)
+    assert said.count("; reliable") == 2
+    recorded = rsv.read_motion(tmp_path / "motion.csv", unit="px")
+    times = TIMING.row_starts(FRAMES, HEIGHT)
+    error = recorded.displacement(times).numpy() - Swept().displacement(times.numpy())
+    assert (error - error.mean((0, 1))).std() < 0.03
 
 
 def test_bad_values_are_named():
