@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from rsvib_torch.imaging.psf import RowPSF
+from rsvib_torch.precision import full_precision
 from rsvib_torch.splines import bspline_coefficients, bspline_coefficients_adjoint, mirrored_index
 
 __all__ = ["RowVaryingBlur", "blur_rows", "blur_rows_adjoint"]
@@ -33,6 +34,7 @@ def _frame_size(
     return width, origin
 
 
+@full_precision
 def blur_rows(
     scene: Tensor, psf: RowPSF, *, frame_width: int | None = None, origin: tuple[int, int] | None = None
 ) -> Tensor:
@@ -67,6 +69,7 @@ def blur_rows(
     return frames
 
 
+@full_precision
 def blur_rows_adjoint(
     frames: Tensor, psf: RowPSF, scene_shape: tuple[int, ...], *, origin: tuple[int, int] | None = None
 ) -> Tensor:

@@ -1,0 +1,375 @@
+"""The augmentation against frames taken by the independent simulator, and inside Kornia's containers."""
+
+import copy
+import math
+import pickle
+
+import kornia.augmentation as kornia_augmentation
+import numpy as np
+import pytest
+import torch
+from kornia.geometry.boxes import Boxes
+from kornia.geometry.keypoints import Keypoints
+from scipy.optimize import brentq
+from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
+
+from rsvib_torch import RollingShutterVibration, SensorTiming
+
+TIMING = SensorTiming(row_time=40e-6, exposure_rows=30, frame_rows=320)
+HEIGHT, WIDTH = 240, 200
+MOTION = Motion(amplitude=(3.1, 4.2), frequency=(130.0, 90.0), phase=(0.4, 1.3), image_motion=(60.0, -80.0))
+
+
+def fixed(motion=MOTION, timing=TIMING, **options):
+    """The augmentation with ranges of one value."""
+    ranges = {
+        name: tuple((value, value) for value in getattr(motion, name))
+        for name in ("amplitude", "frequency", "phase", "image_motion")
+    }
+    return RollingShutterVibration(timing, **ranges, **options)
+
+
+def mean_displacement(times, motion=MOTION, timing=TIMING):
+    """Mean over exposures that begin at ``times``, as a plain sum."""
+    nodes = (np.arange(400) + 0.5) / 400 * timing.exposure_time
+    return motion.displacement(np.asarray(times, dtype=float)[..., None] + nodes).mean(-2)
+
+
+def place(point, motion=MOTION, timing=TIMING, start=0.0):
+    """Where the frame shows a scene point: the root of ``r = y + Y(t(r))``."""
+
+    def shown(row):
+        return mean_displacement(start + row * timing.row_time, motion, timing)
+
+    row = brentq(lambda r: r - point[1] - shown(r)[1], point[1] - 30, point[1] + 30, xtol=1e-10)
+    return point[0] + shown(row)[0], row
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return draw_scene(HEIGHT + 2 * MARGIN, WIDTH + 2 * MARGIN, seed=11, blur=1.2)
+
+
+@pytest.fixture(scope="module")
+def still(scene):
+    return torch.from_numpy(crop(scene))
+
+
+def test_image_is_that_of_the_camera(scene, still):
+    truth = take_frames(scene, TIMING, MOTION, 1)[0]
+    assert decibel(still, truth) < 25
+    assert decibel(fixed()(still[None, None])[0, 0], truth) > 58
+    assert decibel(fixed()(still[None, None].float())[0, 0], truth) > 58
+    cubic, linear = (decibel(fixed(interpolation=kind)(still[None, None])[0, 0], truth) for kind in ("cubic", "linear"))
+    assert linear < cubic - 6
+
+
+@pytest.mark.parametrize("scan_axis", [-2, -1])
+@pytest.mark.parametrize("readout_direction", ["forward", "reverse"])
+def test_any_orientation(still, scan_axis, readout_direction):
+    """The image turned by hand, moved by the motion turned by hand."""
+    timing = SensorTiming(40e-6, 30, 320, scan_axis=scan_axis, readout_direction=readout_direction)
+
+    def turned(image):
+        image = image.mT if scan_axis == -1 else image
+        return image.flip(-2) if readout_direction == "reverse" else image
+
+    def turned_back(image):
+        image = image.flip(-2) if readout_direction == "reverse" else image
+        return image.mT if scan_axis == -1 else image
+
+    sign = -1.0 if readout_direction == "reverse" else 1.0
+    swap = scan_axis == -1
+    values = {
+        name: getattr(MOTION, name)[::-1] if swap else getattr(MOTION, name)
+        for name in ("amplitude", "frequency", "phase", "image_motion")
+    }
+    values["phase"] = (values["phase"][0], values["phase"][1] + (math.pi if sign < 0 else 0.0))
+    values["image_motion"] = (values["image_motion"][0], sign * values["image_motion"][1])
+    in_rows = Motion(**values)
+    moved = fixed(MOTION, timing)(still[None, None])[0, 0]
+    torch.testing.assert_close(moved, turned_back(fixed(in_rows)(turned(still)[None, None])[0, 0]), rtol=0, atol=1e-5)
+
+    point = (60.0, 130.0)
+    rows = WIDTH if swap else HEIGHT
+    x, y = point[::-1] if swap else point
+    x, y = place((x, rows - 1 - y if sign < 0 else y), in_rows)
+    y = rows - 1 - y if sign < 0 else y
+    augmentation = kornia_augmentation.AugmentationSequential(fixed(MOTION, timing), data_keys=["input", "keypoints"])
+    _, found = augmentation(still[None, None], torch.tensor([[point]], dtype=torch.float64))
+    np.testing.assert_allclose(found[0, 0].numpy(), (y, x) if swap else (x, y), atol=1e-4)
+
+
+def test_keypoints_masks_and_boxes_follow_the_image(still):
+    """Discs: their centres are keypoints, their pixels the mask, their extent the boxes."""
+    centres = torch.tensor([[40.0, 50.0], [150.0, 60.0], [60.0, 180.0], [140.0, 200.0]], dtype=torch.float64)
+    radius = 12.0
+    y, x = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
+    distances = torch.stack([torch.hypot(x - cx, y - cy) for cx, cy in centres])
+    images = torch.sigmoid((radius - distances) / 0.7)[None]
+    mask = (distances <= radius).double()[None]
+    corners = torch.cat([centres - radius, centres + radius], -1)[None]
+    chain = kornia_augmentation.AugmentationSequential(fixed(), data_keys=["input", "mask", "keypoints", "bbox_xyxy"])
+    image, moved_mask, points, boxes = chain(images, mask, centres[None], corners + torch.tensor([0, 0, 1.0, 1.0]))
+
+    expected = np.array([place(centre) for centre in centres.numpy()])
+    assert np.abs(expected - centres.numpy()).min(0).max() > 0.3  # something moves
+    np.testing.assert_allclose(points[0].numpy(), expected, atol=1e-4)
+    weight = image[0] / image[0].sum((-2, -1), keepdim=True)
+    centroids = torch.stack([(weight * x).sum((-2, -1)), (weight * y).sum((-2, -1))], -1)
+    np.testing.assert_allclose(centroids.numpy(), points[0].numpy(), atol=0.3)  # a disc is not a point
+    differing = ((image[0] > 0.5) != (moved_mask[0] > 0.5)).sum((-2, -1)).double()
+    unmoved = ((image[0] > 0.5) != (mask[0] > 0.5)).sum((-2, -1)).double()
+    assert (differing < 25).all()  # of 75 pixels of the rim, whose sides blur and rounding shift by half a pixel
+    assert (unmoved > 50).all()
+    assert set(moved_mask.unique().tolist()) == {0.0, 1.0}
+    for index, (left, top, right, bottom) in enumerate((boxes - torch.tensor([0, 0, 1.0, 1.0]))[0].tolist()):
+        rows, columns = (moved_mask[0, index] > 0).nonzero().unbind(-1)
+        for side, edge in ((left, columns.min()), (top, rows.min()), (-right, -columns.max()), (-bottom, -rows.max())):
+            assert side <= float(edge) + 0.6  # nothing outside, but for rounding of the mask
+
+
+def test_boxes_are_the_smallest_around_the_bent_contents():
+    """A tall box over several periods: its sides lie at the largest displacements of the rows in it."""
+    motion = Motion((3.0, 0.0), (400.0, 0.0), (0.3, 0.0))
+    boxes = Boxes.from_tensor(torch.tensor([[[50.0, 20.0, 91.0, 221.0]]], dtype=torch.float64), mode="xyxy")
+    augmentation = fixed(motion)
+    augmentation(torch.zeros(1, 1, HEIGHT, WIDTH))
+    moved = augmentation.transform_boxes(boxes, augmentation._params, augmentation.flags)
+    x = mean_displacement(np.arange(20, 221) * TIMING.row_time, motion)[:, 0]
+    np.testing.assert_allclose(moved.to_tensor("xyxy")[0, 0], [50 + x.min(), 20, 91 + x.max(), 221], atol=1e-3)
+    slanted = Boxes(torch.tensor([[[[50.0, 60.0], [80.0, 70.0], [70.0, 100.0], [40.0, 90.0]]]], dtype=torch.float64))
+    corners = augmentation.transform_boxes(slanted, augmentation._params, augmentation.flags).data[0, 0]
+    np.testing.assert_allclose(corners, [place(p, motion) for p in slanted.data[0, 0].numpy()], atol=1e-4)
+
+
+def test_clip_is_a_recording(scene, still):
+    """Frames of a clip are consecutive frames of one camera; labels of the clip move with it."""
+    truth = take_frames(scene, TIMING, MOTION, 3)
+    clip = still.expand(1, 3, 1, -1, -1)
+    video = kornia_augmentation.VideoSequential(fixed(), same_on_frame=True)
+    taken = video(clip)
+    for frame in range(3):
+        assert decibel(taken[0, frame, 0], truth[frame]) > 58
+    assert torch.equal(video(clip, params=video._params), taken)
+    point = (80.0, 120.0)
+    labelled = kornia_augmentation.AugmentationSequential(
+        kornia_augmentation.VideoSequential(fixed()), data_keys=["input", "keypoints"]
+    )
+    _, points = labelled(clip, torch.tensor(point, dtype=torch.float64).expand(1, 3, 1, 2))
+    for frame in range(3):
+        expected = place(point, start=frame * TIMING.frame_period)
+        np.testing.assert_allclose(points.reshape(3, 2)[frame], expected, atol=1e-4)
+
+
+def test_clips_of_a_batch_and_free_frames():
+    clips = torch.rand(2, 3, 1, 48, 40, dtype=torch.float64)[:, :1].expand(-1, 3, -1, -1, -1)
+    augmentation = RollingShutterVibration(TIMING)
+    shared = kornia_augmentation.VideoSequential(augmentation)
+    taken = shared(clips)
+    for clip in range(2):
+        alone = {name: value[3 * clip : 3 * clip + 3] for name, value in shared._params[0].data.items() if value.ndim}
+        alone |= {"forward_input_shape": torch.tensor([1, 1, 48, 40]), "video_batch_size": torch.tensor(1)}
+        torch.testing.assert_close(augmentation(clips[clip], params=alone), taken[clip], rtol=0, atol=1e-3)
+    free = kornia_augmentation.VideoSequential(RollingShutterVibration(TIMING), same_on_frame=False)
+    frames = free(clips)
+    drawn = {name: value for name, value in free._params[0].data.items() if name != "video_batch_size"}
+    torch.testing.assert_close(augmentation(clips.flatten(0, 1), params=drawn), frames.flatten(0, 1))
+
+
+def test_draws_lie_in_their_ranges_and_fill_them():
+    augmentation = RollingShutterVibration(
+        TIMING,
+        amplitude=((0.0, 1.0), (2.0, 3.0)),
+        frequency=(50.0, 60.0),
+        phase=(-1.0, 1.0),
+        image_motion=((-10.0, 10.0), (0.0, 5.0)),
+        exposure_rows=(5.0, 50.0),
+        tones=2,
+    )
+    drawn = augmentation.forward_parameters((400, 1, 8, 8))
+    bounds = {
+        "amplitude": (torch.tensor([0.0, 2.0]), torch.tensor([1.0, 3.0])),
+        "frequency": (torch.tensor([50.0, 50.0]), torch.tensor([60.0, 60.0])),
+        "phase": (torch.tensor([-1.0, -1.0]), torch.tensor([1.0, 1.0])),
+        "image_motion": (torch.tensor([-10.0, 0.0]), torch.tensor([10.0, 5.0])),
+    }
+    for name, (low, high) in bounds.items():
+        values = drawn[name] if drawn[name].ndim == 3 else drawn[name][..., None]
+        assert values.shape == (400, 2, 1 if name == "image_motion" else 2)
+        least, most = values.amin((0, 2)), values.amax((0, 2))
+        assert (least >= low).all()
+        assert (most <= high).all()
+        assert (most - least > 0.9 * (high - low)).all()
+    assert 5 <= drawn["exposure_rows"].min() < 8
+    assert 47 < drawn["exposure_rows"].max() <= 50
+
+
+def test_every_image_has_its_own_motion_and_exposure(still):
+    """A batch equals its images taken one by one; the exposure drawn is the one that blurs."""
+    images = still[None, None].expand(3, 2, -1, -1)[..., 20:120, 20:100]
+    augmentation = RollingShutterVibration(TIMING, exposure_rows=(2.0, 200.0), tones=2, image_motion=(-50.0, 50.0))
+    together = augmentation(images)
+    params = augmentation._params
+    for index in range(3):
+        alone = {
+            name: value if value.ndim == 1 and len(value) == 4 else value[index : index + 1]
+            for name, value in params.items()
+        }
+        torch.testing.assert_close(
+            augmentation(images[index : index + 1], params=alone)[0], together[index], rtol=0, atol=1e-4
+        )
+    assert augmentation.drawn_vibration(params).amplitude.shape == (3, 2, 2)
+    longer = SensorTiming(row_time=40e-6, exposure_rows=90, frame_rows=320)
+    torch.testing.assert_close(fixed(exposure_rows=90)(images), fixed(timing=longer)(images))
+    assert (fixed()(images) - fixed(timing=longer)(images)).abs().max() > 0.01
+    assert not torch.equal(together[0], together[1])
+
+
+def test_replay_same_on_batch_keepdim_probability():
+    images = torch.rand(4, 3, 40, 32)
+    augmentation = RollingShutterVibration(TIMING)
+    first = augmentation(images)
+    params = augmentation._params
+    assert not torch.equal(first, augmentation(images))
+    assert torch.equal(first, augmentation(images, params=params))
+    torch.manual_seed(3)
+    seeded = augmentation(images)
+    torch.manual_seed(3)
+    assert torch.equal(seeded, augmentation(images))
+
+    same = RollingShutterVibration(TIMING, same_on_batch=True)
+    moved = same(images[:1].expand(4, -1, -1, -1))
+    assert torch.equal(moved[0], moved[3])
+    assert not torch.equal(moved[0], images[0])
+
+    assert RollingShutterVibration(TIMING, keepdim=True)(images[0]).shape == (3, 40, 32)
+    assert RollingShutterVibration(TIMING, keepdim=True)(images[0, 0]).shape == (40, 32)
+    assert RollingShutterVibration(TIMING)(images[0]).shape == (1, 3, 40, 32)
+    assert augmentation(images[:0]).shape == (0, 3, 40, 32)
+
+    half = RollingShutterVibration(TIMING, p=0.5)
+    torch.manual_seed(0)
+    moved = half(images.repeat(4, 1, 1, 1))
+    left = torch.tensor([torch.equal(a, b) for a, b in zip(moved, images.repeat(4, 1, 1, 1), strict=True)])
+    assert torch.equal(left, half._params["batch_prob"] < 0.5)
+    assert 0 < left.sum() < 16
+    assert torch.equal((half.drawn_vibration().amplitude == 0).all((1, 2)), left)
+    points = Keypoints(torch.full((16, 1, 2), 15.0))
+    shifted = half.transform_keypoints(points, half._params, half.flags).data
+    assert torch.equal((shifted == 15.0).flatten(1).all(1), left)
+
+
+def test_dtype_gradient_and_autocast():
+    images = torch.rand(2, 1, 40, 32, dtype=torch.float64, requires_grad=True)
+    augmentation = RollingShutterVibration(TIMING)
+    moved = augmentation(images)
+    moved.square().sum().backward()
+    # the operator is linear: <A x, A x> has the gradient 2 A^T A x, whose product with x is 2 |A x|^2
+    torch.testing.assert_close((images.grad * images).sum(), 2 * moved.square().sum())
+    params = augmentation._params
+    for dtype, tolerance in ((torch.float32, 2e-6), (torch.float16, 1e-3), (torch.bfloat16, 8e-3)):
+        found = augmentation(images.detach().to(dtype), params=params)
+        assert found.dtype == dtype
+        torch.testing.assert_close(
+            found.double(), augmentation(images.detach().to(dtype).double(), params=params), rtol=0, atol=tolerance
+        )
+    plain = augmentation(images.detach().float(), params=params)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(augmentation(images.detach().float(), params=params), plain)
+
+
+class Patches(torch.utils.data.Dataset):
+    def __init__(self):
+        self.augmentation = RollingShutterVibration(TIMING, keepdim=True)
+
+    def __len__(self):
+        return 8
+
+    def __getitem__(self, index):
+        image = torch.linspace(0, 1, 32).expand(1, 40, 32).sin()
+        return self.augmentation(image), self.augmentation.drawn_vibration().amplitude[0]
+
+
+def test_workers_draw_differently_and_reproducibly():
+    def run(workers):
+        torch.manual_seed(7)
+        loader = torch.utils.data.DataLoader(Patches(), batch_size=2, num_workers=workers)
+        return [torch.cat(parts) for parts in zip(*loader, strict=True)]
+
+    images, amplitudes = run(2)
+    assert images.shape == (8, 1, 40, 32)
+    assert len(amplitudes[:, 0, 0].unique()) == 8
+    again, _ = run(2)
+    assert torch.equal(images, again)
+
+
+def test_copies_draw_alike():
+    augmentation = RollingShutterVibration(TIMING, tones=2)
+    images = torch.rand(2, 1, 40, 32)
+    expected = augmentation(images)
+    for other in (copy.deepcopy(augmentation), pickle.loads(pickle.dumps(augmentation))):
+        assert torch.equal(other(images, params=augmentation._params), expected)
+        other.load_state_dict(augmentation.state_dict())
+    assert "RollingShutterVibration(" in repr(augmentation)
+    assert "frequency=((20.0, 200.0)" in repr(augmentation)
+
+
+def test_in_a_chain_with_other_augmentations():
+    """After a crop the rows count anew; the points of the whole chain agree with the marks in the image."""
+    images = torch.zeros(1, 1, 96, 96, dtype=torch.float64)
+    y, x = torch.meshgrid(torch.arange(96.0), torch.arange(96.0), indexing="ij")
+    images[0, 0] = torch.exp(-((x - 50) ** 2 + (y - 40) ** 2) / 8)
+    chain = kornia_augmentation.AugmentationSequential(
+        kornia_augmentation.RandomCrop((80, 80), p=1.0),
+        RollingShutterVibration(TIMING, amplitude=(2.0, 4.0), frequency=(20.0, 60.0)),
+        kornia_augmentation.RandomHorizontalFlip(p=1.0),
+        data_keys=["input", "keypoints"],
+    )
+    torch.manual_seed(1)
+    image, points = chain(images, torch.tensor([[[50.0, 40.0]]], dtype=torch.float64))
+    weight = image[0, 0].clamp(min=0)
+    centre = torch.stack([(weight * x[:80, :80]).sum(), (weight * y[:80, :80]).sum()]) / weight.sum()
+    torch.testing.assert_close(points[0, 0], centre, rtol=0, atol=0.05)
+    replayed, _ = chain(images, torch.tensor([[[50.0, 40.0]]], dtype=torch.float64), params=chain._params)
+    assert torch.equal(replayed, image)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "match"),
+    [
+        ({"amplitude": (2.0, 1.0)}, ValueError, "amplitude must have low before high"),
+        ({"amplitude": -1.0}, ValueError, "amplitude must be at least 0"),
+        ({"frequency": "fast"}, TypeError, "frequency must be a number, \\(low, high\\)"),
+        ({"frequency": (1.0, 2.0, 3.0)}, TypeError, "frequency must be a number, \\(low, high\\)"),
+        ({"phase": (0.0, math.nan)}, ValueError, "phase must be finite"),
+        ({"exposure_rows": 0.0}, ValueError, "exposure_rows must be larger than 0"),
+        ({"exposure_rows": (20, 400)}, ValueError, "exposure_rows must be at most 320"),
+        ({"tones": 0}, ValueError, "tones must be at least 1"),
+        ({"interpolation": "nearest"}, ValueError, "interpolation must be one of"),
+        ({"p": 1.5}, ValueError, "p must be at most 1"),
+    ],
+)
+def test_wrong_options_are_named(options, error, match):
+    with pytest.raises(error, match=match):
+        RollingShutterVibration(TIMING, **options)
+
+
+def test_refusals():
+    with pytest.raises(TypeError, match="timing must be a SensorTiming"):
+        RollingShutterVibration(2e-5)
+    augmentation = RollingShutterVibration(TIMING)
+    with pytest.raises(ValueError, match="no vibration has been drawn yet"):
+        augmentation.drawn_vibration()
+    with pytest.raises(ValueError, match="less than the 400 rows"):
+        augmentation(torch.zeros(1, 1, 400, 8))
+    images = torch.rand(1, 1, 40, 32)
+    for data_key, value in (
+        ("input", images),
+        ("keypoints", torch.ones(1, 1, 2)),
+        ("bbox_xyxy", torch.tensor([[[1.0, 1, 5, 5]]])),
+    ):
+        chain = kornia_augmentation.AugmentationSequential(augmentation, data_keys=["input", data_key])
+        outputs = chain(images, value)
+        with pytest.raises(NotImplementedError, match="restore\\(frames, timing, vibration\\)"):
+            chain.inverse(outputs[1], data_keys=[data_key])
