@@ -16,6 +16,7 @@ from rsvib_torch.pages.template import write_page
 from rsvib_torch.pictures import axis_offset_figure, detailed_places
 from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
 from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.vibration import Vibration
 
 __all__ = ["Report", "write_report_page"]
 
@@ -61,6 +62,17 @@ class Report:
         return self.frames[index], self.restored[min(index, len(self.restored) - 1)], index
 
     @property
+    def num_rows(self) -> int:
+        """Rows of a frame, along the scan axis."""
+        return self.frames.shape[int(self.timing.scan_axis)]
+
+    @property
+    def undone(self) -> Vibration:
+        """The part of the vibration that is known well enough to be undone, on the CPU."""
+        vibration, _ = trusted_vibration(self.detection, self.timing, len(self.frames), self.num_rows)
+        return vibration.to("cpu")
+
+    @property
     def names(self) -> tuple[str, str]:
         """What before and after are called."""
         return "as taken", "restored" if self.was_restored else "left as taken"
@@ -82,8 +94,7 @@ def _details(report: Report) -> list[Any]:
 
 def _drawings(report: Report) -> dict[str, list[Drawing]]:
     result, timing = report.detection, report.timing
-    num_rows = report.frames.shape[int(timing.scan_axis)]
-    undone, _ = trusted_vibration(result, timing, len(report.frames), num_rows)
+    undone, num_rows = report.undone, report.num_rows
     offsets = [
         drawing(
             axis_offset_figure(result, axis),
@@ -153,8 +164,6 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         for axis in ("horizontal", "vertical")
         if any(pair.axis == axis for pair in pairs)
     ]
-    num_rows = report.frames.shape[int(report.timing.scan_axis)]
-    undone, _ = trusted_vibration(report.detection, report.timing, len(report.frames), num_rows)
     options = ", ".join(f"{name} = {value}" for name, value in report.options.items() if report.was_restored)
     content |= {
         "title": report.title,
@@ -162,9 +171,9 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         "mood": in_words.mood_of(report.detection, report.verdict, report.was_restored),
         "verdict": in_words.verdict_words(
             report.detection,
-            undone,
+            report.undone,
             report.timing,
-            num_rows,
+            report.num_rows,
             restored=report.was_restored,
             left_alone=report.left_alone,
             verdict=report.verdict,
