@@ -1,6 +1,5 @@
 """What a run keeps on disk until it is complete: a header, and one line for every window that is safely written."""
 
-import fcntl
 import json
 import os
 import shutil
@@ -9,6 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from rsvib_torch.stacks.atomic import whole_file
+
+try:
+    import fcntl
+except ImportError:  # systems without it do not keep two runs apart
+    fcntl = None  # type: ignore[assignment]
 
 __all__ = ["Journal", "describe_difference", "work_folder"]
 
@@ -61,7 +65,8 @@ class Journal:
             ) from error
         self._lock = os.open(self.folder / _LOCK, os.O_CREAT | os.O_RDWR)
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if fcntl is not None:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             os.close(self._lock)
             raise BlockingIOError(f"cannot write {sink}: another run is writing it") from error

@@ -83,7 +83,7 @@ class PlacedReader:
         self._shape = info.stored_shape[1:]
         self._bytes = int(np.prod(self._shape)) * dtype.itemsize
         check_frames_held(info, offset, path.stat().st_size, strict=False)
-        self._file = path.open("rb")
+        self._file = path.open("rb", buffering=0)
 
     def frame(self, index: int) -> NDArray[Any]:
         """Pixels of a frame as stored."""
@@ -92,10 +92,11 @@ class PlacedReader:
             raise FrameError(f"{self._name}: truncated: frame {index} lies beyond the end of the file")
         pixels = np.empty(self._shape, self._dtype)
         view, done = memoryview(pixels.data).cast("B"), 0
+        self._file.seek(start)
         while done < len(view):
             # read, not mapped: a file that shrinks meanwhile is an error then, not the end of the process
-            count = os.preadv(self._file.fileno(), [view[done:]], start + done)
-            if count == 0:
+            count = self._file.readinto(view[done:])
+            if not count:
                 raise FrameError(f"{self._name}: truncated: frame {index} lies beyond the end of the file")
             done += count
         frame = frame_from_file_order(pixels, self.info)
@@ -118,7 +119,7 @@ class PlacedWriter:
     def __init__(self, path: Path, info: StackInfo, offset: int) -> None:
         self._info, self._offset = info, offset
         self._bytes = int(np.prod(info.shape[1:])) * np.dtype(info.dtype).itemsize
-        self._file = os.open(path, os.O_RDWR)
+        self._file = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
         needed = offset + self._bytes * info.shape[0]
         if os.fstat(self._file).st_size < needed:
             os.ftruncate(self._file, needed)
@@ -137,10 +138,9 @@ class PlacedWriter:
     def write(self, index: int, frame: NDArray[Any]) -> None:
         """Put a frame in its place."""
         data = memoryview(frame_to_file_order(frame, self._info).data).cast("B")
-        place = self._offset + index * self._bytes
+        os.lseek(self._file, self._offset + index * self._bytes, os.SEEK_SET)
         while len(data):
-            done = os.pwrite(self._file, data, place)
-            data, place = data[done:], place + done
+            data = data[os.write(self._file, data) :]
 
     def sync(self) -> None:
         """See that what was written is on the disk."""
