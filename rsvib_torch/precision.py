@@ -1,13 +1,13 @@
-"""Full precision where mixed precision would spoil the result."""
+"""Full precision and plain execution, where mixed precision or a compiler would spoil the result."""
 
 from collections.abc import Callable
-from functools import wraps
-from typing import ParamSpec, TypeVar
+from functools import cache, wraps
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
-__all__ = ["full_precision"]
+__all__ = ["full_precision", "outside_graphs"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -33,3 +33,23 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
 
     return with_all_digits
+
+
+def outside_graphs(function: Callable[P, R]) -> Callable[P, R]:
+    """Make ``torch.compile`` call a function as it is: one break of the graph instead of many.
+
+    Sizes of kernels and bands follow from the motion, so that a graph could not outlive the next vibration.
+    """
+
+    @wraps(function)
+    def as_it_is(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.compiler.is_compiling():
+            return _disabled(function)(*args, **kwargs)  # type: ignore[no-any-return]
+        return function(*args, **kwargs)
+
+    return as_it_is
+
+
+@cache  # on demand: importing the compiler takes seconds
+def _disabled(function: Callable[..., Any]) -> Callable[..., Any]:
+    return torch.compiler.disable(function, reason="sizes follow from the motion")  # type: ignore[no-any-return]

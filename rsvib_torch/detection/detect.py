@@ -22,7 +22,7 @@ from rsvib_torch.orientation import (
     offsets_from_row_order,
     vibration_from_row_order,
 )
-from rsvib_torch.precision import full_precision
+from rsvib_torch.precision import full_precision, outside_graphs
 from rsvib_torch.registration import OffsetCurve, Registration
 from rsvib_torch.registration.register import register_rows
 from rsvib_torch.sensor import SensorTiming
@@ -102,6 +102,7 @@ _METHODS: dict[
 ] = {"direct": _detect_direct, "bands": _detect_bands}
 
 
+@outside_graphs
 @full_precision
 def detect_vibration(
     frames: Tensor,

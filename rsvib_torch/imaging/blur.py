@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from rsvib_torch.imaging.psf import RowPSF
-from rsvib_torch.precision import full_precision
+from rsvib_torch.precision import full_precision, outside_graphs
 from rsvib_torch.splines import bspline_coefficients, bspline_coefficients_adjoint, mirrored_index
 
 __all__ = ["RowVaryingBlur", "blur_rows", "blur_rows_adjoint"]
@@ -34,6 +34,7 @@ def _frame_size(
     return width, origin
 
 
+@outside_graphs
 @full_precision
 def blur_rows(
     scene: Tensor, psf: RowPSF, *, frame_width: int | None = None, origin: tuple[int, int] | None = None
@@ -69,6 +70,7 @@ def blur_rows(
     return frames
 
 
+@outside_graphs
 @full_precision
 def blur_rows_adjoint(
     frames: Tensor, psf: RowPSF, scene_shape: tuple[int, ...], *, origin: tuple[int, int] | None = None

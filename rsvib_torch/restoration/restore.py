@@ -16,7 +16,7 @@ from rsvib_torch.orientation import (
     frames_to_row_order,
     vibration_to_row_order,
 )
-from rsvib_torch.precision import full_precision
+from rsvib_torch.precision import full_precision, outside_graphs
 from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact import restore_exact
@@ -92,6 +92,7 @@ def _without_added_axes(restored: Tensor, ndim: int) -> Tensor:
     return restored[:, 0] if ndim == 3 else restored
 
 
+@outside_graphs
 @full_precision
 def restore(
     frames: Tensor,
