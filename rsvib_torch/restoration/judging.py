@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from rsvib_torch.arrays import as_tensor
 from rsvib_torch.checks import check_whole_number
 from rsvib_torch.free_motion import rest_reach
 from rsvib_torch.orientation import as_float_frames, frames_to_row_order, time_axis, vibration_to_row_order
@@ -210,7 +211,8 @@ def judge_restoration(
     Raises:
         ValueError: If there is one frame only, shapes differ, or two frames have too little in common.
     """
-    hidden = hidden_pixels(torch.as_tensor(frames), ignore)
+    frames, restored = as_tensor("frames", frames), as_tensor("restored", restored)
+    hidden = hidden_pixels(frames, None if ignore is None else as_tensor("ignore", ignore))
     raw = as_float_frames(frames if hidden is None else frames.masked_fill(hidden, 0), full_scale, minimum_frames=2)
     raw = raw if hidden is None else fill_roughly(raw, hidden)
     if raw.ndim == 5 or time_axis(raw) != 0:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from rsvib_torch.arrays import ArrayLike, as_tensor
 from rsvib_torch.checks import check_choice
 from rsvib_torch.free_motion import detached, rest_reach
 from rsvib_torch.orientation import (
@@ -95,7 +96,7 @@ def _without_added_axes(restored: Tensor, ndim: int) -> Tensor:
 @outside_graphs
 @full_precision
 def restore(
-    frames: Tensor,
+    frames: ArrayLike,
     timing: SensorTiming,
     vibration: Vibration | Detected,
     *,
@@ -118,7 +119,7 @@ def restore(
     pixels at their level.
 
     Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation; tensor or NumPy array.
         timing: The sensor.
         vibration: The motion in image axes: one for all, or a batch (B,) for a batch of stacks. Or what
             ``detect_vibration`` returned: axes that it does not trust are then left alone, see ``trusted_vibration``.
@@ -150,8 +151,8 @@ def restore(
     """
     check_choice("method", method, tuple(METHODS))
     _check_options(method, options)
-    given = _as_tensor(frames)
-    hidden = hidden_pixels(given, ignore)
+    given = as_tensor("frames", frames)
+    hidden = hidden_pixels(given, None if ignore is None else as_tensor("ignore", ignore))
     clipped = saturated_pixels(given, saturation, full_scale)
     for mask, message in ((hidden, "ignore leaves no pixel"), (clipped, "every pixel is saturated")):
         if mask is not None and bool(mask.all()):
@@ -182,13 +183,6 @@ def restore(
         _warn_if_worse(raw.detach(), restored.detach(), motion, timing, options.get("joint", False))
     restored = frames_from_row_order(restored, timing)
     return _without_added_axes(restored, given.ndim).to(dtype)
-
-
-def _as_tensor(frames: Tensor) -> Tensor:
-    try:
-        return torch.as_tensor(frames)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"frames must be a tensor or array of numbers, got {type(frames).__name__}") from error
 
 
 def _to_undo(vibration: Vibration | Detected, timing: SensorTiming, num_frames: int, num_rows: int) -> Vibration:

@@ -9,15 +9,16 @@ from rsvib_torch.restoration.sampled_rows import Explained, sample_rows
 
 __all__ = ["prior_strength"]
 
-_STRENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
+_STRENGTHS = (2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
+_DOUBT = 0.014  # by how much a prior half as strong has to predict better, in logarithms
 _ROWS = 512  # at most, from the middle of the frames
 _FREQUENCIES = 24
 _LOWEST = 0.02  # cycles per px; the taper spreads what lies below
 _SMALLEST = 64  # rows and columns that a choice can be made from
 
 
-def _cross_validation(explained: Explained) -> int:
-    """Index of the prior, of those from strong to weak, that generalised cross-validation asks for.
+def _cross_validation(explained: Explained, strengths: Tensor) -> int:
+    """Index of the strength, of those from strong to weak, that generalised cross-validation asks for.
 
     ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from all
     others. For all frequencies together, those with the largest errors decide; its geometric mean over the frequencies
@@ -26,7 +27,8 @@ def _cross_validation(explained: Explained) -> int:
     left = explained.count - explained.freedom
     together = explained.power.sum(-1).log() - 2 * left.sum(-1).log()
     one_by_one = (explained.power.log() - 2 * left.log()).mean(-1)
-    return int(torch.maximum(together.argmin(), one_by_one.argmin()))
+    doubt = _DOUBT * strengths.log2().neg().clamp(min=0.0)
+    return int(torch.maximum((together + doubt).argmin(), (one_by_one + doubt).argmin()))
 
 
 @torch.no_grad()
@@ -61,4 +63,4 @@ def prior_strength(
     sample = sample_rows(images[..., top : top + count, :], part, chosen)
     strengths = [strength for strength in _STRENGTHS if certain or strength <= 1]
     explained = sample.explain([prior.precision(noise_power, strength)[..., place] for strength in strengths])
-    return strengths[_cross_validation(explained)]
+    return strengths[_cross_validation(explained, explained.power.new_tensor(strengths))]

@@ -233,3 +233,20 @@ def test_module(dtype):
     assert torch.equal(blur.adjoint(frame, (24, 28)), blur_rows_adjoint(frame, psf, (24, 28), origin=(3, 4)))
     assert {name for name, _ in blur.named_buffers()} == {"first_tap", "weights"}
     torch.testing.assert_close(frame.double(), blur(scene.double()), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_gradients_to_the_vibration(interpolation):
+    timing = SensorTiming(row_time=1e-3, exposure_rows=3, frame_rows=12)
+    scene = torch.rand(9, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    values = [[0.83, 0.61], [21.0, 33.0], [0.3, 1.0], [11.0, -7.0]]
+    parameters = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in values]
+
+    def frame(amplitude, frequency, phase, image_motion):
+        vibration = Vibration(amplitude, frequency, phase, image_motion)
+        psf = row_psf(vibration, timing.row_starts(1, 7)[0], timing, interpolation=interpolation)
+        return RowVaryingBlur(psf, frame_width=6)(scene)
+
+    assert torch.autograd.gradcheck(frame, parameters)
+    gradients = torch.autograd.grad(frame(*parameters).sin().sum(), parameters)
+    assert all(gradient.abs().min() > 1e-6 for gradient in gradients)

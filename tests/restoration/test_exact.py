@@ -255,3 +255,19 @@ def test_segments_of_rows_change_nothing(short, joint, monkeypatch):
     monkeypatch.setattr(solver_module, "Segments", partial(Segments, overlap=2))
     careless = restore(frames, TIMING, motion.vibration(), segments=3, check=False, joint=joint)
     assert (careless - whole).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_gradients_through_filled_pixels_and_ends(joint, prior_fitted_once):
+    timing = SensorTiming(row_time=1e-3, exposure_rows=12, frame_rows=16)
+    frames = torch.rand(2, 6, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ignore = torch.zeros(2, 6, 5, dtype=torch.bool)
+    ignore[0, 2, 3] = True
+    inputs = (frames, torch.tensor([1.6, 0.6], dtype=torch.float64), torch.tensor([0.3, 1.0], dtype=torch.float64))
+
+    def run(images, amplitude, phase):
+        vibration = Vibration(amplitude, [40.0, 30.0], phase)
+        return restore(images, timing, vibration, noise=0.05, ignore=ignore, joint=joint, check=False)
+
+    values = tuple(value.clone().requires_grad_() for value in inputs)
+    assert torch.autograd.gradcheck(run, values, fast_mode=True)
