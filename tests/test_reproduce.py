@@ -154,3 +154,25 @@ def test_a_tiny_run(tmp_path, capsys):
     assert all(source.startswith("data:image/") for source in sources)
     for name in ("figure_4", "figure_5", "figure_6a_default", "figure_7", "figure_8", "figure_9", "sampling"):
         assert (out / f"{name}.png").stat().st_size > 5000
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("scripts")
+def test_the_quick_form(tmp_path):
+    import reproduce
+
+    reproduce.main(["--quick", "--out", str(tmp_path)])
+    data = json.loads((tmp_path / "reproduction.json").read_text(encoding="utf-8"))
+    better = {cell["row"]: [] for cell in data["cells"]}
+    for cell in data["cells"]:
+        better[cell["row"]].append(cell["default_better_worst"])
+    for row in ("error of the period", "error of the amplitude", "PSNR, restored", "PSNR, improvement"):
+        assert all(better[row])
+    for trial in data["push_scan"]:
+        for values in trial["detection"]["default"].values():
+            assert abs(values["period_error"]) < 0.02
+            assert abs(values["amplitude_error"]) < 0.3
+    for value in data["closing"]:
+        if value["method"] == "default":
+            assert value["least_share"] > 0.9
+            assert value["largest_share"] < 1.05
