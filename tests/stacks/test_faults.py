@@ -278,6 +278,19 @@ def test_interrupt_keeps_what_is_done(whole, tmp_path):
     check_whole(whole, tmp_path, "out.tif")
 
 
+def test_torn_chunks_of_zarr_are_cleared(whole_zarr, tmp_path):
+    def stop(done, total):
+        if done > 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        process_small(whole_zarr / "frames.tif", tmp_path / "out.zarr", progress=stop)
+    chunk = next((work_folder(tmp_path / "out.zarr") / "out.zarr" / "c").iterdir())
+    (chunk / "0" / "0.1003c751a7d14a53b4832d1c3c0beb81.partial").write_bytes(b"torn")  # as the store leaves it
+    process_small(whole_zarr / "frames.tif", tmp_path / "out.zarr", resume=True)
+    check_whole(whole_zarr, tmp_path, "out.zarr")
+
+
 def test_input_that_vanishes_stops_the_run_and_can_come_back(whole, tmp_path):
     frames = tifffile.imread(whole / "frames.tif")
     for index, frame in enumerate(frames):
