@@ -14,6 +14,8 @@ __all__ = ["Vibration", "blind_frequencies"]
 
 TensorLike = Tensor | float | Sequence[float] | Sequence[Sequence[float]]
 
+_SAME_PLACE = 1e-6  # of a turn
+
 
 def _tones(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
     """Turn a float, (2,), (2, K) or (..., 2, K) value into a (..., 2, K) float64 tensor."""
@@ -239,10 +241,11 @@ class Vibration:
 
 
 def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
-    """Frequencies up to ``highest`` Hz that one frame pair cannot see.
+    """Frequencies up to ``highest`` Hz that the frames cannot see.
 
     ``j / (m T_row)``: every frame is displaced alike (the gain of Eq. 7 is zero). ``j / T_e``: the exposure averages
-    the tone out (the sinc of Eq. 2 is zero).
+    the tone out (the sinc of Eq. 2 is zero). With frame start times of its own, a camera is blind to what returns in
+    all of its frames; a pair, to ``j`` over the time between the two.
 
     Returns:
         Sorted float64 tensor.
@@ -252,9 +255,14 @@ def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
         >>> [round(f, 1) for f in blind_frequencies(timing, 50.0).tolist()]
         [23.8, 47.6]
     """
-    found = [
-        torch.arange(1, math.floor(highest * interval) + 1, dtype=torch.float64) / interval
-        for interval in (timing.frame_period, timing.exposure_time)
-    ]
-    frequencies: Tensor = torch.cat(found).unique(sorted=True)
+    starts = timing.frame_starts(len(timing.frame_start_times) if timing.frame_start_times else 2)
+    intervals = starts[1:] - starts[0]
+
+    def multiples(interval: float) -> Tensor:
+        return torch.arange(1, math.floor(highest * interval) + 1, dtype=torch.float64) / interval
+
+    alike = multiples(float(intervals[0])) if len(intervals) else starts[:0]
+    turns = alike[:, None] * intervals
+    alike = alike[((turns - turns.round()).abs() < _SAME_PLACE).all(-1)]
+    frequencies: Tensor = torch.cat([alike, multiples(timing.exposure_time)]).unique(sorted=True)
     return frequencies

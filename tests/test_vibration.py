@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -76,6 +77,15 @@ def test_blind_frequencies():
         assert tone.offset(starts, starts + TIMING.frame_period, TIMING.exposure_time).abs().max() < 1e-9
     averaged = Vibration(5.0, 1 / TIMING.exposure_time, 0.7)
     assert averaged.mean_displacement(starts, TIMING.exposure_time).abs().max() < 1e-9
+
+
+def test_uneven_frames_are_blind_to_what_returns_in_all_of_them():
+    period = TIMING.frame_period
+    pair = blind_frequencies(replace(TIMING, frame_start_times=(0.0, 2 * period)), 50.0)
+    torch.testing.assert_close(pair, torch.arange(1, 5).double() / (2 * period))
+    three = blind_frequencies(replace(TIMING, frame_start_times=(0.0, 2 * period, 5 * period)), 50.0)
+    torch.testing.assert_close(three, torch.arange(1, 3).double() / period)
+    assert not len(blind_frequencies(replace(TIMING, frame_start_times=(0.0, period, 2.37 * period)), 90.0))
 
 
 def test_displacement_within_a_row_time():
