@@ -9,6 +9,7 @@ import math
 import torch
 from torch import Tensor
 
+from rsvib_torch.arrays import ArrayLike, as_tensor
 from rsvib_torch.checks import check_number
 from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.sensor import SensorTiming
@@ -82,7 +83,7 @@ def offsets_from_row_order(offsets: Tensor, timing: SensorTiming) -> Tensor:
 
 
 def as_float_frames(
-    frames: Tensor, full_scale: float | None = None, *, minimum_frames: int = 1, nan_is_missing: bool = False
+    frames: ArrayLike, full_scale: float | None = None, *, minimum_frames: int = 1, nan_is_missing: bool = False
 ) -> Tensor:
     """Check a stack of frames and turn integers into floats where full scale is 1.
 
@@ -107,10 +108,7 @@ def as_float_frames(
         >>> as_float_frames(torch.full((2, 4, 4), 255, dtype=torch.uint8)).max().item()
         1.0
     """
-    try:
-        frames = torch.as_tensor(frames)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"frames must be a tensor or array of numbers, got {type(frames).__name__}") from error
+    frames = as_tensor("frames", frames)
     if frames.ndim not in (3, 4, 5):
         raise ValueError(
             f"frames must have shape (T, H, W), (T, C, H, W) or (B, T, C, H, W), got {tuple(frames.shape)}"

@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from rsvib_torch.arrays import ArrayLike, as_tensor
 from rsvib_torch.checks import check_choice, check_whole_number
 from rsvib_torch.detection.direct import LARGEST_GROUP, refine_directly
 from rsvib_torch.detection.inversion import vibration_of_fit
@@ -105,7 +106,7 @@ _METHODS: dict[
 @outside_graphs
 @full_precision
 def detect_vibration(
-    frames: Tensor,
+    frames: ArrayLike,
     timing: SensorTiming,
     *,
     method: DetectionMethod = "direct",
@@ -129,8 +130,8 @@ def detect_vibration(
     row tell what it still misses, and fits again: all frames of a stack together, down to the noise.
 
     Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames; floats, or integers of known
-            full scale. NaN marks pixels that were not measured.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, tensor or NumPy array;
+            floats, or integers of known full scale. NaN marks pixels that were not measured.
         timing: The sensor. Frame start times of its own (dropped frames) open frequencies that even ones are blind to.
         method: ``"direct"``, or ``"bands"`` (the paper's method), several times faster and ten times less accurate.
         registration: ``"ncc"``, ``"phase"`` or ``"projection"``.
@@ -205,7 +206,7 @@ def _valid_pixels(frames: Tensor, ignore: Tensor | None) -> Tensor | None:
     missing = torch.isnan(frames)
     missing = missing if frames.ndim == 3 else missing.any(-3)
     if ignore is not None:
-        ignore = torch.as_tensor(ignore, device=frames.device)
+        ignore = as_tensor("ignore", ignore).to(frames.device)
         if ignore.dtype != torch.bool:
             raise TypeError(f"ignore must be a bool tensor, got {ignore.dtype}")
         try:

@@ -7,6 +7,7 @@ import torch
 from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
 
+from rsvib_torch.arrays import ArrayLike, as_tensor
 from rsvib_torch.checks import check_choice, check_number, check_whole_number
 
 __all__ = ["offset_endpoint_error", "psnr", "ssim"]
@@ -14,11 +15,10 @@ __all__ = ["offset_endpoint_error", "psnr", "ssim"]
 _SSIM_WINDOW = 11  # taps of scikit-image's Gaussian window of sigma 1.5 px, cut at 3.5 sigma
 
 
-def _compared(image: Tensor, reference: Tensor, rim: int) -> tuple[Tensor, Tensor]:
+def _compared(image: ArrayLike, reference: ArrayLike, rim: int) -> tuple[Tensor, Tensor]:
     """Both images without their rim in float32 or float64, as (N, C, H, W), one entry of N an image."""
+    image, reference = as_tensor("image", image), as_tensor("reference", reference)
     for name, value in (("image", image), ("reference", reference)):
-        if not isinstance(value, Tensor):
-            raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
         if value.dtype.is_complex or value.dtype == torch.bool:
             raise TypeError(f"{name} must be real numbers, got {value.dtype}")
     if not 2 <= image.ndim <= 5:
@@ -47,12 +47,12 @@ def _compared(image: Tensor, reference: Tensor, rim: int) -> tuple[Tensor, Tenso
     return first.reshape(size), second.reshape(size)
 
 
-def _per_image(values: Tensor, image: Tensor) -> Tensor:
+def _per_image(values: Tensor, image: ArrayLike) -> Tensor:
     """Values (N,) in the leading shape of the images: (), (T,) or (B, T)."""
     return values.reshape(image.shape[: -3 if image.ndim >= 4 else -2])
 
 
-def psnr(image: Tensor, reference: Tensor, data_range: float, *, rim: int = 0) -> Tensor:
+def psnr(image: ArrayLike, reference: ArrayLike, data_range: float, *, rim: int = 0) -> Tensor:
     """Peak signal-to-noise ratio of each image.
 
     ``10 log10(data_range^2 / mean (image - reference)^2)`` in dB, the mean over the pixels and channels of one image;
@@ -68,7 +68,7 @@ def psnr(image: Tensor, reference: Tensor, data_range: float, *, rim: int = 0) -
         float64 tensor with one value an image: shape (), (T,) or (B, T).
 
     Raises:
-        TypeError: If the images are not tensors of real numbers.
+        TypeError: If the images are not tensors or arrays of real numbers.
         ValueError: If the shapes do not fit, the rim leaves nothing, or the data range is not positive.
 
     Example:
@@ -81,7 +81,7 @@ def psnr(image: Tensor, reference: Tensor, data_range: float, *, rim: int = 0) -
     return _per_image(10.0 * torch.log10(data_range**2 / error), image)
 
 
-def ssim(image: Tensor, reference: Tensor, data_range: float, *, rim: int = 0) -> Tensor:
+def ssim(image: ArrayLike, reference: ArrayLike, data_range: float, *, rim: int = 0) -> Tensor:
     """Structural similarity of each image (Wang et al. 2004).
 
     Equal to scikit-image's with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False``: Gaussian window of
@@ -98,7 +98,7 @@ def ssim(image: Tensor, reference: Tensor, data_range: float, *, rim: int = 0) -
         float64 tensor with one value in -1 ... 1 an image: shape (), (T,) or (B, T).
 
     Raises:
-        TypeError: If the images are not tensors of real numbers.
+        TypeError: If the images are not tensors or arrays of real numbers.
         ValueError: If the shapes do not fit, fewer than 11 px are left within the rim, or the data range is not
             positive.
 

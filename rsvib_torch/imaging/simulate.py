@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor
 
+from rsvib_torch.arrays import ArrayLike, as_tensor
 from rsvib_torch.imaging.noise import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.orientation import frames_from_row_order, frames_to_row_order, vibration_to_row_order
@@ -21,7 +22,7 @@ _CHUNK = 64  # rows formed at a time
 
 
 def simulate_frames(
-    scene: Tensor,
+    scene: ArrayLike,
     timing: SensorTiming,
     vibration: Vibration,
     num_frames: int = 2,
@@ -59,7 +60,8 @@ def simulate_frames(
         >>> simulate_frames(torch.rand(128, 256), timing, Vibration(2.0, 50.0)).shape
         torch.Size([2, 92, 220])
     """
-    if not isinstance(scene, Tensor) or not scene.dtype.is_floating_point:
+    scene = as_tensor("scene", scene)
+    if not scene.dtype.is_floating_point:
         raise TypeError("scene must be a floating-point tensor whose full scale is 1")
     if scene.ndim not in (2, 3) or not bool(torch.isfinite(scene).all()):
         raise ValueError(f"scene must be a finite (H, W) or (C, H, W) tensor, got shape {tuple(scene.shape)}")

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
+from rsvib_torch.arrays import ArrayLike, as_tensor
 from rsvib_torch.checks import check_choice
 from rsvib_torch.stacks import arrays, hdf5, images, raw, tiff, video, zarr_store
 from rsvib_torch.stacks.atomic import check_writable, place, workplace
@@ -148,7 +149,7 @@ def check_stack_target(
 
 def write_stack(
     path: PathLike,
-    frames: Tensor,
+    frames: ArrayLike,
     *,
     dtype: str | None = None,
     full_scale: float | None = None,
@@ -175,9 +176,9 @@ def write_stack(
         ValueError: If the format cannot hold them, or the full scale is not stated.
     """
     path = Path(path)
-    if not isinstance(frames, Tensor) or not frames.dtype.is_floating_point:
-        kind = getattr(frames, "dtype", type(frames).__name__)
-        raise TypeError(f"frames must be a floating-point tensor whose full scale is 1, got {kind}")
+    frames = as_tensor("frames", frames)
+    if not frames.dtype.is_floating_point:
+        raise TypeError(f"frames must be a floating-point tensor whose full scale is 1, got {frames.dtype}")
     full_scale = check_stack_target(path, tuple(frames.shape), dtype=dtype, full_scale=full_scale)
     pixels = frames_to_counts(frames, np.dtype(dtype or np.float32), full_scale)
     info = StackInfo(tuple(pixels.shape), pixels.dtype.name, full_scale)
