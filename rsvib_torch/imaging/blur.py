@@ -11,6 +11,8 @@ from rsvib_torch.splines import bspline_coefficients, bspline_coefficients_adjoi
 
 __all__ = ["RowVaryingBlur", "blur_rows", "blur_rows_adjoint"]
 
+_MEANING = ("degree", "frame_width", "origin", "scene_size")  # of the kernels, beside the buffers
+
 
 def _gather_index(psf: RowPSF, tap: int, scene_size: tuple[int, int], width: int, origin: tuple[int, int]) -> Tensor:
     """Flat scene index (..., R, width + KW - 1) of the pixels that kernel row ``tap`` of each row may touch."""
@@ -105,22 +107,41 @@ def blur_rows_adjoint(
 class RowVaryingBlur(nn.Module):
     """``blur_rows`` with fixed kernels as a module, with its adjoint.
 
+    ``A`` and ``A_adjoint`` are the pair that solvers of linear inverse problems ask for, as deepinv's
+    ``LinearPhysics(A=blur.A, A_adjoint=blur.A_adjoint)`` does.
+
     Args:
         psf: Kernels of all rows (kept as buffers).
         frame_width: Width of the frame, by default that of the scene.
         origin: As in ``blur_rows``.
+        scene_size: Height and width of the scene for ``A_adjoint``, by default those of the frames.
+
+    Example:
+        >>> from rsvib_torch import SensorTiming, Vibration, row_psf
+        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
+        >>> psf = row_psf(Vibration(2.0, 50.0), timing.row_starts(1, 64)[0], timing)
+        >>> blur = RowVaryingBlur(psf)
+        >>> scene, frame = torch.rand(2, 1, 3, 64, 48, dtype=torch.float64)
+        >>> torch.testing.assert_close((blur.A(scene) * frame).sum(), (scene * blur.A_adjoint(frame)).sum())
     """
 
     first_tap: Tensor
     weights: Tensor
 
-    def __init__(self, psf: RowPSF, frame_width: int | None = None, origin: tuple[int, int] | None = None) -> None:
+    def __init__(
+        self,
+        psf: RowPSF,
+        frame_width: int | None = None,
+        origin: tuple[int, int] | None = None,
+        scene_size: tuple[int, int] | None = None,
+    ) -> None:
         super().__init__()
         self.register_buffer("first_tap", psf.first_tap)
         self.register_buffer("weights", psf.weights)
         self.degree = psf.degree
         self.frame_width = frame_width
         self.origin = origin
+        self.scene_size = scene_size
 
     @property
     def psf(self) -> RowPSF:
@@ -134,3 +155,21 @@ class RowVaryingBlur(nn.Module):
     def adjoint(self, frames: Tensor, scene_shape: tuple[int, ...]) -> Tensor:
         """Apply the exact adjoint to frames (..., R, W)."""
         return blur_rows_adjoint(frames, self.psf, scene_shape, origin=self.origin)
+
+    def A(self, x: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - the name that solvers call
+        """``forward`` under the name that solvers call; their further keywords are ignored."""
+        return self(x)  # type: ignore[no-any-return]
+
+    def A_adjoint(self, y: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - the name that solvers call
+        """``adjoint`` for scenes with the leading dimensions of the frames and ``scene_size``."""
+        size = (y.shape[-2], y.shape[-1]) if self.scene_size is None else self.scene_size
+        return self.adjoint(y, (*y.shape[:-2], *size))
+
+    def get_extra_state(self) -> dict[str, object]:
+        """What the kernels mean, for ``state_dict``."""
+        return {name: getattr(self, name) for name in _MEANING}
+
+    def set_extra_state(self, state: dict[str, object]) -> None:
+        """Take over what ``get_extra_state`` gave."""
+        for name in _MEANING:
+            setattr(self, name, state[name])
