@@ -11,6 +11,7 @@ __all__ = ["prior_strength"]
 
 _STRENGTHS = (2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 _DOUBT = 0.014  # by how much a prior half as strong has to predict better, in logarithms
+_CLEAR = 4.0  # times what the kernel between rows cannot follow: less noise hides behind that
 _ROWS = 512  # at most, from the middle of the frames
 _FREQUENCIES = 24
 _LOWEST = 0.02  # cycles per px; the taper spreads what lies below
@@ -61,6 +62,7 @@ def prior_strength(
     chosen = torch.linspace(_LOWEST * width, width // 2, min(_FREQUENCIES, width // 4), device=images.device).long()
     place = (chosen / width * 2 * (prior.power.shape[-1] - 1)).round().long()
     sample = sample_rows(images[..., top : top + count, :], part, chosen)
+    certain = certain and bool(noise_power > _CLEAR * prior.blind.mean())
     strengths = [strength for strength in _STRENGTHS if certain or strength <= 1]
     explained = sample.explain([prior.precision(noise_power, strength)[..., place] for strength in strengths])
     return strengths[_cross_validation(explained, explained.power.new_tensor(strengths))]
