@@ -6,10 +6,12 @@ process of its own, so that its peak of memory is its own.
 
 import argparse
 import json
+import math
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from rsvib_torch.stacks import process_stack
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.windows import cut_windows
 
-_DRAWN, WINDOW = 15, 8  # a period of 14 frames: windows of 7 new frames see whole ones
+_DRAWN, WINDOW = 14, 8  # frames after which the vibration repeats itself, and the stack with it
 DETECTION = {"method": "bands", "tones": 1, "band_step": 32, "search": 8}
 RESTORATION = {"method": "dewarp"}
 _RUN = """
@@ -37,6 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this part."""
     parser.add_argument("--frames", type=int, nargs="+", default=[100, 1000], help="streaming: lengths of the stacks")
     parser.add_argument("--frame-size", type=int, default=1024, help="streaming: rows and columns (default: 1024)")
+    parser.add_argument("--dask", action="store_true", help="streaming: Dask with one and two local workers, too")
     parser.add_argument("--memory", default="2GB", help="streaming: memory of the process (default: 2GB)")
 
 
@@ -48,14 +51,15 @@ def timing_of(size: int) -> rsv.SensorTiming:
 def write_long(path: Path, count: int, size: int) -> None:
     """A stack of 16-bit frames, written piece by piece."""
     scene = city_and_fields(size + 80, size + 80, seed=3)
-    vibration = rsv.Vibration([1.6, 1.1], [71.0, 113.0], [0.6, -1.2])
-    taken = rsv.simulate_frames(scene, timing_of(size), vibration, min(_DRAWN, count), frame_size=(size, size))
+    timing = timing_of(size)
+    frequencies = [turns / (_DRAWN * timing.frame_period) for turns in (21, 33)]
+    vibration = rsv.Vibration([1.6, 1.1], frequencies, [0.6, -1.2])
+    taken = rsv.simulate_frames(scene, timing, vibration, _DRAWN, frame_size=(size, size))
     noise = np.random.default_rng(1)
     drawn = [np.clip(np.round(frame * 4095 + noise.normal(0, 8, frame.shape)), 0, 4095) for frame in taken.numpy()]
     stack = np.lib.format.open_memmap(path, "w+", "u2", (count, size, size))
-    turn = [*range(len(drawn)), *range(len(drawn) - 2, 0, -1)]
     for index in range(count):
-        stack[index] = drawn[turn[index % len(turn)]]
+        stack[index] = drawn[index % _DRAWN]
     stack.flush()
 
 
@@ -138,19 +142,23 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
             common = {"source": str(source), "sink": str(sink), "size": size, "scheduler": None}
             run = _apart(**common, memory=options.memory, workers=None)
             results.append({"name": f"{count} frames, memory {options.memory}", **run})
-        few = 5 * (WINDOW - 1) + 1
+        few = 3 * (WINDOW - 1) + 1
         write_long(folder / "few.npy", few, size)
-        torch.set_num_threads(1)
         common |= {"source": str(folder / "few.npy"), "memory": None}
-        alone, streamed = [], []
-        for _ in range(max(2, options.runs - 2)):
-            alone.append(_computing_alone(folder / "few.npy", size, 5))
-            streamed.append(_apart(**common, workers=1))
-        best = min(alone)
-        results.append({"name": "computing alone, one thread", "seconds_a_frame": best})
-        run = min(streamed, key=lambda run: float(run["seconds_a_frame"]))
-        results.append({"name": "read, computed, written, one worker", **run, "rate": best / run["seconds_a_frame"]})
-        for workers in (1, 2):
+        torch.set_num_threads(1)
+        works: dict[str, Callable[[], Any]] = {
+            "computing alone, one thread": lambda: _computing_alone(folder / "few.npy", size, 3),
+            "read, computed, written, one worker": lambda: one_run(**common, workers=1),
+        }
+        best = dict.fromkeys(works, math.inf)
+        for turn in range(1 + options.runs):
+            for what, work in works.items():
+                result = work()
+                seconds = result if isinstance(result, float) else result["seconds_a_frame"]
+                best[what] = min(best[what], seconds if turn else math.inf)  # the first warms up
+        results += [{"name": name, "seconds_a_frame": seconds} for name, seconds in best.items()]
+        results[-1]["rate"] = results[-2]["seconds_a_frame"] / results[-1]["seconds_a_frame"]
+        for workers in (1, 2) if options.dask else ():
             run = _apart(**{**common, "scheduler": "local"}, workers=workers)
             results.append({"name": f"Dask, {workers} local workers", **run})
     return results
