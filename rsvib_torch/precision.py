@@ -1,8 +1,8 @@
 """Full precision and plain execution, where mixed precision or a compiler would spoil the result."""
 
 from collections.abc import Callable
-from functools import cache, wraps
-from typing import Any, ParamSpec, TypeVar
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -41,15 +41,14 @@ def outside_graphs(function: Callable[P, R]) -> Callable[P, R]:
     Sizes of kernels and bands follow from the motion, so that a graph could not outlive the next vibration.
     """
 
+    disabled: list[Callable[P, R]] = []  # filled on demand: importing the compiler takes seconds
+
     @wraps(function)
     def as_it_is(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling():
-            return _disabled(function)(*args, **kwargs)  # type: ignore[no-any-return]
-        return function(*args, **kwargs)
+        if not torch.compiler.is_compiling():
+            return function(*args, **kwargs)
+        if not disabled:
+            disabled.append(torch.compiler.disable(function, reason="sizes follow from the motion"))
+        return disabled[0](*args, **kwargs)
 
     return as_it_is
-
-
-@cache  # on demand: importing the compiler takes seconds
-def _disabled(function: Callable[..., Any]) -> Callable[..., Any]:
-    return torch.compiler.disable(function, reason="sizes follow from the motion")  # type: ignore[no-any-return]
