@@ -1,4 +1,4 @@
-"""Stacks in NumPy ``.npy`` files, memory-mapped."""
+"""Stacks in NumPy ``.npy`` files, read in place frame by frame."""
 
 from pathlib import Path
 from typing import Any, BinaryIO
