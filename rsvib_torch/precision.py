@@ -40,7 +40,6 @@ def outside_graphs(function: Callable[P, R]) -> Callable[P, R]:
 
     Sizes of kernels and bands follow from the motion, so that a graph could not outlive the next vibration.
     """
-
     disabled: list[Callable[P, R]] = []  # filled on demand: importing the compiler takes seconds
 
     @wraps(function)

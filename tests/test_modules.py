@@ -1,0 +1,278 @@
+"""The modules as parts of a model: batches, copies, state, compilers, mixed precision, workers, gradients, arrays."""
+
+import copy
+import io
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
+
+import rsvib_torch as rsv
+
+TIMING = rsv.SensorTiming(row_time=40e-6, exposure_rows=30, frame_rows=320)
+MOTIONS = (
+    Motion((3.1, 4.2), (130.0, 90.0), (0.4, 1.3)),
+    Motion((2.2, 1.4), (70.0, 210.0), (-1.0, 2.0)),
+)
+METHODS = ("exact", "banded", "dewarp")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return draw_scene(256 + 2 * MARGIN, 160 + 2 * MARGIN, seed=4)
+
+
+@pytest.fixture(scope="module")
+def frames(scene):
+    """A batch (2, 2, 1, 256, 160) of two stacks, each with a vibration of its own."""
+    stacks = [take_frames(scene, TIMING, motion, 2, 0.002, seed=seed) for seed, motion in enumerate(MOTIONS)]
+    return torch.from_numpy(np.stack(stacks)[:, :, None]).float()
+
+
+@pytest.fixture(scope="module")
+def vibration():
+    both = [motion.vibration() for motion in MOTIONS]
+    return rsv.Vibration(
+        *(torch.stack([getattr(v, name) for v in both]) for name in ("amplitude", "frequency", "phase"))
+    )
+
+
+@pytest.fixture(scope="module")
+def blur():
+    psf = rsv.row_psf(
+        MOTIONS[0].vibration(), TIMING.row_starts(1, 48)[0], TIMING, interpolation="cubic", quadrature="gauss"
+    )
+    return rsv.RowVaryingBlur(psf)
+
+
+def modules(blur, vibration):
+    """Name, module, arguments for small frames."""
+    small = torch.rand(2, 2, 1, 48, 40, generator=torch.Generator().manual_seed(1))
+    yield "blur", blur, (small,)
+    for method in METHODS:
+        yield method, rsv.VibrationRestorer(TIMING, method=method), (small, vibration)
+
+
+def test_batch_of_stacks_is_detected_and_restored(frames, vibration, scene):
+    """From frames to restored frames by the modules alone; a batch is the loop of its stacks."""
+    detector = rsv.VibrationDetector(TIMING, method="bands", tones=1)
+    found = detector(frames)
+    torch.testing.assert_close(found.vibration.amplitude, vibration.amplitude, rtol=0, atol=0.4)  # bands
+    torch.testing.assert_close(found.vibration.frequency, vibration.frequency, rtol=0.02, atol=0)
+    for index in range(2):
+        alone = detector(frames[index]).vibration
+        torch.testing.assert_close(alone.amplitude, found.vibration.amplitude[index], rtol=1e-3, atol=1e-3)
+    still = crop(scene)
+    assert all(decibel(frame[0], still) < 26 for stack in frames for frame in stack)
+    for method in METHODS:
+        restorer = rsv.VibrationRestorer(TIMING, method=method)
+        restored = restorer(frames, vibration)
+        assert restored.shape == frames.shape
+        assert all(decibel(frame[0], still) > 33 for stack in restored for frame in stack)
+        torch.testing.assert_close(restorer(frames[1], vibration[1]), restored[1], rtol=0, atol=2e-3)
+
+
+def test_copies_and_state(blur, vibration):
+    for name, module, arguments in modules(blur, vibration):
+        expected = module(*arguments)
+        assert torch.equal(module(*arguments), expected), name  # deterministic
+        stored = io.BytesIO()
+        torch.save(module.state_dict(), stored)
+        stored.seek(0)
+        for other in (copy.deepcopy(module), pickle.loads(pickle.dumps(module))):
+            other.load_state_dict(torch.load(stored, weights_only=True))
+            stored.seek(0)
+            assert torch.equal(other(*arguments), expected), name
+    detector = pickle.loads(pickle.dumps(rsv.VibrationDetector(TIMING, method="bands", tones=1)))
+    assert detector.options == {"method": "bands", "tones": 1}
+
+
+def test_state_of_the_blur_is_its_meaning(blur):
+    """Kernels for linear interpolation become those for cubic, with window and size, by loading the state."""
+    scene = torch.rand(64, 60)
+    options = {"frame_width": 40, "origin": (5, 7), "scene_size": (64, 60)}
+    cubic = rsv.RowVaryingBlur(blur.psf, **options)
+    linear = rsv.RowVaryingBlur(type(blur.psf)(blur.psf.first_tap * 0, blur.psf.weights * 0, 1))
+    linear.load_state_dict(cubic.state_dict())
+    assert torch.equal(linear(scene), cubic(scene))
+    assert linear.A_adjoint(cubic(scene)).shape == (64, 60)
+
+
+def test_half_precision_and_autocast(frames, vibration, blur):
+    """Autocast changes nothing; half-precision frames are restored in float32 and rounded once."""
+    for _, module, arguments in modules(blur, vibration):
+        expected = module(*arguments)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            assert torch.equal(module(*arguments), expected)
+    for method in METHODS:
+        restorer = rsv.VibrationRestorer(TIMING, method=method, check=False)
+        for dtype, step in ((torch.bfloat16, 2.0**-8), (torch.float16, 2.0**-11)):
+            rounded = frames[:1, :, :, :64].to(dtype)
+            restored = restorer(rounded, vibration[0])
+            assert restored.dtype == dtype
+            torch.testing.assert_close(restored.float(), restorer(rounded.float(), vibration[0]), rtol=step, atol=1e-6)
+        assert restorer(frames[:1, :, :, :64].double(), vibration[0]).dtype == torch.float64
+    detector = rsv.VibrationDetector(TIMING, method="bands", tones=1)
+    expected = detector(frames[0]).vibration
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(detector(frames[0]).vibration.amplitude, expected.amplitude)
+
+
+def test_compiler_leaves_one_break(blur, vibration):
+    """Around each module the model is compiled; the module itself runs as it is."""
+    frames = torch.rand(2, 1, 48, 40, generator=torch.Generator().manual_seed(2))
+    restorer = rsv.VibrationRestorer(TIMING, method="dewarp", check=False)
+    motion = vibration[0]
+
+    def blurred(images):
+        return blur(images * 2) + 1
+
+    def restored(images):
+        return restorer(images * 2, motion) + 1
+
+    for model in (blurred, restored):
+        torch.compile(model, backend="eager")(frames)  # at the first time there is one more break to prepare
+        torch._dynamo.reset()
+        explained = torch._dynamo.explain(model)(frames)
+        assert (explained.graph_count, explained.graph_break_count) == (2, 1)
+        assert torch.equal(torch.compile(model, backend="eager")(frames), model(frames))
+
+
+class Stacks(torch.utils.data.Dataset):
+    """Stacks that are detected and restored where they are loaded."""
+
+    def __init__(self, frames):
+        self.frames = frames
+        self.detector = rsv.VibrationDetector(TIMING, method="bands", tones=1)
+        self.restorer = rsv.VibrationRestorer(TIMING, method="dewarp")
+
+    def __len__(self):
+        return len(self.frames)
+
+    def __getitem__(self, index):
+        return self.restorer(self.frames[index], self.detector(self.frames[index]).vibration)
+
+
+def test_workers_give_what_the_main_process_gives(frames):
+    data = Stacks(frames)
+    loader = torch.utils.data.DataLoader(data, batch_size=2, num_workers=2)
+    torch.testing.assert_close(next(iter(loader)), torch.stack([data[0], data[1]]), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_gradients_reach_frames_and_vibration(method):
+    """Against central differences of the same loss, in float64."""
+    generator = torch.Generator().manual_seed(5)
+    frames = torch.nn.functional.avg_pool2d(torch.rand(1, 2, 52, 44, generator=generator, dtype=torch.float64), 5, 1)[0]
+    values = torch.tensor([[1.3, 2.1], [130.0, 90.0], [0.4, 1.3]], dtype=torch.float64)
+    fixed = {"exact": {"noise": 0.01}, "banded": {"noise_to_signal": 0.01}, "dewarp": {}}[method]
+    restorer = rsv.VibrationRestorer(TIMING, method=method, check=False, **fixed)
+    weights = torch.rand(frames.shape, generator=generator, dtype=torch.float64)
+
+    def loss(images, numbers):
+        return (restorer(images, rsv.Vibration(*numbers)) * weights).sum()
+
+    images, numbers = frames.clone().requires_grad_(), values.clone().requires_grad_()
+    loss(images, numbers).backward()
+    direction = torch.rand(frames.shape, generator=generator, dtype=torch.float64) - 0.5
+    for gradient, step, moved in (
+        ((images.grad * direction).sum(), 1e-4, lambda h: loss(frames + h * direction, values)),
+        *(
+            (numbers.grad[kind, axis], 1e-4, lambda h, k=kind, a=axis: loss(frames, values + h * unit(k, a)))
+            for kind in range(3)
+            for axis in range(2)
+        ),
+    ):
+        numeric = (moved(step) - moved(-step)) / (2 * step)
+        # the prior of "exact" is fitted to the frames, and no part of the gradient
+        tolerance = 0.08 if method == "exact" else 1e-4
+        torch.testing.assert_close(gradient, numeric.detach(), rtol=tolerance, atol=1e-6)
+
+
+def unit(kind, axis):
+    one = torch.zeros(3, 2, dtype=torch.float64)
+    one[kind, axis] = 1.0
+    return one
+
+
+def test_blur_is_the_linear_operator_of_a_solver():
+    """Least squares by conjugate gradients that know ``A`` and ``A_adjoint`` only brings the scene back."""
+    generator = torch.Generator().manual_seed(6)
+    truth = torch.rand(1, 1, 72, 64, generator=generator, dtype=torch.float64)
+    truth = torch.nn.functional.avg_pool2d(truth, 9, 1)  # 64 rows, of which the frame shows 48
+    short = rsv.SensorTiming(row_time=40e-6, exposure_rows=8, frame_rows=320)
+    starts = short.row_starts(1, 48)[0]
+    psf = rsv.row_psf(MOTIONS[0].vibration(), starts, short, interpolation="cubic", quadrature="gauss")
+    operator = rsv.RowVaryingBlur(psf, scene_size=(64, 56))
+    measured = operator.A(truth)
+    scene = torch.zeros_like(truth)
+    residual = operator.A_adjoint(measured)
+    direction, energy = residual, residual.square().sum()
+    for _ in range(120):
+        product = operator.A_adjoint(operator.A(direction))
+        length = energy / (direction * product).sum()
+        scene, residual = scene + length * direction, residual - length * product
+        energy, previous = residual.square().sum(), energy
+        direction = residual + energy / previous * direction
+    inner = (..., slice(8, -8), slice(8, -8))
+    seen = (..., slice(8, -8), slice(None))  # of the scene: the rows of the frame
+    before, after = ((image - truth[seen])[inner].square().mean().sqrt() for image in (measured, scene[seen]))
+    assert before > 0.01
+    assert after < 0.1 * before
+
+
+def strange_arrays(frames):
+    readonly = frames.copy()
+    readonly.flags.writeable = False
+    field = np.zeros(frames.shape, dtype=[("pixel", "f4"), ("flag", "u1")])
+    field["pixel"] = frames
+    return {
+        "plain": frames,
+        "read-only": readonly,
+        "reversed": frames[:, ::-1].copy()[:, ::-1],
+        "big-endian": frames.astype(">f4"),
+        "packed": field["pixel"],
+        "Fortran": np.asfortranarray(frames),
+    }
+
+
+def test_arrays_are_as_good_as_tensors(frames, vibration):
+    tensor = frames[0, :, 0]
+    restored = rsv.restore(tensor, TIMING, vibration[0], method="dewarp")
+    amplitude = rsv.detect_vibration(tensor, TIMING, method="bands", tones=1).vibration.amplitude
+    for name, array in strange_arrays(tensor.numpy()).items():
+        kept = array.copy()
+        assert torch.equal(rsv.restore(array, TIMING, vibration[0], method="dewarp"), restored), name
+        found = rsv.detect_vibration(array, TIMING, method="bands", tones=1).vibration.amplitude
+        assert torch.equal(found, amplitude), name
+        assert torch.equal(rsv.psnr(array, tensor.numpy() + np.float32(0.1), 1.0), rsv.psnr(tensor, tensor + 0.1, 1.0))
+        np.testing.assert_array_equal(array, kept)  # nothing is written into what was lent
+    ignored = np.zeros(tensor.shape, dtype=bool)
+    ignored[:, 20:30, 40:50] = True
+    torch.testing.assert_close(
+        rsv.restore(tensor.numpy(), TIMING, vibration[0], method="dewarp", ignore=ignored),
+        rsv.restore(tensor, TIMING, vibration[0], method="dewarp", ignore=torch.from_numpy(ignored)),
+    )
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, ">u2", np.float32, np.float64, np.float16])
+def test_there_and_back_loses_nothing(frames, vibration, dtype):
+    """What comes in as an array leaves as an array of the same values, shape and, for floats, dtype."""
+    array = (frames[0, :, 0].numpy() * (1 if np.dtype(dtype).kind == "f" else 255)).astype(dtype)
+    still = rsv.Vibration.still()
+    scale = None if np.dtype(dtype).kind == "f" else 255.0
+    back = rsv.restore(array, TIMING, still, method="dewarp", full_scale=scale).numpy()
+    assert back.dtype == (array.dtype if scale is None else np.float32)
+    np.testing.assert_allclose(back * (scale or 1), array.astype(np.float64), rtol=0, atol=2e-4 * (scale or 1))
+    if scale is not None:
+        np.testing.assert_array_equal(np.round(back * scale).astype(dtype), array)
+    numbers = rsv.Vibration(*(getattr(vibration, name).numpy() for name in ("amplitude", "frequency", "phase")))
+    assert torch.equal(numbers.phase, vibration.phase)
+
+
+def test_what_is_no_array_is_named():
+    for value in ("frames", np.array(["a", "b"]), np.zeros((2, 2), dtype=object)):
+        with pytest.raises(TypeError, match=r"frames must be a tensor or array of numbers, got (str|ndarray)"):
+            rsv.restore(value, TIMING, rsv.Vibration.still())
