@@ -115,6 +115,8 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
     def drawn_vibration(self, params: Parameters | None = None) -> Vibration:
         """The vibration of every image of the last call, in image axes: the truth that a network may learn.
 
+        Clips whose frames share one draw have one vibration each, as a stack has for ``restore``.
+
         Images that were left alone (``p`` below 1) have amplitude and image motion 0.
 
         Args:
@@ -127,12 +129,14 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         if "amplitude" not in params:
             raise ValueError("no vibration has been drawn yet: call the augmentation first")
         taken = self._gate(params).to(torch.float64)
-        return Vibration(
+        drawn = (
             params["amplitude"] * taken[:, None, None],
             params["frequency"],
             params["phase"],
             params["image_motion"] * taken[:, None],
         )
+        step = self._recording_length(params)
+        return Vibration(*(value[::step] for value in drawn))
 
     def compute_transformation(self, input: Tensor, params: Parameters, flags: dict[str, Any]) -> Tensor:
         """Return identities (B, 3, 3): no matrix describes rows that move apart."""
@@ -198,13 +202,20 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         )
 
     def _frame_starts(self, params: Parameters, count: int) -> Tensor:
-        """When each image begins: at 0, or in its turn where a clip shares one draw."""
-        clips = params.get("video_batch_size")
-        length = 1 if clips is None else count // max(int(clips), 1)
-        shared = all(bool((clip := params[name].unflatten(0, (-1, length))).eq(clip[:, :1]).all()) for name in _DRAWN)
-        if length == 1 or not shared:
+        """When each image begins: at 0, or in its turn within a recording."""
+        length = self._recording_length(params)
+        if length == 1:
             return torch.zeros(count, dtype=torch.float64)
         return self.timing.frame_starts(length).repeat(count // length)
+
+    def _recording_length(self, params: Parameters) -> int:
+        """Frames of the clips of a video that share one draw; 1 for images, and frames that were drawn each."""
+        clips = params.get("video_batch_size")
+        count = len(params["exposure_rows"])
+        if clips is None or count == 0:
+            return 1
+        drawn = (params[name].unflatten(0, (int(clips), -1)) for name in (*_DRAWN, "batch_prob"))
+        return count // int(clips) if all(bool((clip == clip[:, :1]).all()) for clip in drawn) else 1
 
     def _points(self, points: Tensor, params: Parameters) -> Tensor:
         """Points (..., 2) of images as points of images in row order."""

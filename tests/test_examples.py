@@ -1,0 +1,50 @@
+"""The example scripts in a quick form: they run, print, and reach what they promise."""
+
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "scripts" / "examples"
+
+
+def run(name, arguments, capsys):
+    runpy.run_path(str(EXAMPLES / name))["main"](arguments)
+    return capsys.readouterr().out
+
+
+def test_gradient_descent_refines_the_vibration(capsys):
+    printed = run("refine_vibration.py", ["--size", "512", "128"], capsys)
+    rows = re.findall(r"(\w+) [xy] \(\w+\)\s+(\S+)\s+(\S+)\s+(\S+)", printed)
+    assert len(rows) == 6
+    for name, *numbers in rows:
+        start, refined, true = map(float, numbers)
+        tolerance = {"amplitude": 0.03, "frequency": 0.15, "phase": 0.02}[name]
+        assert abs(start - true) > 5 * tolerance
+        assert abs(refined - true) < tolerance, (name, numbers)
+    before, after = map(float, re.search(r"frames: (\S+) before, (\S+) after", printed).groups())
+    assert after < 0.2 * before
+
+
+def test_network_learns_behind_the_restorer(capsys):
+    printed = run("train_behind_restorer.py", ["--steps", "25", "--batch", "6"], capsys)
+    taken, restored, modelled = (float(value) for value in re.findall(r"(\S+) dB", printed))
+    assert restored > taken + 2
+    assert modelled > restored + 1
+
+
+def test_gradients_pass_through_the_restorer_to_the_first_layer():
+    example = runpy.run_path(str(EXAMPLES / "train_behind_restorer.py"))
+    model = example["RestoringModel"]()
+    camera = example["rsv"].RollingShutterVibration(example["TIMING"])
+    clips, still, vibration = example["take_clips"](example["city_and_fields"](100, 100, 3), 2, camera)
+    (model(clips, vibration) - still).square().sum().backward()
+    assert model.before.layers[-1].weight.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("script", sorted(path.name for path in EXAMPLES.glob("*.py")))
+def test_help_is_the_docstring(script, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        run(script, ["--help"], capsys)
+    assert "Printed:" in capsys.readouterr().out
