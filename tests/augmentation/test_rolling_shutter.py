@@ -263,6 +263,23 @@ def test_replay_same_on_batch_keepdim_probability():
     assert torch.equal((shifted == 15.0).flatten(1).all(1), left)
 
 
+def test_masks_of_many_kinds(still):
+    """Integer labels, a list with one mask an image, and masks without channels move alike."""
+    images = still[None, None].expand(2, -1, -1, -1).float()
+    labels = (torch.arange(HEIGHT)[:, None] // 7 + torch.arange(WIDTH) // 5).remainder(9).expand(2, 1, -1, -1)
+    augmentation = RollingShutterVibration(TIMING)
+    chain = kornia_augmentation.AugmentationSequential(augmentation, data_keys=["input", "mask"])
+    _, moved = chain(images, labels.long())
+    params = chain._params
+    assert not torch.equal(moved.long(), labels)
+    assert set(moved.unique().tolist()) <= set(range(9))
+    _, listed = chain(images, list(labels.float()), params=params)
+    _, flat = chain(images, labels[:, 0].float(), params=params)
+    for index in range(2):
+        assert torch.equal(listed[index].reshape(HEIGHT, WIDTH), moved[index, 0].float())
+        assert torch.equal(flat[index].reshape(HEIGHT, WIDTH), moved[index, 0].float())
+
+
 def test_dtype_gradient_and_autocast():
     images = torch.rand(2, 1, 40, 32, dtype=torch.float64, requires_grad=True)
     augmentation = RollingShutterVibration(TIMING)
