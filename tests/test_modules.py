@@ -89,6 +89,21 @@ def test_copies_and_state(blur, vibration):
     assert detector.options == {"method": "bands", "tones": 1}
 
 
+def test_deterministic_algorithms_suffice(blur, vibration):
+    """Nothing that a caller of ``use_deterministic_algorithms`` has refused is used, back and forth."""
+    torch.use_deterministic_algorithms(True)
+    try:
+        for name, module, (frames, *rest) in modules(blur, vibration):
+            gradients = []
+            for _ in range(2):
+                images = frames.clone().requires_grad_()
+                module(images, *rest).square().sum().backward()
+                gradients.append(images.grad)
+            assert torch.equal(*gradients), name
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
 def test_state_of_the_blur_is_its_meaning(blur):
     """Kernels for linear interpolation become those for cubic, with window and size, by loading the state."""
     scene = torch.rand(64, 60)

@@ -129,6 +129,21 @@ def test_keypoints_masks_and_boxes_follow_the_image(still):
             assert side <= float(edge) + 0.6  # nothing outside, but for rounding of the mask
 
 
+@pytest.mark.parametrize("exposure_rows", [1, 30, 60])
+def test_points_of_fast_vibrations_and_long_exposures(exposure_rows):
+    """Up to two and a half periods in an exposure: the mean of one and a half has the sign of its last half."""
+    motion = Motion((6.0, 5.0), (640.0, 1060.0), (0.3, -0.9))
+    timing = SensorTiming(row_time=40e-6, exposure_rows=exposure_rows, frame_rows=320)
+    slow = Motion((3.0, 2.0), (640.0, 1060.0), (0.3, -0.9)) if exposure_rows == 1 else motion
+    points = torch.tensor([[20.0, 30.0], [100.0, 31.0], [100.0, 120.5]], dtype=torch.float64)
+    augmentation = fixed(slow, timing)
+    augmentation(torch.zeros(1, 1, HEIGHT, WIDTH))
+    moved = augmentation.transform_keypoints(Keypoints(points[None]), augmentation._params, augmentation.flags).data[0]
+    expected = np.array([place(point, slow, timing) for point in points.numpy()])
+    assert np.abs(expected - points.numpy()).max() > 0.2
+    np.testing.assert_allclose(moved.numpy(), expected, atol=2e-4)
+
+
 def test_boxes_are_the_smallest_around_the_bent_contents():
     """A tall box over several periods: its sides lie at the largest displacements of the rows in it."""
     motion = Motion((3.0, 0.0), (400.0, 0.0), (0.3, 0.0))
