@@ -337,7 +337,9 @@ def _swap_std(std: VibrationStd) -> VibrationStd:
 
 
 class VibrationDetector(nn.Module):
-    """``detect_vibration`` with fixed timing and options as a module.
+    """``detect_vibration`` with fixed timing and options as a module, for one stack or a batch of stacks.
+
+    It has no weights. Autocast does not reach it, and ``torch.compile`` calls it as it is, at one break of the graph.
 
     Args:
         timing: The sensor.

@@ -222,7 +222,10 @@ def _warn_if_worse(raw: Tensor, restored: Tensor, motion: Vibration, timing: Sen
 
 
 class VibrationRestorer(nn.Module):
-    """``restore`` as a module.
+    """``restore`` as a module, for stacks (T, H, W) to batches of stacks (B, T, C, H, W).
+
+    It has no weights. Autocast does not reach it, and ``torch.compile`` calls it as it is, at one break of the graph.
+    Gradients flow to frames and vibration.
 
     Args:
         timing: The sensor.
