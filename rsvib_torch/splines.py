@@ -7,7 +7,8 @@ from torch import Tensor
 
 __all__ = ["bspline_coefficients", "bspline_coefficients_adjoint", "bspline_weights", "mirrored_index"]
 
-_PRECISION = 1e-9
+_PRECISION = 1e-9  # of the largest tap, below which the prefilter is cut off
+_SINGLE_PRECISION = 3e-8  # the same for float32, which does not hold more
 
 
 def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
@@ -40,7 +41,7 @@ def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
 
 
 @cache
-def _prefilter_taps(degree: int) -> tuple[float, ...]:
+def _prefilter_taps(degree: int, double: bool) -> tuple[float, ...]:
     """One half (taps 0, 1, 2 ...) of the symmetric inverse of the sampled B-spline."""
     length = 1024
     samples = bspline_weights(torch.zeros((), dtype=torch.float64), degree)[:-1]
@@ -49,7 +50,7 @@ def _prefilter_taps(degree: int) -> tuple[float, ...]:
     for tap, value in enumerate(samples.tolist()):
         kernel[(tap - half) % length] = value
     inverse = torch.fft.irfft(1.0 / torch.fft.rfft(kernel).real, n=length)
-    reach = int((inverse[: length // 2].abs() > _PRECISION).nonzero().max()) + 1
+    reach = int((inverse[: length // 2].abs() > (_PRECISION if double else _SINGLE_PRECISION)).nonzero().max()) + 1
     return tuple(inverse[:reach].tolist())
 
 
@@ -87,7 +88,8 @@ def _filter_symmetric(samples: Tensor, taps: tuple[float, ...], dim: int) -> Ten
 def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
     """B-spline coefficients along ``dim`` that interpolate the samples, with mirrored ends.
 
-    The inverse of the sampled spline is applied as a finite symmetric filter, cut where it is below 1e-9.
+    The inverse of the sampled spline is applied as a finite symmetric filter, cut where it is below 1e-9
+    (float32: 3e-8).
 
     Args:
         samples: Tensor of samples.
@@ -99,7 +101,7 @@ def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
     """
     if degree == 1:
         return samples
-    taps = _prefilter_taps(degree)
+    taps = _prefilter_taps(degree, samples.dtype in (torch.float64, torch.complex128))
     length, reach = samples.shape[dim], len(taps) - 1
     index = mirrored_index(-reach, length + reach, length, samples.device)
     return _filter_symmetric(samples.index_select(dim, index), taps, dim)
@@ -109,7 +111,7 @@ def bspline_coefficients_adjoint(values: Tensor, degree: int, dim: int) -> Tenso
     """Adjoint (transpose) of ``bspline_coefficients``."""
     if degree == 1:
         return values
-    taps = _prefilter_taps(degree)
+    taps = _prefilter_taps(degree, values.dtype in (torch.float64, torch.complex128))
     length, reach = values.shape[dim], len(taps) - 1
     shape = list(values.shape)
     shape[dim] = 2 * reach

@@ -237,7 +237,7 @@ def refine_directly(
             careful = replace(measurements, independent=independent_fraction(measurements, left))
             fit = find_tones(careful, interval, tones, model, _LEAST_GAIN, strongest_only(fit))
         else:
-            fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model)
+            fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual_of(measurements, fit))
         motion, _ = vibration_of_fit(fit)
         if step == iterations - 1:
             break

@@ -11,7 +11,7 @@ from rsvib_torch.detection.tones import MotionModel, ToneFit, drift_response, mo
 __all__ = ["fit_tones"]
 
 _ITERATIONS = 30
-_TOLERANCE = 1e-8  # of the cost: steps that promise less are not worth taking
+_TOLERANCE = 1e-7  # of the cost: steps that promise less are not worth taking
 _PARAMETERS = 3  # of a tone: real and imaginary part of its amplitude, and its frequency
 
 

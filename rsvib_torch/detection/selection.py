@@ -159,7 +159,8 @@ def find_tones(
     first = none if start is None else start.active
     known = none.double() if start is None else start.frequencies
     reckon = start is None
-    fit, weighed = robust_fit(measurements, known, first, model)
+    left = None if start is None else residual_of(measurements, start)
+    fit, weighed = robust_fit(measurements, known, first, model, left)
     parameters = 2 * model.harmonics + 1
     going = torch.ones_like(none[..., 0])  # an axis that stopped stays stopped
     for _ in range(keep.shape[-1] // model.harmonics, MAX_TONES if tones is None else tones):
