@@ -105,6 +105,7 @@ _METHODS: dict[
 
 @outside_graphs
 @full_precision
+@torch.no_grad()
 def detect_vibration(
     frames: ArrayLike,
     timing: SensorTiming,
@@ -127,7 +128,8 @@ def detect_vibration(
     Row bands are registered between frames, and the offset curve is fitted with sinusoids and a uniform motion
     (Eq. 5) whose gain, exposure, band average and coupling with the scan are part of the model (Eqs. 4, 6-8). Start
     values come from the data. The direct method then warps the frames to the scene with what was found, lets every
-    row tell what it still misses, and fits again: all frames of a stack together, down to the noise.
+    row tell what it still misses, and fits again: all frames of a stack together, down to the noise. The result is a
+    measurement: no gradient flows back through it.
 
     Args:
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, tensor or NumPy array;
