@@ -74,6 +74,13 @@ def test_batch_of_stacks_is_detected_and_restored(frames, vibration, scene):
         torch.testing.assert_close(restorer(frames[1], vibration[1]), restored[1], rtol=0, atol=2e-3)
 
 
+def test_warnings_point_at_the_caller(frames):
+    wrong = rsv.Vibration([2.0, 3.0], [40.0, 250.0], [2.0, 0.0])
+    with pytest.warns(rsv.RestorationWarning) as given:
+        rsv.restore(frames[0], TIMING, wrong, method="dewarp")
+    assert {warning.filename for warning in given} == {__file__}
+
+
 def test_copies_and_state(blur, vibration):
     for name, module, arguments in modules(blur, vibration):
         expected = module(*arguments)

@@ -35,6 +35,7 @@ from rsvib_torch.vibration import Vibration
 __all__ = ["MASKS", "METHODS", "VibrationRestorer", "method_options", "restore"]
 
 MASKS = ("ignore", "clipped")  # what a method is told of pixels; no options of the user's
+_CALLER = 5  # levels up from where a warning is given: helper, restore and its two decorators
 _JUDGED_PAIRS, _JUDGED_COLUMNS = 2, 160  # of every stack
 
 METHODS: dict[str, Callable[..., Tensor]] = {
@@ -193,7 +194,7 @@ def _to_undo(vibration: Vibration | Detected, timing: SensorTiming, num_frames: 
         raise TypeError(f"vibration must be a Vibration or a detection, got {type(vibration).__name__}")
     trusted, notes = trusted_vibration(vibration, timing, num_frames, num_rows)
     for note in notes:
-        warnings.warn(note, RestorationWarning, stacklevel=3)
+        warnings.warn(note, RestorationWarning, stacklevel=_CALLER)
     return trusted
 
 
@@ -218,7 +219,7 @@ def _warn_if_worse(raw: Tensor, restored: Tensor, motion: Vibration, timing: Sen
         if verdict.overall in ("partly", "worse"):
             where = f"stack {stack}: " if len(raw) > 1 else ""
             summary = verdict.in_image_axes(timing).summary
-            warnings.warn(f"{where}{summary}", RestorationWarning, stacklevel=3)
+            warnings.warn(f"{where}{summary}", RestorationWarning, stacklevel=_CALLER)
 
 
 class VibrationRestorer(nn.Module):
