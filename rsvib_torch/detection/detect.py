@@ -27,6 +27,7 @@ from rsvib_torch.precision import full_precision, outside_graphs
 from rsvib_torch.registration import OffsetCurve, Registration
 from rsvib_torch.registration.register import register_rows
 from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.vibration import blind_frequencies
 
 __all__ = ["DetectionMethod", "VibrationDetector", "detect_vibration"]
 
@@ -82,7 +83,9 @@ def _detect_bands(
 ) -> tuple[ToneFit, OtherMotion | None]:
     """The paper's method: a fit of tones to the offsets of row bands."""
     measurements = measurements_of_curve(curve, timing, options.band_step)
-    return find_tones(measurements, options.band_step * timing.row_time, options.tones, options.model), None
+    interval = options.band_step * timing.row_time
+    blind = blind_frequencies(timing, 0.5 / interval).to(frames.device)
+    return find_tones(measurements, interval, options.tones, options.model, blind=blind), None
 
 
 def _detect_direct(

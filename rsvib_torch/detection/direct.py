@@ -19,7 +19,7 @@ from rsvib_torch.registration.gradients import RowGradients, row_gradients, row_
 from rsvib_torch.registration.pattern import column_pattern
 from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra
 from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.vibration import Vibration
+from rsvib_torch.vibration import Vibration, blind_frequencies
 
 __all__ = ["LARGEST_GROUP", "DirectFit", "refine_directly"]
 
@@ -227,6 +227,7 @@ def refine_directly(
     cleanings = _CLEANINGS
     search_at = 1  # the first round removes the error of the bands: then weak tones show
     interval = max(_BLOCK * timing.row_time, 0.5 * timing.exposure_time)  # the exposure averages out what is faster
+    blind = blind_frequencies(timing, 0.5 / interval).to(frames.device)
     for step in range(iterations):
         measured = [measure_group(group, timing, motion, known) for group, known in zip(groups, gradients, strict=True)]
         gradients = [known for _, known in measured]
@@ -235,7 +236,7 @@ def refine_directly(
         if step == search_at:
             left = residual_of(measurements, fit)
             careful = replace(measurements, independent=independent_fraction(measurements, left))
-            fit = find_tones(careful, interval, tones, model, _LEAST_GAIN, strongest_only(fit))
+            fit = find_tones(careful, interval, tones, model, _LEAST_GAIN, strongest_only(fit), blind)
         else:
             fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual_of(measurements, fit))
         motion, _ = vibration_of_fit(fit)

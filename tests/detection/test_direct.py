@@ -234,6 +234,29 @@ def test_disturbed_frames(clean_pairs, paper_camera, disturb, motion):
     assert float(phase.max()) < 0.01
 
 
+@pytest.mark.parametrize("method", ["direct", "bands"])
+def test_side_tones_of_a_blind_tone_are_not_reported_as_tones(paper_camera, method):
+    """Motion along the scan lets a blind tone through at its frequency plus and minus that of the motion."""
+    blind = 3 / paper_camera.frame_period
+    motion = Motion((1.6, 5.2), (blind, 30.0), (0.4, 1.3))
+    frames = take_frames(draw_scene(2128, 336, 64), paper_camera, motion, 2, 0.005, seed=64, samples=8)
+    result = detect_vibration(torch.from_numpy(frames).float(), paper_camera, method=method)
+    assert result.reliable.tolist() == [False, True]
+    assert any("nearly blind" in reason for reason in result.reasons[0])
+    assert abs(float(result.vibration.frequency[0, 0]) - blind) < 1.0
+    assert (result.vibration.amplitude[0] > 0).sum() == 1
+
+
+def test_a_weak_tone_where_a_side_tone_would_be_is_a_tone(paper_camera):
+    motion = Motion((0.05, 5.2), (3 / paper_camera.frame_period + 30.0, 30.0), (0.4, 1.3))
+    frames = take_frames(draw_scene(2128, 336, 65), paper_camera, motion, 2, 0.005, seed=65, samples=8)
+    result = detect_vibration(torch.from_numpy(frames).float(), paper_camera)
+    assert result.reliable.tolist() == [True, True], result.reasons
+    period, amplitude, _ = errors(result.vibration, motion)
+    assert float(period.max()) < 0.3
+    assert float(amplitude.max()) < 5.0
+
+
 @pytest.mark.parametrize(("top", "move"), [(120, (-4, -6)), (700, (5, 0)), (1610, (2, 7))])
 def test_a_cloud_over_a_fifth_of_the_rows(paper_camera, top, move):
     """Wherever it is and however it moves, slow tones are those of the other rows."""
