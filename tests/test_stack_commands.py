@@ -108,7 +108,10 @@ def test_interrupted_run_says_how_to_go_on(place, tmp_path):
     arguments = ["run", tmp_path / "long.npy", out, "--config", place / "camera.toml", "--workers", "1"]
     program = Path(sys.executable).with_name("rsvib")
     journal = out / ".restored.tif.rsvib" / "journal.jsonl"
+    # a shell's background jobs ignore SIGINT, and what they start would inherit that
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     with subprocess.Popen([program, *map(str, arguments)], stderr=subprocess.PIPE, text=True) as process:
+        signal.signal(signal.SIGINT, before)
         while not journal.exists() or journal.read_bytes().count(b"\n") < 2:
             assert process.poll() is None
             time.sleep(0.01)
