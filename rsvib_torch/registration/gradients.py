@@ -62,12 +62,15 @@ def _wiener(mean: Tensor, noise: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """
 
     def smooth(spectrum: Tensor) -> Tensor:
-        parts = torch.view_as_real(spectrum).flatten(-2)
-        return functional.avg_pool2d(parts.square()[:, None], (_SMOOTH, 2 * _SMOOTH), ceil_mode=True)
+        parts = torch.view_as_real(spectrum).flatten(-2)[:, None]
+        chunks = row_chunks(parts.shape[2], 4 * parts.shape[3] * len(parts), _SMOOTH, parts.device)
+        window = (_SMOOTH, 2 * _SMOOTH)
+        pooled = [functional.avg_pool2d(parts[:, :, part].square(), window, ceil_mode=True) for part in chunks]
+        return torch.cat(pooled, 2)[:, 0]
 
     total, noise_power = smooth(mean), smooth(noise)
     share = (1 - noise_power / total.clamp(min=torch.finfo(total.dtype).tiny)).clamp(min=0.0)
-    share = functional.interpolate(share, scale_factor=_SMOOTH, mode="nearest")[:, 0, : len(v), : len(u)]
+    share = share.repeat_interleave(_SMOOTH, 1)[:, : len(v)].repeat_interleave(_SMOOTH, 2)[..., : len(u)]
     # all but the slowest, 1 - exp(-(u^2 + v^2) / slowest^2), within the pass band
     along, across = _pass(u, _PASS_COLUMNS), _pass(v, _PASS_ROWS)
     slow = torch.outer(across * torch.exp(-((v / _SLOWEST) ** 2)), along * torch.exp(-((u / _SLOWEST) ** 2)))

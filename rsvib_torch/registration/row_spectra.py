@@ -15,7 +15,7 @@ DEGREE = 7  # of the spline across rows: what it smooths, and the noise it colou
 MARGIN = 8  # px from the ends of rows and columns that do not count
 _POWERS = 32  # of a turn, computed one by one
 _EXTENSION = 32  # px that rows are continued by, so that their Fourier transform closes smoothly
-_CHUNK = {"cpu": 2**23}  # bytes that stay in a cache
+_CHUNK = {"cpu": 2**24}  # bytes that stay in a cache
 _LARGE_CHUNK = 2**30  # bytes at a time elsewhere
 
 
