@@ -8,9 +8,10 @@ from torch import Tensor
 
 from rsvib_torch.checks import check_number
 from rsvib_torch.detection.detect import measurements_of_curve
-from rsvib_torch.detection.direct import _join, _unexplained, independent_fraction, measure_group
-from rsvib_torch.detection.freeform import groups_of_frames, start_curve
+from rsvib_torch.detection.freeform import start_curve
+from rsvib_torch.detection.leftovers import independent_fraction, unexplained
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.row_groups import frame_groups, measure_groups
 from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.orientation import vibration_to_row_order
 from rsvib_torch.registration import Registration
@@ -121,22 +122,21 @@ def align_motion(
     """
     if recorded.batch_shape:
         raise ValueError("align_motion takes one motion, not a batch")
-    grey, rowwise, curve = start_curve(frames, timing, full_scale, registration, band_rows, band_step, search)
+    grey, rowwise, curve, (first, last) = start_curve(
+        frames, timing, full_scale, registration, band_rows, band_step, search
+    )
     turned = vibration_to_row_order(recorded, timing)
     assert isinstance(turned, FreeMotion)
     turned = turned.to(grey.device)
-    starts = rowwise.frame_starts(grey.shape[1], grey.device)
-    first = float(starts[0])
-    last = float(starts[-1]) + grey.shape[-2] * rowwise.row_time + rowwise.exposure_time
     low, high = _offsets(turned, first, last, offsets)
     measured = measurements_of_curve(curve, rowwise, band_step)
     offset, other = _best_offset(measured, turned, low, high, rowwise)
     clock = _Clock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
     clock, covariance = _refine(measured, turned, clock, False, fit_gain)
     clock, covariance = _refine(measured.reweighted(_left(measured, turned, clock)), turned, clock, fit_scale, fit_gain)
+    groups = frame_groups(grey, None, rowwise, clock.motion(turned).expanded(1))
     for _ in range(_LOOKS):
-        groups = groups_of_frames(grey, starts, clock.motion(turned).expanded(1))
-        measured = _join([measure_group(g, rowwise, clock.motion(turned).expanded(1), None)[0] for g in groups])
+        measured = measure_groups(groups, rowwise, clock.motion(turned).expanded(1))
         weighed = measured.reweighted(_left(measured, turned, clock))
         clock, covariance = _refine(weighed, turned, clock, fit_scale, fit_gain)
     left = _left(measured, turned, clock)
@@ -145,10 +145,10 @@ def align_motion(
     # from the middle of the record to time 0
     reach = torch.tensor([1.0, -clock.middle], dtype=torch.float64, device=std.device)
     offset_std = float((reach @ covariance[:2, :2] @ reach / honest).clamp(min=0.0).sqrt())
-    unexplained = _unexplained(measured, left)[0]
+    beside = unexplained(measured, left)[0]
     moved = measured.relative(clock.motion(turned).mean_displacement(measured.moments, rowwise.exposure_time))
     size = moved[0].square().sum(1).div(measured.differences[0].clamp(min=1.0)[:, None]).mean(0).sqrt()
-    reasons = _reasons(unexplained, size, other, float(std[0]))
+    reasons = _reasons(beside, size, other, float(std[0]))
     swap = timing.scan_axis == -1
     result = FreeMotion(recorded.coefficients, recorded.start, recorded.spacing, recorded.tones)
     sign = -1.0 if timing.readout_direction == "reverse" else 1.0
@@ -166,7 +166,7 @@ def align_motion(
         scale_std=float(std[1]),
         gain=there.gain,
         drift=torch.tensor(there.drift, dtype=torch.float64),
-        unexplained=unexplained.flip(-1) if swap else unexplained,
+        unexplained=beside.flip(-1) if swap else beside,
         reliable=not reasons,
         reasons=tuple(reasons),
     )

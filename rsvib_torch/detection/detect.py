@@ -9,10 +9,11 @@ from torch import Tensor, nn
 
 from rsvib_torch.arrays import ArrayLike, as_tensor
 from rsvib_torch.checks import check_choice, check_whole_number
-from rsvib_torch.detection.direct import LARGEST_GROUP, refine_directly
+from rsvib_torch.detection.direct import refine_directly
 from rsvib_torch.detection.inversion import vibration_of_fit
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, VibrationStd, stacked
+from rsvib_torch.detection.row_groups import LARGEST_GROUP
 from rsvib_torch.detection.selection import MAX_TONES, find_tones
 from rsvib_torch.detection.tones import MotionModel, ToneFit, model_displacements
 from rsvib_torch.detection.verdict import judge
@@ -186,11 +187,7 @@ def detect_vibration(
             where = (share < _LEAST_FRAME).nonzero()[0].tolist()
             raise ValueError(f"frame {where[-1]} has only {share[*where]:.1%} of pixels that count")
         frames = fill_roughly(frames, ~valid[:, :, None].expand(frames.shape))
-    low, high = frames.amin((-3, -2, -1)), frames.amax((-3, -2, -1))
-    flat = high - low <= 1e-6 * torch.maximum(low.abs(), high.abs())
-    if bool(flat.any()):
-        where = flat.nonzero()[0].tolist()
-        raise ValueError(f"frame {where[-1]} is constant: without detail there is nothing to register")
+    check_detail(frames)
     count = None if tones == "auto" else tones
     model = MotionModel(harmonics, 2 if image_acceleration else 1)
     options = _Options(method, registration, count, model, band_rows, band_step, search)
@@ -204,6 +201,15 @@ def detect_vibration(
     ]
     followed = stacked(results)
     return followed if batched else followed[0]
+
+
+def check_detail(frames: Tensor) -> None:
+    """Raise ValueError for frames (B, T, C, H, W) of which one is constant."""
+    low, high = frames.amin((-3, -2, -1)), frames.amax((-3, -2, -1))
+    flat = high - low <= 1e-6 * torch.maximum(low.abs(), high.abs())
+    if bool(flat.any()):
+        where = flat.nonzero()[0].tolist()
+        raise ValueError(f"frame {where[-1]} is constant: without detail there is nothing to register")
 
 
 def _valid_pixels(frames: Tensor, ignore: Tensor | None) -> Tensor | None:

@@ -7,18 +7,10 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks import check_whole_number
-from rsvib_torch.detection.detect import measurements_of_curve
-from rsvib_torch.detection.direct import (
-    _frames_in_group,
-    _Group,
-    _join,
-    _standardised,
-    _unexplained,
-    groups_of,
-    independent_fraction,
-    measure_group,
-)
+from rsvib_torch.detection.detect import check_detail, measurements_of_curve
+from rsvib_torch.detection.leftovers import independent_fraction, unexplained
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.row_groups import frame_groups, measure_groups
 from rsvib_torch.detection.spline_fit import SplineFit, fit_spline
 from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.orientation import (
@@ -29,11 +21,10 @@ from rsvib_torch.orientation import (
 )
 from rsvib_torch.registration import OffsetCurve, Registration
 from rsvib_torch.registration.register import register_rows
-from rsvib_torch.registration.row_spectra import RowSpectra
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
-__all__ = ["MotionDetection", "detect_motion", "groups_of_frames", "start_curve"]
+__all__ = ["MotionDetection", "detect_motion", "start_curve"]
 
 _MOST_KNOTS = 3000
 _LOOKS = 32  # rows of a frame at which the motion is reported
@@ -115,17 +106,16 @@ def detect_motion(
     """
     check_whole_number("knot_rows", knot_rows, at_least=4)
     check_whole_number("iterations", iterations, at_least=1)
-    grey, rowwise, curve = start_curve(frames, timing, full_scale, registration, band_rows, band_step, search)
+    grey, rowwise, curve, record = start_curve(frames, timing, full_scale, registration, band_rows, band_step, search)
     starts = rowwise.frame_starts(grey.shape[1], grey.device)
-    record = (float(starts[0]), float(starts[-1]) + grey.shape[-2] * rowwise.row_time + rowwise.exposure_time)
     spacing = max(knot_rows * rowwise.row_time, (record[1] - record[0]) / _MOST_KNOTS)
     size = (grey.shape[-2], grey.shape[-1])
     measured = measurements_of_curve(curve, rowwise, band_step)
     fit = fit_spline(measured, max(spacing, 0.5 * band_rows * rowwise.row_time), record)
     motion = _motion(fit, size, 0.0)
-    groups = groups_of_frames(grey, starts, motion)
+    groups = frame_groups(grey, None, rowwise, motion)
     for step in range(iterations):
-        measured = _join([measure_group(group, rowwise, motion, None)[0] for group in groups])
+        measured = measure_groups(groups, rowwise, motion)
         if step:  # blocks that show something that moves by itself have less say
             measured = measured.reweighted(_left(measured, motion))
         fit = fit_spline(measured, spacing, record)
@@ -143,8 +133,8 @@ def start_curve(
     band_rows: int,
     band_step: int,
     search: int,
-) -> tuple[Tensor, SensorTiming, OffsetCurve]:
-    """Grey frames (1, T, H, W) and timing in row order, and the offsets of their row bands.
+) -> tuple[Tensor, SensorTiming, OffsetCurve, tuple[float, float]]:
+    """Grey frames (1, T, H, W) and timing in row order, the offsets of their row bands, start and end of the record.
 
     Raises:
         TypeError: If frames are not numbers.
@@ -155,9 +145,7 @@ def start_curve(
         raise ValueError(f"this takes one stack, got a batch of shape {tuple(images.shape)}")
     images = frames_to_row_order(images, timing)
     grey = (images.mean(-3) if images.ndim == 4 else images)[None]
-    flat = grey[0].flatten(1).std(-1) <= 1e-7 * grey[0].flatten(1).abs().amax(-1)
-    if bool(flat.any()):
-        raise ValueError(f"frame {int(flat.nonzero()[0])} is constant: without detail there is nothing to register")
+    check_detail(grey[:, :, None])
     rowwise = timing.in_row_order()
     rowwise.check_rows(grey.shape[-2])
     curve = register_rows(
@@ -169,14 +157,9 @@ def start_curve(
             f"only {found:.0%} of the row bands are found in the next frame: the motion is beyond search={search} px "
             "within a frame, or the frames show different scenes"
         )
-    return grey, rowwise, curve
-
-
-def groups_of_frames(grey: Tensor, starts: Tensor, motion: FreeMotion) -> list[_Group]:
-    """Frames (1, T, H, W), taken from ``starts`` (T,) on, in groups that share a scene; the motion is a batch of 1."""
-    even = _standardised(grey, None)
-    members = groups_of(grey.shape[1], _frames_in_group(motion, starts[None], (grey.shape[-2], grey.shape[-1])))
-    return [_Group(RowSpectra(even[:, m.start : m.stop]), starts[None, m.start : m.stop]) for m in members]
+    starts = rowwise.frame_starts(grey.shape[1])
+    end = float(starts[-1]) + grey.shape[-2] * rowwise.row_time + rowwise.exposure_time
+    return grey, rowwise, curve, (float(starts[0]), end)
 
 
 def _left(measured: Measurements, motion: FreeMotion) -> Tensor:
@@ -223,25 +206,25 @@ def _report(
         seen.append(variance_seen.mean().sqrt())
         common = centred.mean(0)
         unseen.append(honest * torch.einsum("rp,pq,rq->r", common, fit.covariance[axis], common).mean().sqrt())
-    unexplained = _unexplained(measured, left)[0]
+    beside = unexplained(measured, left)[0]
     value = motion[0].displacement(times)
     value = value - value.mean((0, 1))
     relative = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     reasons = []
     for axis in range(2):
-        much, sure, moved = float(unexplained[axis]), float(seen[axis]), float(relative[axis])
+        much, sure, moved = float(beside[axis]), float(seen[axis]), float(relative[axis])
         found = []
         if much > max(_EXPLAINED * moved, _FINEST):
             found.append(f"rows move by {much:.3g} px that no smooth motion explains")
         if sure > _SURE:
             found.append(f"rows tell the motion to {sure:.3g} px only: they may show different scenes")
         reasons.append(tuple(found))
-    reliable = torch.tensor([not found for found in reasons], device=unexplained.device)
+    reliable = torch.tensor([not found for found in reasons], device=beside.device)
     turned = vibration_from_row_order(motion[0], timing)
     assert isinstance(turned, FreeMotion)
     swap = timing.scan_axis == -1
     per_axis = [torch.stack(values, -1) for values in (stds, seen, unseen)]
-    per_axis += [unexplained, reliable]
+    per_axis += [beside, reliable]
     spread, seen_std, unseen_std, rest, good = ((v.flip(-1) if swap else v) for v in per_axis)
     return MotionDetection(
         motion=turned,

@@ -109,13 +109,6 @@ class Measurements:
         """The rows that count (B, N), the others known no more."""
         return replace(self, information=self.information * counts[..., None, None])
 
-    def __getitem__(self, stacks: slice) -> "Measurements":
-        """Some of the stacks."""
-        moments, displacements, seen, information = (
-            t[stacks] for t in (self.moments, self.displacements, self.seen, self.information)
-        )
-        return replace(self, moments=moments, displacements=displacements, seen=seen, information=information)
-
     def relative(self, values: Tensor) -> Tensor:
         """Values (B, N, G, ...) of every frame less their mean over the frames that see the row, 0 where unseen."""
         ones = (1,) * (values.ndim - 3)

@@ -9,9 +9,10 @@ from torch import Tensor
 
 from rsvib_torch.checks import check_whole_number
 from rsvib_torch.detection.detect import measurements_of_curve
-from rsvib_torch.detection.direct import _join, _unexplained, independent_fraction, measure_group
-from rsvib_torch.detection.freeform import groups_of_frames, start_curve
+from rsvib_torch.detection.freeform import start_curve
+from rsvib_torch.detection.leftovers import independent_fraction, unexplained
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.row_groups import frame_groups, measure_groups
 from rsvib_torch.detection.spline_fit import precision_of_axis
 from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.orientation import vibration_from_row_order
@@ -96,16 +97,14 @@ def detect_swept_tone(
         ValueError: If they cannot be registered, see ``detect_motion``, or an option is out of range.
     """
     check_whole_number("iterations", iterations, at_least=1)
-    grey, rowwise, curve = start_curve(frames, timing, full_scale, registration, band_rows, band_step, search)
-    starts = rowwise.frame_starts(grey.shape[1], grey.device)
-    record = (float(starts[0]), float(starts[-1]) + grey.shape[-2] * rowwise.row_time + rowwise.exposure_time)
+    grey, rowwise, curve, record = start_curve(frames, timing, full_scale, registration, band_rows, band_step, search)
     measured = measurements_of_curve(curve, rowwise, band_step)
     highest = 0.5 / (band_rows * rowwise.row_time)
     fits = [_start(measured, axis, record, highest) for axis in range(2)]
+    groups = frame_groups(grey, None, rowwise, _motion(fits, record, rowwise))
     for _ in range(iterations):
         motion = _motion(fits, record, rowwise)
-        groups = groups_of_frames(grey, starts, motion)
-        measured = _join([measure_group(group, rowwise, motion, None)[0] for group in groups])
+        measured = measure_groups(groups, rowwise, motion)
         weighed = measured.reweighted(_left(measured, motion))
         fits = [_settle(weighed, axis, record, fit)[0] for axis, fit in enumerate(fits)]
     solved = [_settle(weighed, axis, record, fit) for axis, fit in enumerate(fits)]
@@ -114,7 +113,7 @@ def detect_swept_tone(
     motion = _motion(fits, record, rowwise)
     left = _left(measured, motion)
     honest = independent_fraction(measured, left)
-    return _report(fits, covariances, honest, motion, _unexplained(measured, left)[0], measured, record, timing)
+    return _report(fits, covariances, honest, motion, unexplained(measured, left)[0], measured, record, timing)
 
 
 def _still(fit: Tensor) -> Tensor:

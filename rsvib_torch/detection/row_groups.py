@@ -1,0 +1,177 @@
+"""Frames in groups that share a scene, and what their rows tell of a motion: where images become measurements."""
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.imaging.coupling import rows_showing
+from rsvib_torch.registration.gradients import RowGradients, row_gradients, row_shifts
+from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra
+from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.vibration import Vibration
+
+__all__ = [
+    "BLOCK",
+    "LARGEST_GROUP",
+    "FrameGroup",
+    "frame_groups",
+    "join_groups",
+    "measure_group",
+    "measure_groups",
+    "warping",
+]
+
+BLOCK = 8  # rows that give one measurement: tones up to 1 / (16 T_row) are told apart
+LARGEST_GROUP = 8  # of a group that shares one mean scene
+_LEAST_OVERLAP = 0.5  # of the frame that the frames of a group share
+_CONDITION = 1e-4  # least share of the product of the diagonal that a block's determinant must keep
+
+
+@dataclass(frozen=True, eq=False)
+class FrameGroup:
+    """Consecutive frames that share a scene: their spectra and when they were taken."""
+
+    spectra: RowSpectra
+    starts: Tensor  # (B, G) s
+
+
+def _members(num_frames: int, most: int) -> list[range]:
+    """Consecutive groups of at most ``most`` frames, each sharing one frame with the next, as even as can be."""
+    count = max(1, math.ceil((num_frames - 1) / (most - 1)))
+    ends = [round(i * (num_frames - 1) / count) for i in range(count + 1)]
+    return [range(first, last + 1) for first, last in itertools.pairwise(ends)]
+
+
+def _frames_in_group(motion: Vibration, starts: Tensor, size: tuple[int, int]) -> int:
+    """How many frames of (H, W) px still share enough of the scene when the image moves."""
+    moved = (motion.drift(starts[:, 1:]) - motion.drift(starts[:, :-1])).abs().amax((0, 1))
+    extent = torch.tensor([size[1], size[0]], dtype=moved.dtype, device=moved.device)
+    fraction = float((moved / extent).amax())
+    return int(max(2, min(LARGEST_GROUP, 1 + (1 - _LEAST_OVERLAP) // max(fraction, 1e-9))))
+
+
+def frame_groups(frames: Tensor, valid: Tensor | None, timing: SensorTiming, motion: Vibration) -> list[FrameGroup]:
+    """Frames (B, T, H, W) in row order in groups that share enough of the scene when it moves by ``motion``.
+
+    Args:
+        frames: Grey frames.
+        valid: (B, T, H, W) bool, pixels that count; None for all.
+        timing: The sensor, in row order.
+        motion: Of each stack (B).
+    """
+    starts = timing.frame_starts(frames.shape[1], frames.device).expand(len(frames), -1)
+    even = _standardised(frames, valid)
+    members = _members(frames.shape[1], _frames_in_group(motion, starts, (frames.shape[-2], frames.shape[-1])))
+    parts = [slice(member.start, member.stop) for member in members]
+    return [
+        FrameGroup(RowSpectra(even[:, part], None if valid is None else valid[:, part]), starts[:, part])
+        for part in parts
+    ]
+
+
+def warping(group: FrameGroup, timing: SensorTiming, motion: Vibration) -> tuple[RowSpectra, Tensor, Tensor, Tensor]:
+    """A group with what warps its frames back by a motion."""
+    rows, shift, seen, _ = _place(group, timing, motion)
+    return group.spectra, rows, shift, seen
+
+
+def _place(group: FrameGroup, timing: SensorTiming, motion: Vibration) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Where the frames of a group show the scene rows.
+
+    Returns:
+        Frame rows, displacement along the rows to take out and visibility, and exposure starts of
+        those rows, (B, G, S) each.
+    """
+    height = group.spectra.height
+    scene_rows = torch.arange(height, dtype=torch.float64, device=group.starts.device)
+    starts = group.starts[..., None]
+    # whole pixels of an image motion move the scene rows and columns that this group sees
+    middle = group.starts.mean(-1, keepdim=True) + 0.5 * height * timing.row_time
+    travelled = motion.drift(middle).round()[:, :, None]  # (B, 1, 1, 2)
+    rows = rows_showing(scene_rows - travelled[..., 1], starts, timing, motion)
+    moments = starts + rows * timing.row_time
+    blocks = height // BLOCK
+    inside = ((rows >= MARGIN) & (rows <= height - 1 - MARGIN)).double()
+    whole = inside[..., : blocks * BLOCK].unflatten(-1, (blocks, BLOCK)).amin(-1)
+    seen = functional.pad(whole.repeat_interleave(BLOCK, dim=-1), (0, height - blocks * BLOCK))
+    shift = motion.mean_displacement(moments, timing.exposure_time)[..., 0] - travelled[..., 0]
+    return rows, shift, seen, moments
+
+
+def _blocks(values: Tensor) -> Tensor:
+    """Rows on axis 2 gathered in blocks on axes 2 and 3."""
+    count = values.shape[2] // BLOCK
+    blocks: Tensor = values[:, :, : count * BLOCK].unflatten(2, (count, BLOCK))
+    return blocks
+
+
+def measure_group(
+    group: FrameGroup, timing: SensorTiming, motion: Vibration, gradients: RowGradients | None
+) -> tuple[Measurements, RowGradients]:
+    """Displacements of blocks of scene rows in the frames of a group, measured around a motion.
+
+    The motion's own displacement is added to what remains, so that the measurements do not depend on it to first order.
+    """
+    rows, shift, seen, moments = _place(group, timing, motion)
+    warped = group.spectra.warped(rows, shift)
+    gradients = gradients or row_gradients(group.spectra, warped, rows, shift, seen)
+    matrix, right = row_shifts(warped, gradients, seen)
+    matrix = _blocks(matrix[:, None]).sum(3)[:, 0]  # (B, N, 2, 2)
+    right = _blocks(right).sum(3)  # (B, G, N, 2)
+    determinant = matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1].square()
+    known = (determinant > _CONDITION * matrix[..., 0, 0] * matrix[..., 1, 1]) & (determinant > 0)
+    eye = torch.eye(2, dtype=matrix.dtype, device=matrix.device)
+    remaining = torch.linalg.solve(torch.where(known[..., None, None], matrix, eye)[:, None], right[..., None])[..., 0]
+    remaining = torch.where(known[:, None, :, None], remaining, 0.0)
+    block_moments = _blocks(moments).mean(3)
+    around = motion.mean_displacement(block_moments, timing.exposure_time)
+    measurements = Measurements(
+        moments=block_moments.transpose(1, 2),
+        displacements=(around + remaining).transpose(1, 2),
+        seen=_blocks(seen)[..., 0].transpose(1, 2),
+        information=torch.where(known[..., None, None], matrix, 0.0),
+        exposure_time=timing.exposure_time,
+    )
+    return replace(measurements, displacements=measurements.relative(measurements.displacements)), gradients
+
+
+def join_groups(parts: list[Measurements]) -> Measurements:
+    """Measurements of all groups as one record; smaller groups get frames that see nothing."""
+    most = max(part.moments.shape[-1] for part in parts)
+
+    def padded(values: Tensor) -> Tensor:
+        missing = most - values.shape[2]
+        return (
+            torch.cat([values, values[:, :, :1].expand(-1, -1, missing, *values.shape[3:])], 2) if missing else values
+        )
+
+    return replace(
+        parts[0],
+        moments=torch.cat([padded(part.moments) for part in parts], 1),
+        displacements=torch.cat([padded(part.displacements) for part in parts], 1),
+        seen=torch.cat([functional.pad(part.seen, (0, most - part.seen.shape[-1])) for part in parts], 1),
+        information=torch.cat([part.information for part in parts], 1),
+    )
+
+
+def measure_groups(groups: list[FrameGroup], timing: SensorTiming, motion: Vibration) -> Measurements:
+    """``measure_group`` of all groups, with gradients of their own, as one record."""
+    return join_groups([measure_group(group, timing, motion, None)[0] for group in groups])
+
+
+def _standardised(frames: Tensor, valid: Tensor | None) -> Tensor:
+    """Frames of mean 0 and variance 1: brightness and contrast may differ from frame to frame."""
+    if valid is None:
+        centred = frames - frames.mean((-2, -1), keepdim=True)
+        size = torch.linalg.vector_norm(centred, dim=(-2, -1), keepdim=True)
+        return centred.mul_(math.sqrt(frames[0, 0].numel()) / size)
+    weight = valid.to(frames.dtype)
+    count = weight.sum((-2, -1), keepdim=True)
+    centred = frames - (frames * weight).sum((-2, -1), keepdim=True) / count
+    variance = (centred.square() * weight).sum((-2, -1), keepdim=True) / count
+    return centred * variance.rsqrt()
