@@ -1,7 +1,6 @@
 """Motion of any shape from consecutive frames, with what cannot be known of it."""
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -39,17 +38,19 @@ _FAR = 0.25  # of the frame, from where on a steady motion is that of the image
 class MotionDetection:
     """A motion of any shape, and how well it is known.
 
-    Rows tell how far they moved between frames. What repeats in every frame they do not tell: there
-    smoothness decides, and ``std`` is larger than ``std_seen``. The mean over the record is never known, nor counted.
+    Rows tell how far they moved between frames. A warp that is fixed to the scene they do not tell: frames of a warped
+    scene look the same, D(t) of the row that shows scene row s being larger by w(s) in every frame. For w the motion's
+    own power at other frequencies decides, and ``std`` is larger than ``std_seen``. The mean over the record is never
+    known, nor counted.
 
     Attributes:
         motion: The motion in image axes.
         times: (T, R) s, mid-exposures of rows spread over the frames.
         displacement: (T, R, 2) px, the motion there, less its mean over the record.
         std: (T, R, 2) px, standard deviation of that.
-        std_seen: (2,) px, root mean square of the standard deviation of what rows tell: the displacement less its
-            mean over the frames, row by row.
-        unseen: (2,) px, root mean square of the standard deviation of what repeats in every frame.
+        std_seen: (2,) px, root mean square of the standard deviation of what rows tell: the displacement of the rows
+            that show one scene row, less its mean over the frames.
+        unseen: (2,) px, root mean square of the standard deviation of that mean: of the warp.
         unexplained: (2,) px, rms displacement of rows that the motion does not explain, beyond their noise.
         reliable: (2,) bool, whether the motion explains what the rows show.
         reasons: Why not, for each axis (x, y).
@@ -121,8 +122,11 @@ def detect_motion(
         fit = fit_spline(measured, spacing, record)
         motion = _motion(fit, size, 0.0)  # groups follow the image as it moves on
     left = _left(measured, motion)
-    honest = 1 / math.sqrt(independent_fraction(measured, left))
-    return _report(_motion(fit, size, _FAR), fit, measured, left, honest, timing, starts, size[0])
+    weighed = measured.reweighted(left)
+    share = independent_fraction(weighed, left) * measured.share_counted(left)
+    fit = fit_spline(replace(weighed, independent=share), spacing, record, learn=True)
+    motion = _motion(fit, size, _FAR)
+    return _report(motion, fit, measured, _left(measured, motion), timing, starts, size[0])
 
 
 def start_curve(
@@ -180,12 +184,25 @@ def _motion(fit: SplineFit, size: tuple[int, int], far: float) -> FreeMotion:
     return FreeMotion((fit.coefficients - speed[:, None] * knots)[None], fit.start, fit.spacing, drift)
 
 
+def _variance(columns: Tensor, covariance: Tensor) -> Tensor:
+    """Variances (S,) of what columns (S, N) make of coefficients of this covariance."""
+    return ((columns @ covariance) * columns).sum(-1).clamp(min=0.0)
+
+
+def _told_and_common(fit: SplineFit, moments: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+    """Columns (S, N) of what the frames (N, G) that see a row of the scene tell of it, and (R, N) of their mean."""
+    several = seen.sum(-1) > 1
+    seen = seen[several]
+    columns = fit.columns(moments[several].flatten()).unflatten(0, seen.shape)
+    mean = (seen[..., None] * columns).sum(1) / seen.sum(-1)[:, None]
+    return (columns - mean[:, None])[seen > 0], mean
+
+
 def _report(
     motion: FreeMotion,
     fit: SplineFit,
     measured: Measurements,
     left: Tensor,
-    honest: float,
     timing: SensorTiming,
     starts: Tensor,
     num_rows: int,
@@ -193,19 +210,15 @@ def _report(
     """The motion in image axes and how well it is known at some rows of every frame."""
     rows = torch.linspace(0, num_rows - 1, min(_LOOKS, num_rows), dtype=torch.float64, device=starts.device)
     times = starts[:, None] + rows * timing.row_time + 0.5 * timing.exposure_time
+    moments = measured.moments[0] + 0.5 * measured.exposure_time
     stds, seen, unseen = [], [], []
     for axis in range(2):
-        columns = fit.columns(times.flatten()).unflatten(0, times.shape)
-        centred = columns - columns.mean((0, 1))
-        apart = columns - columns.mean(0)
-        variance, variance_seen = (
-            honest**2 * torch.einsum("trp,pq,trq->tr", c, fit.covariance[axis], c).clamp(min=0.0)
-            for c in (centred, apart)
-        )
-        stds.append(variance.sqrt())
-        seen.append(variance_seen.mean().sqrt())
-        common = centred.mean(0)
-        unseen.append(honest * torch.einsum("rp,pq,rq->r", common, fit.covariance[axis], common).mean().sqrt())
+        columns = fit.columns(times.flatten())
+        centred = columns - columns.mean(0)
+        stds.append(_variance(centred, fit.covariance[axis]).sqrt().unflatten(0, times.shape))
+        told, common = _told_and_common(fit, moments, measured.seen[0])
+        seen.append(_variance(told, fit.covariance[axis]).mean().sqrt())
+        unseen.append(_variance(common - columns.mean(0), fit.covariance[axis]).mean().sqrt())
     beside = unexplained(measured, left)[0]
     value = motion[0].displacement(times)
     value = value - value.mean((0, 1))

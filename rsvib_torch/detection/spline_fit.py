@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.motion_spectrum import MOST_KNOTS, fit_with_spectrum
 from rsvib_torch.splines import bspline_weights
 
 __all__ = ["SplineFit", "fit_spline", "precision_of_axis", "spline_basis"]
@@ -56,16 +57,20 @@ def spline_basis(times: Tensor, start: float, spacing: float, count: int) -> tup
     return cell.to(torch.int64)[..., None] + torch.arange(4, device=times.device), bspline_weights(place - cell, 3)
 
 
-def fit_spline(measurements: Measurements, spacing: float, record: tuple[float, float]) -> SplineFit:
+def fit_spline(
+    measurements: Measurements, spacing: float, record: tuple[float, float], *, learn: bool = False
+) -> SplineFit:
     """Fit a spline to the measurements of one stack, each axis by itself.
 
     Minimises ``sum w (d - relative(D))^2 + lambda |D''|^2``: rows tell only differences between the frames that see
-    them, so that what repeats in every frame is left to smoothness. lambda maximises the marginal likelihood.
+    them, so that a warp of the scene is left to smoothness. lambda maximises the marginal likelihood.
 
     Args:
         measurements: Of one stack (B = 1).
         spacing: Seconds between knots.
         record: First and last time in seconds that the spline is wanted for.
+        learn: Whether to learn the power spectrum of the motion, in place of one smoothness; splines of many knots
+            keep to smoothness.
     """
     first, last = record
     count = math.ceil((last - first) / spacing) + 3
@@ -73,7 +78,7 @@ def fit_spline(measurements: Measurements, spacing: float, record: tuple[float, 
     shape = SplineFit(
         torch.zeros(2, count, dtype=torch.float64, device=device), torch.zeros(2, 0, 0, device=device), first, spacing
     )
-    values, covariances = zip(*(_fit_axis(measurements, shape, axis) for axis in range(2)), strict=True)
+    values, covariances = zip(*(_fit_axis(measurements, shape, axis, learn) for axis in range(2)), strict=True)
     return SplineFit(torch.stack(values), torch.stack(covariances), first, spacing)
 
 
@@ -92,7 +97,7 @@ def _design(measurements: Measurements, shape: SplineFit, axis: int, part: slice
     return seen * (columns - mean)
 
 
-def _fit_axis(measurements: Measurements, shape: SplineFit, axis: int) -> tuple[Tensor, Tensor]:
+def _fit_axis(measurements: Measurements, shape: SplineFit, axis: int, learn: bool) -> tuple[Tensor, Tensor]:
     """Coefficients (N,) of one axis and their covariance (N, N)."""
     values = (measurements.displacements[..., axis] * measurements.seen)[0]
     weight = precision_of_axis(measurements.information[0], axis)
@@ -124,8 +129,11 @@ def _fit_axis(measurements: Measurements, shape: SplineFit, axis: int) -> tuple[
     tried = {smoothness: evidence(smoothness)[0] for smoothness in _SMOOTHNESS}
     best = max(tried, key=tried.__getitem__)
     tried |= {best * 10**step: evidence(best * 10**step)[0] for step in _FINER}
-    _, found, factor = evidence(max(tried, key=tried.__getitem__))
-    noise = max(energy - float(right @ found), 0.0) / known
+    smoothness = max(tried, key=tried.__getitem__)
+    _, found, factor = evidence(smoothness)
+    noise = max(energy - float(right @ found), _WORTH * energy) / known
+    if learn and count <= MOST_KNOTS and noise > 0:
+        return fit_with_spectrum(gram, right, noise, smoothness * scale, float((found - found.mean()).square().mean()))
     return found, noise * torch.cholesky_inverse(factor)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from motion_truth import common_warp, offset_error, rms
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
@@ -25,12 +26,8 @@ class Jitter(Motion):
 
 
 def seen(values):
-    """Displacements (T, R, 2) less their mean over the frames, row by row."""
+    """Displacements (T, R, 2) less their mean over the frames, row by row: near enough to what frames tell here."""
     return values - values.mean(0)
-
-
-def rms(values):
-    return np.sqrt(np.mean(np.square(values), axis=(0, 1)))
 
 
 @pytest.fixture(scope="module", name="scene")
@@ -168,3 +165,38 @@ def test_motion_beyond_the_search_range_is_named(scene):
     frames = take_frames(scene, TIMING, Far(), 3, 0.005)
     with pytest.raises(ValueError, match="search=4 px"):
         rsv.detect_motion(torch.from_numpy(frames).float(), TIMING, search=4)
+
+
+class Ringing(Motion):
+    """Like a spacecraft's: two tones, one of them once a frame, over a drift along the scan."""
+
+    def displacement(self, times):
+        turns = times / TIMING.frame_period
+        x = 3.0 * np.sin(2 * np.pi * 0.61 * turns + 0.4) + 1.2 * np.sin(2 * np.pi * turns + 1.0) + 0.08 * turns**2
+        y = 2.0 * np.sin(2 * np.pi * 0.83 * turns + 2.0) + 1.6 * np.cos(2 * np.pi * 0.26 * turns) + 3.0 * turns
+        return np.stack([x, y], axis=-1)
+
+
+def test_offsets_between_any_two_frames_are_found_beside_what_no_frame_tells():
+    """A tone that turns once a frame is a warp of the scene: it is lost, and harms nothing else."""
+    scene = draw_scene(HEIGHT + 2 * MARGIN, WIDTH + 2 * MARGIN, 12)
+    frames = torch.from_numpy(take_frames(scene, TIMING, Ringing(), 8, 0.005)).float()
+    found = rsv.detect_motion(frames, TIMING)
+    times = (TIMING.row_starts(8, HEIGHT) + 0.5 * TIMING.exposure_time).numpy()
+    truth, motion = Ringing().displacement(times), found.motion.displacement(torch.from_numpy(times)).numpy()
+    assert (offset_error(motion, truth) < 0.03).all()
+    assert (offset_error(0.5 * truth, truth) > 1.0).all()
+    error = motion - truth - (motion - truth).mean((0, 1))
+    less = error - common_warp(error, truth)
+    assert (rms(less) < 0.03).all()
+    assert rms(error)[0] > 0.5
+    assert (found.std_seen.numpy() < 0.01).all()
+    assert (found.unseen > 5 * found.std_seen).all()
+    assert found.reliable.all()
+    best, here = (
+        decibel(
+            rsv.restore(frames, TIMING, FreeMotion.from_samples(times.ravel(), d.reshape(-1, 2))).numpy(), crop(scene)
+        )
+        for d in (truth, truth + less)
+    )
+    assert here > best - 0.2
