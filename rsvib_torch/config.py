@@ -146,7 +146,7 @@ class _SimulationSection(Section):
 
 
 _DetectionSection = options_section(
-    "_DetectionSection", detect_vibration, skip=("full_scale", "ignore", "window", "window_step")
+    "_DetectionSection", detect_vibration, skip=("model", "full_scale", "ignore", "window", "window_step")
 )
 
 

@@ -123,6 +123,17 @@ class FreeMotion(Vibration):
         even = np.linspace(grid[0], grid[-1], count)
         return cls.through(torch.from_numpy(even), torch.from_numpy(CubicSpline(grid, values)(even)), tones)
 
+    @classmethod
+    def stacked(cls, motions: Sequence["FreeMotion"]) -> "FreeMotion":
+        """Motions of equal knots and equally many tones as a batch; its first dimension counts them."""
+        first = motions[0]
+        knots = {(m.start, m.spacing, m.coefficients.shape) for m in motions}
+        if len(knots) > 1:
+            raise ValueError(f"motions of different knots cannot be stacked: {sorted(knots)}")
+        fields = ([getattr(m, name) for m in motions] for name in Vibration.__dataclass_fields__)
+        tones = Vibration(*(torch.stack(values) for values in fields))
+        return cls(torch.stack([m.coefficients for m in motions]), first.start, first.spacing, tones)
+
     @property
     def tones(self) -> Vibration:
         """Tones and image motion alone."""

@@ -115,7 +115,8 @@ def save(path: Path, frames: Tensor, stack: Stack) -> None:
 def detect_frames(stack: Stack, config: Config) -> DetectionResult:
     """Detect the vibration as the config says."""
     with working("detecting the vibration"):
-        return detect_vibration(stack.frames, config.timing, **config.detection)
+        found: DetectionResult = detect_vibration(stack.frames, config.timing, **config.detection)
+    return found
 
 
 def _frames_together(text: str | None) -> bool | int | None:

@@ -6,14 +6,17 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from rsvib_torch.arrays import ArrayLike
 from rsvib_torch.checks import check_number
-from rsvib_torch.detection.detect import measurements_of_curve
+from rsvib_torch.detection.band_curve import Bands, measurements_of_curve
+from rsvib_torch.detection.door import grey_frames
 from rsvib_torch.detection.freeform import start_curve
 from rsvib_torch.detection.leftovers import independent_fraction, unexplained
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.row_groups import frame_groups, measure_groups
 from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.orientation import vibration_to_row_order
+from rsvib_torch.precision import full_precision, outside_graphs
 from rsvib_torch.registration import Registration
 from rsvib_torch.sensor import SensorTiming
 
@@ -81,8 +84,11 @@ class _Clock:
         return FreeMotion(moved.coefficients + drift, moved.start, moved.spacing, moved.tones)
 
 
+@outside_graphs
+@full_precision
+@torch.no_grad()
 def align_motion(
-    frames: Tensor,
+    frames: ArrayLike,
     timing: SensorTiming,
     recorded: FreeMotion,
     *,
@@ -93,6 +99,7 @@ def align_motion(
     band_rows: int = 32,
     band_step: int = 16,
     search: int = 16,
+    ignore: ArrayLike | None = None,
     full_scale: float | None = None,
 ) -> ClockAlignment:
     """Find offset and scale between the clock of a recorded motion and that of the frames.
@@ -102,7 +109,8 @@ def align_motion(
     around it, row by row. A uniform drift of each axis is fitted as well.
 
     Args:
-        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames.
+        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames, tensor or NumPy array; NaN marks pixels that
+            were not measured.
         timing: The sensor.
         recorded: The motion on its own clock, in image axes.
         offsets: Least and largest offset to look at, in seconds; by default all for which the recording covers the
@@ -113,6 +121,7 @@ def align_motion(
         band_rows: Rows of a band of the start.
         band_step: Rows from one band to the next.
         search: Search range of the start in px around the whole-frame offset.
+        ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out.
         full_scale: Count that means 1.0, for integer frames.
 
     Raises:
@@ -122,19 +131,22 @@ def align_motion(
     """
     if recorded.batch_shape:
         raise ValueError("align_motion takes one motion, not a batch")
-    grey, rowwise, curve, (first, last) = start_curve(
-        frames, timing, full_scale, registration, band_rows, band_step, search
-    )
+    stack = grey_frames(frames, timing, full_scale, ignore)
+    if stack.batched:
+        raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")
+    grey = stack.images
+    bands = Bands(registration, band_rows, band_step, search)
+    rowwise, curve, (first, last) = start_curve(stack, timing, bands)
     turned = vibration_to_row_order(recorded, timing)
     assert isinstance(turned, FreeMotion)
     turned = turned.to(grey.device)
     low, high = _offsets(turned, first, last, offsets)
-    measured = measurements_of_curve(curve, rowwise, band_step)
+    measured = measurements_of_curve(curve, rowwise, bands.band_step)
     offset, other = _best_offset(measured, turned, low, high, rowwise)
     clock = _Clock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
     clock, covariance = _refine(measured, turned, clock, False, fit_gain)
     clock, covariance = _refine(measured.reweighted(_left(measured, turned, clock)), turned, clock, fit_scale, fit_gain)
-    groups = frame_groups(grey, None, rowwise, clock.motion(turned).expanded(1))
+    groups = frame_groups(grey, stack.valid, rowwise, clock.motion(turned).expanded(1))
     for _ in range(_LOOKS):
         measured = measure_groups(groups, rowwise, clock.motion(turned).expanded(1))
         weighed = measured.reweighted(_left(measured, turned, clock))

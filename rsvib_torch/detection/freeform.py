@@ -1,25 +1,23 @@
 """Motion of any shape from consecutive frames, with what cannot be known of it."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from rsvib_torch.arrays import ArrayLike
 from rsvib_torch.checks import check_whole_number
-from rsvib_torch.detection.detect import check_detail, measurements_of_curve
+from rsvib_torch.detection.band_curve import Bands, band_curve, measurements_of_curve
+from rsvib_torch.detection.door import GreyFrames, grey_frames
 from rsvib_torch.detection.leftovers import independent_fraction, unexplained
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.row_groups import frame_groups, measure_groups
 from rsvib_torch.detection.spline_fit import SplineFit, fit_spline
 from rsvib_torch.free_motion import FreeMotion
-from rsvib_torch.orientation import (
-    as_float_frames,
-    frames_to_row_order,
-    offsets_from_row_order,
-    vibration_from_row_order,
-)
+from rsvib_torch.orientation import offsets_from_row_order, vibration_from_row_order
+from rsvib_torch.precision import full_precision, outside_graphs
 from rsvib_torch.registration import OffsetCurve, Registration
-from rsvib_torch.registration.register import register_rows
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
@@ -36,7 +34,7 @@ _FAR = 0.25  # of the frame, from where on a steady motion is that of the image
 
 @dataclass(frozen=True, eq=False)
 class MotionDetection:
-    """A motion of any shape, and how well it is known.
+    """A motion of any shape, and how well it is known. A batch of stacks leads all tensors but ``times``.
 
     Rows tell how far they moved between frames. A warp that is fixed to the scene they do not tell: frames of a warped
     scene look the same, D(t) of the row that shows scene row s being larger by w(s) in every frame. For w the motion's
@@ -46,14 +44,14 @@ class MotionDetection:
     Attributes:
         motion: The motion in image axes.
         times: (T, R) s, mid-exposures of rows spread over the frames.
-        displacement: (T, R, 2) px, the motion there, less its mean over the record.
-        std: (T, R, 2) px, standard deviation of that.
-        std_seen: (2,) px, root mean square of the standard deviation of what rows tell: the displacement of the rows
-            that show one scene row, less its mean over the frames.
-        unseen: (2,) px, root mean square of the standard deviation of that mean: of the warp.
-        unexplained: (2,) px, rms displacement of rows that the motion does not explain, beyond their noise.
-        reliable: (2,) bool, whether the motion explains what the rows show.
-        reasons: Why not, for each axis (x, y).
+        displacement: (..., T, R, 2) px, the motion there, less its mean over the record.
+        std: (..., T, R, 2) px, standard deviation of that.
+        std_seen: (..., 2) px, root mean square of the standard deviation of what rows tell: the displacement of the
+            rows that show one scene row, less its mean over the frames.
+        unseen: (..., 2) px, root mean square of the standard deviation of that mean: of the warp.
+        unexplained: (..., 2) px, rms displacement of rows that the motion does not explain, beyond their noise.
+        reliable: (..., 2) bool, whether the motion explains what the rows show.
+        reasons: Why not, for each axis (x, y); a tuple of those for a batch.
     """
 
     motion: FreeMotion
@@ -64,11 +62,19 @@ class MotionDetection:
     unseen: Tensor
     unexplained: Tensor
     reliable: Tensor
-    reasons: tuple[tuple[str, ...], tuple[str, ...]]
+    reasons: tuple[Any, ...]
+
+    def __getitem__(self, index: int) -> "MotionDetection":
+        """The result of one stack out of a batch."""
+        rest = {name: getattr(self, name)[index] for name in self.__dataclass_fields__ if name != "times"}
+        return replace(self, **rest)
 
 
+@outside_graphs
+@full_precision
+@torch.no_grad()
 def detect_motion(
-    frames: Tensor,
+    frames: ArrayLike,
     timing: SensorTiming,
     *,
     registration: Registration = "ncc",
@@ -77,6 +83,7 @@ def detect_motion(
     band_rows: int = 32,
     band_step: int = 16,
     search: int = 16,
+    ignore: ArrayLike | None = None,
     full_scale: float | None = None,
 ) -> MotionDetection:
     """Detect a motion of any shape from consecutive frames: the free model.
@@ -86,7 +93,8 @@ def detect_motion(
     of them, its smoothness chosen by the data.
 
     Args:
-        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames; floats, or integers of known full scale.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, tensor or NumPy array;
+            floats, or integers of known full scale. NaN marks pixels that were not measured.
         timing: The sensor.
         registration: ``"ncc"``, ``"phase"`` or ``"projection"``, for the start.
         knot_rows: Rows read from one knot of the spline to the next: tones up to ``1 / (2 knot_rows T_row)`` fit in.
@@ -95,6 +103,7 @@ def detect_motion(
         band_rows: Rows of a band of the start.
         band_step: Rows from one band to the next.
         search: Search range of the start in px around the whole-frame offset.
+        ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out (dead, saturated).
         full_scale: Count that means 1.0, for integer frames.
 
     Returns:
@@ -102,19 +111,39 @@ def detect_motion(
 
     Raises:
         TypeError: If frames are not numbers.
-        ValueError: If there are fewer than two frames, they are a batch, a frame is constant, the motion is beyond the
-            search range, or an option is out of range.
+        ValueError: If there are fewer than two frames, a frame is constant or has hardly a pixel that counts, the
+            motion is beyond the search range, or an option is out of range.
     """
     check_whole_number("knot_rows", knot_rows, at_least=4)
     check_whole_number("iterations", iterations, at_least=1)
-    grey, rowwise, curve, record = start_curve(frames, timing, full_scale, registration, band_rows, band_step, search)
+    stacks = grey_frames(frames, timing, full_scale, ignore)
+    bands = Bands(registration, band_rows, band_step, search)
+    found = [_detect(stacks.one(i), timing, bands, knot_rows, iterations) for i in range(len(stacks.images))]
+    return _stacked(found) if stacks.batched else found[0]
+
+
+def _stacked(found: list[MotionDetection]) -> MotionDetection:
+    """Results of stacks as one of a batch."""
+    names = ("displacement", "std", "std_seen", "unseen", "unexplained", "reliable")
+    return MotionDetection(
+        motion=FreeMotion.stacked([one.motion for one in found]),
+        times=found[0].times,
+        reasons=tuple(one.reasons for one in found),
+        **{name: torch.stack([getattr(one, name) for one in found]) for name in names},
+    )
+
+
+def _detect(stack: GreyFrames, timing: SensorTiming, bands: Bands, knot_rows: int, iterations: int) -> MotionDetection:
+    """``detect_motion`` of one stack."""
+    grey, valid = stack.images, stack.valid
+    rowwise, curve, record = start_curve(stack, timing, bands)
     starts = rowwise.frame_starts(grey.shape[1], grey.device)
     spacing = max(knot_rows * rowwise.row_time, (record[1] - record[0]) / _MOST_KNOTS)
     size = (grey.shape[-2], grey.shape[-1])
-    measured = measurements_of_curve(curve, rowwise, band_step)
-    fit = fit_spline(measured, max(spacing, 0.5 * band_rows * rowwise.row_time), record)
+    measured = measurements_of_curve(curve, rowwise, bands.band_step)
+    fit = fit_spline(measured, max(spacing, 0.5 * bands.band_rows * rowwise.row_time), record)
     motion = _motion(fit, size, 0.0)
-    groups = frame_groups(grey, None, rowwise, motion)
+    groups = frame_groups(grey, valid, rowwise, motion)
     for step in range(iterations):
         measured = measure_groups(groups, rowwise, motion)
         if step:  # blocks that show something that moves by itself have less say
@@ -130,40 +159,26 @@ def detect_motion(
 
 
 def start_curve(
-    frames: Tensor,
-    timing: SensorTiming,
-    full_scale: float | None,
-    registration: Registration,
-    band_rows: int,
-    band_step: int,
-    search: int,
-) -> tuple[Tensor, SensorTiming, OffsetCurve, tuple[float, float]]:
-    """Grey frames (1, T, H, W) and timing in row order, the offsets of their row bands, start and end of the record.
+    stack: GreyFrames, timing: SensorTiming, bands: Bands
+) -> tuple[SensorTiming, OffsetCurve, tuple[float, float]]:
+    """Timing in row order, the offsets of the row bands of one stack, start and end of the record.
 
     Raises:
-        TypeError: If frames are not numbers.
-        ValueError: If they are no stack of two frames or more, a frame is constant, or hardly a band is found.
+        ValueError: If the frames do not fit the timing, or hardly a band is found.
     """
-    images = as_float_frames(frames, full_scale, minimum_frames=2)
-    if images.ndim == 5:
-        raise ValueError(f"this takes one stack, got a batch of shape {tuple(images.shape)}")
-    images = frames_to_row_order(images, timing)
-    grey = (images.mean(-3) if images.ndim == 4 else images)[None]
-    check_detail(grey[:, :, None])
+    frames = stack.images
     rowwise = timing.in_row_order()
-    rowwise.check_rows(grey.shape[-2])
-    curve = register_rows(
-        grey[:, :, None], rowwise, method=registration, band_rows=band_rows, band_step=band_step, search=search
-    )
+    rowwise.check_rows(frames.shape[-2])
+    curve = band_curve(frames, stack.valid, rowwise, bands, mere_start=True)
     found = float(curve.good.double().mean())
     if found < _LEAST_FOUND:
         raise ValueError(
-            f"only {found:.0%} of the row bands are found in the next frame: the motion is beyond search={search} px "
-            "within a frame, or the frames show different scenes"
+            f"only {found:.0%} of the row bands are found in the next frame: the motion is beyond "
+            f"search={bands.search} px within a frame, or the frames show different scenes"
         )
-    starts = rowwise.frame_starts(grey.shape[1])
-    end = float(starts[-1]) + grey.shape[-2] * rowwise.row_time + rowwise.exposure_time
-    return grey, rowwise, curve, (float(starts[0]), end)
+    starts = rowwise.frame_starts(frames.shape[1])
+    end = float(starts[-1]) + frames.shape[-2] * rowwise.row_time + rowwise.exposure_time
+    return rowwise, curve, (float(starts[0]), end)
 
 
 def _left(measured: Measurements, motion: FreeMotion) -> Tensor:

@@ -2,13 +2,16 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from rsvib_torch.arrays import ArrayLike
 from rsvib_torch.checks import check_whole_number
-from rsvib_torch.detection.detect import measurements_of_curve
+from rsvib_torch.detection.band_curve import Bands, measurements_of_curve
+from rsvib_torch.detection.door import GreyFrames, grey_frames
 from rsvib_torch.detection.freeform import start_curve
 from rsvib_torch.detection.leftovers import independent_fraction, unexplained
 from rsvib_torch.detection.measurements import Measurements
@@ -16,6 +19,7 @@ from rsvib_torch.detection.row_groups import frame_groups, measure_groups
 from rsvib_torch.detection.spline_fit import precision_of_axis
 from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.orientation import vibration_from_row_order
+from rsvib_torch.precision import full_precision, outside_graphs
 from rsvib_torch.registration import Registration
 from rsvib_torch.sensor import SensorTiming
 
@@ -38,19 +42,20 @@ class SweptTone:
     """One tone an axis that fades and sweeps: ``A exp(-g t) sin(2 pi (f t + c t^2 / 2) + phi) + v t``.
 
     All values are those at the time origin, in image axes (x, y); an axis without a significant tone has amplitude 0.
+    A batch of stacks leads all tensors.
 
     Attributes:
-        amplitude: (2,) px A.
-        frequency: (2,) Hz f.
-        decay: (2,) 1/s g; negative where the tone grows.
-        chirp: (2,) Hz/s c.
-        phase: (2,) rad phi.
-        image_motion: (2,) px/s v.
-        std: Standard deviations of amplitude, frequency, decay, chirp and phase by name, (2,) each.
+        amplitude: (..., 2) px A.
+        frequency: (..., 2) Hz f.
+        decay: (..., 2) 1/s g; negative where the tone grows.
+        chirp: (..., 2) Hz/s c.
+        phase: (..., 2) rad phi.
+        image_motion: (..., 2) px/s v.
+        std: Standard deviations of amplitude, frequency, decay, chirp and phase by name, (..., 2) each.
         motion: The motion, as ``restore`` and ``simulate_frames`` take it.
-        unexplained: (2,) px, rms displacement of rows that it does not explain, beyond their noise.
-        reliable: (2,) bool.
-        reasons: Why not, for each axis.
+        unexplained: (..., 2) px, rms displacement of rows that it does not explain, beyond their noise.
+        reliable: (..., 2) bool.
+        reasons: Why not, for each axis; a tuple of those for a batch.
     """
 
     amplitude: Tensor
@@ -63,11 +68,19 @@ class SweptTone:
     motion: FreeMotion
     unexplained: Tensor
     reliable: Tensor
-    reasons: tuple[tuple[str, ...], tuple[str, ...]]
+    reasons: tuple[Any, ...]
+
+    def __getitem__(self, index: int) -> "SweptTone":
+        """The result of one stack out of a batch."""
+        rest = {name: getattr(self, name)[index] for name in self.__dataclass_fields__ if name != "std"}
+        return SweptTone(**rest, std={name: value[index] for name, value in self.std.items()})
 
 
+@outside_graphs
+@full_precision
+@torch.no_grad()
 def detect_swept_tone(
-    frames: Tensor,
+    frames: ArrayLike,
     timing: SensorTiming,
     *,
     registration: Registration = "ncc",
@@ -75,6 +88,7 @@ def detect_swept_tone(
     band_rows: int = 32,
     band_step: int = 16,
     search: int = 16,
+    ignore: ArrayLike | None = None,
     full_scale: float | None = None,
 ) -> SweptTone:
     """Detect one tone an axis whose amplitude decays or grows and whose frequency changes steadily.
@@ -83,13 +97,15 @@ def detect_swept_tone(
     repeated on displacements measured around it on the images, row by row.
 
     Args:
-        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, tensor or NumPy array. NaN
+            marks pixels that were not measured.
         timing: The sensor.
         registration: ``"ncc"``, ``"phase"`` or ``"projection"``, for the start.
         iterations: Rounds of measuring and fitting.
         band_rows: Rows of a band of the start.
         band_step: Rows from one band to the next.
         search: Search range of the start in px around the whole-frame offset.
+        ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out (dead, saturated).
         full_scale: Count that means 1.0, for integer frames.
 
     Raises:
@@ -97,11 +113,49 @@ def detect_swept_tone(
         ValueError: If they cannot be registered, see ``detect_motion``, or an option is out of range.
     """
     check_whole_number("iterations", iterations, at_least=1)
-    grey, rowwise, curve, record = start_curve(frames, timing, full_scale, registration, band_rows, band_step, search)
-    measured = measurements_of_curve(curve, rowwise, band_step)
-    highest = 0.5 / (band_rows * rowwise.row_time)
+    stacks = grey_frames(frames, timing, full_scale, ignore)
+    bands = Bands(registration, band_rows, band_step, search)
+    found = [_detect(stacks.one(index), timing, bands, iterations) for index in range(len(stacks.images))]
+    return _stacked(found, timing) if stacks.batched else found[0].tone
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A result with the parameters, about the middle of the record, that it comes from."""
+
+    tone: SweptTone
+    fits: list[Tensor]
+    record: tuple[float, float]
+
+
+def _stacked(found: list[_Found], timing: SensorTiming) -> SweptTone:
+    """Results of stacks as one of a batch, their motions sampled as finely as the fastest of them needs."""
+    step = min(_step(one.fits, one.record, timing) for one in found)
+    motions = [_in_image(_motion(one.fits, one.record, timing, step), timing) for one in found]
+    tones = [one.tone for one in found]
+    names = (*_NAMES, "image_motion", "unexplained", "reliable")
+    return SweptTone(
+        **{name: torch.stack([getattr(tone, name) for tone in tones]) for name in names},
+        std={name: torch.stack([tone.std[name] for tone in tones]) for name in _NAMES},
+        motion=FreeMotion.stacked(motions),
+        reasons=tuple(tone.reasons for tone in tones),
+    )
+
+
+def _in_image(motion: FreeMotion, timing: SensorTiming) -> FreeMotion:
+    """A batch of one motion in row order as a single one in image axes."""
+    turned = vibration_from_row_order(motion[0], timing)
+    assert isinstance(turned, FreeMotion)
+    return turned
+
+
+def _detect(stack: GreyFrames, timing: SensorTiming, bands: Bands, iterations: int) -> _Found:
+    """``detect_swept_tone`` of one stack."""
+    rowwise, curve, record = start_curve(stack, timing, bands)
+    measured = measurements_of_curve(curve, rowwise, bands.band_step)
+    highest = 0.5 / (bands.band_rows * rowwise.row_time)
     fits = [_start(measured, axis, record, highest) for axis in range(2)]
-    groups = frame_groups(grey, None, rowwise, _motion(fits, record, rowwise))
+    groups = frame_groups(stack.images, stack.valid, rowwise, _motion(fits, record, rowwise))
     for _ in range(iterations):
         motion = _motion(fits, record, rowwise)
         measured = measure_groups(groups, rowwise, motion)
@@ -112,8 +166,9 @@ def detect_swept_tone(
     fits = [fit if gain > _SIGNIFICANT else _still(fit) for fit, _, gain in solved]
     motion = _motion(fits, record, rowwise)
     left = _left(measured, motion)
-    honest = independent_fraction(measured, left)
-    return _report(fits, covariances, honest, motion, unexplained(measured, left)[0], measured, record, timing)
+    honest = independent_fraction(weighed, left) * measured.share_counted(left)
+    tone = _report(fits, covariances, honest, motion, unexplained(measured, left)[0], measured, record, timing)
+    return _Found(tone, fits, record)
 
 
 def _still(fit: Tensor) -> Tensor:
@@ -239,11 +294,19 @@ def _settle(
     return fit, noise * inverse, (alone - cost) / (5 * noise + 1e-300)
 
 
-def _motion(fits: list[Tensor], record: tuple[float, float], timing: SensorTiming) -> FreeMotion:
+def _step(fits: list[Tensor], record: tuple[float, float], timing: SensorTiming) -> float:
+    """Time between the knots of a motion: fine enough for its fastest part."""
+    span = record[1] - record[0]
+    fastest = max(float(fit[2].abs() + 0.5 * fit[4].abs() * span) for fit in fits)
+    return max(min(1 / (_SAMPLES * fastest + 1e-9), span / 64), timing.row_time)
+
+
+def _motion(
+    fits: list[Tensor], record: tuple[float, float], timing: SensorTiming, step: float | None = None
+) -> FreeMotion:
     """Both axes as one motion, sampled finely, as a batch of one."""
     middle, span = 0.5 * (record[0] + record[1]), record[1] - record[0]
-    fastest = max(float(fit[2].abs() + 0.5 * fit[4].abs() * span) for fit in fits)
-    step = max(min(1 / (_SAMPLES * fastest + 1e-9), span / 64), timing.row_time)
+    step = _step(fits, record, timing) if step is None else step
     times = torch.linspace(*record, math.ceil(span / step) + 1, dtype=torch.float64, device=fits[0].device)
     return FreeMotion.through(times, torch.stack([_value(times - middle, fit) for fit in fits], -1)).expanded(1)
 
@@ -294,14 +357,12 @@ def _report(
     order = [1, 0] if timing.scan_axis == -1 else [0, 1]
     whole, spread = torch.stack(values)[order], torch.stack(stds)[order]
     reasons = [reasons[axis] for axis in order]
-    turned = vibration_from_row_order(motion[0], timing)
-    assert isinstance(turned, FreeMotion)
     named = dict(zip(_NAMES, whole.unbind(-1), strict=True))
     return SweptTone(
         **named,
         image_motion=torch.stack(drift)[order],
         std=dict(zip(_NAMES, spread.unbind(-1), strict=True)),
-        motion=turned,
+        motion=_in_image(motion, timing),
         unexplained=unexplained[order],
         reliable=torch.tensor([not found for found in reasons], device=unexplained.device),
         reasons=(reasons[0], reasons[1]),

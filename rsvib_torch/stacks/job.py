@@ -145,7 +145,8 @@ class StackJob:
     def _detect(self, window: Window, frames: Tensor, timing: SensorTiming) -> DetectionResult | DetectedWindow | None:
         if self.given is not None:
             return self.given[window.index]
-        return detect_vibration(frames, timing, **self.detection)
+        found: DetectionResult = detect_vibration(frames, timing, **self.detection)
+        return found
 
     def stored(self, result: WindowResult, pixels: WindowFrames) -> StoredWindow:
         """The frames of a result as they go into the file: what was not restored goes there unchanged."""

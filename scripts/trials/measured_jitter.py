@@ -75,7 +75,7 @@ def scene_of(source: int | Path, height: int, width: int) -> Array:
     """A drawn city, or the middle of an image, its brightness within 0 ... 1."""
     if isinstance(source, int):
         return draw_scene(height, width, source)
-    image = rsv.read_stack(source, full_scale=1.0)[0].double().numpy()
+    image = rsv.read_stack(source, full_scale=65535)[0].double().numpy()
     image = image.mean(0) if image.ndim == 3 else image
     top, left = ((size - wanted) // 2 for size, wanted in zip(image.shape, (height, width), strict=True))
     part = image[top : top + height, left : left + width]

@@ -125,6 +125,58 @@ def test_a_scene_that_changes_is_not_reliable():
         assert not found.reliable.any()
 
 
+@pytest.fixture(scope="module", name="few")
+def make_few(frames):
+    return frames[:4]
+
+
+@pytest.fixture(scope="module", name="few_found")
+def make_few_found(few):
+    return rsv.detect_motion(few, TIMING)
+
+
+def test_pixels_that_were_not_measured_do_not_count(few, few_found):
+    """Dirt on the sensor: bright spots that do not move with the scene."""
+    hole = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    for top, left in np.random.default_rng(1).integers(0, (HEIGHT - 12, WIDTH - 12), (40, 2)):
+        hole[top : top + 12, left : left + 12] = True
+    assert 0.08 < hole.mean() < 0.3
+    dirty = torch.where(torch.from_numpy(hole), 0.9 + 0.1 * torch.rand(HEIGHT, WIDTH), few)
+    truth = Jitter().displacement(few_found.times.numpy())
+
+    def error(result):
+        return rms(seen(result.displacement.numpy() - truth)).max()
+
+    masked = rsv.detect_motion(dirty, TIMING, ignore=hole)
+    assert error(masked) < 0.05
+    assert error(rsv.detect_motion(dirty, TIMING)) > 3 * error(masked)
+    holes = rsv.detect_motion(dirty.masked_fill(torch.from_numpy(hole), torch.nan), TIMING)
+    assert torch.equal(holes.displacement, masked.displacement)
+
+
+def test_a_batch_is_a_loop_and_an_array_a_tensor(few, few_found):
+    other = few.flip(-1).contiguous()
+    both = rsv.detect_motion(torch.stack([few, other])[:, :, None].numpy(), TIMING)
+    for index, single in enumerate((few_found, rsv.detect_vibration(other, TIMING, model="free"))):
+        one = both[index]
+        for name in ("times", "displacement", "std", "std_seen", "unseen", "unexplained", "reliable"):
+            assert torch.equal(getattr(one, name), getattr(single, name)), name
+        times = single.times + 1e-3
+        assert torch.equal(one.motion.displacement(times), single.motion.displacement(times))
+        assert one.reasons == single.reasons
+    assert torch.allclose(both.displacement[1, ..., 0], -few_found.displacement[..., 0], atol=0.05)
+    assert both.motion.displacement(both.times[None]).shape == (2, 4, 32, 2)
+
+
+def test_options_of_tones_do_not_go_with_other_models(few):
+    with pytest.raises(ValueError, match=r"tones=2 goes with model='tones', not with model='free'"):
+        rsv.detect_vibration(few, TIMING, model="free", tones=2)
+    with pytest.raises(ValueError, match="model must be one of"):
+        rsv.detect_vibration(few, TIMING, model="spline")
+    with pytest.raises(ValueError, match="finds steady tones"):
+        rsv.VibrationDetector(TIMING, model="free")
+
+
 def test_command(scene, frames, tmp_path, capsys):
     (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 6e-5\nexposure_rows = 20\nframe_rows = 270\n")
     rsv.write_stack(tmp_path / "frames.tif", frames)
@@ -145,7 +197,8 @@ def test_command(scene, frames, tmp_path, capsys):
     ("frames", "options", "message"),
     [
         (torch.rand(1, 64, 64), {}, "at least 2 frames"),
-        (torch.rand(2, 2, 1, 64, 64), {}, "takes one stack"),
+        (torch.full((2, 64, 64), torch.nan), {}, "frame 0 has only 0.0% of pixels"),
+        (torch.rand(2, 64, 64), {"ignore": torch.zeros(3, 64, 64, dtype=torch.bool)}, "ignore"),
         (torch.rand(2, 64, 64), {"knot_rows": 1}, "knot_rows"),
         (torch.rand(2, 64, 64), {"iterations": 0}, "iterations"),
         (torch.full((2, 64, 64), 0.5), {}, "frame 0 is constant"),

@@ -90,6 +90,30 @@ def test_a_still_axis_has_no_tone(scene):
     assert found.frequency[0].item() == pytest.approx(45.0, rel=0.02)
 
 
+def test_pixels_that_were_not_measured_do_not_count(frames):
+    hole = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    hole[20:230, 60:90] = True  # a bright strip on the sensor
+    dirty = torch.where(hole, 0.5 + 0.5 * torch.rand(HEIGHT, WIDTH), frames)
+    found = rsv.detect_swept_tone(dirty.numpy(), TIMING, ignore=hole.numpy())
+    assert found.amplitude.tolist() == pytest.approx(AMPLITUDE, rel=0.02)
+    assert found.decay.tolist() == pytest.approx(DECAY, abs=0.9)
+    plain = rsv.detect_swept_tone(dirty, TIMING)
+    assert abs(plain.amplitude[1] - AMPLITUDE[1]) > 3 * abs(found.amplitude[1] - AMPLITUDE[1])
+
+
+def test_a_batch_is_a_loop(frames, found):
+    other = frames.flip(-1).contiguous()
+    both = rsv.detect_vibration(torch.stack([frames, other])[:, :, None], TIMING, model="swept")
+    times = TIMING.row_starts(FRAMES, HEIGHT)
+    for index, single in enumerate((found, rsv.detect_swept_tone(other, TIMING))):
+        one = both[index]
+        for name in ("amplitude", "frequency", "decay", "chirp", "phase", "image_motion", "unexplained", "reliable"):
+            assert torch.equal(getattr(one, name), getattr(single, name)), name
+        assert all(torch.equal(one.std[name], single.std[name]) for name in single.std)
+        assert torch.allclose(one.motion.displacement(times), single.motion.displacement(times), atol=1e-4)
+        assert one.reasons == single.reasons
+
+
 def test_command(frames, tmp_path, capsys):
     (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 6e-5\nexposure_rows = 20\nframe_rows = 270\n")
     rsv.write_stack(tmp_path / "frames.tif", frames)
