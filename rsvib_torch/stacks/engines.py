@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import torch
 
 from rsvib_torch.stacks.formats import needed_package
+from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowReader, WindowResult
 from rsvib_torch.stacks.windows import Window
 
@@ -49,6 +50,7 @@ def compute_here(
     Yields:
         What ``finish`` made, in the order of the windows.
     """
+    share_one_heap()
     reader = WindowReader(job.source, job.info)
     before = torch.get_num_threads()
 
