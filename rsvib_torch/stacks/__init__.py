@@ -2,12 +2,16 @@
 
 from rsvib_torch.stacks.atomic import check_writable, whole_file, whole_folder
 from rsvib_torch.stacks.blocks import restore_block
+from rsvib_torch.stacks.detect_windows import detect_stack
 from rsvib_torch.stacks.files import check_stack_target, open_stack, read_stack, read_stack_info, write_stack
 from rsvib_torch.stacks.formats import FrameReader, FrameWriter, StackFormat, register_format
 from rsvib_torch.stacks.info import FrameError, StackInfo
+from rsvib_torch.stacks.iterate import iterate_stack
 from rsvib_torch.stacks.job import BadFrames, WindowResult
+from rsvib_torch.stacks.job_setup import DEFAULT_WINDOW
 from rsvib_torch.stacks.manifest import StackManifest, read_manifest, timing_keys
-from rsvib_torch.stacks.process import DEFAULT_WINDOW, StackReport, detect_stack, iterate_stack, process_stack
+from rsvib_torch.stacks.process import process_stack
+from rsvib_torch.stacks.run import StackReport
 from rsvib_torch.stacks.window_restoration import RestoredFrames, restore_trusted
 from rsvib_torch.stacks.windows import Window, cut_windows
 

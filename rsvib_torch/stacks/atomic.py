@@ -1,5 +1,6 @@
 """Files and folders that appear whole or not at all."""
 
+import glob
 import os
 import shutil
 import tempfile
@@ -8,7 +9,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
+try:
+    import fcntl
+except ImportError:  # systems without it keep what a killed process leaves
+    fcntl = None  # type: ignore[assignment]
+
 __all__ = ["check_writable", "place", "whole_file", "whole_folder", "workplace"]
+
+_ENDING = ".part"
+_DRAWN = "?" * 8  # characters that ``tempfile`` puts between
 
 
 def _nearest_folder(path: Path) -> Path:
@@ -19,18 +28,58 @@ def _nearest_folder(path: Path) -> Path:
     return parent
 
 
+def _remove_abandoned(parent: Path, name: str) -> None:
+    """Remove the temporary folders of processes that were killed: nobody has their lock any more."""
+    for folder in parent.glob(f".{glob.escape(name)}.{_DRAWN}{_ENDING}"):
+        try:
+            file = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY)
+        except OSError:
+            continue
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(folder, ignore_errors=True)
+        except OSError:
+            pass  # in use
+        finally:
+            os.close(file)
+
+
+def _made_and_locked(parent: Path, name: str) -> tuple[Path, int | None]:
+    """A new temporary folder and its lock, where the file system knows locks; the system opens it with the process."""
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=f".{name}.", suffix=_ENDING, dir=parent))
+        if fcntl is None:
+            return folder, None
+        try:
+            file = os.open(folder, os.O_RDONLY)
+        except FileNotFoundError:
+            continue  # another process took it for abandoned
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX)
+        except OSError:
+            os.close(file)
+            return folder, None
+        if folder.is_dir():
+            return folder, file
+        os.close(file)
+
+
 @contextmanager
 def workplace(path: Path) -> Iterator[Path]:
-    """A temporary folder on the file system of ``path``, gone afterwards."""
+    """A temporary folder on the file system of ``path``, gone afterwards; what killed processes left there goes too."""
     parent = _nearest_folder(path)
+    if fcntl is not None:
+        _remove_abandoned(parent, path.name)
     try:
-        work = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=parent))
+        work, lock = _made_and_locked(parent, path.name)
     except OSError as error:
         raise OSError(f"cannot write {path}: folder {parent} is not writable ({error.strerror})") from error
     try:
         yield work
     finally:
         shutil.rmtree(work, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
 
 
 def _check_file_place(path: Path, *, parent_exists: bool = True) -> None:

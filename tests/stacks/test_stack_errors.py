@@ -221,6 +221,37 @@ def test_failure_while_writing_leaves_the_old_file_and_nothing_else(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.txt", "new", "taken"]
 
 
+def test_leftovers_of_killed_processes_go_and_those_in_use_stay(tmp_path):
+    abandoned = tmp_path / ".a[1].txt.k2_w9xyz.part"
+    abandoned.mkdir()
+    (abandoned / "a[1].txt").write_text("half")
+    others = [tmp_path / name for name in (".b.txt.k2_w9xyz.part", ".a[1].txt.part", "a[1].txt.k2_w9xyz.part", "far")]
+    for folder in others:
+        folder.mkdir()
+    (tmp_path / ".a[1].txt.linked00.part").symlink_to(tmp_path / "far", target_is_directory=True)
+    with whole_file(tmp_path / "a[1].txt") as first:
+        assert not abandoned.exists()
+        with whole_file(tmp_path / "a[1].txt") as second:
+            first.write_text("first")
+            second.write_text("second")
+        assert (tmp_path / "a[1].txt").read_text() == "second"
+    assert (tmp_path / "a[1].txt").read_text() == "first"
+    left = {"a[1].txt", ".a[1].txt.linked00.part", *(folder.name for folder in others)}
+    assert {path.name for path in tmp_path.iterdir()} == left
+
+
+def test_file_systems_without_locks_are_written_to(tmp_path, monkeypatch):
+    def refuse(file, operation):
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    kept = tmp_path / ".a.txt.k2_w9xyz.part"  # perhaps in use
+    kept.mkdir()
+    with whole_file(tmp_path / "a.txt") as part:
+        part.write_text("whole")
+    assert {path.name for path in tmp_path.iterdir()} == {"a.txt", kept.name}
+
+
 def test_places_that_cannot_be_written(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.tif").mkdir()
