@@ -12,21 +12,16 @@ import typer
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rsvib_torch.command_options import ConfigOption, DeviceOption, ScaleOption
 from rsvib_torch.config import read_config
-from rsvib_torch.detection import align_motion, detect_motion, detect_swept_tone
+from rsvib_torch.detection import align_motion, check_motion, detect_motion, detect_swept_tone
 from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.motion_file import MotionUnit, TimeUnit, read_motion
 from rsvib_torch.restoration import restore
 from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.stacks import (
-    check_stack_target,
-    check_writable,
-    read_stack,
-    read_stack_info,
-    whole_file,
-    write_stack,
-)
+from rsvib_torch.stacks import check_stack_target, check_writable, read_stack_info, whole_file
 from rsvib_torch.terminal import error_line, say, working
+from rsvib_torch.workflow import chosen_device, full_scale_of, load, save
 
 __all__ = ["known", "motion"]
 
@@ -36,7 +31,7 @@ Array = NDArray[np.float64]
 def motion(
     frames: Annotated[Path, typer.Argument(help="Stack of frames.")],
     *,
-    config: Annotated[Path, typer.Option("--config", help="TOML file that describes the camera.")],
+    config: ConfigOption,
     out: Annotated[Path, typer.Option(help="CSV file to write: time, x, y; and std_x, std_y of a free motion.")],
     model: Annotated[
         Literal["free", "swept"],
@@ -44,7 +39,8 @@ def motion(
     ] = "free",
     knot_rows: Annotated[int, typer.Option(help="Rows from one knot of a free motion to the next.")] = 24,
     search: Annotated[int, typer.Option(help="Search range in px around the whole-frame offset.")] = 16,
-    full_scale: Annotated[float | None, typer.Option(help="Count that means full scale.")] = None,
+    device: DeviceOption = "auto",
+    full_scale: ScaleOption = None,
 ) -> None:
     """Detect a motion that is no steady vibration in a stack of frames.
 
@@ -52,12 +48,9 @@ def motion(
     """
     settings = read_config(config)
     check_writable(out)
-    info = read_stack_info(frames)
-    scale = full_scale if full_scale is not None or not info.is_integer else info.full_scale or settings.full_scale
-    with working(f"reading {frames}"):
-        stack = read_stack(frames, full_scale=scale)
+    stack = load(frames, settings, full_scale, chosen_device(device))
     with working("detecting the motion"):
-        lines, table = _MODELS[model](stack, settings.timing, knot_rows, search)
+        lines, table = _MODELS[model](stack.frames, settings.timing, knot_rows, search)
     with whole_file(out) as file, file.open("w", newline="", encoding="utf-8") as text:
         csv.writer(text).writerows(table)
     for line in lines:
@@ -75,8 +68,8 @@ def _free(stack: Tensor, timing: SensorTiming, knot_rows: int, search: int) -> t
     for axis, name in enumerate("xy"):
         size = float(found.displacement[..., axis].square().mean().sqrt())
         lines.append(
-            f"{name}: moves by {size:.3f} px rms; known to {float(found.std_seen[axis]):.3f} px between frames, what "
-            f"repeats in every frame to {float(found.unseen[axis]):.3f} px; {_verdict(found.reasons[axis])}"
+            f"{name}: moves by {size:.3f} px rms; known to {float(found.std_seen[axis]):.3f} px between frames, a "
+            f"warp that stays with the scene to {float(found.unseen[axis]):.3f} px; {_verdict(found.reasons[axis])}"
         )
     times, values = _sampled(found.motion, float(found.times.max()) + timing.exposure_time, 0.5)
     known_at, stds = found.times.flatten().cpu().numpy(), found.std.flatten(0, 1).cpu().numpy()
@@ -125,7 +118,7 @@ def known(
     frames: Annotated[Path, typer.Argument(help="Stack of frames.")],
     restored: Annotated[Path, typer.Argument(help="Stack to write, in the type and full scale of the frames.")],
     *,
-    config: Annotated[Path, typer.Option("--config", help="TOML file that describes the camera.")],
+    config: ConfigOption,
     motion: Annotated[Path, typer.Option(help="CSV file with the columns time, x and y.")],
     unit: Annotated[MotionUnit, typer.Option(help="Of x and y: px, angles, or rates of angles.")],
     focal_length: Annotated[float | None, typer.Option(help="In px, for angles and rates.")] = None,
@@ -139,9 +132,16 @@ def known(
         ),
     ] = None,
     fit_gain: Annotated[bool, typer.Option("--fit-gain", help="Find the focal length in the frames as well.")] = False,
-    full_scale: Annotated[float | None, typer.Option(help="Count that means full scale.")] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Restore also where the recording does not explain the frames.")
+    ] = False,
+    device: DeviceOption = "auto",
+    full_scale: ScaleOption = None,
 ) -> None:
-    """Restore frames with a motion recorded by a gyroscope or attitude sensor."""
+    """Restore frames with a motion recorded by a gyroscope or attitude sensor.
+
+    The motion is held against the offsets of rows between the frames: one that does not explain them is refused.
+    """
     settings = read_config(config)
     recorded = read_motion(
         motion,
@@ -151,29 +151,65 @@ def known(
         signs=(-1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0),
     )
     info = read_stack_info(frames)
-    scale = full_scale if full_scale is not None or not info.is_integer else info.full_scale or settings.full_scale
+    scale = full_scale_of(frames, info, settings, full_scale)
     check_stack_target(restored, info.shape, dtype=info.dtype, full_scale=scale)
-    with working(f"reading {frames}"):
-        stack = read_stack(frames, full_scale=scale)
+    stack = load(frames, settings, full_scale, chosen_device(device))
     if offset is None:
         with working("looking for the frames in the recording"):
-            found = align_motion(stack, settings.timing, recorded, fit_gain=fit_gain)
+            found = align_motion(stack.frames, settings.timing, recorded, fit_gain=fit_gain)
         say(f"clock {found.offset:.6f} ± {found.offset_std:.6f} s at the first row, speed {found.scale:.7f}")
         say(f"gain {found.gain[0]:.4f}, {found.gain[1]:.4f}; drift {found.drift[0]:.4g}, {found.drift[1]:.4g} px/s")
-        for reason in found.reasons:
-            error_line(reason, "warning")
+        _refuse(motion, found.reasons, force)
         moving = found.motion
     else:
-        moving = recorded.retimed(offset)
-        rows = stack.shape[-1 if settings.timing.scan_axis == -1 else -2]
-        last = float(settings.timing.row_starts(len(stack), rows).max()) + settings.timing.exposure_time
-        if moving.start > 1e-9 or moving.end < last - 1e-9:
-            raise ValueError(
-                f"{motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, the frames need {offset:.6g} to "
-                f"{offset + last:.6g} s"
-            )
+        moving = _placed(motion, recorded, offset, stack.frames, settings.timing)
+    _judge(motion, stack.frames, settings.timing, moving, force, required=offset is None)
     with working("restoring the frames"):
-        clear = restore(stack, settings.timing, moving, **settings.restoration)
-    with working(f"writing {restored}"):
-        write_stack(restored, clear, dtype=info.dtype, full_scale=scale)
+        clear = restore(stack.frames, settings.timing, moving, **settings.restoration)
+    save(restored, clear, stack)
     say(f"{restored}: {len(clear)} frames restored, {info.dtype}")
+
+
+def _refuse(path: Path, reasons: tuple[str, ...], force: bool) -> None:
+    """An error for a recording that speaks against itself; warnings where it is to be used all the same."""
+    if reasons and not force:
+        raise ValueError(f"{path}: {'; '.join(reasons)}; --force restores with it all the same")
+    for reason in reasons:
+        error_line(reason, "warning")
+
+
+def _placed(path: Path, recorded: FreeMotion, offset: float, frames: Tensor, timing: SensorTiming) -> FreeMotion:
+    """The recording on the clock of the frames, at an offset that was given."""
+    moving = recorded.retimed(offset)
+    rows = frames.shape[-1 if timing.scan_axis == -1 else -2]
+    starts = timing.row_starts(len(frames), rows)
+    first, last = float(starts.min()), float(starts.max()) + timing.exposure_time
+    if moving.start > first + 1e-9 or moving.end < last - 1e-9:
+        raise ValueError(
+            f"{path}: covers {recorded.start:.6g} to {recorded.end:.6g} s, the frames need {offset + first:.6g} to "
+            f"{offset + last:.6g} s"
+        )
+    return moving
+
+
+def _judge(
+    path: Path, frames: Tensor, timing: SensorTiming, moving: FreeMotion, force: bool, *, required: bool
+) -> None:
+    """Say how far rows are apart before and after, and refuse a motion that brings them no closer."""
+    if len(frames) < 2:
+        error_line("one frame alone does not tell whether the motion fits", "warning")
+        return
+    try:
+        with working("holding the motion against the frames"):
+            check = check_motion(frames, timing, moving)
+    except ValueError as error:
+        if required:
+            raise
+        error_line(f"whether the motion fits cannot be told: {error}", "warning")
+        return
+    before, after = (" and ".join(f"{value:.3f}" for value in sizes) for sizes in (check.before, check.after))
+    say(f"rows are {before} px rms apart between frames along x and y, less the motion {after} px")
+    if not check.helps:
+        _refuse(path, check.reasons or ("the motion brings rows no closer to each other",), force)
+    for reason in check.reasons if check.helps else ():
+        error_line(reason, "warning")

@@ -21,9 +21,9 @@ FLOORS = (
     {"stacks", "motion_file"},
     {"config", "pictures", "terminal"},
     {"report", "pages"},
-    {"workflow", "calibrate_command", "motion_command"},
+    {"workflow", "calibrate_command"},
     {"command_options"},
-    {"stack_commands"},
+    {"stack_commands", "motion_command"},
     {"cli"},
 )
 

@@ -300,7 +300,7 @@ def _reasons(unexplained: Tensor, size: Tensor, other: float | None, offset_std:
     if float(size.amax()) < _LEAST_MOTION:
         reasons.append(f"the recorded motion moves rows by {float(size.amax()):.2g} px between frames: too little")
     for axis, name in enumerate(("along the rows", "across the rows")):
-        if float(unexplained[axis]) > max(_EXPLAINED * float(size.amax()), _FINEST):
+        if float(unexplained[axis]) > max(_EXPLAINED * float(size[axis]), _FINEST):
             reasons.append(f"rows move by {float(unexplained[axis]):.3g} px {name} that the recording does not explain")
     if other is not None:
         reasons.append(f"an offset of {other:.6g} s explains the frames as well: the motion repeats")

@@ -17,7 +17,7 @@ MOST_KNOTS = 800  # whose spectrum is learned: the cost grows with the cube of t
 _ROUNDS = 20
 _NEIGHBOURS = 2.0  # standard deviation of the window over frequencies, in half cycles in the record
 _BEYOND = 10  # knots, at least, by which cosines reach beyond the record: their ends are level
-_FREE = 1e-6  # of the precision of the motion's own size, on its mean and slope
+_ANCHOR = 1e-9  # of the mean information, on all: the mean over the record is not known
 
 
 def fit_with_spectrum(
@@ -34,7 +34,6 @@ def fit_with_spectrum(
         right: (N,) right-hand side.
         noise: Variance of measurements of unit weight.
         smoothness: Weight of the squares of second differences in the sum of squares, to start with.
-        size: Mean square of the motion.
 
     Returns:
         Coefficients and covariance.
@@ -46,17 +45,18 @@ def fit_with_spectrum(
     place = torch.arange(count, dtype=torch.float64, device=right.device)
     angle = math.pi / length * order
     waves = torch.cos(angle * (place[:, None] + beyond + 0.5)) * math.sqrt(2 / length)
-    columns = torch.cat([waves, (place - place.mean())[:, None] / count], 1)
+    line = place - place.mean()
+    columns = torch.cat([waves, (line / line.norm())[:, None]], 1)
     matrix = columns.mT @ gram @ columns / noise
     target = columns.mT @ right / noise
     expected = noise / smoothness * (2 * torch.sin(0.5 * angle[1:])) ** -4
     window = torch.exp(-0.5 * ((order[1:, None] - order[1:]) / _NEIGHBOURS) ** 2)
     window = window / window.sum(1, keepdim=True)
-    free = right.new_full((1,), _FREE / (max(size, 1e-300) * count))
+    anchor = (_ANCHOR * matrix.diagonal().mean()).expand(1)
     power = expected
     amplitude, spread = torch.zeros_like(target), matrix
     for _ in range(_ROUNDS):
-        whole = matrix + torch.diag(torch.cat([free, 1 / power, free]))
+        whole = matrix + torch.diag(torch.cat([anchor, anchor + 1 / power, anchor]))
         spread = torch.cholesky_inverse(torch.linalg.cholesky(whole))
         amplitude = spread @ target
         found = amplitude[1:-1].square() + spread.diagonal()[1:-1]

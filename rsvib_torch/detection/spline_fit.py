@@ -133,7 +133,7 @@ def _fit_axis(measurements: Measurements, shape: SplineFit, axis: int, learn: bo
     _, found, factor = evidence(smoothness)
     noise = max(energy - float(right @ found), _WORTH * energy) / known
     if learn and count <= MOST_KNOTS and noise > 0:
-        return fit_with_spectrum(gram, right, noise, smoothness * scale, float((found - found.mean()).square().mean()))
+        return fit_with_spectrum(gram, right, noise, smoothness * scale)
     return found, noise * torch.cholesky_inverse(factor)
 
 

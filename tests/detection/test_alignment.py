@@ -1,5 +1,7 @@
 """Motion recorded on another clock: found again in the frames of an independent simulator."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -139,14 +141,23 @@ def test_command(frames, gyroscope, tmp_path, capsys):
         str(tmp_path / "camera.toml"),
     ]
     arguments += ["--motion", str(gyroscope), "--unit", "rad/s"]
-    assert run_command([*arguments, "--focal-length", "900"]) == 0
-    assert "clock 812.34" in capsys.readouterr().out
+    assert run_command([*arguments, "--focal-length", "900", "--device", "cpu"]) == 0
+    said = capsys.readouterr().out
+    assert "clock 812.34" in said
+    before, after = (
+        float(value) for value in re.search(r"rows are (\S+) and .* less the motion (\S+) and", said).groups()
+    )
+    assert before > 1.0
+    assert after < 0.1 * before
     first = rsv.read_stack(tmp_path / "out.tif")
     assert first.shape == frames.shape
     assert run_command([*arguments, "--focal-length", "900", "--offset", str(CLOCK)]) == 0
     assert (rsv.read_stack(tmp_path / "out.tif") - first).square().mean() < 0.01
+    (tmp_path / "out.tif").unlink()
     for more, message in (
         (["--focal-length", "900", "--offset", "813.35"], "the frames need"),
+        (["--focal-length", "900", "--offset", str(CLOCK), "--flip-x", "--flip-y"], "further apart along x"),
+        (["--focal-length", "900", "--flip-x"], "does not explain"),
         ([], "needs a focal_length"),
         (["--focal-length", "900", "--time-unit", "us"], "really in us"),
     ):
@@ -155,3 +166,61 @@ def test_command(frames, gyroscope, tmp_path, capsys):
         errors = capsys.readouterr().err.strip().splitlines()
         assert len(errors) == 1
         assert message in errors[0]
+        assert not (tmp_path / "out.tif").exists()
+    forced = ["--focal-length", "900", "--offset", str(CLOCK), "--flip-x", "--flip-y", "--force"]
+    assert run_command([*arguments, *forced]) == 0
+    assert "further apart along y" in capsys.readouterr().err
+    assert (tmp_path / "out.tif").exists()
+
+
+def at(times, factor=1.0):
+    return rsv.FreeMotion.from_samples(times, factor * Shaken().displacement(times))
+
+
+def test_the_right_motion_explains_the_offsets_and_wrong_ones_do_not(frames):
+    times = np.arange(-0.01, 0.1, 5e-4)
+    right = rsv.check_motion(frames.numpy(), TIMING, at(times))
+    assert right.helps
+    assert right.reasons == ()
+    assert (right.after < 0.1).all()
+    assert (right.before > 1.0).all()
+    curve = rsv.register_bands(frames, TIMING).offsets
+    assert (right.before < curve.square().nanmean((0, 1)).sqrt()).all()
+    half = rsv.check_motion(frames, TIMING, at(times, 0.4))
+    assert half.helps
+    assert all("the motion leaves" in reason for reason in half.reasons)
+    assert len(half.reasons) == 2
+    wrong = rsv.check_motion(frames, TIMING, at(times, -1.0))
+    assert not wrong.helps
+    assert all("further apart along" in reason for reason in wrong.reasons)
+    still = rsv.check_motion(frames, TIMING, at(times, 0.0))
+    assert not still.helps
+
+
+def test_axes_are_those_of_the_image(frames):
+    timing = rsv.SensorTiming(6e-5, 20, 300, scan_axis=-1, readout_direction="reverse")
+    times = np.arange(-0.01, 0.1, 5e-4)
+    straight = rsv.check_motion(frames, TIMING, at(times))
+    turned = rsv.FreeMotion.from_samples(times, Shaken().displacement(times)[:, ::-1] * [-1, 1])
+    other = rsv.check_motion(frames.flip(-2).transpose(-2, -1), timing, turned)
+    assert torch.allclose(other.before, straight.before.flip(0), rtol=1e-3)
+    assert (other.after < 0.1).all()
+
+
+def test_pixels_that_were_not_measured_do_not_count(frames, gyroscope):
+    hole = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    hole[10:200, 60:85] = True
+    dirty = torch.where(hole, 0.5 + 0.5 * torch.rand(HEIGHT, WIDTH), frames)
+    recorded = rsv.read_motion(gyroscope, unit="rad/s", focal_length=FOCAL_LENGTH)
+    found = rsv.align_motion(dirty, TIMING, recorded, ignore=hole)
+    assert found.offset == pytest.approx(CLOCK, abs=5e-5)
+    assert found.reliable
+
+
+@pytest.mark.parametrize("function", [rsv.align_motion, rsv.check_motion])
+def test_one_stack_and_one_motion_are_taken(frames, function):
+    recorded = at(np.arange(-0.01, 0.1, 5e-4))
+    with pytest.raises(ValueError, match="takes one"):
+        function(frames[None, :, None], TIMING, recorded)
+    with pytest.raises(ValueError, match="takes one"):
+        function(frames, TIMING, recorded.expanded(2))
