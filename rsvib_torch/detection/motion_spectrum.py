@@ -20,9 +20,7 @@ _BEYOND = 10  # knots, at least, by which cosines reach beyond the record: their
 _ANCHOR = 1e-9  # of the mean information, on all: the mean over the record is not known
 
 
-def fit_with_spectrum(
-    gram: Tensor, right: Tensor, noise: float, smoothness: float, size: float
-) -> tuple[Tensor, Tensor]:
+def fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: float) -> tuple[Tensor, Tensor]:
     """Coefficients (N,) of a spline and their covariance (N, N), the power of each frequency being estimated.
 
     The coefficients are a straight line and cosines that reach beyond the record, ``c = sum_j a_j cos(w_j (n + 1/2))``
