@@ -144,7 +144,9 @@ class Journal:
     def add(self, record: dict[str, Any]) -> None:
         """Note a window whose frames are on the disk."""
         assert self._file is not None
-        os.write(self._file, json.dumps(record, allow_nan=False).encode() + b"\n")
+        line = json.dumps(record, allow_nan=False).encode() + b"\n"
+        while line:  # a disk that is almost full takes a part of it
+            line = line[os.write(self._file, line) :]
         os.fsync(self._file)
         self.count += 1
         self.written += record["written"]

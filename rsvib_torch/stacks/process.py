@@ -122,7 +122,9 @@ def process_stack(
             return run.report(_records(target), len(windows), start, target)
         fresh = not journal.open(header, resume=resume)
         resumed = journal.count
-        writer = Sink(sink, journal.folder, form, out, sure=bad_frames == "pass", compression=compression, fresh=fresh)
+        sure = bad_frames == "pass"
+        with disk_trouble_named(sink, journal):
+            writer = Sink(sink, journal.folder, form, out, sure=sure, compression=compression, fresh=fresh)
         try:
             run.write(writer, journal)
             with disk_trouble_named(sink, journal):

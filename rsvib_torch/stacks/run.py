@@ -1,5 +1,6 @@
 """The windows of a stack on their way through an engine into a sink."""
 
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -52,7 +53,9 @@ def disk_trouble_named(sink: Path, journal: Journal) -> Iterator[None]:
         yield
     except OSError as error:
         kept = f"; {journal.count} windows are kept, resume goes on with them" if journal.count else ""
-        raise OSError(error.errno, f"{error.strerror or error}{kept}", str(sink)) from error
+        # libraries add much to what the system says
+        said = os.strerror(error.errno) if error.errno else " ".join(str(error).split())
+        raise OSError(error.errno, f"{said}{kept}", str(sink)) from error
 
 
 class StackRun:

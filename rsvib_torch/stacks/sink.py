@@ -68,7 +68,9 @@ class Sink:
         elif frames:
             part = self._staged / f"{window:06d}.part"
             with part.open("wb") as file:
-                np.save(file, np.stack(frames), allow_pickle=False)
+                stack = np.stack(frames)
+                np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(stack))
+                file.write(stack.data)  # np.save does not say why it cannot
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(part, self._staged / f"{window:06d}.npy")

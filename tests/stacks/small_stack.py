@@ -19,6 +19,26 @@ OPTIONS = {
     "workers": 1,
 }
 WINDOWS = 8
+CONFIG = """
+[sensor]
+row_time = 1e-4
+exposure_rows = 6
+frame_rows = 104
+full_scale = 4095
+
+[detection]
+method = "bands"
+band_rows = 16
+band_step = 8
+search = 6
+tones = 1
+
+[restoration]
+method = "dewarp"
+
+[stack]
+window = 3
+"""
 _TEXTURE = ndimage.gaussian_filter(np.random.default_rng(4).standard_normal((HEIGHT + 80, WIDTH + 80)), 1.1)
 SCENE = np.clip(0.5 + 0.15 * _TEXTURE / _TEXTURE.std(), 0.0, 1.0)
 STILL = crop(SCENE)

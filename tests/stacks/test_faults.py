@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from small_stack import FRAMES, OPTIONS, WINDOWS, fork_server, process_small, write_small
+from small_stack import CONFIG, FRAMES, OPTIONS, WINDOWS, fork_server, process_small, write_small
 
+from rsvib_torch.cli import run_command
 from rsvib_torch.stacks import read_manifest
 from rsvib_torch.stacks.journal import work_folder
 
@@ -164,6 +165,26 @@ def test_kill_at_every_kind_of_file_call(forks, whole_zarr, tmp_path, name):
     assert run_apart(forks, whole / "frames.tif", tmp_path / "count" / name, counted=counted, **options) == 0
     for die_at in {*range(1, 12, 2), *range(12, counted.value, 11), *range(counted.value - 12, counted.value + 1)}:
         kill_and_resume(forks, whole, tmp_path / f"{die_at}", name, die_at=die_at, **options)
+
+
+def _command(arguments, die_at):
+    torch.set_num_threads(1)
+    _count_file_calls(die_at)
+    assert run_command(arguments) == 0
+
+
+def test_command_killed_at_its_first_look_leaves_nothing_for_good(forks, whole, tmp_path):
+    (tmp_path / "camera.toml").write_text(CONFIG)
+    arguments = ["run", str(whole / "frames.tif"), str(tmp_path / "out"), "--config", str(tmp_path / "camera.toml")]
+    process = forks.Process(target=_command, args=(arguments, 2))
+    process.start()
+    process.join(timeout=60)
+    assert process.exitcode == -signal.SIGKILL
+    left = [path for path in tmp_path.iterdir() if path.name.startswith(".out.")]
+    assert [path.suffix for path in left] == [".part"]
+    assert run_command([*arguments, "--resume"]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"camera.toml", "out"}
+    assert (tmp_path / "out" / "restored.tif").read_bytes() == (whole / "out.tif").read_bytes()
 
 
 @pytest.fixture(name="broken")

@@ -1,0 +1,68 @@
+"""Runs on a file system that is full, with nothing but JSON on standard output: to be run where it may be mounted.
+
+Every run is told by what it said, what it left, and whether it went on to the same bytes when there was room again.
+"""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import torch
+from small_stack import process_small
+
+from rsvib_torch.cli import run_command
+
+PAGE = 4096
+
+
+def free_pages(folder):
+    disk = os.statvfs(folder)
+    return disk.f_bavail * disk.f_frsize // PAGE
+
+
+def leave_free(folder, pages):
+    """Fill the disk up to so many pages."""
+    with (folder / "ballast").open("wb") as file:
+        file.write(b"b" * (PAGE * (free_pages(folder) - pages)))
+    assert abs(free_pages(folder) - pages) <= 1
+
+
+def content(path):
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    return {str(file.relative_to(path)): file.read_bytes() for file in files}
+
+
+def try_small_disk(source, whole, disk, name, pages, options):
+    leave_free(disk, pages)
+    said = "done"
+    try:
+        process_small(source, disk / "new" / name, **options)
+    except OSError as error:
+        said = str(error)
+    made = (disk / "new" / name).exists()
+    left = [path.name for path in (disk / "new").iterdir()] if (disk / "new").exists() else []
+    (disk / "ballast").unlink()
+    report = process_small(source, disk / "new" / name, resume=True, **options)
+    same = content(disk / "new" / name) == content(whole / name)
+    names = sorted(path.name for path in (disk / "new").iterdir())
+    for path in sorted((disk / "new").rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    (disk / "new").rmdir()
+    return {"said": said, "made": made, "left": left, "resumed": report.resumed, "same": same, "names": names}
+
+
+def main():
+    source, whole, disk, trials = Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), json.loads(sys.argv[4])
+    torch.set_num_threads(1)
+    results = [try_small_disk(source, whole, disk, *trial) for trial in trials]
+    leave_free(disk, 20)
+    command = ["run", str(source), str(disk / "out"), "--config", str(source.with_name("camera.toml"))]
+    code = run_command([*command, "--output", "out.zarr"])
+    (disk / "ballast").unlink()
+    again = run_command([*command, "--output", "out.zarr", "--resume"])
+    print(json.dumps({"runs": results, "codes": [code, again], "names": sorted(os.listdir(disk / "out"))}))
+
+
+if __name__ == "__main__":
+    main()

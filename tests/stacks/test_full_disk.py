@@ -1,0 +1,107 @@
+"""A disk that is really full: one line, nothing half-written, and the run goes on when there is room again."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from small_stack import CONFIG, WINDOWS, process_small, write_small
+
+TRIALS = [
+    ["out.tif", 20, {}],  # the room that it needs is taken first
+    ["out.tif", 55, {}],  # enough for the frames, not for the journal
+    ["out.zarr", 20, {}],
+    ["out.npy", 30, {"bad_frames": "skip"}],  # windows wait in files of their own
+    ["out.npy", 70, {"bad_frames": "skip"}],  # all of them do, but what is made of them does not fit beside
+]
+MORE_TRIALS = [
+    [name, pages, options]
+    for name, options in (
+        ("out.tif", {}),
+        ("out.tif", {"bad_frames": "skip"}),
+        ("packed.tif", {"compression": "zlib"}),
+        ("out.zarr", {}),
+        ("out.h5", {}),
+        ("out.raw", {}),
+        ("frames", {}),
+    )
+    for pages in (2, 5, 9, 14, 23, 37, 52, 58, 61, 80)
+]
+
+
+@pytest.fixture(scope="module", name="mount")
+def find_how_to_mount():
+    """A command that runs a shell where it may mount, seen by nobody else."""
+    for options in ("-m", "-rm"):
+        command = ["unshare", options, "sh", "-c"]
+        if shutil.which("unshare") is None:
+            break
+        trial = subprocess.run([*command, "mount -t tmpfs -o size=64k none /mnt"], capture_output=True, check=False)
+        if trial.returncode == 0:
+            return command
+    pytest.skip("file systems cannot be mounted here")
+
+
+@pytest.fixture(scope="module", name="whole")
+def process_whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    write_small(folder / "frames.tif")
+    (folder / "camera.toml").write_text(CONFIG)
+    return folder
+
+
+def run_on_full_disks(mount, whole, folder, trials):
+    for name, options in {name: options for name, _, options in trials}.items():
+        if not (whole / name).exists():
+            process_small(whole / "frames.tif", whole / name, **options)
+    (folder / "disk").mkdir()
+    shell = f'mount -t tmpfs -o size=1m,mode=755 none "{folder / "disk"}" && exec "$@"'
+    program = [sys.executable, str(Path(__file__).with_name("small_disk.py"))]
+    arguments = [str(whole / "frames.tif"), str(whole), str(folder / "disk"), json.dumps(trials)]
+    done = subprocess.run(
+        [*mount, shell, "sh", *program, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = json.loads(done.stdout.splitlines()[-1])
+    for trial, run in zip(trials, found["runs"], strict=True):
+        if run["said"] != "done":
+            assert "No space left on device" in run["said"], trial
+            assert "\n" not in run["said"]
+            assert not run["made"], trial
+            assert set(run["left"]) <= {f".{trial[0]}.rsvib"}, trial
+            kept = f"{run['resumed']} windows are kept, resume goes on with them"
+            assert (kept in run["said"]) == (run["resumed"] > 0), trial
+        assert run["same"], trial
+        companion = {"out.raw.json"} if trial[0] == "out.raw" else set()
+        assert set(run["names"]) == {trial[0], f"{trial[0]}.manifest.json"} | companion, trial
+    return found, done.stderr
+
+
+def test_full_disk_stops_in_one_line_and_the_run_goes_on_later(mount, whole, tmp_path):
+    found, shown = run_on_full_disks(mount, whole, tmp_path, TRIALS)
+    runs = found["runs"]
+    assert all(run["said"] != "done" for run in runs)
+    assert runs[0]["left"] == []
+    assert runs[0]["resumed"] == 0 < runs[1]["resumed"] < WINDOWS
+    assert 0 < runs[2]["resumed"] < WINDOWS
+    assert 0 < runs[3]["resumed"] < WINDOWS
+    assert runs[4]["resumed"] == WINDOWS
+    assert found["codes"] == [2, 0]
+    assert {"out.zarr", "manifest.json"} < set(found["names"])
+    assert shown.count("\n") == shown.count("rsvib: error: ") == 1
+
+
+@pytest.mark.slow
+def test_disks_full_at_any_moment(mount, whole, tmp_path):
+    found, _ = run_on_full_disks(mount, whole, tmp_path, MORE_TRIALS)
+    stopped = [run["resumed"] for run in found["runs"] if run["said"] != "done"]
+    assert len(stopped) > len(MORE_TRIALS) // 2
+    assert len(set(stopped)) > 3
