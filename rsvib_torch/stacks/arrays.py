@@ -1,4 +1,4 @@
-"""Stacks in NumPy ``.npy`` files, read in place frame by frame."""
+"""Stacks in NumPy ``.npy`` files, mapped into memory to be read."""
 
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -7,7 +7,8 @@ import numpy as np
 
 from rsvib_torch.stacks.formats import StackFormat, register_format
 from rsvib_torch.stacks.info import StackInfo
-from rsvib_torch.stacks.placed import ArrayReader, PlacedReader, PlacedWriter, check_frames_held
+from rsvib_torch.stacks.mapped import MappedReader
+from rsvib_torch.stacks.placed import PlacedWriter
 from rsvib_torch.stacks.scale import check_dtype, known_full_scale
 
 __all__ = ["create_array", "open_array"]
@@ -37,16 +38,13 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[tuple[int, ...], bool, np.
     return shape, columns_first, dtype, file.tell()
 
 
-def open_array(path: Path) -> ArrayReader | PlacedReader:
-    """Open a ``.npy`` file: (H, W), (T, H, W) or (T, C, H, W). Pickled objects are refused."""
+def open_array(path: Path) -> MappedReader:
+    """Map a ``.npy`` file: (H, W), (T, H, W) or (T, C, H, W). Pickled objects are refused."""
     with path.open("rb") as file:
         shape, columns_first, dtype, offset = _read_header(file, path)
     info = StackInfo(_stack_shape(shape, path), dtype.name, known_full_scale(dtype))
     try:
-        if not columns_first:
-            return PlacedReader(path, info, offset, dtype)
-        check_frames_held(info, offset, path.stat().st_size)
-        return ArrayReader(info, np.load(path, mmap_mode="r", allow_pickle=False).reshape(info.shape))
+        return MappedReader(path, info, offset, dtype, "F" if columns_first else "C")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

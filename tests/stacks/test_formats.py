@@ -2,6 +2,7 @@
 
 import json
 import sys
+from pathlib import Path
 
 import cv2
 import h5py
@@ -12,6 +13,7 @@ import torch
 import zarr
 
 from rsvib_torch.stacks import (
+    FrameError,
     StackFormat,
     StackInfo,
     formats,
@@ -91,6 +93,41 @@ def test_frames_are_read_one_at_a_time_in_any_order(tmp_path):
         for index in (2, 0, 1):
             np.testing.assert_array_equal(reader.frame(index), COUNTS[index])
         reader.close()
+
+
+def _file_pages():
+    """Memory of this process that is pages of files, in bytes."""
+    line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("RssFile:"))
+    return 1024 * int(line.split()[1])
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell")
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_mapped_pages_do_not_pile_up(tmp_path, order):
+    frames = np.random.default_rng(2).integers(0, 256, (32, 512, 512)).astype(np.uint8)
+    np.save(tmp_path / "a.npy", np.asarray(frames, order=order))
+    reader = open_stack(tmp_path / "a.npy")
+    before = _file_pages()
+    for index in range(32):
+        np.testing.assert_array_equal(reader.frame(index), frames[index])
+    assert _file_pages() - before < 1_000_000
+    reader.close()
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_mapped_file_that_shrinks_is_an_error(tmp_path, order):
+    big_endian = np.asarray(COUNTS.repeat(800, axis=1).astype(">u2"), order=order)
+    np.save(tmp_path / "a.npy", big_endian)
+    reader = open_stack(tmp_path / "a.npy")
+    frame = reader.frame(2)
+    np.testing.assert_array_equal(frame, big_endian[2])
+    assert frame.dtype.isnative
+    with (tmp_path / "a.npy").open("r+b") as file:
+        file.truncate(5000)
+    for index in range(3):
+        with pytest.raises(FrameError, match=f"truncated: frame {index} lies beyond the end of the file"):
+            reader.frame(index)
+    reader.close()
 
 
 def test_floats_go_into_a_folder_of_tiff_files(tmp_path):
