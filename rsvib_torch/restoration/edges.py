@@ -8,14 +8,23 @@ from torch import Tensor
 from rsvib_torch.restoration.row_kernel import REACH, kernel_samples
 from rsvib_torch.restoration.scene_solver import Coefficients, SceneSolver
 
-__all__ = ["STAGES", "expectation", "expectation_precision", "shrink_patches"]
+__all__ = ["expectation", "expectation_precision", "shrink_patches", "stages"]
 
 # strength of the pull towards the patches in units of the data's weight, level of what is cut out of them in units of
 # the noise, and px between patches; chosen on scenes of four kinds at noise 0.02
-STAGES = ((1.0, 1.0, 2), (3.0, 0.7, 2), (10.0, 0.5, 1))
+_STAGES = ((1.0, 1.0, 2), (3.0, 0.7, 2), (10.0, 0.5, 1))
+# a long exposure leaves far more noise in what is hardly seen than white noise of one level: the patches fill that
+# first, from what stands out most
+_STAGES_OF_BLUR = ((0.03, 5.0, 2), (0.1, 3.0, 2), (0.3, 1.8, 2))
+_BLURRED = 1.0  # px that the scene moves during an exposure
 _PATCH = 8  # px
 _THRESHOLD = 2.0  # cosines of a patch weaker than this many standard deviations are taken for noise
 _ROWS = 64  # of pixels, at a time; a multiple of all steps
+
+
+def stages(smear: float) -> tuple[tuple[float, float, int], ...]:
+    """Strength, level and step of all pulls towards the patches, for exposures that smear the scene by so many px."""
+    return _STAGES if smear <= _BLURRED else _STAGES_OF_BLUR + _STAGES
 
 
 def _cosines(like: Tensor) -> Tensor:

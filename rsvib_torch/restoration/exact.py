@@ -1,6 +1,6 @@
 """Exact restoration: all rows of a frame, each with its own PSF, solved together."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -9,13 +9,14 @@ from torch import Tensor
 from rsvib_torch.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.disagreement import noise_levels
-from rsvib_torch.restoration.edges import STAGES, expectation, expectation_precision
+from rsvib_torch.restoration.edges import expectation, expectation_precision, stages
+from rsvib_torch.restoration.filling import fill_beyond_ends, fill_unmeasured
 from rsvib_torch.restoration.missing import fill_roughly, measured_values
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.prior import fit_prior
 from rsvib_torch.restoration.row_system import RowKernels, row_kernels
 from rsvib_torch.restoration.rows import continue_rows
-from rsvib_torch.restoration.scene_solver import SceneSolver
+from rsvib_torch.restoration.scene_problem import SceneProblem
 from rsvib_torch.restoration.strength import prior_strength
 from rsvib_torch.spectral import fast_length
 
@@ -24,10 +25,8 @@ __all__ = ["ScenePrior", "restore_exact"]
 ScenePrior = Literal["gaussian", "edges"]
 
 _MARGIN = 16  # px beyond what the motion shows, more than the reach of a deconvolution filter
-_FILL_ITERATIONS = 8  # of filling values that were not measured
 _LONG = 1.0  # px along the row either way: beyond, ends of rows are worth being continued by what the blur demands
-_MOSTLY = 0.9  # frames with at least this part of the most complete one start the filling
-_LOOSE, _REST = 0.1, 0.1  # parts of the quadratic prior that patches start from and keep
+_LOOSE, _REST = 0.3, 0.03  # parts of the quadratic prior that patches start from and keep
 _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
 _SEGMENT_ROWS = {"cuda": 256}  # rows solved side by side
 _CHUNK_ELEMENTS = {"cpu": 3 << 18, "cuda": 1 << 26}  # rows times frequencies solved at a time
@@ -53,89 +52,12 @@ def _chosen_by(groups: list[tuple[list[int], int]], shift: Tensor) -> tuple[list
     return [frame for frame in members if torch.equal(shift[frame], shift[reference])], reference
 
 
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """One scene, seen by M frames.
-
-    Attributes:
-        data: (M, C, R, L) rows continued to a period.
-        kernels: How the frames see it.
-        precision: What it is like, products as from ``RowPrior.precision``.
-        level: Standard deviation of the noise of data of weight 1.
-        chunk: Frequencies solved at a time.
-        segments: Segments of rows that are solved side by side.
-    """
-
-    data: Tensor
-    kernels: RowKernels
-    precision: Tensor
-    level: Tensor
-    chunk: int
-    segments: int
-
-    def solver(self, weight: Tensor | None = None, *, keep: bool = False) -> SceneSolver:
-        """The fast solver, if all data had been measured."""
-        size = (self.data.shape[-2], self.data.shape[-1])
-        return SceneSolver(
-            self.kernels,
-            self.precision,
-            size,
-            self.data.dtype,
-            self.chunk,
-            weight=weight,
-            keep=keep,
-            segments=self.segments,
-        )
-
-
-def _fill(problem: _Problem, measured: Tensor, floor: Tensor | None) -> Tensor:
-    """Data with what was not measured replaced by what the solution for all other data predicts.
-
-    Solved by conjugate gradients for the values that are missing, each step of which is one fast solution: what the
-    solution for filled data leaves unexplained has to vanish where the filling is.
-
-    Args:
-        problem: The scene.
-        measured: (M, C, R, L) which values count.
-        floor: (M, C, R, L) least value of what was not measured (saturated), or None.
-    """
-    data, weight = problem.data, problem.kernels.weight
-    share = measured.flatten(1).to(weight.dtype).mean(1)
-    whole = weight * (share >= _MOSTLY * share.amax())[:, None]
-    start = problem.solver(whole)
-    data = torch.where(measured, data, start.predict(start.fit(data)))
-    solver = problem.solver(keep=True)
-    scale = weight.to(data.dtype)[:, None, :, None]
-    rounds = 1 if floor is None else 2
-    for _ in range(rounds):
-        if floor is not None:
-            low = ~measured & (data < floor)
-            data, measured = torch.where(low, floor, data), measured | low
-        missing = ~measured
-
-        def unexplained(values: Tensor, missing: Tensor = missing) -> Tensor:
-            return torch.where(missing, values - solver.predict(solver.fit(values)), 0.0)
-
-        residual = -unexplained(data)
-        step, energy = residual, (scale * residual.square()).sum()
-        for _ in range(_FILL_ITERATIONS // rounds):
-            if not bool(energy > 0):
-                break
-            image = unexplained(step)
-            length = energy / (scale * step * image).sum()
-            data = data + length * step
-            residual = residual - length * image
-            before, energy = energy, (scale * residual.square()).sum()
-            step = residual + energy / before * step
-    return data
-
-
-def _with_edges(problem: _Problem, factor: float) -> Tensor:
+def _with_edges(problem: SceneProblem, factor: float) -> Tensor:
     """Restore one scene (C, R, L) with a prior of few cosines in every patch, by half-quadratic splitting."""
     weak = replace(problem, precision=_LOOSE * problem.precision).solver()
     coefficients = weak.fit(problem.data)
     solver, weight = weak, float(problem.kernels.weight.detach().mean(-1).sum())
-    for strength, level, step in STAGES:
+    for strength, level, step in stages(problem.kernels.smear):
         pull = strength * weight * factor
         frequencies = problem.precision.shape[-1]
         precision = expectation_precision(pull, frequencies, problem.precision)
@@ -147,14 +69,20 @@ def _with_edges(problem: _Problem, factor: float) -> Tensor:
     return solver.scene(coefficients)
 
 
-def _restore_group(problem: _Problem, measured: Tensor | None, floor: Tensor | None, edges: float | None) -> Tensor:
-    """Restore one scene (C, R, L) from M frames."""
-    if measured is not None:
-        problem = replace(problem, data=_fill(problem, measured, floor))
+def _restore_group(problem: SceneProblem, edges: float | None) -> Tensor:
+    """Restore one scene (C, R, L) from M frames, all values of which are measured or filled."""
     if edges is not None:
         return _with_edges(problem, edges)
     solver = problem.solver()
     return solver.scene(solver.fit(problem.data))
+
+
+def _floor(data: Tensor, clipped: Tensor) -> Tensor:
+    """Least values (M, C, R, L) of what was not measured: of saturated pixels (M, C, R, W) what they hold."""
+    bottomless = torch.full_like(data, -torch.inf)
+    width = clipped.shape[-1]
+    bottomless[..., :width] = torch.where(clipped, data[..., :width], -torch.inf)
+    return bottomless
 
 
 def restore_exact(
@@ -236,16 +164,17 @@ def restore_exact(
         for members, reference in groups:
             kernels = system(members, reference)
             along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
-            problem = _Problem(data[stack, members], kernels, precision, typical.sqrt(), chunk, segments)
+            problem = SceneProblem(data[stack, members], kernels, precision, typical.sqrt(), chunk, segments)
             hidden = None if lost is None else lost[stack, members]
             ends = kernels.reach > _LONG
-            measured = measured_values(along, hidden, problem.data.shape, W, ends=ends)
-            floor = None
-            if clipped is not None:
-                bottomless = torch.full_like(problem.data, -torch.inf)
-                bottomless[..., :W] = torch.where(clipped[stack, members], problem.data[..., :W], -torch.inf)
-                floor = bottomless
-            restored.append(_restore_group(problem, measured, floor, factor if prior == "edges" else None))
+            if hidden is None and ends and not bool(along.any()):
+                problem = replace(problem, data=fill_beyond_ends(problem, W, kernels.reach))
+            else:
+                measured = measured_values(along, hidden, problem.data.shape, W, ends=ends)
+                floor = None if clipped is None else _floor(problem.data, clipped[stack, members])
+                if measured is not None:
+                    problem = replace(problem, data=fill_unmeasured(problem, measured, floor))
+            restored.append(_restore_group(problem, factor if prior == "edges" else None))
     stacked: Tensor = torch.stack(restored).unflatten(0, (B, len(groups)))[..., :W]
     return stacked + mean
 

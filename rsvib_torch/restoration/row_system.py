@@ -56,6 +56,11 @@ class RowKernels:
         """Largest distance along the row from the middle in px."""
         return float(self.along.detach().abs().amax())
 
+    @property
+    def smear(self) -> float:
+        """Largest distance in px that the scene moves during an exposure, across the rows in whole px."""
+        return max(2.0 * self.reach, float(self.taps.shape[-2] - TAPS))
+
     def scene_rows(self, num_rows: int) -> SceneRows:
         """All scene rows seen, and those that frames of ``num_rows`` rows need to be evaluated."""
         top = min(int(self.first.amin()), 1 - REACH)

@@ -55,6 +55,18 @@ def test_better_than_the_quadratic_prior(town, joint):
     assert decibel(kept, truth) > decibel(plain, truth) + 0.15
 
 
+@pytest.mark.parametrize("exposure_rows", [100, 400])
+@pytest.mark.parametrize("joint", [False, True])
+def test_better_than_the_quadratic_prior_where_exposures_blur(joint, exposure_rows):
+    scene = draw_scene(272, 240, seed=5)
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=exposure_rows, frame_rows=2048)
+    frames = torch.from_numpy(take_frames(scene, timing, Motion(), 2, 0.02, samples=32)).float()
+    plain, kept = (
+        restore(frames, timing, Motion().vibration(), joint=joint, prior=prior) for prior in ("gaussian", "edges")
+    )
+    assert decibel(kept, crop(scene)) > decibel(plain, crop(scene)) + 0.2
+
+
 def test_steps_ring_less_and_are_far_less_noisy(step):
     truth, frames, timing, along = step
     plain, kept = (
