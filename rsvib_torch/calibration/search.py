@@ -67,6 +67,8 @@ def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
     for scene, curve in scenes:
         fits = [fit_period(brightness, start, scene) for start in _starts(curve)]
         usable = [fit for fit in fits if fit is not None and fit.period <= brightness.shape[1]]
+        if scene == "fixed":  # a pattern that stays is texture, whatever harmonics of it do
+            usable = [fit for fit in usable if moves(fit)]
         found += [(max(usable, key=lambda fit: fit.evidence), scene)] if usable else []
     trusted = [
         (fit, scene)

@@ -90,6 +90,22 @@ def test_texture_drops_out_of_several_frames():
         calibrate_row_time(frames[:1], 997.0)
 
 
+def test_texture_that_repeats_with_every_other_band_is_no_flicker():
+    """A pattern of twice the period takes the texture with it, but stays where it is."""
+    frequency, row_time = 583.7, 19.47e-6  # a third of a turn a frame, 88 rows
+    frames = film(
+        lambda t: sine(t, frequency, 0.1),
+        frames=4,
+        scene=0.6 * draw_scene(HEIGHT, WIDTH, 22),
+        row_time=row_time,
+        noise=0.003,
+        frame_rate=frequency / 19.472,
+        seed=22,
+    )
+    found = calibrate_row_time(frames, frequency)
+    assert found.row_time == pytest.approx(row_time, rel=2e-3)
+
+
 def test_bands_of_a_photograph_are_found():
     scene = np.stack([0.5 * draw_scene(HEIGHT, WIDTH, seed) for seed in (5, 6, 7)])
     grey = torch.stack([film(sine, scene=channel)[0] for channel in scene])
