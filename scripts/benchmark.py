@@ -4,6 +4,7 @@
 Registration: all bands of a pair of frames, against skimage.registration.phase_cross_correlation band by band.
 Cost: detection in FFT round trips. Detection: errors against the Cramer-Rao bound, and whether error bars cover.
 Restoration: one frame, see benchmarks/restoration.py. Streaming: long stacks, see benchmarks/streaming.py.
+Dask: workers of a cluster on this machine, see benchmarks/streaming_dask.py.
 """
 
 import argparse
@@ -15,7 +16,7 @@ from typing import Any
 
 import skimage
 import torch
-from benchmarks import detection, detection_cost, detection_report, registration, restoration, streaming
+from benchmarks import detection, detection_cost, detection_report, registration, restoration, streaming, streaming_dask
 from benchmarks.measure import machine
 
 PARTS: dict[str, tuple[Callable[..., list[dict[str, Any]]], Callable[..., list[str]]]] = {
@@ -24,6 +25,7 @@ PARTS: dict[str, tuple[Callable[..., list[dict[str, Any]]], Callable[..., list[s
     "detection": (detection.rows, detection.lines),
     "restoration": (restoration.rows, restoration.lines),
     "streaming": (streaming.rows, streaming.lines),
+    "dask": (streaming_dask.rows, streaming_dask.lines),
 }
 
 
@@ -44,6 +46,7 @@ def main() -> None:
     restoration.add_options(parser)
     detection.add_options(parser)
     streaming.add_options(parser)
+    streaming_dask.add_options(parser)
     options = parser.parse_args()
     torch.set_num_threads(os.cpu_count() or 1)
     summary: dict[str, Any] = {

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import torch
 
 from rsvib_torch.stacks.formats import needed_package
-from rsvib_torch.stacks.heap import share_one_heap
+from rsvib_torch.stacks.heap import keep_freed_memory, share_one_heap
 from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowReader, WindowResult
 from rsvib_torch.stacks.windows import Window
 
@@ -86,6 +86,8 @@ def compute_here(
 
 def _compute_there(job: StackJob, window: Window, several: bool) -> StoredWindow:
     """Read, compute and store one window, on a Dask worker."""
+    share_one_heap()
+    keep_freed_memory()
     threads = torch.get_num_threads()
     if several:
         torch.set_num_threads(1)

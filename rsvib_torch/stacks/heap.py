@@ -1,11 +1,12 @@
-"""One heap for all threads, so that memory does not creep up with the number of windows."""
+"""How the C library keeps memory: in one heap for all threads, and from one window to the next."""
 
 import ctypes
 import platform
 
-__all__ = ["share_one_heap"]
+__all__ = ["keep_freed_memory", "share_one_heap"]
 
-_ARENA_MAX = -8  # of glibc's mallopt
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of glibc's mallopt
+_MMAP_FROM = 1 << 25  # bytes; as far as glibc goes by itself
 
 
 def share_one_heap() -> bool:
@@ -18,9 +19,25 @@ def share_one_heap() -> bool:
     Returns:
         Whether the C library took it.
     """
+    return _set(_ARENA_MAX, 1)
+
+
+def keep_freed_memory() -> bool:
+    """Have this process keep freed memory for the next frames, as glibc does unless it is told otherwise.
+
+    Dask tells the workers it starts to hand it back to the system at once: the pages of every large tensor are then
+    asked for, and cleared, anew.
+
+    Returns:
+        Whether the C library took it.
+    """
+    return _set(_MMAP_THRESHOLD, _MMAP_FROM) and _set(_TRIM_THRESHOLD, 2 * _MMAP_FROM)
+
+
+def _set(parameter: int, value: int) -> bool:
     if platform.libc_ver()[0] != "glibc":
         return False
     try:
-        return bool(ctypes.CDLL(None).mallopt(_ARENA_MAX, 1))
+        return bool(ctypes.CDLL(None).mallopt(parameter, value))
     except (AttributeError, OSError):
         return False

@@ -1,4 +1,4 @@
-"""Long stacks: memory and time a frame against the number of frames, overlap of reading and writing, Dask's cost.
+"""Long stacks: memory and time a frame against the number of frames, overlap of reading and writing.
 
 Frames are written over and over from a few simulated ones, so that long stacks cost no time to make. Every run is a
 process of its own, so that its peak of memory is its own.
@@ -39,7 +39,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this part."""
     parser.add_argument("--frames", type=int, nargs="+", default=[100, 1000], help="streaming: lengths of the stacks")
     parser.add_argument("--frame-size", type=int, default=1024, help="streaming: rows and columns (default: 1024)")
-    parser.add_argument("--dask", action="store_true", help="streaming: Dask with one and two local workers, too")
     parser.add_argument("--memory", default="2GB", help="streaming: memory of the process (default: 2GB)")
 
 
@@ -128,7 +127,7 @@ def _computing_alone(source: Path, size: int, windows: int) -> float:
 
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Runs of each length; then one worker with and without reading and writing in turns, and Dask."""
+    """Runs of each length; then one worker with and without reading and writing in turns."""
     import torch  # noqa: PLC0415
 
     results: list[dict[str, Any]] = []
@@ -158,9 +157,6 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
                 best[what] = min(best[what], seconds if turn else math.inf)  # the first warms up
         results += [{"name": name, "seconds_a_frame": seconds} for name, seconds in best.items()]
         results[-1]["rate"] = results[-2]["seconds_a_frame"] / results[-1]["seconds_a_frame"]
-        for workers in (1, 2) if options.dask else ():
-            run = _apart(**{**common, "scheduler": "local"}, workers=workers)
-            results.append({"name": f"Dask, {workers} local workers", **run})
     return results
 
 
