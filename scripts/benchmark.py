@@ -4,6 +4,7 @@
 Registration: all bands of a pair of frames, against skimage.registration.phase_cross_correlation band by band.
 Cost: detection in FFT round trips. Detection: errors against the Cramer-Rao bound, and whether error bars cover.
 Restoration: one frame, see benchmarks/restoration.py. Streaming: long stacks, see benchmarks/streaming.py.
+Memory: asked for and measured, see benchmarks/streaming_memory.py.
 Dask: workers of a cluster on this machine, see benchmarks/streaming_dask.py.
 """
 
@@ -16,7 +17,16 @@ from typing import Any
 
 import skimage
 import torch
-from benchmarks import detection, detection_cost, detection_report, registration, restoration, streaming, streaming_dask
+from benchmarks import (
+    detection,
+    detection_cost,
+    detection_report,
+    registration,
+    restoration,
+    streaming,
+    streaming_dask,
+    streaming_memory,
+)
 from benchmarks.measure import machine
 
 PARTS: dict[str, tuple[Callable[..., list[dict[str, Any]]], Callable[..., list[str]]]] = {
@@ -25,6 +35,7 @@ PARTS: dict[str, tuple[Callable[..., list[dict[str, Any]]], Callable[..., list[s
     "detection": (detection.rows, detection.lines),
     "restoration": (restoration.rows, restoration.lines),
     "streaming": (streaming.rows, streaming.lines),
+    "memory": (streaming_memory.rows, streaming_memory.lines),
     "dask": (streaming_dask.rows, streaming_dask.lines),
 }
 
@@ -46,6 +57,7 @@ def main() -> None:
     restoration.add_options(parser)
     detection.add_options(parser)
     streaming.add_options(parser)
+    streaming_memory.add_options(parser)
     streaming_dask.add_options(parser)
     options = parser.parse_args()
     torch.set_num_threads(os.cpu_count() or 1)

@@ -71,6 +71,8 @@ def make_job(
     for name in ("window", "window_step"):
         if name in options:
             raise TypeError(f"{name!r} is no option of detection here: a stack is cut into windows by window=")
+    if options.get("model", "tones") != "tones":
+        raise ValueError(f"model={options['model']!r}: in windows only tones are detected; see detect_vibration")
     return StackJob(
         Path(source),
         info,
@@ -93,7 +95,7 @@ def job_windows_at_once(job: StackJob, window: int, memory: str | float | None, 
     """
     most = check_whole_number("workers", workers, at_least=1) if workers is not None else _processors(job.device)
     limit = None if memory is None else parse_memory(memory)
-    return windows_at_once(job.info, window, memory=limit, most=most)
+    return windows_at_once(job.info, window, memory=limit, most=most, restoration=job.restoration)
 
 
 def _processors(device: str) -> int:

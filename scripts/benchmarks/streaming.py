@@ -70,7 +70,15 @@ def peak_memory() -> float:
     raise OSError("the kernel does not tell the peak of memory")
 
 
-def one_run(source: str, sink: str, size: int, memory: str | None, workers: int | None, scheduler: str | None) -> Any:
+def one_run(
+    source: str,
+    sink: str,
+    size: int,
+    memory: str | int | None,
+    workers: int | None,
+    scheduler: str | None,
+    restoration: dict[str, Any] | None = None,
+) -> Any:
     """Process a stack in this process."""
     import resource  # noqa: PLC0415 - where there is none, there is no streaming benchmark
 
@@ -81,7 +89,7 @@ def one_run(source: str, sink: str, size: int, memory: str | None, workers: int 
         timing_of(size),
         window=WINDOW,
         detection=DETECTION,
-        restoration=RESTORATION,
+        restoration=RESTORATION if restoration is None else restoration,
         full_scale=4095,
         memory=memory,
         workers=workers,
@@ -100,7 +108,8 @@ def one_run(source: str, sink: str, size: int, memory: str | None, workers: int 
     }
 
 
-def _apart(**arguments: Any) -> dict[str, Any]:
+def run_apart(**arguments: Any) -> dict[str, Any]:
+    """``one_run`` in a process of its own."""
     done = subprocess.run(
         [sys.executable, "-c", _RUN, json.dumps(arguments)],
         cwd=Path(__file__).parents[1],
@@ -139,7 +148,7 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
             source = folder / "frames.npy"
             write_long(source, count, size)
             common = {"source": str(source), "sink": str(sink), "size": size, "scheduler": None}
-            run = _apart(**common, memory=options.memory, workers=None)
+            run = run_apart(**common, memory=options.memory, workers=None)
             results.append({"name": f"{count} frames, memory {options.memory}", **run})
         few = 3 * (WINDOW - 1) + 1
         write_long(folder / "few.npy", few, size)

@@ -13,7 +13,7 @@ from truth import decibel
 
 import rsvib_torch as rsv
 from rsvib_torch.stacks import cut_windows, detect_stack, open_stack, read_manifest, write_stack
-from rsvib_torch.stacks.memory import parse_memory, windows_at_once
+from rsvib_torch.stacks.memory import memory_needed, parse_memory, windows_at_once
 
 
 @pytest.fixture(scope="module", name="place")
@@ -212,15 +212,31 @@ def test_frame_times_of_the_file_are_used_and_kept(place, tmp_path):
         assert found.amplitude[0][0] == pytest.approx(MOTION.amplitude[0], rel=0.1)
 
 
-def test_memory_is_read_and_kept_to():
+@pytest.mark.parametrize(
+    ("restoration", "at_once"),
+    [
+        (None, [1, 2, 13]),
+        ({"method": "dewarp"}, [1, 2, 13]),
+        ({}, [1, 2, 10]),
+        ({"joint": True}, [1, 2, 10]),
+        ({"prior": "edges"}, [1, 2, 10]),
+        ({"method": "richardson-lucy"}, [0, 1, 7]),
+    ],
+)
+def test_windows_at_once_keep_to_the_memory(restoration, at_once):
     info = rsv.StackInfo((1000, 1024, 1024), "uint16", 4095.0)
-    assert [windows_at_once(info, 8, memory=parse_memory(text), most=16) for text in ("1.2GB", "2GB", "8 GB")] == [
-        1,
-        2,
-        11,
-    ]
-    with pytest.raises(ValueError, match=r"memory of 0.5 GB is too little: a window of 8 frames of 1024 x 1024 px"):
-        windows_at_once(info, 8, memory=parse_memory("500MB"), most=16)
+    for text, count in zip(("1.3GB", "2GB", "8 GB"), at_once, strict=True):
+        memory = parse_memory(text)
+        if count == 0:
+            with pytest.raises(ValueError, match=r"memory of 1.3 GB is too little: a window of 8 frames of 1024 x"):
+                windows_at_once(info, 8, memory=memory, most=16, restoration=restoration)
+            continue
+        assert windows_at_once(info, 8, memory=memory, most=16, restoration=restoration) == count
+        assert memory_needed(info, 8, restoration, count) <= memory < memory_needed(info, 8, restoration, count + 1)
+
+
+def test_memory_is_read():
+    assert [parse_memory(text) for text in ("2GB", "1.5 GiB", "500 MB", 4096)] == [2 * 10**9, 3 << 29, 5 * 10**8, 4096]
     for text in ("much", "-1GB", "0", "2 GBB", ""):
         with pytest.raises(ValueError, match="memory must be like '2GB'"):
             parse_memory(text)
@@ -235,6 +251,7 @@ def test_memory_is_read_and_kept_to():
         ({"device": "tpu"}, ValueError, "device must be one of"),
         ({"detection": {"window": 4}}, TypeError, "a stack is cut into windows by window="),
         ({"detection": {"bands": 4}}, TypeError, "bands"),
+        ({"detection": {"model": "free"}}, ValueError, "in windows only tones are detected"),
         ({"restoration": {"method": "magic"}}, ValueError, "method must be one of"),
         ({"memory": "1KB"}, ValueError, "is too little"),
     ],

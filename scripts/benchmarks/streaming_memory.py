@@ -1,0 +1,71 @@
+"""Memory that is asked for, and the peak that is measured: for every way of restoring, one and two windows at once."""
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from benchmarks import streaming
+
+from rsvib_torch.stacks import read_stack_info
+from rsvib_torch.stacks.memory import memory_needed
+
+RESTORATIONS: list[dict[str, Any]] = [
+    {"method": "dewarp"},
+    {"method": "banded"},
+    {"method": "exact"},
+    {"method": "exact", "joint": 3},
+    {"method": "exact", "joint": True},
+    {"method": "exact", "prior": "edges"},
+    {"method": "richardson-lucy"},
+]
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this part."""
+    parser.add_argument("--memory-sizes", type=int, nargs="+", default=[512], help="memory: rows and columns")
+    parser.add_argument("--memory-windows", type=int, nargs="+", default=[1, 2], help="memory: windows at once")
+
+
+def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Runs that may take no more than a window, or two, are reckoned to need."""
+    results = []
+    with tempfile.TemporaryDirectory() as name:
+        source, sink = Path(name) / "frames.npy", Path(name) / "out.tif"
+        for size in options.memory_sizes:
+            streaming.write_long(source, 4 * (streaming.WINDOW - 1) + 1, size)
+            info = read_stack_info(source)
+            for restoration in RESTORATIONS:
+                for count in options.memory_windows:
+                    asked = memory_needed(info, streaming.WINDOW, restoration, count)
+                    run = streaming.run_apart(
+                        source=str(source),
+                        sink=str(sink),
+                        size=size,
+                        memory=asked,
+                        workers=count,
+                        scheduler=None,
+                        restoration=restoration,
+                    )
+                    results.append(
+                        {"size": size, "restoration": restoration, "windows_at_once": count, "asked_gb": asked / 1e9}
+                        | run
+                    )
+    return results
+
+
+def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+    """The table in words."""
+    table = [
+        f"Memory of a run, windows of {streaming.WINDOW} frames, bands.",
+        "",
+        "| frames | restoration | windows at once | asked for (GB) | peak (GB) | of it |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in results:
+        how = ", ".join(f"{key}={value!r}" for key, value in row["restoration"].items())
+        asked, peak = row["asked_gb"], row["peak_memory_gb"]
+        numbers = f"{row['windows_at_once']} | {asked:.2f} | {peak:.2f} | {100 * peak / asked:.0f} %"
+        table.append(f"| {row['size']} x {row['size']} | {how} | {numbers} |")
+    most = max(row["peak_memory_gb"] / row["asked_gb"] for row in results)
+    return [*table, "", f"At most {100 * most:.0f} % of what was asked for."]
