@@ -62,7 +62,10 @@ def judge(
     for axis, found in enumerate(reasons):
         amplitude = vibration.amplitude[axis]
         if share < _LEAST_GOOD:
-            found.append(f"too few good bands: {share:.0%} of {int(shown.sum())}")
+            found.append(
+                f"too few good bands: {share:.0%} of {int(shown.sum())}; the motion is beyond the search range, or the "
+                "frames show no detail or different scenes"
+            )
         if not bool((amplitude > 0).any()):
             found.append("no significant tone")
         for k in amplitude.nonzero()[:, 0].tolist():

@@ -173,6 +173,27 @@ def test_command(frames, gyroscope, tmp_path, capsys):
     assert (tmp_path / "out.tif").exists()
 
 
+@pytest.mark.parametrize(
+    ("place", "size", "message"),
+    [
+        (slice(None, None, -1), 1.0, "times must increase"),
+        (np.r_[0:500, 520:1000], 1.0, "gap of"),
+        (slice(None), 1e3, "really in s"),
+    ],
+)
+def test_mistakes_in_a_recording_are_one_line(frames, tmp_path, capsys, place, size, message):
+    (tmp_path / "camera.toml").write_text(CONFIG)
+    rsv.write_stack(tmp_path / "frames.tif", frames)
+    clock = np.arange(812.0, 813.0, 1e-3)
+    path = log(tmp_path / "angles.csv", size * clock[place], angles(clock)[place])
+    files = [str(tmp_path / "frames.tif"), str(tmp_path / "out.tif"), "--config", str(tmp_path / "camera.toml")]
+    assert run_command(["known", *files, "--motion", str(path), "--unit", "rad", "--focal-length", "900"]) == 2
+    errors = capsys.readouterr().err.strip().splitlines()
+    assert len(errors) == 1
+    assert message in errors[0]
+    assert not (tmp_path / "out.tif").exists()
+
+
 def at(times, factor=1.0):
     return rsv.FreeMotion.from_samples(times, factor * Shaken().displacement(times))
 

@@ -218,6 +218,9 @@ def test_motion_beyond_the_search_range_is_named(scene):
     frames = take_frames(scene, TIMING, Far(), 3, 0.005)
     with pytest.raises(ValueError, match="search=4 px"):
         rsv.detect_motion(torch.from_numpy(frames).float(), TIMING, search=4)
+    tones = rsv.detect_vibration(torch.from_numpy(frames).float(), TIMING, search=4)
+    assert not tones.reliable.any()
+    assert all("beyond the search range" in reasons[0] for reasons in tones.reasons)
 
 
 class Ringing(Motion):
