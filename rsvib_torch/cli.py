@@ -36,6 +36,8 @@ from rsvib_torch.stacks import (
     check_writable,
     read_manifest,
     read_stack,
+    read_stack_info,
+    timing_from_first_frame,
     whole_folder,
     write_stack,
 )
@@ -128,7 +130,10 @@ def detect(
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
 ) -> None:
-    """Detect the vibration in a stack of frames."""
+    """Detect the vibration in a stack of frames.
+
+    It is one of steady tones; rsvib motion finds motion of any shape, and tones that fade or sweep.
+    """
     settings = read_config(config)
     if window is not None or "window" in settings.stack:
         size = window_of(settings, window)
@@ -136,9 +141,9 @@ def detect(
             frames, settings, out, size, device=device, full_scale=full_scale, memory=memory, workers=workers
         )
         return
-    settings, _, result = _detected(frames, config, out, device, full_scale)
+    settings, stack, result = _detected(frames, config, out, device, full_scale)
     with whole_folder(out) as folder:
-        write_detection(folder, result, settings)
+        write_detection(folder, result, stack.timing)
     show_result(result)
     say(f"{out}: vibration.json, offsets.csv, offsets.png")
 
@@ -179,7 +184,7 @@ def restore_command(
         manifest = read_manifest(vibration)
         restore_windows(frames, restored, settings, manifest, wishes, device=device, full_scale=full_scale)
         return
-    detected = read_vibration(vibration, settings.timing)
+    detected = read_vibration(vibration, timing_from_first_frame(settings.timing, read_stack_info(frames)))
     stack = load(frames, settings, full_scale, chosen_device(device))
     shape = (1, *stack.info.shape[1:]) if joint == "all" else stack.info.shape
     check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale)
@@ -233,7 +238,7 @@ def report(
         frames=stack.frames,
         restored=result.frames,
         was_restored=result.restored,
-        timing=settings.timing,
+        timing=stack.timing,
         detection=detection,
         verdict=result.verdict,
         left_alone=result.left_alone,

@@ -1,0 +1,142 @@
+#!/usr/bin/env python
+"""Whether error bars are honest: errors over what is stated for them, on simulated recordings.
+
+Free motions are random walks, smooth motions, sums of three tones, and lone tones within 8 % of the frequency at which
+all frames are displaced alike; five frames of drawn cities, noise 0.005. Printed: root mean square of error over
+standard deviation for what rows tell of the motion, and for all of it.
+
+Calibrations have random row times and LED frequencies, in front of a plain wall, with 20 times the noise, of textured
+scenes in one frame, strong and weak, and in four frames. Printed: how many were found, and root mean square and median
+size of error over standard deviation; 1 and 0.67 are expected.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "calibration"))
+import torch
+from motion_truth import common_warp, rms
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+from test_calibrate import HEIGHT, WIDTH, blink, film, shaded, sine
+from truth import Motion, draw_scene, take_frames
+
+import rsvib_torch as rsv
+
+Array = NDArray[np.float64]
+TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=270)
+FRAMES, ROWS, COLUMNS, NOISE, RIM = 5, 192, 160, 0.005, 12
+KINDS = ("walk", "smooth", "tones", "blind")
+RECORDINGS = ("wall", "noisy wall", "textured", "weakly textured", "textured, four frames")
+
+
+class Drawn(Motion):
+    """A random motion of one kind."""
+
+    def __init__(self, kind: str, seed: int) -> None:
+        draw = np.random.default_rng(seed)
+        span = 1.2 * FRAMES * TIMING.frame_period
+        times = np.linspace(-0.1 * span, span, 400)
+        turns = times[:, None] / TIMING.frame_period
+        if kind == "walk":
+            path = gaussian_filter1d(np.cumsum(draw.standard_normal((400, 2)), 0), 8, axis=0)
+            path *= 2.0 / path.std(0)
+        elif kind == "smooth":
+            path = np.cumsum(np.cumsum(draw.standard_normal((400, 2)), 0), 0)
+            path = 3.0 * (path - path.mean(0)) / path.std(0)
+        else:
+            tones = [(draw.uniform(0.2, 1.8), draw.uniform(0.3, 2, 2)) for _ in range(3)]
+            tones = tones if kind == "tones" else [(1 + draw.uniform(-0.08, 0.08), np.full(2, 1.5))]
+            path = draw.uniform(-2, 2, 2) * turns
+            for frequency, size in tones:
+                path = path + size * np.sin(2 * np.pi * frequency * turns + draw.uniform(0, 2 * np.pi, 2))
+        object.__setattr__(self, "curve", CubicSpline(times, path))
+
+    def displacement(self, times: Array) -> Array:
+        """Displacement in px at times in seconds."""
+        return np.asarray(self.curve(times))  # type: ignore[attr-defined]
+
+
+def free_motion(kind: str, motions: int, seeds: int) -> str:
+    pulls, seen = [], []
+    moments = (TIMING.row_starts(FRAMES, ROWS) + 0.5 * TIMING.exposure_time).numpy()
+    for number in range(motions):
+        motion = Drawn(kind, 100 + number)
+        clean = take_frames(draw_scene(ROWS + 80, COLUMNS + 80, 20 + number % 5), TIMING, motion, FRAMES, 0.0)
+        for seed in range(seeds):
+            noise = NOISE * np.random.default_rng(seed).standard_normal(clean.shape)
+            found = rsv.detect_motion(torch.from_numpy(clean + noise).float(), TIMING)
+            error = found.displacement.numpy() - motion.displacement(found.times.numpy())
+            pulls.append((error - error.mean((0, 1))) / found.std.numpy())
+            truth = motion.displacement(moments)
+            left = found.motion.displacement(torch.from_numpy(moments)).numpy() - truth
+            left = left - common_warp(left, truth)
+            seen.append(rms(left[:, RIM:-RIM]) / found.std_seen.numpy())
+    size = np.abs(pulls)
+    return (
+        f"{kind}, {motions} motions, {seeds} seeds: what rows tell {np.sqrt(np.mean(np.square(seen))):.2f}; "
+        f"all {np.sqrt(np.mean(size**2)):.2f} (median {np.median(size):.2f}; {np.mean(size < 2):.0%} within two)"
+    )
+
+
+def calibration(kind: str, count: int) -> str:
+    pulls = []
+    for seed in range(count):
+        draw = np.random.default_rng(1000 + seed)
+        row_time, frequency, start = 1e-6 * draw.uniform(8, 30), draw.uniform(500, 1500), draw.uniform(0, 1)
+        city = draw_scene(HEIGHT, WIDTH, seed % 30)
+        scene, contrast = {
+            "textured": (0.5 * city, 0.5),
+            "weakly textured": (0.35 + 0.05 * (city - 0.45), 0.3),
+            "textured, four frames": (0.6 * city, 0.1),
+        }.get(kind, (shaded(), 0.6))
+        square = "wall" in kind and seed % 2 == 0
+
+        def light(
+            time: Array, frequency: float = frequency, contrast: float = contrast, square: bool = square
+        ) -> Array:
+            return np.asarray(blink(time, frequency) if square else sine(time, frequency, contrast))
+
+        frames = film(
+            light,
+            frames=4 if "four" in kind else 1,
+            row_time=row_time,
+            scene=scene,
+            noise=0.06 if "noisy" in kind else 0.003,
+            seed=seed,
+            start=start,
+        )
+        try:
+            found = rsv.calibrate_row_time(frames, frequency)
+        except ValueError:
+            continue
+        pulls.append((found.row_time - row_time) / found.row_time_std)
+    return (
+        f"{kind}: {len(pulls)} of {count} found, {np.sqrt(np.mean(np.square(pulls))):.2f}, median "
+        f"{np.median(np.abs(pulls)):.2f}, largest {np.max(np.abs(pulls)):.1f}"
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=("motion", "calibration"))
+    parser.add_argument("--motions", type=int, default=12)
+    parser.add_argument("--seeds", type=int, default=1, help="of the noise, for each motion")
+    parser.add_argument("--recordings", type=int, default=40)
+    options = parser.parse_args()
+    if options.only != "calibration":
+        for kind in KINDS:
+            print(free_motion(kind, options.motions, options.seeds), flush=True)
+    if options.only != "motion":
+        for kind in RECORDINGS:
+            print(calibration(kind, options.recordings), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
