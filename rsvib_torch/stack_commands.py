@@ -26,6 +26,7 @@ from rsvib_torch.command_options import (
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.pictures import comparison_figure, save_figure
+from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.stacks import (
     DEFAULT_WINDOW,
     StackManifest,
@@ -38,6 +39,7 @@ from rsvib_torch.stacks import (
     process_stack,
     read_manifest,
     read_stack_info,
+    timing_from_first_frame,
     timing_keys,
     whole_folder,
 )
@@ -148,7 +150,7 @@ def run(
     names = [output, "manifest.json"]
     with whole_folder(out) as folder:
         if report.windows == 1:
-            _write_single(folder, first, options, settings)
+            _write_single(folder, first, options, timing_from_first_frame(settings.timing, info))
             names += ["restoration.json", "vibration.json", "offsets.csv", "offsets.png"]
         else:
             _write_table(folder / "windows.csv", read_manifest(out / "manifest.json"))
@@ -160,12 +162,12 @@ def run(
     say(f"{out}: {', '.join(names)}")
 
 
-def _write_single(folder: Path, result: WindowResult, options: dict[str, Any], config: Config) -> None:
+def _write_single(folder: Path, result: WindowResult, options: dict[str, Any], timing: SensorTiming) -> None:
     """What is written of a stack that is one window."""
     restoration = result.restoration
     assert isinstance(result.detection, DetectionResult)
     assert restoration is not None
-    write_detection(folder, result.detection, config)
+    write_detection(folder, result.detection, timing)
     told = Restored(result.frames, result.restored, options, restoration.left_alone, restoration.verdict)
     told.write_report(folder / "restoration.json")
 

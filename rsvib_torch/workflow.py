@@ -1,7 +1,7 @@
 """What the commands do with a stack: read it, detect, restore and judge, write."""
 
 import inspect
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +16,17 @@ from rsvib_torch.report import write_offsets, write_restoration, write_vibration
 from rsvib_torch.restoration import RestorationVerdict, restore
 from rsvib_torch.restoration.restore import method_options
 from rsvib_torch.restoration.trust import Detected
-from rsvib_torch.stacks import RestoredFrames, StackInfo, read_stack, read_stack_info, restore_trusted, write_stack
+from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.stacks import (
+    RestoredFrames,
+    StackInfo,
+    exposure_times,
+    read_stack,
+    read_stack_info,
+    restore_trusted,
+    timing_from_first_frame,
+    write_stack,
+)
 from rsvib_torch.terminal import error_line, say, working
 
 __all__ = [
@@ -42,11 +52,12 @@ _JUDGED_PAIRS = 8  # of a stack, evenly spread
 
 @dataclass(frozen=True)
 class Stack:
-    """Frames in memory and how their file keeps them."""
+    """Frames in memory, how their file keeps them, and the sensor with the frame times of the file."""
 
     frames: Tensor
     info: StackInfo
     full_scale: float | None
+    timing: SensorTiming
 
 
 @dataclass(frozen=True)
@@ -101,21 +112,21 @@ def load(path: Path, config: Config, option: float | None, device: torch.device)
     scale = full_scale_of(path, info, config, option)
     with working(f"reading {path}"):
         frames = read_stack(path, full_scale=scale)
-    # A video only estimates its length beforehand.
-    info = StackInfo(tuple(frames.shape), info.dtype, info.full_scale)
-    return Stack(frames.to(device), info, scale)
+    timing = timing_from_first_frame(config.timing, info)
+    info = replace(info, frame_times=exposure_times(info, config.timing), times_of_playback=False)
+    return Stack(frames.to(device), info, scale, timing)
 
 
 def save(path: Path, frames: Tensor, stack: Stack) -> None:
     """Write frames in the type and full scale of the stack they come from."""
     with working(f"writing {path.name}"):
-        write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale)
+        write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
 
 
 def detect_frames(stack: Stack, config: Config) -> DetectionResult:
     """Detect the vibration as the config says."""
     with working("detecting the vibration"):
-        found: DetectionResult = detect_vibration(stack.frames, config.timing, **config.detection)
+        found: DetectionResult = detect_vibration(stack.frames, stack.timing, **config.detection)
     return found
 
 
@@ -155,7 +166,7 @@ def restore_and_judge(stack: Stack, config: Config, detected: Detected, wishes: 
     options = restoration_options(stack.info, stack.full_scale, config, wishes)
     with working("restoring the frames and judging the result"):
         result = restore_trusted(
-            stack.frames, config.timing, detected, options, force=wishes.force, most_pairs=_JUDGED_PAIRS
+            stack.frames, stack.timing, detected, options, force=wishes.force, most_pairs=_JUDGED_PAIRS
         )
     tell_restoration(result)
     return Restored(result.frames, result.restored, options, result.left_alone, result.verdict)
@@ -176,9 +187,9 @@ def tell_restoration(result: RestoredFrames) -> None:
         say(result.verdict.summary)
 
 
-def write_detection(folder: Path, result: DetectionResult, config: Config) -> None:
+def write_detection(folder: Path, result: DetectionResult, timing: SensorTiming) -> None:
     """Write what was detected into a folder."""
     with working("drawing the offset curve"):
-        write_vibration(folder / "vibration.json", result, config.timing)
+        write_vibration(folder / "vibration.json", result, timing)
         write_offsets(folder / "offsets.csv", result)
         save_figure(offset_figure(result), folder / "offsets.png")

@@ -5,6 +5,7 @@ from rsvib_torch.stacks.blocks import restore_block
 from rsvib_torch.stacks.detect_windows import detect_stack
 from rsvib_torch.stacks.files import check_stack_target, open_stack, read_stack, read_stack_info, write_stack
 from rsvib_torch.stacks.formats import FrameReader, FrameWriter, StackFormat, register_format
+from rsvib_torch.stacks.frame_times import exposure_times, timing_from_first_frame
 from rsvib_torch.stacks.info import FrameError, StackInfo
 from rsvib_torch.stacks.iterate import iterate_stack
 from rsvib_torch.stacks.job import BadFrames, WindowResult
@@ -32,6 +33,7 @@ __all__ = [
     "check_writable",
     "cut_windows",
     "detect_stack",
+    "exposure_times",
     "iterate_stack",
     "open_stack",
     "process_stack",
@@ -41,6 +43,7 @@ __all__ = [
     "register_format",
     "restore_block",
     "restore_trusted",
+    "timing_from_first_frame",
     "timing_keys",
     "whole_file",
     "whole_folder",

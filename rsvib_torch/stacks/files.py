@@ -1,6 +1,7 @@
 """Reading and writing whole stacks: the file ending chooses the format."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -154,6 +155,7 @@ def write_stack(
     dtype: str | None = None,
     full_scale: float | None = None,
     compression: str | None = None,
+    like: StackInfo | None = None,
 ) -> None:
     """Write a stack of frames whose full scale is 1.
 
@@ -169,6 +171,8 @@ def write_stack(
         full_scale: Count to write for 1.0; 255 for ``"uint8"`` if not given, to be stated for other integers. Floats
             keep their values.
         compression: ``"zlib"`` or ``"lzma"`` for TIFF files; None for none.
+        like: The stack that the frames come from, whose resolution, order of channels and, if it has as many frames,
+            frame times are kept as far as the format has room for them.
 
     Raises:
         OSError: If the file cannot be written.
@@ -182,6 +186,9 @@ def write_stack(
     full_scale = check_stack_target(path, tuple(frames.shape), dtype=dtype, full_scale=full_scale)
     pixels = frames_to_counts(frames, np.dtype(dtype or np.float32), full_scale)
     info = StackInfo(tuple(pixels.shape), pixels.dtype.name, full_scale)
+    if like is not None:
+        times = like.frame_times if like.shape[0] == info.shape[0] and not like.times_of_playback else None
+        info = replace(info, frame_times=times, resolution=like.resolution, channels_last=like.channels_last)
     form = check_info_target(path, info, compression)
     with workplace(path) as work:
         part = work / path.name

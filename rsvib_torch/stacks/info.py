@@ -21,6 +21,8 @@ class StackInfo:
         frame_times: Exposure start of the first row of every frame in seconds, where the file states it.
         resolution: Pixels per unit along x and y, and the unit (``"inch"``, ``"centimeter"``), where stated.
         channels_last: Whether the file keeps the channels of a pixel next to each other.
+        times_of_playback: Whether ``frame_times`` are when frames are to be shown, as in videos: rounded, and perhaps
+            at another rate than they were taken.
     """
 
     shape: tuple[int, ...]
@@ -29,6 +31,7 @@ class StackInfo:
     frame_times: tuple[float, ...] | None = None
     resolution: tuple[float, float, str] | None = None
     channels_last: bool = field(default=False, compare=False)
+    times_of_playback: bool = field(default=False, compare=False)
 
     @property
     def axes(self) -> str:

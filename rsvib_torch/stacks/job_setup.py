@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -12,6 +11,7 @@ import torch
 from rsvib_torch.checks import check_choice, check_whole_number
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.stacks.files import PathLike, open_stack
+from rsvib_torch.stacks.frame_times import timing_of_stack
 from rsvib_torch.stacks.job import BadFrames, StackJob
 from rsvib_torch.stacks.memory import parse_memory, windows_at_once
 from rsvib_torch.stacks.records import DetectedWindow
@@ -63,8 +63,7 @@ def make_job(
         full_scale = check_full_scale(scale, np.dtype(info.dtype))
     else:
         full_scale = None
-    if timing.frame_start_times is None and info.frame_times is not None:
-        timing = replace(timing, frame_start_times=info.frame_times)
+    timing = timing_of_stack(timing, info)
     timing.frame_starts(info.shape[0])
     timing.check_rows(info.shape[-1 if timing.scan_axis == -1 else -2])
     options = dict(detection or {})

@@ -10,6 +10,7 @@ from typing import Any
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.stacks.files import PathLike, check_info_target
 from rsvib_torch.stacks.fingerprint import fingerprint
+from rsvib_torch.stacks.frame_times import exposure_times
 from rsvib_torch.stacks.job import BadFrames
 from rsvib_torch.stacks.job_setup import DEFAULT_WINDOW, job_windows_at_once, make_job
 from rsvib_torch.stacks.journal import Journal, describe_difference
@@ -106,7 +107,7 @@ def process_stack(
         job.info,
         shape=(count, *job.info.shape[1:]),
         full_scale=job.full_scale,
-        frame_times=job.info.frame_times if count == job.info.shape[0] else None,
+        frame_times=exposure_times(job.info, timing) if count == job.info.shape[0] else None,
     )
     form = check_info_target(sink, out, compression, try_folder=False)
     target = sink.with_name(sink.name + ".manifest.json") if manifest is None else Path(manifest)

@@ -1,5 +1,7 @@
 """Stacks in video files, read through OpenCV."""
 
+import itertools
+import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -39,19 +41,21 @@ def _opened(path: Path) -> Any:
     return video
 
 
-def _count(path: Path) -> int:
-    """Frames that can be decoded: containers only estimate their number."""
+def _playback_times(path: Path) -> list[float]:
+    """When each frame that can be decoded is to be shown, in seconds: containers only estimate their number."""
     video = _opened(path)
+    times = []
     with _silent():
-        promised, count = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 0
+        promised = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         while video.grab():
-            count += 1
+            times.append(1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC)))
         video.release()
+    count = len(times)
     if count == 0:
         raise ValueError(f"{path}: no frame of the video can be read")
     if count < promised - max(1, promised // 10):
         raise ValueError(f"{path}: truncated: {count} of {promised} frames can be read")
-    return count
+    return times
 
 
 class VideoReader:
@@ -61,11 +65,19 @@ class VideoReader:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, count = path, _count(path)
+        self._path, times = path, _playback_times(path)
         self._video: Any = _opened(path)
         self._next = 0
         height, width = (int(self._video.get(key)) for key in (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH))
-        self.info = StackInfo((count, 3, height, width), "uint8", 255.0, channels_last=True)
+        rising = all(0.0 <= a < b < math.inf for a, b in itertools.pairwise(times))
+        self.info = StackInfo(
+            (len(times), 3, height, width),
+            "uint8",
+            255.0,
+            tuple(times) if rising and len(times) > 1 else None,
+            channels_last=True,
+            times_of_playback=True,
+        )
 
     def frame(self, index: int) -> NDArray[Any]:
         """Pixels of a frame."""

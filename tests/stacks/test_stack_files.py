@@ -3,6 +3,7 @@
 import json
 import struct
 import zlib
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -121,7 +122,10 @@ def test_video_is_read_as_rgb(tmp_path):
     for level in (40, 90, 140, 190):
         writer.write(np.dstack([np.full((48, 64), value, np.uint8) for value in (level, 60, 30)]))
     writer.release()
-    assert read_stack_info(path) == StackInfo((4, 3, 48, 64), "uint8", 255.0)
+    info = read_stack_info(path)
+    assert replace(info, frame_times=None) == StackInfo((4, 3, 48, 64), "uint8", 255.0)
+    assert info.times_of_playback
+    assert info.frame_times == pytest.approx([0, 1 / 24, 2 / 24, 3 / 24], abs=1e-6)
     means = (read_stack(path) * 255).mean((-2, -1))
     np.testing.assert_allclose(means, [[30, 60, level] for level in (40, 90, 140, 190)], atol=4)
 
