@@ -7,9 +7,10 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from rsvib_torch.arrays import ArrayLike, as_tensor
 from rsvib_torch.checks import check_number, check_whole_number
 from rsvib_torch.evaluation.slanted_edge.geometry import EdgeFit, Scatter, fit_edge, linearised, start_edge, straighten
-from rsvib_torch.evaluation.slanted_edge.refusals import check_edge, uneven_patches
+from rsvib_torch.evaluation.slanted_edge.refusals import as_real, check_edge, uneven_patches
 
 __all__ = ["SlantedEdge", "find_slanted_edges"]
 
@@ -50,13 +51,13 @@ class SlantedEdge:
     bright_side: _Side
     contrast: float
 
-    def crop(self, image: Tensor) -> Tensor:
+    def crop(self, image: ArrayLike) -> Tensor:
         """The ROI (..., height, width) of an image of the same size, or of a stack of them."""
-        return image[..., self.top : self.top + self.height, self.left : self.left + self.width]
+        return as_tensor("image", image)[..., self.top : self.top + self.height, self.left : self.left + self.width]
 
 
 def find_slanted_edges(
-    image: Tensor, *, min_length: int = 32, max_length: int = 160, min_contrast: float = 0.1
+    image: ArrayLike, *, min_length: int = 32, max_length: int = 160, min_contrast: float = 0.1
 ) -> list[SlantedEdge]:
     """Find ROIs for ``slanted_edge_mtf``: straight edges, 2 ... 30 degrees off an axis, between even sides.
 
@@ -64,7 +65,7 @@ def find_slanted_edges(
     is all there is.
 
     Args:
-        image: (H, W), linear in light; any scale.
+        image: (H, W), tensor or NumPy array, linear in light; any scale.
         min_length: px, shortest edge.
         max_length: px of a longer edge that are used, from its middle.
         min_contrast: Smallest step, as a part of the range between the image's 1 and 99 % quantiles.
@@ -73,7 +74,7 @@ def find_slanted_edges(
         The edges, those of the largest contrast times length first; no two of them overlap by more than half.
 
     Raises:
-        TypeError: If the image is not a tensor of real numbers.
+        TypeError: If the image does not hold real numbers.
         ValueError: If it is not one finite image, or an option is out of range.
 
     Example:
@@ -82,15 +83,13 @@ def find_slanted_edges(
         >>> len(edges), {round(abs(edge.angle), 1) for edge in edges}
         (16, {5.0})
     """
-    if not isinstance(image, Tensor) or image.dtype == torch.bool or image.dtype.is_complex:
-        kind = f"a tensor of {image.dtype}" if isinstance(image, Tensor) else type(image).__name__
-        raise TypeError(f"image must be a tensor of real numbers, got {kind}")
-    if image.ndim != 2 or not bool(torch.isfinite(image).all()):
-        raise ValueError(f"image must be one finite grey image (H, W), got shape {tuple(image.shape)}")
+    grey = as_real("image", image)
+    if grey.ndim != 2 or not bool(torch.isfinite(grey).all()):
+        raise ValueError(f"image must be one finite grey image (H, W), got shape {tuple(grey.shape)}")
     min_length = check_whole_number("min_length", min_length, at_least=16)
     max_length = check_whole_number("max_length", max_length, at_least=min_length)
     check_number("min_contrast", min_contrast, above=0.0, at_most=1.0)
-    values = image.detach().to(torch.float64)
+    values = grey.detach().to(torch.float64)
     if min(values.shape) < 2 * _TAPS + 1:
         return []
     low, high = (values.flatten().kthvalue(max(1, int(q * (values.numel() - 1)) + 1)).values for q in (0.01, 0.99))

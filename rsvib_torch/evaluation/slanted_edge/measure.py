@@ -3,11 +3,11 @@
 import math
 
 import torch
-from torch import Tensor
 
+from rsvib_torch.arrays import ArrayLike
 from rsvib_torch.evaluation.slanted_edge.curve import FREQUENCIES, MtfCurve, first_crossing
 from rsvib_torch.evaluation.slanted_edge.geometry import fit_edge, start_edge, straighten
-from rsvib_torch.evaluation.slanted_edge.refusals import check_edge, check_roi
+from rsvib_torch.evaluation.slanted_edge.refusals import as_real, check_edge, check_roi
 from rsvib_torch.evaluation.slanted_edge.spread import fit_spread
 
 __all__ = ["slanted_edge_mtf"]
@@ -15,7 +15,7 @@ __all__ = ["slanted_edge_mtf"]
 _STEP = 1e-4  # cycles/px, for the slope of the curve
 
 
-def slanted_edge_mtf(roi: Tensor) -> MtfCurve:
+def slanted_edge_mtf(roi: ArrayLike) -> MtfCurve:
     """Measure the MTF across a slanted edge (ISO 12233, e-SFR).
 
     ``MTF(f) = |int LSF(x) exp(-2 pi i f x) dx|`` with the line spread function along the *normal* of the edge, pixel
@@ -29,14 +29,14 @@ def slanted_edge_mtf(roi: Tensor) -> MtfCurve:
     and counts as level of the sides otherwise.
 
     Args:
-        roi: (h, w), at least 16 x 16 px, with one straight edge 2 ... 40 degrees from the vertical or horizontal
-            that reaches from border to border, either side brighter.
+        roi: (h, w), tensor or NumPy array, at least 16 x 16 px, with one straight edge 2 ... 40 degrees from the
+            vertical or horizontal that reaches from border to border, either side brighter.
 
     Returns:
         The curve up to 1 cycle/px, with MTF50, standard deviations, and the spread functions.
 
     Raises:
-        TypeError: If the ROI is not a tensor of real numbers.
+        TypeError: If the ROI does not hold real numbers.
         ValueError: If it is not one finite image, too small, shows no edge, the edge is not slanted or too near to
             45 degrees, comes too near to a border alongside it, or is clipped.
 
@@ -46,16 +46,17 @@ def slanted_edge_mtf(roi: Tensor) -> MtfCurve:
         >>> f"{curve.angle:.2f} degrees, MTF50 {curve.mtf50:.4f}, at Nyquist {curve.at(0.5):.4f}"
         '5.71 degrees, MTF50 0.2354, at Nyquist 0.0438'
     """
-    values = check_roi(roi)
+    grey = as_real("roi", roi)
+    values = check_roi(grey)
     limits = (0.0, 1.0)
-    if not roi.dtype.is_floating_point:
-        limits = (float(torch.iinfo(roi.dtype).min), float(torch.iinfo(roi.dtype).max))
+    if not grey.dtype.is_floating_point:
+        limits = (float(torch.iinfo(grey.dtype).min), float(torch.iinfo(grey.dtype).max))
     scatter, columns, near_vertical, mirrored = straighten(values)
     fit = fit_edge(scatter, start_edge(scatter, columns))
     room = check_edge(fit, scatter, columns, limits)
     spread = fit_spread(fit, scatter, room)
 
-    frequency = torch.linspace(0, 1, FREQUENCIES, dtype=torch.float64, device=roi.device)
+    frequency = torch.linspace(0, 1, FREQUENCIES, dtype=torch.float64, device=grey.device)
     mtf = spread.mtf(frequency)
     mtf50 = first_crossing(spread.mtf, frequency, mtf, 0.5)
     beside = spread.mtf(torch.stack([mtf50 - _STEP, mtf50 + _STEP]))

@@ -6,9 +6,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from rsvib_torch.arrays import as_tensor
 from rsvib_torch.evaluation.slanted_edge.geometry import EdgeFit, Scatter, fit_edge, linearised
 
-__all__ = ["check_edge", "check_roi", "uneven_patches"]
+__all__ = ["as_real", "check_edge", "check_roi", "uneven_patches"]
 
 _SMALLEST = 16  # px
 _ANGLES = (2.0, 40.0)  # degrees
@@ -22,11 +23,16 @@ _BETTER = 0.6  # parts of the misfit that remain where clipping explains it
 _OVERSHOOT = 0.05  # of the contrast: how far a clipped side would have gone on
 
 
-def check_roi(roi: object) -> Tensor:
-    """Return a ROI in float64 after looking at its type, shape and values."""
-    if not isinstance(roi, Tensor) or roi.dtype == torch.bool or roi.dtype.is_complex:
-        found = f"a tensor of {roi.dtype}" if isinstance(roi, Tensor) else type(roi).__name__
-        raise TypeError(f"roi must be a tensor of real numbers, got {found}")
+def as_real(name: str, value: object) -> Tensor:
+    """Return a tensor or array of real numbers as a tensor."""
+    values = as_tensor(name, value)
+    if values.dtype == torch.bool or values.dtype.is_complex:
+        raise TypeError(f"{name} must hold real numbers, got {values.dtype}")
+    return values
+
+
+def check_roi(roi: Tensor) -> Tensor:
+    """Return a ROI in float64 after looking at its shape and values."""
     if roi.ndim != 2:
         raise ValueError(f"roi must be one grey image (h, w), got shape {tuple(roi.shape)}")
     if min(roi.shape) < _SMALLEST:
