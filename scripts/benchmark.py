@@ -15,7 +15,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import skimage
 import torch
 from benchmarks import (
     detection,
@@ -27,7 +26,7 @@ from benchmarks import (
     streaming_dask,
     streaming_memory,
 )
-from benchmarks.measure import machine
+from benchmarks.measure import add_options, machine
 
 PARTS: dict[str, tuple[Callable[..., list[dict[str, Any]]], Callable[..., list[str]]]] = {
     "registration": (registration.rows, registration.lines),
@@ -42,9 +41,12 @@ PARTS: dict[str, tuple[Callable[..., list[dict[str, Any]]], Callable[..., list[s
 
 def machine_line(machine: dict[str, Any]) -> str:
     """What the figures were taken on, in words."""
+    libraries = ", ".join(f"{name} {version}" for name, version in machine["libraries"].items())
+    load = "" if machine["load"] is None else f" Load at the start: {machine['load']:.1f}."
+    cuda = "No CUDA device here: tables are of the CPU alone." if machine["cuda"] is None else f"{machine['cuda']}."
     return (
         f"{machine['cores']} cores ({machine['processor']}), Python {machine['python']}, torch {machine['torch']} on "
-        f"{machine['threads']} threads, scikit-image {machine['skimage']}."
+        f"{machine['threads']} threads, {libraries}.{load} {cuda}"
     )
 
 
@@ -54,6 +56,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=2048, help="rows and columns of the frames (default: 2048)")
     parser.add_argument("--runs", type=int, default=5, help="timed runs of each (default: 5)")
     parser.add_argument("--only", choices=PARTS, nargs="+", default=PARTS, help="parts to run (default: all)")
+    add_options(parser)
     restoration.add_options(parser)
     detection.add_options(parser)
     streaming.add_options(parser)
@@ -64,7 +67,7 @@ def main() -> None:
     summary: dict[str, Any] = {
         "size": options.size,
         "runs": options.runs,
-        "machine": {**machine(), "skimage": skimage.__version__},
+        "machine": machine(),
     }
     text = [machine_line(summary["machine"])]
     for name in options.only:

@@ -4,7 +4,7 @@ import argparse
 from typing import Any
 
 import torch
-from benchmarks.measure import in_turns
+from benchmarks.measure import in_turns, named, shown_seconds
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
@@ -20,17 +20,25 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     scene = city_and_fields(options.size + 2 * MARGIN, options.size + 2 * MARGIN, seed=SEED)
     frames = rsv.simulate_frames(scene, timing, vibration, 4, frame_size=(options.size, options.size))
     frames = frames + NOISE * torch.randn(frames.shape, generator=torch.Generator().manual_seed(SEED))
-    tasks = {"round trip": lambda: torch.fft.irfft2(torch.fft.rfft2(frames[0]))}
-    for method in ("bands", "direct"):
-        for count in (2, 4):
-            tasks[f"{method}, {count} frames"] = lambda m=method, n=count: rsv.detect_vibration(
-                frames[:n], timing, method=m
-            )
-    seconds = {name: taken for name, (taken, _) in in_turns(tasks, options.runs).items()}
-    return [{"name": name, "seconds": s, "round_trips": s / seconds["round trip"]} for name, s in seconds.items()]
+    results = []
+    for device in options.device:
+        taken = frames.to(device)
+        tasks = {"round trip": lambda f=taken: torch.fft.irfft2(torch.fft.rfft2(f[0]))}
+        for method in ("bands", "direct"):
+            for count in (2, 4):
+                tasks[f"{method}, {count} frames"] = lambda m=method, f=taken[:count]: rsv.detect_vibration(
+                    f, timing, method=m
+                )
+        done = in_turns(tasks, options.runs)
+        unit = done["round trip"].seconds
+        results += [
+            {"name": named(name, device), **timed.figures(), "round_trips": timed.seconds / unit}
+            for name, timed in done.items()
+        ]
+    return results
 
 
 def lines(rows: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
     """The table in Markdown."""
     text = [f"| detection, {options.size}^2 | seconds | FFT round trips |", "|---|---|---|"]
-    return text + [f"| {row['name']} | {row['seconds']:.3f} | {row['round_trips']:.1f} |" for row in rows]
+    return text + [f"| {row['name']} | {shown_seconds(row)} | {row['round_trips']:.1f} |" for row in rows]

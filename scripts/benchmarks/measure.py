@@ -1,25 +1,110 @@
-"""How all benchmarks measure: pieces of work in turns, and the machine they ran on."""
+"""How all benchmarks measure: pieces of work in turns, medians and spread, peak memory, and the machine."""
 
+import argparse
 import os
 import platform
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
 from typing import Any
 
 import torch
 
+_LIBRARIES = {
+    "OpenCV": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
+    "SciPy": ("scipy",),
+    "scikit-image": ("scikit-image",),
+    "Kornia": ("kornia",),
+    "NumPy": ("numpy",),
+    "PyLops": ("pylops",),
+    "deepinv": ("deepinv",),
+}
 
-def in_turns(works: dict[str, Callable[[], Any]], runs: int) -> dict[str, tuple[float, Any]]:
-    """Median time of each piece of work, and its result, all taking turns so that a busy moment hits all alike."""
+
+@dataclass(frozen=True, eq=False)
+class Timed:
+    """Timed runs of a piece of work.
+
+    Attributes:
+        result: What the work returned.
+        runs: Seconds of each run.
+    """
+
+    result: Any
+    runs: tuple[float, ...]
+
+    @property
+    def seconds(self) -> float:
+        """The median."""
+        return statistics.median(self.runs)
+
+    def __add__(self, other: "Timed") -> "Timed":
+        """Both one after the other, turn by turn; the result is that of the latter."""
+        return Timed(other.result, tuple(a + b for a, b in zip(self.runs, other.runs, strict=True)))
+
+    def scaled(self, factor: float) -> "Timed":
+        """As if it had been that many times as much work."""
+        return Timed(self.result, tuple(factor * seconds for seconds in self.runs))
+
+    def figures(self) -> dict[str, float]:
+        """Median, fastest and slowest run, for the results of a benchmark."""
+        return {"seconds": self.seconds, "seconds_least": min(self.runs), "seconds_most": max(self.runs)}
+
+
+def shown_seconds(row: dict[str, Any]) -> str:
+    """Figures of ``Timed`` as a cell of a table."""
+    return f"{row['seconds']:.3f} ({row['seconds_least']:.3f} to {row['seconds_most']:.3f})"
+
+
+def seconds_of(work: Callable[[], Any]) -> float:
+    """Seconds of one run; what a GPU has still to do counts."""
+    _finish()
+    begin = time.perf_counter()
+    work()
+    _finish()
+    return time.perf_counter() - begin
+
+
+def _finish() -> None:
+    """Wait for a GPU, if one is at work."""
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+
+
+def in_turns(works: dict[str, Callable[[], Any]], runs: int) -> dict[str, Timed]:
+    """Timed runs of each piece of work, all taking turns so that a busy moment hits all alike."""
     results = {name: work() for name, work in works.items()}  # warms up
     seconds: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(runs):
+    for _ in range(max(1, runs)):
         for name, work in works.items():
-            begin = time.perf_counter()
-            work()
-            seconds[name].append(time.perf_counter() - begin)
-    return {name: (statistics.median(seconds[name]), results[name]) for name in works}
+            seconds[name].append(seconds_of(work))
+    return {name: Timed(results[name], tuple(seconds[name])) for name in works}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options that all parts share."""
+    there = devices()
+    parser.add_argument(
+        "--device",
+        choices=there,
+        nargs="+",
+        default=there,
+        help="devices that the package is timed on; peers run on the CPU (default: all that are there)",
+    )
+
+
+def devices() -> list[str]:
+    """Devices of this machine."""
+    return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+
+
+def named(name: str, device: str) -> str:
+    """A name for a piece of work on a device."""
+    return name if device == "cpu" else f"{name} on {device}"
 
 
 def machine() -> dict[str, Any]:
@@ -28,6 +113,71 @@ def machine() -> dict[str, Any]:
         "cores": os.cpu_count() or 1,
         "threads": torch.get_num_threads(),
         "processor": platform.processor() or platform.machine(),
+        "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "python": platform.python_version(),
         "torch": torch.__version__,
+        "libraries": {name: version for name in _LIBRARIES if (version := _version(name)) is not None},
     }
+
+
+def _version(library: str) -> str | None:
+    for distribution in _LIBRARIES[library]:
+        try:
+            return metadata.version(distribution)
+        except metadata.PackageNotFoundError:
+            continue
+    return None
+
+
+_MEMORY_PROBE = """
+import re, sys, torch, rsvib_torch as rsv
+from pathlib import Path
+
+device, threads, work, num_frames, height, width = sys.argv[1], int(sys.argv[2]), sys.argv[3], *map(int, sys.argv[4:])
+torch.set_num_threads(threads)
+torch.manual_seed(0)
+
+def memory(name):
+    return 1024 * int(re.search(name + r":\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1])
+
+def run(num_frames, height, width):
+    timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=max(height, 2048))
+    frame = torch.rand(height, width)
+    frames = torch.stack([frame.roll(3 * index, -1) for index in range(num_frames)]).to(device)
+    begin()
+    if work == "detection":
+        rsv.detect_vibration(frames, timing)
+    else:
+        rsv.restore(frames, timing, rsv.Vibration([3.1, 5.2], [50.0, 30.0]), method=work, check=False)
+
+def begin():
+    global before
+    if device == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+    else:
+        Path("/proc/self/clear_refs").write_text("5")  # forgets the peak so far
+        before = memory("VmRSS")
+
+run(min(num_frames, 2), 160, 160)
+run(num_frames, height, width)
+peak = torch.cuda.max_memory_allocated() if device == "cuda" else memory("VmHWM")
+print(peak - before)
+"""
+
+
+def peak_memory(work: str, num_frames: int, height: int, width: int, device: str = "cpu") -> float | None:
+    """Bytes that a piece of work adds at its peak, in a process of its own; None where the system does not tell.
+
+    Args:
+        work: ``"detection"``, or a method of restoration.
+        num_frames: Frames of the stack.
+        height: Their rows.
+        width: Their columns.
+        device: Where the frames are.
+    """
+    numbers = [str(number) for number in (num_frames, height, width)]
+    command = [sys.executable, "-c", _MEMORY_PROBE, device, str(torch.get_num_threads()), work, *numbers]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return float(done.stdout) if done.returncode == 0 else None

@@ -1,15 +1,14 @@
 """Restoration next to its peers: quality over scenes, exposures and noise, speed in FFT round trips, memory.
 
-Peers: unwarping by ``cv2.remap`` (Lanczos-4), a loop of ``skimage.restoration.wiener`` over the rows, and CGLS on
-``pylops.signalprocessing.NonStationaryConvolve2D`` where pylops is installed (extra ``compare``). What a peer has to be
-told (balance, damping, iterations) is the best of several for the truth; ours chooses for itself. Frames come from a
-camera made without the package.
+Peers: unwarping by ``cv2.remap`` (Lanczos-4), loops of ``skimage.restoration.wiener`` and ``richardson_lucy`` over the
+rows, CGLS on ``pylops.signalprocessing.NonStationaryConvolve2D`` where pylops is installed (extra ``compare``), and
+``deepinv.physics.TiledSpaceVaryingBlur`` with its solver of least squares where deepinv can be imported. What a peer
+has to be told (balance, damping, iterations) is the best of several for the truth; ours chooses for itself. Frames come
+from a camera made without the package.
 """
 
 import argparse
 import math
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,8 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 from benchmarks.independent_camera import Shake, closed, take_frames
-from benchmarks.measure import in_turns
-from benchmarks.restoration_peers import Peer, remap_lanczos, wiener_rows
+from benchmarks.measure import in_turns, named, peak_memory, shown_seconds
+from benchmarks.restoration_peers import LOOPS, Peer, loop_rows, remap_lanczos
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -37,6 +36,7 @@ AMPLITUDE, FREQUENCY = (3.1, 5.2), (50.0, 30.0)
 NOISES = (0.0, 0.005, 0.02)
 EXPOSURES = (20, 100, 400)
 TIMED_NOISE = 0.005
+ROUND_TRIP = "FFT round trip"
 SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
     "city": city_and_fields,
     "chart": lambda height, width, seed: resolution_chart(height, width, seed=seed),
@@ -114,7 +114,8 @@ def methods(
     found["exact, 2 frames jointly"] = ours(2, method="exact", joint=True)
     array = frames[0].numpy()
     found["cv2.remap, Lanczos-4"] = lambda: remap_lanczos(array, timing, truth)
-    found["skimage wiener, row loop"] = lambda: wiener_rows(array, timing, truth, still, RIM)
+    for name in LOOPS:
+        found[name] = lambda n=name: loop_rows(n, array, timing, truth, still, RIM)
     if cgls_restore is not None and not options.no_pylops:
         found["pylops CGLS"] = lambda: cgls_restore(array, timing, truth, still, RIM)
     return found
@@ -164,48 +165,27 @@ def speed(options: argparse.Namespace) -> list[dict[str, Any]]:
     scene = city_and_fields(size + 2 * MARGIN, size + 2 * MARGIN, SEED)
     noise, generator = rsv.SensorNoise(read_noise=TIMED_NOISE), torch.Generator().manual_seed(SEED)
     frame = rsv.simulate_frames(scene, timing, truth, 1, frame_size=(size, size), noise=noise, generator=generator)
-    works: dict[str, Callable[[], Any]] = {"FFT round trip": lambda: fft_round_trip(frame[0])}
-    works |= {name: lambda m=name: rsv.restore(frame, timing, truth, method=m) for name in METHODS}
-    array = frame[0].numpy()
-    works["cv2.remap, Lanczos-4"] = lambda: remap_lanczos(array, timing, truth)
-    done = in_turns(works, options.runs)
-    unit = done["FFT round trip"][0]
-    return [
-        {
-            "method": name,
-            "seconds": seconds,
-            "round_trips": seconds / unit,
-            "frames_of_memory": peak_memory(name, size) if name in METHODS else None,
-        }
-        for name, (seconds, _) in done.items()
-    ]
-
-
-MEMORY_PROBE = """
-import re, sys, torch, rsvib_torch as rsv
-from pathlib import Path
-
-def memory(name):
-    return 1024 * int(re.search(name + r":\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1])
-
-method, size, threads = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-torch.set_num_threads(threads)
-timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=max(size, 2048))
-truth = rsv.Vibration([3.1, 5.2], [50.0, 30.0])
-rsv.restore(torch.rand(1, 64, 64), timing, truth, method=method)
-frame = torch.rand(1, size, size)
-Path("/proc/self/clear_refs").write_text("5")  # forgets the peak so far
-before = memory("VmRSS")
-rsv.restore(frame, timing, truth, method=method)
-print((memory("VmHWM") - before) / (8 * size * size))
-"""
-
-
-def peak_memory(method: str, size: int) -> float | None:
-    """Peak memory that restoring one frame adds, over that of the frame in complex64; None where it is not told."""
-    arguments = [sys.executable, "-c", MEMORY_PROBE, method, str(size), str(torch.get_num_threads())]
-    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
-    return float(done.stdout) if done.returncode == 0 else None
+    results = []
+    for device in options.device:
+        taken = frame.to(device)
+        works: dict[str, Callable[[], Any]] = {ROUND_TRIP: lambda f=taken: fft_round_trip(f[0])}
+        works |= {name: lambda m=name, f=taken: rsv.restore(f, timing, truth, method=m) for name in METHODS}
+        if device == "cpu":
+            array = frame[0].numpy()
+            works["cv2.remap, Lanczos-4"] = lambda a=array: remap_lanczos(a, timing, truth)
+        done = in_turns(works, options.runs)
+        unit = done[ROUND_TRIP].seconds
+        for name, timed in done.items():
+            memory = peak_memory(name, 1, size, size, device) if name in METHODS else None
+            results.append(
+                {
+                    "method": named(name, device),
+                    **timed.figures(),
+                    "round_trips": timed.seconds / unit,
+                    "frames_of_memory": None if memory is None else memory / (8 * size * size),
+                }
+            )
+    return results
 
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
@@ -247,11 +227,11 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
     for row in (row for row in results if row["part"] == "speed"):
         memory = row["frames_of_memory"]
         shown = "" if memory is None else f"{memory:.1f}"
-        text.append(f"| {row['method']} | {row['seconds']:.3f} | {row['round_trips']:.1f} | {shown} |")
+        text.append(f"| {row['method']} | {shown_seconds(row)} | {row['round_trips']:.1f} | {shown} |")
     text += [
         "",
-        "The best of each column has a star. The row loop of skimage is run on some rows only: its time is scaled to "
-        f"all of them, its PSNR is that of those rows. Speed: medians of {options.runs} runs in turns; memory over "
-        "that of the frame in complex64.",
+        "The best of each column has a star. The row loops of skimage are run on some rows only: their time is scaled "
+        f"to all of them, their PSNR is that of those rows. Speed: medians of {options.runs} runs in turns (fastest to "
+        "slowest); memory over that of the frame in complex64.",
     ]
     return text

@@ -1,14 +1,14 @@
-"""What others would do: unwarping with OpenCV, and scikit-image's Wiener filter row by row."""
+"""What others would do: unwarping with OpenCV, and deconvolution by scikit-image row by row."""
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
-from skimage.restoration import wiener
+from skimage.restoration import richardson_lucy, wiener
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -17,6 +17,7 @@ from rsvib_torch.imaging import rows_showing
 HALF_ROWS = 16  # of the slab that a row is deconvolved in
 SAMPLED_ROWS = 32
 BALANCES = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)  # of skimage.restoration.wiener
+ITERATIONS = (5, 20, 60)  # of skimage.restoration.richardson_lucy
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,18 +37,20 @@ class Peer:
     rows: list[int] | None = None
 
 
-def rows_and_displacements(scene_rows: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration) -> tuple[Tensor, Tensor]:
-    """Frame rows that show rows of the scene in frame 0, and their mean displacements (N, 2)."""
-    start = timing.frame_starts(1)[0]
+def rows_and_displacements(
+    scene_rows: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration, index: int = 0
+) -> tuple[Tensor, Tensor]:
+    """Rows of frame ``index`` that show rows of the scene, and their mean displacements (N, 2)."""
+    start = timing.frame_starts(index + 1)[index]
     shown_by = rows_showing(scene_rows.double(), start, timing, truth)
     return shown_by, truth.mean_displacement(start + shown_by * timing.row_time, timing.exposure_time)
 
 
-def remap_lanczos(frame: np.ndarray, timing: rsv.SensorTiming, truth: rsv.Vibration) -> Peer:
+def remap_lanczos(frame: np.ndarray, timing: rsv.SensorTiming, truth: rsv.Vibration, index: int = 0) -> Peer:
     """Every pixel fetched from where its row's mean displacement put it, by Lanczos-4."""
     begin = time.perf_counter()
     height, width = frame.shape
-    shown_by, mean = rows_and_displacements(torch.arange(height), timing, truth)
+    shown_by, mean = rows_and_displacements(torch.arange(height), timing, truth, index)
     map_x = (np.arange(width)[None] + mean[:, :1].numpy()).astype(np.float32)
     map_y = np.broadcast_to(shown_by[:, None].numpy().astype(np.float32), map_x.shape)
     fetched = cv2.remap(frame, map_x, np.ascontiguousarray(map_y), cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT)
@@ -55,11 +58,11 @@ def remap_lanczos(frame: np.ndarray, timing: rsv.SensorTiming, truth: rsv.Vibrat
 
 
 def slab_kernels(
-    scene_rows: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration
+    scene_rows: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration, index: int = 0
 ) -> tuple[list[int], list[np.ndarray]]:
     """Frame row in the middle of each row's slab, and the centred kernel of the whole slab (Eqs. 26-39)."""
-    start = timing.frame_starts(1)[0]
-    shown_by, _ = rows_and_displacements(scene_rows, timing, truth)
+    start = timing.frame_starts(index + 1)[index]
+    shown_by, _ = rows_and_displacements(scene_rows, timing, truth, index)
     middles = shown_by.round().long()
     psf = rsv.row_psf(truth, start + shown_by * timing.row_time, timing)
     kernels, (left, top) = psf.dense()
@@ -79,31 +82,76 @@ def slab_kernels(
 
 
 def restore_rows(
-    frame: np.ndarray, middles: Sequence[int], kernels: Sequence[np.ndarray], balance: float
+    frame: np.ndarray,
+    middles: Sequence[int],
+    kernels: Sequence[np.ndarray],
+    deconvolve: Callable[[np.ndarray, np.ndarray], np.ndarray],
 ) -> np.ndarray:
     """Central rows of slabs deconvolved one after another."""
     return np.stack(
         [
-            wiener(frame[m - HALF_ROWS : m + HALF_ROWS + 1], kernel, balance, clip=False)[HALF_ROWS]
+            deconvolve(frame[m - HALF_ROWS : m + HALF_ROWS + 1], kernel)[HALF_ROWS]
             for m, kernel in zip(middles, kernels, strict=True)
         ]
     )
 
 
-def wiener_rows(frame: np.ndarray, timing: rsv.SensorTiming, truth: rsv.Vibration, still: Tensor, rim: int) -> Peer:
-    """Rows drawn at random and restored one by one, with the balance that is best for the truth."""
-    height = frame.shape[0]
+def sampled_rows(height: int, rim: int, count: int = SAMPLED_ROWS) -> Tensor:
+    """Rows of a frame drawn at random, so far inside that a slab fits around each."""
     safe = rim + HALF_ROWS
     generator = torch.Generator().manual_seed(0)
-    sampled = (torch.randperm(height - 2 * safe, generator=generator)[:SAMPLED_ROWS] + safe).sort().values
-    middles, kernels = slab_kernels(sampled, timing, truth)
-    best, told, error = None, 0.0, math.inf
-    begin = time.perf_counter()
-    for balance in BALANCES:
-        found = torch.from_numpy(restore_rows(frame, middles, kernels, balance))
+    return (torch.randperm(height - 2 * safe, generator=generator)[:count] + safe).sort().values
+
+
+def by_wiener(balance: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """``skimage.restoration.wiener`` with that balance."""
+    return lambda slab, kernel: wiener(slab, kernel, balance, clip=False)
+
+
+def by_richardson_lucy(iterations: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """``skimage.restoration.richardson_lucy`` with that many iterations."""
+    return lambda slab, kernel: richardson_lucy(slab, kernel, iterations, clip=False, filter_epsilon=1e-6)
+
+
+@dataclass(frozen=True, eq=False)
+class _Loop:
+    """A loop over sampled rows of a frame, with several settings to choose from."""
+
+    settings: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]]
+    count: int
+
+
+LOOPS = {
+    "skimage wiener, row loop": _Loop(
+        {f"balance {balance:g}": by_wiener(balance) for balance in BALANCES}, SAMPLED_ROWS
+    ),
+    "skimage richardson_lucy, row loop": _Loop(
+        {f"{count} iterations": by_richardson_lucy(count) for count in ITERATIONS}, SAMPLED_ROWS // 2
+    ),
+}
+
+
+def loop_rows(
+    name: str,
+    frame: np.ndarray,
+    timing: rsv.SensorTiming,
+    truth: rsv.Vibration,
+    still: Tensor,
+    rim: int,
+    index: int = 0,
+) -> Peer:
+    """Rows drawn at random and restored one by one, with the setting that is best for the truth."""
+    height = frame.shape[0]
+    sampled = sampled_rows(height, rim, LOOPS[name].count)
+    middles, kernels = slab_kernels(sampled, timing, truth, index)
+    best, error = None, math.inf
+    for told, deconvolve in LOOPS[name].settings.items():
+        begin = time.perf_counter()
+        found = torch.from_numpy(restore_rows(frame, middles, kernels, deconvolve))
+        seconds = (time.perf_counter() - begin) * height / len(sampled)
         wrong = float((found - still[sampled])[:, rim:-rim].square().mean())
         if wrong < error:
-            best, told, error = found, balance, wrong
-    seconds = (time.perf_counter() - begin) / len(BALANCES) * height / len(sampled)
-    assert best is not None
-    return Peer(best, seconds, f"balance {told:g}", sampled.tolist())
+            best, error = Peer(found, seconds, told, sampled.tolist()), wrong
+    if best is None:
+        raise ValueError(f"{name}: no setting gives finite values")
+    return best
