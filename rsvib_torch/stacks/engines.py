@@ -151,14 +151,15 @@ def compute_with_dask(
     job = replace(job, source=job.source.absolute())
     several = _several(windows)
     with _dask_client(scheduler, workers) as client:
-        shared = client.scatter(job, broadcast=False, hash=False) if windows else None
         waiting: deque[Any] = deque()
         left = iter(windows)
         try:
             while True:
                 room = max(1, _AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"])))
                 while len(waiting) < room and (window := next(left, None)) is not None:
-                    waiting.append(client.submit(_compute_there, shared, window, several, retries=_RETRIES, pure=False))
+                    # the job goes along: what is scattered is lost with the worker that holds it
+                    task = (job.of_window(window), window, several)
+                    waiting.append(client.submit(_compute_there, *task, retries=_RETRIES, pure=False))
                 if not waiting:
                     break
                 yield waiting.popleft().result()

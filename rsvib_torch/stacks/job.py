@@ -1,7 +1,7 @@
 """What is done with every window, wherever it is done."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -72,7 +72,7 @@ class StackJob:
         full_scale: Count that means 1.0; None for floats.
         detection: Options of ``detect_vibration``.
         restoration: Options of ``restore``, for frames whose full scale is 1; None to detect only.
-        given: Detections to use instead, one a window; None where a window has none.
+        given: Detections to use instead, by number of the window; None where a window has none.
         bad_frames: Whether frames that cannot be used are written as they are, or left out.
         force: Keep restored frames even where they are judged no better than raw.
         device: Where to compute.
@@ -84,7 +84,7 @@ class StackJob:
     full_scale: float | None
     detection: Mapping[str, Any] = field(default_factory=dict)
     restoration: Mapping[str, Any] | None = field(default_factory=dict)
-    given: Sequence[DetectedWindow | None] | None = None
+    given: Mapping[int, DetectedWindow | None] | None = None
     bad_frames: BadFrames = "pass"
     force: bool = False
     device: str = "cpu"
@@ -93,6 +93,10 @@ class StackJob:
     def joined(self) -> bool:
         """Whether the frames of a window become one image."""
         return self.restoration is not None and self.restoration.get("joint", False) is True
+
+    def of_window(self, window: Window) -> "StackJob":
+        """The same for one window: of the detections to use only its own."""
+        return self if self.given is None else replace(self, given={window.index: self.given[window.index]})
 
     def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
         """Detect, restore and judge one window.

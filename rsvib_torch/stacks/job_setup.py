@@ -79,7 +79,7 @@ def make_job(
         full_scale,
         options,
         None if restoration is None else dict(restoration),
-        given,
+        None if given is None else dict(enumerate(given)),
         bad_frames,
         force,
         _device(device),

@@ -91,7 +91,7 @@ def manifest_header(
         "window": window,
         "detection": dict(job.detection),
         "restoration": None if job.restoration is None else dict(job.restoration),
-        "given": None if job.given is None else _given_keys(job.given),
+        "given": None if job.given is None else _given_keys(job.given.values()),
         "bad_frames": job.bad_frames,
         "force": job.force,
         "device": job.device.partition(":")[0],

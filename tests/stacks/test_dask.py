@@ -57,20 +57,23 @@ def test_run_of_threads_resumes_with_dask(place, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_local_processes_and_a_worker_that_is_killed(place, tmp_path):
+def test_workers_that_are_killed_are_replaced(place, tmp_path):
+    """Each of both once: nothing may be kept in one alone."""
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        pids = [worker.pid for worker in cluster.workers.values()]
-        seen = []
+        pids = [worker.process.process.pid for worker in cluster.workers.values()]
+        done_at_death = []
 
         def kill(done, total):
-            seen.append(done)
-            if len(seen) == 2:
-                with distributed.Client(cluster, set_as_default=False) as client:
-                    os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
+            if done > 2 + 6 * len(done_at_death) and pids:
+                done_at_death.append(done)
+                os.kill(pids.pop(), signal.SIGKILL)
 
-        process_small(place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address, progress=kill)
-        assert len(pids) == 2
-    check_same(place, tmp_path)
+        given = [record.detection.detected() for record in read_manifest(place / "out.tif.manifest.json").windows]
+        options = {"given": given, "detection": None, "scheduler": cluster.scheduler_address}
+        process_small(place / "frames.tif", tmp_path / "out.tif", **options, progress=kill)
+        assert len(done_at_death) == 2
+        assert max(done_at_death) < FRAMES
+    assert (tmp_path / "out.tif").read_bytes() == (place / "out.tif").read_bytes()
 
 
 @pytest.mark.slow
