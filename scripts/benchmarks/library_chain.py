@@ -1,0 +1,92 @@
+"""From frames to vibration with OpenCV and SciPy alone, as the paper describes it: the peer of ``detect_vibration``.
+
+Bands are registered by ``cv2.matchTemplate`` with a parabola, and the offsets of each axis are fitted by
+``scipy.optimize.curve_fit`` with Eqs. (4), (6)-(8) of Liu et al. 2023: a sine of amplitude A, frequency f and phase φ
+seen through an exposure T_e and a frame period m T_row. It starts from the best of a grid of frequencies.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from benchmarks.registration_peers import Array, by_match_template
+from numpy.typing import NDArray
+from scipy.optimize import curve_fit
+
+import rsvib_torch as rsv
+
+BAND_ROWS, BAND_STEP = 32, 16
+_LEAST_BANDS = 8
+_LOWEST_GAIN = 0.2  # frequencies that a pair hardly sees start no fit
+_LARGEST = 32.0  # px of amplitude
+_OUTLIER = 0.1  # px: offsets that are further off count less and less
+_GRID_STEP = 0.25  # of the frequency resolution
+
+
+def offset_model(timing: rsv.SensorTiming) -> Callable[..., Array]:
+    """The offset in px at times in s of a vibration (amplitude, frequency, phase) and a uniform motion in px/s."""
+    period, exposure = timing.frame_period, timing.exposure_time
+
+    def offset(times: Array, amplitude: float, frequency: float, phase: float, motion: float) -> Array:
+        gain = 2 * np.sin(np.pi * frequency * period) * np.sinc(frequency * exposure)
+        middle = times + 0.5 * exposure + 0.5 * period
+        return amplitude * gain * np.cos(2 * np.pi * frequency * middle + phase) + motion * period
+
+    return offset
+
+
+def start_values(times: Array, offsets: Array, timing: rsv.SensorTiming) -> list[float]:
+    """Amplitude, frequency, phase and motion of the best frequency of a grid, each fitted linearly."""
+    period, exposure = timing.frame_period, timing.exposure_time
+    resolution = 1.0 / (times[-1] - times[0])
+    highest = 0.5 / (BAND_STEP * timing.row_time) / 4
+    best, values = np.inf, [1.0, resolution, 0.0, 0.0]
+    for frequency in np.arange(0.5 * resolution, highest, _GRID_STEP * resolution):
+        gain = 2 * np.sin(np.pi * frequency * period) * np.sinc(frequency * exposure)
+        if abs(gain) < _LOWEST_GAIN:
+            continue
+        angle = 2 * np.pi * frequency * (times + 0.5 * exposure + 0.5 * period)
+        basis = np.stack([np.cos(angle), -np.sin(angle), np.ones_like(angle)], axis=1)
+        (c, s, constant), *_ = np.linalg.lstsq(basis, offsets, rcond=None)
+        wrong = float(np.square(basis @ (c, s, constant) - offsets).sum())
+        amplitude = float(np.hypot(c, s) / abs(gain))
+        if wrong < best and amplitude < _LARGEST:
+            phase = float(np.arctan2(s / gain, c / gain))
+            best, values = wrong, [amplitude, float(frequency), phase, float(constant / period)]
+    return values
+
+
+def fit_axis(times: Array, offsets: Array, timing: rsv.SensorTiming) -> Array:
+    """Amplitude in px, frequency in Hz, phase in rad and motion in px/s of one axis; NaN where no fit was found."""
+    known = np.isfinite(offsets)
+    if known.sum() < _LEAST_BANDS:
+        return np.full(4, np.nan)
+    times, offsets = times[known], offsets[known]
+    start = start_values(times, offsets, timing)
+    limits = ([0.0, 0.0, -np.inf, -np.inf], [_LARGEST, np.inf, np.inf, np.inf])
+    scale = [1.0, 0.1 * start[1], 1.0, 1.0 / timing.frame_period]
+    try:
+        found, _ = curve_fit(
+            offset_model(timing),
+            times,
+            offsets,
+            p0=start,
+            bounds=limits,
+            x_scale=scale,
+            loss="soft_l1",
+            f_scale=_OUTLIER,
+            max_nfev=200,
+        )
+    except RuntimeError:  # it does not converge
+        return np.array(start)
+    return np.asarray(found, dtype=float)
+
+
+def detect_by_libraries(frames: NDArray[np.float32], timing: rsv.SensorTiming) -> rsv.Vibration:
+    """The vibration of a pair of frames (2, H, W)."""
+    tops = list(range(0, frames.shape[1] - BAND_ROWS + 1, BAND_STEP))
+    offsets = by_match_template(frames, tops, BAND_ROWS)
+    times = (np.array(tops) + 0.5 * (BAND_ROWS - 1)) * timing.row_time
+    values = np.stack([fit_axis(times, offsets[:, axis], timing) for axis in range(2)], axis=1)
+    amplitude, frequency, phase, _ = torch.from_numpy(np.nan_to_num(values))  # the constant takes what is no vibration
+    return rsv.Vibration(amplitude, frequency, phase)

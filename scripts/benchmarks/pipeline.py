@@ -1,0 +1,356 @@
+"""From a pair of frames to both restored: chains of libraries and the package side by side, accuracy and time.
+
+The paper's chain: bands by ``cv2.matchTemplate`` with a parabola, ``scipy.optimize.curve_fit`` of Eqs. (4), (6)-(8) of
+Liu et al. 2023, and ``skimage.restoration.wiener`` row by row (on some rows, its time scaled to all of them). The
+fastest chain that anyone could write: the same detection, and ``cv2.remap``. Nobody is told more than frames and
+camera, but for the balance of the Wiener filter, which is the best of several for the truth. Frames whose accuracy is
+compared come from a camera made without the package.
+"""
+
+import argparse
+import math
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from benchmarks.independent_camera import Shake, closed, take_frames
+from benchmarks.library_chain import detect_by_libraries
+from benchmarks.measure import Timed, in_turns, named, shown_seconds
+from benchmarks.registration import fastest_method
+from benchmarks.restoration import (
+    AMPLITUDE,
+    FADE,
+    FREQUENCY,
+    MARGIN,
+    RIM,
+    SCENES,
+    SEED,
+    TIMED_NOISE,
+    fft_round_trip,
+    quality,
+    vibration,
+)
+from benchmarks.restoration_peers import (
+    Peer,
+    by_wiener,
+    loop_rows,
+    remap_lanczos,
+    restore_rows,
+    sampled_rows,
+    slab_kernels,
+)
+from torch import Tensor
+
+import rsvib_torch as rsv
+
+PAPER, FASTEST = "matchTemplate, curve_fit, wiener rows (the paper's)", "matchTemplate, curve_fit, remap (fastest)"
+OURS, DEWARP = "detect_vibration, restore", 'detect_vibration, "dewarp"'
+WIENER = "skimage wiener, row loop"
+TIMED_BALANCE = 0.01
+NAMES = {"amplitude_percent": "amplitude", "period_percent": "period", "psnr_db": "PSNR"}
+FIGURES = tuple(NAMES)
+REGISTRATION = "ncc"  # of detect_vibration unless told otherwise
+CAMERA_RATE, GOAL_RATE = 24.0, 100.0  # frames a second: the paper's camera, and what a large GPU should restore
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this part; scenes, exposures, noises and the width of the frames are those of restoration."""
+    parser.add_argument(
+        "--pipeline-rows", type=int, default=2048, help="rows of the frames where chains are compared (default: 2048)"
+    )
+
+
+def bands_chain(registration: str) -> str:
+    """The name of the chain of the package's fastest methods."""
+    return f'"bands" by "{registration}", "dewarp"'
+
+
+def camera(exposure: float, num_rows: int) -> rsv.SensorTiming:
+    """The paper's camera; with fewer rows they are slower, so that frame period and exposure stay what they are."""
+    slower = 2048 / num_rows
+    return rsv.SensorTiming(row_time=20.52e-6 * slower, exposure_rows=exposure / slower, frame_rows=num_rows)
+
+
+def errors_of(found: rsv.Vibration) -> dict[str, float]:
+    """Errors of amplitude and period in % of the strongest tone, on the axis that has the larger one."""
+    amplitude, frequency = found.amplitude[:, 0].cpu(), found.frequency[:, 0].cpu()
+    true_amplitude, true_frequency = (torch.tensor(v, dtype=torch.float64) for v in (AMPLITUDE, FREQUENCY))
+    lost = amplitude <= 0
+    wrong = (amplitude / true_amplitude - 1).abs()
+    period = torch.where(lost, math.nan, (true_frequency / frequency - 1).abs())
+    return {"amplitude_percent": 100 * float(wrong.max()), "period_percent": 100 * float(period.max())}
+
+
+def restored_by(frames: Tensor, timing: rsv.SensorTiming, found: rsv.DetectionResult, method: str) -> list[Peer]:
+    """Both frames restored by the package."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rsv.RestorationWarning)
+        return [Peer(frame, 0.0, "") for frame in rsv.restore(frames, timing, found, method=method)]
+
+
+def compare_chains(
+    frames: Tensor, still: Tensor, timing: rsv.SensorTiming, registrations: list[str]
+) -> list[dict[str, Any]]:
+    """Errors of the vibration, and the PSNR of the worse of the two frames, of every chain."""
+    array = frames.numpy()
+    by_libraries = detect_by_libraries(array, timing)
+    direct = rsv.detect_vibration(frames, timing)
+    chains: dict[str, tuple[rsv.Vibration, Callable[[], list[Peer]]]] = {
+        PAPER: (
+            by_libraries,
+            lambda: [loop_rows(WIENER, array[i], timing, by_libraries, still, RIM, i) for i in range(2)],
+        ),
+        FASTEST: (by_libraries, lambda: [remap_lanczos(array[i], timing, by_libraries, i) for i in range(2)]),
+        OURS: (direct.vibration, lambda: restored_by(frames, timing, direct, "exact")),
+        DEWARP: (direct.vibration, lambda: restored_by(frames, timing, direct, "dewarp")),
+    }
+    for registration in registrations:
+        bands = rsv.detect_vibration(frames, timing, method="bands", registration=registration)
+        restore = lambda found=bands: restored_by(frames, timing, found, "dewarp")  # noqa: E731
+        chains[bands_chain(registration)] = (bands.vibration, restore)
+    results = []
+    for name, (found, restore) in chains.items():
+        try:
+            psnr = min(quality(figure, still) for figure in restore())
+        except ValueError:  # a row loop whose kernels are larger than its slabs: the detection was far off
+            psnr = math.nan
+        results.append({"chain": name, **errors_of(found), "psnr_db": psnr})
+    return results
+
+
+def accuracy(options: argparse.Namespace, registrations: list[str]) -> list[dict[str, Any]]:
+    """Every chain on every scene, exposure and noise."""
+    truth, size = vibration(), (options.pipeline_rows, options.grid_size)
+    shake = Shake(*(values.numpy() for values in (truth.amplitude, truth.frequency, truth.phase, truth.image_motion)))
+    results = []
+    for name in options.scenes:
+        scene = SCENES[name](size[0] + 2 * MARGIN, size[1] + 2 * MARGIN, SEED)
+        still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
+        for exposure in options.exposures:
+            timing = camera(exposure, size[0])
+            taken = take_frames(
+                closed(scene.double().numpy(), FADE),
+                shake,
+                row_time=timing.row_time,
+                exposure_rows=timing.exposure_rows,
+                frame_rows=timing.frame_rows,
+                num_frames=2,
+                size=size,
+            )
+            clean = torch.from_numpy(taken).float()
+            for noise in options.noises:
+                frames = rsv.SensorNoise(read_noise=noise).apply(clean, torch.Generator().manual_seed(SEED))
+                case = {"part": "accuracy", "scene": name, "exposure_rows": exposure, "noise": noise}
+                results += [{**case, **row} for row in compare_chains(frames, still, timing, registrations)]
+    return results
+
+
+def _of_libraries(frames: Tensor, timing: rsv.SensorTiming) -> dict[str, Callable[[], Any]]:
+    """Pieces of work of the libraries, on the CPU."""
+    array = frames.numpy()
+    found = detect_by_libraries(array, timing)
+    rows = sampled_rows(frames.shape[-2], RIM)
+    slabs = [slab_kernels(rows, timing, found, i) for i in range(2)]
+    filtered = by_wiener(TIMED_BALANCE)
+    return {
+        "libraries": lambda: detect_by_libraries(array, timing),
+        "wiener": lambda: [restore_rows(array[i], *slab, filtered) for i, slab in enumerate(slabs)],
+        "remap": lambda: [remap_lanczos(array[i], timing, found, i) for i in range(2)],
+    }
+
+
+def _of_the_package(frames: Tensor, timing: rsv.SensorTiming, registrations: list[str]) -> dict[str, Callable[[], Any]]:
+    """Pieces of work of the package, where the frames are."""
+    found = rsv.detect_vibration(frames, timing)
+    works: dict[str, Callable[[], Any]] = {
+        "round trip": lambda: fft_round_trip(frames[0]),
+        "direct": lambda: rsv.detect_vibration(frames, timing),
+        "exact": lambda: restored_by(frames, timing, found, "exact"),
+        "dewarp": lambda: restored_by(frames, timing, found, "dewarp"),
+    }
+    for name in registrations:
+        works[name] = lambda n=name: rsv.detect_vibration(frames, timing, method="bands", registration=n)
+    return works
+
+
+def speed(
+    options: argparse.Namespace, frames: Tensor, timing: rsv.SensorTiming, registrations: list[str]
+) -> list[dict[str, Any]]:
+    """Seconds of every chain, of its two halves, and these in FFT round trips of one frame."""
+    results = []
+    for device in options.device:
+        taken = frames.to(device)
+        pieces = _of_the_package(taken, timing, registrations)
+        chains = {OURS: ("direct", "exact"), DEWARP: ("direct", "dewarp")}
+        chains |= {bands_chain(registration): (registration, "dewarp") for registration in registrations}
+        if device == "cpu":
+            pieces |= _of_libraries(taken, timing)
+            chains = {PAPER: ("libraries", "wiener"), FASTEST: ("libraries", "remap"), **chains}
+        done = in_turns(pieces, options.runs)
+        if "wiener" in done:
+            count = len(sampled_rows(frames.shape[-2], RIM))
+            done["wiener"] = done["wiener"].scaled(frames.shape[-2] / count)
+        results += [
+            {"part": "speed", "chain": named(name, device), **_figures(done[first], done[second], done["round trip"])}
+            for name, (first, second) in chains.items()
+        ]
+    return results
+
+
+def _figures(detection: Timed, restoration: Timed, round_trip: Timed) -> dict[str, float]:
+    whole = detection + restoration
+    return {
+        **whole.figures(),
+        "detection_seconds": detection.seconds,
+        "restoration_seconds": restoration.seconds,
+        "detection_round_trips": detection.seconds / round_trip.seconds,
+        "restoration_round_trips": restoration.seconds / 2 / round_trip.seconds,
+        "frames_a_second": 2 / whole.seconds,
+        "frames_restored_a_second": 2 / restoration.seconds,
+    }
+
+
+def _target(target: str, value: float, goal: float, *, at_least: bool = False) -> dict[str, Any]:
+    met = value >= goal if at_least else value <= goal
+    bound = f"at least {goal:g}" if at_least else f"at most {goal:g}"
+    return {"part": "target", "target": target, "value": value, "goal": bound, "met": met}
+
+
+def targets(compared: list[dict[str, Any]], timed: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What is aimed at, and whether it is met."""
+    speed_of = {row["chain"]: row for row in timed}
+    found = []
+    if OURS in speed_of:
+        ours, paper, fastest = (speed_of[name]["seconds"] for name in (OURS, PAPER, FASTEST))
+        found += [
+            _target("time of the paper's chain over ours", paper / ours, 10.0, at_least=True),
+            _target("time of ours over that of the fastest chain", ours / fastest, 3.0),
+        ]
+        found += [
+            _target(f"time of {name} over that of the fastest chain", row["seconds"] / fastest, 1.0)
+            for name, row in speed_of.items()
+            if name.endswith('"dewarp"')
+        ]
+        found += [
+            _target("FFT round trips of detection of a pair", speed_of[OURS]["detection_round_trips"], 30.0),
+            _target("FFT round trips of restoration of a frame", speed_of[OURS]["restoration_round_trips"], 10.0),
+        ]
+    on_gpu = speed_of.get(named(OURS, "cuda"))
+    if on_gpu is not None:
+        restored = on_gpu["frames_restored_a_second"]
+        found += [
+            _target(
+                "frames a second on cuda, detected and restored", on_gpu["frames_a_second"], CAMERA_RATE, at_least=True
+            ),
+            _target("frames restored a second on cuda", restored, GOAL_RATE, at_least=True),
+        ]
+    behind = behind_libraries(compared, OURS)
+    for figure in FIGURES:
+        worse = sum(row["figure"] == figure for row in behind)
+        found.append(_target(f"cases where a chain of libraries is ahead in {NAMES[figure]}", float(worse), 0.0))
+    return found
+
+
+def behind_libraries(compared: list[dict[str, Any]], chain: str) -> list[dict[str, Any]]:
+    """Where the better chain of libraries is more accurate than ``chain``: case, figure, by whom and both values."""
+    cases: dict[tuple[Any, ...], dict[str, dict[str, Any]]] = {}
+    for row in compared:
+        cases.setdefault((row["scene"], row["exposure_rows"], row["noise"]), {})[row["chain"]] = row
+    found = []
+    for case, rows_of in cases.items():
+        for figure in FIGURES:
+            sign = 1 if figure == "psnr_db" else -1
+            peers = [peer for peer in (PAPER, FASTEST) if not math.isnan(rows_of[peer][figure])]
+            if not peers:
+                continue
+            best = max(peers, key=lambda peer, s=sign, r=rows_of, f=figure: s * r[peer][f])
+            own, theirs = rows_of[chain][figure], rows_of[best][figure]
+            if not sign * own > sign * theirs:
+                found.append({"case": case, "figure": figure, "peer": best, "own": own, "theirs": theirs})
+    return found
+
+
+def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Accuracy of all chains, their time, and what is met of what is aimed at."""
+    size, timing = options.size, camera(20, options.size)
+    scene = SCENES["city"](size + 2 * MARGIN, size + 2 * MARGIN, SEED)
+    noise, generator = rsv.SensorNoise(read_noise=TIMED_NOISE), torch.Generator().manual_seed(SEED)
+    frames = rsv.simulate_frames(
+        scene, timing, vibration(), 2, frame_size=(size, size), noise=noise, generator=generator
+    )
+    fastest, _ = fastest_method(frames, timing, options.runs)
+    registrations = list(dict.fromkeys([REGISTRATION, fastest]))
+    compared = accuracy(options, registrations)
+    timed = speed(options, frames, timing, registrations)
+    return [*compared, *timed, *targets(compared, timed)]
+
+
+def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+    """The figures as Markdown tables."""
+    of_part = {part: [r for r in results if r["part"] == part] for part in ("accuracy", "speed", "target")}
+    text = [
+        f"From a pair of frames to both restored, {options.pipeline_rows} x {options.grid_size} px. Errors of "
+        "amplitude and period in % on the worse axis, PSNR in dB of the worse frame. The row loop is run on some rows, "
+        "and its time scaled to all; making its kernels is not counted.",
+    ]
+    chains = list(dict.fromkeys(row["chain"] for row in of_part["accuracy"]))
+    for scene, exposure in dict.fromkeys((r["scene"], r["exposure_rows"]) for r in of_part["accuracy"]):
+        here = [r for r in of_part["accuracy"] if (r["scene"], r["exposure_rows"]) == (scene, exposure)]
+        heads = " | ".join(f"noise {noise}: amplitude | period | PSNR" for noise in options.noises)
+        text += [
+            "",
+            f"| {scene}, exposure of {exposure} rows | {heads} |",
+            "|---" * (1 + 3 * len(options.noises)) + "|",
+        ]
+        for chain in chains:
+            cells = [_accuracy_cells(r) for r in here if r["chain"] == chain]
+            text.append(f"| {chain} | {' | '.join(cells)} |")
+    text += [
+        "",
+        f"| a pair of {options.size} x {options.size} px | seconds | detection | restoration "
+        "| FFT round trips: detection | restoration a frame | frames a second |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for r in of_part["speed"]:
+        text.append(
+            f"| {r['chain']} | {shown_seconds(r)} | {r['detection_seconds']:.3f} | {r['restoration_seconds']:.3f} "
+            f"| {r['detection_round_trips']:.1f} | {r['restoration_round_trips']:.1f} | {r['frames_a_second']:.1f} |"
+        )
+    text += [
+        "",
+        f"Medians of {options.runs} runs in turns (fastest to slowest).",
+        "",
+        "| target | goal | found | |",
+        "|---|---|---|---|",
+    ]
+    text += [
+        f"| {r['target']} | {r['goal']} | {r['value']:.2f} | {'met' if r['met'] else '**missed**'} |"
+        for r in of_part["target"]
+    ]
+    if not any(r["chain"].endswith("on cuda") for r in of_part["speed"]):
+        text += ["", "Frames a second on a GPU: not measured, there is none here or it was left out."]
+    return [*text, "", *_losses(of_part["accuracy"], chains)]
+
+
+def _losses(compared: list[dict[str, Any]], chains: list[str]) -> list[str]:
+    """Where chains of the package are behind those of libraries: each case of the default, numbers of the others."""
+    text = []
+    for chain in (chain for chain in chains if chain not in (PAPER, FASTEST)):
+        behind = behind_libraries(compared, chain)
+        cases = len({(row["scene"], row["exposure_rows"], row["noise"]) for row in compared})
+        counts = ", ".join(f"{NAMES[name]} {sum(row['figure'] == name for row in behind)}" for name in FIGURES)
+        text.append(f"- {chain} is behind a chain of libraries in so many of {cases} cases: {counts}.")
+        for row in behind if chain == OURS else ():
+            scene, exposure, noise = row["case"]
+            text.append(
+                f"  - {NAMES[row['figure']]}, {scene}, {exposure} rows, noise {noise}: {row['own']:.3g} against "
+                f"{row['theirs']:.3g} of {row['peer']}"
+            )
+    return text
+
+
+def _accuracy_cells(row: dict[str, Any]) -> str:
+    period = "lost" if math.isnan(row["period_percent"]) else f"{row['period_percent']:.3g}"
+    psnr = "failed" if math.isnan(row["psnr_db"]) else f"{row['psnr_db']:.2f}"
+    return f"{row['amplitude_percent']:.3g} | {period} | {psnr}"
