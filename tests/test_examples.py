@@ -27,6 +27,17 @@ def test_gradient_descent_refines_the_vibration(capsys):
     assert after < 0.2 * before
 
 
+def test_a_third_line_opens_what_two_are_blind_to(capsys):
+    printed = run("push_broom_jitter.py", ["--size", "448", "112"], capsys)
+    truth, two, three = (line for line in printed.splitlines() if "px at" in line)
+    assert "refused" in two
+    found, true = (float(re.search(r"(\S+) px at 13\d", line).group(1)) for line in (three, truth))
+    assert found == pytest.approx(true, rel=0.02)
+    taken, blind, seen = (float(re.search(r"(\S+) dB", line).group(1)) for line in (truth, two, three))
+    assert seen > blind + 8
+    assert blind > taken + 2
+
+
 def test_network_learns_behind_the_restorer(capsys):
     printed = run("train_behind_restorer.py", ["--steps", "25", "--batch", "6"], capsys)
     taken, restored, modelled = (float(value) for value in re.findall(r"(\S+) dB", printed))

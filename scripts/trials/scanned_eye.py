@@ -21,14 +21,15 @@ from rsvib_torch.registration import Registration
 
 FILES = ("tslo-dark.avi", "tslo-stim.avi")
 PERIOD, ROWS, RIM = 1 / 30, 512, 32
+METHODS: tuple[tuple[Registration, int], ...] = (("ncc", 32), ("phase", 32), ("phase", 48))
 
 Array = NDArray[np.float64]
 
 
-def offsets(frames: torch.Tensor, first: int, second: int, method: Registration) -> tuple[Array, Array]:
+def offsets(frames: torch.Tensor, first: int, second: int, method: Registration, tall: int) -> tuple[Array, Array]:
     """Rows and offsets (N, 2) between two frames, bands that were not found left out."""
     timing = rsv.SensorTiming(PERIOD / ROWS, 1, ROWS, frame_start_times=[first * PERIOD, second * PERIOD])
-    curve = rsv.register_bands(frames[[first, second]], timing, method=method)
+    curve = rsv.register_bands(frames[[first, second]], timing, method=method, band_rows=tall)
     found = curve.offsets[0].numpy()
     good = np.isfinite(found).all(1)
     return curve.rows.numpy()[good], found[good]
@@ -50,14 +51,14 @@ def correlation(one: Array, other: Array) -> float:
     return float(np.corrcoef(one[inside].ravel(), other[inside].ravel())[0, 1])
 
 
-def report(path: Path, method: Registration) -> str:
+def report(path: Path, method: Registration, tall: int) -> str:
     frames = rsv.read_stack(path).mean(1)
     pictures = frames.double().numpy()
     down, across = np.mgrid[: frames.shape[-2], : frames.shape[-1]].astype(float)
     told: list[list[float]] = []
     misfits, sizes = [], []
     for p in range(len(frames) - 1):
-        rows, found = offsets(frames, p, p + 1, method)
+        rows, found = offsets(frames, p, p + 1, method, tall)
         moved = at(np.arange(frames.shape[-2]), rows, found)
         sizes.append(np.abs(moved).mean(0))
         place = [down + moved[:, 1:], across + moved[:, :1]]
@@ -67,15 +68,16 @@ def report(path: Path, method: Registration) -> str:
             values += [correlation(one, other), correlation(one, back)]
         told.append(values)
         if p + 2 < len(frames):
-            next_rows, step = offsets(frames, p + 1, p + 2, method)
-            both_rows, both = offsets(frames, p, p + 2, method)
+            next_rows, step = offsets(frames, p + 1, p + 2, method, tall)
+            both_rows, both = offsets(frames, p, p + 2, method, tall)
             misfits.append(np.abs(found + at(rows + found[:, 1], next_rows, step) - at(rows, both_rows, both)))
     raw, after, even, even_after = np.mean(told, axis=0)
     apart = np.median(np.concatenate(misfits), axis=0)
     size = np.mean(sizes, axis=0)
     return (
-        f"{path.name} {method:>5}: offsets {size[0]:.2f}, {size[1]:.2f} px; correlation {raw:.3f} -> {after:.3f}, "
-        f"without vignette {even:.3f} -> {even_after:.3f}; add up to {apart[0]:.3f}, {apart[1]:.3f} px (median x, y)"
+        f"{path.name} {method:>5}, bands of {tall} rows: offsets {size[0]:.2f}, {size[1]:.2f} px; "
+        f"correlation {raw:.3f} -> {after:.3f}, without vignette {even:.3f} -> {even_after:.3f}; "
+        f"add up to {apart[0]:.3f}, {apart[1]:.3f} px (median x, y)"
     )
 
 
@@ -88,8 +90,8 @@ def main() -> int:
         print(f"{folder}: {', '.join(missing)} not there", file=sys.stderr)
         return 2
     for name in FILES:
-        for method in ("ncc", "phase"):
-            print(report(folder / name, method))
+        for method, tall in METHODS:
+            print(report(folder / name, method, tall), flush=True)
         timing = rsv.SensorTiming(PERIOD / ROWS, 1, ROWS)
         found = rsv.detect_vibration(rsv.read_stack(folder / name), timing)
         for axis, reasons in zip("xy", found.reasons, strict=True):
