@@ -1,7 +1,9 @@
 """How the C library keeps memory: in one heap for all threads, and from one window to the next."""
 
 import ctypes
+import functools
 import platform
+from typing import Any
 
 __all__ = ["keep_freed_memory", "share_one_heap"]
 
@@ -34,10 +36,13 @@ def keep_freed_memory() -> bool:
     return _set(_MMAP_THRESHOLD, _MMAP_FROM) and _set(_TRIM_THRESHOLD, 2 * _MMAP_FROM)
 
 
+@functools.cache
+def _glibc() -> Any:
+    return ctypes.CDLL(None) if platform.libc_ver()[0] == "glibc" else None
+
+
 def _set(parameter: int, value: int) -> bool:
-    if platform.libc_ver()[0] != "glibc":
-        return False
     try:
-        return bool(ctypes.CDLL(None).mallopt(parameter, value))
+        return _glibc() is not None and bool(_glibc().mallopt(parameter, value))
     except (AttributeError, OSError):
         return False

@@ -1,13 +1,13 @@
 """One heap for all threads: none of them keeps memory of its own."""
 
+import os
 import platform
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-import rsvib_torch.stacks.heap
+from rsvib_torch.stacks import heap
 
 _COUNT = """
 import ctypes, os, runpy, sys, threading
@@ -31,7 +31,7 @@ libc.fflush(ctypes.c_void_p(file))
 def test_threads_share_one_heap():
     heaps = {}
     for choice in ("one", "own"):
-        command = [sys.executable, "-c", _COUNT, str(Path(rsvib_torch.stacks.heap.__file__)), choice]
+        command = [sys.executable, "-c", _COUNT, heap.__file__, choice]
         done = subprocess.run(command, check=True, capture_output=True, text=True)
         heaps[choice] = done.stdout.count("<heap nr=")
     assert heaps["one"] == 1
@@ -40,4 +40,31 @@ def test_threads_share_one_heap():
 
 def test_other_c_libraries_are_left_alone(monkeypatch):
     monkeypatch.setattr(platform, "libc_ver", lambda: ("", ""))
-    assert not rsvib_torch.stacks.heap.share_one_heap()
+    heap._glibc.cache_clear()
+    assert not heap.share_one_heap()
+    assert not heap.keep_freed_memory()
+    heap._glibc.cache_clear()
+
+
+_FAULTS = """
+import ctypes, os, resource, runpy, sys
+heap = runpy.run_path(sys.argv[1])
+if sys.argv[2] == "kept":
+    assert heap["keep_freed_memory"]()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(20):
+    bytearray(8_000_000)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+def test_freed_memory_is_kept_where_dask_would_have_it_handed_back():
+    faults = {}
+    for choice in ("kept", "handed back"):
+        command = [sys.executable, "-c", _FAULTS, heap.__file__, choice]
+        environment = {**os.environ, "MALLOC_TRIM_THRESHOLD_": "65536"}  # as Dask starts its workers
+        done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
+        faults[choice] = int(done.stdout)
+    assert faults["handed back"] > 20_000
+    assert faults["kept"] < 5_000
