@@ -18,7 +18,7 @@ _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "
 # whatever its size, and bytes a pixel (and channel) of a window that is detected, restored and judged.
 _PROCESS, _WINDOW = 450 * 10**6, 80 * 10**6
 _PIXEL = {"dewarp": 55, "banded": 55, "exact": 68, "richardson-lucy": 105}
-_EDGES = 75  # with prior="edges"
+_EDGES = 80  # with prior="edges"
 _METHOD = inspect.signature(restore).parameters["method"].default
 
 

@@ -219,7 +219,7 @@ def test_frame_times_of_the_file_are_used_and_kept(place, tmp_path):
         ({"method": "dewarp"}, [1, 2, 13]),
         ({}, [1, 2, 10]),
         ({"joint": True}, [1, 2, 10]),
-        ({"prior": "edges"}, [1, 2, 10]),
+        ({"prior": "edges"}, [1, 1, 9]),
         ({"method": "richardson-lucy"}, [0, 1, 7]),
     ],
 )
