@@ -1,9 +1,12 @@
 #!/usr/bin/env python
 """Speed and accuracy next to peers, in one run on one machine.
 
-Registration: all bands of a pair of frames, against skimage.registration.phase_cross_correlation band by band.
+Registration: all bands of a pair of frames, against OpenCV and scikit-image band by band.
 Cost: detection in FFT round trips. Detection: errors against the Cramer-Rao bound, and whether error bars cover.
-Restoration: one frame, see benchmarks/restoration.py. Streaming: long stacks, see benchmarks/streaming.py.
+Restoration: one frame, see benchmarks/restoration.py. Pipeline: from a pair of frames to both restored, against chains
+of libraries; goals met and missed, see benchmarks/pipeline.py. Scaling: time and memory against size, frames, exposure,
+bandwidth and tones. Roofline: bytes and operations of restoration against what the device copies and multiplies.
+Streaming: long stacks, see benchmarks/streaming.py.
 Memory: asked for and measured, see benchmarks/streaming_memory.py.
 Dask: workers of a cluster on this machine, see benchmarks/streaming_dask.py.
 """
@@ -11,6 +14,7 @@ Dask: workers of a cluster on this machine, see benchmarks/streaming_dask.py.
 import argparse
 import json
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,8 +24,11 @@ from benchmarks import (
     detection,
     detection_cost,
     detection_report,
+    pipeline,
     registration,
     restoration,
+    roofline,
+    scaling,
     streaming,
     streaming_dask,
     streaming_memory,
@@ -33,6 +40,9 @@ PARTS: dict[str, tuple[Callable[..., list[dict[str, Any]]], Callable[..., list[s
     "cost": (detection_cost.rows, detection_cost.lines),
     "detection": (detection.rows, detection.lines),
     "restoration": (restoration.rows, restoration.lines),
+    "pipeline": (pipeline.rows, pipeline.lines),
+    "scaling": (scaling.rows, scaling.lines),
+    "roofline": (roofline.rows, roofline.lines),
     "streaming": (streaming.rows, streaming.lines),
     "memory": (streaming_memory.rows, streaming_memory.lines),
     "dask": (streaming_dask.rows, streaming_dask.lines),
@@ -58,6 +68,8 @@ def main() -> None:
     parser.add_argument("--only", choices=PARTS, nargs="+", default=PARTS, help="parts to run (default: all)")
     add_options(parser)
     restoration.add_options(parser)
+    pipeline.add_options(parser)
+    scaling.add_options(parser)
     detection.add_options(parser)
     streaming.add_options(parser)
     streaming_memory.add_options(parser)
@@ -70,16 +82,20 @@ def main() -> None:
         "machine": machine(),
     }
     text = [machine_line(summary["machine"])]
+    print(text[0])
+    options.out.mkdir(parents=True, exist_ok=True)
     for name in options.only:
         rows, lines = PARTS[name]
+        begin = time.perf_counter()
         summary[name] = rows(options)
-        text += ["", *lines(summary[name], options)]
-    options.out.mkdir(parents=True, exist_ok=True)
+        found = ["", *lines(summary[name], options), "", f"({name}: {time.perf_counter() - begin:.0f} s)"]
+        text += found
+        # after every part, so that a later one that fails takes nothing away
+        (options.out / "benchmark.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+        (options.out / "benchmark.md").write_text("\n".join(text) + "\n", encoding="utf-8")
+        print("\n".join(found), flush=True)
     if "detection" in summary:
         detection_report.draw(summary["detection"], options.out)
-    (options.out / "benchmark.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
-    (options.out / "benchmark.md").write_text("\n".join(text) + "\n", encoding="utf-8")
-    print("\n".join(text))
 
 
 if __name__ == "__main__":

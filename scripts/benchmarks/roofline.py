@@ -1,0 +1,207 @@
+"""Roofline of the exact restoration: bytes and operations of one frame against what the device copies and multiplies.
+
+Counted from the shapes of its steps, complex64. "Least" is what a step has to read and write if it keeps to itself what
+is in between; "moved" is what its tensor operations read and write one by one, caches or not. A complex product and sum
+is eight operations, a real Fourier transform of L values 2.5 L log2 L. Estimates of noise and prior are not counted,
+but they are in the measured time; so is what overlapping segments of rows do twice on a GPU.
+"""
+
+import argparse
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from benchmarks.measure import in_turns, shown_seconds
+from benchmarks.restoration import MARGIN, SEED, TIMED_NOISE, camera, vibration
+
+import rsvib_torch as rsv
+from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.restoration import exact, prior
+from rsvib_torch.restoration.motion import as_batch, frame_motion
+from rsvib_torch.restoration.row_kernel import kernel_samples
+from rsvib_torch.restoration.row_system import row_kernels, smooth_band, smooth_kernels
+from rsvib_torch.spectral import fast_length
+
+REAL, COMPLEX = 4, 8  # bytes
+COPIED = 1 << 28  # bytes copied to measure the bandwidth
+MULTIPLIED = 1536  # rows and columns of the matrices multiplied to measure the rate
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Sizes of the systems that restore one frame.
+
+    Attributes:
+        rows: H.
+        columns: W.
+        length: Period that rows are continued to.
+        frequencies: Along a row; one system each.
+        unknowns: Scene rows in a system.
+        taps: Scene rows that a row of the frame sees.
+        width: Half-width of the band.
+        kernel_terms: Terms that kernels are put together from at each frequency.
+        band_terms: Terms that entries of the band are put together from.
+        chunks: Parts that the frequencies are solved in.
+    """
+
+    rows: int
+    columns: int
+    length: int
+    frequencies: int
+    unknowns: int
+    taps: int
+    width: int
+    kernel_terms: int
+    band_terms: int
+    chunks: int
+
+
+def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibration, device: str = "cpu") -> Shapes:
+    """Sizes for a frame of that size, camera and vibration."""
+    height, width = size
+    motion = frame_motion(as_batch(truth, 1), timing.in_row_order(), 1, height)
+    length = fast_length(width + 4 * (exact._MARGIN + motion.reach(height)))
+    starts = motion.row_starts(torch.arange(height, dtype=torch.float64)).expand(1, 1, height)
+    moved, weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
+    kernels = row_kernels(moved[0], weights, torch.ones(1), height, exact._MARGIN)
+    seen, order = kernels.scene_rows(height), prior.ORDER
+    band = smooth_band(kernels, seen, max(kernels.taps.shape[-2] - 1, order), order, torch.float32)
+    frequencies = length // 2 + 1
+    return Shapes(
+        rows=height,
+        columns=width,
+        length=length,
+        frequencies=frequencies,
+        unknowns=seen.count,
+        taps=kernels.taps.shape[-2],
+        width=band.left.shape[1] // 2,
+        kernel_terms=smooth_kernels(kernels, torch.float32).left.shape[-1],
+        band_terms=band.left.shape[-1],
+        chunks=math.ceil(frequencies / max(1, exact._CHUNK_ELEMENTS[device] // height)),
+    )
+
+
+def steps(s: Shapes) -> list[dict[str, Any]]:
+    """Operations and bytes of each step of restoring one frame."""
+    frame, period, spectrum = REAL * s.rows * s.columns, REAL * s.rows * s.length, COMPLEX * s.rows * s.frequencies
+    solution = COMPLEX * s.unknowns * s.frequencies
+    values, unknowns, b = s.rows * s.frequencies, s.unknowns * s.frequencies, s.width
+    transform = 2.5 * s.rows * s.length * math.log2(s.length)
+    kernels = REAL * s.rows * s.taps * s.kernel_terms
+    entries = (s.unknowns + b) * (2 * b + 1)
+    band, terms = COMPLEX * entries * s.frequencies, REAL * entries * s.band_terms
+    shared = len(kernel_samples())
+    counted = [
+        ("Fourier transform of rows", transform, frame + spectrum, frame + 2 * period + spectrum),
+        (
+            "right sides: kernels times data",
+            (14 + s.taps * (4 * s.kernel_terms + 8)) * values,
+            kernels + spectrum + solution,
+            6 * spectrum + s.taps * 7 * spectrum + s.chunks * kernels + 2 * solution,
+        ),
+        ("bands of all frequencies", 4 * entries * s.band_terms * s.frequencies, terms + band, s.chunks * terms + band),
+        (
+            "factors",
+            8 * b * (b + 2) * unknowns,
+            2 * band + 2 * solution,
+            (2 * b * b + 7 * b) * solution,
+        ),
+        ("back substitution", 8 * b * unknowns, (b + 2) * solution, (3 * b + 1) * solution),
+        (
+            "scene between its rows",
+            4 * shared * values,
+            solution + spectrum,
+            5 * shared * spectrum + 2 * spectrum,
+        ),
+        ("Fourier transform back", transform, spectrum + frame, 3 * spectrum + period),
+    ]
+    return [
+        {"part": "step", "step": name, "operations": operations, "bytes_least": least, "bytes_moved": moved}
+        for name, operations, least, moved in counted
+    ]
+
+
+def _device(options: argparse.Namespace, device: str, frame: torch.Tensor, timing: rsv.SensorTiming) -> dict[str, Any]:
+    """What the device copies and multiplies a second, and how long restoration takes on it, in the same run."""
+    source = torch.ones(COPIED // REAL, device=device)
+    target, taken = torch.empty_like(source), frame.to(device)
+    left, right = torch.ones(2, MULTIPLIED, MULTIPLIED, device=device)
+    truth = vibration()
+    done = in_turns(
+        {
+            "copy": lambda: target.copy_(source),
+            "multiply": lambda: left @ right,
+            "restore": lambda: rsv.restore(taken, timing, truth),
+        },
+        options.runs,
+    )
+    shapes = shapes_of(tuple(frame.shape[-2:]), timing, truth, device)
+    counted = steps(shapes)
+    operations, least, moved = (sum(s[key] for s in counted) for key in ("operations", "bytes_least", "bytes_moved"))
+    bandwidth, rate = 2 * COPIED / done["copy"].seconds, 2 * MULTIPLIED**3 / done["multiply"].seconds
+    seconds = done["restore"].seconds
+    return {
+        "part": "device",
+        "device": device,
+        "shapes": vars(shapes),
+        "bytes_a_second": bandwidth,
+        "operations_a_second": rate,
+        **done["restore"].figures(),
+        "least_seconds": max(least / bandwidth, operations / rate),
+        "moved_seconds": max(moved / bandwidth, operations / rate),
+        "share_of_bandwidth": moved / bandwidth / seconds,
+        "share_of_operations": operations / rate / seconds,
+    }
+
+
+def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """The count, and every device that is there."""
+    size, timing, truth = options.size, camera(20), vibration()
+    if size > timing.frame_rows:
+        timing = rsv.SensorTiming(timing.row_time, timing.exposure_rows, size)
+    scene = city_and_fields(size + 2 * MARGIN, size + 2 * MARGIN, SEED)
+    noise, generator = rsv.SensorNoise(read_noise=TIMED_NOISE), torch.Generator().manual_seed(SEED)
+    frame = rsv.simulate_frames(scene, timing, truth, 1, frame_size=(size, size), noise=noise, generator=generator)
+    counted = steps(shapes_of((size, size), timing, truth))
+    return [*counted, *(_device(options, device, frame, timing) for device in options.device)]
+
+
+def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+    """The count and the devices as Markdown tables."""
+    counted = [row for row in results if row["part"] == "step"]
+    on_devices = [row for row in results if row["part"] == "device"]
+    shapes = on_devices[0]["shapes"]
+    total = {"step": "**together**"} | {
+        key: sum(row[key] for row in counted) for key in ("operations", "bytes_least", "bytes_moved")
+    }
+    text = [
+        f'Roofline of restore(method="exact"), one frame of {options.size} x {options.size} px: '
+        f"{shapes['frequencies']} systems of {shapes['unknowns']} unknowns, half-width of the band {shapes['width']}. "
+        "At best: least bytes at the rate of copying, or operations at that of multiplying matrices, whichever takes "
+        "longer; the rates are measured in the same run.",
+        "",
+        "| step | Gop | MB at least | MB moved | operations / byte moved |",
+        "|---|---|---|---|---|",
+    ]
+    text += [
+        f"| {row['step']} | {row['operations'] / 1e9:.2f} | {row['bytes_least'] / 1e6:.0f} "
+        f"| {row['bytes_moved'] / 1e6:.0f} | {row['operations'] / row['bytes_moved']:.1f} |"
+        for row in [*counted, total]
+    ]
+    text += [
+        "",
+        "| device | copies (GB/s) | multiplies (Gop/s, float32) | at best (s) | operation by operation (s) "
+        "| measured (s) | share of the bandwidth | of the operations |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in on_devices:
+        text.append(
+            f"| {row['device']} | {row['bytes_a_second'] / 1e9:.1f} | {row['operations_a_second'] / 1e9:.0f} "
+            f"| {row['least_seconds']:.4f} | {row['moved_seconds']:.4f} | {shown_seconds(row)} "
+            f"| {100 * row['share_of_bandwidth']:.0f} % | {100 * row['share_of_operations']:.0f} % |"
+        )
+    if all(row["device"] == "cpu" for row in on_devices):
+        text += ["", "No CUDA device here, or it was left out: the CPU alone."]
+    return text
