@@ -10,7 +10,7 @@ import time
 import numba
 import numpy as np
 import torch
-from benchmarks.restoration_peers import Peer
+from benchmarks.restoration_peers import Peer, row_kernels
 from pylops import LinearOperator
 from pylops.optimization.cls_basic import CGLS
 from pylops.signalprocessing import NonStationaryConvolve2D
@@ -19,27 +19,8 @@ from torch import Tensor
 import rsvib_torch as rsv
 
 ROWS_PER_KERNEL = 8
-SAMPLES = 64  # of the exposure
 ITERATIONS, PATIENCE = 40, 4  # at most, and without a better result
 DAMPINGS = (1e-3, 1e-2, 5e-2, 0.15, 0.4)
-
-
-def lanczos(place: np.ndarray) -> np.ndarray:
-    """Lanczos-4 window at distances in px."""
-    return np.where(np.abs(place) < 4, np.sinc(place) * np.sinc(place / 4), 0.0)
-
-
-def row_kernels(rows: np.ndarray, timing: rsv.SensorTiming, truth: rsv.Vibration, dtype: str) -> np.ndarray:
-    """Kernels (N, KH, KW) of frame rows, centred: how far content moved during their exposures."""
-    times = torch.from_numpy(rows * timing.row_time)[:, None] + timing.exposure_time * (
-        (torch.arange(SAMPLES, dtype=torch.float64) + 0.5) / SAMPLES
-    )
-    moved = truth.displacement(times).numpy()
-    half_x, half_y = (math.ceil(float(a.sum())) + 4 for a in truth.amplitude)
-    taps_x = lanczos(np.arange(-half_x, half_x + 1) - moved[..., :1])
-    taps_y = lanczos(np.arange(-half_y, half_y + 1) - moved[..., 1:])
-    taps_x, taps_y = (taps / taps.sum(-1, keepdims=True) for taps in (taps_x, taps_y))
-    return (np.einsum("nsy,nsx->nyx", taps_y, taps_x) / SAMPLES).astype(dtype)
 
 
 def frame_operator(

@@ -25,10 +25,15 @@ import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields, resolution_chart
 from rsvib_torch.restoration.restore import METHODS
 
+LEFT_OUT: dict[str, str] = {}  # peers that cannot be had here, and why
 try:
     from benchmarks.pylops_peer import cgls_restore
-except ImportError:  # pylops or numba is not installed
-    cgls_restore = None
+except ImportError as missing:  # pylops or numba is not installed
+    LEFT_OUT["pylops"] = str(missing)
+try:
+    from benchmarks.deepinv_peer import tiled_restore
+except (ImportError, RuntimeError) as missing:  # RuntimeError: its torchvision was built for another torch
+    LEFT_OUT["deepinv"] = str(missing)
 
 SEED = 7
 RIM, MARGIN, FADE = 32, 48, 24  # px
@@ -53,6 +58,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", choices=SCENES, nargs="*", default=list(SCENES), help="drawn scenes to compare on")
     parser.add_argument("--images", type=Path, nargs="*", default=[], help="images to compare on as well")
     parser.add_argument("--no-pylops", action="store_true", help="leave pylops out: it takes minutes")
+    parser.add_argument("--no-deepinv", action="store_true", help="leave deepinv out: it takes minutes")
 
 
 def camera(exposure_rows: int) -> rsv.SensorTiming:
@@ -116,8 +122,10 @@ def methods(
     found["cv2.remap, Lanczos-4"] = lambda: remap_lanczos(array, timing, truth)
     for name in LOOPS:
         found[name] = lambda n=name: loop_rows(n, array, timing, truth, still, RIM)
-    if cgls_restore is not None and not options.no_pylops:
+    if "pylops" not in LEFT_OUT and not options.no_pylops:
         found["pylops CGLS"] = lambda: cgls_restore(array, timing, truth, still, RIM)
+    if "deepinv" not in LEFT_OUT and not options.no_deepinv:
+        found["deepinv tiled blur, CG"] = lambda: tiled_restore(frames[0], timing, truth, still, RIM)
     return found
 
 
@@ -196,7 +204,11 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
         for exposure in options.exposures
         for row in compare(name, scene, exposure, options)
     ]
-    return [*({"part": "quality", **row} for row in compared), *({"part": "speed", **row} for row in speed(options))]
+    return [
+        *({"part": "quality", **row} for row in compared),
+        *({"part": "speed", **row} for row in speed(options)),
+        *({"part": "left out", "peer": peer, "why": why} for peer, why in LEFT_OUT.items()),
+    ]
 
 
 def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
@@ -234,4 +246,6 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         f"to all of them, their PSNR is that of those rows. Speed: medians of {options.runs} runs in turns (fastest to "
         "slowest); memory over that of the frame in complex64.",
     ]
+    for row in (row for row in results if row["part"] == "left out"):
+        text.append(f"Not compared with {row['peer']}, which cannot be imported here: {row['why'].splitlines()[0]}.")
     return text

@@ -16,6 +16,7 @@ from rsvib_torch.imaging import rows_showing
 
 HALF_ROWS = 16  # of the slab that a row is deconvolved in
 SAMPLED_ROWS = 32
+SAMPLES = 64  # of an exposure
 BALANCES = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)  # of skimage.restoration.wiener
 ITERATIONS = (5, 20, 60)  # of skimage.restoration.richardson_lucy
 
@@ -79,6 +80,24 @@ def slab_kernels(
         inner = tuple(slice(h - k, h + k + 1) for h, k in zip(half, keep, strict=True))
         padded.append(canvas[inner])
     return middles.tolist(), padded
+
+
+def lanczos(place: np.ndarray) -> np.ndarray:
+    """Lanczos-4 window at distances in px."""
+    return np.where(np.abs(place) < 4, np.sinc(place) * np.sinc(place / 4), 0.0)
+
+
+def row_kernels(rows: np.ndarray, timing: rsv.SensorTiming, truth: rsv.Vibration, dtype: str) -> np.ndarray:
+    """Kernels (N, KH, KW) of frame rows, centred: how far content moved during their exposures."""
+    times = torch.from_numpy(rows * timing.row_time)[:, None] + timing.exposure_time * (
+        (torch.arange(SAMPLES, dtype=torch.float64) + 0.5) / SAMPLES
+    )
+    moved = truth.displacement(times).numpy()
+    half_x, half_y = (math.ceil(float(a.sum())) + 4 for a in truth.amplitude)
+    taps_x = lanczos(np.arange(-half_x, half_x + 1) - moved[..., :1])
+    taps_y = lanczos(np.arange(-half_y, half_y + 1) - moved[..., 1:])
+    taps_x, taps_y = (taps / taps.sum(-1, keepdims=True) for taps in (taps_x, taps_y))
+    return (np.einsum("nsy,nsx->nyx", taps_y, taps_x) / SAMPLES).astype(dtype)
 
 
 def restore_rows(

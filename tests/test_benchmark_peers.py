@@ -1,0 +1,118 @@
+"""What the benchmark compares with does its work: peers against offsets, tones and frames that are known."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
+
+import rsvib_torch as rsv
+
+TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=100, frame_rows=2048)
+
+
+@pytest.fixture(autouse=True)
+def scripts(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "scripts"))
+    yield
+    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
+        monkeypatch.delitem(sys.modules, name)
+
+
+def shifted_pair(shift, size=(160, 192)):
+    """A smooth random image, and the same moved by ``shift`` (x, y) px by its Fourier transform."""
+    generator = np.random.default_rng(5)
+    v, u = np.fft.fftfreq(size[0])[:, None], np.fft.rfftfreq(size[1])[None]
+    spectrum = np.fft.rfft2(generator.standard_normal(size)) * np.exp(-0.5 * ((u**2 + v**2) / 0.2**2))
+    moved = spectrum * np.exp(-2j * np.pi * (u * shift[0] + v * shift[1]))
+    pair = np.stack([np.fft.irfft2(values, s=size) for values in (spectrum, moved)])
+    return (0.5 + 0.15 * pair / pair.std()).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("name", "tolerance"),
+    [
+        ("cv2.matchTemplate, parabola", 0.08),
+        ("cv2.findTransformECC, from matchTemplate", 0.08),
+        ("cv2.phaseCorrelate", 0.5),
+        ("skimage phase_cross_correlation", 0.25),
+    ],
+)
+def test_peers_register_bands(name, tolerance):
+    from benchmarks.registration_peers import PEERS
+
+    shift = (2.3, -1.4)
+    frames = shifted_pair(shift)
+    before = frames.copy()
+    tops = [0, 16, 64, 96, 128]
+    found = PEERS[name](frames, tops, 32)
+    np.testing.assert_array_equal(frames, before)
+    assert np.isfinite(found[1:]).all()  # what the first band shows has left the frame
+    np.testing.assert_allclose(np.median(found[1:], axis=0), shift, rtol=0, atol=tolerance)
+
+
+def test_libraries_fit_tones():
+    from benchmarks.library_chain import fit_axis
+
+    # mean displacements by brute force, not by a formula
+    def place(starts, amplitude, frequency, phase):
+        inside = (np.arange(2000) + 0.5) / 2000 * TIMING.exposure_time
+        return (amplitude * np.sin(2 * np.pi * frequency * (starts[:, None] + inside) + phase)).mean(1)
+
+    times = (np.arange(0, 2017, 16) + 15.5) * TIMING.row_time
+    for amplitude, frequency, phase in ((3.1, 50.0, 0.7), (5.2, 30.0, -2.1), (0.4, 155.0, 1.5)):
+        offsets = [place(start, amplitude, frequency, phase) for start in (times, times + TIMING.frame_period)]
+        offsets = offsets[1] - offsets[0] + np.random.default_rng(0).normal(0, 1e-4, len(times))
+        found = fit_axis(times, offsets, TIMING)
+        np.testing.assert_allclose(found[:2], (amplitude, frequency), rtol=1e-3)
+        assert abs(np.angle(np.exp(1j * (found[2] - phase)))) < 2e-3
+        offsets[[3, 40, 90]] = np.nan, 4.0, -3.0  # bands that failed
+        np.testing.assert_allclose(fit_axis(times, offsets, TIMING)[:2], (amplitude, frequency), rtol=2e-2)
+
+
+@pytest.fixture(scope="module")
+def taken():
+    scene = draw_scene(160 + 2 * MARGIN, 144 + 2 * MARGIN, seed=61)
+    return crop(scene), take_frames(scene, TIMING, Motion(), 2, samples=64)
+
+
+def noisy(frames):
+    return (frames + 0.005 * np.random.default_rng(1).standard_normal(frames.shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_row_loops_and_unwarping_restore_either_frame(taken, index):
+    from benchmarks.restoration_peers import LOOPS, loop_rows, remap_lanczos
+
+    scene, frames = taken
+    frame, motion = noisy(frames)[index], Motion().vibration()
+    unwarped = remap_lanczos(frame, TIMING, motion, index).restored.numpy()
+    assert decibel(unwarped, scene, 24) > decibel(frame, scene, 24) + 8
+    for name in LOOPS:
+        figure = loop_rows(name, frame, TIMING, motion, torch.from_numpy(scene), 24, index)
+        errors = [
+            image[:, 24:-24] - scene[figure.rows, 24:-24] for image in (frame[figure.rows], figure.restored.numpy())
+        ]
+        before, after = (float(np.square(error).mean()) for error in errors)
+        assert after < before / 6, name
+        assert figure.seconds > 0
+        assert figure.told
+
+
+def test_deepinv_forms_the_frame_and_restores_it(taken):
+    try:
+        from benchmarks.deepinv_peer import frame_physics, tiled_restore
+    except (ImportError, RuntimeError) as missing:
+        pytest.skip(f"deepinv cannot be imported: {missing}")
+    scene, frames = taken
+    motion = Motion().vibration()
+    physics = frame_physics(scene.shape, TIMING, motion)
+    top, left = ((size - 1) // 2 for size in physics.filters.shape[-2:])
+    wide = draw_scene(160 + 2 * MARGIN, 144 + 2 * MARGIN, seed=61)
+    seen = wide[MARGIN - top : len(wide) - MARGIN + top, MARGIN - left : wide.shape[1] - MARGIN + left]
+    formed = physics.A(torch.from_numpy(seen).float()[None, None])[0, 0].numpy()
+    assert decibel(formed, frames[0], 16) > 55
+    figure = tiled_restore(torch.from_numpy(noisy(frames)[0]), TIMING, motion, torch.from_numpy(scene), 24)
+    assert decibel(figure.restored.numpy(), scene, 24) > decibel(noisy(frames)[0], scene, 24) + 12
