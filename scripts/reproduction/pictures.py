@@ -117,8 +117,8 @@ def errors_figure(found: Found, plan: Plan) -> Figure:
         panel.set_xticks(range(len(places)), [f"{TARGETS[t]}\n{AXIS_NAMES[a]}" for t, a in places])
         panel.set_ylabel(f"error of the {quantity} (%)")
         panel.plot([], [], color="#c8102e", linewidth=2.5, label="the paper")
-        for method, name in NAMES.items():
-            panel.plot([], [], "o", color=_COLOURS[method], markersize=4, label=name)
+        for method in METHODS:
+            panel.plot([], [], "o", color=_COLOURS[method], markersize=4, label=NAMES[method])
         plain_axes(panel)
     panel.legend(fontsize=9, frameon=False, loc="best")
     return figure
@@ -194,13 +194,13 @@ def gallery(found: Found, plan: Plan) -> Gallery:
         "Bands of rows of both frames: the later one is displaced.",
     )
     for axis, letter in enumerate("ab"):
-        for method, name in NAMES.items():
+        for method in METHODS:
             add(
                 "frames",
                 f"figure_6{letter}_{method}",
                 lambda axis=axis, method=method: axis_offset_figure(found.images["chart"].detections[method], axis),
                 f"As Figure 6 ({letter})",
-                f"Relative offset and fit, {AXIS_NAMES[AXES[axis]]}, {name}.",
+                f"Relative offset and fit, {AXIS_NAMES[AXES[axis]]}, {NAMES[method]}.",
             )
     for target, number in (("chart", 8), ("landscape", 9)):
         add(

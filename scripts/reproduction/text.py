@@ -7,7 +7,7 @@ import numpy as np
 from reproduction.cells import FRAMES, Cell, Spread, at_noise, collected, metric, mtf_against_still
 from reproduction.paper import AMPLITUDE, AXES, AXIS_NAMES, DETECTED, FREQUENCY, RESTORED, TARGETS, Target
 from reproduction.trials import FREQUENCY as MTF_FREQUENCY
-from reproduction.trials import METHODS
+from reproduction.trials import METHODS, RESTORED_BY
 from reproduction.work import Found, Plan
 
 GOAL_FREQUENCY, GOAL_SHARE, GOAL_OVERSHOOT = 0.4, 0.95, 1.05  # of the restored MTF over the still camera's
@@ -17,7 +17,7 @@ _METRIC_NAMES = {
     "mtf_x": "MTF at Nyquist, horizontal",
     "mtf_y": "MTF at Nyquist, vertical",
 }
-NAMES = {"paper": "the paper's methods", "default": "default methods"}
+NAMES = {"paper": "the paper's methods", "default": "default methods", "joint": "both frames jointly"}
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
@@ -46,12 +46,13 @@ def cells_table(cells: Sequence[Cell], *, column: str) -> list[str]:
         ahead = "in every trial" if cell.better("default") else "on average" if cell.better("default", "mean") else "no"
         rows.append(
             [f"{cell.row}{unit}", cell.column, f"{cell.paper:g}"]
-            + [_spread(cell.ours[method], cell) for method in METHODS]
+            + [_spread(found, cell) for found in cell.ours.values()]
             + ([_number(cell.still, cell.digits) if cell.still is not None else ""] if column == "frame" else [])
             + [ahead]
         )
     still = ["still camera"] if column == "frame" else []
-    return table(["", column, "paper", *NAMES.values(), *still, "default ahead of the paper"], rows)
+    names = [NAMES[method] for method in cells[0].ours]
+    return table(["", column, "paper", *names, *still, "default ahead of the paper"], rows)
 
 
 def detected_table(target: Target, trials: Sequence[dict[str, Any]]) -> list[str]:
@@ -72,7 +73,7 @@ def detected_table(target: Target, trials: Sequence[dict[str, Any]]) -> list[str
             errors = np.abs(collected(trials, lambda t: t["detection"][method][axis]["phase_error"]))  # noqa: B023
             ours.append(f"error {errors.mean():.5f} ({errors.max():.5f})")
         rows.append(["phase (π)", AXIS_NAMES[axis], "drawn", f"{printed.phase:g}, truth not stated", *ours])
-    return table(["", "axis", "true", "paper", *NAMES.values()], rows)
+    return table(["", "axis", "true", "paper", *(NAMES[method] for method in METHODS)], rows)
 
 
 def degraded_table(target: Target, trials: Sequence[dict[str, Any]]) -> list[str]:
@@ -93,15 +94,16 @@ def noise_table(found: Found, plan: Plan) -> list[str]:
     for target, name in TARGETS.items():
         for noise in sorted(plan.noises):
             trials, still = at_noise(found.trials[target], noise), at_noise(found.still[target], noise)[0]
-            for method in METHODS:
+            for method in RESTORED_BY:
                 detection = [
                     np.abs([t["detection"][method][axis][f"{quantity}_error"] for t in trials for axis in AXES])
                     for quantity in ("period", "amplitude")
+                    if method in METHODS
                 ]
                 quality = [np.array([t["restoration"][method][what] for t in trials]) for what in ("psnr", "ssim")]
                 rows.append(
                     [name, f"{noise:g}", NAMES[method]]
-                    + [f"{e.mean():.4f} ({e.max():.4f})" for e in detection]
+                    + ([f"{e.mean():.4f} ({e.max():.4f})" for e in detection] or ["", ""])
                     + [f"{q.mean():.{d}f} ({q.min():.{d}f})" for q, d in zip(quality, (2, 4), strict=True)]
                     + [f"{still['psnr'][0]:.2f}, {still['ssim'][0]:.4f}"]
                 )
@@ -120,7 +122,7 @@ def mtf_table(found: Found, plan: Plan) -> list[str]:
             kinds = {
                 "still camera": [still["mtf"]],
                 "degraded": [t["degraded"]["mtf"] for t in trials],
-                **{NAMES[m]: [t["restoration"][m]["mtf"] for t in trials] for m in METHODS},
+                **{NAMES[m]: [t["restoration"][m]["mtf"] for t in trials] for m in RESTORED_BY},
             }
             for name, frames in kinds.items():
                 curves = [frame[axis][kind] for pair in frames for frame in pair if kind in frame[axis]]
@@ -139,7 +141,7 @@ def closing_values(found: Found, noise: float) -> list[dict[str, Any]]:
     trials, still = at_noise(found.trials["chart"], noise), at_noise(found.still["chart"], noise)[0]
     inside = (MTF_FREQUENCY > 0) & (MTF_FREQUENCY <= GOAL_FREQUENCY + 1e-9)
     values = []
-    for method in METHODS:
+    for method in RESTORED_BY:
         for axis in AXES:
             for kind in ("straight", "along"):
                 share = mtf_against_still(trials, still, method, axis, kind)

@@ -1,4 +1,7 @@
-"""One trial: frames of a target, detection and restoration by the paper's methods and by the default ones."""
+"""One trial: frames of a target, detection and restoration by the paper's methods and by the default ones.
+
+The default restoration makes each frame from itself, as the paper does, and once more from both frames jointly.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -23,6 +26,8 @@ METHODS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # options of dete
     "paper": ({"method": "bands", "registration": "projection"}, {"method": "banded"}),
     "default": ({}, {}),
 }
+JOINT: dict[str, Any] = {"joint": 2}  # what the default restoration is told to make every frame from both
+RESTORED_BY = (*METHODS, "joint")
 _PER_AXIS = ("period", "amplitude", "phase")
 
 
@@ -136,6 +141,10 @@ def run_trial(
             restored = rsv.restore(as_frames(taken), timing, result.vibration, check=False, **restoring)
             images.restored[name] = restored.double().numpy()
             values["restoration"][name] = quality(images.restored[name], scene.still, edges)
+    if restore:
+        vibration = images.detections["default"].vibration
+        jointly = rsv.restore(as_frames(taken), timing, vibration, check=False, **JOINT)
+        values["restoration"]["joint"] = quality(jointly.double().numpy(), scene.still, edges)
     return images
 
 
