@@ -43,6 +43,7 @@ PAGES = (
     "accuracy.md",
     "bound.md",
     "measuring.md",
+    "gallery.md",
     "your_own_camera.md",
     "stacks.md",
     "ml_pipeline.md",
