@@ -82,7 +82,7 @@ def errors_of(found: rsv.Vibration) -> dict[str, float]:
     return {"amplitude_percent": 100 * float(wrong.max()), "period_percent": 100 * float(period.max())}
 
 
-def restored_by(frames: Tensor, timing: rsv.SensorTiming, found: rsv.DetectionResult, method: str) -> list[Peer]:
+def restored_by(frames: Tensor, timing: rsv.SensorTiming, found: rsv.Vibration, method: str) -> list[Peer]:
     """Both frames restored by the package."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rsv.RestorationWarning)
@@ -102,20 +102,22 @@ def compare_chains(
             lambda: [loop_rows(WIENER, array[i], timing, by_libraries, still, RIM, i) for i in range(2)],
         ),
         FASTEST: (by_libraries, lambda: [remap_lanczos(array[i], timing, by_libraries, i) for i in range(2)]),
-        OURS: (direct.vibration, lambda: restored_by(frames, timing, direct, "exact")),
-        DEWARP: (direct.vibration, lambda: restored_by(frames, timing, direct, "dewarp")),
+        OURS: (direct.vibration, lambda: restored_by(frames, timing, direct.vibration, "exact")),
+        DEWARP: (direct.vibration, lambda: restored_by(frames, timing, direct.vibration, "dewarp")),
     }
     for registration in registrations:
         bands = rsv.detect_vibration(frames, timing, method="bands", registration=registration)
-        restore = lambda found=bands: restored_by(frames, timing, found, "dewarp")  # noqa: E731
+        restore = lambda found=bands.vibration: restored_by(frames, timing, found, "dewarp")  # noqa: E731
         chains[bands_chain(registration)] = (bands.vibration, restore)
+    trusted = {OURS: direct, DEWARP: direct}
     results = []
     for name, (found, restore) in chains.items():
         try:
             psnr = min(quality(figure, still) for figure in restore())
         except ValueError:  # a row loop whose kernels are larger than its slabs: the detection was far off
             psnr = math.nan
-        results.append({"chain": name, **errors_of(found), "psnr_db": psnr})
+        reliable = bool(trusted[name].reliable.all()) if name in trusted else None
+        results.append({"chain": name, **errors_of(found), "psnr_db": psnr, "reliable": reliable})
     return results
 
 
@@ -162,7 +164,7 @@ def _of_libraries(frames: Tensor, timing: rsv.SensorTiming) -> dict[str, Callabl
 
 def _of_the_package(frames: Tensor, timing: rsv.SensorTiming, registrations: list[str]) -> dict[str, Callable[[], Any]]:
     """Pieces of work of the package, where the frames are."""
-    found = rsv.detect_vibration(frames, timing)
+    found = rsv.detect_vibration(frames, timing).vibration
     works: dict[str, Callable[[], Any]] = {
         "round trip": lambda: fft_round_trip(frames[0]),
         "direct": lambda: rsv.detect_vibration(frames, timing),
@@ -330,6 +332,8 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
     ]
     if not any(r["chain"].endswith("on cuda") for r in of_part["speed"]):
         text += ["", "Frames a second on a GPU: not measured, there is none here or it was left out."]
+    unsure = [row for row in of_part["accuracy"] if row["chain"] == OURS and not row["reliable"]]
+    text += ["", f"Cases whose detection says of itself that it is not reliable: {len(unsure)}."]
     return [*text, "", *_losses(of_part["accuracy"], chains)]
 
 

@@ -1,0 +1,228 @@
+"""The parts of the benchmark at small sizes: figures are sane and agree with each other, however fast."""
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import rsvib_torch as rsv
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+
+
+@pytest.fixture(autouse=True)
+def scripts(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    yield
+    for name in [name for name in sys.modules if name.split(".")[0] in ("benchmarks", "benchmark")]:
+        monkeypatch.delitem(sys.modules, name)
+
+
+def options(**chosen):
+    usual = {"size": 256, "runs": 2, "device": ["cpu"], "scenes": ["city"], "exposures": [20], "noises": [0.005]}
+    return argparse.Namespace(**usual | {"grid_size": 128, "pipeline_rows": 384, "scaling_size": 256} | chosen)
+
+
+def in_order(row):
+    return 0 < row["seconds_least"] <= row["seconds"] <= row["seconds_most"]
+
+
+def test_timed_runs_add_turn_by_turn_and_scale():
+    from benchmarks.measure import Timed, in_turns, shown_seconds
+
+    first, second = Timed("a", (1.0, 4.0, 2.0)), Timed("b", (0.5, 0.1, 0.2))
+    both = first + second
+    assert both.result == "b"
+    assert both.runs == (1.5, 4.1, 2.2)
+    assert first.scaled(10).figures() == {"seconds": 20.0, "seconds_least": 10.0, "seconds_most": 40.0}
+    assert shown_seconds(both.figures()) == "2.200 (1.500 to 4.100)"
+    calls = []
+    done = in_turns({"x": lambda: calls.append("x"), "y": lambda: calls.append("y")}, 2)
+    assert calls == ["x", "y", "x", "y", "x", "y"]
+    assert [len(timed.runs) for timed in done.values()] == [2, 2]
+
+
+def test_registration():
+    from benchmarks import registration
+
+    chosen = options()
+    found = {row["method"]: row for row in registration.rows(chosen)}
+    assert all(in_order(row) for row in found.values())
+    slowest = found["skimage phase_cross_correlation"]
+    for row in found.values():
+        assert row["ratio"] == pytest.approx(slowest["seconds"] / row["seconds"])
+    for name in ("ncc", "phase", "cv2.matchTemplate, parabola", "cv2.findTransformECC, from matchTemplate"):
+        assert found[name]["share_off"] < 0.15
+        assert max(found[name]["rms_px"]) < 0.12
+    assert sum(line.startswith("| ") for line in registration.lines(list(found.values()), chosen)) == len(found) + 1
+
+
+def test_pipeline():
+    from benchmarks import pipeline
+
+    chosen = options(runs=1)
+    results = pipeline.rows(chosen)
+    compared = {row["chain"]: row for row in results if row["part"] == "accuracy"}
+    timed = {row["chain"]: row for row in results if row["part"] == "speed"}
+    assert list(compared) == list(timed)
+    assert {pipeline.PAPER, pipeline.FASTEST, pipeline.OURS, pipeline.DEWARP} < set(compared)
+    for name, row in compared.items():
+        few = 1.0 if name in (pipeline.OURS, pipeline.DEWARP) else 15.0  # bands are few and smear in frames so low
+        assert row["amplitude_percent"] < few
+        assert row["period_percent"] < few
+        assert row["psnr_db"] > (44 if name == pipeline.OURS else 30)
+    for row in timed.values():
+        assert in_order(row)
+        assert row["frames_a_second"] == pytest.approx(2 / row["seconds"])
+        whole = row["detection_seconds"] + row["restoration_seconds"]
+        assert row["seconds_least"] * 0.5 < whole < row["seconds_most"] * 2
+    trip = timed[pipeline.OURS]["detection_seconds"] / timed[pipeline.OURS]["detection_round_trips"]
+    restoration = timed[pipeline.OURS]["restoration_seconds"]
+    assert timed[pipeline.OURS]["restoration_round_trips"] == pytest.approx(restoration / 2 / trip)
+    found = {row["target"]: row for row in results if row["part"] == "target"}
+    ratio = timed[pipeline.PAPER]["seconds"] / timed[pipeline.OURS]["seconds"]
+    assert found["time of the paper's chain over ours"]["value"] == pytest.approx(ratio)
+    text = "\n".join(pipeline.lines(results, chosen))
+    for row in found.values():
+        assert f"| {row['target']} | {row['goal']} | {row['value']:.2f} | " in text
+
+
+def test_targets_are_met_or_missed():
+    from benchmarks import pipeline
+
+    case = {"scene": "city", "exposure_rows": 20, "noise": 0.0}
+    figures = {"amplitude_percent": 1.0, "period_percent": 1.0, "psnr_db": 40.0}
+    compared = [
+        {**case, "chain": pipeline.PAPER, **figures, "period_percent": math.nan},
+        {**case, "chain": pipeline.FASTEST, **figures},
+        {**case, "chain": pipeline.OURS, "amplitude_percent": 0.5, "period_percent": 2.0, "psnr_db": 39.0},
+    ]
+    behind = pipeline.behind_libraries(compared, pipeline.OURS)
+    assert [row["figure"] for row in behind] == ["period_percent", "psnr_db"]
+    assert behind[0]["peer"] == pipeline.FASTEST
+    trips = {"detection_round_trips": 31.0, "restoration_round_trips": 9.0, "frames_a_second": 30.0}
+    timed = [
+        {"chain": name, "seconds": seconds, **trips, "frames_restored_a_second": 90.0}
+        for name, seconds in (
+            (pipeline.PAPER, 11.0),
+            (pipeline.FASTEST, 0.3),
+            (pipeline.OURS, 1.0),
+            (pipeline.DEWARP, 0.25),
+            (f"{pipeline.OURS} on cuda", 0.05),
+        )
+    ]
+    met = [(row["value"], row["met"]) for row in pipeline.targets(compared, timed)]
+    expected = [(11.0, True), (1 / 0.3, False), (0.25 / 0.3, True), (31.0, False), (9.0, True), (30.0, True)]
+    assert met == [*expected, (90.0, False), (0.0, True), (1.0, False), (1.0, False)]
+
+
+def test_scaling(monkeypatch):
+    from benchmarks import scaling
+
+    every = scaling.cases(1024)
+    assert {name for name, _ in every} == {
+        "height",
+        "width",
+        "frames",
+        "exposure rows",
+        "amplitude across (px)",
+        "tones",
+    }
+    usual = every["height", "1024"]
+    assert every["exposure rows", "205"].timing.exposure_rows == pytest.approx(204.8)
+    assert every["tones", "3"].vibration.amplitude.shape == (2, 3)
+    assert every["amplitude across (px)", "8"].vibration.amplitude[1, 0] == 8
+    assert usual.timing.frame_period == pytest.approx(scaling.PERIOD)
+
+    chosen = options(runs=1)
+    picked = scaling.cases(256)
+    names = [("height", "256"), ("width", "128"), ("frames", "2")]
+    monkeypatch.setattr(scaling, "cases", lambda size: {name: picked[name] for name in names})
+    monkeypatch.setattr(scaling, "peak_memory", lambda *asked: 10.0 * asked[2] * asked[3])
+    results = scaling.rows(chosen)
+    first, narrow, again = (row for row in results if row["part"] == "time")
+    assert first["detection"] == again["detection"]  # the same case is measured once
+    assert first["pixels"] == 2 * narrow["pixels"]
+    for row in (first, narrow):
+        assert in_order(row["detection"])
+        assert in_order(row["restoration"])
+        assert row["amplitude_percent"] < 1
+        assert row["band_width"] == 6
+    memory = [row for row in results if row["part"] == "memory"]
+    assert {row["frames_of_memory"] for row in memory} == {1.25}
+    text = "\n".join(scaling.lines(results, chosen))
+    assert f"| width | 128 | 6 | {narrow['detection']['seconds']:.3f}" in text
+
+
+@pytest.mark.slow
+def test_peak_memory():
+    from benchmarks.measure import peak_memory
+
+    if not Path("/proc/self/clear_refs").exists():
+        pytest.skip("the system does not tell the peak of memory")
+    frame = 4 * 1024 * 512
+    exact, dewarped = (peak_memory(method, 1, 1024, 512) for method in ("exact", "dewarp"))
+    assert 2 * frame < dewarped < exact < 200 * frame
+    assert peak_memory("detection", 2, 512, 512) > 2 * 4 * 512 * 512
+
+
+def test_roofline(monkeypatch):
+    from benchmarks import roofline
+
+    monkeypatch.setattr(roofline, "COPIED", 1 << 22)
+    monkeypatch.setattr(roofline, "MULTIPLIED", 256)
+    chosen = options()
+    results = roofline.rows(chosen)
+    (device,) = (row for row in results if row["part"] == "device")
+    shapes, counted = device["shapes"], {row["step"]: row for row in results if row["part"] == "step"}
+    assert shapes["rows"] == shapes["columns"] == 256
+    assert shapes["frequencies"] == shapes["length"] // 2 + 1
+    # the kernel of six rows, and one more row for what moves from cell to cell: half-width six
+    assert (shapes["taps"], shapes["width"]) == (7, 6)
+    steps = shapes["unknowns"] * shapes["frequencies"]
+    updates = 6 * 6 + 6 + 6  # of the window, of the right side, and scaling of a row
+    assert counted["factors"]["operations"] == 8 * updates * steps
+    band = 8 * (shapes["unknowns"] + 6) * 13 * shapes["frequencies"]
+    assert counted["factors"]["bytes_least"] == 2 * band + 2 * 8 * steps
+    for row in counted.values():
+        assert 0 < row["bytes_least"] <= row["bytes_moved"]
+    assert device["least_seconds"] <= device["moved_seconds"]
+    moved = sum(row["bytes_moved"] for row in counted.values())
+    assert device["share_of_bandwidth"] == pytest.approx(moved / device["bytes_a_second"] / device["seconds"])
+    assert "| cpu | " in "\n".join(roofline.lines(results, chosen))
+
+
+def test_restoration_next_to_row_loops():
+    from benchmarks import restoration
+
+    chosen = options(grid_size=176, images=[], no_pylops=True, no_deepinv=True)
+    scene = restoration.scenes(chosen)["city"]
+    found = {row["method"]: row["psnr_db"]["0.005"] for row in restoration.compare("city", scene, 20, chosen)}
+    assert found["raw"] < 25
+    assert found["exact"] > 44
+    for name in ("skimage wiener, row loop", "skimage richardson_lucy, row loop", "cv2.remap, Lanczos-4"):
+        assert found["raw"] + 10 < found[name] < found["exact"]
+
+
+def test_one_command_writes_markdown_and_json(monkeypatch, tmp_path, capsys):
+    import benchmark
+
+    monkeypatch.setattr(sys, "argv", ["benchmark.py", "--out", str(tmp_path), "--size", "224", "--runs", "1"])
+    sys.argv += ["--only", "registration", "--device", "cpu"]
+    threads = torch.get_num_threads()
+    try:
+        benchmark.main()
+    finally:
+        torch.set_num_threads(threads)
+    summary = json.loads((tmp_path / "benchmark.json").read_text())
+    assert summary["machine"]["torch"] == torch.__version__
+    assert {"OpenCV", "SciPy", "scikit-image", "Kornia"} < set(summary["machine"]["libraries"])
+    assert len(summary["registration"]) == 7
+    text = (tmp_path / "benchmark.md").read_text()
+    assert text in capsys.readouterr().out + "\n"
+    assert "skimage" in text
+    assert rsv.__version__
