@@ -104,7 +104,9 @@ def test_times_of_playback_tell_dropped_frames_and_nothing_else():
 
 
 def test_video_at_another_rate_is_taken_at_the_camera_s(tmp_path):
-    writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 24, (WIDTH, HEIGHT))
+    kind = cv2.VideoWriter.fourcc(*"MJPG")
+    # not through FFmpeg, which would go on writing messages to the terminal
+    writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.CAP_OPENCV_MJPEG, kind, 24, (WIDTH, HEIGHT))
     for frame in draw_counts(6):
         writer.write(np.repeat((frame // 16).astype(np.uint8)[..., None], 3, axis=-1))
     writer.release()
