@@ -82,6 +82,23 @@ def noisy(frames):
     return (frames + 0.005 * np.random.default_rng(1).standard_normal(frames.shape)).astype(np.float32)
 
 
+def test_kernels_of_rows_are_those_of_the_package():
+    from benchmarks.library_chain import kernel_of_row
+    from benchmarks.restoration_peers import slab_kernels
+
+    motion, rows = Motion().vibration(), torch.tensor([3, 40, 700])
+    middles, kernels = slab_kernels(rows, TIMING, motion)
+    shown_by = rows.double()
+    for _ in range(30):  # the row r that shows s: r = s + displacement of r
+        shown_by = rows + motion.mean_displacement(shown_by * TIMING.row_time, TIMING.exposure_time)[:, 1]
+    for row, shown, middle, kernel in zip(rows.tolist(), shown_by.tolist(), middles, kernels, strict=True):
+        found = kernel_of_row(motion, shown * TIMING.row_time, TIMING, middle - row)
+        rim = [(large - small) // 2 for large, small in zip(found.shape, kernel.shape, strict=True)]
+        padded = np.pad(kernel, [(n, n) for n in rim])
+        np.testing.assert_allclose(found, padded, rtol=0, atol=1e-6)
+        assert found.sum() == pytest.approx(1)
+
+
 @pytest.mark.parametrize("index", [0, 1])
 def test_row_loops_and_unwarping_restore_either_frame(taken, index):
     from benchmarks.restoration_peers import LOOPS, loop_rows, remap_lanczos

@@ -1,4 +1,4 @@
-"""From frames to vibration with OpenCV and SciPy alone, as the paper describes it: the peer of ``detect_vibration``.
+"""What the paper describes, with OpenCV, SciPy and NumPy alone: the peer of ``detect_vibration``, and kernels of rows.
 
 Bands are registered by ``cv2.matchTemplate`` with a parabola, and the offsets of each axis are fitted by
 ``scipy.optimize.curve_fit`` with Eqs. (4), (6)-(8) of Liu et al. 2023: a sine of amplitude A, frequency f and phase φ
@@ -90,3 +90,29 @@ def detect_by_libraries(frames: NDArray[np.float32], timing: rsv.SensorTiming) -
     values = np.stack([fit_axis(times, offsets[:, axis], timing) for axis in range(2)], axis=1)
     amplitude, frequency, phase, _ = torch.from_numpy(np.nan_to_num(values))  # the constant takes what is no vibration
     return rsv.Vibration(amplitude, frequency, phase)
+
+
+def kernel_of_row(vibration: rsv.Vibration, start: float, timing: rsv.SensorTiming, moved: int) -> Array:
+    """The kernel of a row whose exposure begins at ``start``, by bilinear splats of Eqs. (26)-(39), centred.
+
+    Args:
+        vibration: One tone on either axis.
+        start: Seconds.
+        timing: The camera.
+        moved: Rows that the slab around the row is already moved by.
+    """
+    count = int(np.ceil(timing.exposure_rows))
+    times = start + (np.arange(count) + 0.5) / count * timing.exposure_time
+    amplitude, frequency, phase = (
+        values[:, 0].numpy() for values in (vibration.amplitude, vibration.frequency, vibration.phase)
+    )
+    x, y = amplitude[:, None] * np.sin(2 * np.pi * frequency[:, None] * times + phase[:, None])
+    y = y - moved
+    half = [int(np.floor(np.abs(values).max())) + 1 for values in (y, x)]
+    kernel = np.zeros((2 * half[0] + 1, 2 * half[1] + 1))
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    for down in (0, 1):
+        for right in (0, 1):
+            weight = np.abs(1 - down - (y - top)) * np.abs(1 - right - (x - left))
+            np.add.at(kernel, (top + half[0] + down, left + half[1] + right), weight / count)
+    return kernel
