@@ -13,6 +13,7 @@ Dask: workers of a cluster on this machine, see benchmarks/streaming_dask.py.
 
 import argparse
 import json
+import math
 import os
 import time
 from collections.abc import Callable
@@ -60,6 +61,15 @@ def machine_line(machine: dict[str, Any]) -> str:
     )
 
 
+def finite(figures: Any) -> Any:
+    """Figures with None for those that are not numbers, which JSON does not know."""
+    if isinstance(figures, dict):
+        return {name: finite(value) for name, value in figures.items()}
+    if isinstance(figures, list | tuple):
+        return [finite(value) for value in figures]
+    return None if isinstance(figures, float) and not math.isfinite(figures) else figures
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/benchmark"), help="folder for benchmark.md and .json")
@@ -91,7 +101,8 @@ def main() -> None:
         found = ["", *lines(summary[name], options), "", f"({name}: {time.perf_counter() - begin:.0f} s)"]
         text += found
         # after every part, so that a later one that fails takes nothing away
-        (options.out / "benchmark.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+        stated = json.dumps(finite(summary), indent=1, allow_nan=False)
+        (options.out / "benchmark.json").write_text(stated + "\n", encoding="utf-8")
         (options.out / "benchmark.md").write_text("\n".join(text) + "\n", encoding="utf-8")
         print("\n".join(found), flush=True)
     if "detection" in summary:

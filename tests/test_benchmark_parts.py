@@ -208,6 +208,13 @@ def test_restoration_next_to_row_loops():
         assert found["raw"] + 10 < found[name] < found["exact"]
 
 
+def test_json_knows_no_nan():
+    import benchmark
+
+    figures = {"a": [1.5, math.nan], "b": {"c": (math.inf, 2)}, "d": "nan"}
+    assert benchmark.finite(figures) == {"a": [1.5, None], "b": {"c": [None, 2]}, "d": "nan"}
+
+
 def test_one_command_writes_markdown_and_json(monkeypatch, tmp_path, capsys):
     import benchmark
 
