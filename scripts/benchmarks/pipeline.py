@@ -17,7 +17,8 @@ import numpy as np
 import torch
 from benchmarks.independent_camera import Shake, closed, take_frames
 from benchmarks.library_chain import detect_by_libraries, kernel_of_row
-from benchmarks.measure import Timed, in_turns, named, shown_seconds
+from benchmarks.measure import Timed, in_turns, named
+from benchmarks.pipeline_report import DEWARP, FASTEST, OURS, PAPER, behind_libraries, lines, targets
 from benchmarks.registration import fastest_method
 from benchmarks.restoration import (
     AMPLITUDE,
@@ -46,14 +47,11 @@ from torch import Tensor
 
 import rsvib_torch as rsv
 
-PAPER, FASTEST = "matchTemplate, curve_fit, wiener rows (the paper's)", "matchTemplate, curve_fit, remap (fastest)"
-OURS, DEWARP = "detect_vibration, restore", 'detect_vibration, "dewarp"'
+__all__ = ["add_options", "behind_libraries", "lines", "rows", "targets"]
+
 WIENER = "skimage wiener, row loop"
 TIMED_BALANCE = 0.01
-NAMES = {"amplitude_percent": "amplitude", "period_percent": "period", "psnr_db": "PSNR"}
-FIGURES = tuple(NAMES)
 REGISTRATION = "ncc"  # of detect_vibration unless told otherwise
-CAMERA_RATE, GOAL_RATE = 24.0, 100.0  # frames a second: the paper's camera, and what a large GPU should restore
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -227,66 +225,6 @@ def _figures(detection: Timed, restoration: Timed, round_trip: Timed) -> dict[st
     }
 
 
-def _target(target: str, value: float, goal: float, *, at_least: bool = False) -> dict[str, Any]:
-    met = value >= goal if at_least else value <= goal
-    bound = f"at least {goal:g}" if at_least else f"at most {goal:g}"
-    return {"part": "target", "target": target, "value": value, "goal": bound, "met": met}
-
-
-def targets(compared: list[dict[str, Any]], timed: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What is aimed at, and whether it is met."""
-    speed_of = {row["chain"]: row for row in timed}
-    found = []
-    if OURS in speed_of:
-        ours, paper, fastest = (speed_of[name]["seconds"] for name in (OURS, PAPER, FASTEST))
-        found += [
-            _target("time of the paper's chain over ours", paper / ours, 10.0, at_least=True),
-            _target("time of ours over that of the fastest chain", ours / fastest, 3.0),
-        ]
-        found += [
-            _target(f"time of {name} over that of the fastest chain", row["seconds"] / fastest, 1.0)
-            for name, row in speed_of.items()
-            if name.endswith('"dewarp"')
-        ]
-        found += [
-            _target("FFT round trips of detection of a pair", speed_of[OURS]["detection_round_trips"], 30.0),
-            _target("FFT round trips of restoration of a frame", speed_of[OURS]["restoration_round_trips"], 10.0),
-        ]
-    on_gpu = speed_of.get(named(OURS, "cuda"))
-    if on_gpu is not None:
-        restored = on_gpu["frames_restored_a_second"]
-        found += [
-            _target(
-                "frames a second on cuda, detected and restored", on_gpu["frames_a_second"], CAMERA_RATE, at_least=True
-            ),
-            _target("frames restored a second on cuda", restored, GOAL_RATE, at_least=True),
-        ]
-    behind = behind_libraries(compared, OURS)
-    for figure in FIGURES:
-        worse = sum(row["figure"] == figure for row in behind)
-        found.append(_target(f"cases where a chain of libraries is ahead in {NAMES[figure]}", float(worse), 0.0))
-    return found
-
-
-def behind_libraries(compared: list[dict[str, Any]], chain: str) -> list[dict[str, Any]]:
-    """Where the better chain of libraries is more accurate than ``chain``: case, figure, by whom and both values."""
-    cases: dict[tuple[Any, ...], dict[str, dict[str, Any]]] = {}
-    for row in compared:
-        cases.setdefault((row["scene"], row["exposure_rows"], row["noise"]), {})[row["chain"]] = row
-    found = []
-    for case, rows_of in cases.items():
-        for figure in FIGURES:
-            sign = 1 if figure == "psnr_db" else -1
-            peers = [peer for peer in (PAPER, FASTEST) if not math.isnan(rows_of[peer][figure])]
-            if not peers:
-                continue
-            best = max(peers, key=lambda peer, s=sign, r=rows_of, f=figure: s * r[peer][f])
-            own, theirs = rows_of[chain][figure], rows_of[best][figure]
-            if not sign * own > sign * theirs:
-                found.append({"case": case, "figure": figure, "peer": best, "own": own, "theirs": theirs})
-    return found
-
-
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Accuracy of all chains, their time, and what is met of what is aimed at."""
     size, timing = options.size, camera(20, options.size)
@@ -300,75 +238,3 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     compared = accuracy(options, registrations)
     timed = speed(options, frames, timing, registrations)
     return [*compared, *timed, *targets(compared, timed)]
-
-
-def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
-    """The figures as Markdown tables."""
-    of_part = {part: [r for r in results if r["part"] == part] for part in ("accuracy", "speed", "target")}
-    text = [
-        f"From a pair of frames to both restored, {options.pipeline_rows} x {options.grid_size} px. Errors of "
-        "amplitude and period in % on the worse axis, PSNR in dB of the worse frame. The row loop is run on some rows, "
-        "and its time, with that of making its kernels by NumPy, scaled to all.",
-    ]
-    chains = list(dict.fromkeys(row["chain"] for row in of_part["accuracy"]))
-    for scene, exposure in dict.fromkeys((r["scene"], r["exposure_rows"]) for r in of_part["accuracy"]):
-        here = [r for r in of_part["accuracy"] if (r["scene"], r["exposure_rows"]) == (scene, exposure)]
-        heads = " | ".join(f"noise {noise}: amplitude | period | PSNR" for noise in options.noises)
-        text += [
-            "",
-            f"| {scene}, exposure of {exposure} rows | {heads} |",
-            "|---" * (1 + 3 * len(options.noises)) + "|",
-        ]
-        for chain in chains:
-            cells = [_accuracy_cells(r) for r in here if r["chain"] == chain]
-            text.append(f"| {chain} | {' | '.join(cells)} |")
-    text += [
-        "",
-        f"| a pair of {options.size} x {options.size} px | seconds | detection | restoration "
-        "| FFT round trips: detection | restoration a frame | frames a second |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for r in of_part["speed"]:
-        text.append(
-            f"| {r['chain']} | {shown_seconds(r)} | {r['detection_seconds']:.3f} | {r['restoration_seconds']:.3f} "
-            f"| {r['detection_round_trips']:.1f} | {r['restoration_round_trips']:.1f} | {r['frames_a_second']:.1f} |"
-        )
-    text += [
-        "",
-        f"Medians of {options.runs} runs in turns (fastest to slowest).",
-        "",
-        "| target | goal | found | |",
-        "|---|---|---|---|",
-    ]
-    text += [
-        f"| {r['target']} | {r['goal']} | {r['value']:.2f} | {'met' if r['met'] else '**missed**'} |"
-        for r in of_part["target"]
-    ]
-    if not any(r["chain"].endswith("on cuda") for r in of_part["speed"]):
-        text += ["", "Frames a second on a GPU: not measured, there is none here or it was left out."]
-    unsure = [row for row in of_part["accuracy"] if row["chain"] == OURS and not row["reliable"]]
-    text += ["", f"Cases whose detection says of itself that it is not reliable: {len(unsure)}."]
-    return [*text, "", *_losses(of_part["accuracy"], chains)]
-
-
-def _losses(compared: list[dict[str, Any]], chains: list[str]) -> list[str]:
-    """Where chains of the package are behind those of libraries: each case of the default, numbers of the others."""
-    text = []
-    for chain in (chain for chain in chains if chain not in (PAPER, FASTEST)):
-        behind = behind_libraries(compared, chain)
-        cases = len({(row["scene"], row["exposure_rows"], row["noise"]) for row in compared})
-        counts = ", ".join(f"{NAMES[name]} {sum(row['figure'] == name for row in behind)}" for name in FIGURES)
-        text.append(f"- {chain} is behind a chain of libraries in so many of {cases} cases: {counts}.")
-        for row in behind if chain == OURS else ():
-            scene, exposure, noise = row["case"]
-            text.append(
-                f"  - {NAMES[row['figure']]}, {scene}, {exposure} rows, noise {noise}: {row['own']:.3g} against "
-                f"{row['theirs']:.3g} of {row['peer']}"
-            )
-    return text
-
-
-def _accuracy_cells(row: dict[str, Any]) -> str:
-    period = "lost" if math.isnan(row["period_percent"]) else f"{row['period_percent']:.3g}"
-    psnr = "failed" if math.isnan(row["psnr_db"]) else f"{row['psnr_db']:.2f}"
-    return f"{row['amplitude_percent']:.3g} | {period} | {psnr}"
