@@ -160,7 +160,7 @@ def restore_exact(
         certain = noise != "auto" or T > 1
         chosen = system(members, reference)
         strength = prior_strength(frames[stack, members], chosen, row_prior, typical * length, certain=certain)
-        precision = row_prior.precision(typical * length, factor * strength)
+        precision = row_prior.precision(typical * length, factor * strength, smear=chosen.smear)
         for members, reference in groups:
             kernels = system(members, reference)
             along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
