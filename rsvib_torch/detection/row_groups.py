@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.imaging.coupling import rows_showing
+from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.registration.gradients import RowGradients, row_gradients, row_shifts
 from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra
 from rsvib_torch.sensor import SensorTiming
@@ -29,6 +30,7 @@ __all__ = [
 BLOCK = 8  # rows that give one measurement: tones up to 1 / (16 T_row) are told apart
 LARGEST_GROUP = 8  # of a group that shares one mean scene
 _LEAST_OVERLAP = 0.5  # of the frame that the frames of a group share
+_ALIKE = 0.5  # px: kernels of two frames whose paths differ by less blur the scene alike
 _CONDITION = 1e-4  # least share of the product of the diagonal that a block's determinant must keep
 
 
@@ -47,8 +49,11 @@ def _members(num_frames: int, most: int) -> list[range]:
     return [range(first, last + 1) for first, last in itertools.pairwise(ends)]
 
 
-def _frames_in_group(motion: Vibration, starts: Tensor, size: tuple[int, int]) -> int:
-    """How many frames of (H, W) px still share enough of the scene when the image moves."""
+def _frames_in_group(motion: Vibration, timing: SensorTiming, starts: Tensor, size: tuple[int, int]) -> int:
+    """How many frames of (H, W) px still share enough of the scene when the image moves, and can be blurred alike."""
+    rows = torch.arange(size[0], dtype=torch.float64, device=starts.device)
+    if bool(_unlike(_paths(starts[..., None] + rows * timing.row_time, timing, motion)[0]).any()):
+        return 2
     moved = (motion.drift(starts[:, 1:]) - motion.drift(starts[:, :-1])).abs().amax((0, 1))
     extent = torch.tensor([size[1], size[0]], dtype=moved.dtype, device=moved.device)
     fraction = float((moved / extent).amax())
@@ -66,7 +71,7 @@ def frame_groups(frames: Tensor, valid: Tensor | None, timing: SensorTiming, mot
     """
     starts = timing.frame_starts(frames.shape[1], frames.device).expand(len(frames), -1)
     even = _standardised(frames, valid)
-    members = _members(frames.shape[1], _frames_in_group(motion, starts, (frames.shape[-2], frames.shape[-1])))
+    members = _members(frames.shape[1], _frames_in_group(motion, timing, starts, (frames.shape[-2], frames.shape[-1])))
     parts = [slice(member.start, member.stop) for member in members]
     return [
         FrameGroup(RowSpectra(even[:, part], None if valid is None else valid[:, part]), starts[:, part])
@@ -103,6 +108,38 @@ def _place(group: FrameGroup, timing: SensorTiming, motion: Vibration) -> tuple[
     return rows, shift, seen, moments
 
 
+def _paths(moments: Tensor, timing: SensorTiming, motion: Vibration) -> tuple[Tensor, Tensor]:
+    """Paths (B, G, S, N, 2) about their means during exposures from ``moments``, at nodes with weights (N,)."""
+    path, weights = exposure_trajectory(motion, moments, timing, "gauss")
+    weights = weights.to(path)
+    return path - (path * weights[:, None]).sum(-2, keepdim=True), weights
+
+
+def _unlike(paths: Tensor) -> Tensor:
+    """(B,) whether the frames of a stack are blurred in ways of their own."""
+    return (paths.amax(1) - paths.amin(1)).flatten(1).amax(1) > _ALIKE
+
+
+def _warped(
+    group: FrameGroup, timing: SensorTiming, motion: Vibration, rows: Tensor, shift: Tensor, moments: Tensor
+) -> Tensor:
+    """Frames of a group warped to the scene, (B, G, S, U), each row of a pair seen through the same kernel.
+
+    Where an exposure is long, each frame is blurred in its own way, and fine detail lies elsewhere than the mean
+    displacements say. So the rows of each of two frames are blurred once more, as the other one's are: both then show
+    ``K_1 K_2 f`` of the scene f. That is the mean of frames warped along the other one's path, backwards.
+    """
+    paths, weights = _paths(moments, timing, motion)
+    unlike = _unlike(paths)
+    if rows.shape[1] != 2 or not bool(unlike.any()):
+        return group.spectra.warped(rows, shift)
+    paths = paths * unlike[:, None, None, None, None]
+    warped = torch.zeros((), dtype=group.spectra.values.dtype, device=rows.device)
+    for weight, (x, y) in zip(weights, (path.unbind(-1) for path in paths.flip(1).unbind(-2)), strict=True):
+        warped = warped + weight.to(warped.real.dtype) * group.spectra.warped(rows - y, shift - x)
+    return warped
+
+
 def _blocks(values: Tensor) -> Tensor:
     """Rows on axis 2 gathered in blocks on axes 2 and 3."""
     count = values.shape[2] // BLOCK
@@ -118,7 +155,7 @@ def measure_group(
     The motion's own displacement is added to what remains, so that the measurements do not depend on it to first order.
     """
     rows, shift, seen, moments = _place(group, timing, motion)
-    warped = group.spectra.warped(rows, shift)
+    warped = _warped(group, timing, motion, rows, shift, moments)
     gradients = gradients or row_gradients(group.spectra, warped, rows, shift, seen)
     matrix, right = row_shifts(warped, gradients, seen)
     matrix = _blocks(matrix[:, None]).sum(3)[:, 0]  # (B, N, 2, 2)

@@ -65,6 +65,20 @@ def test_direct_beats_bands_and_keeps_the_curve(paper_camera):
     assert bool((direct.residual < 1.2 * bands.residual + 1e-3).all())
 
 
+@pytest.mark.parametrize("exposure_rows", [200, 400])
+def test_long_exposures_that_blur_each_frame_in_its_own_way(paper_camera, exposure_rows):
+    camera = replace(paper_camera, exposure_rows=exposure_rows)
+    motion = Motion((3.1, 5.2), (50.0, 30.0), (2.5, 0.4))
+    frames = take_frames(draw_scene(2128, 336, 66), camera, motion, 2, 0.005, seed=66, samples=24)
+    found = detect_vibration(torch.from_numpy(frames).float(), camera)
+    amplitude, std = found.vibration.amplitude[:, 0].numpy(), found.std.amplitude[:, 0].numpy()
+    wrong = np.abs(amplitude - np.array(motion.amplitude))
+    assert all(found.reliable)
+    assert (wrong < np.array([0.01, 0.002]) * amplitude).all()
+    assert (wrong < 4 * std).all()
+    np.testing.assert_allclose(found.vibration.frequency[:, 0], (50.0, 30.0), rtol=1e-3)
+
+
 def test_two_tones_over_four_frames_are_counted(paper_camera):
     first = Motion((1.5, 1.2), (41.0, 97.0), (0.7, 0.3))
     second = Motion((0.6, 0.4), (180.0, 66.0), (2.1, -2.0))
