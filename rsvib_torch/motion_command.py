@@ -50,7 +50,7 @@ def motion(
     check_writable(out)
     stack = load(frames, settings, full_scale, chosen_device(device))
     with working("detecting the motion"):
-        lines, table = _MODELS[model](stack.frames, settings.timing, knot_rows, search)
+        lines, table = _MODELS[model](stack.frames, stack.timing, knot_rows, search)
     with whole_file(out) as file, file.open("w", newline="", encoding="utf-8") as text:
         csv.writer(text).writerows(table)
     for line in lines:
@@ -156,16 +156,16 @@ def known(
     stack = load(frames, settings, full_scale, chosen_device(device))
     if offset is None:
         with working("looking for the frames in the recording"):
-            found = align_motion(stack.frames, settings.timing, recorded, fit_gain=fit_gain)
+            found = align_motion(stack.frames, stack.timing, recorded, fit_gain=fit_gain)
         say(f"clock {found.offset:.6f} ± {found.offset_std:.6f} s at the first row, speed {found.scale:.7f}")
         say(f"gain {found.gain[0]:.4f}, {found.gain[1]:.4f}; drift {found.drift[0]:.4g}, {found.drift[1]:.4g} px/s")
         _refuse(motion, found.reasons, force)
         moving = found.motion
     else:
-        moving = _placed(motion, recorded, offset, stack.frames, settings.timing)
-    _judge(motion, stack.frames, settings.timing, moving, force, required=offset is None)
+        moving = _placed(motion, recorded, offset, stack.frames, stack.timing)
+    _judge(motion, stack.frames, stack.timing, moving, force, required=offset is None)
     with working("restoring the frames"):
-        clear = restore(stack.frames, settings.timing, moving, **settings.restoration)
+        clear = restore(stack.frames, stack.timing, moving, **settings.restoration)
     save(restored, clear, stack)
     say(f"{restored}: {len(clear)} frames restored, {info.dtype}")
 

@@ -83,7 +83,7 @@ def refine_directly(
     """
     fit, model = start, start.model
     motion, _ = vibration_of_fit(fit)
-    groups = frame_groups(frames, valid, timing, motion)
+    groups = frame_groups(frames, valid, timing, motion, alike=True)
     gradients: list[RowGradients | None] = [None] * len(groups)
     cleanings = _CLEANINGS
     search_at = 1  # the first round removes the error of the bands: then weak tones show

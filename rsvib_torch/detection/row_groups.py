@@ -49,18 +49,17 @@ def _members(num_frames: int, most: int) -> list[range]:
     return [range(first, last + 1) for first, last in itertools.pairwise(ends)]
 
 
-def _frames_in_group(motion: Vibration, timing: SensorTiming, starts: Tensor, size: tuple[int, int]) -> int:
-    """How many frames of (H, W) px still share enough of the scene when the image moves, and can be blurred alike."""
-    rows = torch.arange(size[0], dtype=torch.float64, device=starts.device)
-    if bool(_unlike(_paths(starts[..., None] + rows * timing.row_time, timing, motion)[0]).any()):
-        return 2
+def _frames_in_group(motion: Vibration, starts: Tensor, size: tuple[int, int]) -> int:
+    """How many frames of (H, W) px still share enough of the scene when the image moves."""
     moved = (motion.drift(starts[:, 1:]) - motion.drift(starts[:, :-1])).abs().amax((0, 1))
     extent = torch.tensor([size[1], size[0]], dtype=moved.dtype, device=moved.device)
     fraction = float((moved / extent).amax())
     return int(max(2, min(LARGEST_GROUP, 1 + (1 - _LEAST_OVERLAP) // max(fraction, 1e-9))))
 
 
-def frame_groups(frames: Tensor, valid: Tensor | None, timing: SensorTiming, motion: Vibration) -> list[FrameGroup]:
+def frame_groups(
+    frames: Tensor, valid: Tensor | None, timing: SensorTiming, motion: Vibration, *, alike: bool = False
+) -> list[FrameGroup]:
     """Frames (B, T, H, W) in row order in groups that share enough of the scene when it moves by ``motion``.
 
     Args:
@@ -68,10 +67,16 @@ def frame_groups(frames: Tensor, valid: Tensor | None, timing: SensorTiming, mot
         valid: (B, T, H, W) bool, pixels that count; None for all.
         timing: The sensor, in row order.
         motion: Of each stack (B).
+        alike: Go in pairs where exposures blur each frame in its own way: only two can be blurred alike. Pairs tell
+            of a tone; a free motion needs all frames that see a place.
     """
     starts = timing.frame_starts(frames.shape[1], frames.device).expand(len(frames), -1)
     even = _standardised(frames, valid)
-    members = _members(frames.shape[1], _frames_in_group(motion, timing, starts, (frames.shape[-2], frames.shape[-1])))
+    most = _frames_in_group(motion, starts, (frames.shape[-2], frames.shape[-1]))
+    rows = torch.arange(frames.shape[-2], dtype=torch.float64, device=frames.device)
+    if alike and bool(_unlike(_paths(starts[..., None] + rows * timing.row_time, timing, motion)[0]).any()):
+        most = 2
+    members = _members(frames.shape[1], most)
     parts = [slice(member.start, member.stop) for member in members]
     return [
         FrameGroup(RowSpectra(even[:, part], None if valid is None else valid[:, part]), starts[:, part])
