@@ -13,6 +13,7 @@ from rsvib_torch.detection.tones import MotionModel, ToneFit, model_displacement
 __all__ = ["MAX_TONES", "find_tones", "residual_of", "robust_fit", "significant_only", "strongest_only"]
 
 MAX_TONES = 4
+_FADED = 0.1  # of its amplitude is all that an exposure leaves of a tone
 _F_THRESHOLD = 14.0  # of chi-square gained per parameter over noise: chance over a whole frequency grid stays below it
 _LEAST_GAIN = 0.2  # of the residual chi-square that a further tone must explain
 _LEAST_APART = 0.7  # of one over the record: tones nearer than this are one that the noise has split
@@ -116,10 +117,14 @@ def _stretches(measurements: Measurements) -> Tensor:
 
 
 def _sighted(measurements: Measurements, frequencies: Tensor) -> Tensor:
-    """(B, 2) 0 for frequencies (B, 2, H) that the record is blind to, 1 where the gain is large."""
+    """(B, 2) 0 for frequencies (B, 2, H) that the record is blind to, 1 where the gain is large.
+
+    The exposure fades tones near multiples of 1/T_e: what long exposures do to fine detail is not to be taken for one.
+    """
     response = tone_response(measurements, frequencies)
     gain = 4 * response.abs().square().mean((1, 2)).amax(-1)
-    return gain / (gain + BLIND**2)
+    shown = torch.sinc(frequencies * measurements.exposure_time).abs().amax(-1) > _FADED
+    return gain / (gain + BLIND**2) * shown
 
 
 def residual_of(measurements: Measurements, fit: ToneFit) -> Tensor:
