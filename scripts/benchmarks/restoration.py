@@ -118,6 +118,8 @@ def methods(
 
     found = {name: ours(method=name) for name in METHODS}
     found["exact, 2 frames jointly"] = ours(2, method="exact", joint=True)
+    found['exact, prior="edges"'] = ours(method="exact", prior="edges")
+    found['2 frames jointly, prior="edges"'] = ours(2, method="exact", joint=True, prior="edges")
     array = frames[0].numpy()
     found["cv2.remap, Lanczos-4"] = lambda: remap_lanczos(array, timing, truth)
     for name in LOOPS:
