@@ -73,9 +73,9 @@ def frame_groups(
     starts = timing.frame_starts(frames.shape[1], frames.device).expand(len(frames), -1)
     even = _standardised(frames, valid)
     most = _frames_in_group(motion, starts, (frames.shape[-2], frames.shape[-1]))
-    rows = torch.arange(frames.shape[-2], dtype=torch.float64, device=frames.device)
-    if alike and bool(_unlike(_paths(starts[..., None] + rows * timing.row_time, timing, motion)[0]).any()):
-        most = 2
+    if alike:
+        moments = timing.row_starts(frames.shape[1], frames.shape[-2], frames.device).expand(len(frames), -1, -1)
+        most = 2 if bool(_unlike(_paths(moments, timing, motion)[0]).any()) else most
     members = _members(frames.shape[1], most)
     parts = [slice(member.start, member.stop) for member in members]
     return [
@@ -134,9 +134,11 @@ def _warped(
     displacements say. So the rows of each of two frames are blurred once more, as the other one's are: both then show
     ``K_1 K_2 f`` of the scene f. That is the mean of frames warped along the other one's path, backwards.
     """
+    if rows.shape[1] != 2:
+        return group.spectra.warped(rows, shift)
     paths, weights = _paths(moments, timing, motion)
     unlike = _unlike(paths)
-    if rows.shape[1] != 2 or not bool(unlike.any()):
+    if not bool(unlike.any()):
         return group.spectra.warped(rows, shift)
     paths = paths * unlike[:, None, None, None, None]
     warped = torch.zeros((), dtype=group.spectra.values.dtype, device=rows.device)

@@ -16,15 +16,14 @@ _STAGES = ((1.0, 1.0, 2), (3.0, 0.7, 2), (10.0, 0.5, 1))
 # a long exposure leaves far more noise in what is hardly seen than white noise of one level: the patches fill that
 # first, from what stands out most
 _STAGES_OF_BLUR = ((0.03, 5.0, 2), (0.1, 3.0, 2), (0.3, 1.8, 2))
-_BLURRED = 1.0  # px that the scene moves during an exposure
 _PATCH = 8  # px
 _THRESHOLD = 2.0  # cosines of a patch weaker than this many standard deviations are taken for noise
 _ROWS = 64  # of pixels, at a time; a multiple of all steps
 
 
-def stages(smear: float) -> tuple[tuple[float, float, int], ...]:
-    """Strength, level and step of all pulls towards the patches, for exposures that smear the scene by so many px."""
-    return _STAGES if smear <= _BLURRED else _STAGES_OF_BLUR + _STAGES
+def stages(*, blurred: bool) -> tuple[tuple[float, float, int], ...]:
+    """Strength, level and step of all pulls towards the patches."""
+    return _STAGES_OF_BLUR + _STAGES if blurred else _STAGES
 
 
 def _cosines(like: Tensor) -> Tensor:

@@ -57,7 +57,7 @@ def _with_edges(problem: SceneProblem, factor: float) -> Tensor:
     weak = replace(problem, precision=_LOOSE * problem.precision).solver()
     coefficients = weak.fit(problem.data)
     solver, weight = weak, float(problem.kernels.weight.detach().mean(-1).sum())
-    for strength, level, step in stages(problem.kernels.smear):
+    for strength, level, step in stages(blurred=problem.kernels.blurred):
         pull = strength * weight * factor
         frequencies = problem.precision.shape[-1]
         precision = expectation_precision(pull, frequencies, problem.precision)
@@ -160,7 +160,7 @@ def restore_exact(
         certain = noise != "auto" or T > 1
         chosen = system(members, reference)
         strength = prior_strength(frames[stack, members], chosen, row_prior, typical * length, certain=certain)
-        precision = row_prior.precision(typical * length, factor * strength, smear=chosen.smear)
+        precision = row_prior.precision(typical * length, factor * strength, blurred=chosen.blurred)
         for members, reference in groups:
             kernels = system(members, reference)
             along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]

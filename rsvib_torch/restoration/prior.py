@@ -21,7 +21,6 @@ _ITERATIONS = 20
 # from the scene's lose them in single precision. Long exposures see every place of the scene from many of its rows.
 _STRONGEST = 1e3
 _WEAKEST, _WEAKEST_OF_BLUR = 1e-4, 5e-5
-_BLURRED = 1.0  # px that the scene moves during an exposure
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +64,7 @@ class RowPrior:
         values = torch.nn.functional.interpolate(stacked[None], count, mode="linear", align_corners=True)[0]
         return RowPrior(values[0].exp(), values[2:], values[1].exp())
 
-    def precision(self, noise_power: Tensor, strength: float, *, smear: float = 0.0) -> Tensor:
+    def precision(self, noise_power: Tensor, strength: float, *, blurred: bool = False) -> Tensor:
         """Products ``a_k a_(k + d)`` of the filter in units of the data's noise, (p + 1, p + 1, U), 0 for k + d > p.
 
         The precision of interior rows d apart is the sum over k; the first and the last rows are predicted from
@@ -74,10 +73,10 @@ class RowPrior:
         Args:
             noise_power: Power of the noise of data of weight 1.
             strength: Factor on the precision.
-            smear: px that the scene moves during an exposure.
+            blurred: Whether the scene moves during an exposure.
         """
         a = self.filter()
-        weakest = _WEAKEST if smear <= _BLURRED else _WEAKEST_OF_BLUR
+        weakest = _WEAKEST_OF_BLUR if blurred else _WEAKEST
         ratio = ((noise_power + self.blind) * strength / self.innovation()).clamp(weakest, _STRONGEST)
         count = len(a)
         products = a.new_zeros(count, count, a.shape[1])

@@ -17,6 +17,7 @@ from rsvib_torch.restoration.row_kernel import REACH, TAPS, kernel_weights
 
 __all__ = ["RowKernels", "SceneRows", "SmoothBand", "SmoothKernels", "row_kernels", "smooth_band", "smooth_kernels"]
 
+_SHARP = 1.0  # px, along the rows or across them, that the scene may move during an exposure
 _TABLE = 64  # frequencies that a phase is stepped through
 
 
@@ -57,9 +58,9 @@ class RowKernels:
         return float(self.along.detach().abs().amax())
 
     @property
-    def smear(self) -> float:
-        """Largest distance in px that the scene moves during an exposure, across the rows in whole px."""
-        return max(2.0 * self.reach, float(self.taps.shape[-2] - TAPS))
+    def blurred(self) -> bool:
+        """Whether the scene moves by more than a px during an exposure."""
+        return max(2.0 * self.reach, float(self.taps.shape[-2] - TAPS)) > _SHARP
 
     def scene_rows(self, num_rows: int) -> SceneRows:
         """All scene rows seen, and those that frames of ``num_rows`` rows need to be evaluated."""
