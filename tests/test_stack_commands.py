@@ -12,29 +12,14 @@ import numpy as np
 import pytest
 import tifffile
 from scipy import ndimage
+from small_config import CAMERA
 from truth import Motion, take_frames
 
 from rsvib_torch import SensorTiming, read_stack_info
 from rsvib_torch.cli import run_command
 
 HEIGHT, WIDTH, FRAMES = 96, 64, 13
-CONFIG = """
-[sensor]
-row_time = 1e-4
-exposure_rows = 6
-frame_rows = 104
-full_scale = 4095
-
-[detection]
-method = "bands"
-band_rows = 16
-band_step = 8
-search = 6
-tones = 1
-
-[restoration]
-method = "dewarp"
-
+CONFIG = f"""{CAMERA}
 [stack]
 window = 4
 """

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from small_stack import CONFIG, HEIGHT, MOTION, STILL, TIMING, WIDTH, draw_counts
+from small_config import CAMERA
+from small_stack import HEIGHT, MOTION, STILL, TIMING, WIDTH, draw_counts
 from truth import decibel
 
 import rsvib_torch as rsv
@@ -35,7 +36,7 @@ def write_stack_with_gaps(tmp_path):
         "resolution": [120.0, 60.0, "centimeter"],
     }
     (tmp_path / "frames.raw.json").write_text(json.dumps(sidecar))
-    (tmp_path / "camera.toml").write_text(CONFIG.split("[stack]")[0])
+    (tmp_path / "camera.toml").write_text(CAMERA)
     return tmp_path
 
 
@@ -110,7 +111,7 @@ def test_video_at_another_rate_is_taken_at_the_camera_s(tmp_path):
     for frame in draw_counts(6):
         writer.write(np.repeat((frame // 16).astype(np.uint8)[..., None], 3, axis=-1))
     writer.release()
-    (tmp_path / "camera.toml").write_text(CONFIG.split("[stack]")[0].replace("full_scale = 4095\n", ""))
+    (tmp_path / "camera.toml").write_text(CAMERA.replace("full_scale = 4095\n", ""))
     arguments = ("run", tmp_path / "clip.avi", tmp_path / "out", "--config", tmp_path / "camera.toml")
     assert rsvib(*arguments, "--output", "restored.h5") == 0
     found = json.loads((tmp_path / "out" / "vibration.json").read_text())
