@@ -276,10 +276,13 @@ def test_arrays_are_as_good_as_tensors(frames, vibration):
     amplitude = rsv.detect_vibration(tensor, TIMING, method="bands", tones=1).vibration.amplitude
     for name, array in strange_arrays(tensor.numpy()).items():
         kept = array.copy()
-        assert torch.equal(rsv.restore(array, TIMING, vibration[0], method="dewarp"), restored), name
+        # Not bit for bit: an array may begin where vector instructions pair other pixels.
+        again = rsv.restore(array, TIMING, vibration[0], method="dewarp")
+        torch.testing.assert_close(again, restored, rtol=0, atol=1e-5, msg=name)
         found = rsv.detect_vibration(array, TIMING, method="bands", tones=1).vibration.amplitude
-        assert torch.equal(found, amplitude), name
-        assert torch.equal(rsv.psnr(array, tensor.numpy() + np.float32(0.1), 1.0), rsv.psnr(tensor, tensor + 0.1, 1.0))
+        torch.testing.assert_close(found, amplitude, rtol=1e-4, atol=1e-6, msg=name)
+        agreement = rsv.psnr(array, tensor.numpy() + np.float32(0.1), 1.0)
+        torch.testing.assert_close(agreement, rsv.psnr(tensor, tensor + 0.1, 1.0), rtol=1e-5, atol=0, msg=name)
         np.testing.assert_array_equal(array, kept)  # nothing is written into what was lent
     ignored = np.zeros(tensor.shape, dtype=bool)
     ignored[:, 20:30, 40:50] = True
