@@ -1,6 +1,7 @@
 """Batched solver for Hermitian positive definite banded systems."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -9,6 +10,7 @@ from torch.autograd.function import once_differentiable
 
 __all__ = [
     "BandedFactor",
+    "BandedMemory",
     "factor_banded",
     "factor_skewed",
     "skew_band",
@@ -42,20 +44,35 @@ class BandedFactor:
         diagonal = self.skewed[: len(self.inverse), self.width]
         return diagonal.real if diagonal.is_complex() else diagonal
 
+    @cached_property
+    def _below(self) -> tuple[Tensor, ...]:
+        return _columns(self.skewed, below=True)
+
+    @cached_property
+    def _above(self) -> tuple[Tensor, ...]:
+        return _columns(self.skewed, below=False)
+
     def solve(self, right_side: Tensor) -> Tensor:
         """Solve ``A x = right_side`` for right sides (K, M, S), M of them per matrix."""
         x = _with_rows(right_side, self.width)
-        columns, windows = _columns(self.skewed, below=True), _windows(x, self.width)
+        columns, windows = self._below, _windows(x, self.width)
         for j, (value, inverse) in enumerate(zip(x[: len(self.inverse)].unbind(), self.inverse.unbind(), strict=True)):
             value.mul_(inverse)
             if columns:
                 windows[j + 1].addcmul_(columns[j], value, value=-1)
-        return self.substitute(x)
+        return self.substitute(x, x.unbind(), windows, len(self.inverse))
 
-    def substitute(self, x: Tensor) -> Tensor:
-        """Solve ``L^H x' = x`` in place for right sides (K + b, M, S); returns the first K rows."""
-        count, width = len(self.inverse), self.width
-        columns, windows, values = _columns(self.skewed, below=False), _windows(x, width), x.unbind()
+    def substitute(self, x: Tensor, values: tuple[Tensor, ...], windows: tuple[Tensor, ...], count: int) -> Tensor:
+        """Solve ``L^H x' = x`` in place for right sides (K + b, M, S); returns the first rows.
+
+        Args:
+            x: Right sides, those beyond ``count`` rows 0.
+            values: Its rows.
+            windows: Every run of b of its rows.
+            count: Rows K, or fewer of a smaller system.
+        """
+        width = self.width
+        columns = self._above
         for j in range(count - 1, 0 if columns else count, -1):
             if j >= width:
                 windows[j - width].addcmul_(columns[j - width], values[j], value=-1)
@@ -87,6 +104,48 @@ def _columns(full: Tensor, *, below: bool) -> tuple[Tensor, ...]:
     return full.as_strided(shape, (line, line - entry, entry, 1), first).unbind()
 
 
+class _Elimination:
+    """Views of every step of factoring matrices in their own memory, of ``factor_skewed``."""
+
+    def __init__(self, full: Tensor, right_side: Tensor | None) -> None:
+        width, size = full.shape[1] // 2, full.shape[2]
+        count = len(full) - width
+        pivots = full[:count, width]
+        self.factor = BandedFactor(full, torch.empty_like(pivots, memory_format=torch.contiguous_format))
+        self.right_side = right_side
+        self.values = () if right_side is None else right_side.unbind()
+        self.windows = () if right_side is None else _windows(right_side, width)
+        line, entry = full.stride(0), full.stride(1)
+        # the trailing window of every step: skewed, so that it is one strided view
+        first = full.storage_offset() + line + width * entry
+        shape, strides = (count, width, width, size), (line, line - entry, entry, 1)
+        self._steps = list(
+            zip(
+                pivots.unbind(),
+                self.factor.inverse.unbind(),
+                full[:count, width + 1 :].unbind(),
+                _columns(full, below=True),
+                full.as_strided(shape, strides, first).unbind() if width else (),
+                strict=False,  # none without a band
+            )
+        )
+
+    def run(self, count: int) -> BandedFactor:
+        """Factor what the first ``count`` rows of the memory hold now."""
+        if self.factor.width == 0:
+            torch.reciprocal(self.factor.skewed[:, 0], out=self.factor.inverse)
+            if self.right_side is not None:
+                self.right_side.mul_(self.factor.inverse[:, None])
+            return self.factor
+        values, windows = self.values, self.windows
+        for j, (pivot, inverse, row, column, trailing) in enumerate(self._steps[:count]):
+            torch.reciprocal(pivot, out=inverse)
+            trailing.addcmul_(column, row.mul_(inverse), value=-1)
+            if values:
+                windows[j + 1].addcmul_(column, values[j].mul_(inverse), value=-1)
+        return self.factor
+
+
 def factor_skewed(full: Tensor, right_side: Tensor | None = None) -> BandedFactor:
     """Factor Hermitian positive definite matrices in their own memory.
 
@@ -97,29 +156,42 @@ def factor_skewed(full: Tensor, right_side: Tensor | None = None) -> BandedFacto
     Returns:
         The factors.
     """
-    width, size = full.shape[1] // 2, full.shape[2]
-    count = len(full) - width
-    pivots = full[:count, width]
-    if width == 0:
-        inverse = pivots.reciprocal()
-        if right_side is not None:
-            right_side.mul_(inverse[:, None])
-        return BandedFactor(full, inverse)
-    inverse = torch.empty_like(pivots)
-    line, entry = full.stride(0), full.stride(1)
-    # the trailing window of every step: skewed, so that it is one strided view
-    first = full.storage_offset() + line + width * entry
-    trailing = full.as_strided((count, width, width, size), (line, line - entry, entry, 1), first).unbind()
-    rows, columns, inverses = full[:count, width + 1 :].unbind(), _columns(full, below=True), inverse.unbind()
-    values = () if right_side is None else right_side.unbind()
-    windows = () if right_side is None else _windows(right_side, width)
-    for j, pivot in enumerate(pivots.unbind()):
-        torch.reciprocal(pivot, out=inverses[j])
-        row = rows[j].mul_(inverses[j])
-        trailing[j].addcmul_(columns[j], row, value=-1)
-        if values:
-            windows[j + 1].addcmul_(columns[j], values[j].mul_(inverses[j]), value=-1)
-    return BandedFactor(full, inverse)
+    return _Elimination(full, right_side).run(len(full) - full.shape[1] // 2)
+
+
+class BandedMemory:
+    """Memory for systems of one size, with views of every step of solving them: made once, for many systems.
+
+    The views cost as much as the arithmetic.
+
+    Args:
+        rows: Rows K of the largest systems.
+        width: Half-width b of the band.
+        right_sides: Right sides M of each matrix.
+        batch: Matrices S that are solved at a time.
+        like: A tensor of the dtype and on the device of the systems.
+
+    Attributes:
+        full: (K + b, 2 b + 1, S), the first rows of which are to hold systems as from ``skew_band``.
+        right_side: (K + b, M, S), likewise.
+    """
+
+    def __init__(self, rows: int, width: int, right_sides: int, batch: int, like: Tensor) -> None:
+        self.full = like.new_empty(rows + width, 2 * width + 1, batch)
+        self.right_side = like.new_empty(rows + width, right_sides, batch)
+        self._elimination = _Elimination(self.full, self.right_side)
+
+    def holds(self, rows: int, width: int, right_sides: int, batch: int) -> bool:
+        """Whether systems of so many rows can be solved in it."""
+        same = self.full.shape[1:] == (2 * width + 1, batch) and self.right_side.shape[1] == right_sides
+        return same and len(self.full) - width >= rows
+
+    def solve(self, rows: int) -> Tensor:
+        """Solve the systems of so many rows that the memory holds; returns a part of ``right_side``."""
+        elimination = self._elimination
+        self.right_side[rows : rows + self.full.shape[1] // 2] = 0
+        factor = elimination.run(rows)
+        return factor.substitute(self.right_side, elimination.values, elimination.windows, rows)
 
 
 def skew_band(band: Tensor) -> Tensor:
@@ -157,8 +229,10 @@ class _Solve(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, full: Tensor, right_side: Tensor) -> Tensor:
         x = _with_rows(right_side, full.shape[1] // 2)
-        factor = factor_skewed(full.clone() if ctx.needs_input_grad[0] else full, x)
-        solution = factor.substitute(x)
+        elimination = _Elimination(full.clone() if ctx.needs_input_grad[0] else full, x)
+        count = len(right_side)
+        factor = elimination.run(count)
+        solution = factor.substitute(x, elimination.values, elimination.windows, count)
         ctx.save_for_backward(factor.skewed, factor.inverse, solution)
         return solution
 

@@ -13,6 +13,7 @@ from rsvib_torch.restoration.edges import expectation, expectation_precision, st
 from rsvib_torch.restoration.filling import fill_beyond_ends, fill_unmeasured
 from rsvib_torch.restoration.missing import fill_roughly, measured_values
 from rsvib_torch.restoration.motion import FrameMotion
+from rsvib_torch.restoration.partition import Partition
 from rsvib_torch.restoration.prior import fit_prior
 from rsvib_torch.restoration.row_system import RowKernels, row_kernels
 from rsvib_torch.restoration.rows import continue_rows
@@ -28,8 +29,6 @@ _MARGIN = 16  # px beyond what the motion shows, more than the reach of a deconv
 _LONG = 1.0  # px along the row either way: beyond, ends of rows are worth being continued by what the blur demands
 _LOOSE, _REST = 0.3, 0.03  # parts of the quadratic prior that patches start from and keep
 _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
-_SEGMENT_ROWS = {"cuda": 256}  # rows solved side by side
-_CHUNK_ELEMENTS = {"cpu": 3 << 18, "cuda": 1 << 26}  # rows times frequencies solved at a time
 
 
 def _groups(count: int, joint: bool | int) -> list[tuple[list[int], int]]:
@@ -119,9 +118,10 @@ def restore_exact(
         ignore: Boolean mask shaped like the frames of pixels that do not count; they may hold anything, and are filled
             with what the others say.
         clipped: Boolean mask of saturated pixels: what they would have shown is at least what they hold.
-        chunk_frequencies: Frequencies solved at a time; bounds the memory, does not change the result.
+        chunk_frequencies: Frequencies solved at a time; bounds the memory, does not change the result. None: as many
+            as take five times the memory of the scene.
         segments: Overlapping segments of rows that are solved side by side, which changes the result by about 1e-5;
-            None: one on a CPU, one for every 256 rows on a GPU, which has to take fewer steps in turn.
+            None: as many as make a step worth its call, of at least 512 rows on a CPU, 256 on a GPU.
 
     Returns:
         Restored frames of the same shape, or (B, 1, C, H, W).
@@ -131,12 +131,11 @@ def restore_exact(
     check_choice("prior", prior, ("gaussian", "edges"))
     groups = _groups(T, joint)
     length = fast_length(W + 4 * (_MARGIN + motion.reach(H)))
-    if chunk_frequencies is None:
-        chunk_frequencies = max(1, _CHUNK_ELEMENTS.get(frames.device.type, 1 << 22) // H)
-    chunk = check_whole_number("chunk_frequencies", chunk_frequencies, at_least=1)
-    if segments is None:
-        segments = max(1, H // _SEGMENT_ROWS.get(frames.device.type, H))
-    segments = check_whole_number("segments", segments, at_least=1)
+    chunk, split = (
+        None if value is None else check_whole_number(name, value, at_least=1)
+        for name, value in (("chunk_frequencies", chunk_frequencies), ("segments", segments))
+    )
+    partition = Partition(chunk, split)
     if ignore is not None:
         frames = fill_roughly(frames, ignore)
     lost = ignore if clipped is None else clipped if ignore is None else ignore | clipped
@@ -164,7 +163,7 @@ def restore_exact(
         for members, reference in groups:
             kernels = system(members, reference)
             along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
-            problem = SceneProblem(data[stack, members], kernels, precision, typical.sqrt(), chunk, segments)
+            problem = SceneProblem(data[stack, members], kernels, precision, typical.sqrt(), partition)
             hidden = None if lost is None else lost[stack, members]
             ends = kernels.reach > _LONG
             if hidden is None and ends and not bool(along.any()):

@@ -2,6 +2,7 @@
 
 import math
 
+import torch
 from torch import Tensor
 
 __all__ = ["estimate_noise", "gradient_energy"]
@@ -10,6 +11,7 @@ _BLOCK = 16
 _DIFFERENCES = 8
 _QUANTILE = 0.15
 _FEW = 8  # blocks have no quiet part
+_ROWS = {"cpu": 64}  # at a time: they stay in the cache
 
 
 def estimate_noise(frames: Tensor) -> Tensor:
@@ -31,15 +33,23 @@ def estimate_noise(frames: Tensor) -> Tensor:
         >>> round(estimate_noise(0.1 * noise).item(), 2)
         0.1
     """
-    detail = frames
-    for axis in (-2, -1):
-        for _ in range(min(_DIFFERENCES, (frames.shape[axis] - 1) // 2 + 1, frames.shape[axis] - 1)):
-            detail = detail.diff(dim=axis)
-    orders = [whole - rest for whole, rest in zip(frames.shape[-2:], detail.shape[-2:], strict=True)]
-    detail = detail.square() / math.prod(math.comb(2 * order, order) for order in orders)
-    block = min(_BLOCK, detail.shape[-2], detail.shape[-1])
-    height, width = (size // block * block for size in detail.shape[-2:])
-    blocks = detail[..., :height, :width].unflatten(-1, (-1, block)).unflatten(-3, (-1, block)).mean((-3, -1))
+    shape = (frames.shape[-2], frames.shape[-1])
+    orders = [min(_DIFFERENCES, (extent - 1) // 2 + 1, extent - 1) for extent in shape]
+    inner = [extent - order for extent, order in zip(shape, orders, strict=True)]
+    block = min(_BLOCK, *inner)
+    height, width = (extent // block * block for extent in inner)
+    step = block * max(1, _ROWS.get(frames.device.type, height) // block)
+    blocks = torch.cat(
+        [
+            _detail(frames[..., top : min(top + step, height) + orders[0], : width + orders[1]], orders)
+            .square()
+            .unflatten(-1, (-1, block))
+            .unflatten(-3, (-1, block))
+            .mean((-3, -1))
+            for top in range(0, height, step)
+        ],
+        dim=-2,
+    ) / math.prod(math.comb(2 * order, order) for order in orders)
     energy = blocks.flatten(-2)
     # means of pure noise scatter (neighbouring responses of the mask are correlated), so that their low quantile lies
     # below the true mean: by as much as a chi-squared variable's does (Wilson and Hilferty)
@@ -50,6 +60,14 @@ def estimate_noise(frames: Tensor) -> Tensor:
         quiet, expected = energy.mean(-1), 1.0
     deviation: Tensor = (quiet / expected).sqrt()
     return deviation
+
+
+def _detail(frames: Tensor, orders: list[int]) -> Tensor:
+    """Differences of these orders along both axes."""
+    for axis, order in zip((-2, -1), orders, strict=True):
+        for _ in range(order):
+            frames = frames.diff(dim=axis)
+    return frames
 
 
 def _correlation_area(order: int) -> float:

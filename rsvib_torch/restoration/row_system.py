@@ -8,12 +8,13 @@ and all frequencies follow by one product of matrices. The phase of the middle g
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.restoration.row_kernel import REACH, TAPS, kernel_weights
+from rsvib_torch.restoration.segments import Segments
 
 __all__ = ["RowKernels", "SceneRows", "SmoothBand", "SmoothKernels", "row_kernels", "smooth_band", "smooth_kernels"]
 
@@ -183,7 +184,8 @@ class SmoothBand:
     """Normal matrices of all frequencies, prior included, as one product of matrices.
 
     Attributes:
-        left: (K + b, 2 b + 1, 2 Q + p + 1) real and imaginary parts at Q nodes, and where each lag of the prior goes.
+        left: (R + b, 2 b + 1, n, 2 Q + p + 1) real and imaginary parts at Q nodes, and where each lag of the prior
+            goes, for n windows of R rows; the last b rows are 0.
         reach: Distance along the rows in px that the products of kernels reach to.
         order: Order p of the prior.
     """
@@ -192,41 +194,44 @@ class SmoothBand:
     reach: float
     order: int
 
-    def memory(self, most: int) -> Tensor | None:
-        """Memory for bands of up to that many frequencies, to be used again and again; None where gradients need them.
+    @property
+    def width(self) -> int:
+        """The half-width b of the band."""
+        return self.left.shape[1] // 2
 
-        Fresh memory costs as much time as the product that fills it.
-        """
-        if torch.is_grad_enabled() and self.left.requires_grad:
-            return None
-        return self.left.new_empty(self.left.shape[0] * self.left.shape[1] * 2 * most)
+    def in_segments(self, segments: Segments) -> "SmoothBand":
+        """The matrices of all rows as those of windows of rows."""
+        if segments.whole:
+            return self
+        windows = segments.split(self.left[: segments.rows, :, 0])
+        return replace(self, left=torch.cat([windows, windows.new_zeros(self.width, *windows.shape[1:])]))
 
-    def at(self, u: Tensor, precision: Tensor, memory: Tensor | None = None) -> Tensor:
-        """Skewed bands (K + b, 2 b + 1, U), complex.
+    def at(self, u: Tensor, precision: Tensor, out: Tensor | None = None) -> Tensor:
+        """Skewed bands (R + b, 2 b + 1, n U), complex.
 
         Args:
             u: Frequencies in cycles per px.
             precision: Products (p + 1, p + 1, U) of the prior there.
-            memory: As from ``memory``.
+            out: Memory for them: fresh memory costs as much time as the product that fills it.
         """
         lags = torch.stack([precision.sum(1), torch.zeros_like(precision[:, 0])], dim=-1).flatten(1)
         right = torch.cat([_interpolation(self.reach, u, _precision(self.left.dtype))[1], lags]).to(self.left.dtype)
-        rows = self.left.flatten(0, 1)
-        if memory is None:
+        rows = self.left.flatten(0, 2)
+        if out is None:
             product = rows @ right
         else:
-            product = torch.mm(rows, right, out=memory[: len(rows) * right.shape[1]].view(len(rows), -1))
-        bands = product.view(*self.left.shape[:2], -1, 2)
-        width, real = self.left.shape[1] // 2, bands[..., 0]
+            product = torch.mm(rows, right, out=torch.view_as_real(out).view(len(rows), -1))
+        bands = product.view(*self.left.shape[:3], -1, 2)
+        width, real = self.width, bands[..., 0]
         count = len(self.left) - width
         for d in range(self.order + 1):
             for side in {d, -d}:
                 for k in range(1, self.order + 1 - d):
                     top = max(0, -side)
-                    real[top : top + k, width + side] -= precision[d, k]
+                    real[top : top + k, width + side, 0] -= precision[d, k]
                     bottom = count - max(0, side)
-                    real[bottom - k : bottom, width + side] -= precision[d, k]
-        return torch.view_as_complex(bands)
+                    real[bottom - k : bottom, width + side, -1] -= precision[d, k]
+        return torch.view_as_complex(bands).flatten(2)
 
 
 def smooth_band(kernels: RowKernels, rows: SceneRows, width: int, order: int, dtype: torch.dtype) -> SmoothBand:
@@ -258,4 +263,4 @@ def smooth_band(kernels: RowKernels, rows: SceneRows, width: int, order: int, dt
         lags[: rows.count - d, width + d, d] = 1
         lags[d : rows.count, width - d, d] = 1
     matrix = torch.cat([_stacked(torch.stack(left + right, dim=1)), lags], dim=-1)
-    return SmoothBand(matrix.to(dtype), 2 * kernels.reach, order)
+    return SmoothBand(matrix.to(dtype)[:, :, None], 2 * kernels.reach, order)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rsvib_torch.restoration.partition import Partition
 from rsvib_torch.restoration.row_system import RowKernels
 from rsvib_torch.restoration.scene_solver import SceneSolver
 
@@ -20,16 +21,14 @@ class SceneProblem:
         kernels: How the frames see it.
         precision: What it is like, products as from ``RowPrior.precision``.
         level: Standard deviation of the noise of data of weight 1.
-        chunk: Frequencies solved at a time.
-        segments: Segments of rows that are solved side by side.
+        partition: What is solved at a time.
     """
 
     data: Tensor
     kernels: RowKernels
     precision: Tensor
     level: Tensor
-    chunk: int
-    segments: int
+    partition: Partition
 
     def solver(self, weight: Tensor | None = None, *, keep: bool = False) -> SceneSolver:
         """The fast solver, if all data had been measured.
@@ -44,10 +43,9 @@ class SceneProblem:
             self.precision,
             size,
             self.data.dtype,
-            self.chunk,
+            self.partition,
             weight=weight,
             keep=keep,
-            segments=self.segments,
         )
 
     def precision_at(self, length: int) -> Tensor:

@@ -1,15 +1,15 @@
 """One scene and the frames that see it: the fast solution, and what a solution predicts."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from rsvib_torch.parallel import in_parallel
 from rsvib_torch.restoration.banded_solver import BandedFactor, factor_skewed, solve_factored, solve_skewed
+from rsvib_torch.restoration.partition import Partition
 from rsvib_torch.restoration.row_kernel import REACH, kernel_samples
 from rsvib_torch.restoration.row_system import RowKernels, smooth_band, smooth_kernels
-from rsvib_torch.restoration.segments import Segments
 
 __all__ = ["Coefficients", "SceneSolver"]
 
@@ -26,10 +26,9 @@ class SceneSolver:
         precision: P, products (p + 1, p + 1, U) as from ``RowPrior.precision``, in units of the noise of weight 1.
         size: Rows R and length L of the period of the data.
         dtype: Of the data.
-        chunk: Frequencies solved at a time.
+        partition: What is solved at a time.
         weight: (M, R) of the rows, by default that of the kernels.
         keep: Keep the factors, for solving again and again.
-        segments: Number of overlapping segments of rows that are solved side by side.
     """
 
     def __init__(
@@ -38,42 +37,40 @@ class SceneSolver:
         precision: Tensor,
         size: tuple[int, int],
         dtype: torch.dtype,
-        chunk: int,
+        partition: Partition,
         *,
         weight: Tensor | None = None,
         keep: bool = False,
-        segments: int = 1,
     ) -> None:
         self.kernels = kernels if weight is None else replace(kernels, weight=weight)
         self.num_rows, self.length = size
         self.rows = kernels.scene_rows(self.num_rows)
         self.u = torch.fft.rfftfreq(self.length, dtype=torch.float64, device=precision.device)
-        self.parts = [slice(k, min(k + chunk, len(self.u))) for k in range(0, len(self.u), chunk)]
         self.dtype = dtype
         self.precision = precision
         order = len(precision) - 1
-        self._normal = smooth_band(self.kernels, self.rows, max(kernels.taps.shape[-2] - 1, order), order, dtype)
+        width = max(kernels.taps.shape[-2] - 1, order)
+        normal = smooth_band(self.kernels, self.rows, width, order, dtype)
+        device = precision.device
+        self._chunk, self._segments = partition.of(self.rows.count, width, len(self.u), device, keep=keep)
+        self._normal = normal.in_segments(self._segments)
+        self._partition = partition
+        self.parts = [slice(k, min(k + self._chunk, len(self.u))) for k in range(0, len(self.u), self._chunk)]
         self._seen = smooth_kernels(kernels, dtype)
         self._base = (kernels.first - self.rows.top).flatten()
-        self._segments = Segments(self.rows.count, segments)
         self._factors: list[BandedFactor] | None = None
         if keep and not (torch.is_grad_enabled() and self._normal.left.requires_grad):
-            self._factors = [
-                factor_skewed(self._segments.split_band(self._normal.at(self.u[part], precision[..., part])))
-                for part in self.parts
-            ]
+            self._factors = [factor_skewed(self._normal.at(self.u[p], precision[..., p])) for p in self.parts]
 
-    def _rights(self, data: Tensor) -> Iterator[Tensor]:
-        """``K^H W g`` of data (M, C, R, L), chunk by chunk."""
-        spectra = torch.fft.rfft(data)
+    def _right(self, spectra: Tensor, part: slice) -> Tensor:
+        """``K^H W g`` (K, C, U') of a chunk of the spectra (M, C, R, U) of data."""
         weight = self.kernels.weight.to(self.dtype)[:, None, :, None]
-        for part in self.parts:
-            turned = spectra[..., part] * self.kernels.phases(self.length, part, self.dtype)[:, None]
-            turned = (turned * weight).transpose(1, 2).flatten(0, 1).conj()
-            right = turned.new_zeros(self.rows.count, *turned.shape[1:])
-            for i, kernel in enumerate(self._seen.taps(self.u[part])):
-                right = right.index_add_(0, self._base + i, kernel[:, None] * turned)
-            yield right.conj().resolve_conj()
+        turned = spectra[..., part] * self.kernels.phases(self.length, part, self.dtype)[:, None]
+        turned = (turned * weight).transpose(1, 2).flatten(0, 1).conj()
+        right = turned.new_zeros(self.rows.count, *turned.shape[1:])
+        for i, kernel in enumerate(self._seen.taps(self.u[part])):
+            right = right.index_add_(0, self._base + i, kernel[:, None] * turned)
+        return right.conj().resolve_conj()
 
     def fit(self, data: Tensor, pull: Coefficients | None = None) -> Coefficients:
         """The coefficients for data (M, C, R, L).
@@ -82,17 +79,47 @@ class SceneSolver:
             data: Rows continued to a period.
             pull: To be added to the right sides: P times what the prior expects.
         """
-        memory = self._normal.memory(max(part.stop - part.start for part in self.parts))
+        spectra = torch.fft.rfft(data)
+        given = (spectra, self._normal.left, self.precision, *(pull or ()))
+        if self._factors is None and not (torch.is_grad_enabled() and any(value.requires_grad for value in given)):
+            return self._fit_in_place(spectra, pull)
         solutions = []
-        for k, (part, right) in enumerate(zip(self.parts, self._rights(data), strict=True)):
-            wanted = right if pull is None else right + pull[k]
+        for k, part in enumerate(self.parts):
+            right = self._right(spectra, part)
+            split = self._segments.split(right if pull is None else right + pull[k]).flatten(-2)
             if self._factors is None:
-                full = self._normal.at(self.u[part], self.precision[..., part], memory)
-                solved = solve_skewed(self._segments.split_band(full), self._segments.split(wanted))
+                solved = solve_skewed(self._normal.at(self.u[part], self.precision[..., part]), split)
             else:
-                solved = solve_factored(self._factors[k], self._segments.split(wanted))
-            solutions.append(self._segments.join(solved))
+                solved = solve_factored(self._factors[k], split)
+            solutions.append(self._segments.join(solved.unflatten(-1, (-1, right.shape[-1]))))
         return solutions
+
+    def _fit_in_place(self, spectra: Tensor, pull: Coefficients | None) -> Coefficients:
+        """``fit`` without gradients, in memory that is used again and again, and on all cores."""
+        segments, width = self._segments, self._normal.width
+        rows, batch = segments.size, len(segments.windows) * self._chunk
+        threads = self._partition.threads(spectra.device)
+
+        def solve(thread: int) -> Coefficients:
+            memory = self._partition.memory(thread, rows, width, spectra.shape[1], batch, spectra)
+            sides = memory.right_side[:rows].unflatten(-1, (-1, self._chunk))
+            solutions = []
+            for k in range(thread, len(self.parts), threads):
+                part = self.parts[k]
+                chunk = slice(part.stop - self._chunk, part.stop)  # the last part is solved as wide as the others
+                self._normal.at(self.u[chunk], self.precision[..., chunk], memory.full[: rows + width])
+                right = self._right(spectra, chunk)
+                own = slice(part.start - part.stop, None)
+                if pull is not None:
+                    right[..., own] += pull[k]
+                for place, window in enumerate(segments.windows):
+                    sides[..., place, :] = right[window]
+                solved = memory.solve(rows).unflatten(-1, (-1, self._chunk))
+                solutions.append(segments.join(solved[..., own]))
+            return solutions
+
+        shares = in_parallel(solve, range(threads), spectra.device)
+        return [shares[k % threads][k // threads] for k in range(len(self.parts))]
 
     def predict(self, coefficients: Coefficients) -> Tensor:
         """What the frames show of a scene, (M, C, R, L)."""
@@ -110,18 +137,11 @@ class SceneSolver:
     def scene(self, coefficients: Coefficients) -> Tensor:
         """Rows of the scene where the frame at rest would show them, (C, R, L)."""
         first = 1 - REACH - self.rows.top
-        spectra = torch.cat(
-            [
-                sum(
-                    (
-                        weight * values[first + k : first + k + self.num_rows]
-                        for k, weight in enumerate(kernel_samples())
-                    ),
-                    start=values.new_zeros(()),
-                )
-                for values in coefficients
-            ],
-            dim=-1,
-        )
-        rows: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=self.length)
-        return rows
+        spectra = []
+        for values in coefficients:
+            rows = values.new_zeros(self.num_rows, *values.shape[1:])
+            for k, weight in enumerate(kernel_samples()):
+                rows = rows.add(values[first + k : first + k + self.num_rows], alpha=weight)
+            spectra.append(rows)
+        scene: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1).movedim(1, 0), n=self.length)
+        return scene

@@ -7,11 +7,10 @@ from scipy import ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch.restoration.exact as exact_module
-import rsvib_torch.restoration.scene_solver as solver_module
+import rsvib_torch.restoration.partition as partition_module
 from rsvib_torch import SensorTiming, Vibration
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
-from rsvib_torch.restoration.segments import Segments
 
 restore = partial(restore_by_any_method, method="exact")
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -252,7 +251,13 @@ def test_segments_of_rows_change_nothing(short, joint, monkeypatch):
     torch.testing.assert_close(split, whole, rtol=0, atol=2e-5)
     gradients = [torch.autograd.grad(image[..., 150:, :].square().sum(), frames)[0] for image in (whole, split)]
     torch.testing.assert_close(gradients[1], gradients[0], rtol=0, atol=2e-4)
-    monkeypatch.setattr(solver_module, "Segments", partial(Segments, overlap=2))
+    with torch.no_grad():  # solved in memory that is used again
+        for chunk in (None, 7, 1000):
+            again = restore(
+                frames, TIMING, motion.vibration(), segments=3, chunk_frequencies=chunk, check=False, joint=joint
+            )
+            torch.testing.assert_close(again, whole.detach(), rtol=0, atol=2e-5)
+    monkeypatch.setattr(partition_module, "_OVERLAP", (2, 0))
     careless = restore(frames, TIMING, motion.vibration(), segments=3, check=False, joint=joint)
     assert (careless - whole).abs().max() > 1e-3
 

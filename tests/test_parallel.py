@@ -1,0 +1,56 @@
+import threading
+
+import pytest
+import torch
+
+from rsvib_torch.parallel import in_parallel
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_items_are_worked_on_side_by_side(two_threads):
+    both = threading.Barrier(2, timeout=20)  # two calls at once, or it breaks
+
+    def work(item):
+        both.wait()
+        return item, torch.get_num_threads(), torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+    assert in_parallel(work, range(4), CPU) == [(item, 1, False, False) for item in range(4)]
+    with torch.inference_mode():
+        assert in_parallel(work, range(2), CPU) == [(item, 1, False, True) for item in range(2)]
+    assert torch.get_num_threads() == 2
+    started = []
+    later = threading.Thread(target=lambda: started.append(torch.get_num_threads()))
+    later.start()
+    later.join()
+    assert started == [2]
+
+
+def test_one_thread_is_a_loop():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        assert in_parallel(lambda _: threading.current_thread(), range(2), CPU) == [threading.main_thread()] * 2
+    finally:
+        torch.set_num_threads(before)
+    assert (
+        in_parallel(lambda _: threading.current_thread(), range(2), torch.device("meta"))
+        == [threading.main_thread()] * 2
+    )
+
+
+def test_errors_come_out(two_threads):
+    def fail(item):
+        raise ValueError(f"no {item}")
+
+    with pytest.raises(ValueError, match="no 0"):
+        in_parallel(fail, range(2), CPU)
+    assert torch.get_num_threads() == 2
