@@ -125,14 +125,16 @@ def restore(
         vibration: The motion in image axes: one for all, or a batch (B,) for a batch of stacks. Or what
             ``detect_vibration`` returned: axes that it does not trust are then left alone, see ``trusted_vibration``.
         method: ``"exact"``: all rows coupled, several frames jointly on demand; ``"banded"``: row by row within
-            slabs (Sec. 3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest.
+            slabs (Sec. 3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest; ``"richardson-lucy"``: iterated,
+            nowhere negative, several frames jointly on demand.
         full_scale: Count that means 1.0, for integer frames other than uint8.
         ignore: Boolean mask shaped like the frames of pixels that do not count; they may hold anything.
         saturation: Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for
             integer frames, none for floats, which do not say where they were cut; None for none.
         check: Judge the result on a part of the frames, and warn where it is no better than what came in; needs two
             frames. ``judge_restoration`` does it on all of them.
-        **options: Options of the method, see ``restore_exact``, ``restore_banded`` and ``restore_dewarp``.
+        **options: Options of the method, see ``restore_exact``, ``restore_banded``, ``restore_dewarp`` and
+            ``restore_richardson_lucy``.
 
     Returns:
         Restored frames of the same shape and floating dtype (float32 where integers went in, full scale 1); with

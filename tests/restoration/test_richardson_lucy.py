@@ -5,7 +5,7 @@ from scipy.interpolate import BSpline
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
-from rsvib_torch.restoration import restore
+from rsvib_torch.restoration import restore, visible_pixels
 
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 SHORT = SensorTiming(row_time=1e-3, exposure_rows=3, frame_rows=24)
@@ -20,11 +20,10 @@ def folded(index, length):
     return np.minimum(index, 2 * length - 2 - index)
 
 
-def dense_operator(timing, motion, height, width, frame=0):
+def dense_operator(timing, motion, height, width, frame=0, samples=400):
     """Frame pixels from spline coefficients, pixel by pixel, the exposure as a fine midpoint sum."""
     basis = BSpline.basis_element(np.arange(5) - 2.0, extrapolate=False)
     matrix = np.zeros((height, width, height, width))
-    samples = 400
     for row in range(height):
         times = (frame * timing.frame_rows + row) * timing.row_time
         x, y = motion.displacement(times + (np.arange(samples) + 0.5) / samples * timing.exposure_time).T
@@ -113,3 +112,112 @@ def test_batch_channels_and_push_scan_change_nothing():
 def test_bad_input():
     with pytest.raises(ValueError, match="iterations must be at least 1"):
         lucy(torch.zeros(1, 16, 16), TIMING, Vibration(1.0, 50.0), iterations=0)
+    with pytest.raises(ValueError, match="joint must be at least 1"):
+        lucy(torch.zeros(2, 16, 16), TIMING, Vibration(1.0, 50.0), joint=0)
+
+
+def within(timing, motion, height, width, frame):
+    """Pixels whose kernels keep to the scene."""
+    seen = np.zeros((height, width), dtype=bool)
+    for row in range(height):
+        times = (frame * timing.frame_rows + row) * timing.row_time + np.linspace(0, timing.exposure_time, 400)
+        x, y = motion.displacement(times).T
+        rows, columns = np.floor(row - y), np.floor(np.arange(width) - x[:, None])
+        seen[row] = (rows.min() >= 1) & (rows.max() + 2 < height) & (columns.min(0) >= 1) & (columns.max(0) + 2 < width)
+    return seen
+
+
+def test_two_frames_agree_with_a_dense_loop():
+    motion = Motion(amplitude=(1.2, 0.8), frequency=(40.0, 31.0), phase=(0.1, 1.2))  # no row stops short of the next px
+    frames = np.random.default_rng(6).uniform(0.3, 1.0, (2, 10, 9))
+    operators = [dense_operator(SHORT, motion, 10, 9, frame, samples=120) for frame in (0, 1)]
+    weights = [within(SHORT, motion, 10, 9, 0).ravel().astype(float), np.ones(90)]  # the second one is the reference
+    tensor = torch.from_numpy(frames)
+    found = lucy(tensor, SHORT, motion.vibration(), iterations=4, joint=True)[0].numpy()
+    start = restore(tensor, SHORT, motion.vibration(), method="dewarp", check=False).numpy().mean(0)
+    scene = start.ravel()
+    assert scene.min() > 1e-3
+    for _ in range(4):
+        parts = zip(operators, weights, frames, strict=True)
+        pulled = sum(a.T @ (w * g.ravel() / (a @ scene)) for a, w, g in parts)
+        scene = scene * pulled / sum(a.T @ w for a, w in zip(operators, weights, strict=True))
+    expected = spline_samples(scene.reshape(10, 9))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-4)
+    assert abs(expected - start).max() > 0.05
+    assert 10 < weights[0].sum() < 80
+
+
+@pytest.mark.parametrize("rows", [20, 200])
+def test_two_frames_beat_one(rows):
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
+    motion, scene = Motion(), draw_scene(272, 240, seed=31)
+    frames = torch.from_numpy(take_frames(scene, timing, motion, 3, 0.02, samples=24)).float()
+    alone = [decibel(frame, crop(scene)) for frame in lucy(frames, timing, motion.vibration())]
+    pairs = lucy(frames, timing, motion.vibration(), joint=2)
+    assert pairs.shape == frames.shape
+    assert min(decibel(frame, crop(scene)) for frame in pairs) > max(alone) + 1.5
+    together = restore(frames, timing, motion.vibration(), method="richardson-lucy", joint=True)
+    assert together.shape == (1, *frames.shape[1:])
+    assert decibel(together[0], crop(scene)) > max(alone) + 2.5
+    assert min(pairs.min(), together.min()) >= 0
+
+
+def test_numbers_of_frames_restored_together():
+    frames = torch.rand(3, 2, 40, 36, generator=torch.Generator().manual_seed(3), dtype=torch.float64) + 0.1
+    vibration = Vibration([1.0, 0.7], [50.0, 30.0])
+    one, all_three, *few = (lucy(frames, TIMING, vibration, iterations=3, joint=joint) for joint in (1, True, 2, 3, 9))
+    assert all_three.shape == (1, 2, 40, 36)
+    torch.testing.assert_close(one, lucy(frames, TIMING, vibration, iterations=3), rtol=0, atol=0)
+    torch.testing.assert_close(few[1][1:2], all_three, rtol=0, atol=1e-12)
+    torch.testing.assert_close(few[2], few[1], rtol=0, atol=0)
+    pair = lucy(frames[:2], TIMING, vibration, iterations=3, joint=2)
+    torch.testing.assert_close(few[0][0], pair[0], rtol=0, atol=1e-12)
+    assert (few[0] - few[1]).abs().max() > 0.01
+    batch = lucy(torch.stack([frames, frames.flip(-1)]), TIMING, vibration, iterations=3, joint=True)
+    torch.testing.assert_close(batch[0], all_three, rtol=0, atol=1e-12)
+
+
+def test_joint_flux_is_conserved():
+    lamps = torch.zeros(2, 96, 96, dtype=torch.float64)
+    lamps[:, 40:56, 40:60] = torch.rand(2, 16, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    still = lucy(lamps, TIMING, Vibration.still(), iterations=5, joint=True)
+    assert still.min() >= 0
+    assert still.sum().item() == pytest.approx(0.5 * lamps.sum().item(), rel=1e-9)
+    moved = lucy(lamps, TIMING, Vibration([1.5, 2.0], [50.0, 30.0]), iterations=5, joint=True)
+    assert moved.min() >= 0
+    assert moved.sum().item() == pytest.approx(0.5 * lamps.sum().item(), rel=0.02)
+
+
+def test_frames_that_lie_apart_are_joined_where_they_overlap():
+    motion = Motion(image_motion=(1500.0, -700.0))  # (63, -29) px from frame to frame
+    scene = draw_scene(420, 420, seed=8)
+    frames = torch.from_numpy(take_frames(scene, TIMING, motion, 2, 0.02, samples=16, margin=110)).float()
+    _, shift = visible_pixels(TIMING, motion.vibration(), (200, 200), 2)
+    columns, rows = (int(step) for step in shift[1] - shift[0])
+    assert (columns, rows) == (63, -29)
+    truth = np.roll(scene, tuple(int(step) for step in shift[1].flip(0)), (0, 1))[110:-110, 110:-110]
+    alone = lucy(frames, TIMING, motion.vibration())[1]
+    joint = lucy(frames, TIMING, motion.vibration(), joint=True)[0]
+    shared = (slice(0, 200 + rows), slice(columns, None))  # of the second frame, whose coordinates these are
+    apart = (slice(8, -8), slice(8, columns - 16))
+    assert decibel(joint[shared], truth[shared], rim=12) > decibel(alone[shared], truth[shared], rim=12) + 1.5
+    torch.testing.assert_close(joint[apart], alone[apart], rtol=0, atol=2e-3)
+
+
+def test_frames_with_nothing_in_common_are_not_joined():
+    motion = Motion(image_motion=(9000.0, 0.0))
+    frames = torch.rand(2, 60, 64, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    joint = lucy(frames, TIMING, motion.vibration(), iterations=3, joint=2)
+    torch.testing.assert_close(joint, lucy(frames, TIMING, motion.vibration(), iterations=3), rtol=0, atol=1e-12)
+
+
+def test_hidden_pixels_are_seen_by_the_other_frame():
+    motion, scene = Motion(), draw_scene(240, 240, seed=12)
+    frames = torch.from_numpy(take_frames(scene, TIMING, motion, 2, 0.005, samples=16)).float()
+    ignore = torch.zeros(frames.shape, dtype=torch.bool)
+    ignore[1, 60:90, 60:90] = True
+    part = (slice(60, 90), slice(60, 90))
+    truth = crop(scene)[part]
+    found = {joint: lucy(frames, TIMING, motion.vibration(), ignore=ignore, joint=joint)[-1][part] for joint in (1, 2)}
+    assert decibel(found[2], truth, rim=2) > 40
+    assert decibel(found[1], truth, rim=2) < 25
