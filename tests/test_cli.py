@@ -227,6 +227,9 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     assert report["options"] == {"method": "exact", "joint": True, "saturation": 1.0}
     assert read_stack_info(out / "restored.tif").shape == (1, 448, 256)
     assert min(psnr(read_stack(out / "restored.tif"), still_frame(place))) > 40
+    assert run(*common, "--method", "richardson-lucy", "--joint", "all") == 0
+    assert read_stack_info(out / "restored.tif").shape == (1, 448, 256)
+    assert min(psnr(read_stack(out / "restored.tif"), still_frame(place))) > 40
     capsys.readouterr()
     for options, message in (
         (("--method", "magic"), "method must be one of 'exact', 'banded', 'dewarp'"),
