@@ -13,7 +13,7 @@ from rsvib_torch.detection.door import grey_frames
 from rsvib_torch.detection.freeform import start_curve
 from rsvib_torch.detection.leftovers import independent_fraction, unexplained
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.row_groups import frame_groups, measure_groups
+from rsvib_torch.detection.row_groups import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.orientation import vibration_to_row_order
 from rsvib_torch.precision import full_precision, outside_graphs
@@ -146,7 +146,7 @@ def align_motion(
     clock = _Clock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
     clock, covariance = _refine(measured, turned, clock, False, fit_gain)
     clock, covariance = _refine(measured.reweighted(_left(measured, turned, clock)), turned, clock, fit_scale, fit_gain)
-    groups = frame_groups(grey, stack.valid, rowwise, clock.motion(turned).expanded(1))
+    groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, clock.motion(turned).expanded(1))
     for _ in range(_LOOKS):
         measured = measure_groups(groups, rowwise, clock.motion(turned).expanded(1))
         weighed = measured.reweighted(_left(measured, turned, clock))

@@ -15,7 +15,7 @@ from rsvib_torch.detection.door import grey_frames
 from rsvib_torch.detection.freeform import MotionDetection, detect_motion
 from rsvib_torch.detection.inversion import vibration_of_fit
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, VibrationStd, stacked
-from rsvib_torch.detection.row_groups import LARGEST_GROUP
+from rsvib_torch.detection.row_groups import LARGEST_GROUP, stack_spectra
 from rsvib_torch.detection.selection import MAX_TONES, find_tones
 from rsvib_torch.detection.swept import SweptTone, detect_swept_tone
 from rsvib_torch.detection.tones import MotionModel, ToneFit, model_displacements
@@ -82,7 +82,7 @@ def _detect_direct(
 ) -> tuple[ToneFit, OtherMotion | None]:
     """The bands' result, refined on the images themselves, row by row."""
     start, _ = _detect_bands(curve, frames, valid, timing, options)
-    found = refine_directly(frames, valid, timing, start, options.tones)
+    found = refine_directly(stack_spectra(frames, valid), timing, start, options.tones)
     return found.fit, found.other_motion
 
 

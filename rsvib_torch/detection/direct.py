@@ -16,6 +16,7 @@ from rsvib_torch.detection.selection import find_tones, residual_of, robust_fit,
 from rsvib_torch.detection.tones import ToneFit
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.pattern import column_pattern
+from rsvib_torch.registration.row_spectra import RowSpectra
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration, blind_frequencies
 
@@ -58,8 +59,7 @@ def _settled(before: ToneFit, after: ToneFit) -> bool:
 
 
 def refine_directly(
-    frames: Tensor,
-    valid: Tensor | None,
+    spectra: RowSpectra,
     timing: SensorTiming,
     start: ToneFit,
     tones: int | None,
@@ -71,8 +71,7 @@ def refine_directly(
     and how well it knows it, and the motion is fitted again to those rows; image work and motion model meet only here.
 
     Args:
-        frames: (B, T, H, W) grey, in row order.
-        valid: (B, T, H, W) bool, pixels that count; None for all.
+        spectra: Of all frames, from ``stack_spectra``.
         timing: The sensor, in row order.
         start: The motion to start with, from the band offsets.
         tones: Number of tones of each axis; None to choose it from the rows.
@@ -83,12 +82,12 @@ def refine_directly(
     """
     fit, model = start, start.model
     motion, _ = vibration_of_fit(fit)
-    groups = frame_groups(frames, valid, timing, motion, alike=True)
+    groups = frame_groups(spectra, timing, motion, alike=True)
     gradients: list[RowGradients | None] = [None] * len(groups)
     cleanings = _CLEANINGS
     search_at = 1  # the first round removes the error of the bands: then weak tones show
     interval = max(BLOCK * timing.row_time, 0.5 * timing.exposure_time)  # the exposure averages out what is faster
-    blind = blind_frequencies(timing, 0.5 / interval).to(frames.device)
+    blind = blind_frequencies(timing, 0.5 / interval).to(spectra.values.device)
     for step in range(iterations):
         measured = [measure_group(group, timing, motion, known) for group, known in zip(groups, gradients, strict=True)]
         gradients = [known for _, known in measured]

@@ -12,7 +12,7 @@ from rsvib_torch.detection.band_curve import Bands, band_curve, measurements_of_
 from rsvib_torch.detection.door import GreyFrames, grey_frames
 from rsvib_torch.detection.leftovers import independent_fraction, unexplained
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.row_groups import frame_groups, measure_groups
+from rsvib_torch.detection.row_groups import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.spline_fit import SplineFit, fit_spline
 from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.orientation import offsets_from_row_order, vibration_from_row_order
@@ -143,7 +143,7 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: Bands, knot_rows: in
     measured = measurements_of_curve(curve, rowwise, bands.band_step)
     fit = fit_spline(measured, max(spacing, 0.5 * bands.band_rows * rowwise.row_time), record)
     motion = _motion(fit, size, 0.0)
-    groups = frame_groups(grey, valid, rowwise, motion)
+    groups = frame_groups(stack_spectra(grey, valid), rowwise, motion)
     for step in range(iterations):
         measured = measure_groups(groups, rowwise, motion)
         if step:  # blocks that show something that moves by itself have less say

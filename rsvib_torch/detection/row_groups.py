@@ -24,6 +24,7 @@ __all__ = [
     "join_groups",
     "measure_group",
     "measure_groups",
+    "stack_spectra",
     "warping",
 ]
 
@@ -57,31 +58,37 @@ def _frames_in_group(motion: Vibration, starts: Tensor, size: tuple[int, int]) -
     return int(max(2, min(LARGEST_GROUP, 1 + (1 - _LEAST_OVERLAP) // max(fraction, 1e-9))))
 
 
-def frame_groups(
-    frames: Tensor, valid: Tensor | None, timing: SensorTiming, motion: Vibration, *, alike: bool = False
-) -> list[FrameGroup]:
-    """Frames (B, T, H, W) in row order in groups that share enough of the scene when it moves by ``motion``.
+def stack_spectra(frames: Tensor, valid: Tensor | None) -> RowSpectra:
+    """Spectra of grey frames (B, T, H, W) in row order, all of one brightness and contrast.
 
     Args:
-        frames: Grey frames.
+        frames: The frames.
         valid: (B, T, H, W) bool, pixels that count; None for all.
+    """
+    return RowSpectra(_standardised(frames, valid), valid)
+
+
+def frame_groups(
+    spectra: RowSpectra, timing: SensorTiming, motion: Vibration, *, alike: bool = False
+) -> list[FrameGroup]:
+    """Frames in groups that share enough of the scene when it moves by ``motion``.
+
+    Args:
+        spectra: Of all frames, from ``stack_spectra``.
         timing: The sensor, in row order.
         motion: Of each stack (B).
         alike: Go in pairs where exposures blur each frame in its own way: only two can be blurred alike. Pairs tell
             of a tone; a free motion needs all frames that see a place.
     """
-    starts = timing.frame_starts(frames.shape[1], frames.device).expand(len(frames), -1)
-    even = _standardised(frames, valid)
-    most = _frames_in_group(motion, starts, (frames.shape[-2], frames.shape[-1]))
+    stacks, count = spectra.values.shape[:2]
+    device = spectra.values.device
+    starts = timing.frame_starts(count, device).expand(stacks, -1)
+    most = _frames_in_group(motion, starts, (spectra.height, spectra.width))
     if alike:
-        moments = timing.row_starts(frames.shape[1], frames.shape[-2], frames.device).expand(len(frames), -1, -1)
+        moments = timing.row_starts(count, spectra.height, device).expand(stacks, -1, -1)
         most = 2 if bool(_unlike(_paths(moments, timing, motion)[0]).any()) else most
-    members = _members(frames.shape[1], most)
-    parts = [slice(member.start, member.stop) for member in members]
-    return [
-        FrameGroup(RowSpectra(even[:, part], None if valid is None else valid[:, part]), starts[:, part])
-        for part in parts
-    ]
+    parts = [slice(member.start, member.stop) for member in _members(count, most)]
+    return [FrameGroup(spectra.part(part), starts[:, part]) for part in parts]
 
 
 def warping(group: FrameGroup, timing: SensorTiming, motion: Vibration) -> tuple[RowSpectra, Tensor, Tensor, Tensor]:

@@ -46,9 +46,10 @@ def robust_fit(
     if residual is None:
         fit = fit_tones(measurements, frequencies, active, model)
         frequencies, residual = fit.frequencies, residual_of(measurements, fit)
-    for _ in range(_ROBUST_STEPS):
+    for step in range(_ROBUST_STEPS):
         weighed = measurements.reweighted(residual)
-        fit = fit_tones(weighed, frequencies, active, model)
+        enough = {} if step == _ROBUST_STEPS - 1 else {"iterations": _FEW_ITERATIONS}
+        fit = fit_tones(weighed, frequencies, active, model, **enough)
         frequencies, residual = fit.frequencies, residual_of(measurements, fit)
     return fit, weighed
 

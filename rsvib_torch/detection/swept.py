@@ -15,7 +15,7 @@ from rsvib_torch.detection.door import GreyFrames, grey_frames
 from rsvib_torch.detection.freeform import start_curve
 from rsvib_torch.detection.leftovers import independent_fraction, unexplained
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.row_groups import frame_groups, measure_groups
+from rsvib_torch.detection.row_groups import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.spline_fit import precision_of_axis
 from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.orientation import vibration_from_row_order
@@ -155,7 +155,7 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: Bands, iterations: i
     measured = measurements_of_curve(curve, rowwise, bands.band_step)
     highest = 0.5 / (bands.band_rows * rowwise.row_time)
     fits = [_start(measured, axis, record, highest) for axis in range(2)]
-    groups = frame_groups(stack.images, stack.valid, rowwise, _motion(fits, record, rowwise))
+    groups = frame_groups(stack_spectra(stack.images, stack.valid), rowwise, _motion(fits, record, rowwise))
     for _ in range(iterations):
         motion = _motion(fits, record, rowwise)
         measured = measure_groups(groups, rowwise, motion)

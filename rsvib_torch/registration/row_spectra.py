@@ -1,6 +1,7 @@
 """Fourier transforms along the rows of frames, and the frames warped by a motion in them."""
 
 import math
+from copy import copy
 
 import torch
 from torch import Tensor
@@ -44,6 +45,13 @@ class RowSpectra:
             # what interpolation takes from a bad pixel does not count either
             spoilt = functional.max_pool2d((~valid).to(frames.dtype), 2 * (DEGREE // 2) + 1, 1, DEGREE // 2)
             self.valid = spoilt == 0
+
+    def part(self, frames: slice) -> "RowSpectra":
+        """Those of some of the frames."""
+        part = copy(self)
+        part.values = self.values[:, frames]
+        part.valid = None if self.valid is None else self.valid[:, frames]
+        return part
 
     def warped(self, rows: Tensor, shift: Tensor) -> Tensor:
         """Spectra (B, T, S, U) of frame rows at fractional places ``rows``, moved back by ``shift``, both (B, T, S)."""
