@@ -66,7 +66,7 @@ class SceneSolver:
         """``K^H W g`` (K, C, U') of a chunk of the spectra (M, C, R, U) of data."""
         weight = self.kernels.weight.to(self.dtype)[:, None, :, None]
         turned = spectra[..., part] * self.kernels.phases(self.length, part, self.dtype)[:, None]
-        turned = (turned * weight).transpose(1, 2).flatten(0, 1).conj()
+        turned = (turned * weight).transpose(1, 2).flatten(0, 1).conj().resolve_conj()
         right = turned.new_zeros(self.rows.count, *turned.shape[1:])
         for i, kernel in enumerate(self._seen.taps(self.u[part])):
             right = right.index_add_(0, self._base + i, kernel[:, None] * turned)
