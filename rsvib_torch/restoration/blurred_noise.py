@@ -1,0 +1,124 @@
+"""Noise told from texture by motion blur: what the scene holds is blurred, row by row, and noise is not."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.restoration.motion import FrameMotion
+
+__all__ = ["noise_beside_blur"]
+
+_PIECE = 64  # rows and columns of the pieces whose spectra are compared
+_PIECES, _LEAST, _MOST = 64, 25, 256  # of a frame, of a frame of many, and of all, about
+_EVERY = 8  # rows of a piece, of which the blur is looked at
+_COARSE = 0.12  # cycles per px; below, scenes are so strong that they say nothing of noise
+_BARE, _ENOUGH = 0.05, 0.02  # power that the blur lets through, in so many of the values
+_ITERATIONS = 12
+_STEP = 0.5  # of a power at most, downwards
+
+
+@torch.no_grad()
+def noise_beside_blur(frames: Tensor, motion: FrameMotion, stack: int) -> Tensor | None:
+    """Power of the white noise in frames whose scene is blurred, more here and less there.
+
+    At frequency k, piece p of a frame has the power ``a_p T_pk S_k + noise``: T is what the blur of its rows lets
+    through, S the spectrum of the scene, and a how much texture the piece has. Where T is near zero the noise lies
+    bare, however dense the texture. Fisher scoring finds all of them together, for powers that scatter exponentially
+    about their means (Whittle 1953).
+
+    Args:
+        frames: (T, C, H, W) in row order.
+        motion: Motion of the batch of stacks.
+        stack: Index of the stack in the batch.
+
+    Returns:
+        Power (T,), float64; None where blur hides too little of the scene to tell.
+    """
+    shape, device = frames.shape[-2:], frames.device
+    if min(shape) < 2 * _PIECE:
+        return None
+    counts = _counts(shape, min(max(_MOST // len(frames), _LEAST), _PIECES))
+    starts = [_spread(extent, count).to(device) for extent, count in zip(shape, counts, strict=True)]
+    rows, columns = (begin[:, None] + torch.arange(_PIECE, device=device) for begin in starts)
+    u = torch.fft.rfftfreq(_PIECE, dtype=torch.float64, device=device)
+    v = torch.fft.fftfreq(_PIECE, dtype=torch.float64, device=device)
+    fine = _pooled(torch.hypot(u[:, None], v)) > _COARSE
+    times = motion.frame_starts[:, None, None] + rows * motion.timing.row_time
+    transfer = _pooled(_transfer(motion, stack, times[..., _EVERY // 2 :: _EVERY], u, v))[..., fine]
+    if float((transfer < _BARE).double().mean()) < _ENOUGH:
+        return None
+    taper = _taper(frames)
+    pieces = frames[:, :, rows[:, None, :, None], columns[None, :, None, :]]  # (T, C, pieces, pieces, rows, columns)
+    pieces = (pieces - pieces.mean((-2, -1), keepdim=True)) * taper * taper[:, None]
+    mean = motion.vibration[stack].mean_displacement(times, motion.timing.exposure_time)[..., 0]
+    back = _waves(mean, -u).to(frames.dtype.to_complex())  # neighbouring rows are to be alike as in the scene
+    power = torch.fft.fft(torch.fft.rfft(pieces) * back[:, None, :, None], dim=-2).abs().square().mean(1)
+    power = _pooled(power.transpose(-2, -1).to(torch.float64))[..., fine]
+    return _score(power.flatten(1, 2), transfer[:, :, None].expand_as(power).flatten(1, 2))
+
+
+def _score(power: Tensor, transfer: Tensor) -> Tensor:
+    """Noise (T,) that explains powers (T, P, K) of pieces, of whose scene the blur lets ``transfer`` through."""
+    noise = power.mean(-2, keepdim=True).amin(-1, keepdim=True)
+    texture = torch.ones_like(power[..., :1])
+    scene = (power - noise).mean(-2, keepdim=True).clamp(min=0.1 * noise) / transfer.mean(-2, keepdim=True)
+    for _ in range(_ITERATIONS):
+        shown = texture * transfer
+        model = shown * scene + noise
+        weight, rest = model.square().reciprocal(), power - model
+        own, pull = (shown.square() * weight).sum(-2, keepdim=True), (shown * weight * rest).sum(-2, keepdim=True)
+        both = (shown * weight).sum(-2, keepdim=True)
+        # normal equations of scene and noise, the scene's eliminated
+        pulled = (weight * rest).sum((-2, -1), keepdim=True) - (both * pull / own).sum(-1, keepdim=True)
+        step = pulled / (weight.sum((-2, -1), keepdim=True) - (both.square() / own).sum(-1, keepdim=True))
+        step = step.clamp(min=-_STEP * noise, max=noise)
+        scene, noise = torch.maximum(scene + (pull - both * step) / own, _STEP * scene), noise + step
+        full = transfer * scene
+        model = texture * full + noise
+        weight, rest = model.square().reciprocal(), power - model
+        change = (full * weight * rest).sum(-1, keepdim=True) / (full.square() * weight).sum(-1, keepdim=True)
+        texture = torch.maximum(texture + change, _STEP * texture)
+        mean = texture.mean(-2, keepdim=True)
+        texture, scene = texture / mean, scene * mean
+    return noise[:, 0, 0]
+
+
+def _counts(shape: torch.Size, most: int) -> list[int]:
+    """Pieces along each axis, half overlapping where there are few."""
+    counts = [2 * extent // _PIECE - 1 for extent in shape]
+    excess = max(1.0, math.sqrt(math.prod(counts) / most))
+    return [max(1, round(count / excess)) for count in counts]
+
+
+def _spread(extent: int, count: int) -> Tensor:
+    return torch.linspace(0, extent - _PIECE, count).round().to(torch.int64)
+
+
+def _taper(like: Tensor) -> Tensor:
+    """Taper of unit energy for the rows and columns of a piece."""
+    taper = torch.hann_window(_PIECE + 2, periodic=False, dtype=like.dtype, device=like.device)[1:-1]
+    return taper / taper.square().sum().sqrt()
+
+
+def _transfer(motion: FrameMotion, stack: int, times: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Power (..., U, V) that the blur of rows exposed from ``times`` (..., R) on lets through, weighed by the taper."""
+    displacement, weights = exposure_trajectory(motion.vibration[stack], times, motion.timing, "gauss")
+    along = _waves(displacement[..., 0], u) * weights[:, None]
+    across = _waves(displacement[..., 1], v)
+    share = torch.hann_window(2 * times.shape[-1] + 1, periodic=False, dtype=u.dtype, device=u.device)[1::2].square()
+    seen = (along.transpose(-2, -1) @ across).abs().square()
+    return (seen * (share / share.sum())[:, None, None]).sum(-3)
+
+
+def _pooled(values: Tensor) -> Tensor:
+    """Mean over 2 x 2 neighbouring frequencies of (..., U, V), without the lowest and the highest u."""
+    inner = values[..., 1 : (values.shape[-2] - 2) // 2 * 2 + 1, :]
+    pooled: Tensor = inner.unflatten(-2, (-1, 2)).unflatten(-1, (-1, 2)).mean((-3, -1))
+    return pooled
+
+
+def _waves(places: Tensor, frequencies: Tensor) -> Tensor:
+    angle = (-2 * math.pi) * places[..., None] * frequencies
+    return torch.polar(torch.ones_like(angle), angle)
