@@ -1,10 +1,14 @@
 """Fourier transforms along rows of images that are not periodic."""
 
+import math
+
 import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
 
-__all__ = ["extend_rows", "fast_length"]
+__all__ = ["extend_rows", "fast_length", "shift_phases"]
+
+_TABLE = 64  # frequencies that a phase is stepped through
 
 
 def fast_length(minimum: int) -> int:
@@ -40,3 +44,34 @@ def extend_rows(images: Tensor, length: int) -> Tensor:
     gap[..., :reach] += after
     gap[..., extra - reach :] += before.flip(-1)
     return torch.cat([images, gap], dim=-1)
+
+
+def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dtype) -> Tensor:
+    """``exp(2 pi i k shift / length)``: what moves rows back by a shift, as products of two tables.
+
+    Args:
+        shift: (...) px, float64.
+        length: L of the period.
+        frequencies: Which k of ``rfft``, from start to stop.
+        dtype: Complex, of the result.
+
+    Returns:
+        (..., stop - start).
+
+    Example:
+        >>> rows = torch.sin(2 * torch.pi * (torch.arange(8.0) - 0.25) / 8)
+        >>> phases = shift_phases(torch.tensor(0.25, dtype=torch.float64), 8, slice(0, 5), torch.complex64)
+        >>> moved = torch.fft.irfft(torch.fft.rfft(rows) * phases, n=8)
+        >>> torch.allclose(moved, torch.sin(2 * torch.pi * torch.arange(8.0) / 8), atol=1e-6)
+        True
+    """
+    start, stop = frequencies.start, frequencies.stop
+    coarse = torch.arange(start, stop, _TABLE, device=shift.device)
+    fine = torch.arange(_TABLE, device=shift.device)
+    tables = []
+    for steps in (coarse, fine):
+        turns = shift[..., None] * (steps.to(torch.float64) / length)
+        angle = (turns - turns.detach().round()) * (2 * math.pi)
+        tables.append(torch.polar(torch.ones_like(angle), angle).to(dtype))
+    product = tables[0][..., :, None] * tables[1][..., None, :]
+    return product.flatten(-2)[..., : stop - start]

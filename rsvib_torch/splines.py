@@ -63,7 +63,7 @@ def mirrored_index(start: int, stop: int, length: int, device: torch.device | No
     return torch.where(index >= length, 2 * (length - 1) - index, index)
 
 
-_BLOCK = 128  # samples filtered together: one small dense matrix serves all blocks
+_BLOCK = 64  # samples filtered together: one small dense matrix serves all blocks
 
 
 def _filter_symmetric(samples: Tensor, taps: tuple[float, ...], dim: int) -> Tensor:

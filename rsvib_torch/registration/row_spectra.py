@@ -7,14 +7,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.spectral import extend_rows, fast_length
+from rsvib_torch.spectral import extend_rows, fast_length, shift_phases
 from rsvib_torch.splines import bspline_coefficients, bspline_weights
 
 __all__ = ["DEGREE", "MARGIN", "RowSpectra", "combined", "inner_columns", "mean_over_frames", "row_chunks"]
 
 DEGREE = 7  # of the spline across rows: what it smooths, and the noise it colours, lie above the pass band
 MARGIN = 8  # px from the ends of rows and columns that do not count
-_POWERS = 32  # of a turn, computed one by one
 _EXTENSION = 32  # px that rows are continued by, so that their Fourier transform closes smoothly
 _CHUNK = {"cpu": 2**24}  # bytes that stay in a cache
 _LARGE_CHUNK = 2**30  # bytes at a time elsewhere
@@ -72,15 +71,8 @@ class RowSpectra:
         return result
 
     def ramp(self, shift: Tensor) -> Tensor:
-        """exp(2 pi i u shift) for all frequencies u (..., U), as products of few powers of one turn."""
-        turn = 2 * math.pi * shift[..., None] / self.length
-        coarse = torch.arange(0, len(self.frequencies), _POWERS, dtype=torch.float64, device=shift.device)
-        fine = torch.arange(_POWERS, dtype=torch.float64, device=shift.device)
-        first, second = (
-            torch.polar(torch.ones_like(angle), angle).to(self.values.dtype) for angle in (turn * coarse, turn * fine)
-        )
-        ramp: Tensor = (first[..., None] * second[..., None, :]).flatten(-2)[..., : len(self.frequencies)]
-        return ramp
+        """exp(2 pi i u shift) for all frequencies u (..., U)."""
+        return shift_phases(shift, self.length, slice(0, len(self.frequencies)), self.values.dtype)
 
     def subtract(self, pattern: Tensor) -> None:
         """Take a pattern (B, U) out of every row of every frame."""

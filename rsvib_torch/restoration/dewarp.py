@@ -1,14 +1,13 @@
 """Restoration of the geometry only: every pixel fetched from where its row's mean displacement put it."""
 
-import math
-
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
 from rsvib_torch.checks import check_whole_number
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.rows import continue_rows
-from rsvib_torch.spectral import fast_length
+from rsvib_torch.spectral import fast_length, shift_phases
 from rsvib_torch.splines import bspline_coefficients, bspline_weights, mirrored_index
 
 __all__ = ["restore_dewarp"]
@@ -32,32 +31,32 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 256
         Restored frames of the same shape.
     """
     chunk_rows = check_whole_number("chunk_rows", chunk_rows, at_least=1)
-    B, T, _, H, W = frames.shape
+    B, T, C, H, W = frames.shape
     rows = motion.frame_rows(torch.arange(H, dtype=torch.float64, device=frames.device))
     mean = motion.vibration.mean_displacement(motion.row_starts(rows), motion.timing.exposure_time)[..., 0]
     along = (mean - motion.shift[..., 0, None]).flatten(0, 1)
     rows = rows.flatten(0, 1)
 
     length = fast_length(W + 4 * (_MARGIN + motion.reach(H)))
-    u = torch.fft.rfftfreq(length, dtype=torch.float64, device=frames.device)
     spectra = torch.fft.rfft(continue_rows(bspline_coefficients(frames, _DEGREE, -2), length))
-    spectra = spectra.movedim(2, 3).flatten(0, 1)  # (B T, H, C, U)
+    count = spectra.shape[-1]
     cell = rows.detach().floor()
     weights = bspline_weights(rows - cell, _DEGREE).to(frames.dtype)
     taps = cell.to(torch.int64)[..., None] + torch.arange(_DEGREE + 1, device=frames.device) - _DEGREE // 2
     reach = int(torch.stack([-taps.amin(), taps.amax() - (H - 1)]).amax().clamp(min=0))
     taps = mirrored_index(-reach, H + reach, H, frames.device)[taps + reach]
-    image = torch.arange(B * T, device=frames.device)[:, None]
+    image = torch.arange(B * T, device=frames.device)[:, None, None]
+    taps = taps + image * H
+    # one row after the other, all channels in it
+    flat = torch.view_as_real(spectra.movedim(2, 3)).reshape(B * T * H, -1)
     restored = []
     for begin in range(0, H, chunk_rows):
         part = slice(begin, begin + chunk_rows)
-        turns = along[:, part, None] * u
-        angle = ((turns - turns.detach().round()) * (2 * math.pi)).to(frames.dtype)
-        fetched = sum(
-            (weights[:, part, k, None, None] * spectra[image, taps[:, part, k]] for k in range(_DEGREE + 1)),
-            start=spectra.new_zeros(()),
+        fetched = embedding_bag(
+            taps[:, part].flatten(0, 1), flat, per_sample_weights=weights[:, part].flatten(0, 1), mode="sum"
         )
-        fetched = fetched * torch.complex(angle.cos(), angle.sin())[:, :, None]
-        restored.append(torch.fft.irfft(fetched, n=length)[..., :W])
+        moved = torch.view_as_complex(fetched.view(B * T, -1, C, count, 2))
+        moved = moved * shift_phases(along[:, part], length, slice(0, count), moved.dtype)[:, :, None]
+        restored.append(torch.fft.irfft(moved, n=length)[..., :W])
     stacked: Tensor = torch.cat(restored, dim=1).unflatten(0, (B, T)).movedim(3, 2)
     return stacked

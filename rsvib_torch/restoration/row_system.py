@@ -15,11 +15,11 @@ from torch import Tensor
 
 from rsvib_torch.restoration.row_kernel import REACH, TAPS, kernel_weights
 from rsvib_torch.restoration.segments import Segments
+from rsvib_torch.spectral import shift_phases
 
 __all__ = ["RowKernels", "SceneRows", "SmoothBand", "SmoothKernels", "row_kernels", "smooth_band", "smooth_kernels"]
 
 _SHARP = 1.0  # px, along the rows or across them, that the scene may move during an exposure
-_TABLE = 64  # frequencies that a phase is stepped through
 
 
 @dataclass(frozen=True)
@@ -85,17 +85,8 @@ class RowKernels:
         return torch.complex(self.taps @ angle.cos(), self.taps @ angle.sin())
 
     def phases(self, length: int, frequencies: slice, dtype: torch.dtype) -> Tensor:
-        """``exp(2 pi i u x)`` of the middles (M, R, U) at frequencies ``u = k / length``, as products of two tables."""
-        start, stop = frequencies.start, frequencies.stop
-        coarse = torch.arange(start, stop, _TABLE, device=self.middle.device)
-        fine = torch.arange(_TABLE, device=self.middle.device)
-        tables = []
-        for steps in (coarse, fine):
-            turns = self.middle[..., None] * (steps.to(torch.float64) / length)
-            angle = (turns - turns.round()) * (2 * math.pi)
-            tables.append(torch.polar(torch.ones_like(angle), angle).to(dtype.to_complex()))
-        product = tables[0][..., :, None] * tables[1][..., None, :]
-        return product.flatten(-2)[..., : stop - start]
+        """``exp(2 pi i u x)`` of the middles (M, R, U) at frequencies ``u = k / length``."""
+        return shift_phases(self.middle, length, frequencies, dtype.to_complex())
 
 
 def row_kernels(displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int, margin: int) -> RowKernels:
