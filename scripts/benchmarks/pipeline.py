@@ -52,6 +52,7 @@ __all__ = ["add_options", "behind_libraries", "lines", "rows", "targets"]
 WIENER = "skimage wiener, row loop"
 TIMED_BALANCE = 0.01
 REGISTRATION = "ncc"  # of detect_vibration unless told otherwise
+STRIP = 512  # columns that are enough for bands, where nothing but time counts
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -64,6 +65,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def bands_chain(registration: str) -> str:
     """The name of the chain of the package's fastest methods."""
     return f'"bands" by "{registration}", "dewarp"'
+
+
+def strip_chain() -> str:
+    """The name of the chain for which nothing but time counts."""
+    return f'"bands" on {STRIP} columns, "dewarp" unchecked'
 
 
 def camera(exposure: float, num_rows: int) -> rsv.SensorTiming:
@@ -82,11 +88,13 @@ def errors_of(found: rsv.Vibration) -> dict[str, float]:
     return {"amplitude_percent": 100 * float(wrong.max()), "period_percent": 100 * float(period.max())}
 
 
-def restored_by(frames: Tensor, timing: rsv.SensorTiming, found: rsv.Vibration, method: str) -> list[Peer]:
+def restored_by(
+    frames: Tensor, timing: rsv.SensorTiming, found: rsv.Vibration, method: str, *, check: bool = True
+) -> list[Peer]:
     """Both frames restored by the package."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rsv.RestorationWarning)
-        return [Peer(frame, 0.0, "") for frame in rsv.restore(frames, timing, found, method=method)]
+        return [Peer(frame, 0.0, "") for frame in rsv.restore(frames, timing, found, method=method, check=check)]
 
 
 def compare_chains(
@@ -182,7 +190,10 @@ def _of_the_package(frames: Tensor, timing: rsv.SensorTiming, registrations: lis
         "direct": lambda: rsv.detect_vibration(frames, timing),
         "exact": lambda: restored_by(frames, timing, found, "exact"),
         "dewarp": lambda: restored_by(frames, timing, found, "dewarp"),
+        "unchecked": lambda: restored_by(frames, timing, found, "dewarp", check=False),
     }
+    middle = slice(max(0, (frames.shape[-1] - STRIP) // 2), (frames.shape[-1] + STRIP) // 2)
+    works["strip"] = lambda: rsv.detect_vibration(frames[..., middle], timing, method="bands")
     for name in registrations:
         works[name] = lambda n=name: rsv.detect_vibration(frames, timing, method="bands", registration=n)
     return works
@@ -198,6 +209,7 @@ def speed(
         pieces = _of_the_package(taken, timing, registrations)
         chains = {OURS: ("direct", "exact"), DEWARP: ("direct", "dewarp")}
         chains |= {bands_chain(registration): (registration, "dewarp") for registration in registrations}
+        chains[strip_chain()] = ("strip", "unchecked")
         if device == "cpu":
             pieces |= _of_libraries(taken, timing)
             chains = {PAPER: ("libraries", "wiener"), FASTEST: ("libraries", "remap"), **chains}
