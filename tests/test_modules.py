@@ -208,9 +208,7 @@ def test_gradients_reach_frames_and_vibration(method):
         ),
     ):
         numeric = (moved(step) - moved(-step)) / (2 * step)
-        # the prior of "exact" is fitted to the frames, and no part of the gradient
-        tolerance = 0.08 if method == "exact" else 1e-4
-        torch.testing.assert_close(gradient, numeric.detach(), rtol=tolerance, atol=1e-6)
+        torch.testing.assert_close(gradient, numeric.detach(), rtol=1e-4, atol=1e-6)
 
 
 def test_no_gradient_through_detection(frames):

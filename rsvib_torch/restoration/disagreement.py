@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.restoration.blurred_noise import noise_beside_blur
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.prior import RowPrior
@@ -21,8 +22,9 @@ _WEAK = 1e-4  # of the prior that bridges what no frame saw, relative to the dat
 def noise_levels(frames: Tensor, motion: FrameMotion, stack: int) -> Tensor:
     """Standard deviation of the noise of each frame of a stack.
 
-    What texture adds to the noise estimated from single frames is the same in all of them. It is the excess of that
-    estimate over what the two middle frames disagree by, once the scene that explains them best is taken away.
+    Where the scene is blurred, noise is what is not. Elsewhere, what texture adds to the noise estimated from single
+    frames is the same in all of them: the excess of that estimate over what the two middle frames disagree by, once the
+    scene that explains them best is taken away.
 
     Args:
         frames: (T, C, H, W) in row order.
@@ -33,7 +35,10 @@ def noise_levels(frames: Tensor, motion: FrameMotion, stack: int) -> Tensor:
         (T,), in the dtype of the frames.
     """
     power = estimate_noise(frames).square().mean(-1)
-    if len(frames) > 1:
+    bare = noise_beside_blur(frames, motion, stack)
+    if bare is not None:
+        power = power.minimum(bare.to(power.dtype))
+    elif len(frames) > 1:
         pair = _shared_part(frames, motion, stack)
         if pair is not None:
             images, rows, members = pair

@@ -11,6 +11,7 @@ from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.disagreement import noise_levels
 from rsvib_torch.restoration.edges import expectation, expectation_precision, stages
 from rsvib_torch.restoration.filling import fill_beyond_ends, fill_unmeasured
+from rsvib_torch.restoration.groups import joint_groups
 from rsvib_torch.restoration.missing import fill_roughly, measured_values
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.partition import Partition
@@ -31,20 +32,11 @@ _LOOSE, _REST = 0.3, 0.03  # parts of the quadratic prior that patches start fro
 _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
 
 
-def _groups(count: int, joint: bool | int) -> list[tuple[list[int], int]]:
-    """Frames restored together, and the frame whose coordinates the result has, for every result."""
-    if joint is True:
-        return [(list(range(count)), count // 2)]
-    size = 1 if joint is False else min(check_whole_number("joint", joint, at_least=1), count)
-    starts = [min(max(frame - (size - 1) // 2, 0), count - size) for frame in range(count)]
-    return [(list(range(first, first + size)), frame) for frame, first in enumerate(starts)]
-
-
 def _chosen_by(groups: list[tuple[list[int], int]], shift: Tensor) -> tuple[list[int], int]:
     """Frames that the strength of the prior is chosen by, and in whose coordinates.
 
     Args:
-        groups: As from ``_groups``.
+        groups: As from ``joint_groups``.
         shift: (T, 2) reference shifts of the frames: those that lie apart do not show the same columns.
     """
     members, reference = groups[len(groups) // 2]
@@ -129,7 +121,7 @@ def restore_exact(
     B, T, _, H, W = frames.shape
     factor = check_number("regularisation", regularisation, above=0.0)
     check_choice("prior", prior, ("gaussian", "edges"))
-    groups = _groups(T, joint)
+    groups = joint_groups(T, joint)
     length = fast_length(W + 4 * (_MARGIN + motion.reach(H)))
     chunk, split = (
         None if value is None else check_whole_number(name, value, at_least=1)

@@ -57,12 +57,16 @@ class Partition:
         values = max(_VALUES[kind], _TIMES_THE_SCENE * rows * frequencies)
         most = max(1, values // (threads * rows * (2 * width + 1)))
         rounds = -(-frequencies // (threads * most))
-        chunk = _round_up(-(-frequencies // (threads * rounds)), _ALIGNED)
+        narrow = -(-frequencies // (threads * rounds))
+        split = max(1, rows // _LEAST_ROWS[kind])
+        if width**2 * narrow * split < _STEP[kind] // 2:  # threads would wait for each other
+            narrow = -(-frequencies // rounds)
+        chunk = _round_up(narrow, _ALIGNED)
         chunk = min(self.chunk or chunk, frequencies)
         if keep and self.chunk is None:
             chunk = frequencies
         wanted = -(-_STEP[kind] // (max(width, 1) ** (1 if keep else 2) * chunk))
-        count = self.segments or max(1, min(wanted, rows // _LEAST_ROWS[kind]))
+        count = self.segments or max(1, min(wanted, split))
         return chunk, Segments(rows, count, _OVERLAP[0] + _OVERLAP[1] * width)
 
     def memory(self, thread: int, rows: int, width: int, right_sides: int, batch: int, like: Tensor) -> BandedMemory:

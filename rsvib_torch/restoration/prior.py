@@ -110,7 +110,9 @@ def _smooth(moments: Tensor) -> Tensor:
     return pooled
 
 
-def autoregressive_prior(observed: Tensor, transfer: Tensor, noise_power: Tensor, order: int = ORDER) -> RowPrior:
+def autoregressive_prior(
+    observed: Tensor, transfer: Tensor, aliases: Tensor, noise_power: Tensor, order: int = ORDER
+) -> RowPrior:
     """Fit the prior to the power spectrum of blurred, noisy frames by expectation maximisation.
 
     Each step adds what the blurred spectrum says about the scene's and what the noise leaves open, and fits the
@@ -119,6 +121,7 @@ def autoregressive_prior(observed: Tensor, transfer: Tensor, noise_power: Tensor
     Args:
         observed: (U, V) power of the frames, horizontal frequencies by vertical ones.
         transfer: (U, V) power that the blur lets through.
+        aliases: (U, V) power of what the kernel between rows cannot follow, through the blur, of a wave of power 1.
         noise_power: Power of the noise in each value, shape (U, V) or ().
         order: Rows that a row is predicted from.
 
@@ -136,11 +139,10 @@ def autoregressive_prior(observed: Tensor, transfer: Tensor, noise_power: Tensor
         model = prior.innovation()[:, None] / ((whitener @ cosine.T).square() + (whitener @ sine.T).square())
         gain = model / (transfer * model + noise_power)
         scene = gain * noise_power + gain.square() * transfer * observed
-    blind = (model * interpolation_error(v)).mean(-1)
+    blind = (model * aliases).mean(-1)
     return RowPrior(prior.power, prior.reflections, blind.clamp(min=torch.finfo(blind.dtype).tiny))
 
 
-@torch.no_grad()
 def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, length: int) -> RowPrior:
     """Fit the prior to the frames of a stack.
 
@@ -184,11 +186,16 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     along = _ramps(displacement[..., 0], u) * weights[:, None]
     across = _ramps(displacement[..., 1], v)
     transfer = (along.transpose(-2, -1) @ across).abs().square() * kernel_response(v).square()
+    aliases = torch.zeros_like(transfer[0, 0])
+    for cycle in (-1, 1):  # all others together are less than 4 % of these
+        beyond = across * _ramps(displacement[..., 1], v.new_tensor([cycle]))
+        blurred = (along.transpose(-2, -1) @ beyond).abs().square().mean((0, 1))
+        aliases = aliases + blurred * interpolation_error(v, [cycle])
     weight = transfer / levels.to(torch.float64).square()[:, None, None, None]
     total = weight.sum((0, 1)).clamp(min=torch.finfo(torch.float32).tiny)
     observed = (weight * power).sum((0, 1)) / total
     noise_power = transfer.sum((0, 1)) / total * length
-    prior = autoregressive_prior(observed, (weight * transfer).sum((0, 1)) / total, noise_power)
+    prior = autoregressive_prior(observed, (weight * transfer).sum((0, 1)) / total, aliases, noise_power)
     return prior.resampled(length // 2 + 1)
 
 

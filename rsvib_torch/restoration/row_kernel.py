@@ -1,5 +1,7 @@
 """The kernel that interpolates a scene between its rows."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -57,17 +59,18 @@ def kernel_response(frequencies: Tensor) -> Tensor:
     return response
 
 
-def interpolation_error(frequencies: Tensor) -> Tensor:
+def interpolation_error(frequencies: Tensor, cycles: Sequence[int] = (-3, -2, -1, 1, 2, 3)) -> Tensor:
     """Power of the aliases that a wave of unit coefficients has between the rows.
 
     Args:
         frequencies: Cycles per row within -0.5 ... 0.5, any shape.
+        cycles: How many cycles per row beyond to look.
 
     Returns:
-        Power of the same shape: what the kernel lets through at whole cycles per row beyond.
+        Power of the same shape: what the kernel lets through there.
     """
     nodes, weights = np.polynomial.legendre.leggauss(64)
     places = torch.from_numpy(nodes * REACH).to(frequencies)
     values = torch.from_numpy(weights * REACH).to(frequencies) * _kernel(places)
-    aliases = frequencies[..., None] + torch.tensor([-3, -2, -1, 1, 2, 3]).to(frequencies)
+    aliases = frequencies[..., None] + torch.tensor(cycles).to(frequencies)
     return (torch.cos(2 * torch.pi * aliases[..., None] * places) @ values).square().sum(-1)

@@ -59,7 +59,8 @@ class SceneSolver:
         self._seen = smooth_kernels(kernels, dtype)
         self._base = (kernels.first - self.rows.top).flatten()
         self._factors: list[BandedFactor] | None = None
-        if keep and not (torch.is_grad_enabled() and self._normal.left.requires_grad):
+        moving = self._normal.left.requires_grad or precision.requires_grad
+        if keep and not (torch.is_grad_enabled() and moving):
             self._factors = [factor_skewed(self._normal.at(self.u[p], precision[..., p])) for p in self.parts]
 
     def _right(self, spectra: Tensor, part: slice) -> Tensor:
@@ -98,7 +99,7 @@ class SceneSolver:
         """``fit`` without gradients, in memory that is used again and again, and on all cores."""
         segments, width = self._segments, self._normal.width
         rows, batch = segments.size, len(segments.windows) * self._chunk
-        threads = self._partition.threads(spectra.device)
+        threads = min(self._partition.threads(spectra.device), len(self.parts))
 
         def solve(thread: int) -> Coefficients:
             memory = self._partition.memory(thread, rows, width, spectra.shape[1], batch, spectra)

@@ -11,7 +11,7 @@ __all__ = ["prior_strength"]
 
 _STRENGTHS = (2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 _DOUBT = 0.014  # by how much a prior half as strong has to predict better, in logarithms
-_CLEAR = 100.0  # times what the kernel between rows cannot follow: less noise hides behind that
+_CLEAR = 200.0  # times what the kernel between rows cannot follow: less noise hides behind that
 _ROWS = 512  # at most, from the middle of the frames
 _FREQUENCIES = 24
 _LOWEST = 0.02  # cycles per px; the taper spreads what lies below

@@ -18,6 +18,7 @@ RESTORATIONS: list[dict[str, Any]] = [
     {"method": "exact", "joint": True},
     {"method": "exact", "prior": "edges"},
     {"method": "richardson-lucy"},
+    {"method": "richardson-lucy", "joint": 3},
 ]
 
 

@@ -206,7 +206,7 @@ def test_dead_rows_and_pixels_harm_no_others(short):
     assert decibel(np.where(harmed, truth, blind), truth) < decibel(clean, truth) - 3
 
 
-def test_gradients_to_frames_and_vibration(prior_fitted_once):
+def test_gradients_to_frames_and_vibration():
     generator = torch.Generator().manual_seed(0)
     timing = SensorTiming(row_time=1e-3, exposure_rows=2, frame_rows=8)
     frames = torch.rand(1, 6, 5, generator=generator, dtype=torch.float64)
@@ -263,7 +263,7 @@ def test_segments_of_rows_change_nothing(short, joint, monkeypatch):
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_gradients_through_filled_pixels_and_ends(joint, prior_fitted_once):
+def test_gradients_through_filled_pixels_and_ends(joint):
     timing = SensorTiming(row_time=1e-3, exposure_rows=12, frame_rows=16)
     frames = torch.rand(2, 6, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     ignore = torch.zeros(2, 6, 5, dtype=torch.bool)

@@ -48,7 +48,7 @@ def without_choice(monkeypatch):
         ("buildings", 100, 0.001, True, -0.1),
         ("soft", 20, 0.005, True, 0.2),
         ("soft", 100, 0.05, True, 1.0),
-        ("dense texture", 100, 0.001, False, 0.6),
+        ("dense texture", 100, 0.001, False, 0.1),
         ("dense texture", 20, 0.001, True, -0.1),
     ],
 )
