@@ -12,8 +12,8 @@ from rsvib_torch.spectral import fast_length
 
 __all__ = ["fill_beyond_ends", "fill_unmeasured"]
 
-_ITERATIONS, _ITERATIONS_OF_ENDS = 8, 24  # at most
-_CONVERGED = 0.1  # of the noise level: what is left unexplained where the filling is
+_ITERATIONS, _ITERATIONS_OF_ENDS = 8, 40  # at most
+_CONVERGED = 0.05  # of the noise level: what is left unexplained where the filling is
 _MOSTLY = 0.9  # frames with at least this part of the most complete one start the filling
 _STRIP = 64  # columns on either side, and what the motion shows, that say how rows go on beyond their ends
 
