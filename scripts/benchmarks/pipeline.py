@@ -72,6 +72,12 @@ def strip_chain() -> str:
     return f'"bands" on {STRIP} columns, "dewarp" unchecked'
 
 
+def strip(frames: Tensor) -> Tensor:
+    """The columns in the middle."""
+    width = frames.shape[-1]
+    return frames[..., max(0, (width - STRIP) // 2) : (width + STRIP) // 2]
+
+
 def camera(exposure: float, num_rows: int) -> rsv.SensorTiming:
     """The paper's camera; with fewer rows they are slower, so that frame period and exposure stay what they are."""
     slower = 2048 / num_rows
@@ -114,9 +120,11 @@ def compare_chains(
         DEWARP: (direct.vibration, lambda: restored_by(frames, timing, direct.vibration, "dewarp")),
     }
     for registration in registrations:
-        bands = rsv.detect_vibration(frames, timing, method="bands", registration=registration)
-        restore = lambda found=bands.vibration: restored_by(frames, timing, found, "dewarp")  # noqa: E731
-        chains[bands_chain(registration)] = (bands.vibration, restore)
+        found = rsv.detect_vibration(frames, timing, method="bands", registration=registration).vibration
+        restore = lambda found=found: restored_by(frames, timing, found, "dewarp")  # noqa: E731
+        chains[bands_chain(registration)] = (found, restore)
+    bands = rsv.detect_vibration(strip(frames), timing, method="bands").vibration
+    chains[strip_chain()] = (bands, lambda: restored_by(frames, timing, bands, "dewarp", check=False))
     trusted = {OURS: direct, DEWARP: direct}
     results = []
     for name, (found, restore) in chains.items():
@@ -192,8 +200,7 @@ def _of_the_package(frames: Tensor, timing: rsv.SensorTiming, registrations: lis
         "dewarp": lambda: restored_by(frames, timing, found, "dewarp"),
         "unchecked": lambda: restored_by(frames, timing, found, "dewarp", check=False),
     }
-    middle = slice(max(0, (frames.shape[-1] - STRIP) // 2), (frames.shape[-1] + STRIP) // 2)
-    works["strip"] = lambda: rsv.detect_vibration(frames[..., middle], timing, method="bands")
+    works["strip"] = lambda: rsv.detect_vibration(strip(frames), timing, method="bands")
     for name in registrations:
         works[name] = lambda n=name: rsv.detect_vibration(frames, timing, method="bands", registration=n)
     return works

@@ -20,6 +20,7 @@ from rsvib_torch.evaluation import city_and_fields
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration import exact, prior
 from rsvib_torch.restoration.motion import as_batch, frame_motion
+from rsvib_torch.restoration.partition import Partition
 from rsvib_torch.restoration.row_kernel import kernel_samples
 from rsvib_torch.restoration.row_system import row_kernels, smooth_band, smooth_kernels
 from rsvib_torch.spectral import fast_length
@@ -69,6 +70,7 @@ def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibrat
     seen, order = kernels.scene_rows(height), prior.ORDER
     band = smooth_band(kernels, seen, max(kernels.taps.shape[-2] - 1, order), order, torch.float32)
     frequencies = length // 2 + 1
+    chunk, _ = Partition().of(seen.count, band.width, frequencies, torch.device(device), keep=False)
     return Shapes(
         rows=height,
         columns=width,
@@ -76,10 +78,10 @@ def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibrat
         frequencies=frequencies,
         unknowns=seen.count,
         taps=kernels.taps.shape[-2],
-        width=band.left.shape[1] // 2,
+        width=band.width,
         kernel_terms=smooth_kernels(kernels, torch.float32).left.shape[-1],
         band_terms=band.left.shape[-1],
-        chunks=math.ceil(frequencies / max(1, exact._CHUNK_ELEMENTS[device] // height)),
+        chunks=math.ceil(frequencies / chunk),
     )
 
 
