@@ -51,8 +51,9 @@ class SceneSolver:
         order = len(precision) - 1
         width = max(kernels.taps.shape[-2] - 1, order)
         normal = smooth_band(self.kernels, self.rows, width, order, dtype)
-        device = precision.device
-        self._chunk, self._segments = partition.of(self.rows.count, width, len(self.u), device, keep=keep)
+        self._chunk, self._segments = partition.of(
+            self.rows.count, width, len(self.u), precision.device, blurred=kernels.blurred, keep=keep
+        )
         self._normal = normal.in_segments(self._segments)
         self._partition = partition
         self.parts = [slice(k, min(k + self._chunk, len(self.u))) for k in range(0, len(self.u), self._chunk)]

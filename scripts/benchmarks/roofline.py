@@ -70,7 +70,9 @@ def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibrat
     seen, order = kernels.scene_rows(height), prior.ORDER
     band = smooth_band(kernels, seen, max(kernels.taps.shape[-2] - 1, order), order, torch.float32)
     frequencies = length // 2 + 1
-    chunk, _ = Partition().of(seen.count, band.width, frequencies, torch.device(device), keep=False)
+    chunk, _ = Partition().of(
+        seen.count, band.width, frequencies, torch.device(device), blurred=kernels.blurred, keep=False
+    )
     return Shapes(
         rows=height,
         columns=width,

@@ -8,9 +8,11 @@ from truth import Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch.restoration.exact as exact_module
 import rsvib_torch.restoration.partition as partition_module
-from rsvib_torch import SensorTiming, Vibration
+from rsvib_torch import SensorTiming, Vibration, psnr, simulate_frames
+from rsvib_torch.evaluation.targets import city_and_fields
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
+from rsvib_torch.restoration.partition import Partition
 
 restore = partial(restore_by_any_method, method="exact")
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -257,9 +259,36 @@ def test_segments_of_rows_change_nothing(short, joint, monkeypatch):
                 frames, TIMING, motion.vibration(), segments=3, chunk_frequencies=chunk, check=False, joint=joint
             )
             torch.testing.assert_close(again, whole.detach(), rtol=0, atol=2e-5)
-    monkeypatch.setattr(partition_module, "_OVERLAP", (2, 0))
+    monkeypatch.setattr(partition_module, "_OVERLAP", 2)
     careless = restore(frames, TIMING, motion.vibration(), segments=3, check=False, joint=joint)
     assert (careless - whole).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("exposure", [20, 300])
+def test_tall_frames_are_split_only_where_rows_depend_on_near_ones(exposure, monkeypatch):
+    """At 300 rows and no noise, segments would go astray by far more than the scene is bright."""
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=exposure, frame_rows=2048)
+    vibration = Vibration([3.1, 5.2], [50.0, 30.0], [0.7, 2.1])
+    scene = city_and_fields(1200 + 96, 64 + 96, seed=4)
+    frames = simulate_frames(scene, timing, vibration, 1, frame_size=(1200, 64))
+    counts = []
+    segments_of = Partition.of
+
+    def counted(*arguments, **options):
+        chunk, segments = segments_of(*arguments, **options)
+        counts.append(len(segments.windows))
+        return chunk, segments
+
+    monkeypatch.setattr(Partition, "of", counted)
+    whole = restore(frames, timing, vibration, segments=1, check=False)
+    assert set(counts) == {1}
+    for options in ({}, {"segments": 4}):
+        counts.clear()
+        restored = restore(frames, timing, vibration, check=False, **options)
+        assert max(counts) == (1 if exposure == 300 else options.get("segments", 2))
+        torch.testing.assert_close(restored, whole, rtol=0, atol=2e-5)
+    inner = (0, slice(48, -48), slice(16, -16))
+    assert psnr(whole[inner], scene[48:-48, 48:-48][inner[1:]], 1.0) > (35 if exposure == 300 else 50)
 
 
 @pytest.mark.parametrize("joint", [False, True])
