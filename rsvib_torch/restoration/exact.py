@@ -111,7 +111,7 @@ def restore_exact(
             with what the others say.
         clipped: Boolean mask of saturated pixels: what they would have shown is at least what they hold.
         chunk_frequencies: Frequencies solved at a time; bounds the memory, does not change the result. None: as many
-            as take five times the memory of the scene.
+            as take eight times the memory of the scene.
         segments: Overlapping segments of rows that are solved side by side, which changes the result by about 1e-5;
             None: as many as make a step worth its call, of at least 512 rows on a CPU, 256 on a GPU. Always one where
             the scene moves by more than a pixel during an exposure: rows then depend on rows far away.

@@ -10,7 +10,7 @@ from rsvib_torch.restoration.segments import Segments
 
 __all__ = ["Partition"]
 
-_TIMES_THE_SCENE = 5  # the coefficients of a scene: memory of the bands that are solved at a time, or
+_TIMES_THE_SCENE = 8  # the coefficients of a scene: memory of the bands that are solved at a time, or
 _VALUES = {"cpu": 1 << 23, "cuda": 1 << 28}  # so many, for small scenes
 _STEP = {"cpu": 40_000, "cuda": 1 << 22}  # values that a step of the elimination should change to be worth its call
 _LEAST_ROWS = {"cpu": 512, "cuda": 256}  # of a segment: its overlap costs time
@@ -60,11 +60,12 @@ class Partition:
         """
         kind = device.type if device.type in _VALUES else "cuda"
         threads = _THREADS if kind == "cpu" else 1  # whatever is allowed: results are the same with any number
+        split = 1 if blurred else max(1, rows // _LEAST_ROWS[kind])
+        windows = rows + 2 * _OVERLAP * (split - 1)
         values = max(_VALUES[kind], _TIMES_THE_SCENE * rows * frequencies)
-        most = max(1, values // (threads * rows * (2 * width + 1)))
+        most = max(1, values // (threads * windows * (2 * width + 1)))
         rounds = -(-frequencies // (threads * most))
         narrow = -(-frequencies // (threads * rounds))
-        split = 1 if blurred else max(1, rows // _LEAST_ROWS[kind])
         if width**2 * narrow * split < _STEP[kind] // 2:  # threads would wait for each other
             narrow = -(-frequencies // rounds)
         chunk = _round_up(narrow, _ALIGNED)
