@@ -6,7 +6,7 @@ import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
 
-__all__ = ["extend_rows", "fast_length", "shift_phases"]
+__all__ = ["extend_rows", "fast_length", "shift_phases", "waves"]
 
 _TABLE = 64  # frequencies that a phase is stepped through
 
@@ -75,3 +75,9 @@ def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dt
         tables.append(torch.polar(torch.ones_like(angle), angle).to(dtype))
     product = tables[0][..., :, None] * tables[1][..., None, :]
     return product.flatten(-2)[..., : stop - start]
+
+
+def waves(places: Tensor, frequencies: Tensor) -> Tensor:
+    """``exp(-2 pi i u x)`` at places (...) in px and frequencies (U,) in cycles per px, (..., U)."""
+    angle = (-2 * math.pi) * places[..., None] * frequencies
+    return torch.polar(torch.ones_like(angle), angle)

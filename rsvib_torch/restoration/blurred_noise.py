@@ -7,6 +7,7 @@ from torch import Tensor
 
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.motion import FrameMotion
+from rsvib_torch.spectral import waves
 
 __all__ = ["noise_beside_blur"]
 
@@ -53,7 +54,7 @@ def noise_beside_blur(frames: Tensor, motion: FrameMotion, stack: int) -> Tensor
     pieces = frames[:, :, rows[:, None, :, None], columns[None, :, None, :]]  # (T, C, pieces, pieces, rows, columns)
     pieces = (pieces - pieces.mean((-2, -1), keepdim=True)) * taper * taper[:, None]
     mean = motion.vibration[stack].mean_displacement(times, motion.timing.exposure_time)[..., 0]
-    back = _waves(mean, -u).to(frames.dtype.to_complex())  # neighbouring rows are to be alike as in the scene
+    back = waves(mean, -u).to(frames.dtype.to_complex())  # neighbouring rows are to be alike as in the scene
     power = torch.fft.fft(torch.fft.rfft(pieces) * back[:, None, :, None], dim=-2).abs().square().mean(1)
     power = _pooled(power.transpose(-2, -1).to(torch.float64))[..., fine]
     return _score(power.flatten(1, 2), transfer[:, :, None].expand_as(power).flatten(1, 2))
@@ -105,8 +106,8 @@ def _taper(like: Tensor) -> Tensor:
 def _transfer(motion: FrameMotion, stack: int, times: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Power (..., U, V) that the blur of rows exposed from ``times`` (..., R) on lets through, weighed by the taper."""
     displacement, weights = exposure_trajectory(motion.vibration[stack], times, motion.timing, "gauss")
-    along = _waves(displacement[..., 0], u) * weights[:, None]
-    across = _waves(displacement[..., 1], v)
+    along = waves(displacement[..., 0], u) * weights[:, None]
+    across = waves(displacement[..., 1], v)
     share = torch.hann_window(2 * times.shape[-1] + 1, periodic=False, dtype=u.dtype, device=u.device)[1::2].square()
     seen = (along.transpose(-2, -1) @ across).abs().square()
     return (seen * (share / share.sum())[:, None, None]).sum(-3)
@@ -117,8 +118,3 @@ def _pooled(values: Tensor) -> Tensor:
     inner = values[..., 1 : (values.shape[-2] - 2) // 2 * 2 + 1, :]
     pooled: Tensor = inner.unflatten(-2, (-1, 2)).unflatten(-1, (-1, 2)).mean((-3, -1))
     return pooled
-
-
-def _waves(places: Tensor, frequencies: Tensor) -> Tensor:
-    angle = (-2 * math.pi) * places[..., None] * frequencies
-    return torch.polar(torch.ones_like(angle), angle)

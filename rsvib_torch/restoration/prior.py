@@ -9,6 +9,7 @@ from torch import Tensor
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.row_kernel import interpolation_error, kernel_response
+from rsvib_torch.spectral import waves
 
 __all__ = ["ORDER", "RowPrior", "autoregressive_prior", "fit_prior"]
 
@@ -174,7 +175,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     vibration = motion.vibration[stack]
     times = motion.frame_starts[:, None] + rows.flatten() * motion.timing.row_time
     mean = vibration.mean_displacement(times, motion.timing.exposure_time)[..., 0]
-    back = _ramps(mean, -u).to(frames.dtype.to_complex()).unflatten(1, rows.shape)  # (T, pieces, rows, U)
+    back = waves(mean, -u).to(frames.dtype.to_complex()).unflatten(1, rows.shape)  # (T, pieces, rows, U)
     spectra = torch.fft.rfft((pieces - frames.mean((-2, -1))[..., None, None, None, None]) * tapers[1])
     spectra = spectra * back[:, None, :, None] * tapers[0][:, None]
     power = torch.fft.fft(spectra, dim=-2).abs().square().mean((1, 3)).transpose(-2, -1)  # (T, pieces, U, V)
@@ -183,12 +184,12 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     displacement, weights = exposure_trajectory(
         vibration, times.unflatten(1, rows.shape)[..., size[0] // 2], motion.timing, "gauss"
     )
-    along = _ramps(displacement[..., 0], u) * weights[:, None]
-    across = _ramps(displacement[..., 1], v)
+    along = waves(displacement[..., 0], u) * weights[:, None]
+    across = waves(displacement[..., 1], v)
     transfer = (along.transpose(-2, -1) @ across).abs().square() * kernel_response(v).square()
     aliases = torch.zeros_like(transfer[0, 0])
     for cycle in (-1, 1):  # all others together are less than 4 % of these
-        beyond = across * _ramps(displacement[..., 1], v.new_tensor([cycle]))
+        beyond = across * waves(displacement[..., 1], v.new_tensor([cycle]))
         blurred = (along.transpose(-2, -1) @ beyond).abs().square().mean((0, 1))
         aliases = aliases + blurred * interpolation_error(v, [cycle])
     weight = transfer / levels.to(torch.float64).square()[:, None, None, None]
@@ -208,8 +209,3 @@ def _spread_pieces(shape: torch.Size, size: list[int]) -> list[Tensor]:
         torch.linspace(0, whole - extent, count).round().to(torch.int64)
         for whole, extent, count in zip(shape, size, counts, strict=True)
     ]
-
-
-def _ramps(places: Tensor, frequencies: Tensor) -> Tensor:
-    angle = (-2 * math.pi) * places[..., None] * frequencies
-    return torch.polar(torch.ones_like(angle), angle)

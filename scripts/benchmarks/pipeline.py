@@ -199,8 +199,8 @@ def _of_the_package(frames: Tensor, timing: rsv.SensorTiming, registrations: lis
         "exact": lambda: restored_by(frames, timing, found, "exact"),
         "dewarp": lambda: restored_by(frames, timing, found, "dewarp"),
         "unchecked": lambda: restored_by(frames, timing, found, "dewarp", check=False),
+        "strip": lambda: rsv.detect_vibration(strip(frames), timing, method="bands"),
     }
-    works["strip"] = lambda: rsv.detect_vibration(strip(frames), timing, method="bands")
     for name in registrations:
         works[name] = lambda n=name: rsv.detect_vibration(frames, timing, method="bands", registration=n)
     return works
