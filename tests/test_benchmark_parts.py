@@ -183,17 +183,32 @@ def test_roofline(monkeypatch):
     assert shapes["frequencies"] == shapes["length"] // 2 + 1
     # the kernel of six rows, and one more row for what moves from cell to cell: half-width six
     assert (shapes["taps"], shapes["width"]) == (7, 6)
-    steps = shapes["unknowns"] * shapes["frequencies"]
+    at_nodes = shapes["unknowns"] * shapes["nodes"]
+    assert shapes["nodes"] == shapes["frequencies"]  # small frames
     updates = 6 * 6 + 6 + 6  # of the window, of the right side, and scaling of a row
-    assert counted["factors"]["operations"] == 8 * updates * steps
-    band = 8 * (shapes["unknowns"] + 6) * 13 * shapes["frequencies"]
-    assert counted["factors"]["bytes_least"] == 2 * band + 2 * 8 * steps
+    assert counted["factors"]["operations"] == 8 * updates * at_nodes
+    band = 8 * (shapes["unknowns"] + 6) * 13 * shapes["nodes"]
+    assert counted["factors"]["bytes_least"] == 2 * band + 2 * 8 * at_nodes
+    assert counted["back substitution"]["operations"] == 8 * 6 * shapes["unknowns"] * shapes["frequencies"]
     for row in counted.values():
         assert 0 < row["bytes_least"] <= row["bytes_moved"]
     assert device["least_seconds"] <= device["moved_seconds"]
     moved = sum(row["bytes_moved"] for row in counted.values())
     assert device["share_of_bandwidth"] == pytest.approx(moved / device["bytes_a_second"] / device["seconds"])
     assert "| cpu | " in "\n".join(roofline.lines(results, chosen))
+
+
+def test_roofline_of_interpolated_factors():
+    from benchmarks import roofline
+    from benchmarks.restoration import camera, vibration
+
+    shapes = roofline.shapes_of((128, 1024), camera(20), vibration())
+    assert shapes.nodes < shapes.frequencies / 3
+    counted = {row["step"]: row for row in roofline.steps(shapes)}
+    assert counted["factors of some"]["operations"] == 8 * (6 * 6 + 6) * shapes.unknowns * shapes.nodes
+    assert counted["forward substitution"]["bytes_least"] == 2 * 8 * shapes.unknowns * shapes.frequencies
+    for row in counted.values():
+        assert 0 < row["bytes_least"] <= row["bytes_moved"]
 
 
 def test_restoration_next_to_row_loops():

@@ -13,6 +13,7 @@ __all__ = [
     "BandedMemory",
     "factor_banded",
     "factor_skewed",
+    "runs_of_rows",
     "skew_band",
     "solve_banded",
     "solve_factored",
@@ -55,7 +56,7 @@ class BandedFactor:
     def solve(self, right_side: Tensor) -> Tensor:
         """Solve ``A x = right_side`` for right sides (K, M, S), M of them per matrix."""
         x = _with_rows(right_side, self.width)
-        columns, windows = self._below, _windows(x, self.width)
+        columns, windows = self._below, runs_of_rows(x, self.width)
         for j, (value, inverse) in enumerate(zip(x[: len(self.inverse)].unbind(), self.inverse.unbind(), strict=True)):
             value.mul_(inverse)
             if columns:
@@ -86,7 +87,7 @@ def _with_rows(values: Tensor, count: int) -> Tensor:
     return torch.cat([values, values.new_zeros(count, *values.shape[1:])])
 
 
-def _windows(x: Tensor, width: int) -> tuple[Tensor, ...]:
+def runs_of_rows(x: Tensor, width: int) -> tuple[Tensor, ...]:
     """Every run of ``width`` rows of x (K + b, M, S)."""
     step = x.stride()
     shape = (len(x) - width + 1, width, *x.shape[1:])
@@ -114,7 +115,7 @@ class _Elimination:
         self.factor = BandedFactor(full, torch.empty_like(pivots, memory_format=torch.contiguous_format))
         self.right_side = right_side
         self.values = () if right_side is None else right_side.unbind()
-        self.windows = () if right_side is None else _windows(right_side, width)
+        self.windows = () if right_side is None else runs_of_rows(right_side, width)
         line, entry = full.stride(0), full.stride(1)
         # the trailing window of every step: skewed, so that it is one strided view
         first = full.storage_offset() + line + width * entry
@@ -167,7 +168,7 @@ class BandedMemory:
     Args:
         rows: Rows K of the largest systems.
         width: Half-width b of the band.
-        right_sides: Right sides M of each matrix.
+        right_sides: Right sides M of each matrix; 0 where only factors are wanted.
         batch: Matrices S that are solved at a time.
         like: A tensor of the dtype and on the device of the systems.
 
@@ -179,12 +180,17 @@ class BandedMemory:
     def __init__(self, rows: int, width: int, right_sides: int, batch: int, like: Tensor) -> None:
         self.full = like.new_empty(rows + width, 2 * width + 1, batch)
         self.right_side = like.new_empty(rows + width, right_sides, batch)
-        self._elimination = _Elimination(self.full, self.right_side)
+        self._elimination = _Elimination(self.full, self.right_side if right_sides else None)
 
     def holds(self, rows: int, width: int, right_sides: int, batch: int) -> bool:
         """Whether systems of so many rows can be solved in it."""
         same = self.full.shape[1:] == (2 * width + 1, batch) and self.right_side.shape[1] == right_sides
         return same and len(self.full) - width >= rows
+
+    def factor(self, rows: int) -> BandedFactor:
+        """Factor the systems of so many rows that the memory holds, in it."""
+        factor, width = self._elimination.run(rows), self.full.shape[1] // 2
+        return BandedFactor(factor.skewed[: rows + width], factor.inverse[:rows])
 
     def solve(self, rows: int) -> Tensor:
         """Solve the systems of so many rows that the memory holds; returns a part of ``right_side``."""

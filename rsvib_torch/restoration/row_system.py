@@ -157,9 +157,13 @@ class SmoothKernels:
 
     def taps(self, u: Tensor) -> Iterator[Tensor]:
         """Kernels (M R, U), complex, without the phase of their middles, one tap after the other."""
-        right = _interpolation(self.reach, u, _precision(self.left.dtype))[1].to(self.left.dtype)
+        right = self.matrix(u)
         for tap in self.left:
             yield torch.view_as_complex((tap @ right).unflatten(-1, (-1, 2)))
+
+    def matrix(self, u: Tensor) -> Tensor:
+        """What turns ``left`` into interleaved real and imaginary parts at frequencies ``u``, (2 Q, 2 U)."""
+        return _interpolation(self.reach, u, _precision(self.left.dtype))[1].to(self.left.dtype)
 
 
 def smooth_kernels(kernels: RowKernels, dtype: torch.dtype) -> SmoothKernels:

@@ -1,5 +1,6 @@
 """One scene and the frames that see it: the fast solution, and what a solution predicts."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -7,13 +8,16 @@ from torch import Tensor
 
 from rsvib_torch.parallel import in_parallel
 from rsvib_torch.restoration.banded_solver import BandedFactor, factor_skewed, solve_factored, solve_skewed
+from rsvib_torch.restoration.interpolated_solver import NodeFactors
 from rsvib_torch.restoration.partition import Partition
 from rsvib_torch.restoration.row_kernel import REACH, kernel_samples
+from rsvib_torch.restoration.row_sums import RowSums
 from rsvib_torch.restoration.row_system import RowKernels, smooth_band, smooth_kernels
 
 __all__ = ["Coefficients", "SceneSolver"]
 
 Coefficients = list[Tensor]  # (K, C, U') for each chunk of frequencies
+SolvePart = Callable[[int, slice, Tensor | None], Tensor]  # thread, chunk of frequencies, pull: its coefficients
 
 
 class SceneSolver:
@@ -51,28 +55,26 @@ class SceneSolver:
         order = len(precision) - 1
         width = max(kernels.taps.shape[-2] - 1, order)
         normal = smooth_band(self.kernels, self.rows, width, order, dtype)
-        self._chunk, self._segments = partition.of(
-            self.rows.count, width, len(self.u), precision.device, blurred=kernels.blurred, keep=keep
-        )
-        self._normal = normal.in_segments(self._segments)
+        place = (self.rows.count, width), precision.device
+        if keep:
+            shares = partition.factoring_all(*place[0], len(self.u), place[1], blurred=kernels.blurred, keep=True)
+        else:
+            shares = partition.of(*place[0], self.length, place[1], kernels.reach, blurred=kernels.blurred)
+        self._shares, self._segments = shares, shares.segments
+        self._whole, self._normal = normal, normal.in_segments(shares.segments)
         self._partition = partition
-        self.parts = [slice(k, min(k + self._chunk, len(self.u))) for k in range(0, len(self.u), self._chunk)]
+        self.parts = shares.parts(len(self.u))
+        self._sums = RowSums(self.kernels, self.rows.top, self.rows.count, dtype)
         self._seen = smooth_kernels(kernels, dtype)
-        self._base = (kernels.first - self.rows.top).flatten()
         self._factors: list[BandedFactor] | None = None
         moving = self._normal.left.requires_grad or precision.requires_grad
         if keep and not (torch.is_grad_enabled() and moving):
             self._factors = [factor_skewed(self._normal.at(self.u[p], precision[..., p])) for p in self.parts]
 
-    def _right(self, spectra: Tensor, part: slice) -> Tensor:
+    def _right(self, spectra: Tensor, part: slice, out: Tensor | None = None) -> Tensor:
         """``K^H W g`` (K, C, U') of a chunk of the spectra (M, C, R, U) of data."""
-        weight = self.kernels.weight.to(self.dtype)[:, None, :, None]
         turned = spectra[..., part] * self.kernels.phases(self.length, part, self.dtype)[:, None]
-        turned = (turned * weight).transpose(1, 2).flatten(0, 1).conj().resolve_conj()
-        right = turned.new_zeros(self.rows.count, *turned.shape[1:])
-        for i, kernel in enumerate(self._seen.taps(self.u[part])):
-            right = right.index_add_(0, self._base + i, kernel[:, None] * turned)
-        return right.conj().resolve_conj()
+        return self._sums.of(turned.transpose(1, 2).flatten(0, 1), self.u[part], out)
 
     def fit(self, data: Tensor, pull: Coefficients | None = None) -> Coefficients:
         """The coefficients for data (M, C, R, L).
@@ -98,37 +100,83 @@ class SceneSolver:
 
     def _fit_in_place(self, spectra: Tensor, pull: Coefficients | None) -> Coefficients:
         """``fit`` without gradients, in memory that is used again and again, and on all cores."""
-        segments, width = self._segments, self._normal.width
-        rows, batch = segments.size, len(segments.windows) * self._chunk
         threads = min(self._partition.threads(spectra.device), len(self.parts))
+        nodes = self._shares.nodes
+        if nodes is None:
+            solve_part = self._factoring_all(threads, spectra)
+        else:
+            solve_part = self._factoring_few(nodes, threads, spectra)
 
         def solve(thread: int) -> Coefficients:
-            memory = self._partition.memory(thread, rows, width, spectra.shape[1], batch, spectra)
-            sides = memory.right_side[:rows].unflatten(-1, (-1, self._chunk))
-            solutions = []
-            for k in range(thread, len(self.parts), threads):
-                part = self.parts[k]
-                chunk = slice(part.stop - self._chunk, part.stop)  # the last part is solved as wide as the others
-                self._normal.at(self.u[chunk], self.precision[..., chunk], memory.full[: rows + width])
-                right = self._right(spectra, chunk)
-                own = slice(part.start - part.stop, None)
-                if pull is not None:
-                    right[..., own] += pull[k]
-                for place, window in enumerate(segments.windows):
-                    sides[..., place, :] = right[window]
-                solved = memory.solve(rows).unflatten(-1, (-1, self._chunk))
-                solutions.append(segments.join(solved[..., own]))
-            return solutions
+            own = range(thread, len(self.parts), threads)
+            return [solve_part(thread, self.parts[k], None if pull is None else pull[k]) for k in own]
 
         shares = in_parallel(solve, range(threads), spectra.device)
         return [shares[k % threads][k // threads] for k in range(len(self.parts))]
+
+    def _factoring_all(self, threads: int, spectra: Tensor) -> SolvePart:
+        """How to find coefficients at a chunk of frequencies, each by itself."""
+        width, rows, right_sides = self._normal.width, self._segments.size, spectra.shape[1]
+        batch = len(self._segments.windows) * self._shares.chunk
+        memories = [self._partition.memory(k, rows, width, right_sides, batch, spectra) for k in range(threads)]
+
+        def solve_part(thread: int, part: slice, pull: Tensor | None) -> Tensor:
+            memory, chunk = memories[thread], self._wide(part)
+            self._normal.at(self.u[chunk], self.precision[..., chunk], memory.full[: rows + width])
+            self._prepare(memory.right_side[:rows], spectra, part, pull)
+            return self._joined(memory.solve(rows), part)
+
+        return solve_part
+
+    def _factoring_few(self, nodes: Tensor, threads: int, spectra: Tensor) -> SolvePart:
+        """How to find coefficients at a chunk of frequencies, with factors between those of a few."""
+        segments = self._shares.node_segments or self._segments
+        normal, rows = self._whole.in_segments(segments), segments.size
+        batch = len(segments.windows) * len(nodes)
+        memory = self._partition.memory("nodes", rows, normal.width, 0, batch, spectra)
+        normal.at(self.u[nodes], self.precision[..., nodes], memory.full[: rows + normal.width])
+        factors = NodeFactors.of(nodes, memory.factor(rows), segments)
+        if not self._segments.whole:
+            factors = factors.in_segments(self._segments)
+        rows = self._segments.size
+        sizes = (normal.width, spectra.shape[1], len(self._segments.windows), self._shares.chunk)
+        memories = [self._partition.substitution_memory(k, rows, *sizes, spectra) for k in range(threads)]
+
+        def solve_part(thread: int, part: slice, pull: Tensor | None) -> Tensor:
+            memory, chunk = memories[thread], self._wide(part)
+            self._prepare(memory.right_side[:rows], spectra, part, pull)
+            solved = memory.solve(factors, factors.between(chunk.start, chunk.stop))
+            return self._joined(solved.conj(), part).resolve_conj()
+
+        return solve_part
+
+    def _wide(self, part: slice) -> slice:
+        """As many frequencies as in all other parts: the last one is solved as wide as the others."""
+        return slice(part.stop - self._shares.chunk, part.stop)
+
+    def _prepare(self, sides: Tensor, spectra: Tensor, part: slice, pull: Tensor | None) -> None:
+        """Write the right sides (K, C, n S) of a part."""
+        whole = self._segments.whole
+        right = self._right(spectra, self._wide(part), sides if whole else None)
+        if pull is not None:
+            right[..., part.start - part.stop :] += pull
+        if not whole:
+            sides.copy_(self._segments.split(right).flatten(-2))
+
+    def _joined(self, solved: Tensor, part: slice) -> Tensor:
+        """Coefficients (K, C, U') of a part from solutions (K, C, n S)."""
+        windows = solved.unflatten(-1, (-1, self._shares.chunk))[..., part.start - part.stop :]
+        return self._segments.join(windows)
 
     def predict(self, coefficients: Coefficients) -> Tensor:
         """What the frames show of a scene, (M, C, R, L)."""
         spectra = []
         for part, values in zip(self.parts, coefficients, strict=True):
             rows = sum(
-                (kernel[:, None] * values[self._base + i] for i, kernel in enumerate(self._seen.taps(self.u[part]))),
+                (
+                    kernel[:, None] * values[self._sums.base + i]
+                    for i, kernel in enumerate(self._seen.taps(self.u[part]))
+                ),
                 start=values.new_zeros(()),
             )
             phases = self.kernels.phases(self.length, part, self.dtype).conj()

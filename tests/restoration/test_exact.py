@@ -275,9 +275,9 @@ def test_tall_frames_are_split_only_where_rows_depend_on_near_ones(exposure, mon
     segments_of = Partition.of
 
     def counted(*arguments, **options):
-        chunk, segments = segments_of(*arguments, **options)
-        counts.append(len(segments.windows))
-        return chunk, segments
+        shares = segments_of(*arguments, **options)
+        counts.append(len(shares.segments.windows))
+        return shares
 
     monkeypatch.setattr(Partition, "of", counted)
     whole = restore(frames, timing, vibration, segments=1, check=False)
