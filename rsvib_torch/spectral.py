@@ -6,7 +6,7 @@ import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
 
-__all__ = ["extend_rows", "fast_length", "shift_phases", "waves"]
+__all__ = ["extend_rows", "fast_length", "shift_phases", "squared_modulus", "waves"]
 
 _TABLE = 64  # frequencies that a phase is stepped through
 
@@ -81,3 +81,8 @@ def waves(places: Tensor, frequencies: Tensor) -> Tensor:
     """``exp(-2 pi i u x)`` at places (...) in px and frequencies (U,) in cycles per px, (..., U)."""
     angle = (-2 * math.pi) * places[..., None] * frequencies
     return torch.polar(torch.ones_like(angle), angle)
+
+
+def squared_modulus(values: Tensor) -> Tensor:
+    """``|z|^2`` of complex values; several times faster than the square of ``abs``, which guards against overflow."""
+    return values.real.square().addcmul_(values.imag, values.imag)

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from rsvib_torch.restoration.in_order import subtract_products
+
 __all__ = [
     "BandedFactor",
     "BandedMemory",
@@ -46,8 +48,9 @@ class BandedFactor:
         return diagonal.real if diagonal.is_complex() else diagonal
 
     @cached_property
-    def _below(self) -> tuple[Tensor, ...]:
-        return _columns(self.skewed, below=True)
+    def _right(self) -> tuple[Tensor, ...]:
+        """Rows of ``L^H`` right of the diagonal, (b, 1, S) each."""
+        return self.skewed[: len(self.inverse), self.width + 1 :, None].unbind() if self.width else ()
 
     @cached_property
     def _above(self) -> tuple[Tensor, ...]:
@@ -55,13 +58,13 @@ class BandedFactor:
 
     def solve(self, right_side: Tensor) -> Tensor:
         """Solve ``A x = right_side`` for right sides (K, M, S), M of them per matrix."""
-        x = _with_rows(right_side, self.width)
-        columns, windows = self._below, runs_of_rows(x, self.width)
-        for j, (value, inverse) in enumerate(zip(x[: len(self.inverse)].unbind(), self.inverse.unbind(), strict=True)):
-            value.mul_(inverse)
-            if columns:
-                windows[j + 1].addcmul_(columns[j], value, value=-1)
-        return self.substitute(x, x.unbind(), windows, len(self.inverse))
+        x = _with_rows(right_side.conj(), self.width)
+        count, values, windows = len(self.inverse), x.unbind(), runs_of_rows(x, self.width)
+        if self.width:
+            subtract_products(windows[1:], self._right, values[:count])  # columns of the conjugate of L
+        x = torch.conj_physical(x) if x.is_complex() else x
+        x[:count] *= self.inverse[:, None]
+        return self.substitute(x, x.unbind(), runs_of_rows(x, self.width), count)
 
     def substitute(self, x: Tensor, values: tuple[Tensor, ...], windows: tuple[Tensor, ...], count: int) -> Tensor:
         """Solve ``L^H x' = x`` in place for right sides (K + b, M, S); returns the first rows.
@@ -73,13 +76,12 @@ class BandedFactor:
             count: Rows K, or fewer of a smaller system.
         """
         width = self.width
-        columns = self._above
-        for j in range(count - 1, 0 if columns else count, -1):
-            if j >= width:
-                windows[j - width].addcmul_(columns[j - width], values[j], value=-1)
-            else:
-                column = torch.stack([self.skewed[k, width + j - k] for k in range(j)])
-                x[:j].addcmul_(column[:, None], values[j], value=-1)
+        if width and count > width:
+            back = slice(count - 1 - width, None, -1)
+            subtract_products(windows[back], self._above[back], values[count - 1 : width - 1 : -1])
+        for j in range(min(width, count) - 1, 0, -1):
+            column = torch.stack([self.skewed[k, width + j - k] for k in range(j)])
+            x[:j].addcmul_(column[:, None], values[j], value=-1)
         return x[:count]
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.motion import FrameMotion
-from rsvib_torch.spectral import waves
+from rsvib_torch.spectral import squared_modulus, waves
 
 __all__ = ["noise_beside_blur"]
 
@@ -55,7 +55,7 @@ def noise_beside_blur(frames: Tensor, motion: FrameMotion, stack: int) -> Tensor
     pieces = (pieces - pieces.mean((-2, -1), keepdim=True)) * taper * taper[:, None]
     mean = motion.vibration[stack].mean_displacement(times, motion.timing.exposure_time)[..., 0]
     back = waves(mean, -u).to(frames.dtype.to_complex())  # neighbouring rows are to be alike as in the scene
-    power = torch.fft.fft(torch.fft.rfft(pieces) * back[:, None, :, None], dim=-2).abs().square().mean(1)
+    power = squared_modulus(torch.fft.fft(torch.fft.rfft(pieces) * back[:, None, :, None], dim=-2)).mean(1)
     power = _pooled(power.transpose(-2, -1).to(torch.float64))[..., fine]
     return _score(power.flatten(1, 2), transfer[:, :, None].expand_as(power).flatten(1, 2))
 
@@ -109,7 +109,7 @@ def _transfer(motion: FrameMotion, stack: int, times: Tensor, u: Tensor, v: Tens
     along = waves(displacement[..., 0], u) * weights[:, None]
     across = waves(displacement[..., 1], v)
     share = torch.hann_window(2 * times.shape[-1] + 1, periodic=False, dtype=u.dtype, device=u.device)[1::2].square()
-    seen = (along.transpose(-2, -1) @ across).abs().square()
+    seen = squared_modulus(along.transpose(-2, -1) @ across)
     return (seen * (share / share.sum())[:, None, None]).sum(-3)
 
 

@@ -64,8 +64,7 @@ def _restore_group(problem: SceneProblem, edges: float | None) -> Tensor:
     """Restore one scene (C, R, L) from M frames, all values of which are measured or filled."""
     if edges is not None:
         return _with_edges(problem, edges)
-    solver = problem.solver()
-    return solver.scene(solver.fit(problem.data))
+    return problem.solver().fit_scene(problem.data)
 
 
 def _floor(data: Tensor, clipped: Tensor) -> Tensor:
@@ -166,9 +165,9 @@ def restore_exact(
                 floor = None if clipped is None else _floor(problem.data, clipped[stack, members])
                 if measured is not None:
                     problem = replace(problem, data=fill_unmeasured(problem, measured, floor))
-            restored.append(_restore_group(problem, factor if prior == "edges" else None))
-    stacked: Tensor = torch.stack(restored).unflatten(0, (B, len(groups)))[..., :W]
-    return stacked + mean
+            restored.append(_restore_group(problem, factor if prior == "edges" else None)[..., :W])
+    stacked: Tensor = torch.stack(restored).unflatten(0, (B, len(groups)))
+    return stacked.add_(mean)
 
 
 def _noise_levels(frames: Tensor, motion: FrameMotion, noise: float | Literal["auto"]) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.row_kernel import interpolation_error, kernel_response
-from rsvib_torch.spectral import waves
+from rsvib_torch.spectral import squared_modulus, waves
 
 __all__ = ["ORDER", "RowPrior", "autoregressive_prior", "fit_prior"]
 
@@ -161,10 +161,9 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
         The prior for transforms of that length.
     """
     size = [min(piece, whole) for piece, whole in zip(_PIECE, frames.shape[-2:], strict=True)]
-    starts = _spread_pieces(frames.shape[-2:], size)
-    rows, columns = (begin[:, None] + torch.arange(extent) for begin, extent in zip(starts, size, strict=True))
-    rows, columns = rows.to(frames.device), columns.to(frames.device)
-    pieces = frames[:, :, rows[:, None, :, None], columns[None, :, None, :]]  # (T, C, pieces, pieces, rows, columns)
+    starts = _spread_pieces(frames.shape[-2:], size)  # rows, columns
+    tops, lefts = (begin.tolist() for begin in starts)
+    rows = (starts[0][:, None] + torch.arange(size[0])).to(frames.device)
     tapers = [
         torch.hann_window(extent + 2, periodic=False, dtype=frames.dtype, device=frames.device)[1:-1] for extent in size
     ]
@@ -176,21 +175,30 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     times = motion.frame_starts[:, None] + rows.flatten() * motion.timing.row_time
     mean = vibration.mean_displacement(times, motion.timing.exposure_time)[..., 0]
     back = waves(mean, -u).to(frames.dtype.to_complex()).unflatten(1, rows.shape)  # (T, pieces, rows, U)
-    spectra = torch.fft.rfft((pieces - frames.mean((-2, -1))[..., None, None, None, None]) * tapers[1])
-    spectra = spectra * back[:, None, :, None] * tapers[0][:, None]
-    power = torch.fft.fft(spectra, dim=-2).abs().square().mean((1, 3)).transpose(-2, -1)  # (T, pieces, U, V)
-    power = power.to(torch.float64) * length
+    back = back * tapers[0][:, None]
+    bright = frames.mean((-2, -1))[..., None, None, None]
+    step = 1 if frames.device.type == "cpu" else len(tops)  # rows of pieces at a time: they stay in the cache
+    found = []
+    for first in range(0, len(tops), step):
+        chosen = slice(first, first + step)
+        strips = torch.stack([frames[..., top : top + size[0], :] for top in tops[chosen]], dim=2)
+        pieces = torch.stack(
+            [strips[..., left : left + size[1]] for left in lefts], dim=3
+        )  # (T, C, n, n, rows, columns)
+        spectra = torch.fft.rfft((pieces - bright[..., None]) * tapers[1]) * back[:, None, chosen, None]
+        found.append(squared_modulus(torch.fft.fft(spectra, dim=-2)).mean((1, 3)).transpose(-2, -1))
+    power = torch.cat(found, dim=1).to(torch.float64) * length  # (T, pieces, U, V)
 
     displacement, weights = exposure_trajectory(
         vibration, times.unflatten(1, rows.shape)[..., size[0] // 2], motion.timing, "gauss"
     )
     along = waves(displacement[..., 0], u) * weights[:, None]
     across = waves(displacement[..., 1], v)
-    transfer = (along.transpose(-2, -1) @ across).abs().square() * kernel_response(v).square()
+    transfer = squared_modulus(along.transpose(-2, -1) @ across) * kernel_response(v).square()
     aliases = torch.zeros_like(transfer[0, 0])
     for cycle in (-1, 1):  # all others together are less than 4 % of these
         beyond = across * waves(displacement[..., 1], v.new_tensor([cycle]))
-        blurred = (along.transpose(-2, -1) @ beyond).abs().square().mean((0, 1))
+        blurred = squared_modulus(along.transpose(-2, -1) @ beyond).mean((0, 1))
         aliases = aliases + blurred * interpolation_error(v, [cycle])
     weight = transfer / levels.to(torch.float64).square()[:, None, None, None]
     total = weight.sum((0, 1)).clamp(min=torch.finfo(torch.float32).tiny)

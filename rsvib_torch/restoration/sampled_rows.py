@@ -87,10 +87,11 @@ def sample_rows(images: Tensor, kernels: RowKernels, chosen: Tensor) -> SampledR
     taper = torch.hann_window(width + 2, periodic=False, dtype=images.dtype, device=images.device)[1:-1]
     u = chosen / width
     angle = (-2 * torch.pi) * (torch.arange(width, device=u.device)[:, None] * chosen % width) / width
-    waves = torch.polar(torch.ones_like(angle, dtype=torch.float64), angle.to(torch.float64))
-    waves = waves.to(images.dtype.to_complex())
+    angle = angle.to(torch.float64)
+    waves = (taper[:, None] * torch.cat([angle.cos(), angle.sin()], dim=-1)).to(images.dtype)
     mean = images.mean((-2, -1), keepdim=True)
-    spectra = (((images - mean) * taper).to(waves.dtype) @ waves).transpose(1, 2)  # (M, R, C, F)
+    spectra = images @ waves - mean * waves.sum(0)
+    spectra = torch.complex(*spectra.chunk(2, dim=-1)).transpose(1, 2)  # (M, R, C, F)
     turns = kernels.middle[..., None] * u
     spectra = spectra * torch.polar(torch.ones_like(turns), 2 * torch.pi * turns).to(spectra.dtype)[:, :, None]
     scene = kernels.scene_rows(count)

@@ -16,6 +16,8 @@ from rsvib_torch.restoration.row_system import RowKernels, smooth_band, smooth_k
 
 __all__ = ["Coefficients", "SceneSolver"]
 
+_ROWS = {"cpu": 64}  # of the scene at a time: they stay in the cache
+
 Coefficients = list[Tensor]  # (K, C, U') for each chunk of frequencies
 SolvePart = Callable[[int, slice, Tensor | None], Tensor]  # thread, chunk of frequencies, pull: its coefficients
 
@@ -84,8 +86,7 @@ class SceneSolver:
             pull: To be added to the right sides: P times what the prior expects.
         """
         spectra = torch.fft.rfft(data)
-        given = (spectra, self._normal.left, self.precision, *(pull or ()))
-        if self._factors is None and not (torch.is_grad_enabled() and any(value.requires_grad for value in given)):
+        if self._factors is None and not self._differentiates(spectra, *(pull or ())):
             return self._fit_in_place(spectra, pull)
         solutions = []
         for k, part in enumerate(self.parts):
@@ -99,7 +100,24 @@ class SceneSolver:
         return solutions
 
     def _fit_in_place(self, spectra: Tensor, pull: Coefficients | None) -> Coefficients:
-        """``fit`` without gradients, in memory that is used again and again, and on all cores."""
+        """``fit`` without gradients."""
+        found: Coefficients = [spectra.new_empty(0)] * len(self.parts)
+
+        def keep(k: int, solved: Tensor) -> None:
+            found[k] = solved.conj_physical() if self._shares.nodes is not None else solved.clone()
+
+        self._solve_in_place(spectra, pull, keep)
+        return found
+
+    def _solve_in_place(self, spectra: Tensor, pull: Coefficients | None, take: Callable[[int, Tensor], None]) -> None:
+        """Solve without gradients, in memory that is used again and again, and on all cores.
+
+        Args:
+            spectra: (M, C, R, U) of the data.
+            pull: As in ``fit``.
+            take: Is given each chunk's number and its coefficients (K, C, U'), conjugated where there are nodes, in
+                memory that will be used again.
+        """
         threads = min(self._partition.threads(spectra.device), len(self.parts))
         nodes = self._shares.nodes
         if nodes is None:
@@ -107,12 +125,11 @@ class SceneSolver:
         else:
             solve_part = self._factoring_few(nodes, threads, spectra)
 
-        def solve(thread: int) -> Coefficients:
-            own = range(thread, len(self.parts), threads)
-            return [solve_part(thread, self.parts[k], None if pull is None else pull[k]) for k in own]
+        def solve(thread: int) -> None:
+            for k in range(thread, len(self.parts), threads):
+                take(k, solve_part(thread, self.parts[k], None if pull is None else pull[k]))
 
-        shares = in_parallel(solve, range(threads), spectra.device)
-        return [shares[k % threads][k // threads] for k in range(len(self.parts))]
+        in_parallel(solve, range(threads), spectra.device)
 
     def _factoring_all(self, threads: int, spectra: Tensor) -> SolvePart:
         """How to find coefficients at a chunk of frequencies, each by itself."""
@@ -145,8 +162,7 @@ class SceneSolver:
         def solve_part(thread: int, part: slice, pull: Tensor | None) -> Tensor:
             memory, chunk = memories[thread], self._wide(part)
             self._prepare(memory.right_side[:rows], spectra, part, pull)
-            solved = memory.solve(factors, factors.between(chunk.start, chunk.stop))
-            return self._joined(solved.conj(), part).resolve_conj()
+            return self._joined(memory.solve(factors, factors.between(chunk.start, chunk.stop)), part)
 
         return solve_part
 
@@ -166,7 +182,7 @@ class SceneSolver:
     def _joined(self, solved: Tensor, part: slice) -> Tensor:
         """Coefficients (K, C, U') of a part from solutions (K, C, n S)."""
         windows = solved.unflatten(-1, (-1, self._shares.chunk))[..., part.start - part.stop :]
-        return self._segments.join(windows)
+        return windows[..., 0, :] if self._segments.whole else self._segments.join(windows)
 
     def predict(self, coefficients: Coefficients) -> Tensor:
         """What the frames show of a scene, (M, C, R, L)."""
@@ -186,12 +202,40 @@ class SceneSolver:
 
     def scene(self, coefficients: Coefficients) -> Tensor:
         """Rows of the scene where the frame at rest would show them, (C, R, L)."""
-        first = 1 - REACH - self.rows.top
-        spectra = []
-        for values in coefficients:
-            rows = values.new_zeros(self.num_rows, *values.shape[1:])
-            for k, weight in enumerate(kernel_samples()):
-                rows = rows.add(values[first + k : first + k + self.num_rows], alpha=weight)
-            spectra.append(rows)
-        scene: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1).movedim(1, 0), n=self.length)
+        spectra = torch.cat([self._between_rows(values) for values in coefficients], dim=-1)
+        scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=self.length)
         return scene
+
+    def fit_scene(self, data: Tensor) -> Tensor:
+        """``scene(fit(data))``, without keeping the coefficients where nothing is to be differentiated."""
+        spectra = torch.fft.rfft(data)
+        if self._factors is not None or self._differentiates(spectra):
+            return self.scene(self.fit(data))
+        found = spectra.new_empty(self.num_rows, spectra.shape[1], len(self.u))
+
+        def take(k: int, solved: Tensor) -> None:
+            step = _ROWS.get(solved.device.type, self.num_rows)
+            for top in range(0, self.num_rows, step):
+                rows = slice(top, min(top + step, self.num_rows))
+                sampled = found[rows, :, self.parts[k]].copy_(self._between_rows(solved, rows))
+                if self._shares.nodes is not None:
+                    sampled.conj_physical_()
+
+        self._solve_in_place(spectra, None, take)
+        scene: Tensor = torch.fft.irfft(found.movedim(1, 0), n=self.length)
+        return scene
+
+    def _differentiates(self, *values: Tensor) -> bool:
+        given = (*values, self._normal.left, self.precision)
+        return torch.is_grad_enabled() and any(value.requires_grad for value in given)
+
+    def _between_rows(self, coefficients: Tensor, rows: slice | None = None) -> Tensor:
+        """What coefficients (K, C, U') make of some rows of the scene, by default all."""
+        chosen = slice(0, self.num_rows) if rows is None else rows
+        first = 1 - REACH - self.rows.top + chosen.start
+        count = chosen.stop - chosen.start
+        weights = kernel_samples()
+        sampled = weights[0] * coefficients[first : first + count]
+        for k, weight in enumerate(weights[1:], 1):
+            sampled = sampled.add_(coefficients[first + k : first + k + count], alpha=weight)
+        return sampled
