@@ -72,7 +72,7 @@ def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dt
     for steps in (coarse, fine):
         turns = shift[..., None] * (steps.to(torch.float64) / length)
         angle = (turns - turns.detach().round()) * (2 * math.pi)
-        tables.append(torch.polar(torch.ones_like(angle), angle).to(dtype))
+        tables.append(torch.complex(angle.cos(), angle.sin()).to(dtype))  # several times faster than torch.polar
     product = tables[0][..., :, None] * tables[1][..., None, :]
     return product.flatten(-2)[..., : stop - start]
 
@@ -80,7 +80,7 @@ def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dt
 def waves(places: Tensor, frequencies: Tensor) -> Tensor:
     """``exp(-2 pi i u x)`` at places (...) in px and frequencies (U,) in cycles per px, (..., U)."""
     angle = (-2 * math.pi) * places[..., None] * frequencies
-    return torch.polar(torch.ones_like(angle), angle)
+    return torch.complex(angle.cos(), angle.sin())  # several times faster than torch.polar
 
 
 def squared_modulus(values: Tensor) -> Tensor:

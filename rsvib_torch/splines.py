@@ -1,11 +1,18 @@
 """B-spline interpolation on a unit grid: basis weights and the prefilter that turns samples into coefficients."""
 
+from collections.abc import Iterator
 from functools import cache
 
 import torch
 from torch import Tensor
 
-__all__ = ["bspline_coefficients", "bspline_coefficients_adjoint", "bspline_weights", "mirrored_index"]
+__all__ = [
+    "bspline_coefficient_rows",
+    "bspline_coefficients",
+    "bspline_coefficients_adjoint",
+    "bspline_weights",
+    "mirrored_index",
+]
 
 _PRECISION = 1e-9  # of the largest tap, below which the prefilter is cut off
 _SINGLE_PRECISION = 3e-8  # the same for float32, which does not hold more
@@ -63,18 +70,15 @@ def mirrored_index(start: int, stop: int, length: int, device: torch.device | No
     return torch.where(index >= length, 2 * (length - 1) - index, index)
 
 
-_BLOCK = 64  # samples filtered together: one small dense matrix serves all blocks
+_BLOCK, _LARGE_BLOCK = 64, 256  # samples filtered together: one small dense matrix serves all blocks
 
 
 def _filter_symmetric(samples: Tensor, taps: tuple[float, ...], dim: int) -> Tensor:
     """Correlate along ``dim`` with a symmetric kernel, valid part only, as products with a Toeplitz matrix."""
     reach = len(taps) - 1
     length = samples.shape[dim] - 2 * reach
-    kernel = torch.tensor(taps[:0:-1] + taps, dtype=samples.dtype, device=samples.device)
     block = min(_BLOCK, length)
-    matrix = kernel.new_zeros(block, block + 2 * reach)
-    row = torch.arange(block, device=samples.device)[:, None]
-    matrix[row, row + torch.arange(len(kernel), device=samples.device)] = kernel
+    matrix = _toeplitz(taps, block, samples)
     moved = samples.movedim(dim, -2) if samples.ndim > 1 else samples[:, None]
     count = -(-length // block)
     missing = count * block - length
@@ -83,6 +87,39 @@ def _filter_symmetric(samples: Tensor, taps: tuple[float, ...], dim: int) -> Ten
     filtered = torch.matmul(matrix, windows.transpose(-2, -1)).flatten(-3, -2)
     filtered = filtered.narrow(-2, 0, length)
     return filtered.movedim(-2, dim) if samples.ndim > 1 else filtered[:, 0]
+
+
+def _toeplitz(taps: tuple[float, ...], rows: int, like: Tensor) -> Tensor:
+    """Matrix (rows, rows + 2 reach) that correlates with the symmetric kernel."""
+    kernel = torch.tensor(taps[:0:-1] + taps, dtype=like.dtype, device=like.device)
+    matrix = kernel.new_zeros(rows, rows + len(kernel) - 1)
+    row = torch.arange(rows, device=like.device)[:, None]
+    matrix[row, row + torch.arange(len(kernel), device=like.device)] = kernel
+    return matrix
+
+
+def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[tuple[slice, Tensor]]:
+    """``bspline_coefficients`` across the rows of images, some rows at a time: they stay in the cache.
+
+    Args:
+        samples: (..., H, W).
+        degree: Odd degree of the spline, at least 3.
+
+    Yields:
+        Which rows, and their coefficients (..., r, W).
+    """
+    taps = _prefilter_taps(degree, samples.dtype in (torch.float64, torch.complex128))
+    reach, height = len(taps) - 1, samples.shape[-2]
+    index = mirrored_index(-reach, height + reach, height, samples.device)
+    step = min(_BLOCK if samples.device.type == "cpu" else _LARGE_BLOCK, height)
+    matrix = _toeplitz(taps, step, samples)
+    for top in range(0, height, step):
+        rows = slice(top, min(top + step, height))
+        count = rows.stop - top
+        near = slice(top - reach, rows.stop + reach)
+        inside = near.start >= 0 and near.stop <= height
+        seen = samples[..., near, :] if inside else samples.index_select(-2, index[top : rows.stop + 2 * reach])
+        yield rows, torch.matmul(matrix[:count, : count + 2 * reach], seen)
 
 
 def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:

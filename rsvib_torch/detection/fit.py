@@ -1,6 +1,7 @@
 """Weighted fit of tones and an image motion to measured displacements (Eqs. 5-8, generalised)."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -60,6 +61,7 @@ class _Unknowns:
         return torch.where(self.is_frequency, values.abs(), values)
 
 
+@cache
 def _tie(model: MotionModel, tones: int, device: torch.device) -> Tensor:
     """Matrix (3 K + J, M) from free parameters of an axis to all: harmonics share a frequency."""
     families = tones // model.harmonics

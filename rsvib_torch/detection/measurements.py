@@ -71,6 +71,17 @@ class Measurements:
         """(B,) mid-time of the record in seconds: phases are fitted there, where they depend least on frequency."""
         return 0.5 * (self.moments.amin((1, 2)) + self.moments.amax((1, 2)) + self.exposure_time)
 
+    @cached_property
+    def middles(self) -> Tensor:
+        """(B, N, G, 1, 1) mid-exposures in seconds from the centre of the record."""
+        return (self.moments + (0.5 * self.exposure_time - self.centre)[:, None, None])[..., None, None]
+
+    @cached_property
+    def smearing_times(self) -> Tensor:
+        """(2, 1, 2, 1) seconds over which displacements (x, y) are averages: the exposure, the rows of a band."""
+        times = [(self.exposure_time, self.exposure_time), self.average_times]
+        return torch.tensor(times, dtype=self.moments.dtype, device=self.moments.device)[:, None, :, None]
+
     @property
     def duration(self) -> Tensor:
         """(B,) seconds from the first to the last row of the record, in any frame but the last of a group."""

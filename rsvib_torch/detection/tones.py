@@ -69,10 +69,9 @@ def tone_response(measurements: Measurements, frequencies: Tensor) -> Tensor:
     Returns:
         complex128 (B, N, G, 2, K).
     """
-    average = _average_times(measurements, frequencies)
-    attenuation = torch.sinc(frequencies * measurements.exposure_time) * torch.sinc(frequencies * average)
-    angle = 2 * math.pi * frequencies[:, None, None] * _time(measurements)
-    return measurements.relative(torch.polar(attenuation[:, None, None].expand_as(angle), angle))
+    attenuation = torch.sinc(frequencies * measurements.smearing_times).prod(0)[:, None, None]
+    angle = 2 * math.pi * frequencies[:, None, None] * measurements.middles
+    return measurements.relative(torch.complex(attenuation * angle.cos(), attenuation * angle.sin()))
 
 
 def tone_columns(measurements: Measurements, coefficients: Tensor, frequencies: Tensor) -> Tensor:
@@ -81,12 +80,11 @@ def tone_columns(measurements: Measurements, coefficients: Tensor, frequencies: 
     The tones are ``Re C S(f) exp(2 pi i f (t - centre))`` with C and f (B, 2, K), as in ``tone_response``; the mean
     over the group is still in.
     """
-    average = _average_times(measurements, frequencies)
-    exposure, exposure_slope = _sinc(frequencies * measurements.exposure_time)
-    band, band_slope = _sinc(frequencies * average)
-    attenuation = exposure * band
-    slope = exposure_slope * measurements.exposure_time * band + exposure * band_slope * average
-    time = _time(measurements)
+    times = measurements.smearing_times
+    smeared, smeared_slope = _sinc(frequencies * times)
+    attenuation = smeared[0] * smeared[1]
+    slope = (smeared_slope * times * smeared.flip(0)).sum(0)
+    time = measurements.middles
     angle = 2 * math.pi * frequencies[:, None, None] * time
     cosine, sine = torch.cos(angle), torch.sin(angle)
     real, imaginary = coefficients.real, coefficients.imag
@@ -96,16 +94,6 @@ def tone_columns(measurements: Measurements, coefficients: Tensor, frequencies: 
     by_frequency = along * cosine - across * sine
     attenuation = attenuation[:, None, None]
     return torch.stack([attenuation * cosine, -attenuation * sine, by_frequency], dim=-1)
-
-
-def _time(measurements: Measurements) -> Tensor:
-    """Mid-exposures (B, N, G, 1, 1) in seconds from the centre of the record."""
-    middle = 0.5 * measurements.exposure_time - measurements.centre
-    return (measurements.moments + middle[:, None, None])[..., None, None]
-
-
-def _average_times(measurements: Measurements, like: Tensor) -> Tensor:
-    return torch.tensor(measurements.average_times, dtype=like.dtype, device=like.device)[:, None]
 
 
 def _sinc(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -118,7 +106,7 @@ def _sinc(x: Tensor) -> tuple[Tensor, Tensor]:
 
 def drift_response(measurements: Measurements, order: int) -> Tensor:
     """What the measurements see of unit drifts s^j / j!, averaged over the exposure, (B, N, G, J)."""
-    time = _time(measurements)[..., 0, 0]
+    time = measurements.middles[..., 0, 0]
     powers = [time, 0.5 * time.square() + measurements.exposure_time**2 / 24.0]
     return measurements.relative(torch.stack(powers[:order], dim=-1))
 

@@ -60,21 +60,28 @@ def _wiener(mean: Tensor, noise: Tensor, u: Tensor, v: Tensor) -> Tensor:
         u: Frequencies along rows, cycles/px.
         v: Frequencies across rows, cycles/px.
     """
-
-    def smooth(spectrum: Tensor) -> Tensor:
-        parts = torch.view_as_real(spectrum).flatten(-2)[:, None]
-        chunks = row_chunks(parts.shape[2], 4 * parts.shape[3] * len(parts), _SMOOTH, parts.device)
-        window = (_SMOOTH, 2 * _SMOOTH)
-        pooled = [functional.avg_pool2d(parts[:, :, part].square(), window, ceil_mode=True) for part in chunks]
-        return torch.cat(pooled, 2)[:, 0]
-
-    total, noise_power = smooth(mean), smooth(noise)
+    total, noise_power = _smoothed(mean), _smoothed(noise)
     share = (1 - noise_power / total.clamp(min=torch.finfo(total.dtype).tiny)).clamp(min=0.0)
-    share = share.repeat_interleave(_SMOOTH, 1)[:, : len(v)].repeat_interleave(_SMOOTH, 2)[..., : len(u)]
     # all but the slowest, 1 - exp(-(u^2 + v^2) / slowest^2), within the pass band
     along, across = _pass(u, _PASS_COLUMNS), _pass(v, _PASS_ROWS)
-    slow = torch.outer(across * torch.exp(-((v / _SLOWEST) ** 2)), along * torch.exp(-((u / _SLOWEST) ** 2)))
-    return share * (torch.outer(across, along) - slow).to(share.dtype)
+    slow_along, slow_across = along * torch.exp(-((u / _SLOWEST) ** 2)), across * torch.exp(-((v / _SLOWEST) ** 2))
+    along, across, slow_along, slow_across = (x.to(share.dtype) for x in (along, across, slow_along, slow_across))
+    passed = torch.outer(across, along).addr_(slow_across, slow_along, alpha=-1)
+    blocks = share[:, :, None, :, None].expand(-1, -1, _SMOOTH, -1, _SMOOTH).flatten(3).flatten(1, 2)
+    return blocks[:, : len(v), : len(u)] * passed
+
+
+def _smoothed(spectrum: Tensor) -> Tensor:
+    """Mean power (B, S / 16, U / 16) of blocks of a spectrum (B, S, U), up to a factor."""
+    parts = torch.view_as_real(spectrum).flatten(-2)
+    rows = []
+    for part in row_chunks(parts.shape[1], 4 * parts.shape[2] * len(parts), _SMOOTH, parts.device):
+        power = parts[:, part].square()
+        whole = power.shape[1] // _SMOOTH * _SMOOTH
+        rows.append(power[:, :whole].unflatten(1, (-1, _SMOOTH)).mean(2))
+        if whole < power.shape[1]:
+            rows.append(power[:, whole:].mean(1, keepdim=True))
+    return functional.avg_pool1d(torch.cat(rows, 1), 2 * _SMOOTH, ceil_mode=True)
 
 
 def _scene(warped: Tensor, mean: Tensor, seen: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -105,7 +112,8 @@ class _Rows:
 
     Attributes:
         images: (B, s, 4, L) gradients along x and y, detail, ones.
-        residual: (B, s, G, L) what the frames differ by from their mean.
+        residual: (B, s, G, L) what the frames differ by from their mean; of two frames the first alone, (B, s, 1, L),
+            since the other differs by the opposite.
         weight: (B, s, L) of the pixels.
         seen: (B, G, s), 1 where a frame sees the row.
     """
@@ -141,9 +149,10 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
         images = mean.real.new_ones(*own.shape[:2], 4, length)
         images[:, :, :3] = torch.fft.irfft(torch.stack([own * along, across[:, part], own], dim=2), n=length)
         visible = seen[:, :, part]
-        difference = (warped[:, :, part] - mean[:, None, part]).transpose(1, 2)
+        frames = slice(1) if seen.shape[1] == 2 else slice(None)
+        difference = (warped[:, frames, part] - mean[:, None, part]).transpose(1, 2)
         residual = torch.fft.irfft(difference, n=length)
-        residual *= visible.transpose(1, 2)[..., None].to(residual.dtype)
+        residual *= visible[:, frames].transpose(1, 2)[..., None].to(residual.dtype)
         weight = inner * (visible.sum(1) > 1)[..., None].to(inner.dtype)
         if valid is not None:
             weight = weight * functional.pad(valid[:, part], (0, length - width))
@@ -171,7 +180,8 @@ def _explained_rows(rows: _Rows, spectra: RowSpectra) -> tuple[RowGradients, Ten
     """Gradients of some rows, and the energy (B, s, L) that brightness, contrast and a shift of them leave."""
     weighted, left, products = _explain(rows.images, rows.residual, rows.weight)
     spare = (rows.seen.sum(1) - 1).clamp(min=1.0)
-    energy = left.square().sum(2)
+    copies = rows.seen.shape[1] / left.shape[2]
+    energy = left.square().sum(2) * copies
     square = (energy * rows.weight).sum(-1).double()
     variance = square / ((products[..., 3, 3] - 4).clamp(min=1.0) * spare)
     mean_images = products[..., :3, 3:] / products[..., 3:, 3:].clamp(min=1e-6)
@@ -190,7 +200,7 @@ def _explain(images: Tensor, residual: Tensor, weight: Tensor) -> tuple[Tensor, 
 
     Args:
         images: (B, S, 4, W) gradients along x and y, detail, ones.
-        residual: (B, S, G, W).
+        residual: (B, S, G or 1, W).
         weight: (B, S, W).
 
     Returns:
@@ -198,7 +208,7 @@ def _explain(images: Tensor, residual: Tensor, weight: Tensor) -> tuple[Tensor, 
     """
     weighted = images * weight[:, :, None]
     products = torch.matmul(weighted, images.transpose(-2, -1)).double()
-    right = torch.matmul(residual, weighted.transpose(-2, -1)).double()  # (B, S, G, 4)
+    right = torch.matmul(residual, weighted.transpose(-2, -1)).double()  # (B, S, G or 1, 4)
     known = (products.diagonal(dim1=-2, dim2=-1) > 0).all(-1)[..., None]
     scale = torch.where(known, products.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt(), 0.0)
     eye = torch.eye(4, dtype=scale.dtype, device=scale.device)
@@ -232,7 +242,7 @@ def _trust(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
 def _halves(weighted: Tensor, images: Tensor, left: Tensor, seen: Tensor, middle: int) -> Tensor:
     """Sums over the halves of each row, as in ``RowGradients.halves``."""
     both = (seen[:, 0] * seen[:, -1])[..., None]
-    change = left[:, :, -1:] - left[:, :, :1]
+    change = left[:, :, -1:] - left[:, :, :1] if left.shape[2] > 1 else -2 * left
     sums = []
     for half in (slice(None, middle), slice(middle, None)):
         own = weighted[:, :, :2, half]

@@ -8,14 +8,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.spectral import extend_rows, fast_length, shift_phases
-from rsvib_torch.splines import bspline_coefficients, bspline_weights
+from rsvib_torch.splines import bspline_coefficient_rows, bspline_weights
 
 __all__ = ["DEGREE", "MARGIN", "RowSpectra", "combined", "inner_columns", "mean_over_frames", "row_chunks"]
 
 DEGREE = 7  # of the spline across rows: what it smooths, and the noise it colours, lie above the pass band
 MARGIN = 8  # px from the ends of rows and columns that do not count
 _EXTENSION = 32  # px that rows are continued by, so that their Fourier transform closes smoothly
-_CHUNK = {"cpu": 2**24}  # bytes that stay in a cache
+_CHUNK = {"cpu": 2**23}  # bytes that stay in a cache
 _LARGE_CHUNK = 2**30  # bytes at a time elsewhere
 
 
@@ -36,8 +36,9 @@ class RowSpectra:
     def __init__(self, frames: Tensor, valid: Tensor | None = None) -> None:
         self.height, self.width = frames.shape[-2:]
         self.length = fast_length(self.width + 2 * _EXTENSION)
-        coefficients = bspline_coefficients(frames, DEGREE, -2)
-        self.values = torch.fft.rfft(extend_rows(coefficients, self.length))
+        self.values = frames.new_empty(*frames.shape[:-1], self.length // 2 + 1, dtype=frames.dtype.to_complex())
+        for rows, coefficients in bspline_coefficient_rows(frames, DEGREE):
+            self.values[..., rows, :] = torch.fft.rfft(extend_rows(coefficients, self.length))
         self.frequencies = torch.fft.rfftfreq(self.length, dtype=torch.float64, device=frames.device)
         self.valid = None
         if valid is not None and not bool(valid.all()):
