@@ -24,6 +24,7 @@ __all__ = ["DirectFit", "refine_directly"]
 
 _CLEANINGS = 2  # rounds of taking out what is fixed to the sensor
 _NEAR = 0.05  # px: gradients of frames that were warped this well need not be taken again
+_RUNAWAY = 2.0  # times larger from round to round: no tone that was found does that
 _LEAST_GAIN = 0.02  # of the residual that a further tone must explain: the rows' noise is nearly white
 
 
@@ -56,6 +57,20 @@ def _settled(before: ToneFit, after: ToneFit) -> bool:
         (before.frequencies - after.frequencies).abs() <= 0.5 * parts[..., 2]
     )
     return bool((small | ~after.active).all())
+
+
+def _without_runaways(measurements: Measurements, before: ToneFit, after: ToneFit) -> ToneFit:
+    """The fit without tones, but the strongest of an axis, that grow from round to round.
+
+    Near a blind frequency a large tone leaves hardly an offset. What no tone explains may ask for one, and for a larger
+    one when frames were warped by it.
+    """
+    size, grown = before.coefficients.abs(), after.coefficients.abs()
+    strongest = size == size.amax(-1, keepdim=True)
+    running = after.active & ~strongest & (grown > _RUNAWAY * size.clamp(min=_NEAR))
+    if not bool(running.any()):
+        return after
+    return robust_fit(measurements, before.frequencies, after.active & ~running, after.model)[0]
 
 
 def refine_directly(
@@ -99,6 +114,8 @@ def refine_directly(
             fit = find_tones(careful, interval, tones, model, _LEAST_GAIN, strongest_only(fit), blind)
         else:
             fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual_of(measurements, fit))
+            if step > search_at:
+                fit = _without_runaways(measurements, before, fit)
         motion, _ = vibration_of_fit(fit)
         if step == iterations - 1:
             break

@@ -7,7 +7,8 @@ import torch
 from scipy import ndimage
 from truth import Motion, draw_scene, take_frames
 
-from rsvib_torch import SensorTiming, detect_vibration, register_bands
+from rsvib_torch import SensorTiming, Vibration, detect_vibration, register_bands, simulate_frames
+from rsvib_torch.evaluation import resolution_chart
 from rsvib_torch.registration.gradients import row_gradients, row_shifts
 from rsvib_torch.registration.row_spectra import RowSpectra
 
@@ -86,6 +87,19 @@ def test_long_exposures_that_blur_each_frame_in_its_own_way(paper_camera, exposu
     assert (wrong < np.array([0.01, 0.002]) * amplitude).all()
     assert (wrong < 4 * std).all()
     np.testing.assert_allclose(found.vibration.frequency[:, 0], (50.0, 30.0), rtol=1e-3)
+
+
+def test_a_blind_tone_that_blur_asks_for_does_not_run_away():
+    """400 rows of a sharp chart without noise: a tone of 23.8 Hz, where the gain is nothing, would grow to 1000 px."""
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=400, frame_rows=2048)
+    generator = torch.Generator().manual_seed(7)
+    phase = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1) * math.pi
+    scene = resolution_chart(2048 + 96, 512 + 96, seed=7)
+    frames = simulate_frames(scene, timing, Vibration([3.1, 5.2], [50.0, 30.0], phase), 2, frame_size=(2048, 512))
+    found = detect_vibration(frames, timing)
+    assert found.reliable.all()
+    assert found.vibration.amplitude[:, 0].tolist() == pytest.approx([3.1, 5.2], rel=0.01)
+    assert found.vibration.frequency[:, 0].tolist() == pytest.approx([50.0, 30.0], rel=0.001)
 
 
 def test_two_tones_over_four_frames_are_counted(paper_camera):
