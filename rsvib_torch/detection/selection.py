@@ -1,6 +1,7 @@
 """How many tones: added one by one, strongest first, as long as the data ask for them."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,10 +22,14 @@ _CANDIDATES = 4  # peaks of the periodogram that are tried: outliers may raise a
 _LEFT_OUT = 0.35  # of the record, the length of a stretch that is left out
 _STRETCHES = 7  # that are left out one at a time, each overlapping the next by half
 _ABSOLUTE_STEPS = 3  # rounds of reweighting towards least absolute residuals
+_NEARLY_ALL, _LITTLE = 0.9, 0.05  # of the rows, and of their typical displacement: what is left when none pulls
 _FEW_CANDIDATES = 2  # for each stretch
 _FEW_ITERATIONS = 5
 _ROBUST_STEPS = 2
 _WEAK = 0.2  # of the largest tone along the scan: side tones of a blind one are smaller
+
+
+Kind = TypeVar("Kind", ToneFit, Measurements)
 
 
 def robust_fit(
@@ -108,6 +113,25 @@ def _best_fit(
     return robust_fit(measurements, frequencies, active, model, residual)
 
 
+def _undisturbed(measurements: Measurements, fit: ToneFit) -> Tensor:
+    """(B,) bool: the fit leaves so little of nearly all rows that no stretch of them can have pulled it away."""
+    left = measurements.sizes(residual_of(measurements, fit)).nanquantile(_NEARLY_ALL, dim=1)
+    whole = measurements.sizes(measurements.relative(measurements.displacements)).nanmedian(1).values
+    return (left < _LITTLE * whole).all(-1)
+
+
+def _of_each(where: Tensor, one: Kind, other: Kind) -> Kind:
+    """One result for the stacks (B,) where that is told, the other for the rest."""
+
+    def pick(field: str) -> Any:
+        mine, yours = getattr(one, field), getattr(other, field)
+        if not isinstance(mine, Tensor):
+            return mine
+        return torch.where(where.reshape(-1, *(1,) * (mine.ndim - 1)), mine, yours)
+
+    return replace(one, **{field.name: pick(field.name) for field in fields(one)})
+
+
 def _stretches(measurements: Measurements) -> Tensor:
     """(S, N) bool, rows that count: all of them first, then all but a stretch, one stretch after the other."""
     rows = measurements.moments.shape[1]
@@ -174,7 +198,13 @@ def find_tones(
     going = torch.ones_like(none[..., 0])  # an axis that stopped stays stopped
     for _ in range(keep.shape[-1] // model.harmonics, MAX_TONES if tones is None else tones):
         active = torch.cat([keep, going[..., None].expand_as(none)], -1)
-        trial, trial_weighed = _best_fit(measurements, weighed, fit, active, sample_interval, reckon)
+        trial, trial_weighed = _best_fit(measurements, weighed, fit, active, sample_interval, False)
+        if reckon:
+            disturbed = ~_undisturbed(measurements, trial)
+            if bool(disturbed.any()):
+                careful = _best_fit(measurements, weighed, fit, active, sample_interval, True)
+                trial = _of_each(disturbed, careful[0], trial)
+                trial_weighed = _of_each(disturbed, careful[1], trial_weighed)
         if tones is None:
             # both fits are judged with the weights of the richer one
             before = trial_weighed.square(residual_of(measurements, fit))

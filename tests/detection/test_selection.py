@@ -1,0 +1,49 @@
+"""Which tones are found, and how carefully they are searched."""
+
+import math
+
+import pytest
+import torch
+
+from rsvib_torch.detection import selection
+from rsvib_torch.detection.measurements import Measurements
+
+ROWS, ROW_TIME, FRAME_PERIOD = 120, 16 * 20.52e-6, 2048 * 20.52e-6
+
+
+def offsets_of(amplitude, frequency, generator):
+    """Offsets (1, N, 2) between rows of two frames that vibrate, measured with an error of 0.003 px."""
+    starts = torch.arange(ROWS, dtype=torch.float64) * ROW_TIME
+    turn = 2 * math.pi * torch.tensor(frequency, dtype=torch.float64)
+    size = torch.tensor(amplitude, dtype=torch.float64)
+    places = [size * torch.cos(turn * (starts + shift)[:, None] + 0.4) for shift in (0, FRAME_PERIOD)]
+    noise = 0.003 * torch.randn(ROWS, 2, dtype=torch.float64, generator=generator)
+    return (places[1] - places[0] + noise)[None]
+
+
+def measured(offsets):
+    starts = (torch.arange(ROWS, dtype=torch.float64) * ROW_TIME).expand(len(offsets), -1)
+    information = torch.eye(2, dtype=torch.float64).expand(len(offsets), ROWS, 2, 2)
+    return Measurements.of_pairs(starts, starts + FRAME_PERIOD, offsets, information, 0.0)
+
+
+def test_stretches_are_left_out_only_where_rows_are_disturbed(monkeypatch):
+    generator = torch.Generator().manual_seed(8)
+    clean = offsets_of([3.1, 5.2], [50.0, 30.0], generator)
+    cloudy = offsets_of([2.0, 1.1], [50.0, 35.0], generator)
+    cloudy[:, 30:58] += torch.linspace(2.0, 9.0, 28)[:, None]  # moves by itself
+    searched = []
+    stretches = selection._stretches
+    monkeypatch.setattr(selection, "_stretches", lambda given: searched.append(1) or stretches(given))
+    alone = []
+    for offsets, careful in ((clean, False), (cloudy, True)):
+        searched.clear()
+        alone.append(selection.find_tones(measured(offsets), ROW_TIME, 1))
+        assert bool(searched) == careful
+    for fit, amplitude, frequency in zip(alone, ([3.1, 5.2], [2.0, 1.1]), ([50.0, 30.0], [50.0, 35.0]), strict=True):
+        assert fit.coefficients.abs().flatten().tolist() == pytest.approx(amplitude, rel=0.01)
+        assert fit.frequencies.flatten().tolist() == pytest.approx(frequency, rel=0.003)
+    together = selection.find_tones(measured(torch.cat([clean, cloudy])), ROW_TIME, 1)
+    for index, fit in enumerate(alone):
+        torch.testing.assert_close(together.frequencies[index], fit.frequencies[0], rtol=1e-9, atol=0)
+        torch.testing.assert_close(together.coefficients[index], fit.coefficients[0], rtol=1e-7, atol=0)
