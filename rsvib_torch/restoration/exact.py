@@ -133,7 +133,7 @@ def restore_exact(
     lost = ignore if clipped is None else clipped if ignore is None else ignore | clipped
     levels = _noise_levels(frames, motion, noise)
     mean = frames.mean((1, 3, 4), keepdim=True)  # the prior is for deviations from it
-    data = continue_rows(frames - mean, length)
+    data = continue_rows(frames, length).sub_(mean)
     starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device)).expand(B, T, H)
     displacement, node_weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
     restored = []
@@ -165,9 +165,10 @@ def restore_exact(
                 floor = None if clipped is None else _floor(problem.data, clipped[stack, members])
                 if measured is not None:
                     problem = replace(problem, data=fill_unmeasured(problem, measured, floor))
-            restored.append(_restore_group(problem, factor if prior == "edges" else None)[..., :W])
+            scene = _restore_group(problem, factor if prior == "edges" else None)[..., :W]
+            restored.append(scene + mean[stack, 0])
     stacked: Tensor = torch.stack(restored).unflatten(0, (B, len(groups)))
-    return stacked.add_(mean)
+    return stacked
 
 
 def _noise_levels(frames: Tensor, motion: FrameMotion, noise: float | Literal["auto"]) -> Tensor:
