@@ -1,6 +1,6 @@
 """Batched solver for Hermitian positive definite banded systems."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -35,6 +35,7 @@ class BandedFactor:
 
     skewed: Tensor
     inverse: Tensor
+    _memories: dict[int, tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]] = field(default_factory=dict)
 
     @property
     def width(self) -> int:
@@ -58,13 +59,23 @@ class BandedFactor:
 
     def solve(self, right_side: Tensor) -> Tensor:
         """Solve ``A x = right_side`` for right sides (K, M, S), M of them per matrix."""
-        x = _with_rows(right_side.conj(), self.width)
-        count, values, windows = len(self.inverse), x.unbind(), runs_of_rows(x, self.width)
+        count, x, values, windows = len(self.inverse), *self._memory(right_side)
+        x[:count] = right_side.conj()
+        x[count:] = 0
         if self.width:
             subtract_products(windows[1:], self._right, values[:count])  # columns of the conjugate of L
-        x = torch.conj_physical(x) if x.is_complex() else x
+        if x.is_complex():
+            x.conj_physical_()
         x[:count] *= self.inverse[:, None]
-        return self.substitute(x, x.unbind(), runs_of_rows(x, self.width), count)
+        return self.substitute(x, values, windows, count).clone()
+
+    def _memory(self, right_side: Tensor) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """Memory for right sides like these, its rows, and every run of b of them: made once, for many solutions."""
+        number = right_side.shape[1]
+        if number not in self._memories:
+            x = right_side.new_empty(len(self.skewed), *right_side.shape[1:])
+            self._memories[number] = (x, x.unbind(), runs_of_rows(x, self.width))
+        return self._memories[number]
 
     def substitute(self, x: Tensor, values: tuple[Tensor, ...], windows: tuple[Tensor, ...], count: int) -> Tensor:
         """Solve ``L^H x' = x`` in place for right sides (K + b, M, S); returns the first rows.
@@ -265,19 +276,19 @@ class _SolveAgain(torch.autograd.Function):
     """Solve with factors at hand, that have no gradient."""
 
     @staticmethod
-    def forward(ctx: Any, skewed: Tensor, inverse: Tensor, right_side: Tensor) -> Tensor:
-        ctx.save_for_backward(skewed, inverse)
-        return BandedFactor(skewed, inverse).solve(right_side)
+    def forward(ctx: Any, factor: BandedFactor, right_side: Tensor) -> Tensor:
+        ctx.factor = factor
+        return factor.solve(right_side)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[None, None, Tensor]:
-        return None, None, BandedFactor(*ctx.saved_tensors).solve(gradient)
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor]:
+        return None, ctx.factor.solve(gradient)
 
 
 def solve_factored(factor: BandedFactor, right_side: Tensor) -> Tensor:
     """Solve ``A x = right_side`` (K, M, S) with the factors of A, differentiably in the right sides."""
-    solution: Tensor = _SolveAgain.apply(factor.skewed, factor.inverse, right_side)  # type: ignore[no-untyped-call]
+    solution: Tensor = _SolveAgain.apply(factor, right_side)  # type: ignore[no-untyped-call]
     return solution
 
 

@@ -5,9 +5,9 @@ from torch import Tensor
 
 from rsvib_torch.restoration.row_system import RowKernels, SmoothKernels, smooth_kernels
 
-__all__ = ["RowSums"]
+__all__ = ["RowSums", "sum_looked_up"]
 
-_ROWS = {"cpu": 64}  # scene rows at a time: they stay in the cache
+_ROWS = {"cpu": 64}  # at a time: they stay in the cache
 _SPREAD = 2  # times as many places as the taps ask for, at most
 
 
@@ -65,15 +65,28 @@ class RowSums:
                 total = total.index_add_(0, self.base + i, kernel[:, None] * rows)
             return total if out is None else out.copy_(total)
         source, left = self._places
-        matrix, most = self.kernels.matrix(u), source.shape[1]
-        step = min(_ROWS.get(rows.device.type, self.count), self.count)
-        kernel = rows.new_empty(step * most, len(u))
-        looked_up = rows.new_empty(step * most, *rows.shape[1:])
-        for top in range(0, self.count, step):
-            part = slice(top, min(top + step, self.count))
-            size = (part.stop - top) * most
-            torch.mm(left[part].flatten(0, 1), matrix, out=torch.view_as_real(kernel[:size]).flatten(1))
-            torch.index_select(rows, 0, source[part].flatten(), out=looked_up[:size])
-            looked_up[:size].mul_(kernel[:size, None])
-            torch.sum(looked_up[:size].unflatten(0, (-1, most)), 1, out=out[part])
-        return out
+        return sum_looked_up(rows, source, left, self.kernels.matrix(u), out)
+
+
+def sum_looked_up(rows: Tensor, source: Tensor, left: Tensor, matrix: Tensor, out: Tensor) -> Tensor:
+    """Sums (N, C, U) over Q of kernels times the rows that they are for, written to ``out``; not differentiated.
+
+    Args:
+        rows: (R, C, U) complex.
+        source: (N, Q) which of them.
+        left: (N, Q, 2 Q') kernels, as in ``SmoothKernels``.
+        matrix: (2 Q', 2 U) from that to kernels at U frequencies.
+        out: (N, C, U).
+    """
+    count, most = source.shape
+    step = min(_ROWS.get(rows.device.type, count), count)
+    kernel = rows.new_empty(step * most, rows.shape[-1])
+    looked_up = rows.new_empty(step * most, *rows.shape[1:])
+    for top in range(0, count, step):
+        part = slice(top, min(top + step, count))
+        size = (part.stop - top) * most
+        torch.mm(left[part].flatten(0, 1), matrix, out=torch.view_as_real(kernel[:size]).flatten(1))
+        torch.index_select(rows, 0, source[part].flatten(), out=looked_up[:size])
+        looked_up[:size].mul_(kernel[:size, None])
+        torch.sum(looked_up[:size].unflatten(0, (-1, most)), 1, out=out[part])
+    return out

@@ -11,7 +11,7 @@ from rsvib_torch.restoration.banded_solver import BandedFactor, factor_skewed, s
 from rsvib_torch.restoration.interpolated_solver import NodeFactors
 from rsvib_torch.restoration.partition import Partition
 from rsvib_torch.restoration.row_kernel import REACH, kernel_samples
-from rsvib_torch.restoration.row_sums import RowSums
+from rsvib_torch.restoration.row_sums import RowSums, sum_looked_up
 from rsvib_torch.restoration.row_system import RowKernels, smooth_band, smooth_kernels
 
 __all__ = ["Coefficients", "SceneSolver"]
@@ -89,8 +89,10 @@ class SceneSolver:
         if self._factors is None and not self._differentiates(spectra, *(pull or ())):
             return self._fit_in_place(spectra, pull)
         solutions = []
+        differentiated = self._differentiates(spectra, *(pull or ()))
         for k, part in enumerate(self.parts):
-            right = self._right(spectra, part)
+            shape = (self.rows.count, spectra.shape[1], part.stop - part.start)
+            right = self._right(spectra, part, None if differentiated else spectra.new_empty(shape))
             split = self._segments.split(right if pull is None else right + pull[k]).flatten(-2)
             if self._factors is None:
                 solved = solve_skewed(self._normal.at(self.u[part], self.precision[..., part]), split)
@@ -188,17 +190,21 @@ class SceneSolver:
         """What the frames show of a scene, (M, C, R, L)."""
         spectra = []
         for part, values in zip(self.parts, coefficients, strict=True):
-            rows = sum(
-                (
-                    kernel[:, None] * values[self._sums.base + i]
-                    for i, kernel in enumerate(self._seen.taps(self.u[part]))
-                ),
-                start=values.new_zeros(()),
-            )
             phases = self.kernels.phases(self.length, part, self.dtype).conj()
+            rows = self._seen_rows(values, self.u[part])
             spectra.append(rows.unflatten(0, phases.shape[:2]) * phases[:, :, None])
         images: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1).transpose(1, 2), n=self.length)
         return images
+
+    def _seen_rows(self, values: Tensor, u: Tensor) -> Tensor:
+        """What the rows (M R, C, U') see of coefficients (K, C, U'), without the phase of their middles."""
+        base, left = self._sums.base, self._seen.left
+        if not self._differentiates(values):
+            source = base[:, None] + torch.arange(len(left), device=base.device)
+            out = values.new_empty(len(base), *values.shape[1:])
+            return sum_looked_up(values, source, left.transpose(0, 1), self._seen.matrix(u), out)
+        seen = (kernel[:, None] * values[base + i] for i, kernel in enumerate(self._seen.taps(u)))
+        return sum(seen, start=values.new_zeros(()))
 
     def scene(self, coefficients: Coefficients) -> Tensor:
         """Rows of the scene where the frame at rest would show them, (C, R, L)."""
