@@ -151,7 +151,7 @@ def restore_exact(
         certain = noise != "auto" or T > 1
         chosen = system(members, reference)
         strength = prior_strength(frames[stack, members], chosen, row_prior, typical * length, certain=certain)
-        precision = row_prior.precision(typical * length, factor * strength, blurred=chosen.blurred)
+        precision = row_prior.precision(typical * length, factor * strength, chosen.reach)
         for members, reference in groups:
             kernels = system(members, reference)
             along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]

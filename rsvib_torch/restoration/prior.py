@@ -19,9 +19,9 @@ _MOST_PIECES = 128  # of a frame
 _SMOOTHING = 3  # neighbouring frequencies whose statistics are pooled
 _ITERATIONS = 20
 # noise power over variance of e: above, the systems lose digits and nothing is gained; below, rows half a pixel apart
-# from the scene's lose them in single precision. Long exposures see every place of the scene from many of its rows.
-_STRONGEST = 1e3
-_WEAKEST, _WEAKEST_OF_BLUR = 1e-4, 5e-5
+# from the scene's lose them in single precision. Long exposures see every place of the scene from many of its rows,
+# and may go as much lower as the blur is longer than a px.
+_STRONGEST, _WEAKEST = 1e3, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class RowPrior:
         values = torch.nn.functional.interpolate(stacked[None], count, mode="linear", align_corners=True)[0]
         return RowPrior(values[0].exp(), values[2:], values[1].exp())
 
-    def precision(self, noise_power: Tensor, strength: float, *, blurred: bool = False) -> Tensor:
+    def precision(self, noise_power: Tensor, strength: float, reach: float = 0.0) -> Tensor:
         """Products ``a_k a_(k + d)`` of the filter in units of the data's noise, (p + 1, p + 1, U), 0 for k + d > p.
 
         The precision of interior rows d apart is the sum over k; the first and the last rows are predicted from
@@ -74,11 +74,11 @@ class RowPrior:
         Args:
             noise_power: Power of the noise of data of weight 1.
             strength: Factor on the precision.
-            blurred: Whether the scene moves during an exposure.
+            reach: Distance in px along the rows that the scene moves in half an exposure.
         """
         a = self.filter()
-        weakest = _WEAKEST_OF_BLUR if blurred else _WEAKEST
-        ratio = ((noise_power + self.blind) * strength / self.innovation()).clamp(weakest, _STRONGEST)
+        ratio = (noise_power + self.blind) * strength / self.innovation()
+        ratio = ratio.clamp(_WEAKEST / (1 + reach), _STRONGEST)
         count = len(a)
         products = a.new_zeros(count, count, a.shape[1])
         for d in range(count):

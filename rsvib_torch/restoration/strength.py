@@ -64,7 +64,7 @@ def prior_strength(
     sample = sample_rows(images[..., top : top + count, :], part, chosen)
     certain = certain and bool(noise_power > _CLEAR * prior.blind.mean())
     strengths = [strength for strength in _STRENGTHS if certain or strength <= 1]
-    blurred = kernels.blurred
-    precisions = [prior.precision(noise_power, strength, blurred=blurred) for strength in strengths]
+    reach = kernels.reach
+    precisions = [prior.precision(noise_power, strength, reach) for strength in strengths]
     explained = sample.explain([precision[..., place] for precision in precisions])
     return strengths[_cross_validation(explained, explained.power.new_tensor(strengths))]
