@@ -42,7 +42,7 @@ class RowSums:
         order = seen.argsort(stable=True)
         seen, row = seen[order], row[order]
         numbers = torch.bincount(seen, minlength=self.count)
-        most = int(numbers.amax())
+        most = max(1, int(numbers.amax()))
         if most * self.count > _SPREAD * taps * rows:
             return None
         place = torch.arange(len(seen), device=seen.device) - (numbers.cumsum(0) - numbers)[seen]

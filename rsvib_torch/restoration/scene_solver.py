@@ -57,11 +57,11 @@ class SceneSolver:
         order = len(precision) - 1
         width = max(kernels.taps.shape[-2] - 1, order)
         normal = smooth_band(self.kernels, self.rows, width, order, dtype)
-        place = (self.rows.count, width), precision.device
+        size_of_all, device, blurred = (self.rows.count, width), precision.device, kernels.blurred
         if keep:
-            shares = partition.factoring_all(*place[0], len(self.u), place[1], blurred=kernels.blurred, keep=True)
+            shares = partition.factoring_all(*size_of_all, len(self.u), device, blurred=blurred, keep=True)
         else:
-            shares = partition.of(*place[0], self.length, place[1], kernels.reach, blurred=kernels.blurred)
+            shares = partition.of(*size_of_all, self.length, device, kernels.reach, blurred=blurred)
         self._shares, self._segments = shares, shares.segments
         self._whole, self._normal = normal, normal.in_segments(shares.segments)
         self._partition = partition
@@ -86,10 +86,10 @@ class SceneSolver:
             pull: To be added to the right sides: P times what the prior expects.
         """
         spectra = torch.fft.rfft(data)
-        if self._factors is None and not self._differentiates(spectra, *(pull or ())):
+        differentiated = self._differentiates(spectra, *(pull or ()))
+        if self._factors is None and not differentiated:
             return self._fit_in_place(spectra, pull)
         solutions = []
-        differentiated = self._differentiates(spectra, *(pull or ()))
         for k, part in enumerate(self.parts):
             shape = (self.rows.count, spectra.shape[1], part.stop - part.start)
             right = self._right(spectra, part, None if differentiated else spectra.new_empty(shape))
