@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from rsvib_torch.restoration.row_system import RowKernels, SmoothKernels, smooth_kernels
+from rsvib_torch.restoration.row_system import RowKernels, SmoothKernels
 
 __all__ = ["RowSums", "sum_looked_up"]
 
@@ -20,15 +20,14 @@ class RowSums:
 
     Args:
         kernels: How M frames of R rows see the scene.
+        smooth: The same at all frequencies.
         top: Index of the scene's first row, in frame coordinates.
         count: Rows K of the scene.
-        dtype: Of the frames.
     """
 
-    def __init__(self, kernels: RowKernels, top: int, count: int, dtype: torch.dtype) -> None:
-        smooth = smooth_kernels(kernels, dtype)
+    def __init__(self, kernels: RowKernels, smooth: SmoothKernels, top: int, count: int) -> None:
         real, imaginary = smooth.left.tensor_split(2, dim=-1)
-        weight = kernels.weight.to(dtype).flatten()[:, None]
+        weight = kernels.weight.to(smooth.left.dtype).flatten()[:, None]
         self.count = count
         self.kernels = SmoothKernels(torch.cat([weight * real, -weight * imaginary], dim=-1), smooth.reach)
         self.base = (kernels.first - top).flatten()

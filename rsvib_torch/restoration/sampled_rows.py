@@ -10,6 +10,7 @@ from torch import Tensor
 from rsvib_torch.restoration.banded_solver import BandedFactor, factor_skewed
 from rsvib_torch.restoration.prior import ORDER
 from rsvib_torch.restoration.row_system import RowKernels, SmoothBand, smooth_band, smooth_kernels
+from rsvib_torch.spectral import squared_modulus, waves
 
 __all__ = ["Explained", "SampledRows", "sample_rows"]
 
@@ -70,7 +71,7 @@ class SampledRows:
         residual = self.spectra[..., None, :] - sum(
             tap[..., None, :] * fitted[self.base + i] for i, tap in enumerate(self.taps)
         )
-        power = (self.weight[..., None] * residual.abs().square()).sum((0, 1)).to(torch.float64) / self.energy
+        power = (self.weight[..., None] * squared_modulus(residual)).sum((0, 1)).to(torch.float64) / self.energy
         freedom = (len(factor.skewed) - width - growth).unflatten(-1, (number, -1))
         return Explained(power, freedom, int((self.weight > 0).sum()))
 
@@ -88,12 +89,11 @@ def sample_rows(images: Tensor, kernels: RowKernels, chosen: Tensor) -> SampledR
     u = chosen / width
     angle = (-2 * torch.pi) * (torch.arange(width, device=u.device)[:, None] * chosen % width) / width
     angle = angle.to(torch.float64)
-    waves = (taper[:, None] * torch.cat([angle.cos(), angle.sin()], dim=-1)).to(images.dtype)
+    tapered = (taper[:, None] * torch.cat([angle.cos(), angle.sin()], dim=-1)).to(images.dtype)
     mean = images.mean((-2, -1), keepdim=True)
-    spectra = images @ waves - mean * waves.sum(0)
+    spectra = images @ tapered - mean * tapered.sum(0)
     spectra = torch.complex(*spectra.chunk(2, dim=-1)).transpose(1, 2)  # (M, R, C, F)
-    turns = kernels.middle[..., None] * u
-    spectra = spectra * torch.polar(torch.ones_like(turns), 2 * torch.pi * turns).to(spectra.dtype)[:, :, None]
+    spectra = spectra * waves(kernels.middle, -u).to(spectra.dtype)[:, :, None]
     scene = kernels.scene_rows(count)
     taps = [tap[:, None] for tap in smooth_kernels(kernels, images.dtype).taps(u)]
     normal = smooth_band(kernels, scene, max(len(taps) - 1, ORDER), ORDER, images.dtype)

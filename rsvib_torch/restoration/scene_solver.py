@@ -66,8 +66,8 @@ class SceneSolver:
         self._whole, self._normal = normal, normal.in_segments(shares.segments)
         self._partition = partition
         self.parts = shares.parts(len(self.u))
-        self._sums = RowSums(self.kernels, self.rows.top, self.rows.count, dtype)
         self._seen = smooth_kernels(kernels, dtype)
+        self._sums = RowSums(self.kernels, self._seen, self.rows.top, self.rows.count)
         self._factors: list[BandedFactor] | None = None
         moving = self._normal.left.requires_grad or precision.requires_grad
         if keep and not (torch.is_grad_enabled() and moving):
