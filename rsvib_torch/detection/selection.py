@@ -17,6 +17,7 @@ MAX_TONES = 4
 _FADED = 0.1  # of its amplitude is all that an exposure leaves of a tone
 _F_THRESHOLD = 14.0  # of chi-square gained per parameter over noise: chance over a whole frequency grid stays below it
 _LEAST_GAIN = 0.2  # of the residual chi-square that a further tone must explain
+_HOPEFUL = 0.5  # of that share, before outliers are weighed anew: with less a tone need not be fitted to the end
 _LEAST_APART = 0.7  # of one over the record: tones nearer than this are one that the noise has split
 _CANDIDATES = 4  # peaks of the periodogram that are tried: outliers may raise a wrong one
 _LEFT_OUT = 0.35  # of the record, the length of a stretch that is left out
@@ -59,19 +60,22 @@ def robust_fit(
     return fit, weighed
 
 
-def _best_fit(
+def _with_one_more(
     measurements: Measurements,
     weighed: Measurements,
     before: ToneFit,
     active: Tensor,
     sample_interval: float,
     reckon: bool,
-) -> tuple[ToneFit, Measurements]:
-    """The robust fit with one more tone (or family) an axis, the one that leaves the majority of rows least.
+) -> tuple[Tensor, Tensor]:
+    """Frequencies with one more tone (or family) an axis, the one that leaves the majority of rows least.
 
     Candidates come from the periodogram of what ``before`` leaves. To ``reckon`` with clouds and with things that move
     by themselves, which cover stretches of rows, every stretch of the record is left out once: where all that pulls
     the fit away is left out, the others fall in line.
+
+    Returns:
+        Frequencies (B, 2, K) and what a first fit with them leaves, (B, N, G, 2).
     """
     model, harmonics = before.model, before.model.harmonics
     left = replace(measurements, displacements=residual_of(measurements, before))
@@ -110,7 +114,7 @@ def _best_fit(
     for _ in range(_ABSOLUTE_STEPS if reckon else 0):
         nearer = fit_tones(measurements.for_least_absolute(residual), frequencies, active, model, _FEW_ITERATIONS)
         frequencies, residual = nearer.frequencies, residual_of(measurements, nearer)
-    return robust_fit(measurements, frequencies, active, model, residual)
+    return frequencies, residual
 
 
 def _undisturbed(measurements: Measurements, fit: ToneFit) -> Tensor:
@@ -198,11 +202,20 @@ def find_tones(
     going = torch.ones_like(none[..., 0])  # an axis that stopped stays stopped
     for _ in range(keep.shape[-1] // model.harmonics, MAX_TONES if tones is None else tones):
         active = torch.cat([keep, going[..., None].expand_as(none)], -1)
-        trial, trial_weighed = _best_fit(measurements, weighed, fit, active, sample_interval, False)
+        further = _with_one_more(measurements, weighed, fit, active, sample_interval, False)
+        if tones is None and keep.shape[-1] > 0:
+            before, after = (weighed.square(left) for left in (residual_of(measurements, fit), further[1]))
+            hopeful = before - after > _HOPEFUL * least_gain * before
+            going = going & (hopeful if not reckon else hopeful | ~_undisturbed(measurements, fit)[:, None])
+            if not bool(going.any()):
+                break
+            active = torch.cat([keep, going[..., None].expand_as(none)], -1)
+        trial, trial_weighed = robust_fit(measurements, further[0], active, model, further[1])
         if reckon:
             disturbed = ~_undisturbed(measurements, trial)
             if bool(disturbed.any()):
-                careful = _best_fit(measurements, weighed, fit, active, sample_interval, True)
+                further = _with_one_more(measurements, weighed, fit, active, sample_interval, True)
+                careful = robust_fit(measurements, further[0], active, model, further[1])
                 trial = _of_each(disturbed, careful[0], trial)
                 trial_weighed = _of_each(disturbed, careful[1], trial_weighed)
         if tones is None:

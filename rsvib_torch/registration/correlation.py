@@ -7,6 +7,8 @@ from rsvib_torch.registration.windows import take_windows
 
 __all__ = ["correlate_bands", "correlate_profiles"]
 
+_FEWEST_ROWS = 8  # of templates that are multiplied at a time
+
 
 def correlate_bands(
     first: Tensor,
@@ -43,14 +45,20 @@ def correlate_bands(
         width + 2 * reach[1],
     ).flatten(0, 1)
     lags_y, lags_x = 2 * reach[0] + 1, 2 * reach[1] + 1
-    products = []
-    for lag in range(lags_x):
-        product = template @ search[..., lag : lag + width].transpose(-2, -1)  # (M, h, h + 2 reach)
-        diagonals = product.as_strided(
-            (product.shape[0], height, lags_y), (product.stride(0), product.stride(1) + 1, 1), product.storage_offset()
-        )
-        products.append(diagonals.sum(1))
-    cross = torch.stack(products, dim=-1).unflatten(0, places.shape[:2])
+    step = min(
+        height, max(_FEWEST_ROWS, lags_y)
+    )  # taller, and most products would be of rows that no lag brings together
+    cross = template.new_zeros(len(template), lags_y, lags_x)
+    for top in range(0, height, step):
+        rows = template[:, top : top + step]
+        own = search[:, top : top + rows.shape[1] + lags_y - 1]
+        for lag in range(lags_x):
+            product = rows @ own[..., lag : lag + width].transpose(-2, -1)  # (M, h, h + 2 reach)
+            diagonals = product.as_strided(
+                (len(product), rows.shape[1], lags_y), (product.stride(0), product.stride(1) + 1, 1)
+            )
+            cross[..., lag] += diagonals.sum(1)
+    cross = cross.unflatten(0, places.shape[:2])
 
     total, energy = _window_sums(second, later_places, size, reach)
     template_total, template_energy = _window_sums(first, places, size, (0, 0))
@@ -89,9 +97,10 @@ def _window_sums(
     extra = int(columns.amax()) - low
     columns = columns - low
     sums = []
-    for values in (images, images.square()):
-        first = values[..., low : low + width].sum(-1, keepdim=True, dtype=torch.float64)
-        change = values[..., low + width : low + width + extra] - values[..., low : low + extra]
+    for power in (1, 2):
+        inner = images[..., low : low + width]
+        first = (inner.sum(-1) if power == 1 else torch.linalg.vecdot(inner, inner)).double()[..., None]
+        change = images[..., low + width : low + width + extra] ** power - images[..., low : low + extra] ** power
         runs = torch.cat([first, first + change.cumsum(-1, dtype=torch.float64)], dim=-1)  # (L, H, extra + 1)
         table = torch.cat([torch.zeros_like(runs[:, :1]), runs.cumsum(1)], dim=1).flatten(1)
         step = extra + 1

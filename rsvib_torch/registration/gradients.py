@@ -8,7 +8,7 @@ Cramer-Rao bound.
 """
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -22,6 +22,7 @@ _PASS_ROWS = (0.24, 0.34)  # cycles/px across rows: full weight below, none abov
 _PASS_COLUMNS = (0.40, 0.48)  # along rows, where interpolation is exact but detail near the limit may be aliased
 _SLOWEST = 1 / 64  # cycles/px: shading and vignetting live below
 _SMOOTH = 16  # values of the spectra that are averaged along each axis
+_SOME = 4  # along rows, of which one tells the noise
 _BLOCK = 16  # px, side of the blocks that are judged together
 _LARGEST_NOISE = 9.0  # mean square of a block over the typical one before it loses weight
 _LARGEST_SHIFT = 0.15  # px, part of a block's residual that the gradient excuses
@@ -32,7 +33,8 @@ class RowGradients:
     """Gradients of the scene as seen by the rows of a group of frames, ready to weigh residuals.
 
     Attributes:
-        spectra: (B, S, 3, U) one-sided transforms of weight times gradient along x, along y, and detail of the scene.
+        spectra: (B, S, 3, U) one-sided transforms, over their length, of weight times gradient along x, along y, and
+            detail of the scene; what has no partner is halved.
         products: (B, S, 3, 3) float64 sums of their products; detail takes out changes of contrast.
         variance: (B, S) float64, noise variance of a pixel in a frame.
         halves: (B, S, 2, 5) float64, sums gx gx, gx gy, gy gy, gx e and gy e over the left and the right half of each
@@ -56,11 +58,11 @@ def _wiener(mean: Tensor, noise: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
     Args:
         mean: (B, S, U) two-dimensional spectrum of the mean of the frames.
-        noise: (B, S, U) spectrum of a difference with the noise of the mean.
+        noise: (B, S, U / 4) spectrum of a difference with the noise of the mean, at every fourth frequency.
         u: Frequencies along rows, cycles/px.
         v: Frequencies across rows, cycles/px.
     """
-    total, noise_power = _smoothed(mean), _smoothed(noise)
+    total, noise_power = _smoothed(mean, _SMOOTH), _smoothed(noise, _SMOOTH // _SOME)
     share = (1 - noise_power / total.clamp(min=torch.finfo(total.dtype).tiny)).clamp(min=0.0)
     # all but the slowest, 1 - exp(-(u^2 + v^2) / slowest^2), within the pass band
     along, across = _pass(u, _PASS_COLUMNS), _pass(v, _PASS_ROWS)
@@ -71,8 +73,8 @@ def _wiener(mean: Tensor, noise: Tensor, u: Tensor, v: Tensor) -> Tensor:
     return blocks[:, : len(v), : len(u)] * passed
 
 
-def _smoothed(spectrum: Tensor) -> Tensor:
-    """Mean power (B, S / 16, U / 16) of blocks of a spectrum (B, S, U), up to a factor."""
+def _smoothed(spectrum: Tensor, columns: int) -> Tensor:
+    """Mean power (B, S / 16, U / columns) of blocks of a spectrum (B, S, U), up to a factor."""
     parts = torch.view_as_real(spectrum).flatten(-2)
     rows = []
     for part in row_chunks(parts.shape[1], 4 * parts.shape[2] * len(parts), _SMOOTH, parts.device):
@@ -81,14 +83,14 @@ def _smoothed(spectrum: Tensor) -> Tensor:
         rows.append(power[:, :whole].unflatten(1, (-1, _SMOOTH)).mean(2))
         if whole < power.shape[1]:
             rows.append(power[:, whole:].mean(1, keepdim=True))
-    return functional.avg_pool1d(torch.cat(rows, 1), 2 * _SMOOTH, ceil_mode=True)
+    return functional.avg_pool1d(torch.cat(rows, 1), 2 * columns, ceil_mode=True)
 
 
 def _scene(warped: Tensor, mean: Tensor, seen: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     """Detail of the scene and its gradient across rows, (B, S, U) each, from the mean of the frames."""
     v = torch.fft.fftfreq(mean.shape[-2], dtype=torch.float64, device=u.device)
     whole = torch.fft.fft(mean, dim=-2)
-    share = _wiener(whole, torch.fft.fft(_noise_of_mean(warped, seen), dim=-2), u, v)
+    share = _wiener(whole, torch.fft.fft(_noise_of_mean(warped[..., ::_SOME], seen), dim=-2), u, v)
     torch.view_as_real(whole).mul_(share[..., None])
     detail = torch.fft.ifft(whole, dim=-2)
     whole *= (2j * math.pi * v).to(whole.dtype)[:, None]
@@ -111,7 +113,7 @@ class _Rows:
     """Some rows of the scene as pixels.
 
     Attributes:
-        images: (B, s, 4, L) gradients along x and y, detail, ones.
+        images: (B, s, 3, L) gradients along x and y, detail.
         residual: (B, s, G, L) what the frames differ by from their mean; of two frames the first alone, (B, s, 1, L),
             since the other differs by the opposite.
         weight: (B, s, L) of the pixels.
@@ -146,8 +148,7 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
 
     def pixels(part: slice) -> _Rows:
         own = detail[:, part]
-        images = mean.real.new_ones(*own.shape[:2], 4, length)
-        images[:, :, :3] = torch.fft.irfft(torch.stack([own * along, across[:, part], own], dim=2), n=length)
+        images = torch.fft.irfft(torch.stack([own * along, across[:, part], own], dim=2), n=length)
         visible = seen[:, :, part]
         frames = slice(1) if seen.shape[1] == 2 else slice(None)
         difference = (warped[:, frames, part] - mean[:, None, part]).transpose(1, 2)
@@ -159,10 +160,11 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
         return _Rows(images, residual, weight, visible)
 
     parts = row_chunks(rows.shape[-1], 4 * length * len(rows) * (8 + 2 * rows.shape[1]), _BLOCK, rows.device)
+    transforms = mean.new_empty(*mean.shape[:2], 3, mean.shape[-1])  # memory is dear: nothing of this size is moved
     results, energies = [], []
     for part in parts:
         some = pixels(part)
-        found, energy = _explained_rows(some, spectra)
+        found, energy = _explained_rows(some, spectra, transforms[:, part])
         results.append(found)
         energies.append(_blocks_of(some, energy))
     trust = _trust(*(torch.cat(values, 1) for values in zip(*energies, strict=True)))
@@ -172,50 +174,61 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
             some = pixels(part)
             spread = own.repeat_interleave(_BLOCK, 1).repeat_interleave(_BLOCK, 2)
             weight = some.weight * spread[:, : some.weight.shape[1], :length]
-            results[place], _ = _explained_rows(replace(some, weight=weight), spectra)
-    return RowGradients(*(torch.cat([getattr(r, f.name) for r in results], 1) for f in fields(RowGradients)))
+            results[place], _ = _explained_rows(replace(some, weight=weight), spectra, transforms[:, part])
+    return RowGradients(transforms, *(torch.cat(values, 1) for values in zip(*results, strict=True)))
 
 
-def _explained_rows(rows: _Rows, spectra: RowSpectra) -> tuple[RowGradients, Tensor]:
-    """Gradients of some rows, and the energy (B, s, L) that brightness, contrast and a shift of them leave."""
-    weighted, left, products = _explain(rows.images, rows.residual, rows.weight)
+def _explained_rows(rows: _Rows, spectra: RowSpectra, out: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+    """What ``RowGradients`` tell of some rows, and the energy (B, s, L) that brightness, contrast and a shift leave.
+
+    Args:
+        rows: The rows.
+        spectra: Of the frames.
+        out: (B, s, 3, U) for the transforms of their images; products, variance and halves are returned.
+    """
+    weighted, left, products, pull = _explain(rows.images, rows.residual, rows.weight)
     spare = (rows.seen.sum(1) - 1).clamp(min=1.0)
     copies = rows.seen.shape[1] / left.shape[2]
     energy = left.square().sum(2) * copies
     square = (energy * rows.weight).sum(-1).double()
     variance = square / ((products[..., 3, 3] - 4).clamp(min=1.0) * spare)
     mean_images = products[..., :3, 3:] / products[..., 3:, 3:].clamp(min=1e-6)
-    centred = weighted[:, :, :3] - rows.weight[:, :, None] * mean_images.to(rows.weight.dtype)
-    gradients = RowGradients(
-        spectra=torch.fft.rfft(centred) * _one_sided(spectra.length, centred),
-        products=products[..., :3, :3] - mean_images * products[..., 3:, :3],
-        variance=variance,
-        halves=_halves(weighted, rows.images, left, rows.seen, spectra.width // 2),
-    )
-    return gradients, energy / spare[..., None].to(energy.dtype)
+    halves = _halves(weighted, rows, left, (products, pull), spectra.width // 2)
+    centred = weighted.addcmul_(rows.weight[:, :, None], mean_images.to(rows.weight.dtype), value=-1)
+    torch.fft.rfft(centred, norm="forward", out=out)
+    _one_sided(out, spectra.length)
+    centred_products = products[..., :3, :3] - mean_images * products[..., 3:, :3]
+    return (centred_products, variance, halves), energy / spare[..., None].to(energy.dtype)
 
 
-def _explain(images: Tensor, residual: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _explain(images: Tensor, residual: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Take out of each row what brightness, contrast and a shift of it explain.
 
     Args:
-        images: (B, S, 4, W) gradients along x and y, detail, ones.
+        images: (B, S, 3, W) gradients along x and y, detail.
         residual: (B, S, G or 1, W).
         weight: (B, S, W).
 
     Returns:
-        Weighted images, what is left of the residual, and the products (B, S, 4, 4) float64 of the images.
+        Weighted images, what is left of the residual, the products (B, S, 4, 4) of the images and ones, and those
+        (B, S, G or 1, 4) with what is left; products in float64.
     """
     weighted = images * weight[:, :, None]
-    products = torch.matmul(weighted, images.transpose(-2, -1)).double()
-    right = torch.matmul(residual, weighted.transpose(-2, -1)).double()  # (B, S, G or 1, 4)
+    products = weight.new_empty(*weight.shape[:2], 4, 4, dtype=torch.float64)
+    products[..., :3, :3] = torch.matmul(weighted, images.transpose(-2, -1))
+    products[..., :3, 3] = products[..., 3, :3] = weighted.sum(-1)
+    products[..., 3, 3] = weight.sum(-1)
+    with_ones = torch.matmul(residual, weight[..., None])
+    right = torch.cat([torch.matmul(residual, weighted.transpose(-2, -1)), with_ones], dim=-1).double()
     known = (products.diagonal(dim1=-2, dim2=-1) > 0).all(-1)[..., None]
     scale = torch.where(known, products.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt(), 0.0)
     eye = torch.eye(4, dtype=scale.dtype, device=scale.device)
     unit = products * scale[..., :, None] * scale[..., None, :] + torch.where(known, 1e-6, 1.0)[..., None] * eye
     solution = torch.linalg.solve(unit, (right * scale[..., None, :]).transpose(-2, -1)).transpose(-2, -1)
-    solution = (solution * scale[..., None, :]).to(images.dtype)
-    return weighted, residual - torch.matmul(solution, images), products
+    solution = solution * scale[..., None, :]
+    explained = solution.to(images.dtype)
+    left = torch.matmul(explained[..., :3], images).add_(explained[..., 3:])
+    return weighted, torch.sub(residual, left, out=left), products, right - solution @ products
 
 
 def _blocks_of(rows: _Rows, energy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -239,25 +252,38 @@ def _trust(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
     return 1 / (1 + (ratio - 1).clamp(min=0.0).square())
 
 
-def _halves(weighted: Tensor, images: Tensor, left: Tensor, seen: Tensor, middle: int) -> Tensor:
-    """Sums over the halves of each row, as in ``RowGradients.halves``."""
-    both = (seen[:, 0] * seen[:, -1])[..., None]
-    change = left[:, :, -1:] - left[:, :, :1] if left.shape[2] > 1 else -2 * left
+def _halves(weighted: Tensor, rows: _Rows, left: Tensor, whole: tuple[Tensor, Tensor], middle: int) -> Tensor:
+    """Sums over the halves of each row, as in ``RowGradients.halves``.
+
+    Args:
+        weighted: (B, S, 3, W) images.
+        rows: What they belong to.
+        left: What is left of the residual.
+        whole: Products of the images, and with what is left, over all columns.
+        middle: Column where the right half begins.
+    """
+    of_left, of_images = left[..., :middle].transpose(-2, -1), rows.images[:, :, :2, :middle].transpose(-2, -1)
+    own = weighted[:, :, :2, :middle]
     sums = []
-    for half in (slice(None, middle), slice(middle, None)):
-        own = weighted[:, :, :2, half]
-        products = torch.matmul(own, images[:, :, :2, half].transpose(-2, -1)).flatten(-2)[..., [0, 1, 3]]
-        sums.append(torch.cat([products, torch.matmul(own, change[..., half].transpose(-2, -1))[..., 0]], dim=-1))
-    return torch.stack(sums, dim=-2).double() * both[..., None]
+    for products, pulls in (
+        (torch.matmul(own, of_images).double(), torch.matmul(own, of_left).double()),
+        (whole[0][..., :2, :2], whole[1][..., :2].transpose(-2, -1)),
+    ):
+        change = pulls[..., -1] - pulls[..., 0] if pulls.shape[-1] > 1 else -2 * pulls[..., 0]
+        sums.append(torch.cat([products.flatten(-2)[..., [0, 1, 3]], change], dim=-1))
+    both = (rows.seen[:, 0] * rows.seen[:, -1])[..., None, None]
+    return torch.stack([sums[0], sums[1] - sums[0]], dim=-2) * both
 
 
-def _one_sided(length: int, like: Tensor) -> Tensor:
-    """Weights (U,) that make a sum of products over the frequencies of ``rfft`` that over the pixels (Parseval)."""
-    weight = torch.full((length // 2 + 1,), 2.0 / length, dtype=like.dtype, device=like.device)
-    weight[0] *= 0.5
+def _one_sided(spectra: Tensor, length: int) -> Tensor:
+    """Spectra (..., U) of length L, of which products summed over all frequencies are half those of the pixels.
+
+    Frequency 0, and the highest of an even length, have no partner (Parseval).
+    """
+    spectra[..., 0] *= 0.5
     if length % 2 == 0:
-        weight[-1] *= 0.5
-    return weight
+        spectra[..., -1] *= 0.5
+    return spectra
 
 
 def row_shifts(warped: Tensor, gradients: RowGradients, seen: Tensor) -> tuple[Tensor, Tensor]:
@@ -275,7 +301,7 @@ def row_shifts(warped: Tensor, gradients: RowGradients, seen: Tensor) -> tuple[T
     """
     weighted = torch.view_as_real(gradients.spectra).flatten(-2)
     seen_by = torch.matmul(torch.view_as_real(warped).flatten(-2).transpose(1, 2), weighted.transpose(-2, -1))
-    right = seen_by.transpose(1, 2).double()  # (B, G, S, 3)
+    right = 2.0 * seen_by.transpose(1, 2).double()  # (B, G, S, 3)
     share = (seen / seen.sum(1, keepdim=True).clamp(min=1.0))[..., None]
     right = seen[..., None] * ((share * right).sum(1, keepdim=True) - right)
     products = gradients.products

@@ -11,7 +11,8 @@ _BLOCK = 16
 _DIFFERENCES = 8
 _QUANTILE = 0.15
 _FEW = 8  # blocks have no quiet part
-_ROWS = {"cpu": 64}  # at a time: they stay in the cache
+_MANY = 4096  # blocks tell as much as all of a larger image
+_ROWS = 64  # at a time: they stay in the cache
 
 
 def estimate_noise(frames: Tensor) -> Tensor:
@@ -19,7 +20,7 @@ def estimate_noise(frames: Tensor) -> Tensor:
 
     The outer product of two eighth differences leaves the corner of the spectrum, where optics pass least; of its
     energy in blocks of 16 x 16 px only the quietest part is taken, where there is no texture. A scene that has texture
-    up to the corner everywhere counts as noise.
+    up to the corner everywhere counts as noise. Of large images, strips spread over all rows are asked.
 
     Args:
         frames: (..., H, W).
@@ -38,7 +39,8 @@ def estimate_noise(frames: Tensor) -> Tensor:
     inner = [extent - order for extent, order in zip(shape, orders, strict=True)]
     block = min(_BLOCK, *inner)
     height, width = (extent // block * block for extent in inner)
-    step = block * max(1, _ROWS.get(frames.device.type, height) // block)
+    step = block * max(1, _ROWS // block)
+    every = max(1, height * width // (block**2 * _MANY))
     blocks = torch.cat(
         [
             _detail(frames[..., top : min(top + step, height) + orders[0], : width + orders[1]], orders)
@@ -46,7 +48,7 @@ def estimate_noise(frames: Tensor) -> Tensor:
             .unflatten(-1, (-1, block))
             .unflatten(-3, (-1, block))
             .mean((-3, -1))
-            for top in range(0, height, step)
+            for top in range(0, height, every * step)
         ],
         dim=-2,
     ) / math.prod(math.comb(2 * order, order) for order in orders)

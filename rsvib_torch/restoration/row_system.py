@@ -183,11 +183,13 @@ class SmoothBand:
             goes, for n windows of R rows; the last b rows are 0.
         reach: Distance along the rows in px that the products of kernels reach to.
         order: Order p of the prior.
+        systems: Whether the windows are systems of their own, not parts of one.
     """
 
     left: Tensor
     reach: float
     order: int
+    systems: bool = False
 
     @property
     def width(self) -> int:
@@ -200,6 +202,11 @@ class SmoothBand:
             return self
         windows = segments.split(self.left[: segments.rows, :, 0])
         return replace(self, left=torch.cat([windows, windows.new_zeros(self.width, *windows.shape[1:])]))
+
+    def apart(self, count: int) -> "SmoothBand":
+        """The matrix of ``count`` systems of one size, one after the other and not coupled by data, as these."""
+        rows = self.left[: len(self.left) - self.width, :, 0].unflatten(0, (count, -1)).movedim(0, 2)
+        return replace(self, left=torch.cat([rows, rows.new_zeros(self.width, *rows.shape[1:])]), systems=True)
 
     def at(self, u: Tensor, precision: Tensor, out: Tensor | None = None) -> Tensor:
         """Skewed bands (R + b, 2 b + 1, n U), complex.
@@ -219,13 +226,14 @@ class SmoothBand:
         bands = product.view(*self.left.shape[:3], -1, 2)
         width, real = self.width, bands[..., 0]
         count = len(self.left) - width
+        first, last = (slice(None), slice(None)) if self.systems else (slice(1), slice(-1, None))
         for d in range(self.order + 1):
             for side in {d, -d}:
                 for k in range(1, self.order + 1 - d):
                     top = max(0, -side)
-                    real[top : top + k, width + side, 0] -= precision[d, k]
+                    real[top : top + k, width + side, first] -= precision[d, k]
                     bottom = count - max(0, side)
-                    real[bottom - k : bottom, width + side, -1] -= precision[d, k]
+                    real[bottom - k : bottom, width + side, last] -= precision[d, k]
         return torch.view_as_complex(bands).flatten(2)
 
 

@@ -12,6 +12,7 @@ __all__ = ["prior_strength"]
 _STRENGTHS = (2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 _DOUBT = 0.014  # by how much a prior half as strong has to predict better, in logarithms
 _CLEAR = 200.0  # times what the kernel between rows cannot follow: less noise hides behind that
+_FIRST = 3  # of them are nearly always enough
 _ROWS = 512  # at most, from the middle of the frames
 _FREQUENCIES = 24
 _LOWEST = 0.02  # cycles per px; the taper spreads what lies below
@@ -65,6 +66,10 @@ def prior_strength(
     certain = certain and bool(noise_power > _CLEAR * prior.blind.mean())
     strengths = [strength for strength in _STRENGTHS if certain or strength <= 1]
     reach = kernels.reach
-    precisions = [prior.precision(noise_power, strength, reach) for strength in strengths]
-    explained = sample.explain([precision[..., place] for precision in precisions])
-    return strengths[_cross_validation(explained, explained.power.new_tensor(strengths))]
+    precisions = [prior.precision(noise_power, strength, reach)[..., place] for strength in strengths]
+    tried = sample.explain(precisions[:_FIRST])
+    choice = _cross_validation(tried, tried.power.new_tensor(strengths[:_FIRST]))
+    if choice == _FIRST - 1:
+        tried = tried.joined(sample.explain(precisions[_FIRST:]))
+        choice = _cross_validation(tried, tried.power.new_tensor(strengths))
+    return strengths[choice]
