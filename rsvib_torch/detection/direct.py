@@ -12,7 +12,14 @@ from rsvib_torch.detection.leftovers import independent_fraction, slant, unexpla
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import OtherMotion
 from rsvib_torch.detection.row_groups import BLOCK, frame_groups, join_groups, measure_group, warping
-from rsvib_torch.detection.selection import find_tones, residual_of, robust_fit, significant_only, strongest_only
+from rsvib_torch.detection.selection import (
+    find_tones,
+    residual_of,
+    robust_fit,
+    shown_size,
+    significant_only,
+    strongest_only,
+)
 from rsvib_torch.detection.tones import ToneFit
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.pattern import column_pattern
@@ -60,13 +67,14 @@ def _settled(before: ToneFit, after: ToneFit) -> bool:
 
 
 def _without_runaways(measurements: Measurements, before: ToneFit, after: ToneFit) -> ToneFit:
-    """The fit without tones, but the strongest of an axis, that grow from round to round.
+    """The fit without tones, but the one of an axis that shows most, that grow from round to round.
 
-    Near a blind frequency a large tone leaves hardly an offset. What no tone explains may ask for one, and for a larger
-    one when frames were warped by it.
+    Near a blind frequency, or where the exposure fades it, a large tone leaves hardly an offset. What no tone explains
+    may ask for one, and for a larger one when frames were warped by it.
     """
     size, grown = before.coefficients.abs(), after.coefficients.abs()
-    strongest = size == size.amax(-1, keepdim=True)
+    shown = shown_size(measurements, before)
+    strongest = shown == shown.amax(-1, keepdim=True)
     running = after.active & ~strongest & (grown > _RUNAWAY * size.clamp(min=_NEAR))
     if not bool(running.any()):
         return after

@@ -13,7 +13,8 @@ BLIND = 0.1  # gain from displacement to offset that counts as half blind
 MAJORITY = 0.65  # of the measurements: outliers may be all others
 _APART = 4  # grid points: peaks nearer than half of 1 / duration are one
 _NOTHING = 1e-300  # keeps equations solvable where nothing is known
-_CHUNK = 2**22  # complex values at a time
+_CHUNK = {"cpu": 2**17}  # complex values at a time: they stay in the cache
+_LARGE_CHUNK = 2**24  # elsewhere
 _MOST_VALUES = 2**25  # responses worth computing: longer records are searched in segments
 _FUNDAMENTAL = 0.95  # of the best score: of bases with the same harmonics in reach, the highest is the simplest
 
@@ -53,7 +54,8 @@ def explained(measurements: Measurements, frequencies: Tensor, weights: Tensor) 
     drifts, both = total(drift.square()[..., None].expand_as(values)), total(drift[..., None] * values)
     prior = 0.5 * BLIND**2 * (weights * measurements.differences[:, None, :, None]).sum(2)[..., None] + _NOTHING
     scores = []
-    for chunk in frequencies.split(max(1, _CHUNK // (2 * measurements.moments.numel())), dim=-1):
+    most = _CHUNK.get(frequencies.device.type, _LARGE_CHUNK)
+    for chunk in frequencies.split(max(1, most // (2 * measurements.moments.numel())), dim=-1):
         response = tone_response(measurements, chunk)
         cosine, sine = response.real, -response.imag
         squares = (total(cosine.square()) + prior, total(cosine * sine), total(sine.square()) + prior)

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,7 +13,7 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.imaging.coupling import rows_showing
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.registration.gradients import RowGradients, row_gradients, row_shifts
-from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra
+from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra, chunks
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
@@ -65,7 +66,7 @@ def stack_spectra(frames: Tensor, valid: Tensor | None) -> RowSpectra:
         frames: The frames.
         valid: (B, T, H, W) bool, pixels that count; None for all.
     """
-    return RowSpectra(_standardised(frames, valid), valid)
+    return RowSpectra(frames, valid, *_level_and_contrast(frames, valid))
 
 
 def frame_groups(
@@ -132,26 +133,36 @@ def _unlike(paths: Tensor) -> Tensor:
     return (paths.amax(1) - paths.amin(1)).flatten(1).amax(1) > _ALIKE
 
 
-def _warped(
+def _warp(
     group: FrameGroup, timing: SensorTiming, motion: Vibration, rows: Tensor, shift: Tensor, moments: Tensor
-) -> Tensor:
-    """Frames of a group warped to the scene, (B, G, S, U), each row of a pair seen through the same kernel.
+) -> Callable[[slice], Tensor]:
+    """What warps the frames of a group to some rows of the scene, (B, G, s, U), those of a pair to the same blur.
 
     Where an exposure is long, each frame is blurred in its own way, and fine detail lies elsewhere than the mean
     displacements say. So the rows of each of two frames are blurred once more, as the other one's are: both then show
     ``K_1 K_2 f`` of the scene f. That is the mean of frames warped along the other one's path, backwards.
     """
+
+    def plain(part: slice) -> Tensor:
+        return group.spectra.warped(rows[..., part], shift[..., part])
+
     if rows.shape[1] != 2:
-        return group.spectra.warped(rows, shift)
+        return plain
     paths, weights = _paths(moments, timing, motion)
     unlike = _unlike(paths)
     if not bool(unlike.any()):
-        return group.spectra.warped(rows, shift)
-    paths = paths * unlike[:, None, None, None, None]
-    warped = torch.zeros((), dtype=group.spectra.values.dtype, device=rows.device)
-    for weight, (x, y) in zip(weights, (path.unbind(-1) for path in paths.flip(1).unbind(-2)), strict=True):
-        warped = warped + weight.to(warped.real.dtype) * group.spectra.warped(rows - y, shift - x)
-    return warped
+        return plain
+    nodes = (paths * unlike[:, None, None, None, None]).flip(1).unbind(-2)
+
+    def blurred(part: slice) -> Tensor:
+        total = torch.zeros((), dtype=group.spectra.values.dtype, device=rows.device)
+        for weight, node in zip(weights, nodes, strict=True):
+            x, y = node[:, :, part].unbind(-1)
+            warped = group.spectra.warped(rows[..., part] - y, shift[..., part] - x)
+            total = total + weight.to(warped.real.dtype) * warped
+        return total
+
+    return blurred
 
 
 def _blocks(values: Tensor) -> Tensor:
@@ -169,8 +180,15 @@ def measure_group(
     The motion's own displacement is added to what remains, so that the measurements do not depend on it to first order.
     """
     rows, shift, seen, moments = _place(group, timing, motion)
-    warped = _warped(group, timing, motion, rows, shift, moments)
-    gradients = gradients or row_gradients(group.spectra, warped, rows, shift, seen)
+    warp = _warp(group, timing, motion, rows, shift, moments)
+    if gradients is None:
+        whole = warp(slice(None))
+        gradients = row_gradients(group.spectra, whole, rows, shift, seen)
+        warped: Iterable[Tensor] = [whole]
+    else:
+        values = group.spectra.values
+        runs = chunks(rows.shape[-1], 2 * values.element_size() * values[:, :, 0].numel(), 1, values.device)
+        warped = (warp(run) for run in runs)  # each is forgotten while it is still in the cache
     matrix, right = row_shifts(warped, gradients, seen)
     matrix = _blocks(matrix[:, None]).sum(3)[:, 0]  # (B, N, 2, 2)
     right = _blocks(right).sum(3)  # (B, G, N, 2)
@@ -215,14 +233,18 @@ def measure_groups(groups: list[FrameGroup], timing: SensorTiming, motion: Vibra
     return join_groups([measure_group(group, timing, motion, None)[0] for group in groups])
 
 
-def _standardised(frames: Tensor, valid: Tensor | None) -> Tensor:
-    """Frames of mean 0 and variance 1: brightness and contrast may differ from frame to frame."""
+def _level_and_contrast(frames: Tensor, valid: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation (B, T, 1, 1) of the pixels of each frame that count."""
     if valid is None:
-        centred = frames - frames.mean((-2, -1), keepdim=True)
-        size = torch.linalg.vector_norm(centred, dim=(-2, -1), keepdim=True)
-        return centred.mul_(math.sqrt(frames[0, 0].numel()) / size)
-    weight = valid.to(frames.dtype)
-    count = weight.sum((-2, -1), keepdim=True)
-    centred = frames - (frames * weight).sum((-2, -1), keepdim=True) / count
-    variance = (centred.square() * weight).sum((-2, -1), keepdim=True) / count
-    return centred * variance.rsqrt()
+        weight, level = None, frames.mean((-2, -1), keepdim=True)
+        count = level.new_tensor(frames[0, 0].numel())
+    else:
+        weight = valid.to(frames.dtype)
+        count = weight.sum((-2, -1), keepdim=True)
+        level = (frames * weight).sum((-2, -1), keepdim=True) / count
+    square = torch.zeros_like(level)
+    for part in chunks(frames.shape[-2], 2 * frames.element_size() * frames[..., 0, :].numel(), 1, frames.device):
+        centred = frames[..., part, :] - level
+        centred = centred if weight is None else centred.mul_(weight[..., part, :])
+        square += centred.square_().sum((-2, -1), keepdim=True)
+    return level, (square / count).sqrt()

@@ -11,7 +11,7 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.periodogram import BLIND, MAJORITY, strongest_frequencies
 from rsvib_torch.detection.tones import MotionModel, ToneFit, model_displacements, tone_response
 
-__all__ = ["MAX_TONES", "find_tones", "residual_of", "robust_fit", "significant_only", "strongest_only"]
+__all__ = ["MAX_TONES", "find_tones", "residual_of", "robust_fit", "shown_size", "significant_only", "strongest_only"]
 
 MAX_TONES = 4
 _FADED = 0.1  # of its amplitude is all that an exposure leaves of a tone
@@ -156,6 +156,12 @@ def _sighted(measurements: Measurements, frequencies: Tensor) -> Tensor:
     return gain / (gain + BLIND**2) * shown
 
 
+def shown_size(measurements: Measurements, fit: ToneFit) -> Tensor:
+    """Root-mean-square displacement (B, 2, K) in px that the record sees of each tone: next to none of a blind one."""
+    seen = tone_response(measurements, fit.frequencies).abs().square().mean((1, 2)).sqrt()
+    return torch.where(fit.active, fit.coefficients.abs() * seen, 0.0)
+
+
 def residual_of(measurements: Measurements, fit: ToneFit) -> Tensor:
     """Displacements (B, N, G, 2) that a fit leaves."""
     return measurements.relative(measurements.displacements - model_displacements(measurements, fit))
@@ -199,6 +205,12 @@ def find_tones(
     left = None if start is None else residual_of(measurements, start)
     fit, weighed = robust_fit(measurements, known, first, model, left)
     parameters = 2 * model.harmonics + 1
+
+    def not_invented(trial: ToneFit) -> Tensor:
+        """(B, 2) whether the last tone may stand: what the record hardly sees may be refused, but not beside others."""
+        sighted = _sighted(measurements, trial.frequencies[..., -model.harmonics :]) > 0.5
+        return sighted if keep.shape[-1] > 0 else torch.ones_like(sighted)
+
     going = torch.ones_like(none[..., 0])  # an axis that stopped stays stopped
     for _ in range(keep.shape[-1] // model.harmonics, MAX_TONES if tones is None else tones):
         active = torch.cat([keep, going[..., None].expand_as(none)], -1)
@@ -225,15 +237,14 @@ def find_tones(
             spare = (measurements.known - parameters * active.sum(-1) // model.harmonics - 1).clamp(min=1.0)
             statistic = (before - after) / parameters / (after / spare).clamp(min=1e-300)
             accepted = going & (statistic > _F_THRESHOLD) & (before - after > least_gain * before)
-            accepted = accepted & _resolved(measurements, trial)
-            if keep.shape[-1] > 0:  # what the record hardly sees may be refused, but is not invented beside others
-                accepted = accepted & (_sighted(measurements, trial.frequencies[..., -model.harmonics :]) > 0.5)
-            if not bool(accepted.any()):
-                break
-            if not bool((accepted == going).all()):
+            accepted = accepted & _resolved(measurements, trial) & not_invented(trial)
+            while bool(accepted.any()) and not bool((accepted == going).all()):
+                going = accepted
                 active = torch.cat([keep, accepted[..., None].expand_as(none)], -1)
                 trial, trial_weighed = robust_fit(measurements, trial.frequencies, active, model)
-            going = accepted
+                accepted = accepted & not_invented(trial)
+            if not bool(accepted.any()):
+                break
         fit, weighed = trial, trial_weighed
         keep = fit.active
     return fit if blind is None or tones is not None else _with_blind_tones(measurements, weighed, fit, blind)

@@ -8,13 +8,14 @@ Cramer-Rao bound.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.registration.row_spectra import RowSpectra, combined, inner_columns, mean_over_frames, row_chunks
+from rsvib_torch.registration.row_spectra import RowSpectra, chunks, combined, inner_columns, mean_over_frames
 
 __all__ = ["RowGradients", "row_gradients", "row_shifts"]
 
@@ -77,7 +78,7 @@ def _smoothed(spectrum: Tensor, columns: int) -> Tensor:
     """Mean power (B, S / 16, U / columns) of blocks of a spectrum (B, S, U), up to a factor."""
     parts = torch.view_as_real(spectrum).flatten(-2)
     rows = []
-    for part in row_chunks(parts.shape[1], 4 * parts.shape[2] * len(parts), _SMOOTH, parts.device):
+    for part in chunks(parts.shape[1], 4 * parts.shape[2] * len(parts), _SMOOTH, parts.device):
         power = parts[:, part].square()
         whole = power.shape[1] // _SMOOTH * _SMOOTH
         rows.append(power[:, :whole].unflatten(1, (-1, _SMOOTH)).mean(2))
@@ -86,12 +87,12 @@ def _smoothed(spectrum: Tensor, columns: int) -> Tensor:
     return functional.avg_pool1d(torch.cat(rows, 1), 2 * columns, ceil_mode=True)
 
 
-def _scene(warped: Tensor, mean: Tensor, seen: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+def _scene(warped: Tensor, seen: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     """Detail of the scene and its gradient across rows, (B, S, U) each, from the mean of the frames."""
-    v = torch.fft.fftfreq(mean.shape[-2], dtype=torch.float64, device=u.device)
-    whole = torch.fft.fft(mean, dim=-2)
-    share = _wiener(whole, torch.fft.fft(_noise_of_mean(warped[..., ::_SOME], seen), dim=-2), u, v)
-    torch.view_as_real(whole).mul_(share[..., None])
+    v = torch.fft.fftfreq(warped.shape[-2], dtype=torch.float64, device=u.device)
+    whole = torch.fft.fft(mean_over_frames(warped, seen), dim=-2)
+    noise = torch.fft.fft(_noise_of_mean(warped[..., ::_SOME], seen), dim=-2)
+    torch.view_as_real(whole).mul_(_wiener(whole, noise, u, v)[..., None])
     detail = torch.fft.ifft(whole, dim=-2)
     whole *= (2j * math.pi * v).to(whole.dtype)[:, None]
     return detail, torch.fft.ifft(whole, dim=-2)
@@ -140,10 +141,9 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
         The gradients.
     """
     length, width = spectra.length, spectra.width
-    mean = mean_over_frames(warped, seen)
-    detail, across = _scene(warped, mean, seen, spectra.frequencies)
-    along = (2j * math.pi * spectra.frequencies).to(mean.dtype)
-    inner = functional.pad(inner_columns(width, shift, mean.real), (0, length - width))
+    detail, across = _scene(warped, seen, spectra.frequencies)
+    along = (2j * math.pi * spectra.frequencies).to(warped.dtype)
+    inner = functional.pad(inner_columns(width, shift, warped.real), (0, length - width))
     valid = spectra.warped_valid(rows, shift)
 
     def pixels(part: slice) -> _Rows:
@@ -151,7 +151,8 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
         images = torch.fft.irfft(torch.stack([own * along, across[:, part], own], dim=2), n=length)
         visible = seen[:, :, part]
         frames = slice(1) if seen.shape[1] == 2 else slice(None)
-        difference = (warped[:, frames, part] - mean[:, None, part]).transpose(1, 2)
+        mean = mean_over_frames(warped[:, :, part], visible)
+        difference = (warped[:, frames, part] - mean[:, None]).transpose(1, 2)
         residual = torch.fft.irfft(difference, n=length)
         residual *= visible[:, frames].transpose(1, 2)[..., None].to(residual.dtype)
         weight = inner * (visible.sum(1) > 1)[..., None].to(inner.dtype)
@@ -159,8 +160,10 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
             weight = weight * functional.pad(valid[:, part], (0, length - width))
         return _Rows(images, residual, weight, visible)
 
-    parts = row_chunks(rows.shape[-1], 4 * length * len(rows) * (8 + 2 * rows.shape[1]), _BLOCK, rows.device)
-    transforms = mean.new_empty(*mean.shape[:2], 3, mean.shape[-1])  # memory is dear: nothing of this size is moved
+    parts = chunks(rows.shape[-1], 4 * length * len(rows) * (8 + 2 * rows.shape[1]), _BLOCK, rows.device)
+    transforms = warped.new_empty(
+        *detail.shape[:2], 3, detail.shape[-1]
+    )  # memory is dear: nothing of this size is moved
     results, energies = [], []
     for part in parts:
         some = pixels(part)
@@ -286,11 +289,12 @@ def _one_sided(spectra: Tensor, length: int) -> Tensor:
     return spectra
 
 
-def row_shifts(warped: Tensor, gradients: RowGradients, seen: Tensor) -> tuple[Tensor, Tensor]:
+def row_shifts(warped: Iterable[Tensor], gradients: RowGradients, seen: Tensor) -> tuple[Tensor, Tensor]:
     """Normal equations of the displacement that every row still misses in each frame.
 
     Args:
-        warped: (B, G, S, U) rows of a group of frames warped to the scene, from ``RowSpectra.warped``.
+        warped: Rows (B, G, s, U) of a group of frames warped to the scene, from ``RowSpectra.warped``: S rows in all,
+            one run of them after the other.
         gradients: Gradients of the scene, from this motion or one near to it.
         seen: (B, G, S) float64, 1 where a frame sees the row.
 
@@ -299,9 +303,12 @@ def row_shifts(warped: Tensor, gradients: RowGradients, seen: Tensor) -> tuple[T
         in px relative to the mean over the group, the matrix its inverse covariance in one frame. Both are 0 for rows
         that fewer than two frames see or that have no detail.
     """
-    weighted = torch.view_as_real(gradients.spectra).flatten(-2)
-    seen_by = torch.matmul(torch.view_as_real(warped).flatten(-2).transpose(1, 2), weighted.transpose(-2, -1))
-    right = 2.0 * seen_by.transpose(1, 2).double()  # (B, G, S, 3)
+    weighted, parts, first = torch.view_as_real(gradients.spectra).flatten(-2), [], 0
+    for run in warped:
+        own = weighted[:, first : first + run.shape[2]]
+        parts.append(torch.matmul(torch.view_as_real(run).flatten(-2).transpose(1, 2), own.transpose(-2, -1)))
+        first += run.shape[2]
+    right = 2.0 * torch.cat(parts, 1).transpose(1, 2).double()  # (B, G, S, 3)
     share = (seen / seen.sum(1, keepdim=True).clamp(min=1.0))[..., None]
     right = seen[..., None] * ((share * right).sum(1, keepdim=True) - right)
     products = gradients.products

@@ -10,7 +10,7 @@ from torch.nn import functional
 from rsvib_torch.spectral import extend_rows, fast_length, shift_phases
 from rsvib_torch.splines import bspline_coefficient_rows, bspline_weights
 
-__all__ = ["DEGREE", "MARGIN", "RowSpectra", "combined", "inner_columns", "mean_over_frames", "row_chunks"]
+__all__ = ["DEGREE", "MARGIN", "RowSpectra", "chunks", "combined", "inner_columns", "mean_over_frames"]
 
 DEGREE = 7  # of the spline across rows: what it smooths, and the noise it colours, lie above the pass band
 MARGIN = 8  # px from the ends of rows and columns that do not count
@@ -19,10 +19,10 @@ _CHUNK = {"cpu": 2**23}  # bytes that stay in a cache
 _LARGE_CHUNK = 2**30  # bytes at a time elsewhere
 
 
-def row_chunks(num_rows: int, bytes_per_row: int, multiple: int, device: torch.device) -> list[slice]:
-    """Slices of consecutive rows, a multiple of ``multiple`` each, that are worked on at a time."""
-    size = max(1, _CHUNK.get(device.type, _LARGE_CHUNK) // (bytes_per_row * multiple)) * multiple
-    return [slice(first, min(first + size, num_rows)) for first in range(0, num_rows, size)]
+def chunks(count: int, bytes_of_one: int, multiple: int, device: torch.device) -> list[slice]:
+    """Slices of consecutive rows or columns, a multiple of ``multiple`` each, that are worked on at a time."""
+    size = max(1, _CHUNK.get(device.type, _LARGE_CHUNK) // (bytes_of_one * multiple)) * multiple
+    return [slice(first, min(first + size, count)) for first in range(0, count, size)]
 
 
 class RowSpectra:
@@ -31,14 +31,24 @@ class RowSpectra:
     Args:
         frames: (B, T, H, W) in row order.
         valid: (B, T, H, W) bool, pixels that count; None for all.
+        level: (B, T, 1, 1) to take off each frame.
+        contrast: (B, T, 1, 1) to divide what is left by.
     """
 
-    def __init__(self, frames: Tensor, valid: Tensor | None = None) -> None:
+    def __init__(
+        self,
+        frames: Tensor,
+        valid: Tensor | None = None,
+        level: Tensor | float = 0.0,
+        contrast: Tensor | float = 1.0,
+    ) -> None:
         self.height, self.width = frames.shape[-2:]
         self.length = fast_length(self.width + 2 * _EXTENSION)
         self.values = frames.new_empty(*frames.shape[:-1], self.length // 2 + 1, dtype=frames.dtype.to_complex())
         for rows, coefficients in bspline_coefficient_rows(frames, DEGREE):
-            self.values[..., rows, :] = torch.fft.rfft(extend_rows(coefficients, self.length))
+            standard = coefficients.sub_(level).div_(contrast)
+            self.values[..., rows, :] = torch.fft.rfft(extend_rows(standard, self.length))
+        self._point_at_rows()
         self.frequencies = torch.fft.rfftfreq(self.length, dtype=torch.float64, device=frames.device)
         self.valid = None
         if valid is not None and not bool(valid.all()):
@@ -46,28 +56,31 @@ class RowSpectra:
             spoilt = functional.max_pool2d((~valid).to(frames.dtype), 2 * (DEGREE // 2) + 1, 1, DEGREE // 2)
             self.valid = spoilt == 0
 
+    def _point_at_rows(self) -> None:
+        """All rows of all frames one after the other, and the first of each frame, which parts share."""
+        frames = self.values.shape[:2]
+        self._all_rows = torch.view_as_real(self.values).view(-1, 2 * self.values.shape[-1])
+        self._first_rows = self.height * torch.arange(frames.numel(), device=self.values.device).view(frames)
+
     def part(self, frames: slice) -> "RowSpectra":
         """Those of some of the frames."""
         part = copy(self)
-        part.values = self.values[:, frames]
+        part.values, part._first_rows = self.values[:, frames], self._first_rows[:, frames]
         part.valid = None if self.valid is None else self.valid[:, frames]
         return part
 
     def warped(self, rows: Tensor, shift: Tensor) -> Tensor:
         """Spectra (B, T, S, U) of frame rows at fractional places ``rows``, moved back by ``shift``, both (B, T, S)."""
-        values = self.values
         cell = rows.floor()
-        weights = bspline_weights(rows - cell, DEGREE).to(values.real.dtype)
+        weights = bspline_weights(rows - cell, DEGREE).to(self._all_rows.dtype)
         first = cell.to(torch.int64) - DEGREE // 2
         taps = torch.arange(DEGREE + 1, device=rows.device)
-        frame = torch.arange(values[..., 0, 0].numel(), device=rows.device).reshape(values.shape[:2])
-        index = frame[..., None, None] * self.height + (first[..., None] + taps).clamp(0, self.height - 1)
-        flat = torch.view_as_real(values).reshape(-1, 2 * values.shape[-1])
+        index = self._first_rows[..., None, None] + (first[..., None] + taps).clamp(0, self.height - 1)
         picked = functional.embedding_bag(
-            index.flatten(0, 2), flat, per_sample_weights=weights.flatten(0, 2), mode="sum"
+            index.flatten(0, 2), self._all_rows, per_sample_weights=weights.flatten(0, 2), mode="sum"
         )
         result: Tensor = torch.view_as_complex(picked.unflatten(-1, (-1, 2))).unflatten(0, rows.shape)
-        for part in row_chunks(rows.shape[-1], 8 * result[..., 0, :].numel(), 1, rows.device):
+        for part in chunks(rows.shape[-1], 8 * result[..., 0, :].numel(), 1, rows.device):
             result[..., part, :] *= self.ramp(shift[..., part])
         return result
 
@@ -76,8 +89,9 @@ class RowSpectra:
         return shift_phases(shift, self.length, slice(0, len(self.frequencies)), self.values.dtype)
 
     def subtract(self, pattern: Tensor) -> None:
-        """Take a pattern (B, U) out of every row of every frame."""
+        """Take a pattern (B, U) out of every row of these frames; those of other parts stay as they are."""
         self.values = self.values - pattern[:, None, None].to(self.values.dtype)
+        self._point_at_rows()
 
     def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None:
         """(B, S, W) bool, pixels of the scene that count in all frames; None for all."""

@@ -133,10 +133,9 @@ def restore_exact(
     lost = ignore if clipped is None else clipped if ignore is None else ignore | clipped
     levels = _noise_levels(frames, motion, noise)
     mean = frames.mean((1, 3, 4), keepdim=True)  # the prior is for deviations from it
-    data = continue_rows(frames, length).sub_(mean)
     starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device)).expand(B, T, H)
     displacement, node_weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
-    restored = []
+    restored = frames.new_empty(B, len(groups), *frames.shape[2:])
     for stack in range(B):
         weights = levels[stack].square().reciprocal()
         typical = weights.mean().reciprocal()
@@ -152,10 +151,11 @@ def restore_exact(
         chosen = system(members, reference)
         strength = prior_strength(frames[stack, members], chosen, row_prior, typical * length, certain=certain)
         precision = row_prior.precision(typical * length, factor * strength, chosen.reach)
-        for members, reference in groups:
+        for place, (members, reference) in enumerate(groups):
             kernels = system(members, reference)
             along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
-            problem = SceneProblem(data[stack, members], kernels, precision, typical.sqrt(), partition)
+            data = continue_rows(frames[stack, members], length).sub_(mean[stack])
+            problem = SceneProblem(data, kernels, precision, typical.sqrt(), partition)
             hidden = None if lost is None else lost[stack, members]
             ends = kernels.reach > _LONG
             if hidden is None and ends and not bool(along.any()):
@@ -166,9 +166,8 @@ def restore_exact(
                 if measured is not None:
                     problem = replace(problem, data=fill_unmeasured(problem, measured, floor))
             scene = _restore_group(problem, factor if prior == "edges" else None)[..., :W]
-            restored.append(scene + mean[stack, 0])
-    stacked: Tensor = torch.stack(restored).unflatten(0, (B, len(groups)))
-    return stacked
+            restored[stack, place] = scene + mean[stack, 0]
+    return restored
 
 
 def _noise_levels(frames: Tensor, motion: FrameMotion, noise: float | Literal["auto"]) -> Tensor:

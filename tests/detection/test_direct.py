@@ -150,7 +150,7 @@ def test_rows_tell_a_known_shift(remaining, num_frames):
     expected = remaining * (torch.arange(num_frames) - (num_frames - 1) / 2)
 
     def told(shift):
-        matrix, right = row_shifts(spectra.warped(rows, shift), gradients, seen)
+        matrix, right = row_shifts([spectra.warped(rows, shift)], gradients, seen)
         known = matrix[0, :, 0, 0] > 0
         assert known.tolist() == seen[0, 0].bool().tolist()
         total, sums = matrix[0].sum(0), right[0].sum(1)
