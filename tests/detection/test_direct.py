@@ -131,6 +131,25 @@ def test_still_camera_and_blind_frequency_are_refused(paper_camera):
     assert result.vibration.frequency[1, 0].item() == pytest.approx(90.0, rel=2e-3)
 
 
+def test_parts_of_a_batch_are_warped_like_the_whole():
+    frames = torch.rand(3, 5, 40, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    spectra = RowSpectra(frames, level=0.5 * torch.ones(3, 5, 1, 1), contrast=2.0 * torch.ones(3, 5, 1, 1))
+    rows = 8 + 20 * torch.rand(3, 5, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    shift = rows.sin()
+    whole, part = spectra.warped(rows, shift), spectra.part(slice(1, 4))
+    torch.testing.assert_close(part.warped(rows[:, 1:4], shift[:, 1:4]), whole[:, 1:4])
+    pattern = torch.rand(3, whole.shape[-1], generator=torch.Generator().manual_seed(4)).to(whole.dtype)
+    part.subtract(pattern)
+    # it stands at the same columns of all rows, which are moved
+    expected = whole[:, 1:4] - pattern[:, None, None] * spectra.ramp(shift[:, 1:4])
+    torch.testing.assert_close(part.warped(rows[:, 1:4], shift[:, 1:4]), expected)
+    torch.testing.assert_close(spectra.warped(rows, shift), whole)
+    # rows where they are: the frames themselves, standardised, within what single rows are continued by
+    there = torch.arange(12, 28, dtype=torch.float64).expand(3, 5, -1)
+    own = torch.fft.irfft(spectra.warped(there, torch.zeros_like(there)), n=spectra.length)[..., :64]
+    torch.testing.assert_close(own, (frames[:, :, 12:28] - 0.5) / 2, rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("remaining", [0.0, 0.05, -0.3])
 @pytest.mark.parametrize("num_frames", [2, 3])
 def test_rows_tell_a_known_shift(remaining, num_frames):
@@ -150,7 +169,9 @@ def test_rows_tell_a_known_shift(remaining, num_frames):
     expected = remaining * (torch.arange(num_frames) - (num_frames - 1) / 2)
 
     def told(shift):
-        matrix, right = row_shifts([spectra.warped(rows, shift)], gradients, seen)
+        runs = (slice(0, 40), slice(40, 96))
+        warped = (spectra.warped(rows[..., run], shift[..., run]) for run in runs)
+        matrix, right = row_shifts(warped, gradients, seen)
         known = matrix[0, :, 0, 0] > 0
         assert known.tolist() == seen[0, 0].bool().tolist()
         total, sums = matrix[0].sum(0), right[0].sum(1)

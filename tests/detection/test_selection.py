@@ -1,11 +1,12 @@
 """Which tones are found, and how carefully they are searched."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from rsvib_torch.detection import selection
+from rsvib_torch.detection import direct, selection
 from rsvib_torch.detection.measurements import Measurements
 
 ROWS, ROW_TIME, FRAME_PERIOD = 120, 16 * 20.52e-6, 2048 * 20.52e-6
@@ -47,3 +48,42 @@ def test_stretches_are_left_out_only_where_rows_are_disturbed(monkeypatch):
     for index, fit in enumerate(alone):
         torch.testing.assert_close(together.frequencies[index], fit.frequencies[0], rtol=1e-9, atol=0)
         torch.testing.assert_close(together.coefficients[index], fit.coefficients[0], rtol=1e-7, atol=0)
+
+
+def test_tones_without_hope_are_not_fitted_to_the_end(monkeypatch):
+    """The next candidate explains nothing, or just enough, of what is left."""
+    generator = torch.Generator().manual_seed(4)
+    fitted = []
+    robust_fit = selection.robust_fit
+    monkeypatch.setattr(
+        selection, "robust_fit", lambda *given, **named: fitted.append(1) or robust_fit(*given, **named)
+    )
+    one = measured(offsets_of([3.1, 5.2], [50.0, 30.0], generator))
+    weak = torch.cat([offsets_of([0.006, 0.005], [88.0, 79.0], generator)])
+    two = measured(one.displacements[:, :, 1] - one.displacements[:, :, 0] + weak)
+    for measurements, tones, fits in ((one, 1, 2), (two, 2, 3)):
+        fitted.clear()
+        fit = selection.find_tones(measurements, ROW_TIME)
+        assert fit.active.sum(-1).tolist() == [[tones, tones]]
+        assert len(fitted) == fits  # without tones, and once for each that is there
+    assert fit.frequencies[0, :, 1].tolist() == pytest.approx([88.0, 79.0], rel=0.02)
+
+
+def test_a_tone_that_the_exposure_fades_does_not_outweigh_one_that_shows():
+    """It is larger than the true one from the start, and grows; 121.8 Hz leave nothing in an exposure of 400 rows."""
+    exposure = 400 * 20.52e-6
+    starts = (torch.arange(ROWS, dtype=torch.float64) * ROW_TIME).expand(1, -1)
+    offsets = offsets_of([3.1, 5.2], [50.0, 30.0], torch.Generator().manual_seed(5))
+    information = torch.eye(2, dtype=torch.float64).expand(1, ROWS, 2, 2)
+    measurements = Measurements.of_pairs(starts, starts + FRAME_PERIOD, offsets, information, exposure)
+    frequencies = torch.tensor([[[50.0, 121.9], [30.0, 121.9]]], dtype=torch.float64)
+    active = torch.tensor([[[True, True], [True, False]]])
+    fit, _ = selection.robust_fit(measurements, frequencies, active, selection.MotionModel())
+    before = replace(fit, coefficients=torch.tensor([[[3.1, 6.0], [5.2, 0.0]]], dtype=torch.complex128))
+    after = replace(before, coefficients=torch.tensor([[[3.0, 600.0], [5.2, 0.0]]], dtype=torch.complex128))
+    shown = selection.shown_size(measurements, before)
+    assert shown[0, 0, 1] < 0.1 * shown[0, 0, 0]
+    kept = direct._without_runaways(measurements, before, after)
+    assert kept.active.tolist() == [[[True, False], [True, False]]]
+    doubled = replace(before, coefficients=torch.tensor([[[5.0, 6.0], [5.2, 0.0]]], dtype=torch.complex128))
+    assert direct._without_runaways(measurements, before, doubled) is doubled

@@ -17,10 +17,18 @@ def levels(frames, motion):
     return noise_levels(torch.as_tensor(frames)[:, None], rowwise, 0)
 
 
-@pytest.mark.parametrize("shape", [(512, 512), (300, 64), (64, 64)])
+@pytest.mark.parametrize("shape", [(512, 512), (300, 64), (64, 64), (1300, 1500)])
 def test_white_noise_is_measured(shape):
     noise = 0.03 * torch.randn(16, *shape, generator=torch.Generator().manual_seed(0))
     assert estimate_noise(noise).square().mean().sqrt().item() == pytest.approx(0.03, rel=0.08)
+
+
+@pytest.mark.parametrize("quiet", [slice(None, 1000), slice(500, 1500), slice(-1000, None)])
+def test_quiet_parts_of_large_images_are_found_wherever_they_are(quiet):
+    generator = torch.Generator().manual_seed(3)
+    image = 0.2 * torch.rand(2000, 1400, generator=generator)
+    image[quiet] = 0.01 * torch.randn(1000, 1400, generator=generator)
+    assert estimate_noise(image).item() == pytest.approx(0.01, rel=0.12)
 
 
 @pytest.mark.parametrize("image_motion", [(0.0, 0.0), (600.0, -400.0)])

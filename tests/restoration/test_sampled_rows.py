@@ -1,0 +1,118 @@
+"""How a sample of rows tells what a prior predicts: slabs side by side, each as if there were no other."""
+
+import numpy as np
+import pytest
+import torch
+from truth import Motion, draw_scene, take_frames
+
+from rsvib_torch import SensorTiming
+from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.restoration import sampled_rows, strength
+from rsvib_torch.restoration.motion import as_batch, frame_motion
+from rsvib_torch.restoration.prior import fit_prior
+from rsvib_torch.restoration.row_system import row_kernels
+from rsvib_torch.restoration.sampled_rows import Explained, sample_rows
+
+NUM_ROWS, WIDTH, NOISE = 264, 240, 0.005
+
+
+@pytest.fixture(scope="module", params=[20, 200])
+def taken(request):
+    """Two frames (2, 1, R, W), their kernels, frequencies, and the products of a prior at these."""
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=request.param, frame_rows=2048)
+    clean = take_frames(draw_scene(NUM_ROWS + 80, WIDTH + 80, 3), timing, Motion(), 2, samples=16)
+    noise = NOISE * np.random.default_rng(2).standard_normal(clean.shape)
+    frames = torch.from_numpy(clean + noise).float()[:, None]
+    motion = frame_motion(as_batch(Motion().vibration(), 1), timing, 2, NUM_ROWS)
+    starts = motion.row_starts(torch.arange(NUM_ROWS, dtype=torch.float64))
+    displacement, weights = exposure_trajectory(motion.vibration[0], starts, timing, "gauss")
+    kernels = row_kernels(displacement, weights, torch.ones(2), NUM_ROWS, 16)
+    prior = fit_prior(frames, motion, 0, torch.full((2,), NOISE), WIDTH)
+    chosen = torch.arange(8, 120, 8)
+    precision = prior.precision(torch.tensor(NOISE**2 * WIDTH), 1.0, kernels.reach)[..., chosen]
+    assert frames.shape == (2, 1, NUM_ROWS, WIDTH)
+    return frames, kernels, chosen, precision
+
+
+def dense(frames, kernels, u, products, rows):
+    """Power and freedom at one frequency of one slab, from whole matrices."""
+    part = kernels.rows(rows.start, rows.stop - rows.start)
+    taper = np.hanning(frames.shape[-1] + 2)[1:-1]
+    waves = np.exp(-2j * np.pi * u * np.arange(frames.shape[-1]))
+    lines = frames[:, 0, rows].double().numpy()
+    data = ((lines - frames.double().mean((-2, -1), keepdim=True)[:, 0].numpy()) * taper) @ waves
+    data = (data * np.exp(2j * np.pi * u * part.middle.numpy())).ravel()
+    taps = part.at(torch.tensor([u], dtype=torch.float64))[..., 0].flatten(0, 1).numpy()
+    first = part.first.flatten().numpy()
+    count = first.max() - first.min() + taps.shape[1]
+    matrix = np.zeros((len(data), count), dtype=complex)
+    for row, (begin, kernel) in enumerate(zip(first - first.min(), taps, strict=True)):
+        matrix[row, begin : begin + len(kernel)] = kernel
+    # the precision of a stationary model: rows near either end have fewer neighbours
+    penalty = np.zeros((count, count))
+    for row in range(count):
+        for lag in range(min(3, count - row)):
+            inner = min(row, count - 1 - row - lag, 2 - lag) + 1
+            penalty[row, row + lag] = penalty[row + lag, row] = products[lag, :inner].sum()
+    seen = matrix.conj().T @ matrix
+    inverse = np.linalg.inv(seen + penalty)
+    left = data - matrix @ (inverse @ (matrix.conj().T @ data))
+    followed = np.linalg.solve(seen + 1.2**0.5 * penalty, seen)  # the middle of the step that its derivative takes
+    return np.square(np.abs(left)).sum() / np.square(taper).sum(), np.trace(followed).real
+
+
+@pytest.mark.parametrize("slab", [1000, 128, 80])
+def test_slabs_are_explained_each_by_itself(taken, monkeypatch, slab):
+    frames, kernels, chosen, precision = taken
+    monkeypatch.setattr(sampled_rows, "_SLAB", slab)
+    found = sample_rows(frames, kernels, chosen).explain([precision, 0.25 * precision])
+    number = max(1, NUM_ROWS // slab)
+    height = NUM_ROWS // number
+    assert found.count == 2 * number * height
+    for place in (1, 6, 13):
+        for index, factor in enumerate((1.0, 0.25)):
+            products = factor * precision[..., place].double().numpy()
+            power, freedom = np.sum(
+                [
+                    dense(frames, kernels, float(chosen[place]) / WIDTH, products, slice(k * height, (k + 1) * height))
+                    for k in range(number)
+                ],
+                axis=0,
+            )
+            assert found.power[index, place].item() == pytest.approx(power, rel=0.01)
+            # its own is a derivative over a step of a fifth
+            assert found.freedom[index, place].item() == pytest.approx(freedom, rel=0.03)
+
+
+def test_weak_priors_are_tried_only_where_they_may_be_wanted(monkeypatch):
+    tried = []
+
+    class Sample:
+        def explain(self, precisions):
+            tried.append(len(precisions))
+            begin = sum(tried[:-1])
+            errors = torch.tensor(self.errors[begin : begin + len(precisions)], dtype=torch.float64)[:, None]
+            return Explained(errors.exp(), torch.zeros_like(errors), 100)
+
+    class Prior:
+        power, blind = torch.ones(65), torch.full((65,), 1e-9)
+
+        def precision(self, noise_power, factor, reach):
+            return torch.zeros(3, 3, 65)
+
+    class Kernels:
+        reach = 0.0
+
+        def rows(self, top, count):
+            return self
+
+    sample = Sample()
+    monkeypatch.setattr(strength, "sample_rows", lambda *arguments: sample)
+    for errors, expected, calls in (
+        ([0.3, 0.0, 0.2, 0.5, 0.7, 0.9, 1.0], 1.0, [3]),
+        ([0.9, 0.8, 0.6, 0.4, 0.1, 0.3, 0.5], 0.12, [3, 4]),
+    ):
+        tried.clear()
+        sample.errors = errors
+        chosen = strength.prior_strength(torch.zeros(1, 1, 128, 128), Kernels(), Prior(), torch.tensor(1.0))
+        assert (chosen, tried) == (expected, calls)
