@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.spectral import extend_rows, fast_length, shift_phases
+from rsvib_torch.spectral import extend_rows, fast_length, gathered, shift_phases
 from rsvib_torch.splines import bspline_coefficient_rows, bspline_weights
 
 __all__ = ["DEGREE", "MARGIN", "RowSpectra", "chunks", "combined", "inner_columns", "mean_over_frames"]
@@ -44,10 +44,11 @@ class RowSpectra:
     ) -> None:
         self.height, self.width = frames.shape[-2:]
         self.length = fast_length(self.width + 2 * _EXTENSION)
-        self.values = frames.new_empty(*frames.shape[:-1], self.length // 2 + 1, dtype=frames.dtype.to_complex())
-        for rows, coefficients in bspline_coefficient_rows(frames, DEGREE):
-            standard = coefficients.sub_(level).div_(contrast)
-            self.values[..., rows, :] = torch.fft.rfft(extend_rows(standard, self.length))
+        pieces = (
+            (rows, torch.fft.rfft(extend_rows(coefficients.sub_(level).div_(contrast), self.length)))
+            for rows, coefficients in bspline_coefficient_rows(frames, DEGREE)
+        )
+        self.values = gathered(pieces, self.height, frames.ndim - 2)
         self._point_at_rows()
         self.frequencies = torch.fft.rfftfreq(self.length, dtype=torch.float64, device=frames.device)
         self.valid = None

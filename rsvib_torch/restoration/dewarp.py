@@ -6,9 +6,9 @@ from torch.nn.functional import embedding_bag
 
 from rsvib_torch.checks import check_whole_number
 from rsvib_torch.restoration.motion import FrameMotion
-from rsvib_torch.restoration.rows import continue_rows
-from rsvib_torch.spectral import fast_length, shift_phases
-from rsvib_torch.splines import bspline_coefficients, bspline_weights, mirrored_index
+from rsvib_torch.restoration.rows import spline_spectra
+from rsvib_torch.spectral import fast_length, gathered, shift_phases
+from rsvib_torch.splines import bspline_weights, mirrored_index
 
 __all__ = ["restore_dewarp"]
 
@@ -38,7 +38,7 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 256
     rows = rows.flatten(0, 1)
 
     length = fast_length(W + 4 * (_MARGIN + motion.reach(H)))
-    spectra = torch.fft.rfft(continue_rows(bspline_coefficients(frames, _DEGREE, -2), length))
+    spectra = spline_spectra(frames, _DEGREE, length)
     count = spectra.shape[-1]
     cell = rows.detach().floor()
     weights = bspline_weights(rows - cell, _DEGREE).to(frames.dtype)
@@ -49,14 +49,16 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 256
     taps = taps + image * H
     # one row after the other, all channels in it
     flat = torch.view_as_real(spectra.movedim(2, 3)).reshape(B * T * H, -1)
-    restored = []
-    for begin in range(0, H, chunk_rows):
-        part = slice(begin, begin + chunk_rows)
+
+    def restored(part: slice) -> Tensor:
         fetched = embedding_bag(
             taps[:, part].flatten(0, 1), flat, per_sample_weights=weights[:, part].flatten(0, 1), mode="sum"
         )
         moved = torch.view_as_complex(fetched.view(B * T, -1, C, count, 2))
         moved = moved * shift_phases(along[:, part], length, slice(0, count), moved.dtype)[:, :, None]
-        restored.append(torch.fft.irfft(moved, n=length)[..., :W])
-    stacked: Tensor = torch.cat(restored, dim=1).unflatten(0, (B, T)).movedim(3, 2)
+        image: Tensor = torch.fft.irfft(moved, n=length)[..., :W]
+        return image
+
+    parts = (slice(begin, min(begin + chunk_rows, H)) for begin in range(0, H, chunk_rows))
+    stacked: Tensor = gathered(((part, restored(part)) for part in parts), H, 1).unflatten(0, (B, T)).movedim(3, 2)
     return stacked

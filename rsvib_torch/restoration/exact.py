@@ -60,11 +60,11 @@ def _with_edges(problem: SceneProblem, factor: float) -> Tensor:
     return solver.scene(coefficients)
 
 
-def _restore_group(problem: SceneProblem, edges: float | None) -> Tensor:
-    """Restore one scene (C, R, L) from M frames, all values of which are measured or filled."""
+def _restore_group(problem: SceneProblem, edges: float | None, width: int) -> Tensor:
+    """Restore one scene (C, R, W) from M frames, all values of which are measured or filled."""
     if edges is not None:
-        return _with_edges(problem, edges)
-    return problem.solver().fit_scene(problem.data)
+        return _with_edges(problem, edges)[..., :width]
+    return problem.solver().fit_scene(problem.data, width)
 
 
 def _floor(data: Tensor, clipped: Tensor) -> Tensor:
@@ -154,7 +154,8 @@ def restore_exact(
         for place, (members, reference) in enumerate(groups):
             kernels = system(members, reference)
             along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
-            data = continue_rows(frames[stack, members], length).sub_(mean[stack])
+            seen = frames[stack, members[0] : members[-1] + 1]  # neighbours
+            data = continue_rows(seen, length).sub_(mean[stack])
             problem = SceneProblem(data, kernels, precision, typical.sqrt(), partition)
             hidden = None if lost is None else lost[stack, members]
             ends = kernels.reach > _LONG
@@ -165,8 +166,8 @@ def restore_exact(
                 floor = None if clipped is None else _floor(problem.data, clipped[stack, members])
                 if measured is not None:
                     problem = replace(problem, data=fill_unmeasured(problem, measured, floor))
-            scene = _restore_group(problem, factor if prior == "edges" else None)[..., :W]
-            restored[stack, place] = scene + mean[stack, 0]
+            scene = _restore_group(problem, factor if prior == "edges" else None, W)
+            restored[stack, place] = scene.add_(mean[stack, 0])
     return restored
 
 

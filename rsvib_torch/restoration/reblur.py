@@ -7,9 +7,9 @@ from torch import Tensor
 
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.motion import FrameMotion
-from rsvib_torch.restoration.rows import continue_rows
+from rsvib_torch.restoration.rows import spline_spectra
 from rsvib_torch.spectral import fast_length
-from rsvib_torch.splines import bspline_coefficients, bspline_weights, mirrored_index
+from rsvib_torch.splines import bspline_weights, mirrored_index
 
 __all__ = ["reblur"]
 
@@ -41,7 +41,7 @@ def reblur(scene: Tensor, motion: FrameMotion, frame: int, *, first_row: int = 0
     reach = math.ceil(float(displacement[..., 0].abs().amax()))
     length = fast_length(width + 4 * (_MARGIN + reach))
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=scene.device)
-    spectra = torch.fft.rfft(continue_rows(bspline_coefficients(scene, _DEGREE, -2), length))
+    spectra = spline_spectra(scene, _DEGREE, length)
 
     place = rows[:, None] - displacement[..., 1]
     cell = place.floor()

@@ -3,7 +3,10 @@
 import torch
 from torch import Tensor
 
-__all__ = ["continue_rows"]
+from rsvib_torch.spectral import gathered
+from rsvib_torch.splines import bspline_coefficient_rows
+
+__all__ = ["continue_rows", "spline_spectra"]
 
 
 def continue_rows(images: Tensor, length: int) -> Tensor:
@@ -27,3 +30,12 @@ def continue_rows(images: Tensor, length: int) -> Tensor:
     progress = ((steps / (length - width + 1) - 0.25) * 2).clamp(0, 1)
     share = (0.5 + 0.5 * torch.cos(torch.pi * progress)).to(images.dtype)
     return torch.cat([images, share * after + (1 - share) * before], dim=-1)
+
+
+def spline_spectra(images: Tensor, degree: int, length: int) -> Tensor:
+    """Transforms (..., H, U) along rows, continued to ``length``, of spline coefficients across images (..., H, W)."""
+    pieces = (
+        (rows, torch.fft.rfft(continue_rows(coefficients, length)))
+        for rows, coefficients in bspline_coefficient_rows(images, degree)
+    )
+    return gathered(pieces, images.shape[-2], images.ndim - 2)

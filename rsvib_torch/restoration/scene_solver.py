@@ -13,6 +13,7 @@ from rsvib_torch.restoration.partition import Partition
 from rsvib_torch.restoration.row_kernel import REACH, kernel_samples
 from rsvib_torch.restoration.row_sums import RowSums, sum_looked_up
 from rsvib_torch.restoration.row_system import RowKernels, smooth_band, smooth_kernels
+from rsvib_torch.spectral import gathered
 
 __all__ = ["Coefficients", "SceneSolver"]
 
@@ -212,11 +213,11 @@ class SceneSolver:
         scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=self.length)
         return scene
 
-    def fit_scene(self, data: Tensor) -> Tensor:
-        """``scene(fit(data))``, without keeping the coefficients where nothing is to be differentiated."""
+    def fit_scene(self, data: Tensor, width: int) -> Tensor:
+        """The first ``width`` columns of ``scene(fit(data))``; coefficients are kept only to be differentiated."""
         spectra = torch.fft.rfft(data)
         if self._factors is not None or self._differentiates(spectra):
-            return self.scene(self.fit(data))
+            return self.scene(self.fit(data))[..., :width]
         found = spectra.new_empty(self.num_rows, spectra.shape[1], len(self.u))
 
         def take(k: int, solved: Tensor) -> None:
@@ -228,8 +229,10 @@ class SceneSolver:
                     sampled.conj_physical_()
 
         self._solve_in_place(spectra, None, take)
-        scene: Tensor = torch.fft.irfft(found.movedim(1, 0), n=self.length)
-        return scene
+        step = _ROWS.get(found.device.type, self.num_rows)
+        runs = (slice(top, min(top + step, self.num_rows)) for top in range(0, self.num_rows, step))
+        images = ((run, torch.fft.irfft(found[run].movedim(1, 0), n=self.length)[..., :width]) for run in runs)
+        return gathered(images, self.num_rows, 1)
 
     def _differentiates(self, *values: Tensor) -> bool:
         given = (*values, self._normal.left, self.precision)
