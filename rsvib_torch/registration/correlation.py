@@ -45,9 +45,8 @@ def correlate_bands(
         width + 2 * reach[1],
     ).flatten(0, 1)
     lags_y, lags_x = 2 * reach[0] + 1, 2 * reach[1] + 1
-    step = min(
-        height, max(_FEWEST_ROWS, lags_y)
-    )  # taller, and most products would be of rows that no lag brings together
+    # of templates taller than this most products would be of rows that no lag brings together
+    step = min(height, max(_FEWEST_ROWS, lags_y))
     cross = template.new_zeros(len(template), lags_y, lags_x)
     for top in range(0, height, step):
         rows = template[:, top : top + step]

@@ -15,15 +15,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.registration.row_spectra import RowSpectra, chunks, combined, inner_columns, mean_over_frames
+from rsvib_torch.registration.row_spectra import RowSpectra, chunks, inner_columns, mean_over_frames
+from rsvib_torch.registration.scene_detail import scene_detail
 
 __all__ = ["RowGradients", "row_gradients", "row_shifts"]
 
-_PASS_ROWS = (0.24, 0.34)  # cycles/px across rows: full weight below, none above
-_PASS_COLUMNS = (0.40, 0.48)  # along rows, where interpolation is exact but detail near the limit may be aliased
-_SLOWEST = 1 / 64  # cycles/px: shading and vignetting live below
-_SMOOTH = 16  # values of the spectra that are averaged along each axis
-_SOME = 4  # along rows, of which one tells the noise
 _BLOCK = 16  # px, side of the blocks that are judged together
 _LARGEST_NOISE = 9.0  # mean square of a block over the typical one before it loses weight
 _LARGEST_SHIFT = 0.15  # px, part of a block's residual that the gradient excuses
@@ -46,67 +42,6 @@ class RowGradients:
     products: Tensor
     variance: Tensor
     halves: Tensor
-
-
-def _pass(frequency: Tensor, limits: tuple[float, float]) -> Tensor:
-    """1 below the first limit, 0 above the second, a half cosine between."""
-    low, high = limits
-    return 0.5 + 0.5 * torch.cos(math.pi * ((frequency.abs() - low) / (high - low)).clamp(0.0, 1.0))
-
-
-def _wiener(mean: Tensor, noise: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Share (B, S, U) of the spectrum of the mean that is scene, within the pass band.
-
-    Args:
-        mean: (B, S, U) two-dimensional spectrum of the mean of the frames.
-        noise: (B, S, U / 4) spectrum of a difference with the noise of the mean, at every fourth frequency.
-        u: Frequencies along rows, cycles/px.
-        v: Frequencies across rows, cycles/px.
-    """
-    total, noise_power = _smoothed(mean, _SMOOTH), _smoothed(noise, _SMOOTH // _SOME)
-    share = (1 - noise_power / total.clamp(min=torch.finfo(total.dtype).tiny)).clamp(min=0.0)
-    # all but the slowest, 1 - exp(-(u^2 + v^2) / slowest^2), within the pass band
-    along, across = _pass(u, _PASS_COLUMNS), _pass(v, _PASS_ROWS)
-    slow_along, slow_across = along * torch.exp(-((u / _SLOWEST) ** 2)), across * torch.exp(-((v / _SLOWEST) ** 2))
-    along, across, slow_along, slow_across = (x.to(share.dtype) for x in (along, across, slow_along, slow_across))
-    passed = torch.outer(across, along).addr_(slow_across, slow_along, alpha=-1)
-    blocks = share[:, :, None, :, None].expand(-1, -1, _SMOOTH, -1, _SMOOTH).flatten(3).flatten(1, 2)
-    return blocks[:, : len(v), : len(u)] * passed
-
-
-def _smoothed(spectrum: Tensor, columns: int) -> Tensor:
-    """Mean power (B, S / 16, U / columns) of blocks of a spectrum (B, S, U), up to a factor."""
-    parts = torch.view_as_real(spectrum).flatten(-2)
-    rows = []
-    for part in chunks(parts.shape[1], 4 * parts.shape[2] * len(parts), _SMOOTH, parts.device):
-        power = parts[:, part].square()
-        whole = power.shape[1] // _SMOOTH * _SMOOTH
-        rows.append(power[:, :whole].unflatten(1, (-1, _SMOOTH)).mean(2))
-        if whole < power.shape[1]:
-            rows.append(power[:, whole:].mean(1, keepdim=True))
-    return functional.avg_pool1d(torch.cat(rows, 1), 2 * columns, ceil_mode=True)
-
-
-def _scene(warped: Tensor, seen: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Detail of the scene and its gradient across rows, (B, S, U) each, from the mean of the frames."""
-    v = torch.fft.fftfreq(warped.shape[-2], dtype=torch.float64, device=u.device)
-    whole = torch.fft.fft(mean_over_frames(warped, seen), dim=-2)
-    noise = torch.fft.fft(_noise_of_mean(warped[..., ::_SOME], seen), dim=-2)
-    torch.view_as_real(whole).mul_(_wiener(whole, noise, u, v)[..., None])
-    detail = torch.fft.ifft(whole, dim=-2)
-    whole *= (2j * math.pi * v).to(whole.dtype)[:, None]
-    return detail, torch.fft.ifft(whole, dim=-2)
-
-
-def _noise_of_mean(warped: Tensor, seen: Tensor) -> Tensor:
-    """Difference (B, S, U) of the outer frames that see a row, with the noise of their mean; 0 where one alone does."""
-    count = seen.shape[1]
-    order = torch.arange(count, device=seen.device)[:, None]
-    first = torch.where(seen > 0, order, count).amin(1, keepdim=True)
-    last = torch.where(seen > 0, order, -1).amax(1, keepdim=True)
-    sign = ((order == last).double() - (order == first).double()) * (last > first)
-    # the difference of two frames has twice the noise of a frame
-    return combined(warped, sign * (0.5 / seen.sum(1, keepdim=True).clamp(min=1.0)).sqrt())
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +76,7 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
         The gradients.
     """
     length, width = spectra.length, spectra.width
-    detail, across = _scene(warped, seen, spectra.frequencies)
+    detail, across = scene_detail(warped, seen, spectra.frequencies)
     along = (2j * math.pi * spectra.frequencies).to(warped.dtype)
     inner = functional.pad(inner_columns(width, shift, warped.real), (0, length - width))
     valid = spectra.warped_valid(rows, shift)
@@ -161,9 +96,8 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
         return _Rows(images, residual, weight, visible)
 
     parts = chunks(rows.shape[-1], 4 * length * len(rows) * (8 + 2 * rows.shape[1]), _BLOCK, rows.device)
-    transforms = warped.new_empty(
-        *detail.shape[:2], 3, detail.shape[-1]
-    )  # memory is dear: nothing of this size is moved
+    # written where they belong: memory for so much takes as long as the transforms
+    transforms = warped.new_empty(*detail.shape[:2], 3, detail.shape[-1])
     results, energies = [], []
     for part in parts:
         some = pixels(part)
