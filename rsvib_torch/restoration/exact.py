@@ -29,6 +29,7 @@ ScenePrior = Literal["gaussian", "edges"]
 _MARGIN = 16  # px beyond what the motion shows, more than the reach of a deconvolution filter
 _LONG = 1.0  # px along the row either way: beyond, ends of rows are worth being continued by what the blur demands
 _LOOSE, _REST = 0.3, 0.03  # parts of the quadratic prior that patches start from and keep
+_EVERY = 8  # rows
 _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
 
 
@@ -132,7 +133,8 @@ def restore_exact(
         frames = fill_roughly(frames, ignore)
     lost = ignore if clipped is None else clipped if ignore is None else ignore | clipped
     levels = _noise_levels(frames, motion, noise)
-    mean = frames.mean((1, 3, 4), keepdim=True)  # the prior is for deviations from it
+    # the prior is for deviations from a mean; some rows tell it well enough
+    mean = frames[..., ::_EVERY, :].mean((1, 3, 4), keepdim=True)
     starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device)).expand(B, T, H)
     displacement, node_weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
     restored = frames.new_empty(B, len(groups), *frames.shape[2:])
@@ -146,13 +148,13 @@ def restore_exact(
             moved = displacement[stack, members] - motion.shift[stack, reference]
             return row_kernels(moved, node_weights, weights[members], H, _MARGIN)
 
-        members, reference = _chosen_by(groups, motion.shift[stack])
+        first = _chosen_by(groups, motion.shift[stack])
         certain = noise != "auto" or T > 1
-        chosen = system(members, reference)
-        strength = prior_strength(frames[stack, members], chosen, row_prior, typical * length, certain=certain)
+        chosen = system(*first)
+        strength = prior_strength(frames[stack, first[0]], chosen, row_prior, typical * length, certain=certain)
         precision = row_prior.precision(typical * length, factor * strength, chosen.reach)
         for place, (members, reference) in enumerate(groups):
-            kernels = system(members, reference)
+            kernels = chosen if (members, reference) == first else system(members, reference)
             along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
             seen = frames[stack, members[0] : members[-1] + 1]  # neighbours
             data = continue_rows(seen, length).sub_(mean[stack])

@@ -11,7 +11,7 @@ _BLOCK = 16
 _DIFFERENCES = 8
 _QUANTILE = 0.15
 _FEW = 8  # blocks have no quiet part
-_MANY = 4096  # blocks tell as much as all of a larger image
+_MANY = 2048  # blocks tell as much as all of a larger image
 _ROWS = 64  # at a time: they stay in the cache
 
 
@@ -39,8 +39,8 @@ def estimate_noise(frames: Tensor) -> Tensor:
     inner = [extent - order for extent, order in zip(shape, orders, strict=True)]
     block = min(_BLOCK, *inner)
     height, width = (extent // block * block for extent in inner)
-    step = block * max(1, _ROWS // block)
     every = max(1, height * width // (block**2 * _MANY))
+    step = block * max(1, _ROWS // block) if every == 1 else block
     blocks = torch.cat(
         [
             _detail(frames[..., top : min(top + step, height) + orders[0], : width + orders[1]], orders)

@@ -16,6 +16,7 @@ __all__ = ["ORDER", "RowPrior", "autoregressive_prior", "fit_prior"]
 ORDER = 2  # rows that a row is predicted from
 _PIECE = (64, 256)  # rows and columns of the pieces whose spectra are averaged
 _MOST_PIECES = 128  # of a frame
+_EVERY = 8  # rows of which one tells how bright a frame is
 _SMOOTHING = 3  # neighbouring frequencies whose statistics are pooled
 _ITERATIONS = 20
 # noise power over variance of e: above, the systems lose digits and nothing is gained; below, rows half a pixel apart
@@ -176,7 +177,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     mean = vibration.mean_displacement(times, motion.timing.exposure_time)[..., 0]
     back = waves(mean, -u).to(frames.dtype.to_complex()).unflatten(1, rows.shape)  # (T, pieces, rows, U)
     back = back * tapers[0][:, None]
-    bright = frames.mean((-2, -1))[..., None, None, None]
+    bright = frames[..., ::_EVERY, :].mean((-2, -1))[..., None, None, None]
     step = 1 if frames.device.type == "cpu" else len(tops)  # rows of pieces at a time: they stay in the cache
     found = []
     for first in range(0, len(tops), step):
