@@ -64,21 +64,22 @@ def _with_one_more(
     measurements: Measurements,
     weighed: Measurements,
     before: ToneFit,
+    left: Tensor,
     active: Tensor,
     sample_interval: float,
     reckon: bool,
 ) -> tuple[Tensor, Tensor]:
     """Frequencies with one more tone (or family) an axis, the one that leaves the majority of rows least.
 
-    Candidates come from the periodogram of what ``before`` leaves. To ``reckon`` with clouds and with things that move
-    by themselves, which cover stretches of rows, every stretch of the record is left out once: where all that pulls
-    the fit away is left out, the others fall in line.
+    Candidates come from the periodogram of what ``before`` has ``left``. To ``reckon`` with clouds and with things that
+    move by themselves, which cover stretches of rows, every stretch of the record is left out once: where all that
+    pulls the fit away is left out, the others fall in line.
 
     Returns:
         Frequencies (B, 2, K) and what a first fit with them leaves, (B, N, G, 2).
     """
     model, harmonics = before.model, before.model.harmonics
-    left = replace(measurements, displacements=residual_of(measurements, before))
+    unexplained = replace(measurements, displacements=left)
     parts, weights = measurements, weighed.weights[:, None]
     if reckon:
         counts = _stretches(measurements)
@@ -86,7 +87,7 @@ def _with_one_more(
         without = counts[1:, :, None] * measurements.weights[:, None]
         weights = torch.cat([weights, without], 1)
     number = _FEW_CANDIDATES if reckon else _CANDIDATES
-    peaks = strongest_frequencies(left, sample_interval, harmonics, number, weights).flatten(0, 1)
+    peaks = strongest_frequencies(unexplained, sample_interval, harmonics, number, weights).flatten(0, 1)
     multiples = torch.arange(1, harmonics + 1, dtype=torch.float64, device=peaks.device)
     further = (peaks[..., None] * multiples).transpose(1, 2).flatten(0, 1)  # (B C, 2, H)
     count = len(further) // len(measurements.moments)
@@ -117,11 +118,11 @@ def _with_one_more(
     return frequencies, residual
 
 
-def _undisturbed(measurements: Measurements, fit: ToneFit) -> Tensor:
-    """(B,) bool: the fit leaves so little of nearly all rows that no stretch of them can have pulled it away."""
-    left = measurements.sizes(residual_of(measurements, fit)).nanquantile(_NEARLY_ALL, dim=1)
+def _undisturbed(measurements: Measurements, left: Tensor) -> Tensor:
+    """(B,) bool: a fit has left so little of nearly all rows that no stretch of them can have pulled it away."""
+    most = measurements.sizes(left).nanquantile(_NEARLY_ALL, dim=1)
     whole = measurements.sizes(measurements.relative(measurements.displacements)).nanmedian(1).values
-    return (left < _LITTLE * whole).all(-1)
+    return (most < _LITTLE * whole).all(-1)
 
 
 def _of_each(where: Tensor, one: Kind, other: Kind) -> Kind:
@@ -202,8 +203,8 @@ def find_tones(
     first = none if start is None else start.active
     known = none.double() if start is None else start.frequencies
     reckon = start is None
-    left = None if start is None else residual_of(measurements, start)
-    fit, weighed = robust_fit(measurements, known, first, model, left)
+    given = None if start is None else residual_of(measurements, start)
+    fit, weighed = robust_fit(measurements, known, first, model, given)
     parameters = 2 * model.harmonics + 1
 
     def not_invented(trial: ToneFit) -> Tensor:
@@ -214,25 +215,26 @@ def find_tones(
     going = torch.ones_like(none[..., 0])  # an axis that stopped stays stopped
     for _ in range(keep.shape[-1] // model.harmonics, MAX_TONES if tones is None else tones):
         active = torch.cat([keep, going[..., None].expand_as(none)], -1)
-        further = _with_one_more(measurements, weighed, fit, active, sample_interval, False)
+        left = residual_of(measurements, fit)
+        further = _with_one_more(measurements, weighed, fit, left, active, sample_interval, False)
         if tones is None and keep.shape[-1] > 0:
-            before, after = (weighed.square(left) for left in (residual_of(measurements, fit), further[1]))
+            before, after = weighed.square(left), weighed.square(further[1])
             hopeful = before - after > _HOPEFUL * least_gain * before
-            going = going & (hopeful if not reckon else hopeful | ~_undisturbed(measurements, fit)[:, None])
+            going = going & (hopeful if not reckon else hopeful | ~_undisturbed(measurements, left)[:, None])
             if not bool(going.any()):
                 break
             active = torch.cat([keep, going[..., None].expand_as(none)], -1)
         trial, trial_weighed = robust_fit(measurements, further[0], active, model, further[1])
         if reckon:
-            disturbed = ~_undisturbed(measurements, trial)
+            disturbed = ~_undisturbed(measurements, residual_of(measurements, trial))
             if bool(disturbed.any()):
-                further = _with_one_more(measurements, weighed, fit, active, sample_interval, True)
+                further = _with_one_more(measurements, weighed, fit, left, active, sample_interval, True)
                 careful = robust_fit(measurements, further[0], active, model, further[1])
                 trial = _of_each(disturbed, careful[0], trial)
                 trial_weighed = _of_each(disturbed, careful[1], trial_weighed)
         if tones is None:
             # both fits are judged with the weights of the richer one
-            before = trial_weighed.square(residual_of(measurements, fit))
+            before = trial_weighed.square(left)
             after = trial_weighed.square(residual_of(measurements, trial))
             spare = (measurements.known - parameters * active.sum(-1) // model.harmonics - 1).clamp(min=1.0)
             statistic = (before - after) / parameters / (after / spare).clamp(min=1e-300)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.registration.row_spectra import RowSpectra, chunks, inner_columns, mean_over_frames
+from rsvib_torch.registration.row_spectra import RowSpectra, inner_columns, mean_over_frames
 from rsvib_torch.spectral import squared_modulus
 
 __all__ = ["column_pattern"]
@@ -40,8 +40,7 @@ def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor
         visible = (seen * (seen.sum(1, keepdim=True) > 1)).to(spectra.values.real.dtype)[..., None]
         # the ends of the rows stay where they are as well, but are no pattern
         inner = inner_columns(spectra.width, shift, spectra.values.real)[0]
-        some = spectra.values[:, :, 0]
-        for run in chunks(rows.shape[-1], 5 * some.element_size() * some.numel(), 1, rows.device):
+        for run in spectra.runs(rows.shape[-1], 5):
             shown, where = visible[:, :, run], seen[..., run]
             warped, ramp = spectra.warped(rows[..., run], shift[..., run]), spectra.ramp(shift[..., run])
             difference = (warped - mean_over_frames(warped, where)[:, None]) * shown

@@ -81,9 +81,14 @@ class RowSpectra:
             index.flatten(0, 2), self._all_rows, per_sample_weights=weights.flatten(0, 2), mode="sum"
         )
         result: Tensor = torch.view_as_complex(picked.unflatten(-1, (-1, 2))).unflatten(0, rows.shape)
-        for part in chunks(rows.shape[-1], 8 * result[..., 0, :].numel(), 1, rows.device):
+        for part in self.runs(rows.shape[-1], 1):
             result[..., part, :] *= self.ramp(shift[..., part])
         return result
+
+    def runs(self, count: int, arrays: int) -> list[slice]:
+        """Runs of ``count`` rows of which so many arrays like these spectra are worked on at a time."""
+        row = self.values[:, :, 0]
+        return chunks(count, arrays * row.element_size() * row.numel(), 1, row.device)
 
     def ramp(self, shift: Tensor) -> Tensor:
         """exp(2 pi i u shift) for all frequencies u (..., U)."""

@@ -1,5 +1,6 @@
 """Exact restoration: all rows of a frame, each with its own PSF, solved together."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Literal
 
@@ -15,12 +16,12 @@ from rsvib_torch.restoration.groups import joint_groups
 from rsvib_torch.restoration.missing import fill_roughly, measured_values
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.partition import Partition
-from rsvib_torch.restoration.prior import fit_prior
+from rsvib_torch.restoration.prior import brightness, fit_prior
 from rsvib_torch.restoration.row_system import RowKernels, row_kernels
 from rsvib_torch.restoration.rows import continue_rows
 from rsvib_torch.restoration.scene_problem import SceneProblem
 from rsvib_torch.restoration.strength import prior_strength
-from rsvib_torch.spectral import fast_length
+from rsvib_torch.spectral import fast_length, gathered
 
 __all__ = ["ScenePrior", "restore_exact"]
 
@@ -29,7 +30,6 @@ ScenePrior = Literal["gaussian", "edges"]
 _MARGIN = 16  # px beyond what the motion shows, more than the reach of a deconvolution filter
 _LONG = 1.0  # px along the row either way: beyond, ends of rows are worth being continued by what the blur demands
 _LOOSE, _REST = 0.3, 0.03  # parts of the quadratic prior that patches start from and keep
-_EVERY = 8  # rows
 _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
 
 
@@ -133,43 +133,46 @@ def restore_exact(
         frames = fill_roughly(frames, ignore)
     lost = ignore if clipped is None else clipped if ignore is None else ignore | clipped
     levels = _noise_levels(frames, motion, noise)
-    # the prior is for deviations from a mean; some rows tell it well enough
-    mean = frames[..., ::_EVERY, :].mean((1, 3, 4), keepdim=True)
+    mean = brightness(frames).mean(1, keepdim=True)[..., None, None]  # the prior is for deviations from it
     starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device)).expand(B, T, H)
     displacement, node_weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
-    restored = frames.new_empty(B, len(groups), *frames.shape[2:])
-    for stack in range(B):
-        weights = levels[stack].square().reciprocal()
-        typical = weights.mean().reciprocal()
-        weights = weights * typical
-        row_prior = fit_prior(frames[stack], motion, stack, levels[stack], length)
 
-        def system(members: list[int], reference: int, stack: int = stack, weights: Tensor = weights) -> RowKernels:
-            moved = displacement[stack, members] - motion.shift[stack, reference]
-            return row_kernels(moved, node_weights, weights[members], H, _MARGIN)
+    def scenes() -> Iterator[tuple[slice, Tensor]]:
+        for stack in range(B):
+            weights = levels[stack].square().reciprocal()
+            typical = weights.mean().reciprocal()
+            weights = weights * typical
+            row_prior = fit_prior(frames[stack], motion, stack, levels[stack], length)
 
-        first = _chosen_by(groups, motion.shift[stack])
-        certain = noise != "auto" or T > 1
-        chosen = system(*first)
-        strength = prior_strength(frames[stack, first[0]], chosen, row_prior, typical * length, certain=certain)
-        precision = row_prior.precision(typical * length, factor * strength, chosen.reach)
-        for place, (members, reference) in enumerate(groups):
-            kernels = chosen if (members, reference) == first else system(members, reference)
-            along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
-            seen = frames[stack, members[0] : members[-1] + 1]  # neighbours
-            data = continue_rows(seen, length).sub_(mean[stack])
-            problem = SceneProblem(data, kernels, precision, typical.sqrt(), partition)
-            hidden = None if lost is None else lost[stack, members]
-            ends = kernels.reach > _LONG
-            if hidden is None and ends and not bool(along.any()):
-                problem = replace(problem, data=fill_beyond_ends(problem, W, kernels.reach))
-            else:
-                measured = measured_values(along, hidden, problem.data.shape, W, ends=ends)
-                floor = None if clipped is None else _floor(problem.data, clipped[stack, members])
-                if measured is not None:
-                    problem = replace(problem, data=fill_unmeasured(problem, measured, floor))
-            scene = _restore_group(problem, factor if prior == "edges" else None, W)
-            restored[stack, place] = scene.add_(mean[stack, 0])
+            def system(members: list[int], reference: int, stack: int = stack, weights: Tensor = weights) -> RowKernels:
+                moved = displacement[stack, members] - motion.shift[stack, reference]
+                return row_kernels(moved, node_weights, weights[members], H, _MARGIN)
+
+            first = _chosen_by(groups, motion.shift[stack])
+            certain = noise != "auto" or T > 1
+            chosen = system(*first)
+            strength = prior_strength(frames[stack, first[0]], chosen, row_prior, typical * length, certain=certain)
+            precision = row_prior.precision(typical * length, factor * strength, chosen.reach)
+            for place, (members, reference) in enumerate(groups):
+                kernels = chosen if (members, reference) == first else system(members, reference)
+                along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
+                seen = frames[stack, members[0] : members[-1] + 1]  # neighbours
+                data = continue_rows(seen, length).sub_(mean[stack])
+                problem = SceneProblem(data, kernels, precision, typical.sqrt(), partition)
+                hidden = None if lost is None else lost[stack, members]
+                ends = kernels.reach > _LONG
+                if hidden is None and ends and not bool(along.any()):
+                    problem = replace(problem, data=fill_beyond_ends(problem, W, kernels.reach))
+                else:
+                    measured = measured_values(along, hidden, problem.data.shape, W, ends=ends)
+                    floor = None if clipped is None else _floor(problem.data, clipped[stack, members])
+                    if measured is not None:
+                        problem = replace(problem, data=fill_unmeasured(problem, measured, floor))
+                scene = _restore_group(problem, factor if prior == "edges" else None, W)
+                number = stack * len(groups) + place
+                yield slice(number, number + 1), scene.add_(mean[stack, 0])[None]
+
+    restored: Tensor = gathered(scenes(), B * len(groups), 0).unflatten(0, (B, len(groups)))
     return restored
 
 

@@ -11,7 +11,7 @@ from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.row_kernel import interpolation_error, kernel_response
 from rsvib_torch.spectral import squared_modulus, waves
 
-__all__ = ["ORDER", "RowPrior", "autoregressive_prior", "fit_prior"]
+__all__ = ["ORDER", "RowPrior", "autoregressive_prior", "brightness", "fit_prior"]
 
 ORDER = 2  # rows that a row is predicted from
 _PIECE = (64, 256)  # rows and columns of the pieces whose spectra are averaged
@@ -145,6 +145,11 @@ def autoregressive_prior(
     return RowPrior(prior.power, prior.reflections, blind.clamp(min=torch.finfo(blind.dtype).tiny))
 
 
+def brightness(frames: Tensor) -> Tensor:
+    """About the mean of each image (..., H, W): some rows tell it well enough to be taken off."""
+    return frames[..., ::_EVERY, :].mean((-2, -1))
+
+
 def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, length: int) -> RowPrior:
     """Fit the prior to the frames of a stack.
 
@@ -177,7 +182,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     mean = vibration.mean_displacement(times, motion.timing.exposure_time)[..., 0]
     back = waves(mean, -u).to(frames.dtype.to_complex()).unflatten(1, rows.shape)  # (T, pieces, rows, U)
     back = back * tapers[0][:, None]
-    bright = frames[..., ::_EVERY, :].mean((-2, -1))[..., None, None, None]
+    bright = brightness(frames)[..., None, None, None]
     step = 1 if frames.device.type == "cpu" else len(tops)  # rows of pieces at a time: they stay in the cache
     found = []
     for first in range(0, len(tops), step):

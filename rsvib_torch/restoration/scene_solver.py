@@ -220,17 +220,16 @@ class SceneSolver:
             return self.scene(self.fit(data))[..., :width]
         found = spectra.new_empty(self.num_rows, spectra.shape[1], len(self.u))
 
+        step = _ROWS.get(found.device.type, self.num_rows)
+        runs = [slice(top, min(top + step, self.num_rows)) for top in range(0, self.num_rows, step)]
+
         def take(k: int, solved: Tensor) -> None:
-            step = _ROWS.get(solved.device.type, self.num_rows)
-            for top in range(0, self.num_rows, step):
-                rows = slice(top, min(top + step, self.num_rows))
+            for rows in runs:
                 sampled = found[rows, :, self.parts[k]].copy_(self._between_rows(solved, rows))
                 if self._shares.nodes is not None:
                     sampled.conj_physical_()
 
         self._solve_in_place(spectra, None, take)
-        step = _ROWS.get(found.device.type, self.num_rows)
-        runs = (slice(top, min(top + step, self.num_rows)) for top in range(0, self.num_rows, step))
         images = ((run, torch.fft.irfft(found[run].movedim(1, 0), n=self.length)[..., :width]) for run in runs)
         return gathered(images, self.num_rows, 1)
 

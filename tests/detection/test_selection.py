@@ -59,7 +59,7 @@ def test_tones_without_hope_are_not_fitted_to_the_end(monkeypatch):
         selection, "robust_fit", lambda *given, **named: fitted.append(1) or robust_fit(*given, **named)
     )
     one = measured(offsets_of([3.1, 5.2], [50.0, 30.0], generator))
-    weak = torch.cat([offsets_of([0.006, 0.005], [88.0, 79.0], generator)])
+    weak = offsets_of([0.006, 0.005], [88.0, 79.0], generator)
     two = measured(one.displacements[:, :, 1] - one.displacements[:, :, 0] + weak)
     for measurements, tones, fits in ((one, 1, 2), (two, 2, 3)):
         fitted.clear()
