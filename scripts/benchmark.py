@@ -15,6 +15,7 @@ import argparse
 import json
 import math
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -34,7 +35,7 @@ from benchmarks import (
     streaming_dask,
     streaming_memory,
 )
-from benchmarks.measure import add_options, machine
+from benchmarks.measure import HUGE_PAGES, add_options, machine
 
 PARTS: dict[str, tuple[Callable[..., list[dict[str, Any]]], Callable[..., list[str]]]] = {
     "registration": (registration.rows, registration.lines),
@@ -54,11 +55,20 @@ def machine_line(machine: dict[str, Any]) -> str:
     """What the figures were taken on, in words."""
     libraries = ", ".join(f"{name} {version}" for name, version in machine["libraries"].items())
     load = "" if machine["load"] is None else f" Load at the start: {machine['load']:.1f}."
+    pages = "huge pages" if machine["huge_pages"] else "pages of the usual size"
     cuda = "No CUDA device here: tables are of the CPU alone." if machine["cuda"] is None else f"{machine['cuda']}."
     return (
         f"{machine['cores']} cores ({machine['processor']}), Python {machine['python']}, torch {machine['torch']} on "
-        f"{machine['threads']} threads, {libraries}.{load} {cuda}"
+        f"{machine['threads']} threads, {libraries}, {pages} for tensors.{load} "
+        f"{cuda}"
     )
+
+
+def with_huge_pages() -> None:
+    """Begin anew with huge pages for tensors: NumPy asks for them by itself, PyTorch only if told before it starts."""
+    if HUGE_PAGES not in os.environ:
+        os.environ[HUGE_PAGES] = "1"
+        os.execv(sys.executable, sys.orig_argv)
 
 
 def finite(figures: Any) -> Any:
@@ -85,6 +95,7 @@ def main() -> None:
     streaming_memory.add_options(parser)
     streaming_dask.add_options(parser)
     options = parser.parse_args()
+    with_huge_pages()
     torch.set_num_threads(os.cpu_count() or 1)
     summary: dict[str, Any] = {
         "size": options.size,

@@ -7,7 +7,7 @@ from rsvib_torch.registration.windows import take_windows
 
 __all__ = ["correlate_bands", "correlate_profiles"]
 
-_FEWEST_ROWS = 8  # of templates that are multiplied at a time
+_ROWS = 8  # of templates that are multiplied at a time: of more, most products are of rows that no lag brings together
 
 
 def correlate_bands(
@@ -45,11 +45,9 @@ def correlate_bands(
         width + 2 * reach[1],
     ).flatten(0, 1)
     lags_y, lags_x = 2 * reach[0] + 1, 2 * reach[1] + 1
-    # of templates taller than this most products would be of rows that no lag brings together
-    step = min(height, max(_FEWEST_ROWS, lags_y))
     cross = template.new_zeros(len(template), lags_y, lags_x)
-    for top in range(0, height, step):
-        rows = template[:, top : top + step]
+    for top in range(0, height, _ROWS):
+        rows = template[:, top : top + _ROWS]
         own = search[:, top : top + rows.shape[1] + lags_y - 1]
         for lag in range(lags_x):
             product = rows @ own[..., lag : lag + width].transpose(-2, -1)  # (M, h, h + 2 reach)

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+HUGE_PAGES = "THP_MEM_ALLOC_ENABLE"  # environment variable of PyTorch: 1 for yes, 0 for no
 _LIBRARIES = {
     "OpenCV": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
     "SciPy": ("scipy",),
@@ -114,6 +115,7 @@ def machine() -> dict[str, Any]:
         "threads": torch.get_num_threads(),
         "processor": platform.processor() or platform.machine(),
         "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "huge_pages": os.environ.get(HUGE_PAGES) == "1",
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "python": platform.python_version(),
         "torch": torch.__version__,
