@@ -95,7 +95,6 @@ def main() -> None:
     streaming_memory.add_options(parser)
     streaming_dask.add_options(parser)
     options = parser.parse_args()
-    with_huge_pages()
     torch.set_num_threads(os.cpu_count() or 1)
     summary: dict[str, Any] = {
         "size": options.size,
@@ -121,4 +120,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    with_huge_pages()
     main()

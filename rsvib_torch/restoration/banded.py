@@ -11,15 +11,14 @@ from rsvib_torch.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.noise import estimate_noise, gradient_energy
-from rsvib_torch.restoration.rows import continue_rows
-from rsvib_torch.spectral import fast_length
+from rsvib_torch.restoration.rows import continue_rows, period_of_rows
 from rsvib_torch.splines import bspline_weights, mirrored_index
 
 __all__ = ["restore_banded"]
 
 _AUTOMATIC_RANGE = (5e-3, 10.0)  # below, the slab's own approximation is amplified more than noise would be
-_MARGIN = 16  # px beyond what the motion shows, more than the reach of a deconvolution filter
 _ALIGN_ROWS = 256  # rows moved at a time
+_RINGING = 8  # px that a Wiener filter reaches beyond the displacement, at least
 _CHUNK_ELEMENTS = {"cpu": 1 << 19, "cuda": 1 << 26}  # of a filter bank: stays in cache, or fills a GPU
 
 
@@ -142,7 +141,7 @@ def restore_banded(
     check_choice("interpolation", interpolation, tuple(_TRANSFERS))
     weights = _noise_to_signal(frames, noise_to_signal)
     B, T, C, H, W = frames.shape
-    length = fast_length(W + 4 * (_MARGIN + motion.reach(H)))
+    length = period_of_rows(W, motion.reach(H) + _RINGING)
     size = 2 * half_rows + 1
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=frames.device)
     v = torch.fft.fftfreq(size, dtype=torch.float64, device=frames.device)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rsvib_torch.restoration.in_order import subtract_products
+from rsvib_torch.restoration.in_order import making_views, subtract_products
 
 __all__ = [
     "BandedFactor",
@@ -49,11 +49,13 @@ class BandedFactor:
         return diagonal.real if diagonal.is_complex() else diagonal
 
     @cached_property
+    @making_views()
     def _right(self) -> tuple[Tensor, ...]:
         """Rows of ``L^H`` right of the diagonal, (b, 1, S) each."""
         return self.skewed[: len(self.inverse), self.width + 1 :, None].unbind() if self.width else ()
 
     @cached_property
+    @making_views()
     def _above(self) -> tuple[Tensor, ...]:
         return _columns(self.skewed, below=False)
 
@@ -69,6 +71,7 @@ class BandedFactor:
         x[:count] *= self.inverse[:, None]
         return self.substitute(x, values, windows, count).clone()
 
+    @making_views()
     def _memory(self, right_side: Tensor) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
         """Memory for right sides like these, its rows, and every run of b of them: made once, for many solutions."""
         number = right_side.shape[1]
@@ -121,6 +124,7 @@ def _columns(full: Tensor, *, below: bool) -> tuple[Tensor, ...]:
 class _Elimination:
     """Views of every step of factoring matrices in their own memory, of ``factor_skewed``."""
 
+    @making_views()
     def __init__(self, full: Tensor, right_side: Tensor | None) -> None:
         width, size = full.shape[1] // 2, full.shape[2]
         count = len(full) - width

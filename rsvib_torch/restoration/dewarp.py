@@ -6,14 +6,13 @@ from torch.nn.functional import embedding_bag
 
 from rsvib_torch.checks import check_whole_number
 from rsvib_torch.restoration.motion import FrameMotion
-from rsvib_torch.restoration.rows import spline_spectra
-from rsvib_torch.spectral import fast_length, gathered, shift_phases
+from rsvib_torch.restoration.rows import period_of_rows, spline_spectra
+from rsvib_torch.spectral import gathered, shift_phases
 from rsvib_torch.splines import bspline_weights, mirrored_index
 
 __all__ = ["restore_dewarp"]
 
 _DEGREE = 5  # of the spline across rows
-_MARGIN = 16  # px beyond what the motion shows
 
 
 def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 256) -> Tensor:
@@ -37,7 +36,7 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 256
     along = (mean - motion.shift[..., 0, None]).flatten(0, 1)
     rows = rows.flatten(0, 1)
 
-    length = fast_length(W + 4 * (_MARGIN + motion.reach(H)))
+    length = period_of_rows(W, motion.reach(H))
     spectra = spline_spectra(frames, _DEGREE, length)
     count = spectra.shape[-1]
     cell = rows.detach().floor()

@@ -18,17 +18,18 @@ from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.partition import Partition
 from rsvib_torch.restoration.prior import brightness, fit_prior
 from rsvib_torch.restoration.row_system import RowKernels, row_kernels
-from rsvib_torch.restoration.rows import continue_rows
+from rsvib_torch.restoration.rows import continue_rows, period_of_rows
 from rsvib_torch.restoration.scene_problem import SceneProblem
 from rsvib_torch.restoration.strength import prior_strength
-from rsvib_torch.spectral import fast_length, gathered
+from rsvib_torch.spectral import gathered
 
 __all__ = ["ScenePrior", "restore_exact"]
 
 ScenePrior = Literal["gaussian", "edges"]
 
-_MARGIN = 16  # px beyond what the motion shows, more than the reach of a deconvolution filter
+_MARGIN = 16  # rows beyond the frame that it may see
 _LONG = 1.0  # px along the row either way: beyond, ends of rows are worth being continued by what the blur demands
+_REACH = 8  # px beyond the displacement that ends say something of where they are not filled so
 _LOOSE, _REST = 0.3, 0.03  # parts of the quadratic prior that patches start from and keep
 _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
 
@@ -123,7 +124,6 @@ def restore_exact(
     factor = check_number("regularisation", regularisation, above=0.0)
     check_choice("prior", prior, ("gaussian", "edges"))
     groups = joint_groups(T, joint)
-    length = fast_length(W + 4 * (_MARGIN + motion.reach(H)))
     chunk, split = (
         None if value is None else check_whole_number(name, value, at_least=1)
         for name, value in (("chunk_frequencies", chunk_frequencies), ("segments", segments))
@@ -136,6 +136,9 @@ def restore_exact(
     mean = brightness(frames).mean(1, keepdim=True)[..., None, None]  # the prior is for deviations from it
     starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device)).expand(B, T, H)
     displacement, node_weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
+    along = displacement[..., 0].detach()
+    filled = bool(((along.amax(-1) - along.amin(-1)).flatten(1).amax(1) > 2 * _LONG).all())
+    length = period_of_rows(W, motion.reach(H) + (0 if filled else _REACH))
 
     def scenes() -> Iterator[tuple[slice, Tensor]]:
         for stack in range(B):

@@ -1,11 +1,30 @@
 """Many small operations in place, one after the other, where each reads what those before it wrote."""
 
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 
 import torch
 from torch import Tensor
 
-__all__ = ["subtract_products"]
+__all__ = ["making_views", "subtract_products"]
+
+
+@contextmanager
+def making_views() -> Iterator[None]:
+    """Let Python not look for garbage while views of every step of a long loop are made.
+
+    After every few hundred new objects it would look through them, and now and then through all objects that there
+    are, which takes longer than the loop.
+    """
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
 
 
 def subtract_products(values: tuple[Tensor, ...], first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> None:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.restoration.banded_solver import BandedFactor, runs_of_rows
-from rsvib_torch.restoration.in_order import subtract_products
+from rsvib_torch.restoration.in_order import making_views, subtract_products
 from rsvib_torch.restoration.segments import Segments
 
 Mixture = list[tuple[slice, slice, Tensor]]
@@ -113,6 +113,7 @@ class SubstitutionMemory:
         right_side: (K, M, n S), the first rows of which are to hold the right sides.
     """
 
+    @making_views()
     def __init__(self, rows: int, width: int, right_sides: int, windows: int, systems: int, like: Tensor) -> None:
         self._sizes = (width, right_sides, windows, systems)
         self._step = min(_ROWS.get(like.device.type, rows), rows)

@@ -7,14 +7,12 @@ from torch import Tensor
 
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.motion import FrameMotion
-from rsvib_torch.restoration.rows import spline_spectra
-from rsvib_torch.spectral import fast_length
+from rsvib_torch.restoration.rows import period_of_rows, spline_spectra
 from rsvib_torch.splines import bspline_weights, mirrored_index
 
 __all__ = ["reblur"]
 
 _DEGREE = 5  # of the spline across rows
-_MARGIN = 16  # px beyond what the motion shows
 _ROWS = {"cpu": 64}  # formed at a time: what they are made of stays in the cache
 
 
@@ -39,7 +37,7 @@ def reblur(scene: Tensor, motion: FrameMotion, frame: int, *, first_row: int = 0
     displacement, node_weights = exposure_trajectory(motion.vibration[0], starts, motion.timing, "gauss")
     displacement = displacement - motion.shift[0, frame]
     reach = math.ceil(float(displacement[..., 0].abs().amax()))
-    length = fast_length(width + 4 * (_MARGIN + reach))
+    length = period_of_rows(width, reach)
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=scene.device)
     spectra = spline_spectra(scene, _DEGREE, length)
 

@@ -3,16 +3,23 @@
 import torch
 from torch import Tensor
 
-from rsvib_torch.spectral import gathered
+from rsvib_torch.spectral import fast_length, gathered
 from rsvib_torch.splines import bspline_coefficient_rows
 
-__all__ = ["continue_rows", "spline_spectra"]
+__all__ = ["continue_rows", "period_of_rows", "spline_spectra"]
+
+_MARGIN = 8  # px beyond what a displacement shows that either end goes on by itself
+
+
+def period_of_rows(width: int, reach: int) -> int:
+    """Length of a period that rows of ``width`` px fit in, moved by up to ``reach`` px: see ``continue_rows``."""
+    return fast_length(width + 4 * (_MARGIN + reach))
 
 
 def continue_rows(images: Tensor, length: int) -> Tensor:
     """Continue rows at their right end to a period of ``length``.
 
-    Both ends go on by odd reflection, which keeps value and slope; halfway through the gap one smoothly takes over
+    Both ends go on by odd reflection, which keeps value and slope; from a quarter of the gap on one smoothly takes over
     from the other, so that what lies near one end is never seen from the other.
 
     Args:

@@ -24,7 +24,7 @@ from rsvib_torch.restoration.motion import as_batch, frame_motion
 from rsvib_torch.restoration.partition import Partition
 from rsvib_torch.restoration.row_kernel import kernel_samples
 from rsvib_torch.restoration.row_system import row_kernels, smooth_band, smooth_kernels
-from rsvib_torch.spectral import fast_length
+from rsvib_torch.restoration.rows import period_of_rows
 
 REAL, COMPLEX = 4, 8  # bytes
 COPIED = 1 << 28  # bytes copied to measure the bandwidth
@@ -68,7 +68,7 @@ def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibrat
     """Sizes for a frame of that size, camera and vibration."""
     height, width = size
     motion = frame_motion(as_batch(truth, 1), timing.in_row_order(), 1, height)
-    length = fast_length(width + 4 * (exact._MARGIN + motion.reach(height)))
+    length = period_of_rows(width, motion.reach(height))
     starts = motion.row_starts(torch.arange(height, dtype=torch.float64)).expand(1, 1, height)
     moved, weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
     kernels = row_kernels(moved[0], weights, torch.ones(1), height, exact._MARGIN)

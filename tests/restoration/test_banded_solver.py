@@ -1,3 +1,4 @@
+import gc
 from itertools import pairwise
 
 import numpy as np
@@ -116,3 +117,19 @@ def test_memory_serves_smaller_systems_too(width):
     assert not memory.holds(41, width, 2, 3)
     assert not memory.holds(29, width, 1, 3)
     assert not memory.holds(29, width + 1, 2, 3)
+
+
+def test_views_are_made_without_a_search_for_garbage():
+    runs = []
+    gc.callbacks.append(lambda phase, info: runs.append(phase) if phase == "start" else None)
+    try:
+        memory = BandedMemory(3000, 4, 1, 2, torch.zeros(1))
+        assert len(runs) <= 2  # one that was due, before it
+        assert gc.isenabled()
+        gc.disable()
+        assert memory.holds(3000, 4, 1, 2)
+        BandedMemory(30, 4, 1, 2, torch.zeros(1))
+        assert not gc.isenabled()  # stays as it was
+    finally:
+        gc.enable()
+        gc.callbacks.pop()
