@@ -2,7 +2,8 @@
 
 The scene is a periodic, band-limited function. It is interpolated densely by Fourier transforms along both axes: a
 phase ramp along rows, and across rows zero padding to eight times as many, between which a polynomial of eight points
-is exact to 1e-6. An exposure is the mean over many moments.
+is exact to 1e-6. An exposure is the mean over its moments, by Gauss-Legendre quadrature: evenly spread moments would
+have to be hundreds where it is long.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ Array = NDArray[np.float64]
 
 FINER = 8  # rows interpolated for every row of the scene
 POINTS = 8  # of the polynomial between them
-MOMENTS = 16  # of an exposure
+MOMENTS = (8, 4.0)  # of an exposure, and more for every px that its fastest part could go
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,11 @@ class Shake:
     def reach(self, duration: float) -> Array:
         """Largest displacement (2,) in px within a duration from the time origin."""
         return self.amplitude.sum(1) + np.abs(self.image_motion) * duration
+
+    def longest_path(self, duration: float) -> float:
+        """Bound on the path in px within a duration: at full speed, or from end to end of every period."""
+        cycles = np.minimum(np.pi * self.frequency * duration, 2.0 + 4.0 * self.frequency * duration)
+        return float((2 * self.amplitude * cycles).sum(1).max() + np.abs(self.image_motion).max() * duration)
 
 
 def closed(scene: Array, rim: int) -> Array:
@@ -68,6 +74,13 @@ def polynomial_weights(fraction: Array) -> Array:
     return weights
 
 
+def exposure_moments(shake: Shake, duration: float) -> tuple[Array, Array]:
+    """Moments of an exposure, parts of it, and their shares."""
+    least, for_a_px = MOMENTS
+    nodes, weights = np.polynomial.legendre.leggauss(least + int(np.ceil(for_a_px * shake.longest_path(duration))))
+    return 0.5 * (nodes + 1), 0.5 * weights
+
+
 def take_frames(
     scene: Array,
     shake: Shake,
@@ -83,10 +96,11 @@ def take_frames(
     top, left = ((whole - part) // 2 for whole, part in zip(scene.shape, size, strict=True))
     u = np.fft.rfftfreq(scene.shape[1])
     frames = np.zeros((num_frames, *size))
+    moments, shares = exposure_moments(shake, exposure_rows * row_time)
     for p in range(num_frames):
         total = np.zeros((size[0], len(u)), dtype=complex)
-        for n in range(MOMENTS):
-            place = p * frame_rows + np.arange(size[0]) + (n + 0.5) / MOMENTS * exposure_rows
+        for moment, share in zip(moments, shares, strict=True):
+            place = p * frame_rows + np.arange(size[0]) + moment * exposure_rows
             x, y = shake.displacement(place * row_time)
             source = (top + np.arange(size[0]) - y) * FINER
             cell = np.floor(source).astype(int)
@@ -94,6 +108,6 @@ def take_frames(
             row = np.zeros_like(total)
             for i in range(POINTS):
                 row += weights[:, i, None] * rows[(cell + i - (POINTS // 2 - 1)) % len(rows)]
-            total += row * np.exp(-2j * np.pi * x[:, None] * u)
-        frames[p] = np.fft.irfft(total / MOMENTS, n=scene.shape[1], axis=1)[:, left : left + size[1]]
+            total += share * row * np.exp(-2j * np.pi * x[:, None] * u)
+        frames[p] = np.fft.irfft(total, n=scene.shape[1], axis=1)[:, left : left + size[1]]
     return frames
