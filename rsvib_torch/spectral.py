@@ -1,13 +1,12 @@
 """Fourier transforms along rows of images that are not periodic."""
 
 import math
-from collections.abc import Iterable
 
 import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
 
-__all__ = ["extend_rows", "fast_length", "gathered", "shift_phases", "squared_modulus", "waves"]
+__all__ = ["extend_rows", "fast_length", "shift_phases", "squared_modulus", "waves"]
 
 _TABLE = 64  # frequencies that a phase is stepped through
 
@@ -83,27 +82,6 @@ def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dt
         tables.append(torch.complex(angle.cos(), angle.sin()).to(dtype))  # several times faster than torch.polar
     product = tables[0][..., :, None] * tables[1][..., None, :]
     return product.flatten(-2)[..., : stop - start]
-
-
-def gathered(pieces: Iterable[tuple[slice, Tensor]], count: int, dim: int) -> Tensor:
-    """Pieces of a tensor, each with its place along ``dim``, as one of ``count`` places.
-
-    Each is written where it belongs as soon as it is made, unless it is differentiated.
-
-    Example:
-        >>> gathered(((slice(i, i + 1), torch.full((1, 2), float(i))) for i in range(3)), 3, 0).tolist()
-        [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]
-    """
-    kept: list[Tensor] = []
-    whole: Tensor | None = None
-    for place, piece in pieces:
-        if piece.requires_grad:
-            kept.append(piece)
-            continue
-        if whole is None:
-            whole = piece.new_empty(*piece.shape[:dim], count, *piece.shape[dim + 1 :])
-        whole.narrow(dim, place.start, piece.shape[dim]).copy_(piece)
-    return torch.cat(kept, dim) if whole is None else whole
 
 
 def waves(places: Tensor, frequencies: Tensor) -> Tensor:

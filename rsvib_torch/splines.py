@@ -6,6 +6,8 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from rsvib_torch.pieces import runs
+
 __all__ = [
     "bspline_coefficient_rows",
     "bspline_coefficients",
@@ -113,12 +115,11 @@ def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[tuple[sli
     index = mirrored_index(-reach, height + reach, height, samples.device)
     step = min(_BLOCK if samples.device.type == "cpu" else _LARGE_BLOCK, height)
     matrix = _toeplitz(taps, step, samples)
-    for top in range(0, height, step):
-        rows = slice(top, min(top + step, height))
-        count = rows.stop - top
-        near = slice(top - reach, rows.stop + reach)
+    for rows in runs(height, step):
+        count = rows.stop - rows.start
+        near = slice(rows.start - reach, rows.stop + reach)
         inside = near.start >= 0 and near.stop <= height
-        seen = samples[..., near, :] if inside else samples.index_select(-2, index[top : rows.stop + 2 * reach])
+        seen = samples[..., near, :] if inside else samples.index_select(-2, index[rows.start : rows.stop + 2 * reach])
         yield rows, torch.matmul(matrix[:count, : count + 2 * reach], seen)
 
 

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.spectral import extend_rows, fast_length, gathered, shift_phases
+from rsvib_torch.pieces import gathered, runs
+from rsvib_torch.spectral import extend_rows, fast_length, shift_phases
 from rsvib_torch.splines import bspline_coefficient_rows, bspline_weights
 
 __all__ = ["DEGREE", "MARGIN", "RowSpectra", "chunks", "combined", "inner_columns", "mean_over_frames"]
@@ -22,7 +23,7 @@ _LARGE_CHUNK = 2**30  # bytes at a time elsewhere
 def chunks(count: int, bytes_of_one: int, multiple: int, device: torch.device) -> list[slice]:
     """Slices of consecutive rows or columns, a multiple of ``multiple`` each, that are worked on at a time."""
     size = max(1, _CHUNK.get(device.type, _LARGE_CHUNK) // (bytes_of_one * multiple)) * multiple
-    return [slice(first, min(first + size, count)) for first in range(0, count, size)]
+    return runs(count, size)
 
 
 class RowSpectra:

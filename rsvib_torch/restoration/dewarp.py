@@ -5,9 +5,10 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from rsvib_torch.checks import check_whole_number
+from rsvib_torch.pieces import gathered, runs
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.rows import period_of_rows, spline_spectra
-from rsvib_torch.spectral import gathered, shift_phases
+from rsvib_torch.spectral import shift_phases
 from rsvib_torch.splines import bspline_weights, mirrored_index
 
 __all__ = ["restore_dewarp"]
@@ -58,6 +59,6 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 256
         image: Tensor = torch.fft.irfft(moved, n=length)[..., :W]
         return image
 
-    parts = (slice(begin, min(begin + chunk_rows, H)) for begin in range(0, H, chunk_rows))
-    stacked: Tensor = gathered(((part, restored(part)) for part in parts), H, 1).unflatten(0, (B, T)).movedim(3, 2)
+    parts = ((part, restored(part)) for part in runs(H, chunk_rows))
+    stacked: Tensor = gathered(parts, H, 1).unflatten(0, (B, T)).movedim(3, 2)
     return stacked

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from rsvib_torch.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.pieces import gathered
 from rsvib_torch.restoration.disagreement import noise_levels
 from rsvib_torch.restoration.edges import expectation, expectation_precision, stages
 from rsvib_torch.restoration.filling import fill_beyond_ends, fill_unmeasured
@@ -21,7 +22,6 @@ from rsvib_torch.restoration.row_system import RowKernels, row_kernels
 from rsvib_torch.restoration.rows import continue_rows, period_of_rows
 from rsvib_torch.restoration.scene_problem import SceneProblem
 from rsvib_torch.restoration.strength import prior_strength
-from rsvib_torch.spectral import gathered
 
 __all__ = ["ScenePrior", "restore_exact"]
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rsvib_torch.pieces import runs
 from rsvib_torch.restoration.banded_solver import BandedFactor, runs_of_rows
 from rsvib_torch.restoration.in_order import making_views, subtract_products
 from rsvib_torch.restoration.segments import Segments
@@ -148,7 +149,7 @@ class SubstitutionMemory:
         """
         rows, width = len(factors.inverse), self._sizes[0]
         uppers, inverses = between
-        blocks = [slice(top, min(top + self._step, rows)) for top in range(0, rows, self._step)]
+        blocks = runs(rows, self._step)
         for block in blocks:
             count = block.stop - block.start
             _mix(factors.upper[block], uppers, self._upper[width : width + count])

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from rsvib_torch.pieces import runs
 from rsvib_torch.restoration.banded_solver import BandedMemory
 from rsvib_torch.restoration.interpolated_solver import SubstitutionMemory, chosen_nodes
 from rsvib_torch.restoration.segments import Segments
@@ -47,7 +48,7 @@ class Shares:
 
     def parts(self, frequencies: int) -> list[slice]:
         """Chunks of all frequencies, the last one narrower."""
-        return [slice(k, min(k + self.chunk, frequencies)) for k in range(0, frequencies, self.chunk)]
+        return runs(frequencies, self.chunk)
 
 
 @dataclass(eq=False)

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.pieces import runs
 from rsvib_torch.restoration.motion import FrameMotion
-from rsvib_torch.restoration.row_kernel import interpolation_error, kernel_response
+from rsvib_torch.restoration.row_kernel import interpolation_error, kernel_spectrum
 from rsvib_torch.spectral import squared_modulus, waves
 
 __all__ = ["ORDER", "RowPrior", "autoregressive_prior", "brightness", "fit_prior"]
@@ -141,7 +142,7 @@ def autoregressive_prior(
         model = prior.innovation()[:, None] / ((whitener @ cosine.T).square() + (whitener @ sine.T).square())
         gain = model / (transfer * model + noise_power)
         scene = gain * noise_power + gain.square() * transfer * observed
-    blind = (model * aliases).mean(-1)
+    blind = (scene * aliases).mean(-1)
     return RowPrior(prior.power, prior.reflections, blind.clamp(min=torch.finfo(blind.dtype).tiny))
 
 
@@ -185,8 +186,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     bright = brightness(frames)[..., None, None, None]
     step = 1 if frames.device.type == "cpu" else len(tops)  # rows of pieces at a time: they stay in the cache
     found = []
-    for first in range(0, len(tops), step):
-        chosen = slice(first, first + step)
+    for chosen in runs(len(tops), step):
         strips = torch.stack([frames[..., top : top + size[0], :] for top in tops[chosen]], dim=2)
         pieces = torch.stack(
             [strips[..., left : left + size[1]] for left in lefts], dim=3
@@ -200,7 +200,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     )
     along = waves(displacement[..., 0], u) * weights[:, None]
     across = waves(displacement[..., 1], v)
-    transfer = squared_modulus(along.transpose(-2, -1) @ across) * kernel_response(v).square()
+    transfer = squared_modulus(along.transpose(-2, -1) @ across) * kernel_spectrum(v).square()
     aliases = torch.zeros_like(transfer[0, 0])
     for cycle in (-1, 1):  # all others together are less than 4 % of these
         beyond = across * waves(displacement[..., 1], v.new_tensor([cycle]))

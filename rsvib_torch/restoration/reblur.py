@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.pieces import runs
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.rows import period_of_rows, spline_spectra
 from rsvib_torch.splines import bspline_weights, mirrored_index
@@ -56,8 +57,7 @@ def reblur(scene: Tensor, motion: FrameMotion, frame: int, *, first_row: int = 0
     seen = fold[source[:, None] + torch.arange(count, device=scene.device) + beyond]  # (H, count)
     step = _ROWS.get(scene.device.type, height)
     formed = []
-    for top in range(0, height, step):
-        part = slice(top, min(top + step, height))
+    for part in runs(height, step):
         transfer = torch.complex(taps[part] @ angle[part].cos(), taps[part] @ angle[part].sin())  # (R, count, U)
         formed.append((transfer * spectra[:, seen[part]]).sum(-2))
     image: Tensor = torch.fft.irfft(torch.cat(formed, dim=-2), n=length)[..., :width]

@@ -1,15 +1,27 @@
 """The kernel that interpolates a scene between its rows."""
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["REACH", "TAPS", "interpolation_error", "kernel_response", "kernel_samples", "kernel_weights"]
+__all__ = [
+    "REACH",
+    "SCENE_REACH",
+    "TAPS",
+    "interpolation_error",
+    "kernel_samples",
+    "kernel_spectrum",
+    "kernel_weights",
+    "scene_weights",
+]
 
 REACH = 3  # rows on either side that a position is interpolated from
 TAPS = 2 * REACH
+SCENE_REACH = 5  # rows on either side that a row of the scene is made from
+_FINEST, _OPTICS = 0.46, 0.6  # cycles per row up to which it is faithful; px, sigma, of the optics that it is made for
 # (1 - z^2)^2 times this polynomial in z^2, z the distance over the reach: of all such kernels that pass at least 5 % at
 # half a cycle per row (less makes the coefficients ill-conditioned; the quintic B-spline passes 7 %) the one that
 # interpolates samples best, gain and images outside the band, for power spectra like frequency^-2 under Gaussian
@@ -51,12 +63,30 @@ def kernel_samples() -> tuple[float, ...]:
     return tuple(_kernel(torch.arange(1 - REACH, REACH, dtype=torch.float64)).tolist())
 
 
-def kernel_response(frequencies: Tensor) -> Tensor:
-    """Fourier transform of the sampled kernel at frequencies in cycles per row."""
-    response = torch.zeros_like(frequencies)
-    for row, weight in enumerate(kernel_samples()):
-        response = response + weight * torch.cos(2 * torch.pi * frequencies * (row - (REACH - 1)))
-    return response
+def kernel_spectrum(frequencies: Tensor) -> Tensor:
+    """Fourier transform of the kernel at frequencies in cycles per row."""
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+    places = torch.from_numpy(nodes * REACH).to(frequencies)
+    values = torch.from_numpy(weights * REACH).to(frequencies) * _kernel(places)
+    return torch.cos(2 * torch.pi * frequencies[..., None] * places) @ values
+
+
+@cache
+def scene_weights() -> tuple[float, ...]:
+    """Weights of the rows -5 ... 5 of coefficients that make a row of the scene.
+
+    Between its rows a wave of coefficients has the height that ``kernel_spectrum`` says, and on them that of its
+    aliases, too. Exposures blur these away, and so do frames that see the rows at many places. So the scene is what the
+    kernel makes of the coefficients without aliases, as well as so few weights can tell, for spectra like frequency^-1
+    (of the amplitude) under Gaussian optics.
+    """
+    v = torch.linspace(0, _FINEST, 369, dtype=torch.float64)
+    spectrum = kernel_spectrum(v)
+    order = torch.arange(SCENE_REACH + 1, dtype=torch.float64)
+    cosines = torch.cos(2 * torch.pi * v[:, None] * order) * torch.where(order > 0, 2.0, 1.0)
+    count = torch.exp(-0.5 * (2 * torch.pi * _OPTICS * v).square()) / ((v + 0.02) * spectrum)
+    half = torch.linalg.lstsq(cosines * count[:, None], (spectrum * count)[:, None]).solution[:, 0]
+    return tuple(torch.cat([half.flip(0), half[1:]]).tolist())
 
 
 def interpolation_error(frequencies: Tensor, cycles: Sequence[int] = (-3, -2, -1, 1, 2, 3)) -> Tensor:
@@ -69,8 +99,4 @@ def interpolation_error(frequencies: Tensor, cycles: Sequence[int] = (-3, -2, -1
     Returns:
         Power of the same shape: what the kernel lets through there.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(64)
-    places = torch.from_numpy(nodes * REACH).to(frequencies)
-    values = torch.from_numpy(weights * REACH).to(frequencies) * _kernel(places)
-    aliases = frequencies[..., None] + torch.tensor(cycles).to(frequencies)
-    return (torch.cos(2 * torch.pi * aliases[..., None] * places) @ values).square().sum(-1)
+    return kernel_spectrum(frequencies[..., None] + torch.tensor(cycles).to(frequencies)).square().sum(-1)

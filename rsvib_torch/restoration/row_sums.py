@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from rsvib_torch.pieces import runs
 from rsvib_torch.restoration.row_system import RowKernels, SmoothKernels
 
 __all__ = ["RowSums", "sum_looked_up"]
@@ -81,9 +82,8 @@ def sum_looked_up(rows: Tensor, source: Tensor, left: Tensor, matrix: Tensor, ou
     step = min(_ROWS.get(rows.device.type, count), count)
     kernel = rows.new_empty(step * most, rows.shape[-1])
     looked_up = rows.new_empty(step * most, *rows.shape[1:])
-    for top in range(0, count, step):
-        part = slice(top, min(top + step, count))
-        size = (part.stop - top) * most
+    for part in runs(count, step):
+        size = (part.stop - part.start) * most
         torch.mm(left[part].flatten(0, 1), matrix, out=torch.view_as_real(kernel[:size]).flatten(1))
         torch.index_select(rows, 0, source[part].flatten(), out=looked_up[:size])
         looked_up[:size].mul_(kernel[:size, None])

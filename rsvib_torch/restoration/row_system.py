@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.restoration.row_kernel import REACH, TAPS, kernel_weights
+from rsvib_torch.restoration.row_kernel import REACH, SCENE_REACH, TAPS, kernel_weights
 from rsvib_torch.restoration.segments import Segments
 from rsvib_torch.spectral import shift_phases
 
@@ -65,8 +65,8 @@ class RowKernels:
 
     def scene_rows(self, num_rows: int) -> SceneRows:
         """All scene rows seen, and those that frames of ``num_rows`` rows need to be evaluated."""
-        top = min(int(self.first.amin()), 1 - REACH)
-        return SceneRows(top, max(int(self.first.amax()) + self.taps.shape[-2], num_rows + REACH - 1) - top)
+        top = min(int(self.first.amin()), -SCENE_REACH)
+        return SceneRows(top, max(int(self.first.amax()) + self.taps.shape[-2], num_rows + SCENE_REACH) - top)
 
     def rows(self, top: int, count: int) -> "RowKernels":
         """Kernels of ``count`` rows from row ``top`` on, counted from there."""

@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor
 
-from rsvib_torch.spectral import fast_length, gathered
+from rsvib_torch.pieces import gathered
+from rsvib_torch.spectral import fast_length
 from rsvib_torch.splines import bspline_coefficient_rows
 
 __all__ = ["continue_rows", "period_of_rows", "spline_spectra"]

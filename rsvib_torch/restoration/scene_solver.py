@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.parallel import in_parallel
+from rsvib_torch.pieces import gathered, runs
 from rsvib_torch.restoration.banded_solver import BandedFactor, factor_skewed, solve_factored, solve_skewed
 from rsvib_torch.restoration.interpolated_solver import NodeFactors
 from rsvib_torch.restoration.partition import Partition
-from rsvib_torch.restoration.row_kernel import REACH, kernel_samples
+from rsvib_torch.restoration.row_kernel import SCENE_REACH, scene_weights
 from rsvib_torch.restoration.row_sums import RowSums, sum_looked_up
 from rsvib_torch.restoration.row_system import RowKernels, smooth_band, smooth_kernels
-from rsvib_torch.spectral import gathered
 
 __all__ = ["Coefficients", "SceneSolver"]
 
@@ -220,17 +220,16 @@ class SceneSolver:
             return self.scene(self.fit(data))[..., :width]
         found = spectra.new_empty(self.num_rows, spectra.shape[1], len(self.u))
 
-        step = _ROWS.get(found.device.type, self.num_rows)
-        runs = [slice(top, min(top + step, self.num_rows)) for top in range(0, self.num_rows, step)]
+        blocks = runs(self.num_rows, _ROWS.get(found.device.type, self.num_rows))
 
         def take(k: int, solved: Tensor) -> None:
-            for rows in runs:
+            for rows in blocks:
                 sampled = found[rows, :, self.parts[k]].copy_(self._between_rows(solved, rows))
                 if self._shares.nodes is not None:
                     sampled.conj_physical_()
 
         self._solve_in_place(spectra, None, take)
-        images = ((run, torch.fft.irfft(found[run].movedim(1, 0), n=self.length)[..., :width]) for run in runs)
+        images = ((rows, torch.fft.irfft(found[rows].movedim(1, 0), n=self.length)[..., :width]) for rows in blocks)
         return gathered(images, self.num_rows, 1)
 
     def _differentiates(self, *values: Tensor) -> bool:
@@ -240,9 +239,9 @@ class SceneSolver:
     def _between_rows(self, coefficients: Tensor, rows: slice | None = None) -> Tensor:
         """What coefficients (K, C, U') make of some rows of the scene, by default all."""
         chosen = slice(0, self.num_rows) if rows is None else rows
-        first = 1 - REACH - self.rows.top + chosen.start
+        first = chosen.start - SCENE_REACH - self.rows.top
         count = chosen.stop - chosen.start
-        weights = kernel_samples()
+        weights = scene_weights()
         sampled = weights[0] * coefficients[first : first + count]
         for k, weight in enumerate(weights[1:], 1):
             sampled = sampled.add_(coefficients[first + k : first + k + count], alpha=weight)

@@ -22,7 +22,7 @@ from rsvib_torch.restoration import exact, prior
 from rsvib_torch.restoration.interpolated_solver import NodeFactors
 from rsvib_torch.restoration.motion import as_batch, frame_motion
 from rsvib_torch.restoration.partition import Partition
-from rsvib_torch.restoration.row_kernel import kernel_samples
+from rsvib_torch.restoration.row_kernel import scene_weights
 from rsvib_torch.restoration.row_system import row_kernels, smooth_band, smooth_kernels
 from rsvib_torch.restoration.rows import period_of_rows
 
@@ -111,7 +111,7 @@ def steps(s: Shapes) -> list[dict[str, Any]]:
     at_nodes = s.unknowns * s.nodes
     factored, updates = ("factors", b * (b + 2)) if s.nodes == s.frequencies else ("factors of some", b * (b + 1))
     sides = solution if s.nodes == s.frequencies else 0  # eliminated along with the factors
-    shared = len(kernel_samples())
+    shared = len(scene_weights())
     counted = [
         ("Fourier transform of rows", transform, frame + spectrum, frame + 2 * period + spectrum),
         (

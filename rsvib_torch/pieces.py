@@ -1,0 +1,39 @@
+"""Tensors in pieces: which runs of rows are worked on at a time, and what they make, joined again."""
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+__all__ = ["gathered", "runs"]
+
+
+def runs(count: int, size: int) -> list[slice]:
+    """Runs of ``size`` places of ``count``, one after the other, the last one shorter.
+
+    Example:
+        >>> runs(5, 2)
+        [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
+    """
+    return [slice(first, min(first + size, count)) for first in range(0, count, size)]
+
+
+def gathered(pieces: Iterable[tuple[slice, Tensor]], count: int, dim: int) -> Tensor:
+    """Pieces of a tensor, each with its place along ``dim``, as one of ``count`` places.
+
+    Each is written where it belongs as soon as it is made, unless it is differentiated.
+
+    Example:
+        >>> gathered(((slice(i, i + 1), torch.full((1, 2), float(i))) for i in range(3)), 3, 0).tolist()
+        [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]
+    """
+    kept: list[Tensor] = []
+    whole: Tensor | None = None
+    for place, piece in pieces:
+        if piece.requires_grad:
+            kept.append(piece)
+            continue
+        if whole is None:
+            whole = piece.new_empty(*piece.shape[:dim], count, *piece.shape[dim + 1 :])
+        whole.narrow(dim, place.start, piece.shape[dim]).copy_(piece)
+    return torch.cat(kept, dim) if whole is None else whole
