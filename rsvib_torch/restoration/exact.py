@@ -30,19 +30,20 @@ ScenePrior = Literal["gaussian", "edges"]
 _MARGIN = 16  # rows beyond the frame that it may see
 _LONG = 1.0  # px along the row either way: beyond, ends of rows are worth being continued by what the blur demands
 _REACH = 8  # px beyond the displacement that ends say something of where they are not filled so
+_SLABS = 4  # of rows that tell the strength of the prior, of all frames together
 _LOOSE, _REST = 0.3, 0.03  # parts of the quadratic prior that patches start from and keep
 _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
 
 
-def _chosen_by(groups: list[tuple[list[int], int]], shift: Tensor) -> tuple[list[int], int]:
-    """Frames that the strength of the prior is chosen by, and in whose coordinates.
+def _alike(members: list[int], reference: int, shift: Tensor) -> list[int]:
+    """Frames of a group that the strength of the prior is chosen by: those that show the same columns.
 
     Args:
-        groups: As from ``joint_groups``.
-        shift: (T, 2) reference shifts of the frames: those that lie apart do not show the same columns.
+        members: Of the group.
+        reference: In whose coordinates it is restored.
+        shift: (T, 2) reference shifts of the frames.
     """
-    members, reference = groups[len(groups) // 2]
-    return [frame for frame in members if torch.equal(shift[frame], shift[reference])], reference
+    return [frame for frame in members if torch.equal(shift[frame], shift[reference])]
 
 
 def _with_edges(problem: SceneProblem, factor: float) -> Tensor:
@@ -151,13 +152,16 @@ def restore_exact(
                 moved = displacement[stack, members] - motion.shift[stack, reference]
                 return row_kernels(moved, node_weights, weights[members], H, _MARGIN)
 
-            first = _chosen_by(groups, motion.shift[stack])
             certain = noise != "auto" or T > 1
-            chosen = system(*first)
-            strength = prior_strength(frames[stack, first[0]], chosen, row_prior, typical * length, certain=certain)
-            precision = row_prior.precision(typical * length, factor * strength, chosen.reach)
+            power = typical * length
             for place, (members, reference) in enumerate(groups):
-                kernels = chosen if (members, reference) == first else system(members, reference)
+                kernels, own_prior = system(members, reference), row_prior.of(members)
+                alike = _alike(members, reference, motion.shift[stack])
+                part = kernels if alike == members else system(alike, reference)
+                strength = prior_strength(
+                    frames[stack, alike], part, own_prior, power, certain=certain, slabs=max(1, _SLABS // len(groups))
+                )
+                precision = own_prior.precision(power, factor * strength, kernels.reach)
                 along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
                 seen = frames[stack, members[0] : members[-1] + 1]  # neighbours
                 data = continue_rows(seen, length).sub_(mean[stack])

@@ -1,7 +1,7 @@
 """Scene prior estimated from the frames themselves."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -36,7 +36,7 @@ class RowPrior:
     Attributes:
         power: (U,) variance of a coefficient.
         reflections: (p, U) partial correlations, within -1 ... 1.
-        blind: (U,) power of what the kernel between rows cannot follow, which counts as noise.
+        blind: (U,) power of what the kernel between rows cannot follow, which counts as noise; (T, U) of each frame.
     """
 
     power: Tensor
@@ -48,6 +48,10 @@ class RowPrior:
         """Neighbouring rows are alike at all frequencies (U,), and the innovation has variance 1."""
         reflections = torch.stack([torch.full_like(u, 0.9), torch.zeros_like(u)])
         return cls(1 / (1 - reflections[0].square()), reflections, torch.zeros_like(u))
+
+    def of(self, members: list[int]) -> "RowPrior":
+        """The prior for restoring a scene from some of the frames: each is blind to what its own blur leaves."""
+        return replace(self, blind=self.blind[members].mean(0))
 
     def filter(self) -> Tensor:
         """Coefficients 1, a_1 ... a_p of the filter that whitens, (p + 1, U)."""
@@ -63,9 +67,10 @@ class RowPrior:
 
     def resampled(self, count: int) -> "RowPrior":
         """The prior at ``count`` frequencies spread over the same range."""
-        stacked = torch.cat([self.power.log()[None], self.blind.log()[None], self.reflections])
-        values = torch.nn.functional.interpolate(stacked[None], count, mode="linear", align_corners=True)[0]
-        return RowPrior(values[0].exp(), values[2:], values[1].exp())
+        parts = [self.power.log()[None], self.reflections, torch.atleast_2d(self.blind).log()]
+        stacked = torch.nn.functional.interpolate(torch.cat(parts)[None], count, mode="linear", align_corners=True)[0]
+        power, reflections, blind = stacked.split([len(part) for part in parts])
+        return RowPrior(power[0].exp(), reflections, blind.exp().reshape(*self.blind.shape[:-1], count))
 
     def precision(self, noise_power: Tensor, strength: float, reach: float = 0.0) -> Tensor:
         """Products ``a_k a_(k + d)`` of the filter in units of the data's noise, (p + 1, p + 1, U), 0 for k + d > p.
@@ -124,7 +129,8 @@ def autoregressive_prior(
     Args:
         observed: (U, V) power of the frames, horizontal frequencies by vertical ones.
         transfer: (U, V) power that the blur lets through.
-        aliases: (U, V) power of what the kernel between rows cannot follow, through the blur, of a wave of power 1.
+        aliases: (T, U, V) power of what the kernel between rows cannot follow, through the blur of each frame, of a
+            wave of power 1.
         noise_power: Power of the noise in each value, shape (U, V) or ().
         order: Rows that a row is predicted from.
 
@@ -201,10 +207,10 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     along = waves(displacement[..., 0], u) * weights[:, None]
     across = waves(displacement[..., 1], v)
     transfer = squared_modulus(along.transpose(-2, -1) @ across) * kernel_spectrum(v).square()
-    aliases = torch.zeros_like(transfer[0, 0])
+    aliases = torch.zeros_like(transfer[:, 0])
     for cycle in (-1, 1):  # all others together are less than 4 % of these
         beyond = across * waves(displacement[..., 1], v.new_tensor([cycle]))
-        blurred = squared_modulus(along.transpose(-2, -1) @ beyond).mean((0, 1))
+        blurred = squared_modulus(along.transpose(-2, -1) @ beyond).mean(1)
         aliases = aliases + blurred * interpolation_error(v, [cycle])
     weight = transfer / levels.to(torch.float64).square()[:, None, None, None]
     total = weight.sum((0, 1)).clamp(min=torch.finfo(torch.float32).tiny)

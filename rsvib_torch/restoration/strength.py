@@ -5,15 +5,14 @@ from torch import Tensor
 
 from rsvib_torch.restoration.prior import RowPrior
 from rsvib_torch.restoration.row_system import RowKernels
-from rsvib_torch.restoration.sampled_rows import Explained, sample_rows
+from rsvib_torch.restoration.sampled_rows import SLAB, Explained, sample_rows
 
 __all__ = ["prior_strength"]
 
 _STRENGTHS = (2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
-_DOUBT = 0.014  # by how much a prior half as strong has to predict better, in logarithms
+_DOUBT = (0.014, 0.002)  # by how much a prior half, or twice, as strong has to predict better, in logarithms
 _CLEAR = 200.0  # times what the kernel between rows cannot follow: less noise hides behind that
 _FIRST = 3  # of them are nearly always enough
-_ROWS = 512  # at most, from the middle of the frames
 _FREQUENCIES = 24
 _LOWEST = 0.02  # cycles per px; the taper spreads what lies below
 _SMALLEST = 64  # rows and columns that a choice can be made from
@@ -24,18 +23,20 @@ def _cross_validation(explained: Explained, strengths: Tensor) -> int:
 
     ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from all
     others. For all frequencies together, those with the largest errors decide; its geometric mean over the frequencies
-    counts all alike. Too weak a prior costs less than one that is too strong, so that the weaker one is taken.
+    counts all alike. Too weak a prior costs less than one that is too strong, so that the weaker one is taken; and what
+    the noise asks for, strength 1, as long as hardly anything speaks against it.
     """
     left = explained.count - explained.freedom
     together = explained.power.sum(-1).log() - 2 * left.sum(-1).log()
     one_by_one = (explained.power.log() - 2 * left.log()).mean(-1)
-    doubt = _DOUBT * strengths.log2().neg().clamp(min=0.0)
+    octaves = strengths.log2()
+    doubt = torch.maximum(-_DOUBT[0] * octaves, _DOUBT[1] * octaves)
     return int(torch.maximum((together + doubt).argmin(), (one_by_one + doubt).argmin()))
 
 
 @torch.no_grad()
 def prior_strength(
-    images: Tensor, kernels: RowKernels, prior: RowPrior, noise_power: Tensor, *, certain: bool = True
+    images: Tensor, kernels: RowKernels, prior: RowPrior, noise_power: Tensor, *, certain: bool = True, slabs: int = 4
 ) -> float:
     """Factor on the prior for restoring one scene.
 
@@ -50,6 +51,7 @@ def prior_strength(
         noise_power: In the units of the prior.
         certain: The noise is known, and not taken from one frame, where texture adds to it: only then can the prior
             be too weak.
+        slabs: How many runs of ``SLAB`` rows in the middle of the frames to look at, at most.
 
     Returns:
         One of a few factors.
@@ -57,7 +59,7 @@ def prior_strength(
     height, width = images.shape[-2:]
     if min(height, width) < _SMALLEST:
         return 1.0
-    count = min(height, _ROWS)
+    count = min(height, slabs * SLAB)
     top = (height - count) // 2
     part = kernels.rows(top, count)
     chosen = torch.linspace(_LOWEST * width, width // 2, min(_FREQUENCIES, width // 4), device=images.device).long()

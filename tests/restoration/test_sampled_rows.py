@@ -27,7 +27,7 @@ def taken(request):
     starts = motion.row_starts(torch.arange(NUM_ROWS, dtype=torch.float64))
     displacement, weights = exposure_trajectory(motion.vibration[0], starts, timing, "gauss")
     kernels = row_kernels(displacement, weights, torch.ones(2), NUM_ROWS, 16)
-    prior = fit_prior(frames, motion, 0, torch.full((2,), NOISE), WIDTH)
+    prior = fit_prior(frames, motion, 0, torch.full((2,), NOISE), WIDTH).of([0, 1])
     chosen = torch.arange(8, 120, 8)
     precision = prior.precision(torch.tensor(NOISE**2 * WIDTH), 1.0, kernels.reach)[..., chosen]
     assert frames.shape == (2, 1, NUM_ROWS, WIDTH)
@@ -64,7 +64,7 @@ def dense(frames, kernels, u, products, rows):
 @pytest.mark.parametrize("slab", [1000, 128, 80])
 def test_slabs_are_explained_each_by_itself(taken, monkeypatch, slab):
     frames, kernels, chosen, precision = taken
-    monkeypatch.setattr(sampled_rows, "_SLAB", slab)
+    monkeypatch.setattr(sampled_rows, "SLAB", slab)
     found = sample_rows(frames, kernels, chosen).explain([precision, 0.25 * precision])
     number = max(1, NUM_ROWS // slab)
     height = NUM_ROWS // number

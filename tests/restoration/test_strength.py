@@ -11,6 +11,8 @@ from truth import Motion, crop, decibel, draw_scene, take_frames
 from rsvib_torch import SensorTiming
 from rsvib_torch.restoration import exact
 from rsvib_torch.restoration import restore as restore_by_any_method
+from rsvib_torch.restoration.motion import as_batch, frame_motion
+from rsvib_torch.restoration.prior import fit_prior
 
 restore = partial(restore_by_any_method, method="exact", check=False)
 MOTION = Motion()
@@ -56,7 +58,7 @@ def without_choice(monkeypatch):
 def test_weight_from_the_data_is_near_the_best_by_hand(without_choice, name, rows, noise, given, joint, least, within):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     scene = SCENES[name]()
-    clean = take_frames(scene, timing, MOTION, 2, samples=16)
+    clean = take_frames(scene, timing, MOTION, 2, samples=64)
     frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()[:given]
     found = decibel(restore(frames, timing, MOTION.vibration(), joint=joint)[0], crop(scene))
     by_hand = {
@@ -66,3 +68,19 @@ def test_weight_from_the_data_is_near_the_best_by_hand(without_choice, name, row
     assert found > max(by_hand.values()) - within
     assert found > by_hand[1.0] + least
     assert max(by_hand.values()) - min(by_hand.values()) > 0.5
+
+
+def test_each_frame_is_blind_to_what_its_own_blur_leaves():
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=200, frame_rows=2048)
+    frames = torch.from_numpy(take_frames(texture(0.7), timing, MOTION, 2, 0.001, samples=100)).float()[:, None]
+    height = frames.shape[-2]
+    motion = frame_motion(as_batch(MOTION.vibration(), 1), timing, 2, height)
+    prior = fit_prior(frames, motion, 0, torch.full((2,), 0.001), 256)
+    assert prior.blind.shape == (2, 129)
+    times = (2048 * np.arange(2)[:, None, None] + np.arange(height)[:, None] + np.arange(0, 200, 5)) * timing.row_time
+    across = MOTION.displacement(times)[..., 1]
+    path = (across.max(-1) - across.min(-1)).mean(-1)  # px that rows are blurred over, in each frame
+    assert path[0] < 0.8 * path[1]
+    assert prior.blind[0].mean() > 3 * prior.blind[1].mean()
+    torch.testing.assert_close(prior.of([0, 1]).blind, prior.blind.mean(0))
+    torch.testing.assert_close(prior.of([1]).blind, prior.blind[1])
