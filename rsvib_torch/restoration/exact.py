@@ -21,7 +21,7 @@ from rsvib_torch.restoration.prior import brightness, fit_prior
 from rsvib_torch.restoration.row_system import RowKernels, row_kernels
 from rsvib_torch.restoration.rows import continue_rows, period_of_rows
 from rsvib_torch.restoration.scene_problem import SceneProblem
-from rsvib_torch.restoration.strength import prior_strength
+from rsvib_torch.restoration.strength import Strengths
 
 __all__ = ["ScenePrior", "restore_exact"]
 
@@ -30,7 +30,6 @@ ScenePrior = Literal["gaussian", "edges"]
 _MARGIN = 16  # rows beyond the frame that it may see
 _LONG = 1.0  # px along the row either way: beyond, ends of rows are worth being continued by what the blur demands
 _REACH = 8  # px beyond the displacement that ends say something of where they are not filled so
-_SLABS = 4  # of rows that tell the strength of the prior, of all frames together
 _LOOSE, _REST = 0.3, 0.03  # parts of the quadratic prior that patches start from and keep
 _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
 
@@ -152,15 +151,13 @@ def restore_exact(
                 moved = displacement[stack, members] - motion.shift[stack, reference]
                 return row_kernels(moved, node_weights, weights[members], H, _MARGIN)
 
-            certain = noise != "auto" or T > 1
+            certain, strengths = noise != "auto" or T > 1, Strengths()
             power = typical * length
             for place, (members, reference) in enumerate(groups):
                 kernels, own_prior = system(members, reference), row_prior.of(members)
                 alike = _alike(members, reference, motion.shift[stack])
                 part = kernels if alike == members else system(alike, reference)
-                strength = prior_strength(
-                    frames[stack, alike], part, own_prior, power, certain=certain, slabs=max(1, _SLABS // len(groups))
-                )
+                strength = strengths.of(frames[stack, alike], part, own_prior, power, certain=certain)
                 precision = own_prior.precision(power, factor * strength, kernels.reach)
                 along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
                 seen = frames[stack, members[0] : members[-1] + 1]  # neighbours

@@ -7,15 +7,17 @@ from rsvib_torch.restoration.prior import RowPrior
 from rsvib_torch.restoration.row_system import RowKernels
 from rsvib_torch.restoration.sampled_rows import SLAB, Explained, sample_rows
 
-__all__ = ["prior_strength"]
+__all__ = ["Strengths", "prior_strength"]
 
 _STRENGTHS = (2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 _DOUBT = (0.014, 0.002)  # by how much a prior half, or twice, as strong has to predict better, in logarithms
 _CLEAR = 200.0  # times what the kernel between rows cannot follow: less noise hides behind that
 _FIRST = 3  # of them are nearly always enough
+_SLABS = 4  # of rows in the middle of the frames
 _FREQUENCIES = 24
 _LOWEST = 0.02  # cycles per px; the taper spreads what lies below
 _SMALLEST = 64  # rows and columns that a choice can be made from
+_ALIKE = 0.2  # in the logarithm of what counts as noise
 
 
 def _cross_validation(explained: Explained, strengths: Tensor) -> int:
@@ -36,7 +38,7 @@ def _cross_validation(explained: Explained, strengths: Tensor) -> int:
 
 @torch.no_grad()
 def prior_strength(
-    images: Tensor, kernels: RowKernels, prior: RowPrior, noise_power: Tensor, *, certain: bool = True, slabs: int = 4
+    images: Tensor, kernels: RowKernels, prior: RowPrior, noise_power: Tensor, *, certain: bool = True
 ) -> float:
     """Factor on the prior for restoring one scene.
 
@@ -51,7 +53,6 @@ def prior_strength(
         noise_power: In the units of the prior.
         certain: The noise is known, and not taken from one frame, where texture adds to it: only then can the prior
             be too weak.
-        slabs: How many runs of ``SLAB`` rows in the middle of the frames to look at, at most.
 
     Returns:
         One of a few factors.
@@ -59,7 +60,7 @@ def prior_strength(
     height, width = images.shape[-2:]
     if min(height, width) < _SMALLEST:
         return 1.0
-    count = min(height, slabs * SLAB)
+    count = min(height, _SLABS * SLAB)
     top = (height - count) // 2
     part = kernels.rows(top, count)
     chosen = torch.linspace(_LOWEST * width, width // 2, min(_FREQUENCIES, width // 4), device=images.device).long()
@@ -75,3 +76,22 @@ def prior_strength(
         tried = tried.joined(sample.explain(precisions[_FIRST:]))
         choice = _cross_validation(tried, tried.power.new_tensor(strengths))
     return strengths[choice]
+
+
+class Strengths:
+    """``prior_strength`` of one scene after the other; those with as much noise, and as blind, share one."""
+
+    def __init__(self) -> None:
+        self._known: list[tuple[float, float]] = []
+
+    def of(
+        self, images: Tensor, kernels: RowKernels, prior: RowPrior, noise_power: Tensor, *, certain: bool = True
+    ) -> float:
+        """The strength for one scene; arguments as of ``prior_strength``."""
+        noise = float((noise_power / kernels.weight.mean() + prior.blind.mean()).detach().log())
+        for known, strength in self._known:
+            if abs(noise - known) < _ALIKE:
+                return strength
+        strength = prior_strength(images, kernels, prior, noise_power, certain=certain)
+        self._known.append((noise, strength))
+        return strength

@@ -9,8 +9,8 @@ from scipy import ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
-from rsvib_torch.restoration import exact
 from rsvib_torch.restoration import restore as restore_by_any_method
+from rsvib_torch.restoration import strength
 from rsvib_torch.restoration.motion import as_batch, frame_motion
 from rsvib_torch.restoration.prior import fit_prior
 
@@ -37,7 +37,7 @@ def without_choice(monkeypatch):
 
     def run(frames, timing, **options):
         with monkeypatch.context() as patch:
-            patch.setattr(exact, "prior_strength", lambda *arguments, **named: 1.0)
+            patch.setattr(strength, "prior_strength", lambda *arguments, **named: 1.0)
             return restore(frames, timing, MOTION.vibration(), **options)
 
     return run
@@ -84,3 +84,21 @@ def test_each_frame_is_blind_to_what_its_own_blur_leaves():
     assert prior.blind[0].mean() > 3 * prior.blind[1].mean()
     torch.testing.assert_close(prior.of([0, 1]).blind, prior.blind.mean(0))
     torch.testing.assert_close(prior.of([1]).blind, prior.blind[1])
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "noise", "choices"), [("buildings", 20, 0.005, 1), ("dense texture", 100, 0.001, 2)]
+)
+def test_frames_that_are_alike_share_a_choice(monkeypatch, name, rows, noise, choices):
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
+    clean = take_frames(SCENES[name](), timing, MOTION, 2, samples=48)
+    frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()
+    made = []
+    choose = strength.prior_strength
+    monkeypatch.setattr(
+        strength, "prior_strength", lambda *arguments, **named: made.append(choose(*arguments, **named)) or made[-1]
+    )
+    restore(frames, timing, MOTION.vibration())
+    assert len(made) == choices
+    restore(frames, timing, MOTION.vibration(), joint=True)
+    assert len(made) == choices + 1
