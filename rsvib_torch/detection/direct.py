@@ -32,6 +32,8 @@ __all__ = ["DirectFit", "refine_directly"]
 _CLEANINGS = 2  # rounds of taking out what is fixed to the sensor
 _NEAR = 0.05  # px: gradients of frames that were warped this well need not be taken again
 _RUNAWAY = 2.0  # times larger from round to round: no tone that was found does that
+_BACK = -0.3  # part of a step that the next one takes back: then both were too long
+_SHORTEST = 0.25  # of what rows say is missing
 _LEAST_GAIN = 0.02  # of the residual that a further tone must explain: the rows' noise is nearly white
 
 
@@ -52,6 +54,22 @@ class DirectFit:
 
 def _displacements(measurements: Measurements, motion: Vibration) -> Tensor:
     return motion.mean_displacement(measurements.moments, measurements.exposure_time)
+
+
+def _believed(told: Measurements, around: Vibration, belief: Tensor) -> Measurements:
+    """Measurements around a motion with parts (B,) of what rows say is missing."""
+    placed = told.relative(_displacements(told, around))
+    return replace(told, displacements=placed + belief[:, None, None, None] * (told.displacements - placed))
+
+
+def _shorter(belief: Tensor, step: Tensor, before: Tensor) -> Tensor:
+    """Parts (B,) of what rows say is missing to believe, after two steps (B, N, G, 2) of the motion.
+
+    Where an exposure is long, a wrong motion blurs frames wrongly as well, and rows say up to twice what is missing.
+    Steps then overshoot: of two in opposite directions the second is ``1 - belief gain`` times the first.
+    """
+    back = (step * before).sum((1, 2, 3)) / before.square().sum((1, 2, 3)).clamp(min=1e-30)
+    return torch.where(back < _BACK, (belief / (1 - back)).clamp(min=_SHORTEST), belief)
 
 
 def _settled(before: ToneFit, after: ToneFit) -> bool:
@@ -107,6 +125,8 @@ def refine_directly(
     motion, _ = vibration_of_fit(fit)
     groups = frame_groups(spectra, timing, motion, alike=True)
     gradients: list[RowGradients | None] = [None] * len(groups)
+    belief = torch.ones(len(start.active), dtype=torch.float64, device=start.active.device)
+    last: Tensor | None = None
     cleanings = _CLEANINGS
     search_at = 1  # the first round removes the error of the bands: then weak tones show
     interval = max(BLOCK * timing.row_time, 0.5 * timing.exposure_time)  # the exposure averages out what is faster
@@ -114,8 +134,9 @@ def refine_directly(
     for step in range(iterations):
         measured = [measure_group(group, timing, motion, known) for group, known in zip(groups, gradients, strict=True)]
         gradients = [known for _, known in measured]
-        measurements = join_groups([part for part, _ in measured])
+        told = join_groups([part for part, _ in measured])
         before, around = fit, motion
+        measurements = _believed(told, motion, belief)
         if step == search_at:
             left = residual_of(measurements, fit)
             careful = replace(measurements, independent=independent_fraction(measurements, left))
@@ -143,12 +164,21 @@ def refine_directly(
         change = measurements.relative(_displacements(measurements, motion) - _displacements(measurements, around))
         if float(change.abs().amax()) > _NEAR:
             gradients = [None] * len(groups)
-    residual = residual_of(measurements, fit)
-    weighed = measurements.reweighted(residual)
-    share = independent_fraction(weighed, residual) * measurements.share_counted(residual)
+        plain = step > search_at and torch.equal(before.active, fit.active)  # else steps are of another model
+        if plain and last is not None:
+            belief = _shorter(belief, change, last)
+        last = change if plain else None
+    return _concluded(told, fit, tones, gradients)
+
+
+def _concluded(told: Measurements, fit: ToneFit, tones: int | None, gradients: list[RowGradients | None]) -> DirectFit:
+    """The last fit, to all that the rows say: with the part of it that was believed their noise would seem smaller."""
+    residual = residual_of(told, fit)
+    weighed = told.reweighted(residual)
+    share = independent_fraction(weighed, residual) * told.share_counted(residual)
     honest = replace(weighed, independent=share)
-    fit = fit_tones(honest, fit.frequencies, fit.active, model)
+    fit = fit_tones(honest, fit.frequencies, fit.active, fit.model)
     if tones is None:
         fit = significant_only(honest, fit)
-    apart = OtherMotion(unexplained(measurements, residual), slant([g for g in gradients if g is not None]))
+    apart = OtherMotion(unexplained(told, residual), slant([g for g in gradients if g is not None]))
     return DirectFit(honest, fit, apart)

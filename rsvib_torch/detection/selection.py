@@ -125,6 +125,11 @@ def _undisturbed(measurements: Measurements, left: Tensor) -> Tensor:
     return (most < _LITTLE * whole).all(-1)
 
 
+def _typical(measurements: Measurements, fit: ToneFit) -> Tensor:
+    """(B,) typical size of what a fit leaves, both axes together: stretches of outliers hardly raise it."""
+    return measurements.sizes(residual_of(measurements, fit)).nanmedian(1).values.square().sum(-1)
+
+
 def _of_each(where: Tensor, one: Kind, other: Kind) -> Kind:
     """One result for the stacks (B,) where that is told, the other for the rest."""
 
@@ -196,8 +201,7 @@ def find_tones(
         The fit, with K the largest number of tones of any axis (at least 1).
     """
     model = model or MotionModel()
-    batch = len(measurements.moments)
-    device = measurements.moments.device
+    batch, device = len(measurements.moments), measurements.moments.device
     none = torch.zeros(batch, 2, model.harmonics, dtype=torch.bool, device=device)
     keep = none[..., :0] if start is None else start.active
     first = none if start is None else start.active
@@ -230,8 +234,9 @@ def find_tones(
             if bool(disturbed.any()):
                 further = _with_one_more(measurements, weighed, fit, left, active, sample_interval, True)
                 careful = robust_fit(measurements, further[0], active, model, further[1])
-                trial = _of_each(disturbed, careful[0], trial)
-                trial_weighed = _of_each(disturbed, careful[1], trial_weighed)
+                better = disturbed & (_typical(measurements, careful[0]) < _typical(measurements, trial))
+                trial = _of_each(better, careful[0], trial)
+                trial_weighed = _of_each(better, careful[1], trial_weighed)
         if tones is None:
             # both fits are judged with the weights of the richer one
             before = trial_weighed.square(left)

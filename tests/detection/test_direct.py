@@ -89,6 +89,21 @@ def test_long_exposures_that_blur_each_frame_in_its_own_way(paper_camera, exposu
     np.testing.assert_allclose(found.vibration.frequency[:, 0], (50.0, 30.0), rtol=1e-3)
 
 
+@pytest.mark.parametrize("seed", [66, 67])
+def test_long_exposures_of_half_a_frame(paper_camera, seed):
+    """One period of x and less of y, all blurred: rounds overshoot, and the bands ask for tones that are not there."""
+    camera = replace(paper_camera, exposure_rows=400)
+    motion = Motion((3.1, 5.2), (50.0, 30.0), (-1.39, -1.42))
+    frames = take_frames(draw_scene(1104, 1104, seed), camera, motion, 2, 0.005, seed=seed, samples=64)
+    found = detect_vibration(torch.from_numpy(frames).float(), camera)
+    amplitude, std = found.vibration.amplitude[:, 0].numpy(), found.std.amplitude[:, 0].numpy()
+    wrong = np.abs(amplitude - np.array(motion.amplitude))
+    assert all(found.reliable)
+    assert (wrong < 0.03 * amplitude).all()
+    assert (wrong < 5 * std).all()
+    np.testing.assert_allclose(found.vibration.frequency[:, 0], (50.0, 30.0), rtol=3e-3)
+
+
 def test_a_blind_tone_that_blur_asks_for_does_not_run_away():
     """400 rows of a sharp chart without noise: a tone of 23.8 Hz, where the gain is nothing, would grow to 1000 px."""
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=400, frame_rows=2048)
