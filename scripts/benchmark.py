@@ -55,12 +55,11 @@ def machine_line(machine: dict[str, Any]) -> str:
     """What the figures were taken on, in words."""
     libraries = ", ".join(f"{name} {version}" for name, version in machine["libraries"].items())
     load = "" if machine["load"] is None else f" Load at the start: {machine['load']:.1f}."
-    pages = "huge pages" if machine["huge_pages"] else "pages of the usual size"
+    pages = "huge pages asked for" if machine["huge_pages"] else "pages of the usual size"
     cuda = "No CUDA device here: tables are of the CPU alone." if machine["cuda"] is None else f"{machine['cuda']}."
     return (
         f"{machine['cores']} cores ({machine['processor']}), Python {machine['python']}, torch {machine['torch']} on "
-        f"{machine['threads']} threads, {libraries}, {pages} for tensors.{load} "
-        f"{cuda}"
+        f"{machine['threads']} threads, {libraries}, {pages}.{load} {cuda}"
     )
 
 

@@ -186,9 +186,8 @@ def measure_group(
         gradients = row_gradients(group.spectra, whole, rows, shift, seen)
         warped: Iterable[Tensor] = [whole]
     else:
-        warped = (
-            warp(run) for run in group.spectra.runs(rows.shape[-1], 2)
-        )  # each is forgotten while it is still in the cache
+        # each is forgotten while it is still in the cache
+        warped = (warp(run) for run in group.spectra.runs(rows.shape[-1], 2))
     matrix, right = row_shifts(warped, gradients, seen)
     matrix = _blocks(matrix[:, None]).sum(3)[:, 0]  # (B, N, 2, 2)
     right = _blocks(right).sum(3)  # (B, G, N, 2)

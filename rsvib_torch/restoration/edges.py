@@ -83,7 +83,10 @@ def expectation(
 
 
 def _sampled(values: Tensor) -> Tensor:
-    """The scene E c on all rows of its coefficients (K, C, U), nothing beyond them; E is symmetric."""
+    """The scene E c on all rows of its coefficients (K, C, U), nothing beyond them; E is symmetric.
+
+    By the kernel itself: more weights, as ``scene_weights`` has, would widen the band of ``E^T E``.
+    """
     edge = values.new_zeros(REACH - 1, *values.shape[1:])
     padded = torch.cat([edge, values, edge])
     return sum(

@@ -23,7 +23,7 @@ from rsvib_torch.restoration.rows import continue_rows, period_of_rows
 from rsvib_torch.restoration.scene_problem import SceneProblem
 from rsvib_torch.restoration.strength import Strengths
 
-__all__ = ["ScenePrior", "restore_exact"]
+__all__ = ["ScenePrior", "restore_exact", "scene_period"]
 
 ScenePrior = Literal["gaussian", "edges"]
 
@@ -32,6 +32,19 @@ _LONG = 1.0  # px along the row either way: beyond, ends of rows are worth being
 _REACH = 8  # px beyond the displacement that ends say something of where they are not filled so
 _LOOSE, _REST = 0.3, 0.03  # parts of the quadratic prior that patches start from and keep
 _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
+
+
+def scene_period(width: int, reach: int, displacement: Tensor) -> int:
+    """Length of the period that scenes of ``width`` px are restored on: longer where ends are not filled.
+
+    Args:
+        width: Columns of the frames.
+        reach: Bound on the displacement along a row in px.
+        displacement: (B, ..., N, 2) during the exposures.
+    """
+    along = displacement[..., 0].detach()
+    filled = bool(((along.amax(-1) - along.amin(-1)).flatten(1).amax(1) > 2 * _LONG).all())
+    return period_of_rows(width, reach if filled else reach + _REACH)
 
 
 def _alike(members: list[int], reference: int, shift: Tensor) -> list[int]:
@@ -136,9 +149,7 @@ def restore_exact(
     mean = brightness(frames).mean(1, keepdim=True)[..., None, None]  # the prior is for deviations from it
     starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device)).expand(B, T, H)
     displacement, node_weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
-    along = displacement[..., 0].detach()
-    filled = bool(((along.amax(-1) - along.amin(-1)).flatten(1).amax(1) > 2 * _LONG).all())
-    length = period_of_rows(W, motion.reach(H) + (0 if filled else _REACH))
+    length = scene_period(W, motion.reach(H), displacement)
 
     def scenes() -> Iterator[tuple[slice, Tensor]]:
         for stack in range(B):
@@ -155,18 +166,19 @@ def restore_exact(
             power = typical * length
             for place, (members, reference) in enumerate(groups):
                 kernels, own_prior = system(members, reference), row_prior.of(members)
+                reach = kernels.reach
                 alike = _alike(members, reference, motion.shift[stack])
                 part = kernels if alike == members else system(alike, reference)
                 strength = strengths.of(frames[stack, alike], part, own_prior, power, certain=certain)
-                precision = own_prior.precision(power, factor * strength, kernels.reach)
+                precision = own_prior.precision(power, factor * strength, reach)
                 along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
                 seen = frames[stack, members[0] : members[-1] + 1]  # neighbours
                 data = continue_rows(seen, length).sub_(mean[stack])
                 problem = SceneProblem(data, kernels, precision, typical.sqrt(), partition)
                 hidden = None if lost is None else lost[stack, members]
-                ends = kernels.reach > _LONG
+                ends = reach > _LONG
                 if hidden is None and ends and not bool(along.any()):
-                    problem = replace(problem, data=fill_beyond_ends(problem, W, kernels.reach))
+                    problem = replace(problem, data=fill_beyond_ends(problem, W, reach))
                 else:
                     measured = measured_values(along, hidden, problem.data.shape, W, ends=ends)
                     floor = None if clipped is None else _floor(problem.data, clipped[stack, members])

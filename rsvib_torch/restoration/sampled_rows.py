@@ -12,10 +12,10 @@ from rsvib_torch.restoration.prior import ORDER
 from rsvib_torch.restoration.row_system import RowKernels, SceneRows, SmoothBand, smooth_band, smooth_kernels
 from rsvib_torch.spectral import squared_modulus, waves
 
-__all__ = ["SLAB", "Explained", "SampledRows", "sample_rows"]
+__all__ = ["Explained", "SampledRows", "sample_rows"]
 
-SLAB = 128  # rows of a slab, about
 _STEP = 1.2  # in the strength of a prior, for a derivative
+_SLAB = 128  # rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def sample_rows(images: Tensor, kernels: RowKernels, chosen: Tensor) -> SampledR
         kernels: How their rows see the scene.
         chosen: (F,) whole numbers of cycles in W px.
     """
-    slabs = max(1, images.shape[-2] // SLAB)
+    slabs = max(1, images.shape[-2] // _SLAB)
     height, width = images.shape[-2] // slabs, images.shape[-1]
     count = slabs * height
     images, kernels = images[..., :count, :], kernels.rows(0, count)

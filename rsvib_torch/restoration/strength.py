@@ -5,7 +5,7 @@ from torch import Tensor
 
 from rsvib_torch.restoration.prior import RowPrior
 from rsvib_torch.restoration.row_system import RowKernels
-from rsvib_torch.restoration.sampled_rows import SLAB, Explained, sample_rows
+from rsvib_torch.restoration.sampled_rows import Explained, sample_rows
 
 __all__ = ["Strengths", "prior_strength"]
 
@@ -13,7 +13,7 @@ _STRENGTHS = (2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 _DOUBT = (0.014, 0.002)  # by how much a prior half, or twice, as strong has to predict better, in logarithms
 _CLEAR = 200.0  # times what the kernel between rows cannot follow: less noise hides behind that
 _FIRST = 3  # of them are nearly always enough
-_SLABS = 4  # of rows in the middle of the frames
+_ROWS = 512  # at most, from the middle of the frames
 _FREQUENCIES = 24
 _LOWEST = 0.02  # cycles per px; the taper spreads what lies below
 _SMALLEST = 64  # rows and columns that a choice can be made from
@@ -60,7 +60,7 @@ def prior_strength(
     height, width = images.shape[-2:]
     if min(height, width) < _SMALLEST:
         return 1.0
-    count = min(height, _SLABS * SLAB)
+    count = min(height, _ROWS)
     top = (height - count) // 2
     part = kernels.rows(top, count)
     chosen = torch.linspace(_LOWEST * width, width // 2, min(_FREQUENCIES, width // 4), device=images.device).long()

@@ -24,7 +24,6 @@ from rsvib_torch.restoration.motion import as_batch, frame_motion
 from rsvib_torch.restoration.partition import Partition
 from rsvib_torch.restoration.row_kernel import scene_weights
 from rsvib_torch.restoration.row_system import row_kernels, smooth_band, smooth_kernels
-from rsvib_torch.restoration.rows import period_of_rows
 
 REAL, COMPLEX = 4, 8  # bytes
 COPIED = 1 << 28  # bytes copied to measure the bandwidth
@@ -68,9 +67,9 @@ def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibrat
     """Sizes for a frame of that size, camera and vibration."""
     height, width = size
     motion = frame_motion(as_batch(truth, 1), timing.in_row_order(), 1, height)
-    length = period_of_rows(width, motion.reach(height))
     starts = motion.row_starts(torch.arange(height, dtype=torch.float64)).expand(1, 1, height)
     moved, weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
+    length = exact.scene_period(width, motion.reach(height), moved)
     kernels = row_kernels(moved[0], weights, torch.ones(1), height, exact._MARGIN)
     seen, order = kernels.scene_rows(height), prior.ORDER
     band = smooth_band(kernels, seen, max(kernels.taps.shape[-2] - 1, order), order, torch.float32)

@@ -64,7 +64,7 @@ def dense(frames, kernels, u, products, rows):
 @pytest.mark.parametrize("slab", [1000, 128, 80])
 def test_slabs_are_explained_each_by_itself(taken, monkeypatch, slab):
     frames, kernels, chosen, precision = taken
-    monkeypatch.setattr(sampled_rows, "SLAB", slab)
+    monkeypatch.setattr(sampled_rows, "_SLAB", slab)
     found = sample_rows(frames, kernels, chosen).explain([precision, 0.25 * precision])
     number = max(1, NUM_ROWS // slab)
     height = NUM_ROWS // number
