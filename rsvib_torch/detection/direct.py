@@ -1,24 +1,28 @@
 """Detection at the limit: measure around the model, fit, repeat."""
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from rsvib_torch.detection.fit import fit_tones
 from rsvib_torch.detection.inversion import vibration_of_fit
 from rsvib_torch.detection.leftovers import independent_fraction, slant, unexplained
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import OtherMotion
-from rsvib_torch.detection.row_groups import BLOCK, frame_groups, join_groups, measure_group, warping
+from rsvib_torch.detection.row_groups import BLOCK, FrameGroup, frame_groups, join_groups, measure_group, warping
 from rsvib_torch.detection.selection import (
     find_tones,
+    of_each,
     residual_of,
     robust_fit,
     shown_size,
     significant_only,
     strongest_only,
+    typical_size,
 )
 from rsvib_torch.detection.tones import ToneFit
 from rsvib_torch.registration.gradients import RowGradients
@@ -32,8 +36,11 @@ __all__ = ["DirectFit", "refine_directly"]
 _CLEANINGS = 2  # rounds of taking out what is fixed to the sensor
 _NEAR = 0.05  # px: gradients of frames that were warped this well need not be taken again
 _RUNAWAY = 2.0  # times larger from round to round: no tone that was found does that
-_BACK = -0.3  # part of a step that the next one takes back: then both were too long
-_SHORTEST = 0.25  # of what rows say is missing
+_LINGERING = 0.3  # of a step that is still missing after it, or was too much: then earlier steps are looked at
+_REMEMBERED = 3  # steps
+_FARTHEST = 4.0  # steps that are taken back or repeated at a time
+_UNEXPLAINED = 3.0  # standard deviations that the typical row is off: the model is wrong
+_TOLD_APART = 0.35  # of one over the time of a scan: frequencies nearer than this look alike to two frames
 _LEAST_GAIN = 0.02  # of the residual that a further tone must explain: the rows' noise is nearly white
 
 
@@ -56,20 +63,42 @@ def _displacements(measurements: Measurements, motion: Vibration) -> Tensor:
     return motion.mean_displacement(measurements.moments, measurements.exposure_time)
 
 
-def _believed(told: Measurements, around: Vibration, belief: Tensor) -> Measurements:
-    """Measurements around a motion with parts (B,) of what rows say is missing."""
-    placed = told.relative(_displacements(told, around))
-    return replace(told, displacements=placed + belief[:, None, None, None] * (told.displacements - placed))
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """What a round of measuring and fitting came to, as relative displacements (B, N, G, 2) of the rows.
 
-
-def _shorter(belief: Tensor, step: Tensor, before: Tensor) -> Tensor:
-    """Parts (B,) of what rows say is missing to believe, after two steps (B, N, G, 2) of the motion.
-
-    Where an exposure is long, a wrong motion blurs frames wrongly as well, and rows say up to twice what is missing.
-    Steps then overshoot: of two in opposite directions the second is ``1 - belief gain`` times the first.
+    Attributes:
+        reached: Those of the fit.
+        change: Those of the fit less those of the motion that the frames were warped by.
     """
-    back = (step * before).sum((1, 2, 3)) / before.square().sum((1, 2, 3)).clamp(min=1e-30)
-    return torch.where(back < _BACK, (belief / (1 - back)).clamp(min=_SHORTEST), belief)
+
+    reached: Tensor
+    change: Tensor
+
+    def lingers(self, before: "_Step") -> Tensor:
+        """(B,) bool: whether much of the step before is still to be gone, or to be taken back."""
+        left = (self.change * before.change).sum((1, 2, 3)) / before.change.square().sum((1, 2, 3)).clamp(min=1e-30)
+        return left.abs() > _LINGERING
+
+
+def _corrected(told: Measurements, steps: list[_Step]) -> Measurements:
+    """Measurements less what the last steps teach about how rows respond to a change of the motion, where steps linger.
+
+    Where an exposure is long, a wrong motion blurs frames wrongly as well, and rows say up to twice what is missing, or
+    half of it. The combination of the last steps is taken that would have left the least change (Anderson, J. ACM 12,
+    547, 1965).
+    """
+    lingering = steps[-1].lingers(steps[-2])
+    if not bool(lingering.any()):
+        return told
+    pairs = list(itertools.pairwise(steps))
+    reached = torch.stack([after.reached - before.reached for before, after in pairs], -1)
+    change = torch.stack([after.change - before.change for before, after in pairs], -1).flatten(1, -2)  # (B, n, M)
+    gram, right = change.mT @ change, change.mT @ steps[-1].change.flatten(1)[..., None]
+    ridge = 1e-3 * gram.diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=1e-30)
+    share = torch.linalg.solve(gram + ridge[:, None, None] * torch.eye(len(pairs)).to(gram), right)[..., 0]
+    share = share.clamp(-_FARTHEST, _FARTHEST) * lingering[:, None]
+    return replace(told, displacements=told.displacements - (reached * share[:, None, None, None]).sum(-1))
 
 
 def _settled(before: ToneFit, after: ToneFit) -> bool:
@@ -100,16 +129,15 @@ def _without_runaways(measurements: Measurements, before: ToneFit, after: ToneFi
 
 
 def refine_directly(
-    spectra: RowSpectra,
-    timing: SensorTiming,
-    start: ToneFit,
-    tones: int | None,
-    iterations: int = 10,
+    spectra: RowSpectra, timing: SensorTiming, start: ToneFit, tones: int | None, iterations: int = 12
 ) -> DirectFit:
     """Refine a detected motion on the images themselves.
 
     The frames of a group are warped to the scene with the motion, every row tells what it still misses in each frame
     and how well it knows it, and the motion is fitted again to those rows; image work and motion model meet only here.
+
+    Tones equally far above and below a blind frequency look alike to a short record, and long exposures mislead the
+    start. Where rows are left unexplained, the other side is tried as well.
 
     Args:
         spectra: Of all frames, from ``stack_spectra``.
@@ -121,22 +149,37 @@ def refine_directly(
     Returns:
         The last measurements and the fit to them.
     """
+    motion, _ = vibration_of_fit(start)
+    groups = frame_groups(spectra, timing, motion, alike=True)
+    found = _refine(groups, timing, start, tones, iterations)
+    tried = torch.zeros_like(start.active[..., 0])
+    misled = any(bool(group.blurred_unlike(timing, motion).any()) for group in groups)
+    for _ in range(2 if misled else 0):
+        other, rival = _beyond_blind(found, tried)
+        if not bool(rival.any()):
+            break
+        tried = tried | rival
+        found = _better_of_each(found, _refine(groups, timing, other, tones, iterations))
+    return found
+
+
+def _refine(
+    groups: list[FrameGroup], timing: SensorTiming, start: ToneFit, tones: int | None, iterations: int
+) -> DirectFit:
+    """Measure around the motion, fit, repeat."""
     fit, model = start, start.model
     motion, _ = vibration_of_fit(fit)
-    groups = frame_groups(spectra, timing, motion, alike=True)
     gradients: list[RowGradients | None] = [None] * len(groups)
-    belief = torch.ones(len(start.active), dtype=torch.float64, device=start.active.device)
-    last: Tensor | None = None
+    steps: list[_Step] = []
     cleanings = _CLEANINGS
     search_at = 1  # the first round removes the error of the bands: then weak tones show
     interval = max(BLOCK * timing.row_time, 0.5 * timing.exposure_time)  # the exposure averages out what is faster
-    blind = blind_frequencies(timing, 0.5 / interval).to(spectra.values.device)
+    blind = blind_frequencies(timing, 0.5 / interval).to(motion.device)
     for step in range(iterations):
         measured = [measure_group(group, timing, motion, known) for group, known in zip(groups, gradients, strict=True)]
         gradients = [known for _, known in measured]
-        told = join_groups([part for part, _ in measured])
-        before, around = fit, motion
-        measurements = _believed(told, motion, belief)
+        measurements = join_groups([part for part, _ in measured])
+        before, placed = fit, measurements.relative(_displacements(measurements, motion))
         if step == search_at:
             left = residual_of(measurements, fit)
             careful = replace(measurements, independent=independent_fraction(measurements, left))
@@ -161,18 +204,67 @@ def refine_directly(
                 group.spectra.subtract(pattern)
             gradients = [None] * len(groups)
             continue
-        change = measurements.relative(_displacements(measurements, motion) - _displacements(measurements, around))
-        if float(change.abs().amax()) > _NEAR:
+        reached = measurements.relative(_displacements(measurements, motion))
+        same = step > search_at and torch.equal(before.active, fit.active)  # else steps are of another model
+        steps = [*(steps[-_REMEMBERED:] if same else ()), _Step(reached, reached - placed)]
+        if len(steps) > 1:
+            nearer = _corrected(measurements, steps)
+            if nearer is not measurements:
+                fit, _ = robust_fit(nearer, fit.frequencies, fit.active, model, residual_of(nearer, fit))
+                motion, _ = vibration_of_fit(fit)
+                reached = measurements.relative(_displacements(measurements, motion))
+        if float((reached - placed).abs().amax()) > _NEAR:
             gradients = [None] * len(groups)
-        plain = step > search_at and torch.equal(before.active, fit.active)  # else steps are of another model
-        if plain and last is not None:
-            belief = _shorter(belief, change, last)
-        last = change if plain else None
-    return _concluded(told, fit, tones, gradients)
+    return _concluded(measurements, fit, tones, gradients)
+
+
+def _beyond_blind(found: DirectFit, tried: Tensor) -> tuple[ToneFit, Tensor]:
+    """The strongest tones, that of the axis that leaves most unexplained on the other side of a blind frequency.
+
+    Two frames see tones equally far above and below ``j / (m T_row)`` with the same gain; they differ within a frame.
+
+    Args:
+        found: So far.
+        tried: (B, 2) bool, axes that need not be looked at.
+
+    Returns:
+        The fit, and for which axes it is another, (B, 2) bool: at most one of a stack.
+    """
+    measurements, fit = found.measurements, strongest_only(found.fit)
+    left = measurements.sizes(residual_of(measurements, found.fit)).nanmedian(1).values.nan_to_num(0.0)  # (B, 2)
+    moments = measurements.moments
+    span = (moments.amax(1) - moments.amin(1)).amax(-1)[:, None]
+    interval = (moments[:, :, 1] - moments[:, :, 0]).mean(1)[:, None]
+    tone = fit.frequencies[..., 0]
+    mirrored = 2 * (tone * interval).round() / interval - tone
+    alike = ((mirrored - tone).abs() * span < _TOLD_APART) & (mirrored > 0) & fit.active[..., 0]
+    rival = alike & ~tried & (left > _UNEXPLAINED) & (left == left.amax(-1, keepdim=True))
+    if not bool(rival.any()) or fit.model.harmonics > 1 or moments.shape[2] > 2:
+        return fit, torch.zeros_like(rival)
+    return robust_fit(measurements, torch.where(rival, mirrored, tone)[..., None], fit.active, fit.model)[0], rival
+
+
+def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:
+    """For every stack the result that leaves the typical row less."""
+    better = typical_size(other.measurements, other.fit) < typical_size(one.measurements, one.fit)
+    if not bool(better.any()):
+        return one
+    if bool(better.all()):
+        return other
+    measurements = of_each(better, other.measurements, one.measurements)
+    most = max(one.fit.active.shape[-1], other.fit.active.shape[-1])
+
+    def tones(name: str) -> Tensor:
+        mine, yours = (getattr(found.fit, name) for found in (other, one))
+        mine, yours = (functional.pad(values, (0, most - values.shape[-1])) for values in (mine, yours))
+        return torch.where(better[:, None, None], mine, yours)
+
+    fit = fit_tones(measurements, tones("frequencies"), tones("active"), one.fit.model)
+    return DirectFit(measurements, fit, of_each(better, other.other_motion, one.other_motion))
 
 
 def _concluded(told: Measurements, fit: ToneFit, tones: int | None, gradients: list[RowGradients | None]) -> DirectFit:
-    """The last fit, to all that the rows say: with the part of it that was believed their noise would seem smaller."""
+    """The last fit, to what the rows say themselves."""
     residual = residual_of(told, fit)
     weighed = told.reweighted(residual)
     share = independent_fraction(weighed, residual) * told.share_counted(residual)

@@ -2,16 +2,15 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.detection.equal_blur import Shown, blurred_unlike, warp_to_same_blur
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.imaging.coupling import rows_showing
-from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.registration.gradients import RowGradients, row_gradients, row_shifts
 from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra, chunks
 from rsvib_torch.sensor import SensorTiming
@@ -32,7 +31,6 @@ __all__ = [
 BLOCK = 8  # rows that give one measurement: tones up to 1 / (16 T_row) are told apart
 LARGEST_GROUP = 8  # of a group that shares one mean scene
 _LEAST_OVERLAP = 0.5  # of the frame that the frames of a group share
-_ALIKE = 0.5  # px: kernels of two frames whose paths differ by less blur the scene alike
 _CONDITION = 1e-4  # least share of the product of the diagonal that a block's determinant must keep
 
 
@@ -42,6 +40,11 @@ class FrameGroup:
 
     spectra: RowSpectra
     starts: Tensor  # (B, G) s
+
+    def blurred_unlike(self, timing: SensorTiming, motion: Vibration) -> Tensor:
+        """(B,) bool: whether the frames are blurred in ways of their own."""
+        rows = torch.arange(self.spectra.height, dtype=torch.float64, device=self.starts.device)
+        return blurred_unlike(self.starts[..., None] + rows * timing.row_time, timing, motion)
 
 
 def _members(num_frames: int, most: int) -> list[range]:
@@ -87,82 +90,32 @@ def frame_groups(
     most = _frames_in_group(motion, starts, (spectra.height, spectra.width))
     if alike:
         moments = timing.row_starts(count, spectra.height, device).expand(stacks, -1, -1)
-        most = 2 if bool(_unlike(_paths(moments, timing, motion)[0]).any()) else most
+        most = 2 if bool(blurred_unlike(moments, timing, motion).any()) else most
     parts = [slice(member.start, member.stop) for member in _members(count, most)]
     return [FrameGroup(spectra.part(part), starts[:, part]) for part in parts]
 
 
 def warping(group: FrameGroup, timing: SensorTiming, motion: Vibration) -> tuple[RowSpectra, Tensor, Tensor, Tensor]:
     """A group with what warps its frames back by a motion."""
-    rows, shift, seen, _ = _place(group, timing, motion)
-    return group.spectra, rows, shift, seen
+    shown = Shown.of(*_place(group, timing, motion), group.starts[..., None], timing, motion)
+    return group.spectra, shown.rows, shown.shift, _seen(shown.rows, group.spectra.height)
 
 
-def _place(group: FrameGroup, timing: SensorTiming, motion: Vibration) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Where the frames of a group show the scene rows.
-
-    Returns:
-        Frame rows, displacement along the rows to take out and visibility, and exposure starts of
-        those rows, (B, G, S) each.
-    """
-    height = group.spectra.height
-    scene_rows = torch.arange(height, dtype=torch.float64, device=group.starts.device)
-    starts = group.starts[..., None]
-    # whole pixels of an image motion move the scene rows and columns that this group sees
-    middle = group.starts.mean(-1, keepdim=True) + 0.5 * height * timing.row_time
+def _place(group: FrameGroup, timing: SensorTiming, motion: Vibration) -> tuple[Tensor, Tensor]:
+    """Scene rows (B, 1, S) that a group sees, and px (B, 1, 1) that the columns it sees have moved by."""
+    scene_rows = torch.arange(group.spectra.height, dtype=torch.float64, device=group.starts.device)
+    # whole pixels of an image motion move both
+    middle = group.starts.mean(-1, keepdim=True) + 0.5 * group.spectra.height * timing.row_time
     travelled = motion.drift(middle).round()[:, :, None]  # (B, 1, 1, 2)
-    rows = rows_showing(scene_rows - travelled[..., 1], starts, timing, motion)
-    moments = starts + rows * timing.row_time
+    return scene_rows - travelled[..., 1], travelled[..., 0]
+
+
+def _seen(rows: Tensor, height: int) -> Tensor:
+    """(B, G, S) float64, 1 for blocks of scene rows that lie well inside the frames that show them at ``rows``."""
     blocks = height // BLOCK
     inside = ((rows >= MARGIN) & (rows <= height - 1 - MARGIN)).double()
     whole = inside[..., : blocks * BLOCK].unflatten(-1, (blocks, BLOCK)).amin(-1)
-    seen = functional.pad(whole.repeat_interleave(BLOCK, dim=-1), (0, height - blocks * BLOCK))
-    shift = motion.mean_displacement(moments, timing.exposure_time)[..., 0] - travelled[..., 0]
-    return rows, shift, seen, moments
-
-
-def _paths(moments: Tensor, timing: SensorTiming, motion: Vibration) -> tuple[Tensor, Tensor]:
-    """Paths (B, G, S, N, 2) about their means during exposures from ``moments``, at nodes with weights (N,)."""
-    path, weights = exposure_trajectory(motion, moments, timing, "gauss")
-    weights = weights.to(path)
-    return path - (path * weights[:, None]).sum(-2, keepdim=True), weights
-
-
-def _unlike(paths: Tensor) -> Tensor:
-    """(B,) whether the frames of a stack are blurred in ways of their own."""
-    return (paths.amax(1) - paths.amin(1)).flatten(1).amax(1) > _ALIKE
-
-
-def _warp(
-    group: FrameGroup, timing: SensorTiming, motion: Vibration, rows: Tensor, shift: Tensor, moments: Tensor
-) -> Callable[[slice], Tensor]:
-    """What warps the frames of a group to some rows of the scene, (B, G, s, U), those of a pair to the same blur.
-
-    Where an exposure is long, each frame is blurred in its own way, and fine detail lies elsewhere than the mean
-    displacements say. So the rows of each of two frames are blurred once more, as the other one's are: both then show
-    ``K_1 K_2 f`` of the scene f. That is the mean of frames warped along the other one's path, backwards.
-    """
-
-    def plain(part: slice) -> Tensor:
-        return group.spectra.warped(rows[..., part], shift[..., part])
-
-    if rows.shape[1] != 2:
-        return plain
-    paths, weights = _paths(moments, timing, motion)
-    unlike = _unlike(paths)
-    if not bool(unlike.any()):
-        return plain
-    nodes = (paths * unlike[:, None, None, None, None]).flip(1).unbind(-2)
-
-    def blurred(part: slice) -> Tensor:
-        total = torch.zeros((), dtype=group.spectra.values.dtype, device=rows.device)
-        for weight, node in zip(weights, nodes, strict=True):
-            x, y = node[:, :, part].unbind(-1)
-            warped = group.spectra.warped(rows[..., part] - y, shift[..., part] - x)
-            total = total + weight.to(warped.real.dtype) * warped
-        return total
-
-    return blurred
+    return functional.pad(whole.repeat_interleave(BLOCK, dim=-1), (0, height - blocks * BLOCK))
 
 
 def _blocks(values: Tensor) -> Tensor:
@@ -179,15 +132,17 @@ def measure_group(
 
     The motion's own displacement is added to what remains, so that the measurements do not depend on it to first order.
     """
-    rows, shift, seen, moments = _place(group, timing, motion)
-    warp = _warp(group, timing, motion, rows, shift, moments)
+    place, left = _place(group, timing, motion)
+    shown = Shown.of(place, left, group.starts[..., None], timing, motion)
+    seen = _seen(shown.rows, group.spectra.height)
+    warp = warp_to_same_blur(group.spectra, shown, place, left, timing, motion)
     if gradients is None:
         whole = warp(slice(None))
-        gradients = row_gradients(group.spectra, whole, rows, shift, seen)
+        gradients = row_gradients(group.spectra, whole, shown.rows, shown.shift, seen)
         warped: Iterable[Tensor] = [whole]
     else:
         # each is forgotten while it is still in the cache
-        warped = (warp(run) for run in group.spectra.runs(rows.shape[-1], 2))
+        warped = (warp(run) for run in group.spectra.runs(place.shape[-1], 2))
     matrix, right = row_shifts(warped, gradients, seen)
     matrix = _blocks(matrix[:, None]).sum(3)[:, 0]  # (B, N, 2, 2)
     right = _blocks(right).sum(3)  # (B, G, N, 2)
@@ -196,7 +151,7 @@ def measure_group(
     eye = torch.eye(2, dtype=matrix.dtype, device=matrix.device)
     remaining = torch.linalg.solve(torch.where(known[..., None, None], matrix, eye)[:, None], right[..., None])[..., 0]
     remaining = torch.where(known[:, None, :, None], remaining, 0.0)
-    block_moments = _blocks(moments).mean(3)
+    block_moments = _blocks(shown.moments).mean(3)
     around = motion.mean_displacement(block_moments, timing.exposure_time)
     measurements = Measurements(
         moments=block_moments.transpose(1, 2),

@@ -9,9 +9,20 @@ from torch import Tensor
 from rsvib_torch.detection.fit import fit_tones
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.periodogram import BLIND, MAJORITY, strongest_frequencies
+from rsvib_torch.detection.result import OtherMotion
 from rsvib_torch.detection.tones import MotionModel, ToneFit, model_displacements, tone_response
 
-__all__ = ["MAX_TONES", "find_tones", "residual_of", "robust_fit", "shown_size", "significant_only", "strongest_only"]
+__all__ = [
+    "MAX_TONES",
+    "find_tones",
+    "of_each",
+    "residual_of",
+    "robust_fit",
+    "shown_size",
+    "significant_only",
+    "strongest_only",
+    "typical_size",
+]
 
 MAX_TONES = 4
 _FADED = 0.1  # of its amplitude is all that an exposure leaves of a tone
@@ -30,7 +41,7 @@ _ROBUST_STEPS = 2
 _WEAK = 0.2  # of the largest tone along the scan: side tones of a blind one are smaller
 
 
-Kind = TypeVar("Kind", ToneFit, Measurements)
+Kind = TypeVar("Kind", ToneFit, Measurements, OtherMotion)
 
 
 def robust_fit(
@@ -125,12 +136,12 @@ def _undisturbed(measurements: Measurements, left: Tensor) -> Tensor:
     return (most < _LITTLE * whole).all(-1)
 
 
-def _typical(measurements: Measurements, fit: ToneFit) -> Tensor:
+def typical_size(measurements: Measurements, fit: ToneFit) -> Tensor:
     """(B,) typical size of what a fit leaves, both axes together: stretches of outliers hardly raise it."""
     return measurements.sizes(residual_of(measurements, fit)).nanmedian(1).values.square().sum(-1)
 
 
-def _of_each(where: Tensor, one: Kind, other: Kind) -> Kind:
+def of_each(where: Tensor, one: Kind, other: Kind) -> Kind:
     """One result for the stacks (B,) where that is told, the other for the rest."""
 
     def pick(field: str) -> Any:
@@ -234,9 +245,9 @@ def find_tones(
             if bool(disturbed.any()):
                 further = _with_one_more(measurements, weighed, fit, left, active, sample_interval, True)
                 careful = robust_fit(measurements, further[0], active, model, further[1])
-                better = disturbed & (_typical(measurements, careful[0]) < _typical(measurements, trial))
-                trial = _of_each(better, careful[0], trial)
-                trial_weighed = _of_each(better, careful[1], trial_weighed)
+                better = disturbed & (typical_size(measurements, careful[0]) < typical_size(measurements, trial))
+                trial = of_each(better, careful[0], trial)
+                trial_weighed = of_each(better, careful[1], trial_weighed)
         if tones is None:
             # both fits are judged with the weights of the richer one
             before = trial_weighed.square(left)
