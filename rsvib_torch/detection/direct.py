@@ -155,7 +155,7 @@ def refine_directly(
     tried = torch.zeros_like(start.active[..., 0])
     misled = any(bool(group.blurred_unlike(timing, motion).any()) for group in groups)
     for _ in range(2 if misled else 0):
-        other, rival = _beyond_blind(found, tried)
+        other, rival = _beyond_blind(found, start, tried)
         if not bool(rival.any()):
             break
         tried = tried | rival
@@ -218,13 +218,14 @@ def _refine(
     return _concluded(measurements, fit, tones, gradients)
 
 
-def _beyond_blind(found: DirectFit, tried: Tensor) -> tuple[ToneFit, Tensor]:
-    """The strongest tones, that of the axis that leaves most unexplained on the other side of a blind frequency.
+def _beyond_blind(found: DirectFit, start: ToneFit, tried: Tensor) -> tuple[ToneFit, Tensor]:
+    """The strongest tones; that of the axis that leaves most unexplained starts beyond a blind frequency instead.
 
     Two frames see tones equally far above and below ``j / (m T_row)`` with the same gain; they differ within a frame.
 
     Args:
         found: So far.
+        start: What it started with.
         tried: (B, 2) bool, axes that need not be looked at.
 
     Returns:
@@ -235,13 +236,14 @@ def _beyond_blind(found: DirectFit, tried: Tensor) -> tuple[ToneFit, Tensor]:
     moments = measurements.moments
     span = (moments.amax(1) - moments.amin(1)).amax(-1)[:, None]
     interval = (moments[:, :, 1] - moments[:, :, 0]).mean(1)[:, None]
-    tone = fit.frequencies[..., 0]
-    mirrored = 2 * (tone * interval).round() / interval - tone
-    alike = ((mirrored - tone).abs() * span < _TOLD_APART) & (mirrored > 0) & fit.active[..., 0]
+    first = strongest_only(start).frequencies[..., 0]
+    mirrored = 2 * (first * interval).round() / interval - first
+    alike = ((mirrored - first).abs() * span < _TOLD_APART) & (mirrored > 0) & fit.active[..., 0]
     rival = alike & ~tried & (left > _UNEXPLAINED) & (left == left.amax(-1, keepdim=True))
     if not bool(rival.any()) or fit.model.harmonics > 1 or moments.shape[2] > 2:
         return fit, torch.zeros_like(rival)
-    return robust_fit(measurements, torch.where(rival, mirrored, tone)[..., None], fit.active, fit.model)[0], rival
+    frequencies = torch.where(rival, mirrored, fit.frequencies[..., 0])[..., None]
+    return robust_fit(measurements, frequencies, fit.active, fit.model)[0], rival
 
 
 def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:
