@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks import check_number
+from rsvib_torch.quadrature import gauss_legendre
 from rsvib_torch.splines import bspline_coefficients, bspline_weights
 from rsvib_torch.vibration import TensorLike, Vibration
 
@@ -256,8 +257,8 @@ def detached(vibration: Vibration) -> Vibration:
 def _nodes(exposure_time: float, spacing: float) -> tuple[list[float], list[float]]:
     """Gauss-Legendre nodes over an exposure and their weights: exact within a knot spacing, close beyond."""
     count = 3 + math.ceil(2 * exposure_time / spacing)
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    return (0.5 * (nodes + 1) * exposure_time).tolist(), (0.5 * weights).tolist()
+    nodes, weights = gauss_legendre(count)
+    return (nodes * exposure_time).tolist(), weights.tolist()
 
 
 def rest_reach(vibration: Vibration) -> Tensor:

@@ -10,7 +10,7 @@ import rsvib_torch
 PACKAGE = Path(rsvib_torch.__file__).parent
 # from the ground up; what shares a floor may not know each other
 FLOORS = (
-    {"pieces"},
+    {"pieces", "quadrature"},
     {"arrays", "checks", "precision", "splines", "spectral", "missing", "parallel", "validation"},
     {"sensor"},
     {"vibration"},

@@ -3,12 +3,12 @@
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.motion_spectrum import MOST_KNOTS, fit_with_spectrum
+from rsvib_torch.quadrature import gauss_legendre
 from rsvib_torch.splines import bspline_weights
 
 __all__ = ["SplineFit", "fit_spline", "precision_of_axis", "spline_basis"]
@@ -86,12 +86,12 @@ def _design(measurements: Measurements, shape: SplineFit, axis: int, part: slice
     """Derivatives (n, G, N) of the relative displacements of some scene rows by the coefficients of an axis."""
     moments = measurements.moments[0, part]
     average = measurements.average_times[axis] + measurements.exposure_time
-    nodes, weights = np.polynomial.legendre.leggauss(3 + math.ceil(2 * average / shape.spacing))
-    middle = moments + 0.5 * measurements.exposure_time
+    nodes, weights = gauss_legendre(3 + math.ceil(2 * average / shape.spacing))
+    first = moments + 0.5 * (measurements.exposure_time - average)
     columns = torch.zeros(*moments.shape, 1, dtype=torch.float64, device=moments.device)
     for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
-        at = (middle + 0.5 * average * node).flatten()
-        columns = columns + 0.5 * weight * shape.columns(at).unflatten(0, moments.shape)
+        at = (first + average * node).flatten()
+        columns = columns + weight * shape.columns(at).unflatten(0, moments.shape)
     seen = measurements.seen[0, part][..., None]
     mean = (seen * columns).sum(1, keepdim=True) / seen.sum(1, keepdim=True).clamp(min=1.0)
     return seen * (columns - mean)

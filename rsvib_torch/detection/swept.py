@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +19,7 @@ from rsvib_torch.detection.spline_fit import precision_of_axis
 from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.orientation import vibration_from_row_order
 from rsvib_torch.precision import full_precision, outside_graphs
+from rsvib_torch.quadrature import gauss_legendre
 from rsvib_torch.registration import Registration
 from rsvib_torch.sensor import SensorTiming
 
@@ -198,9 +198,9 @@ def _columns(times: Tensor, fit: Tensor) -> Tensor:
 def _averaged(measured: Measurements, axis: int, middle: float) -> tuple[list[Tensor], list[float]]:
     """Times (N, G) from the middle of the record over which a measured displacement is a mean, and their weights."""
     duration = measured.exposure_time + measured.average_times[axis]
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    centre = measured.moments[0] + 0.5 * measured.exposure_time - middle
-    return [centre + 0.5 * duration * node for node in nodes.tolist()], (0.5 * weights).tolist()
+    nodes, weights = gauss_legendre(_NODES)
+    first = measured.moments[0] + 0.5 * (measured.exposure_time - duration) - middle
+    return [first + duration * node for node in nodes.tolist()], weights.tolist()
 
 
 def _relative(measured: Measurements, values: Tensor) -> Tensor:

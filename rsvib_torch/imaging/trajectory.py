@@ -3,12 +3,12 @@
 import math
 from typing import Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from rsvib_torch.checks import check_choice
 from rsvib_torch.free_motion import rest_path
+from rsvib_torch.quadrature import gauss_legendre
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
@@ -44,8 +44,8 @@ def exposure_nodes(
     """
     check_choice("quadrature", quadrature, ("midpoint", "gauss"))
     if quadrature == "gauss":
-        nodes, weights = np.polynomial.legendre.leggauss(4 if num_nodes is None else num_nodes)
-        return torch.from_numpy((nodes + 1) / 2) * timing.exposure_time, torch.from_numpy(weights / 2)
+        nodes, weights = gauss_legendre(4 if num_nodes is None else num_nodes)
+        return nodes * timing.exposure_time, weights
     count = math.ceil(timing.exposure_rows - 1e-9) if num_nodes is None else num_nodes
     times = (torch.arange(count, dtype=torch.float64) + 0.5) / count * timing.exposure_time
     return times, torch.full((count,), 1.0 / count, dtype=torch.float64)

@@ -21,6 +21,7 @@ from rsvib_torch.restoration.prior import brightness, fit_prior
 from rsvib_torch.restoration.row_system import RowKernels, row_kernels
 from rsvib_torch.restoration.rows import continue_rows, period_of_rows
 from rsvib_torch.restoration.scene_problem import SceneProblem
+from rsvib_torch.restoration.seen_scene import SeenScene
 from rsvib_torch.restoration.strength import Strengths
 
 __all__ = ["ScenePrior", "restore_exact", "scene_period"]
@@ -62,8 +63,8 @@ def _with_edges(problem: SceneProblem, factor: float) -> Tensor:
     """Restore one scene (C, R, L) with a prior of few cosines in every patch, by half-quadratic splitting."""
     weak = replace(problem, precision=_LOOSE * problem.precision).solver()
     coefficients = weak.fit(problem.data)
-    solver, weight = weak, float(problem.kernels.weight.detach().mean(-1).sum())
-    for strength, level, step in stages(blurred=problem.kernels.blurred):
+    solver, weight = weak, float(problem.seen.kernels.weight.detach().mean(-1).sum())
+    for strength, level, step in stages(blurred=problem.seen.kernels.blurred):
         pull = strength * weight * factor
         frequencies = problem.precision.shape[-1]
         precision = expectation_precision(pull, frequencies, problem.precision)
@@ -174,7 +175,7 @@ def restore_exact(
                 along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
                 seen = frames[stack, members[0] : members[-1] + 1]  # neighbours
                 data = continue_rows(seen, length).sub_(mean[stack])
-                problem = SceneProblem(data, kernels, precision, typical.sqrt(), partition)
+                problem = SceneProblem(data, SeenScene(kernels, H, frames.dtype), precision, typical.sqrt(), partition)
                 hidden = None if lost is None else lost[stack, members]
                 ends = reach > _LONG
                 if hidden is None and ends and not bool(along.any()):

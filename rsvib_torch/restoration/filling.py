@@ -32,7 +32,7 @@ def fill_unmeasured(
         floor: (M, C, R, L) least value of what was not measured (saturated), or None.
         iterations: At most; fewer where the noise hides what is left.
     """
-    data, weight = problem.data, problem.kernels.weight
+    data, weight = problem.data, problem.seen.kernels.weight
     share = measured.flatten(1).to(weight.dtype).mean(1)
     whole = weight * (share >= _MOSTLY * share.amax())[:, None]
     solver = problem.solver(keep=True)

@@ -41,9 +41,10 @@ def estimate_noise(frames: Tensor) -> Tensor:
     height, width = (extent // block * block for extent in inner)
     every = max(1, height * width // (block**2 * _MANY))
     step = block * max(1, _ROWS // block) if every == 1 else block
+    across = torch.eye(step + orders[0], dtype=frames.dtype, device=frames.device).diff(orders[0], dim=0)
     blocks = torch.cat(
         [
-            _detail(frames[..., top : min(top + step, height) + orders[0], : width + orders[1]], orders)
+            _detail(frames[..., top : min(top + step, height) + orders[0], : width + orders[1]], across, orders[1])
             .square()
             .unflatten(-1, (-1, block))
             .unflatten(-3, (-1, block))
@@ -64,11 +65,12 @@ def estimate_noise(frames: Tensor) -> Tensor:
     return deviation
 
 
-def _detail(frames: Tensor, orders: list[int]) -> Tensor:
-    """Differences of these orders along both axes."""
-    for axis, order in zip((-2, -1), orders, strict=True):
-        for _ in range(order):
-            frames = frames.diff(dim=axis)
+def _detail(frames: Tensor, across: Tensor, order: int) -> Tensor:
+    """Differences of an order along rows, and of another, as a matrix for at least as many of them, across rows."""
+    rows = frames.shape[-2]
+    frames = across[: len(across) - across.shape[1] + rows, :rows] @ frames
+    for _ in range(order):
+        frames = frames.diff(dim=-1)
     return frames
 
 

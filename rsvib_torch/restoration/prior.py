@@ -93,8 +93,8 @@ class RowPrior:
         return products
 
 
-def _levinson(moments: Tensor) -> RowPrior:
-    """Autoregressive model of autocovariances (p + 1, U)."""
+def _levinson(moments: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Autoregressive model of autocovariances (p + 1, U): partial correlations, filter and innovation's variance."""
     tiny = torch.finfo(moments.dtype).tiny
     power = moments[0].clamp(min=tiny)
     left, variance = torch.ones_like(power)[None], power
@@ -106,7 +106,7 @@ def _levinson(moments: Tensor) -> RowPrior:
         left = padded - reflection * padded.flip(0)
         variance = variance * (1 - reflection.square())
         reflections.append(reflection)
-    return RowPrior(power, torch.stack(reflections), torch.zeros_like(power))
+    return torch.stack(reflections), left, variance
 
 
 def _smooth(moments: Tensor) -> Tensor:
@@ -140,16 +140,19 @@ def autoregressive_prior(
     v = torch.fft.fftfreq(observed.shape[-1], dtype=observed.dtype, device=observed.device)
     lags = torch.arange(order + 1, dtype=observed.dtype, device=observed.device)
     angles = 2 * torch.pi * v[:, None] * lags
-    cosine, sine = torch.cos(angles), torch.sin(angles)
+    cosine = torch.cos(angles)
+    both = torch.where(lags > 0, 2 * cosine, cosine).T  # of the products a_k a_(k + d) of a filter
+    through = transfer * observed
     scene = torch.maximum(observed - noise_power, 0.02 * noise_power) * transfer / (transfer.square() + 1e-2)
     for _ in range(_ITERATIONS):
-        prior = _levinson(_smooth((scene @ cosine).T / len(v)))
-        whitener = prior.filter().T
-        model = prior.innovation()[:, None] / ((whitener @ cosine.T).square() + (whitener @ sine.T).square())
+        moments = _smooth((scene @ cosine).T / len(v))
+        reflections, filter_, innovation = _levinson(moments)
+        products = torch.stack([(filter_[: order + 1 - d] * filter_[d:]).sum(0) for d in range(order + 1)], -1)
+        model = innovation[:, None] / (products @ both)
         gain = model / (transfer * model + noise_power)
-        scene = gain * noise_power + gain.square() * transfer * observed
-    blind = (scene * aliases).mean(-1)
-    return RowPrior(prior.power, prior.reflections, blind.clamp(min=torch.finfo(blind.dtype).tiny))
+        scene = gain * noise_power + gain.square() * through
+    tiny = torch.finfo(scene.dtype).tiny
+    return RowPrior(moments[0].clamp(min=tiny), reflections, (scene * aliases).mean(-1).clamp(min=tiny))
 
 
 def brightness(frames: Tensor) -> Tensor:

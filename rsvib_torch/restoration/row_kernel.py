@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from functools import cache
 
-import numpy as np
 import torch
 from torch import Tensor
+
+from rsvib_torch.quadrature import gauss_legendre
 
 __all__ = [
     "REACH",
@@ -65,9 +66,9 @@ def kernel_samples() -> tuple[float, ...]:
 
 def kernel_spectrum(frequencies: Tensor) -> Tensor:
     """Fourier transform of the kernel at frequencies in cycles per row."""
-    nodes, weights = np.polynomial.legendre.leggauss(64)
-    places = torch.from_numpy(nodes * REACH).to(frequencies)
-    values = torch.from_numpy(weights * REACH).to(frequencies) * _kernel(places)
+    nodes, weights = gauss_legendre(32)  # of one side
+    places = (nodes * REACH).to(frequencies)
+    values = 2 * REACH * weights.to(frequencies) * _kernel(places)
     return torch.cos(2 * torch.pi * frequencies[..., None] * places) @ values
 
 

@@ -252,12 +252,12 @@ def smooth_band(kernels: RowKernels, rows: SceneRows, width: int, order: int, dt
     weighted = seen * kernels.weight[..., None, None]
     base = (kernels.first - rows.top).flatten()
     sides: list[Tensor] = []
-    for d in range(seen.shape[-2]):
+    taps = seen.shape[-2]
+    for d in range(taps):
+        entry = base[:, None] + torch.arange(taps - d, device=base.device)
+        products = weighted[..., : taps - d, :].conj() * seen[..., d:, :]
         entries = seen.new_zeros(rows.count + width, len(nodes))
-        for i in range(seen.shape[-2] - d):
-            product = weighted[..., i, :].conj() * seen[..., i + d, :]
-            entries = entries.index_add(0, base + i, product.flatten(0, 1))
-        sides.append(entries)  # A[k, k + d]
+        sides.append(entries.index_add(0, entry.flatten(), products.flatten(0, 2)))  # A[k, k + d]
     absent = torch.zeros_like(sides[0])
     right = [sides[d] if d < len(sides) else absent for d in range(width + 1)]
     left = [torch.cat([absent[:d], right[d][: len(absent) - d].conj()]) for d in range(width, 0, -1)]

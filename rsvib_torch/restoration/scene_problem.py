@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.restoration.partition import Partition
-from rsvib_torch.restoration.row_system import RowKernels
 from rsvib_torch.restoration.scene_solver import SceneSolver
+from rsvib_torch.restoration.seen_scene import SeenScene
 
 __all__ = ["SceneProblem"]
 
@@ -18,14 +18,14 @@ class SceneProblem:
 
     Attributes:
         data: (M, C, R, L) rows continued to a period.
-        kernels: How the frames see it.
+        seen: How the frames see it.
         precision: What it is like, products as from ``RowPrior.precision``.
         level: Standard deviation of the noise of data of weight 1.
         partition: What is solved at a time.
     """
 
     data: Tensor
-    kernels: RowKernels
+    seen: SeenScene
     precision: Tensor
     level: Tensor
     partition: Partition
@@ -37,16 +37,8 @@ class SceneProblem:
             weight: (M, R) of the rows, by default that of the kernels.
             keep: Keep the factors, for solving again and again.
         """
-        size = (self.data.shape[-2], self.data.shape[-1])
-        return SceneSolver(
-            self.kernels,
-            self.precision,
-            size,
-            self.data.dtype,
-            self.partition,
-            weight=weight,
-            keep=keep,
-        )
+        seen = self.seen if weight is None else self.seen.weighted(weight)
+        return SceneSolver(seen, self.precision, self.data.shape[-1], self.partition, keep=keep)
 
     def precision_at(self, length: int) -> Tensor:
         """The precision for rows continued to another period."""

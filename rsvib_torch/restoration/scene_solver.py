@@ -1,7 +1,6 @@
 """One scene and the frames that see it: the fast solution, and what a solution predicts."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -12,8 +11,8 @@ from rsvib_torch.restoration.banded_solver import BandedFactor, factor_skewed, s
 from rsvib_torch.restoration.interpolated_solver import NodeFactors
 from rsvib_torch.restoration.partition import Partition
 from rsvib_torch.restoration.row_kernel import SCENE_REACH, scene_weights
-from rsvib_torch.restoration.row_sums import RowSums, sum_looked_up
-from rsvib_torch.restoration.row_system import RowKernels, smooth_band, smooth_kernels
+from rsvib_torch.restoration.row_sums import sum_looked_up
+from rsvib_torch.restoration.seen_scene import SeenScene
 
 __all__ = ["Coefficients", "SceneSolver"]
 
@@ -29,46 +28,30 @@ class SceneSolver:
     It minimises ``sum_m w_m |g_m - K_m c|^2 + c^H P c`` over the coefficients c of the scene.
 
     Args:
-        kernels: How M frames of R rows see the scene.
+        seen: How M frames of R rows see the scene.
         precision: P, products (p + 1, p + 1, U) as from ``RowPrior.precision``, in units of the noise of weight 1.
-        size: Rows R and length L of the period of the data.
-        dtype: Of the data.
+        length: L, of the period of the data.
         partition: What is solved at a time.
-        weight: (M, R) of the rows, by default that of the kernels.
         keep: Keep the factors, for solving again and again.
     """
 
     def __init__(
-        self,
-        kernels: RowKernels,
-        precision: Tensor,
-        size: tuple[int, int],
-        dtype: torch.dtype,
-        partition: Partition,
-        *,
-        weight: Tensor | None = None,
-        keep: bool = False,
+        self, seen: SeenScene, precision: Tensor, length: int, partition: Partition, *, keep: bool = False
     ) -> None:
-        self.kernels = kernels if weight is None else replace(kernels, weight=weight)
-        self.num_rows, self.length = size
-        self.rows = kernels.scene_rows(self.num_rows)
-        self.u = torch.fft.rfftfreq(self.length, dtype=torch.float64, device=precision.device)
-        self.dtype = dtype
-        self.precision = precision
-        order = len(precision) - 1
-        width = max(kernels.taps.shape[-2] - 1, order)
-        normal = smooth_band(self.kernels, self.rows, width, order, dtype)
-        size_of_all, device, blurred = (self.rows.count, width), precision.device, kernels.blurred
+        self.kernels, self.rows, self.num_rows, self.dtype = seen.kernels, seen.rows, seen.num_rows, seen.dtype
+        self.length, self.precision = length, precision
+        self.u = torch.fft.rfftfreq(length, dtype=torch.float64, device=precision.device)
+        normal = seen.band(len(precision) - 1)
+        size_of_all, device, blurred = (self.rows.count, normal.width), precision.device, self.kernels.blurred
         if keep:
             shares = partition.factoring_all(*size_of_all, len(self.u), device, blurred=blurred, keep=True)
         else:
-            shares = partition.of(*size_of_all, self.length, device, kernels.reach, blurred=blurred)
+            shares = partition.of(*size_of_all, length, device, self.kernels.reach, blurred=blurred)
         self._shares, self._segments = shares, shares.segments
         self._whole, self._normal = normal, normal.in_segments(shares.segments)
         self._partition = partition
         self.parts = shares.parts(len(self.u))
-        self._seen = smooth_kernels(kernels, dtype)
-        self._sums = RowSums(self.kernels, self._seen, self.rows.top, self.rows.count)
+        self._seen, self._sums = seen.smooth, seen.sums
         self._factors: list[BandedFactor] | None = None
         moving = self._normal.left.requires_grad or precision.requires_grad
         if keep and not (torch.is_grad_enabled() and moving):
