@@ -32,6 +32,8 @@ from rsvib_torch.vibration import blind_frequencies
 __all__ = ["DetectionMethod", "VibrationDetector", "VibrationModel", "detect_vibration"]
 
 DetectionMethod = Literal["direct", "bands"]
+_NEAR = 0.15  # px: rows as near as this to the start tell the rest themselves
+_FEWEST_COLUMNS = 64  # px: bands of fewer are hardly found again
 VibrationModel = Literal["tones", "free", "swept"]
 
 
@@ -53,6 +55,7 @@ class _ToneOptions(_BandOptions, total=False):
     tones: Literal["auto"] | int
     harmonics: int
     image_acceleration: bool
+    columns: int | None
     window: int | None
     window_step: int | None
 
@@ -67,21 +70,26 @@ class _Options:
     bands: Bands
 
 
+def _tones_of_bands(curve: OffsetCurve, timing: SensorTiming, options: _Options, enough: float = 0.0) -> ToneFit:
+    """A fit of tones to the offsets of row bands."""
+    measurements = measurements_of_curve(curve, timing, options.bands.band_step)
+    interval = options.bands.band_step * timing.row_time
+    blind = blind_frequencies(timing, 0.5 / interval).to(curve.offsets.device)
+    return find_tones(measurements, interval, options.tones, options.model, blind=blind, enough=enough)
+
+
 def _detect_bands(
     curve: OffsetCurve, frames: Tensor, valid: Tensor | None, timing: SensorTiming, options: _Options
 ) -> tuple[ToneFit, OtherMotion | None]:
-    """The paper's method: a fit of tones to the offsets of row bands."""
-    measurements = measurements_of_curve(curve, timing, options.bands.band_step)
-    interval = options.bands.band_step * timing.row_time
-    blind = blind_frequencies(timing, 0.5 / interval).to(frames.device)
-    return find_tones(measurements, interval, options.tones, options.model, blind=blind), None
+    """The paper's method."""
+    return _tones_of_bands(curve, timing, options), None
 
 
 def _detect_direct(
     curve: OffsetCurve, frames: Tensor, valid: Tensor | None, timing: SensorTiming, options: _Options
 ) -> tuple[ToneFit, OtherMotion | None]:
     """The bands' result, refined on the images themselves, row by row."""
-    start, _ = _detect_bands(curve, frames, valid, timing, options)
+    start = _tones_of_bands(curve, timing, options, _NEAR)
     found = refine_directly(stack_spectra(frames, valid), timing, start, options.tones)
     return found.fit, found.other_motion
 
@@ -104,6 +112,7 @@ _DEFAULTS: dict[str, object] = {
     "tones": "auto",
     "harmonics": 1,
     "image_acceleration": False,
+    "columns": None,
     "window": None,
     "window_step": None,
 }
@@ -139,6 +148,7 @@ def detect_vibration(
     band_rows: int = 32,
     band_step: int = 16,
     search: int = 16,
+    columns: int | None = None,
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
 ) -> DetectionResult | MotionDetection | SweptTone:
@@ -168,6 +178,8 @@ def detect_vibration(
         band_rows: Rows of a band.
         band_step: Rows from one band to the next.
         search: Search range in px around the whole-frame offset.
+        columns: Look at so many neighbouring pixels of every row only, those with the most detail: every column shows
+            the same vibration, and a quarter of them tells it in half the time, half as accurately. None for all.
         ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out (dead, saturated).
         full_scale: Count that means 1.0, for integer frames.
 
@@ -190,7 +202,8 @@ def detect_vibration(
     check_choice("model", model, ("tones", *_OTHER_MODELS))
     if model != "tones":
         given: dict[str, object] = {"method": method, "tones": tones, "harmonics": harmonics}
-        given |= {"image_acceleration": image_acceleration, "window": window, "window_step": window_step}
+        given |= {"image_acceleration": image_acceleration, "columns": columns}
+        given |= {"window": window, "window_step": window_step}
         wrong = [name for name, value in given.items() if value != _DEFAULTS[name]]
         if wrong:
             raise ValueError(f"{wrong[0]}={given[wrong[0]]!r} goes with model='tones', not with model={model!r}")
@@ -210,7 +223,10 @@ def detect_vibration(
         if tones > MAX_TONES:
             raise ValueError(f"tones must be 'auto' or 1 to {MAX_TONES}, got {tones}")
     check_whole_number("harmonics", harmonics, at_least=1)
+    if columns is not None:
+        check_whole_number("columns", columns, at_least=_FEWEST_COLUMNS)
     stacks = grey_frames(frames, timing, full_scale, ignore)
+    stacks = stacks if columns is None else stacks.narrowed(columns)
     grey, valid, batched = stacks.images, stacks.valid, stacks.batched
     bands = Bands(registration, band_rows, band_step, search)
     options = _Options(

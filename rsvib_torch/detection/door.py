@@ -8,6 +8,7 @@ from torch import Tensor
 from rsvib_torch.arrays import ArrayLike, as_tensor
 from rsvib_torch.missing import fill_roughly
 from rsvib_torch.orientation import as_float_frames, frames_to_row_order
+from rsvib_torch.registration.columns import detailed_columns
 from rsvib_torch.sensor import SensorTiming
 
 __all__ = ["GreyFrames", "grey_frames"]
@@ -28,6 +29,18 @@ class GreyFrames:
     images: Tensor
     valid: Tensor | None
     batched: bool
+
+    def narrowed(self, columns: int) -> "GreyFrames":
+        """So many neighbouring columns of each stack, those with the most detail."""
+        if columns >= self.images.shape[-1]:
+            return self
+        parts = [detailed_columns(stack[0], columns) for stack in self.images]
+
+        def cut(values: Tensor) -> Tensor:
+            return torch.stack([stack[..., part] for stack, part in zip(values, parts, strict=True)])
+
+        valid = None if self.valid is None else cut(self.valid)
+        return GreyFrames(cut(self.images), None if valid is None or bool(valid.all()) else valid, self.batched)
 
     def one(self, index: int) -> "GreyFrames":
         """One stack out of the batch, as a batch of one."""

@@ -1,28 +1,18 @@
 """How many tones: added one by one, strongest first, as long as the data ask for them."""
 
-from dataclasses import fields, replace
-from typing import Any, TypeVar
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from rsvib_torch.detection.blind_tones import with_blind_tones
 from rsvib_torch.detection.fit import fit_tones
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.periodogram import BLIND, MAJORITY, strongest_frequencies
-from rsvib_torch.detection.result import OtherMotion
-from rsvib_torch.detection.tones import MotionModel, ToneFit, model_displacements, tone_response
+from rsvib_torch.detection.robust import FEW_ITERATIONS, of_each, residual_of, robust_fit, typical_size
+from rsvib_torch.detection.tones import MotionModel, ToneFit, tone_response
 
-__all__ = [
-    "MAX_TONES",
-    "find_tones",
-    "of_each",
-    "residual_of",
-    "robust_fit",
-    "shown_size",
-    "significant_only",
-    "strongest_only",
-    "typical_size",
-]
+__all__ = ["MAX_TONES", "find_tones", "significant_only", "strongest_only"]
 
 MAX_TONES = 4
 _FADED = 0.1  # of its amplitude is all that an exposure leaves of a tone
@@ -36,39 +26,6 @@ _STRETCHES = 7  # that are left out one at a time, each overlapping the next by 
 _ABSOLUTE_STEPS = 3  # rounds of reweighting towards least absolute residuals
 _NEARLY_ALL, _LITTLE = 0.9, 0.05  # of the rows, and of their typical displacement: what is left when none pulls
 _FEW_CANDIDATES = 2  # for each stretch
-_FEW_ITERATIONS = 5
-_ROBUST_STEPS = 2
-_WEAK = 0.2  # of the largest tone along the scan: side tones of a blind one are smaller
-
-
-Kind = TypeVar("Kind", ToneFit, Measurements, OtherMotion)
-
-
-def robust_fit(
-    measurements: Measurements,
-    frequencies: Tensor,
-    active: Tensor,
-    model: MotionModel,
-    residual: Tensor | None = None,
-) -> tuple[ToneFit, Measurements]:
-    """Fit, weigh outliers down, fit again; the fit and the weights it was made with.
-
-    Args:
-        measurements: The displacements.
-        frequencies: (B, 2, K) Hz to start from.
-        active: (B, 2, K) bool.
-        model: What is fitted beside the tones.
-        residual: (B, N, G, 2) what an earlier fit leaves; None for none.
-    """
-    if residual is None:
-        fit = fit_tones(measurements, frequencies, active, model)
-        frequencies, residual = fit.frequencies, residual_of(measurements, fit)
-    for step in range(_ROBUST_STEPS):
-        weighed = measurements.reweighted(residual)
-        enough = {} if step == _ROBUST_STEPS - 1 else {"iterations": _FEW_ITERATIONS}
-        fit = fit_tones(weighed, frequencies, active, model, **enough)
-        frequencies, residual = fit.frequencies, residual_of(measurements, fit)
-    return fit, weighed
 
 
 def _with_one_more(
@@ -108,7 +65,7 @@ def _with_one_more(
         torch.cat([known, further], -1),
         active.repeat_interleave(count, 0),
         model,
-        _FEW_ITERATIONS,
+        FEW_ITERATIONS,
     )
     several = measurements.repeated(count)
     residual = residual_of(several, fit)
@@ -124,7 +81,7 @@ def _with_one_more(
 
     frequencies, residual = chosen(fit.frequencies, 1), chosen(residual, 3)
     for _ in range(_ABSOLUTE_STEPS if reckon else 0):
-        nearer = fit_tones(measurements.for_least_absolute(residual), frequencies, active, model, _FEW_ITERATIONS)
+        nearer = fit_tones(measurements.for_least_absolute(residual), frequencies, active, model, FEW_ITERATIONS)
         frequencies, residual = nearer.frequencies, residual_of(measurements, nearer)
     return frequencies, residual
 
@@ -136,21 +93,19 @@ def _undisturbed(measurements: Measurements, left: Tensor) -> Tensor:
     return (most < _LITTLE * whole).all(-1)
 
 
-def typical_size(measurements: Measurements, fit: ToneFit) -> Tensor:
-    """(B,) typical size of what a fit leaves, both axes together: stretches of outliers hardly raise it."""
-    return measurements.sizes(residual_of(measurements, fit)).nanmedian(1).values.square().sum(-1)
+def _farthest(measurements: Measurements, left: Tensor) -> Tensor:
+    """(B, 2) px, more than a fit that has ``left`` (B, N, G, 2) is off at nearly all rows which tell of an axis."""
+    known = (measurements.weights > 0) & (measurements.differences[..., None] > 0)
+    square = left.square().sum(2) / measurements.differences[..., None].clamp(min=1.0)
+    return torch.where(known, square.sqrt(), torch.nan).nanquantile(_NEARLY_ALL, dim=1).nan_to_num(torch.inf)
 
 
-def of_each(where: Tensor, one: Kind, other: Kind) -> Kind:
-    """One result for the stacks (B,) where that is told, the other for the rest."""
-
-    def pick(field: str) -> Any:
-        mine, yours = getattr(one, field), getattr(other, field)
-        if not isinstance(mine, Tensor):
-            return mine
-        return torch.where(where.reshape(-1, *(1,) * (mine.ndim - 1)), mine, yours)
-
-    return replace(one, **{field.name: pick(field.name) for field in fields(one)})
+def _better_where(
+    where: Tensor, measurements: Measurements, one: tuple[ToneFit, Measurements], other: tuple[ToneFit, Measurements]
+) -> tuple[ToneFit, Measurements]:
+    """Fit and weights of the one for the stacks (B,) where that is asked for and leaves the typical row less."""
+    better = where & (typical_size(measurements, one[0]) < typical_size(measurements, other[0]))
+    return of_each(better, one[0], other[0]), of_each(better, one[1], other[1])
 
 
 def _stretches(measurements: Measurements) -> Tensor:
@@ -173,17 +128,6 @@ def _sighted(measurements: Measurements, frequencies: Tensor) -> Tensor:
     return gain / (gain + BLIND**2) * shown
 
 
-def shown_size(measurements: Measurements, fit: ToneFit) -> Tensor:
-    """Root-mean-square displacement (B, 2, K) in px that the record sees of each tone: next to none of a blind one."""
-    seen = tone_response(measurements, fit.frequencies).abs().square().mean((1, 2)).sqrt()
-    return torch.where(fit.active, fit.coefficients.abs() * seen, 0.0)
-
-
-def residual_of(measurements: Measurements, fit: ToneFit) -> Tensor:
-    """Displacements (B, N, G, 2) that a fit leaves."""
-    return measurements.relative(measurements.displacements - model_displacements(measurements, fit))
-
-
 def find_tones(
     measurements: Measurements,
     sample_interval: float,
@@ -192,6 +136,7 @@ def find_tones(
     least_gain: float = _LEAST_GAIN,
     start: ToneFit | None = None,
     blind: Tensor | None = None,
+    enough: float = 0.0,
 ) -> ToneFit:
     """Find and fit the tones of both axes without start values.
 
@@ -207,19 +152,19 @@ def find_tones(
         least_gain: Share of the residual that a further tone must explain.
         start: Tones that are known to be there; without it the search reckons with stretches of outliers.
         blind: (F,) Hz that the frames cannot see, so that side tones of such a tone are known for what they are.
+        enough: An axis with a tone that leaves nearly all rows less than so many px needs no further one.
 
     Returns:
         The fit, with K the largest number of tones of any axis (at least 1).
     """
     model = model or MotionModel()
-    batch, device = len(measurements.moments), measurements.moments.device
-    none = torch.zeros(batch, 2, model.harmonics, dtype=torch.bool, device=device)
-    keep = none[..., :0] if start is None else start.active
-    first = none if start is None else start.active
-    known = none.double() if start is None else start.frequencies
+    none = measurements.moments.new_zeros(len(measurements.moments), 2, model.harmonics, dtype=torch.bool)
     reckon = start is None
-    given = None if start is None else residual_of(measurements, start)
-    fit, weighed = robust_fit(measurements, known, first, model, given)
+    if start is None:
+        keep, (fit, weighed) = none[..., :0], robust_fit(measurements, none.double(), none, model)
+    else:
+        keep, given = start.active, residual_of(measurements, start)
+        fit, weighed = robust_fit(measurements, start.frequencies, keep, model, given)
     parameters = 2 * model.harmonics + 1
 
     def not_invented(trial: ToneFit) -> Tensor:
@@ -229,8 +174,11 @@ def find_tones(
 
     going = torch.ones_like(none[..., 0])  # an axis that stopped stays stopped
     for _ in range(keep.shape[-1] // model.harmonics, MAX_TONES if tones is None else tones):
-        active = torch.cat([keep, going[..., None].expand_as(none)], -1)
         left = residual_of(measurements, fit)
+        going = going & (_farthest(measurements, left) > enough) if keep.shape[-1] > 0 else going
+        if not bool(going.any()):
+            break
+        active = torch.cat([keep, going[..., None].expand_as(none)], -1)
         further = _with_one_more(measurements, weighed, fit, left, active, sample_interval, False)
         if tones is None and keep.shape[-1] > 0:
             before, after = weighed.square(left), weighed.square(further[1])
@@ -245,17 +193,15 @@ def find_tones(
             if bool(disturbed.any()):
                 further = _with_one_more(measurements, weighed, fit, left, active, sample_interval, True)
                 careful = robust_fit(measurements, further[0], active, model, further[1])
-                better = disturbed & (typical_size(measurements, careful[0]) < typical_size(measurements, trial))
-                trial = of_each(better, careful[0], trial)
-                trial_weighed = of_each(better, careful[1], trial_weighed)
+                trial, trial_weighed = _better_where(disturbed, measurements, careful, (trial, trial_weighed))
         if tones is None:
             # both fits are judged with the weights of the richer one
             before = trial_weighed.square(left)
             after = trial_weighed.square(residual_of(measurements, trial))
             spare = (measurements.known - parameters * active.sum(-1) // model.harmonics - 1).clamp(min=1.0)
-            statistic = (before - after) / parameters / (after / spare).clamp(min=1e-300)
-            accepted = going & (statistic > _F_THRESHOLD) & (before - after > least_gain * before)
-            accepted = accepted & _resolved(measurements, trial) & not_invented(trial)
+            least = _F_THRESHOLD * parameters * after / spare  # an F-test
+            gained = before - after > torch.maximum(least, least_gain * before)
+            accepted = going & gained & _resolved(measurements, trial) & not_invented(trial)
             while bool(accepted.any()) and not bool((accepted == going).all()):
                 going = accepted
                 active = torch.cat([keep, accepted[..., None].expand_as(none)], -1)
@@ -265,51 +211,7 @@ def find_tones(
                 break
         fit, weighed = trial, trial_weighed
         keep = fit.active
-    return fit if blind is None or tones is not None else _with_blind_tones(measurements, weighed, fit, blind)
-
-
-def _with_blind_tones(measurements: Measurements, weighed: Measurements, fit: ToneFit, blind: Tensor) -> ToneFit:
-    """The fit with one tone of a blind frequency in place of its side tones, where that explains no less.
-
-    Motion along the scan lets a little of a tone through to which evenly spaced frames are blind: its rows are not
-    taken exactly one frame apart. It shows at its frequency plus and minus that of the motion, as tones that are not
-    there; the tone itself, of which the verdict knows that it is blind, is the simpler explanation.
-    """
-    if fit.model.harmonics > 1 or len(blind) == 0:
-        return fit
-    size = torch.where(fit.active, fit.coefficients.abs(), 0.0)
-    carrier = size[:, 1] > _WEAK * size[:, 1].amax(-1, keepdim=True)  # (B, K) along the scan
-    swing = torch.where(carrier, fit.frequencies[:, 1], torch.nan)[:, None, None, None]  # (B, 1, 1, 1, K)
-    span = (measurements.moments.amax((1, 2)) - measurements.moments.amin((1, 2)))[:, None, None, None, None]
-    tone, middle = fit.frequencies[..., None, None], blind[:, None]
-    sides = torch.stack([middle + swing, (middle - swing).abs()], -1)  # (B, 1, 1, F, K, 2)
-    miss = ((tone[..., None] - sides).abs() * span[..., None]).nan_to_num(torch.inf).amin((-2, -1))  # (B, 2, K, F)
-    weak = fit.active & (size > 0) & (size < _WEAK * size[:, 1].amax(-1)[:, None, None])
-    near = (miss < 1.0) & weak[..., None]
-    score = near.sum(2) + 0.5 / (1 + miss.amin(2))  # most side tones first, then the nearest
-    best = score.argmax(-1)  # (B, 2)
-    side = near.gather(-1, best[:, :, None, None].expand(-1, -1, near.shape[2], 1))[..., 0]  # (B, 2, K)
-    suspected = side.any(-1)
-    if not bool(suspected.any()):
-        return fit
-    place = side & (side.cumsum(-1) == 1)  # the first of them makes room
-
-    def explained_otherwise(where: Tensor) -> tuple[Tensor, Tensor]:
-        changed = where[..., None]
-        frequencies = torch.where(place & changed, blind[best][..., None], fit.frequencies)
-        return frequencies, fit.active & ~(side & ~place & changed)
-
-    frequencies, active = explained_otherwise(suspected)
-    other = fit_tones(weighed, frequencies, active, fit.model)
-    before = weighed.square(residual_of(measurements, fit))
-    after = weighed.square(residual_of(measurements, other))
-    free = measurements.known - 3 * fit.active.sum(-1)
-    fewer = 3 * (fit.active.sum(-1) - active.sum(-1))
-    better = suspected & (after / (free + fewer).clamp(min=1.0) <= before / free.clamp(min=1.0))
-    if not bool(better.any()):
-        return fit
-    frequencies, active = explained_otherwise(better)
-    return robust_fit(measurements, frequencies, active, fit.model)[0]
+    return fit if blind is None or tones is not None else with_blind_tones(measurements, weighed, fit, blind)
 
 
 def _resolved(measurements: Measurements, fit: ToneFit) -> Tensor:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rsvib_torch.registration.columns import detailed_columns
 from rsvib_torch.restoration.misfit import RIM
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.reblur import reblur
@@ -15,7 +16,6 @@ from rsvib_torch.restoration.verdict import TooLittleInCommonError
 
 __all__ = ["FramePair", "pairs_to_judge", "shared_part"]
 
-_EVERY = 4  # rows of which one tells where detail is
 _MARGIN = 4  # px between the pixels judged and what was made up
 
 
@@ -85,7 +85,7 @@ def shared_part(
     other = scene if single else restored[later][after]
     strip = slice(0, width)
     if columns is not None:
-        detailed = _best_columns(second[..., rim_x : width - rim_x], columns)
+        detailed = detailed_columns(second[..., rim_x : width - rim_x], columns)
         strip = slice(detailed.start, detailed.stop + 2 * rim_x)
     cut = (..., slice(rim_y, height - rim_y), slice(rim_x, -rim_x))
     first, second, scene, other = (image[..., strip] for image in (first, second, scene, other))
@@ -113,15 +113,3 @@ def _moved(motion: FrameMotion, frames: Sequence[int], num_rows: int) -> Tensor:
     starts = motion.frame_starts[list(frames), None] + rows * motion.timing.row_time
     moved = motion.vibration.mean_displacement(starts[None], motion.timing.exposure_time)
     return (moved - motion.shift[:, list(frames), None])[0]
-
-
-def _best_columns(image: Tensor, count: int) -> slice:
-    """The ``count`` neighbouring columns of (C, H, W) with the most detail."""
-    width = image.shape[-1]
-    if width <= count:
-        return slice(0, width)
-    some = slice(0, None, _EVERY)
-    detail = (image[..., 1:, :][..., some, :] - image[..., :-1, :][..., some, :]).square().sum((0, 1))
-    detail = detail.to(torch.float64).cumsum(0)
-    first = int((detail[count:] - detail[:-count]).argmax())
-    return slice(first, first + count)

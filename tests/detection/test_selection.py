@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rsvib_torch.detection import direct, selection
+from rsvib_torch.detection import direct, robust, selection
 from rsvib_torch.detection.measurements import Measurements
 
 ROWS, ROW_TIME, FRAME_PERIOD = 120, 16 * 20.52e-6, 2048 * 20.52e-6
@@ -78,10 +78,10 @@ def test_a_tone_that_the_exposure_fades_does_not_outweigh_one_that_shows():
     measurements = Measurements.of_pairs(starts, starts + FRAME_PERIOD, offsets, information, exposure)
     frequencies = torch.tensor([[[50.0, 121.9], [30.0, 121.9]]], dtype=torch.float64)
     active = torch.tensor([[[True, True], [True, False]]])
-    fit, _ = selection.robust_fit(measurements, frequencies, active, selection.MotionModel())
+    fit, _ = robust.robust_fit(measurements, frequencies, active, selection.MotionModel())
     before = replace(fit, coefficients=torch.tensor([[[3.1, 6.0], [5.2, 0.0]]], dtype=torch.complex128))
     after = replace(before, coefficients=torch.tensor([[[3.0, 600.0], [5.2, 0.0]]], dtype=torch.complex128))
-    shown = selection.shown_size(measurements, before)
+    shown = robust.shown_size(measurements, before)
     assert shown[0, 0, 1] < 0.1 * shown[0, 0, 0]
     kept = direct._without_runaways(measurements, before, after)
     assert kept.active.tolist() == [[[True, False], [True, False]]]
