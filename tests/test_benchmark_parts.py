@@ -100,6 +100,7 @@ def test_targets_are_met_or_missed():
         {**case, "chain": pipeline.PAPER, **figures, "period_percent": math.nan},
         {**case, "chain": pipeline.FASTEST, **figures},
         {**case, "chain": pipeline.OURS, "amplitude_percent": 0.5, "period_percent": 2.0, "psnr_db": 39.0},
+        {**case, "chain": pipeline.NARROW, "amplitude_percent": 2.0, "period_percent": 0.5, "psnr_db": 41.0},
     ]
     behind = pipeline.behind_libraries(compared, pipeline.OURS)
     assert [row["figure"] for row in behind] == ["period_percent", "psnr_db"]
@@ -111,13 +112,15 @@ def test_targets_are_met_or_missed():
             (pipeline.PAPER, 11.0),
             (pipeline.FASTEST, 0.3),
             (pipeline.OURS, 1.0),
+            (pipeline.NARROW, 2.0),
             (pipeline.DEWARP, 0.25),
             (f"{pipeline.OURS} on cuda", 0.05),
         )
     ]
     met = [(row["value"], row["met"]) for row in pipeline.targets(compared, timed)]
-    expected = [(11.0, True), (1 / 0.3, False), (0.25 / 0.3, True), (31.0, False), (9.0, True), (30.0, True)]
-    assert met == [*expected, (90.0, False), (0.0, True), (1.0, False), (1.0, False)]
+    times = [(11.0, True), (5.5, False), (1 / 0.3, False), (0.25 / 0.3, True), (31.0, False), (9.0, True)]
+    ahead = [(0.0, True), (1.0, False), (1.0, False), (1.0, False), (0.0, True), (0.0, True)]
+    assert met == [*times, (30.0, True), (90.0, False), *ahead]
 
 
 def test_scaling(monkeypatch):

@@ -15,7 +15,7 @@ Mixture = list[tuple[slice, slice, Tensor]]
 __all__ = ["NodeFactors", "SubstitutionMemory", "chosen_nodes"]
 
 _FINER = 4.0  # times the frequency itself: steps between low frequencies, where priors change most, are smaller
-_BLOCK = 128  # systems that one product of matrices interpolates
+_BLOCK = 64  # systems that one product of matrices interpolates: few nodes count for them
 _ROWS = {"cpu": 96}  # that are interpolated at a time: they stay in the cache
 
 

@@ -18,7 +18,18 @@ import torch
 from benchmarks.independent_camera import Shake, closed, take_frames
 from benchmarks.library_chain import detect_by_libraries, kernel_of_row
 from benchmarks.measure import Timed, in_turns, named
-from benchmarks.pipeline_report import DEWARP, FASTEST, OURS, PAPER, behind_libraries, lines, targets
+from benchmarks.pipeline_report import (
+    DEWARP,
+    FASTEST,
+    NARROW,
+    NARROW_BANDS,
+    NARROW_DEWARP,
+    OURS,
+    PAPER,
+    behind_libraries,
+    lines,
+    targets,
+)
 from benchmarks.registration import fastest_method
 from benchmarks.restoration import (
     AMPLITUDE,
@@ -52,7 +63,6 @@ __all__ = ["add_options", "behind_libraries", "lines", "rows", "targets"]
 WIENER = "skimage wiener, row loop"
 TIMED_BALANCE = 0.01
 REGISTRATION = "ncc"  # of detect_vibration unless told otherwise
-STRIP = 512  # columns that are enough for bands, where nothing but time counts
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -67,15 +77,9 @@ def bands_chain(registration: str) -> str:
     return f'"bands" by "{registration}", "dewarp"'
 
 
-def strip_chain() -> str:
-    """The name of the chain for which nothing but time counts: bands need not be wide."""
-    return f'"bands" on {STRIP} columns, "dewarp"'
-
-
-def strip(frames: Tensor) -> Tensor:
-    """The columns in the middle."""
-    width = frames.shape[-1]
-    return frames[..., max(0, (width - STRIP) // 2) : (width + STRIP) // 2]
+def quarter(frames: Tensor) -> int:
+    """Columns that are enough where time counts."""
+    return max(96, frames.shape[-1] // 4)
 
 
 def camera(exposure: float, num_rows: int) -> rsv.SensorTiming:
@@ -108,30 +112,38 @@ def compare_chains(
     array = frames.numpy()
     by_libraries = detect_by_libraries(array, timing)
     direct = rsv.detect_vibration(frames, timing)
+    narrow = rsv.detect_vibration(frames, timing, columns=quarter(frames))
+    found: dict[str, tuple[rsv.DetectionResult, str]] = {
+        OURS: (direct, "exact"),
+        NARROW: (narrow, "exact"),
+        DEWARP: (direct, "dewarp"),
+        NARROW_DEWARP: (narrow, "dewarp"),
+    }
+    for registration in registrations:
+        bands = rsv.detect_vibration(frames, timing, method="bands", registration=registration)
+        found[bands_chain(registration)] = (bands, "dewarp")
+    found[NARROW_BANDS] = (
+        rsv.detect_vibration(frames, timing, method="bands", columns=quarter(frames)),
+        "dewarp",
+    )
     chains: dict[str, tuple[rsv.Vibration, Callable[[], list[Peer]]]] = {
         PAPER: (
             by_libraries,
             lambda: [loop_rows(WIENER, array[i], timing, by_libraries, still, RIM, i) for i in range(2)],
         ),
         FASTEST: (by_libraries, lambda: [remap_lanczos(array[i], timing, by_libraries, i) for i in range(2)]),
-        OURS: (direct.vibration, lambda: restored_by(frames, timing, direct.vibration, "exact")),
-        DEWARP: (direct.vibration, lambda: restored_by(frames, timing, direct.vibration, "dewarp")),
     }
-    for registration in registrations:
-        found = rsv.detect_vibration(frames, timing, method="bands", registration=registration).vibration
-        restore = lambda found=found: restored_by(frames, timing, found, "dewarp")  # noqa: E731
-        chains[bands_chain(registration)] = (found, restore)
-    bands = rsv.detect_vibration(strip(frames), timing, method="bands").vibration
-    chains[strip_chain()] = (bands, lambda: restored_by(frames, timing, bands, "dewarp"))
-    trusted = {OURS: direct, DEWARP: direct}
+    for name, (result, method) in found.items():
+        restore = lambda v=result.vibration, m=method: restored_by(frames, timing, v, m)  # noqa: E731
+        chains[name] = (result.vibration, restore)
     results = []
-    for name, (found, restore) in chains.items():
+    for name, (vibration_of, restore) in chains.items():
         try:
             psnr = min(quality(figure, still) for figure in restore())
         except ValueError:  # a row loop whose kernels are larger than its slabs: the detection was far off
             psnr = math.nan
-        reliable = bool(trusted[name].reliable.all()) if name in trusted else None
-        results.append({"chain": name, **errors_of(found), "psnr_db": psnr, "reliable": reliable})
+        reliable = bool(found[name][0].reliable.all()) if name in found else None
+        results.append({"chain": name, **errors_of(vibration_of), "psnr_db": psnr, "reliable": reliable})
     return results
 
 
@@ -196,7 +208,8 @@ def _of_the_package(frames: Tensor, timing: rsv.SensorTiming, registrations: lis
         "direct": lambda: rsv.detect_vibration(frames, timing),
         "exact": lambda: restored_by(frames, timing, found, "exact"),
         "dewarp": lambda: restored_by(frames, timing, found, "dewarp"),
-        "strip": lambda: rsv.detect_vibration(strip(frames), timing, method="bands"),
+        "narrow": lambda: rsv.detect_vibration(frames, timing, columns=quarter(frames)),
+        "narrow bands": lambda: rsv.detect_vibration(frames, timing, method="bands", columns=quarter(frames)),
     }
     for name in registrations:
         works[name] = lambda n=name: rsv.detect_vibration(frames, timing, method="bands", registration=n)
@@ -211,9 +224,14 @@ def speed(
     for device in options.device:
         taken = frames.to(device)
         pieces = _of_the_package(taken, timing, registrations)
-        chains = {OURS: ("direct", "exact"), DEWARP: ("direct", "dewarp")}
+        chains = {
+            OURS: ("direct", "exact"),
+            NARROW: ("narrow", "exact"),
+            DEWARP: ("direct", "dewarp"),
+            NARROW_DEWARP: ("narrow", "dewarp"),
+        }
         chains |= {bands_chain(registration): (registration, "dewarp") for registration in registrations}
-        chains[strip_chain()] = ("strip", "dewarp")
+        chains[NARROW_BANDS] = ("narrow bands", "dewarp")
         if device == "cpu":
             pieces |= _of_libraries(taken, timing)
             chains = {PAPER: ("libraries", "wiener"), FASTEST: ("libraries", "remap"), **chains}
