@@ -13,6 +13,7 @@ from rsvib_torch.sensor import SensorTiming
 
 __all__ = ["GreyFrames", "grey_frames"]
 
+_EVERY = 16  # rows of which one nearly always shows that a frame is not constant
 _LEAST_FRAME = 0.1  # of the pixels of a frame
 
 
@@ -82,15 +83,22 @@ def grey_frames(frames: ArrayLike, timing: SensorTiming, full_scale: float | Non
 
 def _check_detail(frames: Tensor) -> None:
     """Raise ValueError for frames (B, T, C, H, W) of which one is constant."""
-    low, high = frames.amin((-3, -2, -1)), frames.amax((-3, -2, -1))
-    flat = high - low <= 1e-6 * torch.maximum(low.abs(), high.abs())
-    if bool(flat.any()):
+    flat = _flat(frames[..., ::_EVERY, :])
+    if bool(flat.any()) and bool((flat := _flat(frames)).any()):
         where = flat.nonzero()[0].tolist()
         raise ValueError(f"frame {where[-1]} is constant: without detail there is nothing to register")
 
 
+def _flat(frames: Tensor) -> Tensor:
+    """(B, T) bool, frames whose pixels are all alike."""
+    low, high = frames.amin((-3, -2, -1)), frames.amax((-3, -2, -1))
+    return high - low <= 1e-6 * torch.maximum(low.abs(), high.abs())
+
+
 def _valid_pixels(frames: Tensor, ignore: object) -> Tensor | None:
     """Pixels (..., T, H, W) that count, in image orientation; None where all do."""
+    if ignore is None and not bool(torch.isnan(frames.sum())):
+        return None
     missing = torch.isnan(frames)
     missing = missing if frames.ndim == 3 else missing.any(-3)
     if ignore is not None:

@@ -9,9 +9,9 @@ from torch import Tensor
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones import MotionModel, ToneFit, drift_response, model_displacements, tone_columns
 
-__all__ = ["fit_tones"]
+__all__ = ["fit_roughly", "fit_tones"]
 
-_ITERATIONS = 30
+_ITERATIONS, _FEW_ITERATIONS = 30, 5  # of a fit, and of one that another follows
 _TOLERANCE = 1e-7  # of the cost: steps that promise less are not worth taking
 _PARAMETERS = 3  # of a tone: real and imaginary part of its amplitude, and its frequency
 
@@ -148,38 +148,17 @@ def _step(state: _State, keep: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]
     return (inverse @ state.right[..., None])[..., 0], inverse
 
 
-def fit_tones(
-    measurements: Measurements,
-    frequencies: Tensor,
-    active: Tensor,
-    model: MotionModel | None = None,
-    iterations: int = _ITERATIONS,
-) -> ToneFit:
-    """Fit all tones of both axes and the image motion from start frequencies (weighted Levenberg-Marquardt).
-
-    Amplitudes and phases need no start: they are linear once the frequencies are given. Inverting the offsets to the
-    vibration (Eqs. 6-8 with the sign rule) is part of the model, so that a negative gain needs no special case.
-
-    Args:
-        measurements: The displacements.
-        frequencies: (B, 2, K) start frequencies in Hz; with harmonics, K a multiple of their number, each family
-            base first.
-        active: (B, 2, K) bool, tones to fit; the others stay at zero.
-        model: What is fitted beside the tones.
-        iterations: Steps at most.
-
-    Returns:
-        The fit with its covariance, scaled by the observed residual.
-    """
-    model = model or MotionModel()
+def _solved(
+    measurements: Measurements, frequencies: Tensor, active: Tensor, model: MotionModel, iterations: int
+) -> tuple[_Unknowns, _State]:
+    """The least squares solution from start frequencies, as in ``fit_tones``."""
     unknowns = _Unknowns.of(active, model)
     problem = _Problem.of(measurements, model)
     values = frequencies.new_zeros(len(frequencies), 2, len(unknowns.is_frequency))
     values[..., unknowns.is_frequency] = torch.where(active, frequencies, 0.0)
 
     state = problem.evaluate(unknowns, values)
-    none = torch.zeros_like(state.cost)
-    step, _ = _step(state, unknowns.linear, none)
+    step, _ = _step(state, unknowns.linear, torch.zeros_like(state.cost))
     state = problem.evaluate(unknowns, unknowns.moved(values, step))
     damping = torch.full_like(state.cost, 1e-3)
     done = torch.zeros_like(state.cost, dtype=torch.bool)  # each stack stops by itself, whatever it is in a batch with
@@ -192,13 +171,50 @@ def fit_tones(
         better = trial.cost <= state.cost
         state = state.replaced(better & ~done, trial)
         damping = torch.where(better, damping * 0.1, damping * 10.0).clamp(1e-12, 1e6)
-    _, inverse = _step(state, unknowns.free, none)
+    return unknowns, state
+
+
+def fit_roughly(
+    measurements: Measurements, frequencies: Tensor, active: Tensor, model: MotionModel
+) -> tuple[Tensor, Tensor]:
+    """A few steps of ``fit_tones``, which another fit will follow.
+
+    Returns:
+        Frequencies (B, 2, K), and what the fit leaves of the displacements, (B, N, G, 2).
+    """
+    unknowns, state = _solved(measurements, frequencies, active, model, _FEW_ITERATIONS)
+    coefficients, hertz, drift = unknowns.unpack(state.values)
+    fit = ToneFit(coefficients, hertz, active, drift, state.matrix, measurements.centre, model)
+    return hertz, measurements.relative(measurements.displacements - model_displacements(measurements, fit))
+
+
+def fit_tones(
+    measurements: Measurements, frequencies: Tensor, active: Tensor, model: MotionModel | None = None
+) -> ToneFit:
+    """Fit all tones of both axes and the image motion from start frequencies (weighted Levenberg-Marquardt).
+
+    Amplitudes and phases need no start: they are linear once the frequencies are given. Inverting the offsets to the
+    vibration (Eqs. 6-8 with the sign rule) is part of the model, so that a negative gain needs no special case.
+
+    Args:
+        measurements: The displacements.
+        frequencies: (B, 2, K) start frequencies in Hz; with harmonics, K a multiple of their number, each family
+            base first.
+        active: (B, 2, K) bool, tones to fit; the others stay at zero.
+        model: What is fitted beside the tones.
+
+    Returns:
+        The fit with its covariance, scaled by the observed residual.
+    """
+    model = model or MotionModel()
+    unknowns, state = _solved(measurements, frequencies, active, model, _ITERATIONS)
+    _, inverse = _step(state, unknowns.free, torch.zeros_like(state.cost))
     spent = unknowns.free.unflatten(1, (2, -1)).sum(-1)
     coefficients, hertz, drift = unknowns.unpack(state.values)
     fit = ToneFit(coefficients, hertz, active, drift, inverse, measurements.centre, model)
     residual = measurements.displacements - model_displacements(measurements, fit)
     # overlapping bands repeat themselves: the information is that of the independent ones
     variance = measurements.square(residual).clamp(min=0.0) / (measurements.known - spent).clamp(min=1.0)
-    deviation = variance.sqrt().repeat_interleave(values.shape[-1], dim=1)
+    deviation = variance.sqrt().repeat_interleave(state.values.shape[-1], dim=1)
     covariance = (unknowns.tie @ inverse @ unknowns.tie.T) * deviation[:, :, None] * deviation[:, None]
     return replace(fit, covariance=covariance)

@@ -6,15 +6,12 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from rsvib_torch.detection.fit import fit_tones
+from rsvib_torch.detection.fit import fit_roughly, fit_tones
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import OtherMotion
 from rsvib_torch.detection.tones import MotionModel, ToneFit, model_displacements, tone_response
 
-__all__ = ["FEW_ITERATIONS", "of_each", "residual_of", "robust_fit", "shown_size", "typical_size"]
-
-FEW_ITERATIONS = 5  # of a fit that another one follows
-_ROBUST_STEPS = 2
+__all__ = ["of_each", "residual_of", "robust_fit", "shown_size", "typical_size"]
 
 Kind = TypeVar("Kind", ToneFit, Measurements, OtherMotion)
 
@@ -38,12 +35,9 @@ def robust_fit(
     if residual is None:
         fit = fit_tones(measurements, frequencies, active, model)
         frequencies, residual = fit.frequencies, residual_of(measurements, fit)
-    for step in range(_ROBUST_STEPS):
-        weighed = measurements.reweighted(residual)
-        enough = {} if step == _ROBUST_STEPS - 1 else {"iterations": FEW_ITERATIONS}
-        fit = fit_tones(weighed, frequencies, active, model, **enough)
-        frequencies, residual = fit.frequencies, residual_of(measurements, fit)
-    return fit, weighed
+    frequencies, residual = fit_roughly(measurements.reweighted(residual), frequencies, active, model)
+    weighed = measurements.reweighted(residual)
+    return fit_tones(weighed, frequencies, active, model), weighed
 
 
 def residual_of(measurements: Measurements, fit: ToneFit) -> Tensor:

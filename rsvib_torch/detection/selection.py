@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.blind_tones import with_blind_tones
-from rsvib_torch.detection.fit import fit_tones
+from rsvib_torch.detection.fit import fit_roughly, fit_tones
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.periodogram import BLIND, MAJORITY, strongest_frequencies
-from rsvib_torch.detection.robust import FEW_ITERATIONS, of_each, residual_of, robust_fit, typical_size
+from rsvib_torch.detection.robust import of_each, residual_of, robust_fit, typical_size
 from rsvib_torch.detection.tones import MotionModel, ToneFit, tone_response
 
 __all__ = ["MAX_TONES", "find_tones", "significant_only", "strongest_only"]
@@ -60,17 +60,10 @@ def _with_one_more(
     further = (peaks[..., None] * multiples).transpose(1, 2).flatten(0, 1)  # (B C, 2, H)
     count = len(further) // len(measurements.moments)
     known = before.frequencies[..., : active.shape[-1] - harmonics].repeat_interleave(count, 0)
-    fit = fit_tones(
-        parts.repeated(peaks.shape[-1]),
-        torch.cat([known, further], -1),
-        active.repeat_interleave(count, 0),
-        model,
-        FEW_ITERATIONS,
-    )
-    several = measurements.repeated(count)
-    residual = residual_of(several, fit)
+    several, which = measurements.repeated(count), active.repeat_interleave(count, 0)
+    frequencies, residual = fit_roughly(parts.repeated(peaks.shape[-1]), torch.cat([known, further], -1), which, model)
     size = several.sizes(residual).nanquantile(MAJORITY, dim=1).nan_to_num(0.0).unflatten(0, (-1, count))
-    sighted = _sighted(several, fit.frequencies[..., -harmonics:]).unflatten(0, (-1, count))
+    sighted = _sighted(several, frequencies[..., -harmonics:]).unflatten(0, (-1, count))
     best = ((size.amax(1, keepdim=True) - size) * sighted).argmax(1)  # each axis for itself
 
     def chosen(values: Tensor, axis: int) -> Tensor:
@@ -79,10 +72,10 @@ def _with_one_more(
         picked: Tensor = each.gather(1, place)[:, 0].movedim(1, axis)
         return picked
 
-    frequencies, residual = chosen(fit.frequencies, 1), chosen(residual, 3)
+    frequencies, residual = chosen(frequencies, 1), chosen(residual, 3)
     for _ in range(_ABSOLUTE_STEPS if reckon else 0):
-        nearer = fit_tones(measurements.for_least_absolute(residual), frequencies, active, model, FEW_ITERATIONS)
-        frequencies, residual = nearer.frequencies, residual_of(measurements, nearer)
+        nearer = measurements.for_least_absolute(residual)
+        frequencies, residual = fit_roughly(nearer, frequencies, active, model)
     return frequencies, residual
 
 

@@ -345,6 +345,36 @@ def test_agrees_with_the_simulator(paper_camera):
     assert phase < 0.01
 
 
+@pytest.mark.parametrize("method", ["bands", "direct"])
+def test_some_columns_are_those_with_detail(pairs, paper_camera, method):
+    """Columns of either stack that show the scene, among flat ones; and of one on its side."""
+    (first, motion), (second, _), _ = pairs
+    flat = torch.full_like(first[..., :80], 0.5)
+    left, right = torch.cat([first[..., :192], flat, flat], -1), torch.cat([flat, second[..., :192], flat], -1)
+    noise = 0.001 * torch.randn(right.shape, generator=torch.Generator().manual_seed(1))
+    batch = torch.stack([left, right])[:, :, None] + noise[:, None]
+    found = detect_vibration(batch, paper_camera, method=method, columns=160)
+    for index, frames in enumerate((left + noise, right + noise)):
+        alone = detect_vibration(frames, paper_camera, method=method, columns=160)
+        torch.testing.assert_close(found[index].vibration.amplitude, alone.vibration.amplitude, rtol=1e-4, atol=0)
+        assert alone.reliable.all()
+        motion = pairs[index][1]
+        assert errors(alone, motion)[1] < 1.0
+    sideways = replace(paper_camera, scan_axis=-1)
+    turned = detect_vibration(
+        (left + noise).transpose(-2, -1).contiguous(), sideways, method=method, columns=160
+    ).vibration.amplitude
+    torch.testing.assert_close(turned.flip(0), found[0].vibration.amplitude, rtol=1e-4, atol=0)
+
+
+def test_more_columns_than_there_are_are_all(pairs, paper_camera):
+    frames, _ = pairs[0]
+    whole = detect_bands(frames, paper_camera).vibration.amplitude
+    assert torch.equal(detect_bands(frames, paper_camera, columns=4000).vibration.amplitude, whole)
+    with pytest.raises(ValueError, match=r"columns=128 goes with model='tones', not with model='free'"):
+        detect_vibration(frames, paper_camera, model="free", columns=128)
+
+
 def detail(*shape):
     return torch.rand(*shape, generator=torch.Generator().manual_seed(0))
 
@@ -378,6 +408,8 @@ def with_pixel(value):
         (detail(2, 256, 128), {"band_rows": 2}, ValueError, "band_rows must be at least 4, got 2"),
         (detail(2, 256, 128), {"band_step": 0}, ValueError, "band_step must be at least 1, got 0"),
         (detail(2, 256, 128), {"search": 1}, ValueError, "search must be at least 2, got 1"),
+        (detail(2, 256, 128), {"columns": 20}, ValueError, "columns must be at least 64, got 20"),
+        (detail(2, 256, 128), {"columns": 70.5}, TypeError, "columns must be a whole number, got 70.5"),
     ],
 )
 def test_bad_input(paper_camera, frames, options, error, message):
