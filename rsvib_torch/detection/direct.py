@@ -96,7 +96,7 @@ def _corrected(told: Measurements, steps: list[_Step]) -> Measurements:
 def _settled(before: ToneFit, after: ToneFit) -> bool:
     """Whether a round changed coefficients and frequencies by less than half their standard deviations.
 
-    Errors shrink to a tenth and less from round to round, so that what is left is far below the noise.
+    Errors shrink from round to round, under short exposures to a tenth and less: what is left is far below the noise.
     """
     if before.active.shape != after.active.shape:
         return False
