@@ -14,7 +14,7 @@ from rsvib_torch.splines import bspline_weights, mirrored_index
 __all__ = ["reblur"]
 
 _DEGREE = 5  # of the spline across rows
-_ROWS = {"cpu": 64}  # formed at a time: what they are made of stays in the cache
+_VALUES = {"cpu": 1 << 18}  # of kernels at a time: what rows are formed from stays in the cache
 
 
 def reblur(scene: Tensor, motion: FrameMotion, frame: int, *, first_row: int = 0) -> Tensor:
@@ -55,7 +55,7 @@ def reblur(scene: Tensor, motion: FrameMotion, frame: int, *, first_row: int = 0
     beyond = max(int(-source.amin()), int(source.amax()) + count - height, 0)
     fold = mirrored_index(-beyond, height + beyond, height, scene.device)
     seen = fold[source[:, None] + torch.arange(count, device=scene.device) + beyond]  # (H, count)
-    step = _ROWS.get(scene.device.type, height)
+    step = max(1, _VALUES.get(scene.device.type, height * count * len(u)) // (count * len(u)))
     formed = []
     for part in runs(height, step):
         transfer = torch.complex(taps[part] @ angle[part].cos(), taps[part] @ angle[part].sin())  # (R, count, U)
