@@ -20,6 +20,7 @@ _MOST_PIECES = 128  # of a frame
 _EVERY = 8  # rows of which one tells how bright a frame is
 _SMOOTHING = 3  # neighbouring frequencies whose statistics are pooled
 _ITERATIONS = 20
+_ROUNDING = 1e-14  # of the squared modulus of a filter, a sum of terms around 1
 # noise power over variance of e: above, the systems lose digits and nothing is gained; below, rows half a pixel apart
 # from the scene's lose them in single precision. Long exposures see every place of the scene from many of its rows,
 # and may go as much lower as the blur is longer than a px.
@@ -148,7 +149,7 @@ def autoregressive_prior(
         moments = _smooth((scene @ cosine).T / len(v))
         reflections, filter_, innovation = _levinson(moments)
         products = torch.stack([(filter_[: order + 1 - d] * filter_[d:]).sum(0) for d in range(order + 1)], -1)
-        model = innovation[:, None] / (products @ both)
+        model = innovation[:, None] / (products @ both).clamp(min=_ROUNDING)
         gain = model / (transfer * model + noise_power)
         scene = gain * noise_power + gain.square() * through
     tiny = torch.finfo(scene.dtype).tiny
