@@ -32,9 +32,10 @@ from rsvib_torch.vibration import blind_frequencies
 __all__ = ["DetectionMethod", "VibrationDetector", "VibrationModel", "detect_vibration"]
 
 DetectionMethod = Literal["direct", "bands"]
+VibrationModel = Literal["tones", "free", "swept"]
+
 _NEAR = 0.15  # px: rows as near as this to the start tell the rest themselves
 _FEWEST_COLUMNS = 64  # px: bands of fewer are hardly found again
-VibrationModel = Literal["tones", "free", "swept"]
 
 
 class _BandOptions(TypedDict, total=False):

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.detection.equal_blur import blurred_unlike
 from rsvib_torch.detection.fit import fit_tones
 from rsvib_torch.detection.inversion import vibration_of_fit
 from rsvib_torch.detection.leftovers import independent_fraction, slant, unexplained
@@ -150,12 +151,14 @@ def refine_directly(
     groups = frame_groups(spectra, timing, motion, alike=True)
     found = _refine(groups, timing, start, tones, iterations)
     tried = torch.zeros_like(start.active[..., 0])
-    misled = any(bool(group.blurred_unlike(timing, motion).any()) for group in groups)
-    for _ in range(2 if misled else 0):
-        other, rival = _beyond_blind(found, start, tried)
+    for _ in range(2):
+        frequencies, rival = _beyond_blind(found, start, tried)
         if not bool(rival.any()):
             break
+        if not any(bool(blurred_unlike(group.starts, spectra.height, timing, motion).any()) for group in groups):
+            break
         tried = tried | rival
+        other, _ = robust_fit(found.measurements, frequencies, strongest_only(found.fit).active, start.model)
         found = _better_of_each(found, _refine(groups, timing, other, tones, iterations))
     return found
 
@@ -215,8 +218,8 @@ def _refine(
     return _concluded(measurements, fit, tones, gradients)
 
 
-def _beyond_blind(found: DirectFit, start: ToneFit, tried: Tensor) -> tuple[ToneFit, Tensor]:
-    """The strongest tones; that of the axis that leaves most unexplained starts beyond a blind frequency instead.
+def _beyond_blind(found: DirectFit, start: ToneFit, tried: Tensor) -> tuple[Tensor, Tensor]:
+    """Of the strongest tones, that of the axis that leaves most unexplained on the other side of a blind frequency.
 
     Two frames see tones equally far above and below ``j / (m T_row)`` with the same gain; they differ within a frame.
 
@@ -226,7 +229,7 @@ def _beyond_blind(found: DirectFit, start: ToneFit, tried: Tensor) -> tuple[Tone
         tried: (B, 2) bool, axes that need not be looked at.
 
     Returns:
-        The fit, and for which axes it is another, (B, 2) bool: at most one of a stack.
+        (B, 2, 1) Hz, and which axes' are others, (B, 2) bool: at most one of a stack.
     """
     measurements, fit = found.measurements, strongest_only(found.fit)
     left = measurements.sizes(residual_of(measurements, found.fit)).nanmedian(1).values.nan_to_num(0.0)  # (B, 2)
@@ -237,10 +240,9 @@ def _beyond_blind(found: DirectFit, start: ToneFit, tried: Tensor) -> tuple[Tone
     mirrored = 2 * (first * interval).round() / interval - first
     alike = ((mirrored - first).abs() * span < _TOLD_APART) & (mirrored > 0) & fit.active[..., 0]
     rival = alike & ~tried & (left > _UNEXPLAINED) & (left == left.amax(-1, keepdim=True))
-    if not bool(rival.any()) or fit.model.harmonics > 1 or moments.shape[2] > 2:
-        return fit, torch.zeros_like(rival)
-    frequencies = torch.where(rival, mirrored, fit.frequencies[..., 0])[..., None]
-    return robust_fit(measurements, frequencies, fit.active, fit.model)[0], rival
+    if fit.model.harmonics > 1 or moments.shape[2] > 2:
+        rival = torch.zeros_like(rival)
+    return torch.where(rival, mirrored, fit.frequencies[..., 0])[..., None], rival
 
 
 def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:

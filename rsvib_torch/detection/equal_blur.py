@@ -59,9 +59,10 @@ def _unlike(paths: Tensor) -> Tensor:
     return (paths.amax(1) - paths.amin(1)).flatten(1).amax(1) > _ALIKE
 
 
-def blurred_unlike(moments: Tensor, timing: SensorTiming, motion: Vibration) -> Tensor:
-    """(B,) bool: whether frames whose rows are exposed from ``moments`` (B, G, S) are blurred in ways of their own."""
-    return _unlike(_paths(moments, timing, motion)[0])
+def blurred_unlike(starts: Tensor, height: int, timing: SensorTiming, motion: Vibration) -> Tensor:
+    """(B,) bool: whether frames of a height that start at (B, G) s are blurred in ways of their own."""
+    rows = torch.arange(height, dtype=torch.float64, device=starts.device)
+    return _unlike(_paths(starts[..., None] + rows * timing.row_time, timing, motion)[0])
 
 
 def warp_to_same_blur(

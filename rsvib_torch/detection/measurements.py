@@ -132,9 +132,13 @@ class Measurements:
 
     def sizes(self, residual: Tensor) -> Tensor:
         """(B, N, 2) size of residuals (B, N, G, 2) in units of their information; NaN where unknown."""
+        return self.distances(residual) * self.weights.sqrt()
+
+    def distances(self, residual: Tensor) -> Tensor:
+        """(B, N, 2) size of residuals (B, N, G, 2) in px; NaN where unknown."""
         known = (self.weights > 0) & (self.differences[..., None] > 0)
         square = residual.square().sum(2) / self.differences[..., None].clamp(min=1.0)
-        return torch.where(known, (square * self.weights).sqrt(), torch.nan)
+        return torch.where(known, square.sqrt(), torch.nan)
 
     def scaled(self, factor: Tensor) -> "Measurements":
         """The measurements with their information multiplied by factors (B, N, 2) of each axis."""

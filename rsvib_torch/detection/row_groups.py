@@ -41,11 +41,6 @@ class FrameGroup:
     spectra: RowSpectra
     starts: Tensor  # (B, G) s
 
-    def blurred_unlike(self, timing: SensorTiming, motion: Vibration) -> Tensor:
-        """(B,) bool: whether the frames are blurred in ways of their own."""
-        rows = torch.arange(self.spectra.height, dtype=torch.float64, device=self.starts.device)
-        return blurred_unlike(self.starts[..., None] + rows * timing.row_time, timing, motion)
-
 
 def _members(num_frames: int, most: int) -> list[range]:
     """Consecutive groups of at most ``most`` frames, each sharing one frame with the next, as even as can be."""
@@ -85,12 +80,10 @@ def frame_groups(
             of a tone; a free motion needs all frames that see a place.
     """
     stacks, count = spectra.values.shape[:2]
-    device = spectra.values.device
-    starts = timing.frame_starts(count, device).expand(stacks, -1)
+    starts = timing.frame_starts(count, spectra.values.device).expand(stacks, -1)
     most = _frames_in_group(motion, starts, (spectra.height, spectra.width))
     if alike:
-        moments = timing.row_starts(count, spectra.height, device).expand(stacks, -1, -1)
-        most = 2 if bool(blurred_unlike(moments, timing, motion).any()) else most
+        most = 2 if bool(blurred_unlike(starts, spectra.height, timing, motion).any()) else most
     parts = [slice(member.start, member.stop) for member in _members(count, most)]
     return [FrameGroup(spectra.part(part), starts[:, part]) for part in parts]
 

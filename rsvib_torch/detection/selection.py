@@ -88,9 +88,7 @@ def _undisturbed(measurements: Measurements, left: Tensor) -> Tensor:
 
 def _farthest(measurements: Measurements, left: Tensor) -> Tensor:
     """(B, 2) px, more than a fit that has ``left`` (B, N, G, 2) is off at nearly all rows which tell of an axis."""
-    known = (measurements.weights > 0) & (measurements.differences[..., None] > 0)
-    square = left.square().sum(2) / measurements.differences[..., None].clamp(min=1.0)
-    return torch.where(known, square.sqrt(), torch.nan).nanquantile(_NEARLY_ALL, dim=1).nan_to_num(torch.inf)
+    return measurements.distances(left).nanquantile(_NEARLY_ALL, dim=1).nan_to_num(torch.inf)
 
 
 def _better_where(
@@ -168,7 +166,7 @@ def find_tones(
     going = torch.ones_like(none[..., 0])  # an axis that stopped stays stopped
     for _ in range(keep.shape[-1] // model.harmonics, MAX_TONES if tones is None else tones):
         left = residual_of(measurements, fit)
-        going = going & (_farthest(measurements, left) > enough) if keep.shape[-1] > 0 else going
+        going = going & (_farthest(measurements, left) > enough) if enough and keep.shape[-1] > 0 else going
         if not bool(going.any()):
             break
         active = torch.cat([keep, going[..., None].expand_as(none)], -1)

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.independent_camera import Shake, closed, take_frames
-from benchmarks.restoration import FADE, MARGIN, SCENES, SEED, camera, quality, vibration
+from benchmarks.regularisation import two_frames
+from benchmarks.restoration import MARGIN, SCENES, SEED, camera, quality, vibration
 from benchmarks.restoration_peers import Peer, remap_lanczos
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
@@ -29,29 +29,21 @@ UNWARPED = (61.5, 46.5, 34.6, 44.3, 33.2)  # dB by plain unwarping on the scene 
 _STEPS = 9
 
 
-def frames_of(scene: NDArray[np.float64], exposure: int, noise: float) -> tuple[Tensor, Tensor, rsv.SensorTiming]:
-    """Two frames of a scene, what a still camera without noise would show, and the sensor."""
-    truth, timing = vibration(), camera(exposure)
-    shake = Shake(*(values.numpy() for values in (truth.amplitude, truth.frequency, truth.phase, truth.image_motion)))
-    taken = take_frames(
-        closed(scene, FADE),
-        shake,
-        row_time=timing.row_time,
-        exposure_rows=timing.exposure_rows,
-        frame_rows=timing.frame_rows,
-        num_frames=2,
-        size=(scene.shape[0] - 2 * MARGIN, scene.shape[1] - 2 * MARGIN),
-    )
-    frames = torch.from_numpy(taken).float()
-    if noise:
-        frames = rsv.SensorNoise(read_noise=noise).apply(frames, torch.Generator().manual_seed(SEED))
-    return frames, torch.from_numpy(scene[MARGIN:-MARGIN, MARGIN:-MARGIN]).float(), timing
+def frames_of(scene: NDArray[np.float64], exposure: int, noise: float) -> Tensor:
+    """Two frames of a scene."""
+    frames = two_frames(torch.from_numpy(scene), exposure, len(scene) - 2 * MARGIN)
+    generator = torch.Generator().manual_seed(SEED)
+    return rsv.SensorNoise(read_noise=noise).apply(frames, generator) if noise else frames
 
 
-def unwarped(scene: NDArray[np.float64], exposure: int = 20, noise: float = 0.0) -> float:
-    """PSNR in dB that plain unwarping reaches."""
-    frames, still, timing = frames_of(scene, exposure, noise)
-    return quality(remap_lanczos(frames[0].numpy(), timing, vibration()), still)
+def still_of(scene: NDArray[np.float64]) -> Tensor:
+    """What a still camera without noise shows."""
+    return torch.from_numpy(scene[MARGIN:-MARGIN, MARGIN:-MARGIN]).float()
+
+
+def unwarped(frames: Tensor, scene: NDArray[np.float64], exposure: int) -> float:
+    """PSNR in dB that plain unwarping of the first frame reaches."""
+    return quality(remap_lanczos(frames[0].numpy(), camera(exposure), vibration()), still_of(scene))
 
 
 def seen_through(scene: NDArray[np.float64], wanted: float) -> tuple[NDArray[np.float64], float]:
@@ -59,7 +51,9 @@ def seen_through(scene: NDArray[np.float64], wanted: float) -> tuple[NDArray[np.
     low, high = 0.0, 1.5
     for _ in range(_STEPS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if unwarped(gaussian_filter(scene, middle)) < wanted else (low, middle)
+        blurred = gaussian_filter(scene, middle)
+        sharp = unwarped(frames_of(blurred, *CASES[0]), blurred, CASES[0][0]) < wanted
+        low, high = (middle, high) if sharp else (low, middle)
     return gaussian_filter(scene, high), high
 
 
@@ -70,15 +64,12 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     for name in options.scenes:
         scene, sigma = seen_through(SCENES[name](size, size, SEED).double().numpy(), UNWARPED[0])
         for (exposure, noise), goals, before in zip(CASES, GOALS, UNWARPED, strict=True):
-            frames, still, timing = frames_of(scene, exposure, noise)
-
-            def restored(count: int, taken: Tensor = frames, sensor: rsv.SensorTiming = timing) -> Peer:
-                images = rsv.restore(taken[:count], sensor, vibration(), check=False, joint=count > 1)
-                return Peer(images[0], 0.0, "")
-
-            found = [quality(restored(count), still) for count in (1, 2)]
+            frames, found = frames_of(scene, exposure, noise), []
+            for count in (1, 2):
+                images = rsv.restore(frames[:count], camera(exposure), vibration(), check=False, joint=count > 1)
+                found.append(quality(Peer(images[0], 0.0, ""), still_of(scene)))
             case = {"scene": name, "sigma": sigma, "exposure_rows": exposure, "noise": noise}
-            case |= {"unwarped_db": unwarped(scene, exposure, noise), "unwarped_there_db": before}
+            case |= {"unwarped_db": unwarped(frames, scene, exposure), "unwarped_there_db": before}
             results.append({**case, "one_db": found[0], "two_db": found[1], "goals_db": goals})
     return results
 

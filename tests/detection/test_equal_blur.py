@@ -26,6 +26,15 @@ def of_each_stack(motion: Motion) -> Vibration:
     return Vibration(*(value.expand(2, *value.shape) for value in values))
 
 
+def prepared(frames, camera):
+    """Spectra of the frames, where they show the scene by the true motion, and what warps them to it."""
+    spectra, truth = RowSpectra(frames), of_each_stack(MOTION)
+    place = torch.arange(frames.shape[-2], dtype=torch.float64).expand(2, 1, -1)
+    left, starts = torch.zeros(2, 1, 1, dtype=torch.float64), camera.frame_starts(2).expand(2, -1)[..., None]
+    shown = Shown.of(place, left, starts, camera, truth)
+    return spectra, shown, warp_to_same_blur(spectra, shown, place, left, camera, truth)
+
+
 def test_rows_are_where_the_motion_says(pairs):
     """Measured around the true motion rows miss nothing; kernels that change from row to row would leave 3e-3 px."""
     frames, camera = pairs
@@ -39,12 +48,7 @@ def test_rows_are_where_the_motion_says(pairs):
 
 def test_both_frames_show_the_same_image(pairs):
     frames, camera = pairs
-    truth = of_each_stack(MOTION)
-    spectra = RowSpectra(frames)
-    place = torch.arange(frames.shape[-2], dtype=torch.float64).expand(2, 1, -1)
-    left, starts = torch.zeros(2, 1, 1, dtype=torch.float64), camera.frame_starts(2).expand(2, -1)[..., None]
-    shown = Shown.of(place, left, starts, camera, truth)
-    warp = warp_to_same_blur(spectra, shown, place, left, camera, truth)
+    spectra, shown, warp = prepared(frames, camera)
 
     def apart(warped):
         images = torch.fft.irfft(warped, n=spectra.length)[:, :, 40:-40, 40 : frames.shape[-1] - 40]
@@ -58,10 +62,5 @@ def test_both_frames_show_the_same_image(pairs):
 
 def test_frames_blurred_alike_are_only_warped(paper_camera, pairs):
     frames, _ = pairs
-    truth = of_each_stack(MOTION)
-    spectra = RowSpectra(frames)
-    place = torch.arange(frames.shape[-2], dtype=torch.float64).expand(2, 1, -1)
-    left, starts = torch.zeros(2, 1, 1, dtype=torch.float64), paper_camera.frame_starts(2).expand(2, -1)[..., None]
-    shown = Shown.of(place, left, starts, paper_camera, truth)
-    warped = warp_to_same_blur(spectra, shown, place, left, paper_camera, truth)(slice(None))
-    torch.testing.assert_close(warped, spectra.warped(shown.rows, shown.shift))
+    spectra, shown, warp = prepared(frames, paper_camera)
+    torch.testing.assert_close(warp(slice(None)), spectra.warped(shown.rows, shown.shift))
