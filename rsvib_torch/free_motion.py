@@ -13,7 +13,7 @@ from rsvib_torch.quadrature import gauss_legendre
 from rsvib_torch.splines import bspline_coefficients, bspline_weights
 from rsvib_torch.vibration import TensorLike, Vibration
 
-__all__ = ["FreeMotion", "detached", "rest_path", "rest_reach"]
+__all__ = ["FreeMotion", "rest_path", "rest_reach"]
 
 _TAPS = 4
 _REACH = 24  # knots after which an end is forgotten
@@ -151,20 +151,6 @@ class FreeMotion(Vibration):
         count = self.coefficients.shape[-1]
         return self.start + self.spacing * (torch.arange(count, dtype=torch.float64, device=self.device) - 1.0)
 
-    def to(self, device: torch.device | str) -> "FreeMotion":
-        """The same motion on another device."""
-        return FreeMotion(self.coefficients.to(device), self.start, self.spacing, self.tones.to(device))
-
-    def __getitem__(self, index: int) -> "FreeMotion":
-        """One motion out of a batch."""
-        return FreeMotion(self.coefficients[index], self.start, self.spacing, self.tones[index])
-
-    def expanded(self, size: int) -> "FreeMotion":
-        """A motion without batch dimensions as a batch of ``size`` equal ones."""
-        given = [getattr(self, name) for name in Vibration.__dataclass_fields__]
-        tones = Vibration(*(value.expand(size, *value.shape) for value in given))
-        return FreeMotion(self.coefficients.expand(size, -1, -1), self.start, self.spacing, tones)
-
     def with_tones(self, tones: Vibration, signs: Sequence[float] = (1.0, 1.0), *, swap: bool = False) -> "FreeMotion":
         """The same rest, with axes turned by ``signs`` or swapped, beside other tones."""
         rest = self.coefficients * self.coefficients.new_tensor(signs)[:, None]
@@ -244,14 +230,6 @@ class FreeMotion(Vibration):
     def displacement_within_row_time(self, row_time: float) -> Tensor:
         """Largest displacement within one row time, (..., 2), in px (Eq. 24)."""
         return super().displacement_within_row_time(row_time) + rest_path(self, row_time)
-
-
-def detached(vibration: Vibration) -> Vibration:
-    """The same motion without gradients."""
-    tones = Vibration(*(getattr(vibration, name).detach() for name in Vibration.__dataclass_fields__))
-    if not isinstance(vibration, FreeMotion):
-        return tones
-    return FreeMotion(vibration.coefficients.detach(), vibration.start, vibration.spacing, tones)
 
 
 def _nodes(exposure_time: float, spacing: float) -> tuple[list[float], list[float]]:

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from threading import Lock
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -13,8 +14,47 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
+class _WholeProducts:
+    """Products and convolutions of float32 with all their digits, whatever was allowed for the rest of a program.
+
+    Shorter formats (TF32, bfloat16) are allowed for a whole process: where several threads ask for all digits, the
+    first one takes the permission away and the last one gives it back.
+    """
+
+    _BACKENDS: Any = torch.backends  # their attributes are not typed
+    _KINDS = (
+        _BACKENDS.cuda.matmul,
+        _BACKENDS.cudnn.conv,
+        _BACKENDS.cudnn.rnn,  # asked for together with convolutions, by one name
+        _BACKENDS.mkldnn.matmul,
+        _BACKENDS.mkldnn.conv,
+    )
+
+    def __init__(self) -> None:
+        self._lock, self._users = Lock(), 0
+        self._allowed: list[str] = []
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._users += 1
+            if self._users == 1:
+                self._allowed = [kind.fp32_precision for kind in self._KINDS]
+                for kind in self._KINDS:
+                    kind.fp32_precision = "ieee"
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                for kind, allowed in zip(self._KINDS, self._allowed, strict=True):
+                    kind.fp32_precision = allowed
+
+
+_WHOLE_PRODUCTS = _WholeProducts()
+
+
 def full_precision(function: Callable[P, R]) -> Callable[P, R]:
-    """Make a function ignore autocast: splines, transforms and fits need every digit of float32.
+    """Make a function ignore autocast and TF32: splines, transforms and fits need every digit of float32.
 
     The device is that of the first tensor among the arguments.
 
@@ -29,7 +69,7 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
     def with_all_digits(*args: P.args, **kwargs: P.kwargs) -> R:
         tensors = (value for value in (*args, *kwargs.values()) if isinstance(value, Tensor))
         device = next((tensor.device.type for tensor in tensors), "cpu")
-        with torch.autocast(device_type=device, enabled=False):
+        with torch.autocast(device_type=device, enabled=False), _WHOLE_PRODUCTS:
             return function(*args, **kwargs)
 
     return with_all_digits

@@ -13,7 +13,7 @@ __all__ = [
     "bspline_coefficients",
     "bspline_coefficients_adjoint",
     "bspline_weights",
-    "mirrored_index",
+    "mirrored",
 ]
 
 _PRECISION = 1e-9  # of the largest tap, below which the prefilter is cut off
@@ -63,13 +63,16 @@ def _prefilter_taps(degree: int, double: bool) -> tuple[float, ...]:
     return tuple(inverse[:reach].tolist())
 
 
-def mirrored_index(start: int, stop: int, length: int, device: torch.device | None = None) -> Tensor:
-    """Indices ``start .. stop - 1`` folded into ``0 .. length - 1`` by mirroring about the end samples."""
-    index = torch.arange(start, stop, device=device)
-    if length == 1:
-        return torch.zeros_like(index)
-    index = index.remainder(2 * (length - 1))
-    return torch.where(index >= length, 2 * (length - 1) - index, index)
+def mirrored(index: Tensor, length: int) -> Tensor:
+    """Indices, however far out, folded into ``0 .. length - 1`` by mirroring about the end samples.
+
+    Example:
+        >>> mirrored(torch.arange(-3, 7), 4).tolist()
+        [3, 2, 1, 0, 1, 2, 3, 2, 1, 0]
+    """
+    period = 2 * (length - 1)
+    index = index.remainder(max(period, 1))
+    return torch.minimum(index, period - index)
 
 
 _BLOCK, _LARGE_BLOCK = 64, 256  # samples filtered together: one small dense matrix serves all blocks
@@ -112,7 +115,7 @@ def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[tuple[sli
     """
     taps = _prefilter_taps(degree, samples.dtype in (torch.float64, torch.complex128))
     reach, height = len(taps) - 1, samples.shape[-2]
-    index = mirrored_index(-reach, height + reach, height, samples.device)
+    index = mirrored(torch.arange(-reach, height + reach, device=samples.device), height)
     step = min(_BLOCK if samples.device.type == "cpu" else _LARGE_BLOCK, height)
     matrix = _toeplitz(taps, step, samples)
     for rows in runs(height, step):
@@ -141,7 +144,7 @@ def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
         return samples
     taps = _prefilter_taps(degree, samples.dtype in (torch.float64, torch.complex128))
     length, reach = samples.shape[dim], len(taps) - 1
-    index = mirrored_index(-reach, length + reach, length, samples.device)
+    index = mirrored(torch.arange(-reach, length + reach, device=samples.device), length)
     return _filter_symmetric(samples.index_select(dim, index), taps, dim)
 
 
@@ -155,5 +158,5 @@ def bspline_coefficients_adjoint(values: Tensor, degree: int, dim: int) -> Tenso
     shape[dim] = 2 * reach
     edge = values.new_zeros(shape)
     spread = _filter_symmetric(torch.cat([edge, values, edge], dim), taps, dim)
-    index = mirrored_index(-reach, length + reach, length, values.device)
+    index = mirrored(torch.arange(-reach, length + reach, device=values.device), length)
     return torch.zeros_like(values).index_add(dim, index, spread)

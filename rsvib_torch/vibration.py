@@ -1,7 +1,8 @@
 """The vibration model: displacement, mean displacement over an exposure, offset between frames."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Self
 
@@ -15,6 +16,7 @@ __all__ = ["Vibration", "blind_frequencies"]
 TensorLike = Tensor | float | Sequence[float] | Sequence[Sequence[float]]
 
 _SAME_PLACE = 1e-6  # of a turn
+_NOT_NEGATIVE = ("amplitude", "frequency")
 
 
 def _tones(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
@@ -28,8 +30,6 @@ def _tones(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
         raise ValueError(
             f"{name} must have shape (2,), (2, K) or (..., 2, K) for axes (x, y), got {tuple(tensor.shape)}"
         )
-    if not bool(torch.isfinite(tensor).all()):
-        raise ValueError(f"{name} must be finite")
     return tensor
 
 
@@ -39,9 +39,21 @@ def _of_axes(name: str, value: TensorLike, device: torch.device | None) -> Tenso
     tensor = tensor.expand(2) if tensor.ndim == 0 else tensor
     if tensor.shape[-1] != 2:
         raise ValueError(f"{name} must have shape (..., 2) for axes (x, y), got {tuple(tensor.shape)}")
-    if not bool(torch.isfinite(tensor).all()):
-        raise ValueError(f"{name} must be finite")
     return tensor
+
+
+def _check_values(values: dict[str, Tensor]) -> None:
+    """Raise ValueError for values that are not finite, or negative where they must not be."""
+    wrong = [~torch.isfinite(tensor).all() for tensor in values.values()]
+    wrong += [(values[name] < 0).any() for name in _NOT_NEGATIVE]
+    if not bool(torch.stack(wrong).any()):  # a device is waited for once
+        return
+    for name, tensor in values.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise ValueError(f"{name} must be finite")
+    for name in _NOT_NEGATIVE:
+        if bool((values[name] < 0).any()):
+            raise ValueError(f"{name} must not be negative, got {values[name].min().item():g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +111,7 @@ class Vibration:
         except RuntimeError as error:
             shapes = ", ".join(str(tuple(t.shape)) for t in (*tones, motion, acceleration))
             raise ValueError(f"amplitude, frequency, phase and image_motion do not fit together: {shapes}") from error
-        for name, tensor in zip(("amplitude", "frequency"), tones[:2], strict=True):
-            if bool((tensor < 0).any()):
-                raise ValueError(f"{name} must not be negative, got {tensor.min().item():g}")
+        _check_values(dict(zip(Vibration.__dataclass_fields__, (*tones, motion, acceleration), strict=True)))
         tones = [tensor.expand(*batch, *tensor.shape[-2:]) for tensor in tones]
         order = tones[0].detach().argsort(dim=-1, descending=True, stable=True)
         for name, tensor in zip(("amplitude", "frequency", "phase"), tones, strict=True):
@@ -124,15 +134,34 @@ class Vibration:
         """Device of the parameters."""
         return self.amplitude.device
 
-    def to(self, device: torch.device | str) -> "Vibration":
-        """The same vibration on another device."""
-        return Vibration(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+    def mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
+        """The same motion with every parameter put through a function that leaves its values as they are.
 
-    def __getitem__(self, index: int) -> "Vibration":
-        """One vibration out of a batch."""
+        Nothing is checked anew: a device need not be waited for.
+        """
+        result = copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                object.__setattr__(result, name, function(value))
+        return result
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same motion on another device."""
+        return self.mapped(lambda values: values.to(device))
+
+    def detached(self) -> Self:
+        """The same motion without gradients."""
+        return self.mapped(Tensor.detach)
+
+    def expanded(self, size: int) -> Self:
+        """The same motion as a batch of ``size`` equal ones, whose dimension leads."""
+        return self.mapped(lambda values: values.expand(size, *values.shape))
+
+    def __getitem__(self, index: int) -> Self:
+        """One motion out of a batch."""
         if not self.batch_shape:
             raise IndexError("this vibration is not a batch")
-        return Vibration(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+        return self.mapped(lambda values: values[index])
 
     @classmethod
     def still(cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None) -> Self:

@@ -10,7 +10,7 @@ from rsvib_torch.splines import (
     bspline_coefficients,
     bspline_coefficients_adjoint,
     bspline_weights,
-    mirrored_index,
+    mirrored,
 )
 
 DEGREES = (1, 3, 5, 9)
@@ -76,6 +76,6 @@ def test_accuracy_grows_with_the_degree():
 
 
 @pytest.mark.parametrize("length", [1, 2, 5])
-def test_mirrored_index(length):
+def test_mirrored(length):
     expected = np.pad(np.arange(length), 7, mode="reflect") if length > 1 else np.zeros(15)
-    assert mirrored_index(-7, length + 7, length).tolist() == expected.tolist()
+    assert mirrored(torch.arange(-7, length + 7), length).tolist() == expected.tolist()

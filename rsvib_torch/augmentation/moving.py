@@ -7,7 +7,7 @@ from rsvib_torch.augmentation.motion import ImageMotion
 from rsvib_torch.imaging import blur_rows, trajectory_psf
 from rsvib_torch.imaging.psf import Interpolation
 from rsvib_torch.precision import full_precision
-from rsvib_torch.splines import mirrored_index
+from rsvib_torch.splines import mirrored
 
 __all__ = ["move_boxes", "move_images", "move_masks"]
 
@@ -29,18 +29,12 @@ def move_masks(masks: Tensor, motion: ImageMotion) -> Tensor:
     B, _, R, W = masks.shape
     rows = torch.arange(R, dtype=torch.float64, device=masks.device)
     displacement = motion.mean_displacement(rows.expand(B, -1))
-    source_rows = _folded((rows - displacement[..., 1]).round().to(torch.int64), R)
+    source_rows = mirrored((rows - displacement[..., 1]).round().to(torch.int64), R)
     columns = torch.arange(W, dtype=torch.float64, device=masks.device)
-    source_columns = _folded((columns - displacement[..., :1]).round().to(torch.int64), W)
+    source_columns = mirrored((columns - displacement[..., :1]).round().to(torch.int64), W)
     index = source_rows[..., None] * W + source_columns
     index = index.flatten(1)[:, None].expand(-1, masks.shape[1], -1)
     return masks.flatten(-2).gather(-1, index).reshape(masks.shape)
-
-
-def _folded(index: Tensor, length: int) -> Tensor:
-    """Indices mirrored into 0 ... length - 1."""
-    reach = int(torch.stack([-index.amin(), index.amax() - (length - 1)]).amax().clamp(min=0))
-    return mirrored_index(-reach, length + reach, length, index.device)[index + reach]
 
 
 def move_boxes(boxes: Tensor, motion: ImageMotion) -> Tensor:

@@ -112,28 +112,30 @@ def _fit_axis(measurements: Measurements, shape: SplineFit, axis: int, learn: bo
         weighted = flat * weight[part, None].expand(-1, design.shape[1]).flatten()[:, None]
         gram[used[:, None], used] += flat.mT @ weighted
         right[used] += weighted.mT @ values[part].flatten()
-    energy = float((weight[:, None] * values.square()).sum())
-    known = max(float((measurements.differences[0] * (weight > 0)).sum()) * measurements.independent, 1.0)
-    scale = float(gram.diagonal().mean()) + 1e-300
+    energy = (weight[:, None] * values.square()).sum()
+    known = ((measurements.differences[0] * (weight > 0)).sum() * measurements.independent).clamp(min=1.0)
+    scale = gram.diagonal().mean() + 1e-300
     second = torch.eye(count, dtype=torch.float64, device=values.device).diff(n=2, dim=0)
     bend = second.mT @ second
     base = gram + scale * _ANCHOR / count  # on every element: on the mean
 
-    def evidence(smoothness: float) -> tuple[float, Tensor, Tensor]:
+    def evidence(smoothness: float) -> tuple[Tensor, Tensor, Tensor]:
         factor = torch.linalg.cholesky(base + smoothness * scale * bend)
         found = torch.cholesky_solve(right[:, None], factor)[:, 0]
-        left = max(energy - float(right @ found), _WORTH * energy + 1e-300)
-        logarithm = 2 * float(factor.diagonal().log().sum()) - (count - 2) * math.log(smoothness)
-        return -0.5 * (known * math.log(left / known) + logarithm), found, factor
+        left = torch.maximum(energy - right @ found, _WORTH * energy + 1e-300)
+        logarithm = 2 * factor.diagonal().log().sum() - (count - 2) * math.log(smoothness)
+        return -0.5 * (known * (left / known).log() + logarithm), found, factor
 
-    tried = {smoothness: evidence(smoothness)[0] for smoothness in _SMOOTHNESS}
-    best = max(tried, key=tried.__getitem__)
-    tried |= {best * 10**step: evidence(best * 10**step)[0] for step in _FINER}
-    smoothness = max(tried, key=tried.__getitem__)
+    def best_of(tried: tuple[float, ...]) -> float:
+        place = int(torch.stack([evidence(smoothness)[0] for smoothness in tried]).argmax())
+        return tried[place]
+
+    best = best_of(_SMOOTHNESS)
+    smoothness = best_of((best, *(best * 10**step for step in _FINER)))
     _, found, factor = evidence(smoothness)
-    noise = max(energy - float(right @ found), _WORTH * energy) / known
+    noise = float(torch.maximum(energy - right @ found, _WORTH * energy) / known)
     if learn and count <= MOST_KNOTS and noise > 0:
-        return fit_with_spectrum(gram, right, noise, smoothness * scale)
+        return fit_with_spectrum(gram, right, noise, smoothness * float(scale))
     return found, noise * torch.cholesky_inverse(factor)
 
 

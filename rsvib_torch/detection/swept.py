@@ -1,6 +1,7 @@
 """Tones that fade or change their frequency: one of them an axis, from all frames of a stack."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -160,10 +161,10 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: Bands, iterations: i
         motion = _motion(fits, record, rowwise)
         measured = measure_groups(groups, rowwise, motion)
         weighed = measured.reweighted(_left(measured, motion))
-        fits = [_settle(weighed, axis, record, fit)[0] for axis, fit in enumerate(fits)]
-    solved = [_settle(weighed, axis, record, fit) for axis, fit in enumerate(fits)]
-    fits, covariances = [fit for fit, _, _ in solved], [covariance for _, covariance, _ in solved]
-    fits = [fit if gain > _SIGNIFICANT else _still(fit) for fit, _, gain in solved]
+        fits = [_settle(weighed, axis, record, fit[None])[0][0] for axis, fit in enumerate(fits)]
+    solved = [_settle(weighed, axis, record, fit[None]) for axis, fit in enumerate(fits)]
+    covariances = [covariance[0] for _, covariance, _ in solved]
+    fits = [torch.where(gain > _SIGNIFICANT, fit[0], _still(fit[0])) for fit, _, gain in solved]
     motion = _motion(fits, record, rowwise)
     left = _left(measured, motion)
     honest = independent_fraction(weighed, left) * measured.share_counted(left)
@@ -182,17 +183,18 @@ def _waves(times: Tensor, fits: Tensor) -> tuple[Tensor, Tensor]:
     return envelope * angle.cos(), envelope * angle.sin()
 
 
-def _value(times: Tensor, fit: Tensor) -> Tensor:
-    cosine, sine = _waves(times, fit)
-    return fit[0] * cosine + fit[1] * sine + fit[5] * times
+def _value(times: Tensor, fits: Tensor) -> Tensor:
+    cosine, sine = _waves(times, fits)
+    return fits[..., 0] * cosine + fits[..., 1] * sine + fits[..., 5] * times
 
 
-def _columns(times: Tensor, fit: Tensor) -> Tensor:
-    """Derivatives (S, 6) of the displacement by the parameters."""
-    cosine, sine = _waves(times, fit)
-    tone, quarter = fit[0] * cosine + fit[1] * sine, fit[1] * cosine - fit[0] * sine
+def _columns(times: Tensor, fits: Tensor) -> Tensor:
+    """Derivatives (..., 6) of the displacement by the parameters (..., 6)."""
+    cosine, sine = _waves(times, fits)
+    tone, quarter = fits[..., 0] * cosine + fits[..., 1] * sine, fits[..., 1] * cosine - fits[..., 0] * sine
     turn = 2 * math.pi * times
-    return torch.stack([cosine, sine, turn * quarter, -times * tone, 0.5 * turn * times * quarter, times], -1)
+    whole = torch.broadcast_tensors(cosine, sine, turn * quarter, -times * tone, 0.5 * turn * times * quarter, times)
+    return torch.stack(whole, -1)
 
 
 def _averaged(measured: Measurements, axis: int, middle: float) -> tuple[list[Tensor], list[float]]:
@@ -236,62 +238,77 @@ def _start(measured: Measurements, axis: int, record: tuple[float, float], highe
         ridge = torch.diag_embed(1e-9 * gram.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300))
         gains.append((right * torch.linalg.solve(gram + ridge, right[..., None])[..., 0]).sum(-1))
     best = torch.cat(gains).argsort(descending=True)
-    chosen: list[Tensor] = []
+    chosen: list[int] = []
     for place in best.tolist():
-        if all(abs(float(fits[place, 2] - other[2])) > 0.6 / span for other in chosen):
-            chosen.append(fits[place])
+        if all(abs(grid[place][2] - grid[other][2]) > 0.6 / span for other in chosen):
+            chosen.append(place)
         if len(chosen) == _STARTS:
             break
-    settled = [_settle(measured, axis, record, fit) for fit in chosen]
-    return max(settled, key=lambda item: item[2])[0]
+    settled, _, gained = _settle(measured, axis, record, fits[chosen])
+    start: Tensor = settled[gained.argmax()]
+    return start
 
 
 def _settle(
-    measured: Measurements, axis: int, record: tuple[float, float], fit: Tensor
-) -> tuple[Tensor, Tensor, float]:
-    """Levenberg-Marquardt: parameters, their covariance, and chi-square that the tone gains per parameter."""
+    measured: Measurements, axis: int, record: tuple[float, float], fits: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Levenberg-Marquardt from several starts side by side.
+
+    Args:
+        measured: Displacements of one stack.
+        axis: Which of theirs.
+        record: Its first and last moment in seconds.
+        fits: (S, 6) start parameters.
+
+    Returns:
+        Parameters (S, 6), their covariances (S, 6, 6), and chi-square (S,) that the tone gains per parameter.
+    """
     middle = 0.5 * (record[0] + record[1])
     weight = precision_of_axis(measured.information[0], axis)
     values = measured.displacements[0, ..., axis] * measured.seen[0]
     times, shares = _averaged(measured, axis, middle)
-    known = max(float((measured.differences[0] * (weight > 0)).sum()) * measured.independent, 7.0)
+    known = ((measured.differences[0] * (weight > 0)).sum() * measured.independent).clamp(min=7.0)
+    row_weight = weight[:, None].expand_as(values)
+
+    def averaged(function: Callable[[Tensor, Tensor], Tensor], at: Tensor) -> Tensor:
+        """(S, N, G, P) relative means over exposures of what (N, G, S, P) a function makes of times and fits."""
+        mean = torch.stack([share * function(time[..., None], at) for time, share in zip(times, shares, strict=True)])
+        relative: Tensor = _relative(measured, mean.sum(0).flatten(2)).unflatten(-1, (len(at), -1))
+        return relative.movedim(2, 0)
 
     def left_of(at: Tensor) -> Tensor:
-        model = sum(share * _value(time, at) for time, share in zip(times, shares, strict=True))
-        return values - _relative(measured, torch.as_tensor(model)[..., None])[..., 0]
+        return values - averaged(lambda time, fit: _value(time, fit)[..., None], at)[..., 0]
 
-    def cost_of(left: Tensor) -> float:
-        return float((weight[:, None] * left.square()).sum())
+    def cost_of(left: Tensor) -> Tensor:
+        return (row_weight * left.square()).sum((1, 2))
 
-    left = left_of(fit)
-    cost, damping = cost_of(left), 1e-3
-    gram = torch.eye(6, dtype=torch.float64, device=values.device)
+    left = left_of(fits)
+    cost, damping = cost_of(left), torch.full_like(fits[:, 0], 1e-3)
+    settled = torch.zeros_like(cost, dtype=torch.bool)
     for _ in range(_ROUNDS):
-        slopes = sum(share * _columns(time, fit) for time, share in zip(times, shares, strict=True))
-        design = _relative(measured, torch.as_tensor(slopes))
-        gram = torch.einsum("ngp,n,ngq->pq", design, weight, design)
-        right = torch.einsum("ngp,n,ng->p", design, weight, left)
-        size = torch.where(gram.diagonal() > 0, gram.diagonal(), 1.0)
-        change = torch.linalg.solve(gram + torch.diag(damping * size), right)
-        tried = fit + change
+        design = averaged(_columns, fits).flatten(1, 2)  # (S, N G, 6)
+        weighted = (design * row_weight.flatten()[:, None]).mT
+        gram, right = weighted @ design, weighted @ left.flatten(1)[..., None]
+        size = torch.where(gram.diagonal(dim1=-2, dim2=-1) > 0, gram.diagonal(dim1=-2, dim2=-1), 1.0)
+        tried = fits + torch.linalg.solve(gram + torch.diag_embed(damping[:, None] * size), right)[..., 0]
         further = left_of(tried)
-        if cost_of(further) < cost:
-            gained = cost - cost_of(further)
-            fit, left, cost, damping = tried, further, cost_of(further), max(0.1 * damping, 1e-12)
-            if gained < 1e-9 * cost:
-                break
-        else:
-            damping *= 10
-            if damping > 1e8:
-                break
-    without = left_of(_still(fit))
+        gained = cost - cost_of(further)
+        better = (gained > 0) & ~settled
+        settled = settled | (better & (gained < 1e-9 * (cost - gained))) | (~better & (damping > 1e7))
+        fits = torch.where(better[:, None], tried, fits)
+        left = torch.where(better[:, None, None], further, left)
+        cost = torch.where(better, cost - gained, cost)
+        damping = torch.where(better, (0.1 * damping).clamp(min=1e-12), 10 * damping)
+        if bool(settled.all()):
+            break
+    without = left_of(_still(fits))
     drift = _relative(measured, times[0][..., None])[..., 0]
-    norm = float((weight[:, None] * drift.square()).sum()) + 1e-300
-    alone = cost_of(without) - float((weight[:, None] * drift * without).sum()) ** 2 / norm
+    norm = (row_weight * drift.square()).sum() + 1e-300
+    alone = cost_of(without) - (row_weight * drift * without).sum((1, 2)).square() / norm
     noise = cost / known
-    scale = torch.where(gram.diagonal() > 0, gram.diagonal(), 1.0).sqrt()
-    inverse = torch.linalg.pinv(gram / scale / scale[:, None], rtol=1e-12, hermitian=True) / scale / scale[:, None]
-    return fit, noise * inverse, (alone - cost) / (5 * noise + 1e-300)
+    scale = size.sqrt()[..., None]
+    inverse = torch.linalg.pinv(gram / scale / scale.mT, rtol=1e-12, hermitian=True) / scale / scale.mT
+    return fits, noise[:, None, None] * inverse, (alone - cost) / (5 * noise + 1e-300)
 
 
 def _step(fits: list[Tensor], record: tuple[float, float], timing: SensorTiming) -> float:

@@ -12,7 +12,7 @@ from rsvib_torch.imaging import exposure_nodes, exposure_trajectory, rows_showin
 from rsvib_torch.restoration.banded_solver import solve_banded
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.spectral import extend_rows, fast_length
-from rsvib_torch.splines import bspline_coefficients, bspline_weights, mirrored_index
+from rsvib_torch.splines import bspline_coefficients, bspline_weights, mirrored
 from rsvib_torch.vibration import Vibration
 
 __all__ = [
@@ -188,8 +188,7 @@ def _unexplained(place: _Places, spectra: Tensor, u: Tensor) -> Tensor:
     ramps = torch.polar(torch.ones_like(angle), angle) * place.weights[:, None]  # (T, R, N, U)
     reach = place.taps.shape[-1]
     source = place.first[..., None] + torch.arange(reach, device=u.device)  # (T, R, J)
-    height = len(spectra)
-    seen = spectra[mirrored_index(-height, 2 * height, height, u.device)[source + height]]
+    seen = spectra[mirrored(source, len(spectra))]
     along = (place.taps.to(seen.dtype) @ seen) * ramps * (-2j * math.pi * u)
     across = (place.slopes.to(seen.dtype) @ seen) * -ramps
     derivatives = torch.stack(

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from rsvib_torch.imaging.psf import RowPSF
 from rsvib_torch.precision import full_precision, outside_graphs
-from rsvib_torch.splines import bspline_coefficients, bspline_coefficients_adjoint, mirrored_index
+from rsvib_torch.splines import bspline_coefficients, bspline_coefficients_adjoint, mirrored
 
 __all__ = ["RowVaryingBlur", "blur_rows", "blur_rows_adjoint"]
 
@@ -20,11 +20,7 @@ def _gather_index(psf: RowPSF, tap: int, scene_size: tuple[int, int], width: int
     num_rows, kernel_width = psf.weights.shape[-3], psf.weights.shape[-1]
     rows = origin[0] + torch.arange(num_rows, device=device) - psf.first_tap[..., 1] - tap
     columns = origin[1] + torch.arange(-(kernel_width - 1), width, device=device) - psf.first_tap[..., 0, None]
-    folded = []
-    for index, length in ((rows, scene_size[0]), (columns, scene_size[1])):
-        reach = int(torch.stack([-index.amin(), index.amax() - (length - 1)]).amax().clamp(min=0))
-        folded.append(mirrored_index(-reach, length + reach, length, device)[index + reach])
-    return folded[0][..., None] * scene_size[1] + folded[1]
+    return mirrored(rows, scene_size[0])[..., None] * scene_size[1] + mirrored(columns, scene_size[1])
 
 
 def _frame_size(

@@ -11,7 +11,7 @@ from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.orientation import frames_from_row_order, frames_to_row_order, vibration_to_row_order
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.spectral import extend_rows, fast_length
-from rsvib_torch.splines import bspline_coefficients, bspline_weights, mirrored_index
+from rsvib_torch.splines import bspline_coefficients, bspline_weights, mirrored
 from rsvib_torch.vibration import Vibration
 
 __all__ = ["simulate_frames"]
@@ -102,7 +102,6 @@ def _form_rows(scene: Tensor, starts: Tensor, timing: SensorTiming, motion: Vibr
     length = fast_length(scene_width + 2 * _MARGIN)
     spectra = torch.fft.rfft(extend_rows(bspline_coefficients(scene, _DEGREE, -2), length))
     frequencies = torch.fft.rfftfreq(length, dtype=torch.float64, device=scene.device)
-    fold = mirrored_index(-height, 2 * height, height, scene.device)
     taps = torch.arange(_DEGREE + 1, device=scene.device) - _DEGREE // 2
 
     rows = torch.arange(num_rows, device=scene.device)
@@ -122,7 +121,7 @@ def _form_rows(scene: Tensor, starts: Tensor, timing: SensorTiming, motion: Vibr
         ).to(spectra.dtype)
         transfer = spread.transpose(-2, -1).to(spectra.dtype) @ ramps  # (T, rows, taps, frequencies)
         source = top + chunk[:, None] - base.long() - taps[0] - torch.arange(count, device=scene.device)
-        source = fold[source + height]  # (T, rows, taps)
+        source = mirrored(source, height)  # (T, rows, taps)
         if scene.ndim == 3:
             picked = spectra[:, source].movedim(0, 1)
             row_spectra = (picked * transfer[:, None]).sum(-2)

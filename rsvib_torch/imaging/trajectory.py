@@ -28,7 +28,8 @@ def gauss_node_count(vibration: Vibration, exposure_time: float) -> int:
     swing = vibration.amplitude.detach() * torch.where(cycles < 0.5, 2 * torch.sin(math.pi * cycles), 4 * cycles)
     path = swing.sum(-1) + vibration.image_motion.detach().abs() * exposure_time + rest_path(vibration, exposure_time)
     seen_cycles = torch.where(vibration.amplitude.detach() > 1e-4, cycles, torch.zeros_like(cycles))
-    return 3 + math.ceil(2.0 * float(path.amax())) + math.ceil(4.0 * float(seen_cycles.amax()))
+    nodes = torch.stack([2.0 * path.amax(), 4.0 * seen_cycles.amax()]).ceil().sum()
+    return 3 + int(nodes)
 
 
 def exposure_nodes(

@@ -12,7 +12,7 @@ from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.noise import estimate_noise, gradient_energy
 from rsvib_torch.restoration.rows import continue_rows, period_of_rows
-from rsvib_torch.splines import bspline_weights, mirrored_index
+from rsvib_torch.splines import bspline_weights, mirrored
 
 __all__ = ["restore_banded"]
 
@@ -164,8 +164,6 @@ def restore_banded(
     image = torch.arange(B * T, device=frames.device).repeat_interleave(len(centres))
     weight = weights.repeat_interleave(T * len(centres))
 
-    reach = int(torch.stack([-slab_rows.amin(), slab_rows.amax() - (H - 1)]).amax().clamp(min=0)) + half_rows + stride
-    fold = mirrored_index(-reach, H + reach, H, frames.device)
     lags = torch.fft.fftfreq(size, d=1.0 / size, device=frames.device).round().to(torch.int64)
     kept = torch.arange(stride, device=frames.device) - (stride - 1) // 2
     spectra = torch.view_as_real(_aligned_spectra(frames, motion, u, length)).movedim(-1, 0).contiguous()
@@ -173,7 +171,7 @@ def restore_banded(
     for begin in range(0, len(slab_rows), chunk_rows):
         chunk = slice(begin, begin + chunk_rows)
         bank = _filters(displacement[chunk], node_weights, grid, weight[chunk], interpolation)
-        source = fold[slab_rows[chunk, None, None] + kept[:, None] - lags + reach]  # (n, stride, V)
+        source = mirrored(slab_rows[chunk, None, None] + kept[:, None] - lags, H)  # (n, stride, V)
         a, b = bank[:, 0, None, :, None], bank[:, 1, None, :, None]
         real, imaginary = spectra[:, image[chunk, None, None], source]  # each (n, stride, V, C, U)
         rows_out = torch.complex(

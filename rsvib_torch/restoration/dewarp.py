@@ -9,7 +9,7 @@ from rsvib_torch.pieces import gathered, runs
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.rows import period_of_rows, spline_spectra
 from rsvib_torch.spectral import shift_phases
-from rsvib_torch.splines import bspline_weights, mirrored_index
+from rsvib_torch.splines import bspline_weights, mirrored
 
 __all__ = ["restore_dewarp"]
 
@@ -43,10 +43,8 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 256
     cell = rows.detach().floor()
     weights = bspline_weights(rows - cell, _DEGREE).to(frames.dtype)
     taps = cell.to(torch.int64)[..., None] + torch.arange(_DEGREE + 1, device=frames.device) - _DEGREE // 2
-    reach = int(torch.stack([-taps.amin(), taps.amax() - (H - 1)]).amax().clamp(min=0))
-    taps = mirrored_index(-reach, H + reach, H, frames.device)[taps + reach]
     image = torch.arange(B * T, device=frames.device)[:, None, None]
-    taps = taps + image * H
+    taps = mirrored(taps, H) + image * H
     # one row after the other, all channels in it
     flat = torch.view_as_real(spectra.movedim(2, 3)).reshape(B * T * H, -1)
 

@@ -13,7 +13,7 @@ from rsvib_torch.free_motion import rest_reach
 from rsvib_torch.orientation import as_float_frames, frames_to_row_order, time_axis, vibration_to_row_order
 from rsvib_torch.restoration.misfit import misfit
 from rsvib_torch.restoration.missing import fill_roughly
-from rsvib_torch.restoration.motion import FrameMotion, as_batch, frame_motion
+from rsvib_torch.restoration.motion import FrameMotion, frame_motion
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.pairs import FramePair, pairs_to_judge, shared_part
 from rsvib_torch.restoration.pixels import hidden_pixels
@@ -225,7 +225,7 @@ def judge_restoration(
     raw, restored = (
         frames_to_row_order(images if images.ndim == 4 else images[:, None], timing) for images in (raw, restored)
     )
-    rowwise = as_batch(vibration_to_row_order(vibration, timing).to(raw.device), 1)
+    rowwise = vibration_to_row_order(vibration, timing).to(raw.device).expanded(1)
     motion = frame_motion(rowwise, timing.in_row_order(), count, raw.shape[-2])
     verdict = judge_frames(raw, restored, motion, pairs_to_judge(count, joint, most_pairs), shared=shared)
     return verdict.in_image_axes(timing)

@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks import check_whole_number
-from rsvib_torch.free_motion import FreeMotion, rest_reach
+from rsvib_torch.free_motion import rest_reach
 from rsvib_torch.imaging.coupling import rows_showing
 from rsvib_torch.orientation import frames_from_row_order, offsets_from_row_order, vibration_to_row_order
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
-__all__ = ["FrameMotion", "as_batch", "frame_motion", "visible_pixels"]
+__all__ = ["FrameMotion", "frame_motion", "visible_pixels"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,17 +55,6 @@ class FrameMotion:
         return self.frame_starts[:, None] + frame_rows * self.timing.row_time
 
 
-def as_batch(vibration: Vibration, size: int) -> Vibration:
-    """A vibration without batch dimensions as a batch of ``size`` equal ones."""
-    if isinstance(vibration, FreeMotion):
-        return vibration.expanded(size)
-    amplitude, frequency, phase = (
-        tones.expand(size, *tones.shape) for tones in (vibration.amplitude, vibration.frequency, vibration.phase)
-    )
-    motion, acceleration = vibration.image_motion.expand(size, 2), vibration.image_acceleration.expand(size, 2)
-    return Vibration(amplitude, frequency, phase, motion, acceleration)
-
-
 def frame_motion(vibration: Vibration, timing: SensorTiming, num_frames: int, num_rows: int) -> FrameMotion:
     """Motion of ``num_frames`` frames of ``num_rows`` rows for a vibration of batch shape (B,) in row order."""
     starts = timing.frame_starts(num_frames, vibration.device)
@@ -101,7 +90,7 @@ def visible_pixels(
     height, width = size if timing.scan_axis == -2 else (size[1], size[0])
     batch = vibration.batch_shape
     rowwise = vibration_to_row_order(vibration, timing)
-    rowwise = rowwise if batch else as_batch(rowwise, 1)
+    rowwise = rowwise if batch else rowwise.expanded(1)
     motion = frame_motion(rowwise, timing.in_row_order(), num_frames, height)
     rows = motion.frame_rows(torch.arange(height, dtype=torch.float64, device=vibration.device))
     starts = motion.row_starts(rows)

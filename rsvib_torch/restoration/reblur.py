@@ -9,7 +9,7 @@ from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.pieces import runs
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.rows import period_of_rows, spline_spectra
-from rsvib_torch.splines import bspline_weights, mirrored_index
+from rsvib_torch.splines import bspline_weights, mirrored
 
 __all__ = ["reblur"]
 
@@ -52,9 +52,7 @@ def reblur(scene: Tensor, motion: FrameMotion, frame: int, *, first_row: int = 0
     angle = displacement[..., 0, None].to(scene.dtype) * (-2 * math.pi * u).to(scene.dtype)
     taps = taps.to(scene.dtype)
     source = first.to(torch.int64) - _DEGREE // 2
-    beyond = max(int(-source.amin()), int(source.amax()) + count - height, 0)
-    fold = mirrored_index(-beyond, height + beyond, height, scene.device)
-    seen = fold[source[:, None] + torch.arange(count, device=scene.device) + beyond]  # (H, count)
+    seen = mirrored(source[:, None] + torch.arange(count, device=scene.device), height)  # (H, count)
     step = max(1, _VALUES.get(scene.device.type, height * count * len(u)) // (count * len(u)))
     formed = []
     for part in runs(height, step):

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from rsvib_torch.arrays import ArrayLike, as_tensor
 from rsvib_torch.checks import check_choice
-from rsvib_torch.free_motion import detached, rest_reach
+from rsvib_torch.free_motion import rest_reach
 from rsvib_torch.orientation import (
     as_float_frames,
     frames_from_row_order,
@@ -23,7 +23,7 @@ from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact import restore_exact
 from rsvib_torch.restoration.judging import judge_frames
 from rsvib_torch.restoration.missing import fill_roughly
-from rsvib_torch.restoration.motion import as_batch, frame_motion
+from rsvib_torch.restoration.motion import frame_motion
 from rsvib_torch.restoration.pairs import pairs_to_judge
 from rsvib_torch.restoration.pixels import Saturation, hidden_pixels, saturated_pixels
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
@@ -178,7 +178,7 @@ def restore(
             f"{tuple(given.shape)}; one vibration, or one per stack of a (B, T, C, H, W) batch"
         )
     motion = vibration_to_row_order(vibration, timing).to(images.device)
-    motion = motion if motion.batch_shape else as_batch(motion, B)
+    motion = motion if motion.batch_shape else motion.expanded(B)
     images, chosen = _without_lost_pixels(images, hidden, clipped, method, options)
     restored = METHODS[method](images, frame_motion(motion, rowwise, T, H), **chosen)
     if check:
@@ -208,10 +208,10 @@ def _warn_if_worse(raw: Tensor, restored: Tensor, motion: Vibration, timing: Sen
     pairs = pairs_to_judge(count, joint, _JUDGED_PAIRS)
     shared = count if joint is True else max(int(joint), 1)
     for stack in range(len(raw)):
-        still = detached(motion[stack])
+        still = motion[stack].detached()
         if not bool((still.amplitude > 0).any() | (rest_reach(still) > 0).any()):
             continue
-        moved = frame_motion(as_batch(still, 1), timing.in_row_order(), count, raw.shape[-2])
+        moved = frame_motion(still.expanded(1), timing.in_row_order(), count, raw.shape[-2])
         try:
             verdict = judge_frames(
                 raw[stack], restored[stack], moved, pairs, shared=min(shared, count), columns=_JUDGED_COLUMNS

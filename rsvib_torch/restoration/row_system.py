@@ -9,6 +9,7 @@ and all frequencies follow by one product of matrices. The phase of the middle g
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -53,7 +54,7 @@ class RowKernels:
     along: Tensor
     weight: Tensor
 
-    @property
+    @cached_property
     def reach(self) -> float:
         """Largest distance along the row from the middle in px."""
         return float(self.along.detach().abs().amax())

@@ -20,7 +20,7 @@ from rsvib_torch.evaluation import city_and_fields
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration import exact, prior
 from rsvib_torch.restoration.interpolated_solver import NodeFactors
-from rsvib_torch.restoration.motion import as_batch, frame_motion
+from rsvib_torch.restoration.motion import frame_motion
 from rsvib_torch.restoration.partition import Partition
 from rsvib_torch.restoration.row_kernel import scene_weights
 from rsvib_torch.restoration.row_system import row_kernels, smooth_band, smooth_kernels
@@ -66,7 +66,7 @@ class Shapes:
 def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibration, device: str = "cpu") -> Shapes:
     """Sizes for a frame of that size, camera and vibration."""
     height, width = size
-    motion = frame_motion(as_batch(truth, 1), timing.in_row_order(), 1, height)
+    motion = frame_motion(truth.expanded(1), timing.in_row_order(), 1, height)
     starts = motion.row_starts(torch.arange(height, dtype=torch.float64)).expand(1, 1, height)
     moved, weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
     length = exact.scene_period(width, motion.reach(height), moved)

@@ -8,7 +8,7 @@ from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.restoration.blurred_noise import noise_beside_blur
-from rsvib_torch.restoration.motion import as_batch, frame_motion
+from rsvib_torch.restoration.motion import frame_motion
 from rsvib_torch.restoration.noise import estimate_noise
 
 MOTION = Motion()
@@ -23,7 +23,7 @@ def taken(scene, rows, noise, count=1, motion=MOTION):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     clean = take_frames(scene, timing, motion, count, samples=24)
     frames = clean + noise * np.random.default_rng(3).standard_normal(clean.shape)
-    moved = frame_motion(as_batch(motion.vibration(), 1), timing, count, frames.shape[-2])
+    moved = frame_motion(motion.vibration().expanded(1), timing, count, frames.shape[-2])
     return torch.from_numpy(frames).float()[:, None], moved
 
 

@@ -5,7 +5,7 @@ from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.restoration.disagreement import noise_levels
-from rsvib_torch.restoration.motion import as_batch, frame_motion
+from rsvib_torch.restoration.motion import frame_motion
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.row_kernel import interpolation_error, kernel_spectrum, kernel_weights, scene_weights
 
@@ -13,7 +13,7 @@ TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 
 
 def levels(frames, motion):
-    rowwise = frame_motion(as_batch(motion.vibration(), 1), TIMING, len(frames), frames.shape[-2])
+    rowwise = frame_motion(motion.vibration().expanded(1), TIMING, len(frames), frames.shape[-2])
     return noise_levels(torch.as_tensor(frames)[:, None], rowwise, 0)
 
 

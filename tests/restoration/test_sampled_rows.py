@@ -8,7 +8,7 @@ from truth import Motion, draw_scene, take_frames
 from rsvib_torch import SensorTiming
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration import sampled_rows, strength
-from rsvib_torch.restoration.motion import as_batch, frame_motion
+from rsvib_torch.restoration.motion import frame_motion
 from rsvib_torch.restoration.prior import fit_prior
 from rsvib_torch.restoration.row_system import row_kernels
 from rsvib_torch.restoration.sampled_rows import Explained, sample_rows
@@ -23,7 +23,7 @@ def taken(request):
     clean = take_frames(draw_scene(NUM_ROWS + 80, WIDTH + 80, 3), timing, Motion(), 2, samples=16)
     noise = NOISE * np.random.default_rng(2).standard_normal(clean.shape)
     frames = torch.from_numpy(clean + noise).float()[:, None]
-    motion = frame_motion(as_batch(Motion().vibration(), 1), timing, 2, NUM_ROWS)
+    motion = frame_motion(Motion().vibration().expanded(1), timing, 2, NUM_ROWS)
     starts = motion.row_starts(torch.arange(NUM_ROWS, dtype=torch.float64))
     displacement, weights = exposure_trajectory(motion.vibration[0], starts, timing, "gauss")
     kernels = row_kernels(displacement, weights, torch.ones(2), NUM_ROWS, 16)

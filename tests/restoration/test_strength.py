@@ -11,7 +11,7 @@ from truth import Motion, crop, decibel, draw_scene, take_frames
 from rsvib_torch import SensorTiming
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import strength
-from rsvib_torch.restoration.motion import as_batch, frame_motion
+from rsvib_torch.restoration.motion import frame_motion
 from rsvib_torch.restoration.prior import fit_prior
 
 restore = partial(restore_by_any_method, method="exact", check=False)
@@ -74,7 +74,7 @@ def test_each_frame_is_blind_to_what_its_own_blur_leaves():
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=200, frame_rows=2048)
     frames = torch.from_numpy(take_frames(texture(0.7), timing, MOTION, 2, 0.001, samples=100)).float()[:, None]
     height = frames.shape[-2]
-    motion = frame_motion(as_batch(MOTION.vibration(), 1), timing, 2, height)
+    motion = frame_motion(MOTION.vibration().expanded(1), timing, 2, height)
     prior = fit_prior(frames, motion, 0, torch.full((2,), 0.001), 256)
     assert prior.blind.shape == (2, 129)
     times = (2048 * np.arange(2)[:, None, None] + np.arange(height)[:, None] + np.arange(0, 200, 5)) * timing.row_time
