@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.pieces import runs
+from rsvib_torch.toeplitz import correlated, toeplitz
 
 __all__ = [
     "bspline_coefficient_rows",
@@ -18,6 +19,7 @@ __all__ = [
 
 _PRECISION = 1e-9  # of the largest tap, below which the prefilter is cut off
 _SINGLE_PRECISION = 3e-8  # the same for float32, which does not hold more
+_ROWS, _MANY_ROWS = {"cpu": 64}, 256  # at a time: they stay in the cache
 
 
 def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
@@ -63,6 +65,11 @@ def _prefilter_taps(degree: int, double: bool) -> tuple[float, ...]:
     return tuple(inverse[:reach].tolist())
 
 
+def _symmetric(taps: tuple[float, ...], like: Tensor) -> Tensor:
+    """The whole of a symmetric kernel from one half."""
+    return torch.tensor(taps[:0:-1] + taps, dtype=like.dtype, device=like.device)
+
+
 def mirrored(index: Tensor, length: int) -> Tensor:
     """Indices, however far out, folded into ``0 .. length - 1`` by mirroring about the end samples.
 
@@ -73,34 +80,6 @@ def mirrored(index: Tensor, length: int) -> Tensor:
     period = 2 * (length - 1)
     index = index.remainder(max(period, 1))
     return torch.minimum(index, period - index)
-
-
-_BLOCK, _LARGE_BLOCK = 64, 256  # samples filtered together: one small dense matrix serves all blocks
-
-
-def _filter_symmetric(samples: Tensor, taps: tuple[float, ...], dim: int) -> Tensor:
-    """Correlate along ``dim`` with a symmetric kernel, valid part only, as products with a Toeplitz matrix."""
-    reach = len(taps) - 1
-    length = samples.shape[dim] - 2 * reach
-    block = min(_BLOCK, length)
-    matrix = _toeplitz(taps, block, samples)
-    moved = samples.movedim(dim, -2) if samples.ndim > 1 else samples[:, None]
-    count = -(-length // block)
-    missing = count * block - length
-    moved = torch.nn.functional.pad(moved, (0, 0, 0, missing)) if missing else moved
-    windows = moved.unfold(-2, block + 2 * reach, block)  # (..., count, W, block + 2 reach), a view
-    filtered = torch.matmul(matrix, windows.transpose(-2, -1)).flatten(-3, -2)
-    filtered = filtered.narrow(-2, 0, length)
-    return filtered.movedim(-2, dim) if samples.ndim > 1 else filtered[:, 0]
-
-
-def _toeplitz(taps: tuple[float, ...], rows: int, like: Tensor) -> Tensor:
-    """Matrix (rows, rows + 2 reach) that correlates with the symmetric kernel."""
-    kernel = torch.tensor(taps[:0:-1] + taps, dtype=like.dtype, device=like.device)
-    matrix = kernel.new_zeros(rows, rows + len(kernel) - 1)
-    row = torch.arange(rows, device=like.device)[:, None]
-    matrix[row, row + torch.arange(len(kernel), device=like.device)] = kernel
-    return matrix
 
 
 def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[tuple[slice, Tensor]]:
@@ -116,8 +95,8 @@ def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[tuple[sli
     taps = _prefilter_taps(degree, samples.dtype in (torch.float64, torch.complex128))
     reach, height = len(taps) - 1, samples.shape[-2]
     index = mirrored(torch.arange(-reach, height + reach, device=samples.device), height)
-    step = min(_BLOCK if samples.device.type == "cpu" else _LARGE_BLOCK, height)
-    matrix = _toeplitz(taps, step, samples)
+    step = min(_ROWS.get(samples.device.type, _MANY_ROWS), height)
+    matrix = toeplitz(_symmetric(taps, samples), step)
     for rows in runs(height, step):
         count = rows.stop - rows.start
         near = slice(rows.start - reach, rows.stop + reach)
@@ -145,7 +124,7 @@ def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
     taps = _prefilter_taps(degree, samples.dtype in (torch.float64, torch.complex128))
     length, reach = samples.shape[dim], len(taps) - 1
     index = mirrored(torch.arange(-reach, length + reach, device=samples.device), length)
-    return _filter_symmetric(samples.index_select(dim, index), taps, dim)
+    return correlated(samples.index_select(dim, index), _symmetric(taps, samples)[None], dim)[0]
 
 
 def bspline_coefficients_adjoint(values: Tensor, degree: int, dim: int) -> Tensor:
@@ -157,6 +136,6 @@ def bspline_coefficients_adjoint(values: Tensor, degree: int, dim: int) -> Tenso
     shape = list(values.shape)
     shape[dim] = 2 * reach
     edge = values.new_zeros(shape)
-    spread = _filter_symmetric(torch.cat([edge, values, edge], dim), taps, dim)
+    spread = correlated(torch.cat([edge, values, edge], dim), _symmetric(taps, values)[None], dim)[0]
     index = mirrored(torch.arange(-reach, length + reach, device=values.device), length)
     return torch.zeros_like(values).index_add(dim, index, spread)

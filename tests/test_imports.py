@@ -11,6 +11,7 @@ PACKAGE = Path(rsvib_torch.__file__).parent
 # from the ground up; what shares a floor may not know each other
 FLOORS = (
     {"pieces", "quadrature"},
+    {"toeplitz"},
     {"arrays", "checks", "precision", "splines", "spectral", "missing", "parallel", "validation"},
     {"sensor"},
     {"vibration"},

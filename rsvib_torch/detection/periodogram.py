@@ -1,10 +1,12 @@
 """Start frequencies from the data: a gain-aware least-squares periodogram."""
 
+import math
+
 import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones import drift_response, tone_response
+from rsvib_torch.detection.tones import drift_response
 
 __all__ = ["BLIND", "MAJORITY", "strongest_frequencies"]
 
@@ -35,40 +37,62 @@ def explained(measurements: Measurements, frequencies: Tensor, weights: Tensor) 
 
     Args:
         measurements: The displacements.
-        frequencies: (B, 2, F) Hz.
+        frequencies: (B, 2, F) Hz, or (B, 1, F) for both axes.
         weights: (B, S, N, 2), several weights of the displacements at a time.
 
     Returns:
         Weighted squares (B, S, 2, F).
     """
-    drift = drift_response(measurements, 1)
-    values = measurements.displacements[..., None]
-    flat = weights.transpose(2, 3)
+    together = [slice(0, 2)] if frequencies.shape[1] == 1 else [slice(0, 1), slice(1, 2)]
+    parts = (_explained(measurements, frequencies[:, axes.start], weights, axes) for axes in together)
+    return torch.cat(list(parts), dim=2)
 
-    def total(products: Tensor) -> Tensor:
-        """Weighted sums (B, S, 2, F) over the rows of products (B, N, G, 2, F)."""
-        rows = products.sum(2).transpose(1, 2)  # (B, 2, N, F)
-        sums: Tensor = (flat.transpose(1, 2) @ rows).transpose(1, 2)
-        return sums
 
-    drifts, both = total(drift.square()[..., None].expand_as(values)), total(drift[..., None] * values)
-    prior = 0.5 * BLIND**2 * (weights * measurements.differences[:, None, :, None]).sum(2)[..., None] + _NOTHING
+def _explained(measurements: Measurements, frequencies: Tensor, weights: Tensor, axes: slice) -> Tensor:
+    """``explained`` of some axes (B, S, A, F), all at the same frequencies (B, F)."""
+    seen, group = measurements.seen[..., None], measurements.moments.shape[2]
+    of_rows = weights[..., axes].transpose(2, 3)  # (B, S, A, N)
+    each = of_rows.repeat_interleave(group, dim=-1)  # (B, S, A, N G)
+    singly = (each * measurements.seen.flatten(1)[:, None, None]).flatten(1, 2)
+    in_common = (of_rows / measurements.seen.sum(2).clamp(min=1.0)[:, None, None]).flatten(1, 2)
+    drift = drift_response(measurements, 1)[..., 0].flatten(1)[:, None, None]  # (B, 1, 1, N G)
+    values = measurements.displacements[..., axes].flatten(1, 2).transpose(1, 2)[:, None]  # (B, 1, A, N G)
+    drifts, both = ((each * drift * other).sum(-1)[..., None] for other in (drift, values))
+    drifts = drifts * (1 + 1e-12) + _NOTHING
+    prior = 0.5 * BLIND**2 * (of_rows * measurements.differences[:, None, None]).sum(-1)[..., None] + _NOTHING
+    linear = torch.stack([each * drift, each * values], dim=-2).flatten(1, 3)  # (B, 2 S A, N G)
+    shape = each.shape[1:3]
+    smearing = measurements.smearing_times[:, None, :, axes]  # (2, 1, 1, A, 1)
+
+    def sums(of: Tensor, by: Tensor) -> Tensor:
+        """Weighted sums (B, S, A, ..., F) of values (B, n, F)."""
+        total: Tensor = (by @ of).unflatten(1, (*shape, -1))
+        return total
+
     scores = []
     most = _CHUNK.get(frequencies.device.type, _LARGE_CHUNK)
-    for chunk in frequencies.split(max(1, most // (2 * measurements.moments.numel())), dim=-1):
-        response = tone_response(measurements, chunk)
-        cosine, sine = response.real, -response.imag
-        squares = (total(cosine.square()) + prior, total(cosine * sine), total(sine.square()) + prior)
-        with_drift = (total(cosine * drift[..., None]), total(sine * drift[..., None]))
-        with_values = (total(cosine * values), total(sine * values))
-        rows = (
-            (squares[0], squares[1], with_drift[0]),
-            (squares[1], squares[2], with_drift[1]),
-            (*with_drift, (drifts * (1 + 1e-12) + _NOTHING).expand_as(squares[0])),
+    for chunk in frequencies.split(max(1, most // measurements.moments.numel()), dim=-1):
+        angle = 2 * math.pi * chunk[:, None, None] * measurements.middles[..., 0]
+        waves = (angle.cos(), angle.sin())
+        commons = [(seen * wave).sum(2) for wave in waves]  # (B, N, F)
+        fading = torch.sinc(chunk[:, None, None] * smearing).prod(0)  # (B, 1, A, F)
+        (drift_1, right_1), (drift_2, right_2) = (
+            (sums(wave.flatten(1, 2), linear) * fading[..., None, :]).unbind(-2) for wave in waves
         )
-        matrix = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-        right = torch.stack([*with_values, both.expand_as(squares[0])], dim=-1)
-        scores.append((right * torch.linalg.solve(matrix, right[..., None])[..., 0]).sum(-1))
+        # of waves less their mean over the frames that see a row, as which displacements and drifts come
+        first, second, cross = (
+            (sums((waves[i] * waves[j]).flatten(1, 2), singly) - sums(commons[i] * commons[j], in_common))[..., 0, :]
+            * fading.square()
+            for i, j in ((0, 0), (1, 1), (0, 1))
+        )
+        # normal equations of both parts of the tone, the motion's eliminated
+        first, second = (
+            whole + prior - part.square() / drifts for whole, part in ((first, drift_1), (second, drift_2))
+        )
+        cross = cross - drift_1 * drift_2 / drifts
+        right_1, right_2 = (right - part * (both / drifts) for right, part in ((right_1, drift_1), (right_2, drift_2)))
+        gained = second * right_1.square() - 2 * cross * right_1 * right_2 + first * right_2.square()
+        scores.append(gained / (first * second - cross.square()).clamp(min=_NOTHING) + both.square() / drifts)
     return torch.cat(scores, dim=-1)
 
 
@@ -112,7 +136,7 @@ def strongest_frequencies(
     segments = max(1, min(segments, rows // 64))
     longest = float(measurements.in_segments(segments).duration.amax())
     grid = frequency_grid(longest, sample_interval, device).expand(batch, 2, -1)
-    total = _of_families(score(measurements, weights, segments, grid), grid[:, None], harmonics).flatten(0, 1)
+    total = _of_families(score(measurements, weights, segments, grid[:, :1]), grid[:, None], harmonics).flatten(0, 1)
     peak = total >= torch.nn.functional.max_pool1d(total, 2 * _APART + 1, 1, _APART)
     places = torch.where(peak, total, -1.0).topk(min(count, total.shape[-1]), dim=-1).indices
     best = grid.repeat_interleave(weights.shape[1], 0).gather(-1, places)  # (B S, 2, count)

@@ -3,14 +3,23 @@
 import math
 
 import torch
-from kornia.filters import gaussian_blur2d
 from torch import Tensor
+
+from rsvib_torch.toeplitz import correlated
 
 __all__ = ["RIM", "misfit"]
 
 _SMOOTHING = 5.0  # px: reaches displacements of several px, and noise hardly matters
-_STEP = 2  # px between those that count: all others are much the same
+_STEP = 4  # px between those that count: all others are much the same
 RIM = math.ceil(3 * _SMOOTHING) + 1  # px at the borders that smoothing and gradient spoil
+
+
+def _kernels(like: Tensor) -> Tensor:
+    """A Gaussian, and half the difference of it at both sides, (2, 2 RIM + 1)."""
+    place = torch.arange(-RIM, RIM + 1, device=like.device)
+    gaussian = torch.where(place.abs() < RIM, torch.exp(-0.5 * (place / _SMOOTHING).double().square()), 0.0)
+    gaussian = gaussian / gaussian.sum()
+    return torch.stack([gaussian, 0.5 * (gaussian.roll(1) - gaussian.roll(-1))]).to(like.dtype)
 
 
 def misfit(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
@@ -28,14 +37,13 @@ def misfit(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Misfit (2,) and its resolution (2,) in px, axes (x, y), float64: below the resolution it is not told from 0.
     """
-    size = 2 * math.ceil(3 * _SMOOTHING) + 1
-    smooth = gaussian_blur2d(torch.stack([first, second]), (size, size), (_SMOOTHING, _SMOOTHING))
-    inner = smooth[..., RIM - 1 : -RIM + 1, RIM - 1 : -RIM + 1].to(torch.float64)
-    mean = 0.5 * (inner[0] + inner[1])
-    some = slice(None, None, _STEP)
-    along = (0.5 * (mean[:, 1:-1:_STEP, 2:] - mean[:, 1:-1:_STEP, :-2])[..., some]).flatten()
-    across = (0.5 * (mean[:, 2:, 1:-1:_STEP] - mean[:, :-2, 1:-1:_STEP])[..., some, :]).flatten()
-    change = (inner[1] - inner[0])[:, 1:-1:_STEP, 1:-1:_STEP].flatten().square()
+    kernels = _kernels(first)
+    mean, changed = (0.5 * (first + second), second - first)
+    smooth, slope = correlated(torch.stack([mean, changed]), kernels, -1, _STEP)
+    along = correlated(slope[0], kernels[:1], -2, _STEP)[0].flatten().to(torch.float64)
+    (_, change), (across, _) = correlated(smooth, kernels, -2, _STEP)
+    across, change = (values.flatten().to(torch.float64) for values in (across, change))
+    change = change.square()
     energy = along.square() + across.square()
     weight = (energy + energy.mean()).square().clamp(min=torch.finfo(torch.float64).tiny).reciprocal()
     terms = torch.stack([torch.ones_like(along), along.square(), across.square(), 2 * along * across])

@@ -1,6 +1,7 @@
 """Scene prior estimated from the frames themselves."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,6 +12,7 @@ from rsvib_torch.pieces import runs
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.row_kernel import interpolation_error, kernel_spectrum
 from rsvib_torch.spectral import squared_modulus, waves
+from rsvib_torch.splines import mirrored
 
 __all__ = ["ORDER", "RowPrior", "autoregressive_prior", "brightness", "fit_prior"]
 
@@ -94,29 +96,29 @@ class RowPrior:
         return products
 
 
-def _levinson(moments: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Autoregressive model of autocovariances (p + 1, U): partial correlations, filter and innovation's variance."""
-    tiny = torch.finfo(moments.dtype).tiny
-    power = moments[0].clamp(min=tiny)
-    left, variance = torch.ones_like(power)[None], power
-    reflections = []
+def _levinson(moments: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    """Autoregressive model of p + 1 autocovariances (U,): partial correlations, filter and innovation's variance."""
+    variance = moments[0].clamp(min=torch.finfo(moments[0].dtype).tiny)
+    filter_, reflections = [torch.ones_like(variance)], []
     for lag in range(1, len(moments)):
-        reflection = (left * moments[1 : lag + 1].flip(0)).sum(0) / variance
-        reflection = reflection.clamp(-0.9995, 0.9995)
-        padded = torch.cat([left, torch.zeros_like(left[:1])])
-        left = padded - reflection * padded.flip(0)
-        variance = variance * (1 - reflection.square())
+        left = moments[lag]
+        for k in range(1, lag):
+            left = torch.addcmul(left, filter_[k], moments[lag - k])
+        reflection = (left / variance).clamp(-0.9995, 0.9995)
+        inner = [torch.addcmul(filter_[k], reflection, filter_[lag - k], value=-1) for k in range(1, lag)]
+        filter_ = [filter_[0], *inner, -reflection]
+        variance = torch.addcmul(variance, variance * reflection, reflection, value=-1)
         reflections.append(reflection)
-    return torch.stack(reflections), left, variance
+    return reflections, filter_, variance
 
 
-def _smooth(moments: Tensor) -> Tensor:
-    """Pool moments (L, U) over neighbouring frequencies."""
+def _pooling(u: Tensor) -> Tensor:
+    """Matrix (U, U) that pools what is known at frequencies (U,) over neighbouring ones, mirrored at both ends."""
     half = _SMOOTHING // 2
-    kernel = torch.hann_window(_SMOOTHING + 2, periodic=False, dtype=moments.dtype, device=moments.device)[1:-1]
-    padded = torch.cat([moments[:, 1 : half + 1].flip(-1), moments, moments[:, -half - 1 : -1].flip(-1)], dim=-1)
-    pooled: Tensor = torch.nn.functional.conv1d(padded[:, None], (kernel / kernel.sum())[None, None])[:, 0]
-    return pooled
+    kernel = torch.hann_window(_SMOOTHING + 2, periodic=False, dtype=u.dtype, device=u.device)[1:-1]
+    near = torch.arange(len(u), device=u.device)[:, None] + torch.arange(-half, half + 1, device=u.device)
+    taps = (kernel / kernel.sum()).expand(len(u), -1)
+    return torch.zeros_like(u).expand(len(u), -1).scatter_add(1, mirrored(near, len(u)), taps)
 
 
 def autoregressive_prior(
@@ -143,17 +145,24 @@ def autoregressive_prior(
     angles = 2 * torch.pi * v[:, None] * lags
     cosine = torch.cos(angles)
     both = torch.where(lags > 0, 2 * cosine, cosine).T  # of the products a_k a_(k + d) of a filter
-    through = transfer * observed
+
+    def dot(first: Sequence[Tensor], second: Sequence[Tensor]) -> Tensor:
+        total = first[0] * second[0]
+        for one, other in zip(first[1:], second[1:], strict=True):
+            total = torch.addcmul(total, one, other)
+        return total
+
+    through, pooling = transfer * observed, _pooling(observed[:, 0]) / len(v)
     scene = torch.maximum(observed - noise_power, 0.02 * noise_power) * transfer / (transfer.square() + 1e-2)
     for _ in range(_ITERATIONS):
-        moments = _smooth((scene @ cosine).T / len(v))
+        moments = (pooling @ (scene @ cosine)).unbind(-1)
         reflections, filter_, innovation = _levinson(moments)
-        products = torch.stack([(filter_[: order + 1 - d] * filter_[d:]).sum(0) for d in range(order + 1)], -1)
-        model = innovation[:, None] / (products @ both).clamp(min=_ROUNDING)
-        gain = model / (transfer * model + noise_power)
-        scene = gain * noise_power + gain.square() * through
+        products = torch.stack([dot(filter_[: order + 1 - d], filter_[d:]) for d in range(order + 1)], -1)
+        against = (products @ both).clamp(min=_ROUNDING) * (noise_power / innovation[:, None])  # of the noise
+        gain = (against + transfer).reciprocal()
+        scene = torch.addcmul(gain * noise_power, gain.square(), through)
     tiny = torch.finfo(scene.dtype).tiny
-    return RowPrior(moments[0].clamp(min=tiny), reflections, (scene * aliases).mean(-1).clamp(min=tiny))
+    return RowPrior(moments[0].clamp(min=tiny), torch.stack(reflections), (scene * aliases).mean(-1).clamp(min=tiny))
 
 
 def brightness(frames: Tensor) -> Tensor:
@@ -197,11 +206,10 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     step = 1 if frames.device.type == "cpu" else len(tops)  # rows of pieces at a time: they stay in the cache
     found = []
     for chosen in runs(len(tops), step):
-        strips = torch.stack([frames[..., top : top + size[0], :] for top in tops[chosen]], dim=2)
-        pieces = torch.stack(
-            [strips[..., left : left + size[1]] for left in lefts], dim=3
-        )  # (T, C, n, n, rows, columns)
-        spectra = torch.fft.rfft((pieces - bright[..., None]) * tapers[1]) * back[:, None, chosen, None]
+        strips = [frames[..., top : top + size[0], :] for top in tops[chosen]]
+        pieces = torch.stack([strip[..., left : left + size[1]] for strip in strips for left in lefts], dim=2)
+        pieces = pieces.unflatten(2, (-1, len(lefts)))  # (T, C, n, n, rows, columns)
+        spectra = torch.fft.rfft(pieces.sub_(bright[..., None]).mul_(tapers[1])).mul_(back[:, None, chosen, None])
         found.append(squared_modulus(torch.fft.fft(spectra, dim=-2)).mean((1, 3)).transpose(-2, -1))
     power = torch.cat(found, dim=1).to(torch.float64) * length  # (T, pieces, U, V)
 
