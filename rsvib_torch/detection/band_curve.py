@@ -13,7 +13,7 @@ from rsvib_torch.sensor import SensorTiming
 __all__ = ["Bands", "band_curve", "measurements_of_curve"]
 
 _LEAST_VALID = 0.5  # of the pixels of a band
-_ENOUGH_COLUMNS = 768  # px for a start
+_ENOUGH_COLUMNS = 512  # px for a start
 _LEAST_START = 0.8  # of the bands
 
 
