@@ -28,6 +28,8 @@ __all__ = ["DirectFit", "refine_directly"]
 
 _CLEANINGS = 2  # rounds of taking out what is fixed to the sensor
 _NEAR = 0.05  # px: gradients of frames that were warped this well need not be taken again
+_LITTLE, _NOT_MUCH = 0.5, 1.5  # standard deviations that a last round may change, if the one before changed far more
+_HARDLY = 0.1  # standard deviations that the next round may then be expected to change
 _RUNAWAY = 2.0  # times larger from round to round: no tone that was found does that
 _LINGERING = 0.3  # of a step that is still missing after it, or was too much: then earlier steps are looked at
 _REMEMBERED = 3  # steps
@@ -73,6 +75,11 @@ class _Step:
         left = (self.change * before.change).sum((1, 2, 3)) / before.change.square().sum((1, 2, 3)).clamp(min=1e-30)
         return left.abs() > _LINGERING
 
+    def share_of(self, before: "_Step") -> Tensor:
+        """(B,) how large the step is, of the one before."""
+        size, last = (step.change.square().sum((1, 2, 3)) for step in (self, before))
+        return (size / last.clamp(min=1e-30)).sqrt()
+
 
 def _corrected(told: Measurements, steps: list[_Step]) -> Measurements:
     """Measurements less what the last steps teach about how rows respond to a change of the motion, where steps linger.
@@ -94,10 +101,16 @@ def _corrected(told: Measurements, steps: list[_Step]) -> Measurements:
     return replace(told, displacements=told.displacements - (reached * share[:, None, None, None]).sum(-1))
 
 
-def _settled(before: ToneFit, after: ToneFit) -> bool:
-    """Whether a round changed coefficients and frequencies by less than half their standard deviations.
+def _settled(before: ToneFit, after: ToneFit, share: Tensor | None) -> bool:
+    """Whether the next round would change coefficients and frequencies by hardly a tenth of their standard deviations.
 
-    Errors shrink from round to round, under short exposures to a tenth and less: what is left is far below the noise.
+    Errors shrink from round to round, under short exposures to a tenth and less: a round that changed little was the
+    last, and so was one that changed much less than the one before.
+
+    Args:
+        before: The fit of the round before.
+        after: The fit of this round.
+        share: (B,) size of this step, of the one before; None: not known.
     """
     if before.active.shape != after.active.shape:
         return False
@@ -105,8 +118,11 @@ def _settled(before: ToneFit, after: ToneFit) -> bool:
     parts = deviation[..., : 3 * after.frequencies.shape[-1]].unflatten(-1, (-1, 3))
     turn = 2 * math.pi * before.frequencies * (after.centre - before.centre)[:, None, None]
     change = (before.coefficients * torch.polar(torch.ones_like(turn), turn) - after.coefficients).abs()
-    small = (change <= 0.5 * parts[..., :2].amax(-1)) & (
-        (before.frequencies - after.frequencies).abs() <= 0.5 * parts[..., 2]
+    bound = change.new_full((), _LITTLE)
+    if share is not None:
+        bound = (_HARDLY / share.clamp(min=1e-3)).clamp(_LITTLE, _NOT_MUCH)[:, None, None]
+    small = (change <= bound * parts[..., :2].amax(-1)) & (
+        (before.frequencies - after.frequencies).abs() <= bound * parts[..., 2]
     )
     return bool((small | ~after.active).all())
 
@@ -191,7 +207,9 @@ def _refine(
         motion, _ = vibration_of_fit(fit)
         if step == iterations - 1:
             break
-        if step >= search_at and _settled(before, fit):
+        reached = measurements.relative(_displacements(measurements, motion))
+        taken, same = _Step(reached, reached - placed), torch.equal(before.active, fit.active)
+        if step >= search_at and _settled(before, fit, taken.share_of(steps[-1]) if steps and same else None):
             pattern = None
             if cleanings:
                 leaves = [known.variance for known in gradients if known is not None]
@@ -202,11 +220,10 @@ def _refine(
             cleanings, search_at = cleanings - 1, step + 1
             for group in groups:
                 group.spectra.subtract(pattern)
-            gradients = [None] * len(groups)
+            gradients, steps = [None] * len(groups), []
             continue
-        reached = measurements.relative(_displacements(measurements, motion))
-        same = step > search_at and torch.equal(before.active, fit.active)  # else steps are of another model
-        steps = [*(steps[-_REMEMBERED:] if same else ()), _Step(reached, reached - placed)]
+        same = same and step > search_at  # else steps are of another model
+        steps = [*(steps[-_REMEMBERED:] if same else ()), taken]
         if len(steps) > 1:
             nearer = _corrected(measurements, steps)
             if nearer is not measurements:
