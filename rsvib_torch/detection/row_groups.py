@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,7 +10,7 @@ from torch.nn import functional
 
 from rsvib_torch.detection.equal_blur import Shown, blurred_unlike, warp_to_same_blur
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.registration.gradients import RowGradients, row_gradients, row_shifts
+from rsvib_torch.registration.gradients import RowGradients, row_gradients, row_pulls, row_shifts
 from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra, chunks
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
@@ -132,11 +131,11 @@ def measure_group(
     if gradients is None:
         whole = warp(slice(None))
         gradients = row_gradients(group.spectra, whole, shown.rows, shown.shift, seen)
-        warped: Iterable[Tensor] = [whole]
+        pulls = gradients.pulls
     else:
-        # each is forgotten while it is still in the cache
-        warped = (warp(run) for run in group.spectra.runs(place.shape[-1], 2))
-    matrix, right = row_shifts(warped, gradients, seen)
+        # each run of rows is forgotten while it is still in the cache
+        pulls = row_pulls((warp(run) for run in group.spectra.runs(place.shape[-1], 2)), gradients, seen)
+    matrix, right = row_shifts(pulls, gradients, seen)
     matrix = _blocks(matrix[:, None]).sum(3)[:, 0]  # (B, N, 2, 2)
     right = _blocks(right).sum(3)  # (B, G, N, 2)
     determinant = matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1].square()

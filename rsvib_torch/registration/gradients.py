@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.registration.row_spectra import RowSpectra, chunks, inner_columns, mean_over_frames
+from rsvib_torch.registration.row_spectra import RowSpectra, chunks, differences, inner_columns
 from rsvib_torch.registration.scene_detail import scene_detail
 
-__all__ = ["RowGradients", "row_gradients", "row_shifts"]
+__all__ = ["RowGradients", "row_gradients", "row_pulls", "row_shifts"]
 
 _BLOCK = 16  # px, side of the blocks that are judged together
 _LARGEST_NOISE = 9.0  # mean square of a block over the typical one before it loses weight
@@ -30,16 +30,18 @@ class RowGradients:
     """Gradients of the scene as seen by the rows of a group of frames, ready to weigh residuals.
 
     Attributes:
-        spectra: (B, S, 3, U) one-sided transforms, over their length, of weight times gradient along x, along y, and
-            detail of the scene; what has no partner is halved.
+        images: (B, S, 3, L) weight times gradient along x, along y, and detail of the scene, without their means.
         products: (B, S, 3, 3) float64 sums of their products; detail takes out changes of contrast.
+        pulls: (B, S, 3, G) float64 sums of their products with what the frames differ by that they were taken from; of
+            two frames (B, S, 3, 1), from the first.
         variance: (B, S) float64, noise variance of a pixel in a frame.
         halves: (B, S, 2, 5) float64, sums gx gx, gx gy, gy gy, gx e and gy e over the left and the right half of each
             row, with e what is left between the outer frames: halves that move apart are no vibration.
     """
 
-    spectra: Tensor
+    images: Tensor
     products: Tensor
+    pulls: Tensor
     variance: Tensor
     halves: Tensor
 
@@ -49,17 +51,24 @@ class _Rows:
     """Some rows of the scene as pixels.
 
     Attributes:
-        images: (B, s, 3, L) gradients along x and y, detail.
-        residual: (B, s, G, L) what the frames differ by from their mean; of two frames the first alone, (B, s, 1, L),
-            since the other differs by the opposite.
+        planes: (B, s, 3 + G, L) gradients along x and y, detail, and what the frames differ by (``differences``).
         weight: (B, s, L) of the pixels.
         seen: (B, G, s), 1 where a frame sees the row.
     """
 
-    images: Tensor
-    residual: Tensor
+    planes: Tensor
     weight: Tensor
     seen: Tensor
+
+    @property
+    def images(self) -> Tensor:
+        """Gradients along x and y, detail."""
+        return self.planes[:, :, :3]
+
+    @property
+    def residual(self) -> Tensor:
+        """What the frames differ by."""
+        return self.planes[:, :, 3:]
 
 
 def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tensor, seen: Tensor) -> RowGradients:
@@ -82,28 +91,23 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
     valid = spectra.warped_valid(rows, shift)
 
     def pixels(part: slice) -> _Rows:
-        own = detail[:, part]
-        images = torch.fft.irfft(torch.stack([own * along, across[:, part], own], dim=2), n=length)
-        visible = seen[:, :, part]
-        frames = slice(1) if seen.shape[1] == 2 else slice(None)
-        mean = mean_over_frames(warped[:, :, part], visible)
-        difference = (warped[:, frames, part] - mean[:, None]).transpose(1, 2)
-        residual = torch.fft.irfft(difference, n=length)
-        residual *= visible[:, frames].transpose(1, 2)[..., None].to(residual.dtype)
+        own, visible = detail[:, part], seen[:, :, part]
+        spectra = [own * along, across[:, part], own, *differences(warped[:, :, part], visible).unbind(1)]
+        # one by one: a copy of pixels takes half as long as one of their spectra
+        planes = torch.stack([torch.fft.irfft(one, n=length) for one in spectra], dim=2)
         weight = inner * (visible.sum(1) > 1)[..., None].to(inner.dtype)
         if valid is not None:
             weight = weight * functional.pad(valid[:, part], (0, length - width))
-        return _Rows(images, residual, weight, visible)
+        return _Rows(planes, weight, visible)
 
     parts = chunks(rows.shape[-1], 4 * length * len(rows) * (8 + 2 * rows.shape[1]), _BLOCK, rows.device)
-    # written where they belong: memory for so much takes as long as the transforms
-    transforms = warped.new_empty(*detail.shape[:2], 3, detail.shape[-1])
+    images = inner.new_empty(*detail.shape[:2], 3, length)
     results, energies = [], []
     for part in parts:
         some = pixels(part)
-        found, energy = _explained_rows(some, spectra, transforms[:, part])
+        found, blocks = _explained_rows(some, width // 2, images[:, part])
         results.append(found)
-        energies.append(_blocks_of(some, energy))
+        energies.append(blocks)
     trust = _trust(*(torch.cat(values, 1) for values in zip(*energies, strict=True)))
     for place, part in enumerate(parts):
         own = trust[:, part.start // _BLOCK : -(-part.stop // _BLOCK)]
@@ -111,76 +115,96 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
             some = pixels(part)
             spread = own.repeat_interleave(_BLOCK, 1).repeat_interleave(_BLOCK, 2)
             weight = some.weight * spread[:, : some.weight.shape[1], :length]
-            results[place], _ = _explained_rows(replace(some, weight=weight), spectra, transforms[:, part])
-    return RowGradients(transforms, *(torch.cat(values, 1) for values in zip(*results, strict=True)))
+            results[place], _ = _explained_rows(replace(some, weight=weight), width // 2, images[:, part])
+    return RowGradients(images, *(torch.cat(values, 1) for values in zip(*results, strict=True)))
 
 
-def _explained_rows(rows: _Rows, spectra: RowSpectra, out: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
-    """What ``RowGradients`` tell of some rows, and the energy (B, s, L) that brightness, contrast and a shift leave.
+def _explained_rows(rows: _Rows, middle: int, out: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """What ``RowGradients`` tell of some rows, and what ``_trust`` asks for.
 
     Args:
         rows: The rows.
-        spectra: Of the frames.
-        out: (B, s, 3, U) for the transforms of their images; products, variance and halves are returned.
+        middle: Column where the right half begins.
+        out: (B, s, 3, L) for the images; products, pulls, variance and halves are returned.
     """
-    weighted, left, products, pull = _explain(rows.images, rows.residual, rows.weight)
+    weighted = rows.images * rows.weight[:, :, None]
+    sums = _sums_of_halves(weighted, rows, middle)
+    whole = sums.sum(2)
+    products, right = torch.cat([whole[..., :3], whole[..., -1:]], -1), whole[..., 3:-1]
+    solution = _explanation(products, right.transpose(-2, -1))
     spare = (rows.seen.sum(1) - 1).clamp(min=1.0)
-    copies = rows.seen.shape[1] / left.shape[2]
-    energy = left.square().sum(2) * copies
-    square = (energy * rows.weight).sum(-1).double()
-    variance = square / ((products[..., 3, 3] - 4).clamp(min=1.0) * spare)
+    solution_here = solution.to(weighted.dtype)
+    explained = torch.matmul(solution_here[..., :3], rows.images).add_(solution_here[..., 3:])
+    energy = torch.sub(rows.residual, explained, out=explained).square_().sum(2) * rows.weight
+    copies = rows.seen.shape[1] / explained.shape[2]
+    energy *= (copies / spare[..., None]).to(energy.dtype)
+    variance = energy.sum(-1).double() / (products[..., 3, 3] - 4).clamp(min=1.0)
+    slope = (weighted[:, :, 0] * rows.planes[:, :, 0]).addcmul_(weighted[:, :, 1], rows.planes[:, :, 1])
+    blocks = _sum_of_blocks(energy), _sum_of_blocks(slope), _sum_of_blocks(rows.weight)
     mean_images = products[..., :3, 3:] / products[..., 3:, 3:].clamp(min=1e-6)
-    halves = _halves(weighted, rows, left, (products, pull), spectra.width // 2)
-    centred = weighted.addcmul_(rows.weight[:, :, None], mean_images.to(rows.weight.dtype), value=-1)
-    torch.fft.rfft(centred, norm="forward", out=out)
-    _one_sided(out, spectra.length)
-    centred_products = products[..., :3, :3] - mean_images * products[..., 3:, :3]
-    return (centred_products, variance, halves), energy / spare[..., None].to(energy.dtype)
+    torch.addcmul(weighted, rows.weight[:, :, None], mean_images.to(rows.weight.dtype), value=-1, out=out)
+    centred = (values[..., :3, :] - mean_images * values[..., 3:, :] for values in (products[..., :3], right))
+    return (*centred, variance, _halves(sums, solution, rows.seen)), blocks
 
 
-def _explain(images: Tensor, residual: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Take out of each row what brightness, contrast and a shift of it explain.
+def _sums_of_halves(weighted: Tensor, rows: _Rows, middle: int) -> Tensor:
+    """Products (B, s, 2, 4, 4 + G) float64 over both halves of each row of weighted images and ones.
+
+    Those with the images, with what the frames differ by, and with ones.
 
     Args:
-        images: (B, S, 3, W) gradients along x and y, detail.
-        residual: (B, S, G or 1, W).
-        weight: (B, S, W).
-
-    Returns:
-        Weighted images, what is left of the residual, the products (B, S, 4, 4) of the images and ones, and those
-        (B, S, G or 1, 4) with what is left; products in float64.
+        weighted: (B, s, 3, L) images.
+        rows: What they belong to.
+        middle: Column where the right half begins.
     """
-    weighted = images * weight[:, :, None]
-    products = weight.new_empty(*weight.shape[:2], 4, 4, dtype=torch.float64)
-    products[..., :3, :3] = torch.matmul(weighted, images.transpose(-2, -1))
-    products[..., :3, 3] = products[..., 3, :3] = weighted.sum(-1)
-    products[..., 3, 3] = weight.sum(-1)
-    with_ones = torch.matmul(residual, weight[..., None])
-    right = torch.cat([torch.matmul(residual, weighted.transpose(-2, -1)), with_ones], dim=-1).double()
+    sums = weighted.new_empty(*weighted.shape[:2], 2, 4, 1 + rows.planes.shape[2], dtype=torch.float64)
+    for half, columns in enumerate((slice(0, middle), slice(middle, None))):
+        images, weight = weighted[..., columns], rows.weight[..., columns]
+        seen = rows.planes[..., columns].transpose(-2, -1)
+        own = sums[:, :, half]
+        own[..., :3, :-1] = torch.matmul(images, seen)
+        own[..., 3:, :-1] = torch.matmul(weight[:, :, None], seen)
+        own[..., :3, -1] = own[..., 3, :3]
+        own[..., 3, -1] = weight.sum(-1)
+    return sums
+
+
+def _explanation(products: Tensor, right: Tensor) -> Tensor:
+    """Factors (B, s, G, 4) of images and ones that explain most of what the frames differ by.
+
+    Args:
+        products: (B, s, 4, 4) of the images and ones.
+        right: (B, s, G, 4) of what the frames differ by with them.
+    """
     known = (products.diagonal(dim1=-2, dim2=-1) > 0).all(-1)[..., None]
     scale = torch.where(known, products.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt(), 0.0)
     eye = torch.eye(4, dtype=scale.dtype, device=scale.device)
     unit = products * scale[..., :, None] * scale[..., None, :] + torch.where(known, 1e-6, 1.0)[..., None] * eye
     solution = torch.linalg.solve(unit, (right * scale[..., None, :]).transpose(-2, -1)).transpose(-2, -1)
-    solution = solution * scale[..., None, :]
-    explained = solution.to(images.dtype)
-    left = torch.matmul(explained[..., :3], images).add_(explained[..., 3:])
-    return weighted, torch.sub(residual, left, out=left), products, right - solution @ products
+    factors: Tensor = solution * scale[..., None, :]
+    return factors
 
 
-def _blocks_of(rows: _Rows, energy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Means over blocks of what is left of some rows, of the square of their gradient, and of what counts."""
-    used = (rows.weight > 0).to(energy.dtype)
-    slope = rows.images[:, :, :2].square().sum(2)
-    values = torch.stack([energy * used, slope * used, used], dim=1)
-    mean, slope, share = functional.avg_pool2d(values, _BLOCK, ceil_mode=True).unbind(1)
-    return mean, slope, share
+def _sum_of_blocks(values: Tensor) -> Tensor:
+    """Sums (B, N, M) over blocks of values (B, s, L); the last ones of either axis may be smaller."""
+    rows, columns = values.shape[1:]
+    rest = -rows % _BLOCK, -columns % _BLOCK
+    if rest[0]:
+        values = functional.pad(values, (0, 0, 0, rest[0]))
+    strips = values.unflatten(1, (-1, _BLOCK)).sum(2)
+    sums: Tensor = functional.pad(strips, (0, rest[1])).unflatten(2, (-1, _BLOCK)).sum(3)
+    return sums
 
 
 def _trust(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
     """Weight in 0 ... 1 of blocks whose residual neither noise nor a small shift explains.
 
     Things that move by themselves, clouds and parallax leave such blocks.
+
+    Args:
+        energy: (B, N, M) weighted sum over each block of what is left.
+        slope: The same of the square of the gradient.
+        share: Sum of the weights.
     """
     used = share > 0
     mean, slope = energy / share.clamp(min=1e-6), slope / share.clamp(min=1e-6)
@@ -189,47 +213,45 @@ def _trust(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
     return 1 / (1 + (ratio - 1).clamp(min=0.0).square())
 
 
-def _halves(weighted: Tensor, rows: _Rows, left: Tensor, whole: tuple[Tensor, Tensor], middle: int) -> Tensor:
+def _halves(sums: Tensor, solution: Tensor, seen: Tensor) -> Tensor:
     """Sums over the halves of each row, as in ``RowGradients.halves``.
 
     Args:
-        weighted: (B, S, 3, W) images.
-        rows: What they belong to.
-        left: What is left of the residual.
-        whole: Products of the images, and with what is left, over all columns.
-        middle: Column where the right half begins.
+        sums: From ``_sums_of_halves``.
+        solution: (B, s, G, 4) what explains the rows.
+        seen: (B, G, s), 1 where a frame sees the row.
     """
-    of_left, of_images = left[..., :middle].transpose(-2, -1), rows.images[:, :, :2, :middle].transpose(-2, -1)
-    own = weighted[:, :, :2, :middle]
-    sums = []
-    for products, pulls in (
-        (torch.matmul(own, of_images).double(), torch.matmul(own, of_left).double()),
-        (whole[0][..., :2, :2], whole[1][..., :2].transpose(-2, -1)),
-    ):
-        change = pulls[..., -1] - pulls[..., 0] if pulls.shape[-1] > 1 else -2 * pulls[..., 0]
-        sums.append(torch.cat([products.flatten(-2)[..., [0, 1, 3]], change], dim=-1))
-    both = (rows.seen[:, 0] * rows.seen[:, -1])[..., None, None]
-    return torch.stack([sums[0], sums[1] - sums[0]], dim=-2) * both
+    images, ones = solution[:, :, None].transpose(-2, -1).split((3, 1), dim=-2)
+    pulls = sums[..., :2, 3:-1] - sums[..., :2, :3] @ images - sums[..., :2, -1:] @ ones  # (B, s, 2, 2, G)
+    change = pulls[..., -1] - pulls[..., 0] if pulls.shape[-1] > 1 else -2 * pulls[..., 0]
+    own = torch.stack([sums[..., 0, 0], sums[..., 0, 1], sums[..., 1, 1]], dim=-1)
+    return torch.cat([own, change], dim=-1) * (seen[:, 0] * seen[:, -1])[..., None, None]
 
 
-def _one_sided(spectra: Tensor, length: int) -> Tensor:
-    """Spectra (..., U) of length L, of which products summed over all frequencies are half those of the pixels.
-
-    Frequency 0, and the highest of an even length, have no partner (Parseval).
-    """
-    spectra[..., 0] *= 0.5
-    if length % 2 == 0:
-        spectra[..., -1] *= 0.5
-    return spectra
-
-
-def row_shifts(warped: Iterable[Tensor], gradients: RowGradients, seen: Tensor) -> tuple[Tensor, Tensor]:
-    """Normal equations of the displacement that every row still misses in each frame.
+def row_pulls(warped: Iterable[Tensor], gradients: RowGradients, seen: Tensor) -> Tensor:
+    """Products (B, S, 3, G) of gradients with what frames differ by, as ``RowGradients.pulls``.
 
     Args:
         warped: Rows (B, G, s, U) of a group of frames warped to the scene, from ``RowSpectra.warped``: S rows in all,
             one run of them after the other.
-        gradients: Gradients of the scene, from this motion or one near to it.
+        gradients: Gradients of the scene, from a motion near to that of the rows.
+        seen: (B, G, S) float64, 1 where a frame sees the row.
+    """
+    length, parts, first = gradients.images.shape[-1], [], 0
+    for run in warped:
+        part = slice(first, first + run.shape[2])
+        left = torch.fft.irfft(differences(run, seen[:, :, part]).transpose(1, 2), n=length)
+        parts.append(torch.matmul(gradients.images[:, part], left.transpose(-2, -1)))
+        first = part.stop
+    return torch.cat(parts, 1).double()
+
+
+def row_shifts(pulls: Tensor, gradients: RowGradients, seen: Tensor) -> tuple[Tensor, Tensor]:
+    """Normal equations of the displacement that every row still misses in each frame.
+
+    Args:
+        pulls: Those of the gradients, or from ``row_pulls``.
+        gradients: Gradients of the scene.
         seen: (B, G, S) float64, 1 where a frame sees the row.
 
     Returns:
@@ -237,14 +259,7 @@ def row_shifts(warped: Iterable[Tensor], gradients: RowGradients, seen: Tensor) 
         in px relative to the mean over the group, the matrix its inverse covariance in one frame. Both are 0 for rows
         that fewer than two frames see or that have no detail.
     """
-    weighted, parts, first = torch.view_as_real(gradients.spectra).flatten(-2), [], 0
-    for run in warped:
-        own = weighted[:, first : first + run.shape[2]]
-        parts.append(torch.matmul(torch.view_as_real(run).flatten(-2).transpose(1, 2), own.transpose(-2, -1)))
-        first += run.shape[2]
-    right = 2.0 * torch.cat(parts, 1).transpose(1, 2).double()  # (B, G, S, 3)
-    share = (seen / seen.sum(1, keepdim=True).clamp(min=1.0))[..., None]
-    right = seen[..., None] * ((share * right).sum(1, keepdim=True) - right)
+    right = -(torch.cat([pulls, -pulls], -1) if seen.shape[1] == 2 else pulls).permute(0, 3, 1, 2)  # (B, G, S, 3)
     products = gradients.products
     detail = products[..., 2, 2]
     safe = detail.clamp(min=1e-300)

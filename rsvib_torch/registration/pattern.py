@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.registration.row_spectra import RowSpectra, inner_columns, mean_over_frames
+from rsvib_torch.registration.row_spectra import RowSpectra, differences, inner_columns
 from rsvib_torch.spectral import squared_modulus
 
 __all__ = ["column_pattern"]
@@ -37,20 +37,18 @@ def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor
         rows, shift, seen, variance = (values[..., ::_ROW_STEP] for values in places)
         typical = torch.where(variance > 0, variance, torch.nan).nanmedian(dim=-1, keepdim=True).values
         seen = seen * ((variance > 0) & (variance < _LARGEST * typical))[:, None]
-        visible = (seen * (seen.sum(1, keepdim=True) > 1)).to(spectra.values.real.dtype)[..., None]
+        visible = seen * (seen.sum(1, keepdim=True) > 1)
         # the ends of the rows stay where they are as well, but are no pattern
         inner = inner_columns(spectra.width, shift, spectra.values.real)[0]
         for run in spectra.runs(rows.shape[-1], 5):
-            shown, where = visible[:, :, run], seen[..., run]
             warped, ramp = spectra.warped(rows[..., run], shift[..., run]), spectra.ramp(shift[..., run])
-            difference = (warped - mean_over_frames(warped, where)[:, None]) * shown
-            pixels = torch.fft.irfft(difference, n=spectra.length)
+            pixels = torch.fft.irfft(differences(warped, visible[..., run]), n=spectra.length)
             difference = torch.fft.rfft(pixels[..., : spectra.width] * inner, n=spectra.length)
-            moved = (ramp - mean_over_frames(ramp, where)[:, None]) * shown
+            moved = differences(ramp, visible[..., run])
             found = found + (moved.conj() * difference).sum((1, 2))
             power = power + squared_modulus(moved).sum((1, 2))
             noise = noise + squared_modulus(difference).sum((1, 2))
-        count = count + (visible.sum((1, 2, 3)) - (visible.sum(1) > 0).sum((1, 2)))[:, None]
+        count = count + (visible.sum((1, 2)) - (visible.sum(1) > 0).sum(-1)).to(noise.dtype)[:, None]
     pattern = found / power.clamp(min=1e-6)
     strength = pattern.abs().square() * power / (noise / count.clamp(min=1.0)).clamp(min=1e-30)
     half = _NEIGHBOURS // 2

@@ -11,7 +11,7 @@ from rsvib_torch.pieces import gathered, runs
 from rsvib_torch.spectral import extend_rows, fast_length, shift_phases
 from rsvib_torch.splines import bspline_coefficient_rows, bspline_weights
 
-__all__ = ["DEGREE", "MARGIN", "RowSpectra", "chunks", "combined", "inner_columns", "mean_over_frames"]
+__all__ = ["DEGREE", "MARGIN", "RowSpectra", "chunks", "combined", "differences", "inner_columns", "mean_over_frames"]
 
 DEGREE = 7  # of the spline across rows: what it smooths, and the noise it colours, lie above the pass band
 MARGIN = 8  # px from the ends of rows and columns that do not count
@@ -127,6 +127,23 @@ def combined(spectra: Tensor, factors: Tensor) -> Tensor:
 def mean_over_frames(spectra: Tensor, seen: Tensor) -> Tensor:
     """Mean (B, S, U) of spectra (B, G, S, U) over the frames that see a row."""
     return combined(spectra, seen / seen.sum(1, keepdim=True).clamp(min=1.0))
+
+
+def differences(spectra: Tensor, seen: Tensor) -> Tensor:
+    """What rows of each frame differ by from their mean over the frames that see them, (B, G, S, U).
+
+    Of two frames the first alone, (B, 1, S, U): the other differs by the opposite. A frame that does not see a row does
+    not differ.
+
+    Args:
+        spectra: (B, G, S, U).
+        seen: (B, G, S) float64, 1 where a frame sees the row.
+    """
+    if spectra.shape[1] == 2:
+        half = 0.5 * seen.prod(1, keepdim=True)
+        return combined(spectra, torch.cat([half, -half], 1))[:, None]
+    different = spectra - mean_over_frames(spectra, seen)[:, None]
+    return different.mul_(seen[..., None].to(spectra.real.dtype))
 
 
 def inner_columns(width: int, shift: Tensor, like: Tensor) -> Tensor:

@@ -29,12 +29,13 @@ def scene_detail(warped: Tensor, seen: Tensor, u: Tensor) -> tuple[Tensor, Tenso
         Spectra (B, S, U) each, px^-1 the latter.
     """
     v = torch.fft.fftfreq(warped.shape[-2], dtype=torch.float64, device=u.device)
-    whole = torch.fft.fft(mean_over_frames(warped, seen), dim=-2)
-    noise = torch.fft.fft(_noise_of_mean(warped[..., ::_SOME], seen), dim=-2)
+    # transforms across rows leave the rows side by side in memory, and all that follows runs along them
+    whole = torch.fft.fft(mean_over_frames(warped, seen), dim=-2).transpose(-2, -1)
+    noise = torch.fft.fft(_noise_of_mean(warped[..., ::_SOME], seen), dim=-2).transpose(-2, -1)
     torch.view_as_real(whole).mul_(_wiener(whole, noise, u, v)[..., None])
-    detail = torch.fft.ifft(whole, dim=-2)
-    whole *= (2j * math.pi * v).to(whole.dtype)[:, None]
-    return detail, torch.fft.ifft(whole, dim=-2)
+    detail = torch.fft.ifft(whole)
+    whole *= (2j * math.pi * v).to(whole.dtype)
+    return detail.transpose(-2, -1), torch.fft.ifft(whole).transpose(-2, -1)
 
 
 def _pass(frequency: Tensor, limits: tuple[float, float]) -> Tensor:
@@ -44,11 +45,11 @@ def _pass(frequency: Tensor, limits: tuple[float, float]) -> Tensor:
 
 
 def _wiener(mean: Tensor, noise: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Share (B, S, U) of the spectrum of the mean that is scene, within the pass band.
+    """Share (B, U, S) of the spectrum of the mean that is scene, within the pass band.
 
     Args:
-        mean: (B, S, U) two-dimensional spectrum of the mean of the frames.
-        noise: (B, S, U / 4) spectrum of a difference with the noise of the mean, at every fourth frequency.
+        mean: (B, U, S) two-dimensional spectrum of the mean of the frames.
+        noise: (B, U / 4, S) spectrum of a difference with the noise of the mean, at every fourth frequency.
         u: Frequencies along rows, cycles/px.
         v: Frequencies across rows, cycles/px.
     """
@@ -58,22 +59,22 @@ def _wiener(mean: Tensor, noise: Tensor, u: Tensor, v: Tensor) -> Tensor:
     along, across = _pass(u, _PASS_COLUMNS), _pass(v, _PASS_ROWS)
     slow_along, slow_across = along * torch.exp(-((u / _SLOWEST) ** 2)), across * torch.exp(-((v / _SLOWEST) ** 2))
     along, across, slow_along, slow_across = (x.to(share.dtype) for x in (along, across, slow_along, slow_across))
-    passed = torch.outer(across, along).addr_(slow_across, slow_along, alpha=-1)
+    passed = torch.outer(along, across).addr_(slow_along, slow_across, alpha=-1)
     blocks = share[:, :, None, :, None].expand(-1, -1, _SMOOTH, -1, _SMOOTH).flatten(3).flatten(1, 2)
-    return blocks[:, : len(v), : len(u)] * passed
+    return blocks[:, : len(u), : len(v)] * passed
 
 
-def _smoothed(spectrum: Tensor, columns: int) -> Tensor:
-    """Mean power (B, S / 16, U / columns) of blocks of a spectrum (B, S, U), up to a factor."""
+def _smoothed(spectrum: Tensor, frequencies: int) -> Tensor:
+    """Mean power (B, U / frequencies, S / 16) of blocks of a spectrum (B, U, S), up to a factor."""
     parts = torch.view_as_real(spectrum).flatten(-2)
-    rows = []
-    for part in chunks(parts.shape[1], 4 * parts.shape[2] * len(parts), _SMOOTH, parts.device):
+    blocks = []
+    for part in chunks(parts.shape[1], 4 * parts.shape[2] * len(parts), frequencies, parts.device):
         power = parts[:, part].square()
-        whole = power.shape[1] // _SMOOTH * _SMOOTH
-        rows.append(power[:, :whole].unflatten(1, (-1, _SMOOTH)).mean(2))
+        whole = power.shape[1] // frequencies * frequencies
+        blocks.append(power[:, :whole].unflatten(1, (-1, frequencies)).mean(2))
         if whole < power.shape[1]:
-            rows.append(power[:, whole:].mean(1, keepdim=True))
-    return functional.avg_pool1d(torch.cat(rows, 1), 2 * columns, ceil_mode=True)
+            blocks.append(power[:, whole:].mean(1, keepdim=True))
+    return functional.avg_pool1d(torch.cat(blocks, 1), 2 * _SMOOTH, ceil_mode=True)
 
 
 def _noise_of_mean(warped: Tensor, seen: Tensor) -> Tensor:

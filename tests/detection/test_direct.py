@@ -9,7 +9,7 @@ from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, detect_vibration, register_bands, simulate_frames
 from rsvib_torch.evaluation import resolution_chart
-from rsvib_torch.registration.gradients import row_gradients, row_shifts
+from rsvib_torch.registration.gradients import row_gradients, row_pulls, row_shifts
 from rsvib_torch.registration.row_spectra import RowSpectra
 
 MARGIN = 40
@@ -202,7 +202,7 @@ def test_rows_tell_a_known_shift(remaining, num_frames):
     def told(shift):
         runs = (slice(0, 40), slice(40, 96))
         warped = (spectra.warped(rows[..., run], shift[..., run]) for run in runs)
-        matrix, right = row_shifts(warped, gradients, seen)
+        matrix, right = row_shifts(row_pulls(warped, gradients, seen), gradients, seen)
         known = matrix[0, :, 0, 0] > 0
         assert known.tolist() == seen[0, 0].bool().tolist()
         total, sums = matrix[0].sum(0), right[0].sum(1)
