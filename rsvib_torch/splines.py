@@ -1,6 +1,7 @@
 """B-spline interpolation on a unit grid: basis weights and the prefilter that turns samples into coefficients."""
 
 from collections.abc import Iterator
+from fractions import Fraction
 from functools import cache
 
 import torch
@@ -23,7 +24,7 @@ _ROWS, _MANY_ROWS = {"cpu": 64}, 256  # at a time: they stay in the cache
 
 
 def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
-    """Weights of the ``degree + 1`` B-splines that are not zero at a position (Cox-de Boor recursion).
+    """Weights of the ``degree + 1`` B-splines that are not zero at a position.
 
     The value at ``x = n + fraction`` is ``sum_k weights[k] c[n + first_tap(degree) + k]`` with coefficients ``c``
     and ``first_tap(degree) = -(degree // 2)``. ``degree`` must be odd, 1 is linear interpolation.
@@ -39,16 +40,30 @@ def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
         >>> bspline_weights(torch.tensor(0.25), 1).tolist()
         [0.75, 0.25]
     """
-    weights = [torch.ones_like(fraction)]
+    highest, *others = torch.tensor(_polynomials(degree), dtype=fraction.dtype, device=fraction.device)
+    weights, place = highest, fraction[..., None]
+    for lower in others:
+        weights = torch.addcmul(lower, weights, place)
+    return weights
+
+
+@cache
+def _polynomials(degree: int) -> tuple[tuple[float, ...], ...]:
+    """Coefficients of the weights as polynomials of the fraction, highest power first: one row a power, one entry a tap.
+
+    By the Cox-de Boor recursion, in whole fractions.
+    """
+    taps = [[Fraction(1)]]  # of each tap, lowest power first
     for order in range(1, degree + 1):
-        previous = weights
-        weights = [torch.zeros_like(fraction) for _ in range(order + 1)]
-        for tap, weight in enumerate(previous):
-            # knots of the spline of this order that starts `order - 1 - tap` before the cell of the position
-            rising = (fraction + (order - 1 - tap)) / order
-            weights[tap] = weights[tap] + (1 - rising) * weight
-            weights[tap + 1] = weights[tap + 1] + rising * weight
-    return torch.stack(weights, dim=-1)
+        before, taps = taps, [[Fraction(0)] * (order + 1) for _ in range(order + 1)]
+        for tap, weight in enumerate(before):
+            # knots of the spline of this order that starts so many cells before that of the position
+            distance = order - 1 - tap
+            for power, value in enumerate(weight):
+                for which, at_zero, slope in ((tap, order - distance, -1), (tap + 1, distance, 1)):
+                    taps[which][power] += value * at_zero / order
+                    taps[which][power + 1] += value * slope / order
+    return tuple(tuple(float(weight[power]) for weight in taps) for power in reversed(range(degree + 1)))
 
 
 @cache
