@@ -49,7 +49,7 @@ def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
 
 @cache
 def _polynomials(degree: int) -> tuple[tuple[float, ...], ...]:
-    """Coefficients of the weights as polynomials of the fraction, highest power first: one row a power, one entry a tap.
+    """Coefficients of the weights as polynomials of the fraction: a row for each power, highest first, of all taps.
 
     By the Cox-de Boor recursion, in whole fractions.
     """
