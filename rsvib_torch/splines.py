@@ -41,9 +41,9 @@ def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
         [0.75, 0.25]
     """
     highest, *others = torch.tensor(_polynomials(degree), dtype=fraction.dtype, device=fraction.device)
-    weights, place = highest, fraction[..., None]
+    weights: Tensor = highest
     for lower in others:
-        weights = torch.addcmul(lower, weights, place)
+        weights = torch.addcmul(lower, weights, fraction[..., None])
     return weights
 
 

@@ -5,6 +5,8 @@ import math
 import torch
 from torch import Tensor
 
+from rsvib_torch.pieces import runs
+
 __all__ = ["estimate_noise", "gradient_energy"]
 
 _BLOCK = 16
@@ -12,7 +14,7 @@ _DIFFERENCES = 8
 _QUANTILE = 0.15
 _FEW = 8  # blocks have no quiet part
 _MANY = 2048  # blocks tell as much as all of a larger image
-_ROWS = 64  # at a time: they stay in the cache
+_VALUES = {"cpu": 1 << 16}  # at a time: they stay in the cache
 
 
 def estimate_noise(frames: Tensor) -> Tensor:
@@ -40,20 +42,15 @@ def estimate_noise(frames: Tensor) -> Tensor:
     block = min(_BLOCK, *inner)
     height, width = (extent // block * block for extent in inner)
     every = max(1, height * width // (block**2 * _MANY))
-    step = block * max(1, _ROWS // block) if every == 1 else block
-    across = torch.eye(step + orders[0], dtype=frames.dtype, device=frames.device).diff(orders[0], dim=0)
-    blocks = torch.cat(
-        [
-            _detail(frames[..., top : min(top + step, height) + orders[0], : width + orders[1]], across, orders[1])
-            .square()
-            .unflatten(-1, (-1, block))
-            .unflatten(-3, (-1, block))
-            .mean((-3, -1))
-            for top in range(0, height, every * step)
-        ],
-        dim=-2,
-    ) / math.prod(math.comb(2 * order, order) for order in orders)
-    energy = blocks.flatten(-2)
+    inside = frames[..., : height + orders[0], : width + orders[1]]
+    strips = inside.unfold(-2, block + orders[0], every * block).movedim(-3, 0)  # (strips, ..., columns, rows)
+    across = torch.eye(block + orders[0], dtype=frames.dtype, device=frames.device).diff(orders[0], dim=0)
+    one = frames[..., 0, :].numel() * block
+    blocks = [
+        _detail(strips[some], across, orders[1]).square().unflatten(-2, (-1, block)).mean((-2, -1))
+        for some in runs(len(strips), max(1, _VALUES.get(frames.device.type, frames.numel()) // one))
+    ]
+    energy = torch.cat(blocks).movedim(0, -1).flatten(-2) / math.prod(math.comb(2 * order, order) for order in orders)
     # means of pure noise scatter (neighbouring responses of the mask are correlated), so that their low quantile lies
     # below the true mean: by as much as a chi-squared variable's does (Wilson and Hilferty)
     share = min(2.0 * math.prod(_correlation_area(order) for order in orders) / (9.0 * block**2), 0.2)
@@ -65,13 +62,12 @@ def estimate_noise(frames: Tensor) -> Tensor:
     return deviation
 
 
-def _detail(frames: Tensor, across: Tensor, order: int) -> Tensor:
-    """Differences of an order along rows, and of another, as a matrix for at least as many of them, across rows."""
-    rows = frames.shape[-2]
-    frames = across[: len(across) - across.shape[1] + rows, :rows] @ frames
+def _detail(strips: Tensor, across: Tensor, order: int) -> Tensor:
+    """Differences of an order along rows, and of another, as a matrix, across rows, of strips (..., columns, rows)."""
+    differences = strips @ across.T
     for _ in range(order):
-        frames = frames.diff(dim=-1)
-    return frames
+        differences = differences.diff(dim=-2)
+    return differences
 
 
 def _correlation_area(order: int) -> float:
