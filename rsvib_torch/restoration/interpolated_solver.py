@@ -15,8 +15,8 @@ Mixture = list[tuple[slice, slice, Tensor]]
 __all__ = ["NodeFactors", "SubstitutionMemory", "chosen_nodes"]
 
 _FINER = 4.0  # times the frequency itself: steps between low frequencies, where priors change most, are smaller
-_BLOCK = 64  # systems that one product of matrices interpolates: few nodes count for them
-_ROWS = {"cpu": 96}  # that are interpolated at a time: they stay in the cache
+_BLOCK = 96  # systems that one product of matrices interpolates: few nodes count for them
+_ROWS = {"cpu": 160}  # that are interpolated at a time: they stay in the cache
 
 
 def chosen_nodes(frequencies: int, step: float, device: torch.device) -> Tensor:

@@ -8,7 +8,7 @@ from rsvib_torch.restoration.row_system import RowKernels, SmoothKernels
 
 __all__ = ["RowSums", "sum_looked_up"]
 
-_ROWS = {"cpu": 64}  # at a time: they stay in the cache
+_ROWS = {"cpu": 128}  # at a time: they stay in the cache
 _SPREAD = 2  # times as many places as the taps ask for, at most
 
 

@@ -16,7 +16,7 @@ from rsvib_torch.restoration.seen_scene import SeenScene
 
 __all__ = ["Coefficients", "SceneSolver"]
 
-_ROWS = {"cpu": 64}  # of the scene at a time: they stay in the cache
+_ROWS = {"cpu": 128}  # of the scene at a time: they stay in the cache
 
 Coefficients = list[Tensor]  # (K, C, U') for each chunk of frequencies
 SolvePart = Callable[[int, slice, Tensor | None], Tensor]  # thread, chunk of frequencies, pull: its coefficients
