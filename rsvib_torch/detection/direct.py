@@ -29,7 +29,7 @@ __all__ = ["DirectFit", "refine_directly"]
 _CLEANINGS = 2  # rounds of taking out what is fixed to the sensor
 _NEAR = 0.05  # px: gradients of frames that were warped this well need not be taken again
 _LITTLE, _NOT_MUCH = 0.5, 1.5  # standard deviations that a last round may change, if the one before changed far more
-_HARDLY = 0.1  # standard deviations that the next round may then be expected to change
+_HARDLY = 0.05  # standard deviations that the next round may then be expected to change
 _RUNAWAY = 2.0  # times larger from round to round: no tone that was found does that
 _LINGERING = 0.3  # of a step that is still missing after it, or was too much: then earlier steps are looked at
 _REMEMBERED = 3  # steps
@@ -102,7 +102,7 @@ def _corrected(told: Measurements, steps: list[_Step]) -> Measurements:
 
 
 def _settled(before: ToneFit, after: ToneFit, share: Tensor | None) -> bool:
-    """Whether the next round would change coefficients and frequencies by hardly a tenth of their standard deviations.
+    """Whether the next round would change coefficients and frequencies by hardly a twentieth of their deviations.
 
     Errors shrink from round to round, under short exposures to a tenth and less: a round that changed little was the
     last, and so was one that changed much less than the one before.

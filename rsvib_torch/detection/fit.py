@@ -55,6 +55,11 @@ class _Unknowns:
         parts = values[..., :end].unflatten(-1, (self.tones, _PARAMETERS))
         return torch.complex(parts[..., 0], parts[..., 1]), parts[..., 2], values[..., end:]
 
+    def pack(self, fit: ToneFit) -> Tensor:
+        """The parameters (B, 2, 3 K + J) of a fit, of which ``unpack`` makes three."""
+        tones = torch.stack([fit.coefficients.real, fit.coefficients.imag, fit.frequencies], -1).flatten(-2)
+        return torch.cat([tones, fit.drift], -1)
+
     def moved(self, values: Tensor, step: Tensor) -> Tensor:
         """Parameters after a step (B, M) of the free ones; frequencies stay positive."""
         values = values + (step @ self.tie.T).unflatten(1, (2, -1))
@@ -149,17 +154,19 @@ def _step(state: _State, keep: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]
 
 
 def _solved(
-    measurements: Measurements, frequencies: Tensor, active: Tensor, model: MotionModel, iterations: int
+    measurements: Measurements, start: Tensor | ToneFit, active: Tensor, model: MotionModel, iterations: int
 ) -> tuple[_Unknowns, _State]:
-    """The least squares solution from start frequencies, as in ``fit_tones``."""
+    """The least squares solution from start frequencies, or from another solution, as in ``fit_tones``."""
     unknowns = _Unknowns.of(active, model)
     problem = _Problem.of(measurements, model)
-    values = frequencies.new_zeros(len(frequencies), 2, len(unknowns.is_frequency))
-    values[..., unknowns.is_frequency] = torch.where(active, frequencies, 0.0)
-
-    state = problem.evaluate(unknowns, values)
-    step, _ = _step(state, unknowns.linear, torch.zeros_like(state.cost))
-    state = problem.evaluate(unknowns, unknowns.moved(values, step))
+    if isinstance(start, ToneFit):
+        state = problem.evaluate(unknowns, unknowns.pack(start))
+    else:
+        values = start.new_zeros(len(start), 2, len(unknowns.is_frequency))
+        values[..., unknowns.is_frequency] = torch.where(active, start, 0.0)
+        state = problem.evaluate(unknowns, values)
+        step, _ = _step(state, unknowns.linear, torch.zeros_like(state.cost))
+        state = problem.evaluate(unknowns, unknowns.moved(values, step))
     damping = torch.full_like(state.cost, 1e-3)
     done = torch.zeros_like(state.cost, dtype=torch.bool)  # each stack stops by itself, whatever it is in a batch with
     for _ in range(iterations):
@@ -176,20 +183,20 @@ def _solved(
 
 def fit_roughly(
     measurements: Measurements, frequencies: Tensor, active: Tensor, model: MotionModel
-) -> tuple[Tensor, Tensor]:
+) -> tuple[ToneFit, Tensor]:
     """A few steps of ``fit_tones``, which another fit will follow.
 
     Returns:
-        Frequencies (B, 2, K), and what the fit leaves of the displacements, (B, N, G, 2).
+        The fit, whose covariance has no meaning, and what it leaves of the displacements, (B, N, G, 2).
     """
     unknowns, state = _solved(measurements, frequencies, active, model, _FEW_ITERATIONS)
     coefficients, hertz, drift = unknowns.unpack(state.values)
     fit = ToneFit(coefficients, hertz, active, drift, state.matrix, measurements.centre, model)
-    return hertz, measurements.relative(measurements.displacements - model_displacements(measurements, fit))
+    return fit, measurements.relative(measurements.displacements - model_displacements(measurements, fit))
 
 
 def fit_tones(
-    measurements: Measurements, frequencies: Tensor, active: Tensor, model: MotionModel | None = None
+    measurements: Measurements, start: Tensor | ToneFit, active: Tensor, model: MotionModel | None = None
 ) -> ToneFit:
     """Fit all tones of both axes and the image motion from start frequencies (weighted Levenberg-Marquardt).
 
@@ -198,8 +205,8 @@ def fit_tones(
 
     Args:
         measurements: The displacements.
-        frequencies: (B, 2, K) start frequencies in Hz; with harmonics, K a multiple of their number, each family
-            base first.
+        start: (B, 2, K) start frequencies in Hz; with harmonics, K a multiple of their number, each family base
+            first. Or a fit of the same tones to these measurements, weighted otherwise: this one lies near it.
         active: (B, 2, K) bool, tones to fit; the others stay at zero.
         model: What is fitted beside the tones.
 
@@ -207,7 +214,7 @@ def fit_tones(
         The fit with its covariance, scaled by the observed residual.
     """
     model = model or MotionModel()
-    unknowns, state = _solved(measurements, frequencies, active, model, _ITERATIONS)
+    unknowns, state = _solved(measurements, start, active, model, _ITERATIONS)
     _, inverse = _step(state, unknowns.free, torch.zeros_like(state.cost))
     spent = unknowns.free.unflatten(1, (2, -1)).sum(-1)
     coefficients, hertz, drift = unknowns.unpack(state.values)

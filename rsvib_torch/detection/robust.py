@@ -35,9 +35,9 @@ def robust_fit(
     if residual is None:
         fit = fit_tones(measurements, frequencies, active, model)
         frequencies, residual = fit.frequencies, residual_of(measurements, fit)
-    frequencies, residual = fit_roughly(measurements.reweighted(residual), frequencies, active, model)
+    rough, residual = fit_roughly(measurements.reweighted(residual), frequencies, active, model)
     weighed = measurements.reweighted(residual)
-    return fit_tones(weighed, frequencies, active, model), weighed
+    return fit_tones(weighed, rough, active, model), weighed
 
 
 def residual_of(measurements: Measurements, fit: ToneFit) -> Tensor:

@@ -61,9 +61,9 @@ def _with_one_more(
     count = len(further) // len(measurements.moments)
     known = before.frequencies[..., : active.shape[-1] - harmonics].repeat_interleave(count, 0)
     several, which = measurements.repeated(count), active.repeat_interleave(count, 0)
-    frequencies, residual = fit_roughly(parts.repeated(peaks.shape[-1]), torch.cat([known, further], -1), which, model)
+    rough, residual = fit_roughly(parts.repeated(peaks.shape[-1]), torch.cat([known, further], -1), which, model)
     size = several.sizes(residual).nanquantile(MAJORITY, dim=1).nan_to_num(0.0).unflatten(0, (-1, count))
-    sighted = _sighted(several, frequencies[..., -harmonics:]).unflatten(0, (-1, count))
+    sighted = _sighted(several, rough.frequencies[..., -harmonics:]).unflatten(0, (-1, count))
     best = ((size.amax(1, keepdim=True) - size) * sighted).argmax(1)  # each axis for itself
 
     def chosen(values: Tensor, axis: int) -> Tensor:
@@ -72,10 +72,11 @@ def _with_one_more(
         picked: Tensor = each.gather(1, place)[:, 0].movedim(1, axis)
         return picked
 
-    frequencies, residual = chosen(frequencies, 1), chosen(residual, 3)
+    frequencies, residual = chosen(rough.frequencies, 1), chosen(residual, 3)
     for _ in range(_ABSOLUTE_STEPS if reckon else 0):
         nearer = measurements.for_least_absolute(residual)
-        frequencies, residual = fit_roughly(nearer, frequencies, active, model)
+        nearest, residual = fit_roughly(nearer, frequencies, active, model)
+        frequencies = nearest.frequencies
     return frequencies, residual
 
 
