@@ -8,9 +8,11 @@ from scipy import ndimage
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, detect_vibration, register_bands, simulate_frames
+from rsvib_torch.detection import direct
+from rsvib_torch.detection.tones import MotionModel, ToneFit
 from rsvib_torch.evaluation import resolution_chart
 from rsvib_torch.registration.gradients import row_gradients, row_pulls, row_shifts
-from rsvib_torch.registration.row_spectra import RowSpectra
+from rsvib_torch.registration.row_spectra import RowSpectra, differences
 
 MARGIN = 40
 
@@ -181,6 +183,73 @@ def test_parts_of_a_batch_are_warped_like_the_whole():
     torch.testing.assert_close(own, (frames[:, :, 12:28] - 0.5) / 2, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("num_frames", [2, 3, 5])
+def test_differences_from_the_mean_of_the_frames_that_see_a_row(num_frames):
+    generator = torch.Generator().manual_seed(num_frames)
+    spectra = torch.randn(2, num_frames, 7, 5, dtype=torch.complex128, generator=generator)
+    seen = (torch.rand(2, num_frames, 7, generator=generator) > 0.3).double()
+    weight = seen[..., None].numpy()
+    mean = (weight * spectra.numpy()).sum(1) / np.maximum(weight.sum(1), 1)
+    expected = weight * (spectra.numpy() - mean[:, None])
+    found = differences(spectra, seen).numpy()
+    np.testing.assert_allclose(found, expected[:, : found.shape[1]], atol=1e-12)
+    if num_frames == 2:
+        np.testing.assert_allclose(-found[:, 0], expected[:, 1], atol=1e-12)
+
+
+def test_a_further_round_would_change_next_to_nothing(paper_camera, monkeypatch):
+    """Detection ends when rounds tell that the next one is not worth it: held against one that goes on to the end."""
+    frames = pair_of(paper_camera, Motion((3.1, 5.2), (50.0, 30.0), (0.4, -1.1)), 91, 0.005)
+    rounds = []
+    measure = direct.measure_group
+    monkeypatch.setattr(direct, "measure_group", lambda *given: (rounds.append(1), measure(*given))[1])
+    found = detect_vibration(frames, paper_camera)
+    few = len(rounds)
+    monkeypatch.setattr(direct, "_settled", lambda *given: False)
+    whole = detect_vibration(frames, paper_camera)
+    assert few <= 3 < len(rounds) - few
+    for name in ("amplitude", "frequency", "phase"):
+        change = (getattr(found.vibration, name) - getattr(whole.vibration, name)).abs()
+        assert bool((change < 0.1 * getattr(found.std, name)).all())
+
+
+def fit_of(coefficients, frequencies):
+    """A fit of one tone an axis whose standard deviations are 0.01 px and 0.02 Hz."""
+    deviations = torch.tensor([0.01, 0.01, 0.02, 1.0] * 2, dtype=torch.float64)
+    return ToneFit(
+        torch.tensor(coefficients, dtype=torch.complex128).reshape(1, 2, 1),
+        torch.tensor(frequencies, dtype=torch.float64).reshape(1, 2, 1),
+        torch.ones(1, 2, 1, dtype=torch.bool),
+        torch.zeros(1, 2, 1, dtype=torch.float64),
+        torch.diag_embed(deviations.square())[None],
+        torch.zeros(1, dtype=torch.float64),
+        MotionModel(),
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "share", "settled"),
+    [
+        (0.4, None, True),  # of a standard deviation
+        (0.6, None, False),
+        (0.6, 0.5, False),  # slow: as if nothing were known
+        (0.4, 0.9, True),
+        (0.6, 0.05, True),  # fast: the next change is a twentieth of this one
+        (1.4, 0.05, False),
+        (1.4, 0.02, True),
+        (1.6, 0.001, False),
+    ],
+)
+def test_rounds_end_where_the_next_one_would_change_little(change, share, settled):
+    before = fit_of([1.0, 2.0], [50.0, 30.0])
+    share = None if share is None else torch.tensor([share], dtype=torch.float64)
+    for after in (
+        fit_of([1.0 + 0.01 * change, 2.0], [50.0, 30.0]),
+        fit_of([1.0, 2.0], [50.0, 30.0 - 0.02 * change]),
+    ):
+        assert direct._settled(before, after, share) is settled
+
+
 @pytest.mark.parametrize("remaining", [0.0, 0.05, -0.3])
 @pytest.mark.parametrize("num_frames", [2, 3])
 def test_rows_tell_a_known_shift(remaining, num_frames):
@@ -208,6 +277,8 @@ def test_rows_tell_a_known_shift(remaining, num_frames):
         total, sums = matrix[0].sum(0), right[0].sum(1)
         return torch.linalg.solve(total, sums[..., None])[..., 0]
 
+    again = row_pulls([spectra.warped(rows, none)], gradients, seen)
+    torch.testing.assert_close(gradients.pulls, again, rtol=1e-9, atol=1e-9)
     shifts = told(none)
     torch.testing.assert_close(shifts[:, 0], expected.double(), rtol=0.1, atol=2e-4)
     assert shifts[:, 1].abs().max() < 0.02 * abs(remaining) + 1e-5
