@@ -35,7 +35,7 @@ from benchmarks import (
     streaming_dask,
     streaming_memory,
 )
-from benchmarks.measure import HUGE_PAGES, add_options, machine
+from benchmarks.measure import ENVIRONMENT, add_options, machine
 
 PARTS: dict[str, tuple[Callable[..., list[dict[str, Any]]], Callable[..., list[str]]]] = {
     "registration": (registration.rows, registration.lines),
@@ -56,6 +56,7 @@ def machine_line(machine: dict[str, Any]) -> str:
     libraries = ", ".join(f"{name} {version}" for name, version in machine["libraries"].items())
     load = "" if machine["load"] is None else f" Load at the start: {machine['load']:.1f}."
     pages = "huge pages asked for" if machine["huge_pages"] else "pages of the usual size"
+    pages += ", freed memory kept" if machine["kept_memory"] else ""
     cuda = "No CUDA device here: tables are of the CPU alone." if machine["cuda"] is None else f"{machine['cuda']}."
     return (
         f"{machine['cores']} cores ({machine['processor']}), Python {machine['python']}, torch {machine['torch']} on "
@@ -63,10 +64,11 @@ def machine_line(machine: dict[str, Any]) -> str:
     )
 
 
-def with_huge_pages() -> None:
-    """Begin anew with huge pages for tensors: NumPy asks for them by itself, PyTorch only if told before it starts."""
-    if HUGE_PAGES not in os.environ:
-        os.environ[HUGE_PAGES] = "1"
+def in_environment() -> None:
+    """Begin anew in the environment that benchmarks run in, where it is another."""
+    missing = {name: value for name, value in ENVIRONMENT.items() if name not in os.environ}
+    if missing:
+        os.environ.update(missing)
         os.execv(sys.executable, sys.orig_argv)
 
 
@@ -119,5 +121,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with_huge_pages()
+    in_environment()
     main()

@@ -14,7 +14,10 @@ from typing import Any
 
 import torch
 
-HUGE_PAGES = "THP_MEM_ALLOC_ENABLE"  # environment variable of PyTorch: 1 for yes, 0 for no
+# what a process has to be told before it starts: PyTorch to ask for huge pages, as NumPy does by itself; and glibc to
+# keep freed memory for the next call, which systems whose memory is lent to them take long to have back
+HUGE_PAGES, KEPT = "THP_MEM_ALLOC_ENABLE", ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
+ENVIRONMENT = {HUGE_PAGES: "1", **dict.fromkeys(KEPT, str(1 << 40))}
 _LIBRARIES = {
     "OpenCV": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
     "SciPy": ("scipy",),
@@ -116,6 +119,7 @@ def machine() -> dict[str, Any]:
         "processor": platform.processor() or platform.machine(),
         "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "huge_pages": os.environ.get(HUGE_PAGES) == "1",
+        "kept_memory": all(name in os.environ for name in KEPT),
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "python": platform.python_version(),
         "torch": torch.__version__,
@@ -130,6 +134,11 @@ def _version(library: str) -> str | None:
         except metadata.PackageNotFoundError:
             continue
     return None
+
+
+def plain_environment() -> dict[str, str]:
+    """The environment for processes whose memory is measured: freed memory goes where it went before."""
+    return {name: value for name, value in os.environ.items() if name not in KEPT}
 
 
 _MEMORY_PROBE = """
@@ -181,5 +190,5 @@ def peak_memory(work: str, num_frames: int, height: int, width: int, device: str
     """
     numbers = [str(number) for number in (num_frames, height, width)]
     command = [sys.executable, "-c", _MEMORY_PROBE, device, str(torch.get_num_threads()), work, *numbers]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=plain_environment(), capture_output=True, text=True, check=False)
     return float(done.stdout) if done.returncode == 0 else None

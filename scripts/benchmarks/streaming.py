@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmarks.measure import plain_environment
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
@@ -113,6 +114,7 @@ def run_apart(**arguments: Any) -> dict[str, Any]:
     done = subprocess.run(
         [sys.executable, "-c", _RUN, json.dumps(arguments)],
         cwd=Path(__file__).parents[1],
+        env=plain_environment(),
         check=True,
         capture_output=True,
         text=True,
