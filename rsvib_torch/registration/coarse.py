@@ -4,11 +4,14 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.pieces import runs
+
 __all__ = ["coarse_offset"]
 
 _SIZE = 256  # px that the longer side is reduced to
 _CANDIDATES = 4
 _SMALLEST_OVERLAP = 0.3  # of the frame
+_VALUES = 1 << 20  # of overlaps that are compared at a time
 
 
 def _standardise(images: Tensor) -> Tensor:
@@ -59,8 +62,12 @@ def coarse_offset(first: Tensor, second: Tensor) -> Tensor:
     candidates_y = torch.cat([places // columns, places // columns - rows], dim=1).repeat(1, 2)
     candidates_x = (places % columns).repeat(1, 2)
     candidates_x = torch.cat([candidates_x, candidates_x - columns], dim=1)
-    scores = torch.stack(
-        [_overlap_correlation(a, b, candidates_x[:, i], candidates_y[:, i]) for i in range(candidates_x.shape[1])],
+    at_a_time = max(1, _VALUES // a.numel())
+    scores = torch.cat(
+        [
+            _overlap_correlation(a[:, None], b[:, None], candidates_x[:, some], candidates_y[:, some])
+            for some in runs(candidates_x.shape[1], at_a_time)
+        ],
         dim=1,
     )
     best = scores.argmax(1, keepdim=True)
@@ -68,17 +75,25 @@ def coarse_offset(first: Tensor, second: Tensor) -> Tensor:
 
 
 def _overlap_correlation(a: Tensor, b: Tensor, shift_x: Tensor, shift_y: Tensor) -> Tensor:
-    """Correlation of b displaced back by the shift with a, over their overlap, (L,); -1 where that is too small."""
+    """Correlation of b displaced back by shifts (L, C) with a, over their overlap, (L, C); -1 where that is too small.
+
+    Args:
+        a: (L, 1, H, W).
+        b: (L, 1, H, W).
+        shift_x: (L, C) px.
+        shift_y: (L, C) px.
+    """
     rows, columns = a.shape[-2:]
-    y = torch.arange(rows, device=a.device) + shift_y[:, None]
-    x = torch.arange(columns, device=a.device) + shift_x[:, None]
+    y = torch.arange(rows, device=a.device) + shift_y[..., None]
+    x = torch.arange(columns, device=a.device) + shift_x[..., None]
     inside_y, inside_x = (y >= 0) & (y < rows), (x >= 0) & (x < columns)
-    moved = b.gather(1, y.clamp(0, rows - 1)[..., None].expand_as(b))
-    moved = moved.gather(2, x.clamp(0, columns - 1)[:, None].expand_as(b))
-    weight = (inside_y[..., None] & inside_x[:, None]).to(a.dtype)
+    size = (*shift_x.shape, rows, columns)
+    moved = b.expand(size).gather(2, y.clamp(0, rows - 1)[..., None].expand(size))
+    moved = moved.gather(3, x.clamp(0, columns - 1)[..., None, :].expand(size))
+    weight = (inside_y[..., None] & inside_x[..., None, :]).to(a.dtype)
     total = weight.sum((-2, -1)).clamp(min=1)
-    centre_a = a - ((a * weight).sum((-2, -1)) / total)[:, None, None]
-    centre_b = moved - ((moved * weight).sum((-2, -1)) / total)[:, None, None]
+    centre_a = a - ((a * weight).sum((-2, -1)) / total)[..., None, None]
+    centre_b = moved - ((moved * weight).sum((-2, -1)) / total)[..., None, None]
     energy = (weight * centre_a.square()).sum((-2, -1)) * (weight * centre_b.square()).sum((-2, -1))
     correlation = (weight * centre_a * centre_b).sum((-2, -1)) * energy.clamp(min=1e-30).rsqrt()
     enough = total >= _SMALLEST_OVERLAP * rows * columns
