@@ -122,9 +122,13 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
     sums, solution, square = (torch.cat(values, 1) for values in zip(*results, strict=True))
     products, right = _products(sums.sum(2))
     means = _means(products)
-    centred = (values[..., :3, :] - means * values[..., 3:, :] for values in (products[..., :3], right))
-    variance = square / (products[..., 3, 3] - 4).clamp(min=1.0)
-    return RowGradients(images, *centred, variance, _halves(sums, solution, seen))
+    return RowGradients(
+        images,
+        products=products[..., :3, :3] - means * products[..., 3:, :3],
+        pulls=right[..., :3, :] - means * right[..., 3:, :],
+        variance=square / (products[..., 3, 3] - 4).clamp(min=1.0),
+        halves=_halves(sums, solution, seen),
+    )
 
 
 def _explained_rows(rows: _Rows, middle: int, out: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
