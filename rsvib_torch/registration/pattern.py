@@ -12,7 +12,7 @@ from rsvib_torch.spectral import squared_modulus
 
 __all__ = ["column_pattern"]
 
-_ROW_STEP = 4  # every so many rows are asked
+_ASKED, _TOLD = 8, 4  # every so many rows are asked whether there is a pattern, and what it is
 _LARGEST = 3.0  # variance of a row over the typical one
 _NEIGHBOURS = 17  # frequencies judged together
 _SIGNIFICANT = 3.0  # power over what noise gives
@@ -32,9 +32,14 @@ def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor
     Returns:
         (B, U) spectrum of the pattern, shrunk by its noise; None where none stands above it.
     """
+    return None if _pattern_of(groups, _ASKED) is None else _pattern_of(groups, _TOLD)
+
+
+def _pattern_of(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor]], step: int) -> Tensor | None:
+    """``column_pattern`` as every ``step``-th row tells it."""
     found, power, noise, count = (torch.zeros(()) for _ in range(4))
     for spectra, *places in groups:
-        rows, shift, seen, variance = (values[..., ::_ROW_STEP] for values in places)
+        rows, shift, seen, variance = (values[..., ::step] for values in places)
         typical = torch.where(variance > 0, variance, torch.nan).nanmedian(dim=-1, keepdim=True).values
         seen = seen * ((variance > 0) & (variance < _LARGEST * typical))[:, None]
         visible = seen * (seen.sum(1, keepdim=True) > 1)
