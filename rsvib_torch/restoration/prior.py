@@ -19,6 +19,7 @@ __all__ = ["ORDER", "RowPrior", "autoregressive_prior", "brightness", "fit_prior
 ORDER = 2  # rows that a row is predicted from
 _PIECE = (64, 256)  # rows and columns of the pieces whose spectra are averaged
 _MOST_PIECES = 128  # of a frame
+_AT_A_TIME = {"cpu": 4}  # rows of pieces: they stay in the cache
 _EVERY = 8  # rows of which one tells how bright a frame is
 _SMOOTHING = 3  # neighbouring frequencies whose statistics are pooled
 _ITERATIONS = 20
@@ -203,7 +204,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     back = waves(mean, -u).to(frames.dtype.to_complex()).unflatten(1, rows.shape)  # (T, pieces, rows, U)
     back = back * tapers[0][:, None]
     bright = brightness(frames)[..., None, None, None]
-    step = 1 if frames.device.type == "cpu" else len(tops)  # rows of pieces at a time: they stay in the cache
+    step = _AT_A_TIME.get(frames.device.type, len(tops))
     found = []
     for chosen in runs(len(tops), step):
         strips = [frames[..., top : top + size[0], :] for top in tops[chosen]]
