@@ -180,7 +180,8 @@ def detect_vibration(
         band_step: Rows from one band to the next.
         search: Search range in px around the whole-frame offset.
         columns: Look at so many neighbouring pixels of every row only, those with the most detail: every column shows
-            the same vibration, and a quarter of them tells it in half the time, half as accurately. None for all.
+            the same vibration, and a quarter of them tells it in two thirds of the time, half as accurately. None for
+            all.
         ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out (dead, saturated).
         full_scale: Count that means 1.0, for integer frames.
 
