@@ -156,8 +156,8 @@ def _explained_rows(rows: _Rows, middle: int, out: Tensor) -> tuple[tuple[Tensor
     blocks = _sum_of_blocks(energy), _sum_of_blocks(slope), _sum_of_blocks(rows.weight)
     # as a product of matrices: several times faster than with a factor for each row
     means = _means(products).to(weighted.dtype).flatten(0, 1)
-    weighted.flatten(0, 1).baddbmm_(means, rows.weight.flatten(0, 1)[:, None], alpha=-1)
-    out.copy_(weighted)
+    centred = weighted.flatten(0, 1).baddbmm_(means, rows.weight.flatten(0, 1)[:, None], alpha=-1)
+    out.copy_(centred.unflatten(0, out.shape[:2]))
     return (sums, solution, energy.sum(-1).double()), blocks
 
 
