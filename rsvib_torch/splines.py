@@ -21,6 +21,7 @@ __all__ = [
 _PRECISION = 1e-9  # of the largest tap, below which the prefilter is cut off
 _SINGLE_PRECISION = 3e-8  # the same for float32, which does not hold more
 _ROWS, _MANY_ROWS = {"cpu": 64}, 256  # at a time: they stay in the cache
+_FEW, _NOT_MANY = {"cpu": 1 << 20}, 1 << 24  # values of images that do so without being cut
 
 
 def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
@@ -98,7 +99,7 @@ def mirrored(index: Tensor, length: int) -> Tensor:
 
 
 def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[tuple[slice, Tensor]]:
-    """``bspline_coefficients`` across the rows of images, some rows at a time: they stay in the cache.
+    """``bspline_coefficients`` across the rows of images, some rows at a time, or all of small ones.
 
     Args:
         samples: (..., H, W).
@@ -107,6 +108,9 @@ def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[tuple[sli
     Yields:
         Which rows, and their coefficients (..., r, W).
     """
+    if samples.numel() <= _FEW.get(samples.device.type, _NOT_MANY):
+        yield slice(0, samples.shape[-2]), bspline_coefficients(samples, degree, -2)
+        return
     taps = _prefilter_taps(degree, samples.dtype in (torch.float64, torch.complex128))
     reach, height = len(taps) - 1, samples.shape[-2]
     index = mirrored(torch.arange(-reach, height + reach, device=samples.device), height)

@@ -89,6 +89,8 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
     along = (2j * math.pi * spectra.frequencies).to(warped.dtype)
     inner = functional.pad(inner_columns(width, shift, warped.real), (0, length - width))
     valid = spectra.warped_valid(rows, shift)
+    parts = chunks(rows.shape[-1], 4 * length * len(rows) * (8 + 2 * rows.shape[1]), _BLOCK, rows.device)
+    memory = inner.new_empty(len(rows), parts[0].stop, 3 + (1 if rows.shape[1] == 2 else rows.shape[1]), length)
 
     def pixels(part: slice) -> _Rows:
         own, visible = detail[:, part].contiguous(), seen[:, :, part]
@@ -101,8 +103,6 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
             weight = weight * functional.pad(valid[:, part], (0, length - width))
         return _Rows(planes, weight, visible)
 
-    parts = chunks(rows.shape[-1], 4 * length * len(rows) * (8 + 2 * rows.shape[1]), _BLOCK, rows.device)
-    memory = inner.new_empty(len(rows), parts[0].stop, 3 + (1 if rows.shape[1] == 2 else rows.shape[1]), length)
     images = inner.new_empty(*detail.shape[:2], 3, length)
     results, energies = [], []
     for part in parts:

@@ -5,11 +5,10 @@ from torch import Tensor
 
 from rsvib_torch.pieces import gathered
 from rsvib_torch.spectral import fast_length
-from rsvib_torch.splines import bspline_coefficient_rows, bspline_coefficients
+from rsvib_torch.splines import bspline_coefficient_rows
 
 __all__ = ["continue_rows", "period_of_rows", "spline_spectra"]
 
-_FEW = {"cpu": 1 << 20}  # values that stay in the cache without being cut
 _MARGIN = 8  # px beyond what a displacement shows that either end goes on by itself
 
 
@@ -43,9 +42,6 @@ def continue_rows(images: Tensor, length: int) -> Tensor:
 
 def spline_spectra(images: Tensor, degree: int, length: int) -> Tensor:
     """Transforms (..., H, U) along rows, continued to ``length``, of spline coefficients across images (..., H, W)."""
-    if images.numel() <= _FEW.get(images.device.type, images.numel()):
-        spectra: Tensor = torch.fft.rfft(continue_rows(bspline_coefficients(images, degree, -2), length))
-        return spectra
     pieces = (
         (rows, torch.fft.rfft(continue_rows(coefficients, length)))
         for rows, coefficients in bspline_coefficient_rows(images, degree)
