@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones import MotionModel, ToneFit, drift_response, model_displacements, tone_columns
+from rsvib_torch.detection.tones import MotionModel, ToneFit, drift_response, tone_columns
 
 __all__ = ["fit_roughly", "fit_tones"]
 
 _ITERATIONS, _FEW_ITERATIONS = 30, 5  # of a fit, and of one that another follows
-_TOLERANCE = 1e-7  # of the cost: steps that promise less are not worth taking
+_TOLERANCE, _ROUGH_TOLERANCE = 1e-7, 1e-4  # of the cost, of either: steps that promise less are not worth taking
 _PARAMETERS = 3  # of a tone: real and imaginary part of its amplitude, and its frequency
 
 
@@ -83,9 +83,18 @@ def _tie(model: MotionModel, tones: int, device: torch.device) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Parameters with what they leave: cost (B,), normal matrix (B, M, M) and right-hand side (B, M)."""
+    """Parameters with what they leave.
+
+    Attributes:
+        values: (B, 2, 3 K + J) parameters.
+        residual: (B, N, G, 2) px, what they leave of the displacements.
+        cost: (B,) its weighted square.
+        matrix: (B, M, M), normal matrix of the free parameters.
+        right: (B, M), their right-hand side.
+    """
 
     values: Tensor
+    residual: Tensor
     cost: Tensor
     matrix: Tensor
     right: Tensor
@@ -106,15 +115,13 @@ class _Problem:
 
     Attributes:
         measurements: The displacements.
-        drift_columns: (B, N, G, J), what they see of unit drifts.
+        drift_columns: (B, N, G, 2, J), what they see of unit drifts.
         root: (B, N, 1, 2, 2), upper triangle U with U^T U the information of a row.
-        target: (B, 2 N G) U times the displacements.
     """
 
     measurements: Measurements
     drift_columns: Tensor
     root: Tensor
-    target: Tensor
 
     @classmethod
     def of(cls, measurements: Measurements, model: MotionModel) -> "_Problem":
@@ -124,23 +131,22 @@ class _Problem:
         slant = torch.where(size > 0, both / torch.where(size > 0, size, 1.0), 0.0)
         rest = (second - slant.square()).clamp(min=0.0).sqrt()
         root = torch.stack([size, slant, torch.zeros_like(size), rest], -1).unflatten(-1, (2, 2))[:, :, None]
-        target = (root @ measurements.displacements[..., None])[..., 0].flatten(1)
-        return cls(measurements, drift_response(measurements, model.drift_order), root, target)
+        drifts = drift_response(measurements, model.drift_order)[..., None, :]
+        return cls(measurements, drifts.expand(-1, -1, -1, 2, -1), root)
 
     def evaluate(self, unknowns: _Unknowns, values: Tensor) -> _State:
         """The state at parameters ``values`` (B, 2, 3 K + J)."""
-        coefficients, hertz, drift = unknowns.unpack(values)
+        coefficients, hertz, _ = unknowns.unpack(values)
         columns = self.measurements.relative(tone_columns(self.measurements, coefficients, hertz).flatten(-2))
-        drifts = self.drift_columns[..., None, :].expand(*columns.shape[:-1], drift.shape[-1])
-        jacobian = torch.cat([columns, drifts], dim=-1)  # (B, N, G, axis, parameter of the axis)
-        whole = (self.root[..., None] * jacobian[..., None, :, :]).flatten(-2)  # (B, N, G, 2, parameter of any axis)
-        whole = whole.flatten(1, 3)
-        linear = torch.where(unknowns.is_frequency, 0.0, values).flatten(1)
-        residual = self.target - (whole @ linear[..., None])[..., 0]
-        tied = whole @ unknowns.tie
-        transposed = tied.transpose(-2, -1)
-        matrix, right = transposed @ tied, (transposed @ residual[..., None])[..., 0]
-        return _State(values, residual.square().sum(-1), matrix, right)
+        jacobian = torch.cat([columns, self.drift_columns], dim=-1)  # (B, N, G, axis, parameter of the axis)
+        linear = torch.where(unknowns.is_frequency, 0.0, values)[:, None, None]
+        residual = self.measurements.displacements - (jacobian * linear).sum(-1)
+        # (B, 2 N G, parameter of any axis)
+        whole = (self.root[..., None] * jacobian[..., None, :, :]).flatten(-2).flatten(1, 3)
+        told = (self.root @ residual[..., None]).flatten(1)
+        matrix = unknowns.tie.T @ (whole.mT @ whole) @ unknowns.tie
+        right = (whole.mT @ told[..., None])[..., 0] @ unknowns.tie
+        return _State(values, residual, told.square().sum(-1), matrix, right)
 
 
 def _step(state: _State, keep: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
@@ -154,9 +160,10 @@ def _step(state: _State, keep: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]
 
 
 def _solved(
-    measurements: Measurements, start: Tensor | ToneFit, active: Tensor, model: MotionModel, iterations: int
+    measurements: Measurements, start: Tensor | ToneFit, active: Tensor, model: MotionModel, *, rough: bool
 ) -> tuple[_Unknowns, _State]:
     """The least squares solution from start frequencies, or from another solution, as in ``fit_tones``."""
+    iterations, tolerance = (_FEW_ITERATIONS, _ROUGH_TOLERANCE) if rough else (_ITERATIONS, _TOLERANCE)
     unknowns = _Unknowns.of(active, model)
     problem = _Problem.of(measurements, model)
     if isinstance(start, ToneFit):
@@ -171,7 +178,7 @@ def _solved(
     done = torch.zeros_like(state.cost, dtype=torch.bool)  # each stack stops by itself, whatever it is in a batch with
     for _ in range(iterations):
         step, _ = _step(state, unknowns.free, damping)
-        done = done | ((step * state.right).sum(-1) <= _TOLERANCE * state.cost)  # what the step promises
+        done = done | ((step * state.right).sum(-1) <= tolerance * state.cost)  # what the step promises
         if bool(done.all()):
             break
         trial = problem.evaluate(unknowns, unknowns.moved(state.values, step))
@@ -189,10 +196,10 @@ def fit_roughly(
     Returns:
         The fit, whose covariance has no meaning, and what it leaves of the displacements, (B, N, G, 2).
     """
-    unknowns, state = _solved(measurements, frequencies, active, model, _FEW_ITERATIONS)
+    unknowns, state = _solved(measurements, frequencies, active, model, rough=True)
     coefficients, hertz, drift = unknowns.unpack(state.values)
     fit = ToneFit(coefficients, hertz, active, drift, state.matrix, measurements.centre, model)
-    return fit, measurements.relative(measurements.displacements - model_displacements(measurements, fit))
+    return fit, state.residual
 
 
 def fit_tones(
@@ -214,14 +221,13 @@ def fit_tones(
         The fit with its covariance, scaled by the observed residual.
     """
     model = model or MotionModel()
-    unknowns, state = _solved(measurements, start, active, model, _ITERATIONS)
+    unknowns, state = _solved(measurements, start, active, model, rough=False)
     _, inverse = _step(state, unknowns.free, torch.zeros_like(state.cost))
     spent = unknowns.free.unflatten(1, (2, -1)).sum(-1)
     coefficients, hertz, drift = unknowns.unpack(state.values)
     fit = ToneFit(coefficients, hertz, active, drift, inverse, measurements.centre, model)
-    residual = measurements.displacements - model_displacements(measurements, fit)
     # overlapping bands repeat themselves: the information is that of the independent ones
-    variance = measurements.square(residual).clamp(min=0.0) / (measurements.known - spent).clamp(min=1.0)
+    variance = measurements.square(state.residual).clamp(min=0.0) / (measurements.known - spent).clamp(min=1.0)
     deviation = variance.sqrt().repeat_interleave(state.values.shape[-1], dim=1)
     covariance = (unknowns.tie @ inverse @ unknowns.tie.T) * deviation[:, :, None] * deviation[:, None]
     return replace(fit, covariance=covariance)

@@ -1,5 +1,6 @@
 """What registration tells the fit: displacements of scene rows between frames, with no image left."""
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,7 +23,8 @@ class Measurements:
 
     Attributes:
         moments: (B, N, G) float64 s, exposure start of the row of each frame that shows scene row n.
-        displacements: (B, N, G, 2) float64 px, axes (x, y), with zero mean over the frames that see the row.
+        displacements: (B, N, G, 2) float64 px, axes (x, y), with zero mean over the frames that see the row; 0 in the
+            others.
         seen: (B, N, G) float64, 1 where a frame sees the row, else 0.
         information: (B, N, 2, 2) float64 px^-2, inverse covariance of the displacement in one frame up to a common
             factor; 0 where unknown.
@@ -118,7 +120,13 @@ class Measurements:
 
     def only(self, counts: Tensor) -> "Measurements":
         """The rows that count (B, N), the others known no more."""
-        return replace(self, information=self.information * counts[..., None, None])
+        return self._known_by(self.information * counts[..., None, None])
+
+    def _known_by(self, information: Tensor) -> "Measurements":
+        """The same displacements with another information; what follows from their times is not worked out again."""
+        result = copy(self)
+        object.__setattr__(result, "information", information)
+        return result
 
     def relative(self, values: Tensor) -> Tensor:
         """Values (B, N, G, ...) of every frame less their mean over the frames that see the row, 0 where unseen."""
@@ -143,7 +151,7 @@ class Measurements:
     def scaled(self, factor: Tensor) -> "Measurements":
         """The measurements with their information multiplied by factors (B, N, 2) of each axis."""
         root = factor.sqrt()
-        return replace(self, information=self.information * root[..., :, None] * root[..., None, :])
+        return self._known_by(self.information * root[..., :, None] * root[..., None, :])
 
     def for_least_absolute(self, residual: Tensor) -> "Measurements":
         """Weights that turn a sum of squares into a sum of sizes of the residual: outliers have little pull."""

@@ -128,13 +128,12 @@ def measure_group(
     shown = Shown.of(place, left, group.starts[..., None], timing, motion)
     seen = _seen(shown.rows, group.spectra.height)
     warp = warp_to_same_blur(group.spectra, shown, place, left, timing, motion)
+    warped = (warp(run) for run in group.spectra.runs(place.shape[-1], 2))
     if gradients is None:
-        whole = warp(slice(None))
-        gradients = row_gradients(group.spectra, whole, shown.rows, shown.shift, seen)
+        gradients = row_gradients(group.spectra, warped, shown.rows, shown.shift, seen)
         pulls = gradients.pulls
     else:
-        # each run of rows is forgotten while it is still in the cache
-        pulls = row_pulls((warp(run) for run in group.spectra.runs(place.shape[-1], 2)), gradients, seen)
+        pulls = row_pulls(warped, gradients, seen)
     matrix, right = row_shifts(pulls, gradients, seen)
     matrix = _blocks(matrix[:, None]).sum(3)[:, 0]  # (B, N, 2, 2)
     right = _blocks(right).sum(3)  # (B, G, N, 2)
@@ -161,15 +160,17 @@ def join_groups(parts: list[Measurements]) -> Measurements:
 
     def padded(values: Tensor) -> Tensor:
         missing = most - values.shape[2]
-        return (
-            torch.cat([values, values[:, :, :1].expand(-1, -1, missing, *values.shape[3:])], 2) if missing else values
-        )
+        return functional.pad(values, (0, 0) * (values.ndim - 3) + (0, missing)) if missing else values
+
+    def repeated(moments: Tensor) -> Tensor:
+        missing = most - moments.shape[2]
+        return torch.cat([moments, moments[:, :, :1].expand(-1, -1, missing)], 2) if missing else moments
 
     return replace(
         parts[0],
-        moments=torch.cat([padded(part.moments) for part in parts], 1),
+        moments=torch.cat([repeated(part.moments) for part in parts], 1),
         displacements=torch.cat([padded(part.displacements) for part in parts], 1),
-        seen=torch.cat([functional.pad(part.seen, (0, most - part.seen.shape[-1])) for part in parts], 1),
+        seen=torch.cat([padded(part.seen) for part in parts], 1),
         information=torch.cat([part.information for part in parts], 1),
     )
 

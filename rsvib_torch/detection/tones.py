@@ -86,14 +86,12 @@ def tone_columns(measurements: Measurements, coefficients: Tensor, frequencies: 
     slope = (smeared_slope * times * smeared.flip(0)).sum(0)
     time = measurements.middles
     angle = 2 * math.pi * frequencies[:, None, None] * time
-    cosine, sine = torch.cos(angle), torch.sin(angle)
-    real, imaginary = coefficients.real, coefficients.imag
-    turn = 2 * math.pi * attenuation
-    along = (slope * real)[:, None, None] - time * (turn * imaginary)[:, None, None]
-    across = (slope * imaginary)[:, None, None] + time * (turn * real)[:, None, None]
-    by_frequency = along * cosine - across * sine
-    attenuation = attenuation[:, None, None]
-    return torch.stack([attenuation * cosine, -attenuation * sine, by_frequency], dim=-1)
+    wave = torch.complex(angle.cos(), angle.sin())
+    # derivatives by f: of the attenuation, and of the angle
+    start, turn = (slope * coefficients)[:, None, None], (2j * math.pi * attenuation * coefficients)[:, None, None]
+    by_frequency = ((start + time * turn) * wave).real
+    by_parts = torch.view_as_real((attenuation[:, None, None] * wave).conj().resolve_conj())
+    return torch.cat([by_parts, by_frequency[..., None]], dim=-1)
 
 
 def _sinc(x: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,10 +8,11 @@ from rsvib_torch.vibration import Vibration
 
 __all__ = ["rows_showing"]
 
+_STEPS, _FEW = 8, 3  # of Newton's method, and those that are mostly enough
+_TINY = 1e-6  # px: the square of it is what a step as small as that leaves
 
-def rows_showing(
-    scene_rows: Tensor, frame_start: Tensor, timing: SensorTiming, vibration: Vibration, iterations: int = 8
-) -> Tensor:
+
+def rows_showing(scene_rows: Tensor, frame_start: Tensor, timing: SensorTiming, vibration: Vibration) -> Tensor:
     """Frame rows r(s) that show scene rows s: the solution of ``r = s + Y(t(r))``.
 
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
@@ -23,17 +24,19 @@ def rows_showing(
         frame_start: Exposure start of the frame's first row in seconds, broadcastable to S.
         timing: The sensor.
         vibration: The motion, in row order.
-        iterations: Steps.
 
     Returns:
         Frame rows, float64, broadcast shape of S and ``frame_start``.
     """
     scene_rows = scene_rows.to(torch.float64)
     rows = scene_rows + torch.zeros_like(frame_start)
-    for _ in range(iterations):
+    for taken in range(1, _STEPS + 1):
         starts = frame_start + rows * timing.row_time
         miss = scene_rows + vibration.mean_displacement(starts, timing.exposure_time)[..., 1] - rows
         # Newton's step: an image motion of half a frame moves 0.5 px a row time
         slope = vibration.velocity(starts + 0.5 * timing.exposure_time)[..., 1].detach() * timing.row_time
-        rows = rows + miss / (1.0 - slope).clamp(min=0.1)
+        step = miss / (1.0 - slope).clamp(min=0.1)
+        rows = rows + step
+        if taken == _FEW and bool((step.abs() < _TINY).all()):
+            break
     return rows

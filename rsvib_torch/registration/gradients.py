@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.registration.row_spectra import RowSpectra, chunks, differences, inner_columns
-from rsvib_torch.registration.scene_detail import scene_detail
+from rsvib_torch.registration.scene_detail import Compared, scene_detail
 
 __all__ = ["RowGradients", "row_gradients", "row_pulls", "row_shifts"]
 
@@ -71,12 +71,15 @@ class _Rows:
         return self.planes[:, :, 3:]
 
 
-def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tensor, seen: Tensor) -> RowGradients:
+def row_gradients(
+    spectra: RowSpectra, warped: Iterable[Tensor], rows: Tensor, shift: Tensor, seen: Tensor
+) -> RowGradients:
     """Gradients of the scene, its noise, and the weight of every pixel, from frames warped by a motion.
 
     Args:
         spectra: The frames of a group.
-        warped: (B, G, S, U) their rows warped to the scene, from ``RowSpectra.warped``.
+        warped: Their rows (B, G, s, U) warped to the scene, from ``RowSpectra.warped``: S rows in all, one run of them
+            after the other.
         rows: (B, G, S) frame rows that show the S scene rows, in each frame.
         shift: (B, G, S) px, displacement along the rows to be taken out of each.
         seen: (B, G, S) float64, 1 where a frame sees the row.
@@ -85,16 +88,17 @@ def row_gradients(spectra: RowSpectra, warped: Tensor, rows: Tensor, shift: Tens
         The gradients.
     """
     length, width = spectra.length, spectra.width
-    detail, across = scene_detail(warped, seen, spectra.frequencies)
-    along = (2j * math.pi * spectra.frequencies).to(warped.dtype)
-    inner = functional.pad(inner_columns(width, shift, warped.real), (0, length - width))
+    compared = Compared.of(warped, seen)
+    detail, across = scene_detail(compared, spectra.frequencies)
+    along = (2j * math.pi * spectra.frequencies).to(detail.dtype)
+    inner = functional.pad(inner_columns(width, shift, detail.real), (0, length - width))
     valid = spectra.warped_valid(rows, shift)
-    parts = chunks(rows.shape[-1], 4 * length * len(rows) * (8 + 2 * rows.shape[1]), _BLOCK, rows.device)
+    parts = chunks(rows.shape[-1], 4 * length * len(rows) * (4 + rows.shape[1]), _BLOCK, rows.device)
     memory = inner.new_empty(len(rows), parts[0].stop, 3 + (1 if rows.shape[1] == 2 else rows.shape[1]), length)
 
     def pixels(part: slice) -> _Rows:
         own, visible = detail[:, part].contiguous(), seen[:, :, part]
-        spectra = [own * along, across[:, part], own, *differences(warped[:, :, part], visible).unbind(1)]
+        spectra = [own * along, across[:, part], own, *compared.differences[:, :, part].unbind(1)]
         planes = memory[:, : own.shape[1]]
         for place, one in enumerate(spectra):
             planes[:, :, place] = torch.fft.irfft(one, n=length)
@@ -143,7 +147,7 @@ def _explained_rows(rows: _Rows, middle: int, out: Tensor) -> tuple[tuple[Tensor
         Products from ``_sums_of_halves``, the factors that explain the rows, and the weighted sum (B, s) of the squares
         of what is left, in one frame; and what ``_trust`` asks for.
     """
-    weighted = rows.images * rows.weight[:, :, None]
+    weighted = torch.mul(rows.images, rows.weight[:, :, None], out=out)
     sums = _sums_of_halves(weighted, rows, middle)
     products, right = _products(sums.sum(2))
     solution = _explanation(products, right.transpose(-2, -1))
@@ -154,10 +158,10 @@ def _explained_rows(rows: _Rows, middle: int, out: Tensor) -> tuple[tuple[Tensor
     energy /= spare[..., None].to(energy.dtype)
     slope = (weighted[:, :, 0] * rows.planes[:, :, 0]).addcmul_(weighted[:, :, 1], rows.planes[:, :, 1])
     blocks = _sum_of_blocks(energy), _sum_of_blocks(slope), _sum_of_blocks(rows.weight)
-    # as a product of matrices: several times faster than with a factor for each row
-    means = _means(products).to(weighted.dtype).flatten(0, 1)
-    centred = weighted.flatten(0, 1).baddbmm_(means, rows.weight.flatten(0, 1)[:, None], alpha=-1)
-    out.copy_(centred.unflatten(0, out.shape[:2]))
+    means = _means(products).to(weighted.dtype)
+    for image, mean, weight in zip(weighted, means, rows.weight, strict=True):
+        # as a product of matrices: several times faster than with a factor for each row
+        image.baddbmm_(mean, weight[:, None], alpha=-1)
     return (sums, solution, energy.sum(-1).double()), blocks
 
 

@@ -1,14 +1,16 @@
 """What the mean of warped frames tells of the scene: all of it that stands above the noise, by a Wiener filter."""
 
 import math
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.registration.row_spectra import chunks, combined, mean_over_frames
+from rsvib_torch.registration.row_spectra import chunks, combined, differences, mean_over_frames
 
-__all__ = ["scene_detail"]
+__all__ = ["Compared", "scene_detail"]
 
 _PASS_ROWS = (0.24, 0.34)  # cycles/px across rows: full weight below, none above
 _PASS_COLUMNS = (0.40, 0.48)  # along rows, where interpolation is exact but detail near the limit may be aliased
@@ -17,21 +19,58 @@ _SMOOTH = 16  # values of the spectra that are averaged along each axis
 _SOME = 4  # along rows, of which one tells the noise
 
 
-def scene_detail(warped: Tensor, seen: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """What the frames of a group show of a scene together, and what they differ by: spectra along its S rows.
+
+    Attributes:
+        mean: (B, S, U), over the frames that see a row.
+        noise: (B, S, U / 4), a difference of two frames with the noise of their mean, at every fourth frequency.
+        differences: (B, G, S, U), or (B, 1, S, U) of two frames, as from ``differences``.
+    """
+
+    mean: Tensor
+    noise: Tensor
+    differences: Tensor
+
+    @classmethod
+    def of(cls, warped: Iterable[Tensor], seen: Tensor) -> "Compared":
+        """From frames warped to the scene.
+
+        Args:
+            warped: (B, G, s, U) for S rows in all, one run of them after the other: each is forgotten while it is still
+                in the cache.
+            seen: (B, G, S) float64, 1 where a frame sees the row.
+        """
+        whole: list[Tensor] = []
+        first = 0
+        for run in warped:
+            visible = seen[:, :, first : first + run.shape[2]]
+            of_run = (
+                mean_over_frames(run, visible),
+                _noise_of_mean(run[..., ::_SOME], visible),
+                differences(run, visible),
+            )
+            whole = whole or [one.new_empty(*one.shape[:-2], seen.shape[2], one.shape[-1]) for one in of_run]
+            for all_rows, one in zip(whole, of_run, strict=True):
+                all_rows[..., first : first + run.shape[2], :] = one
+            first += run.shape[2]
+        return cls(*whole)
+
+
+def scene_detail(compared: Compared, u: Tensor) -> tuple[Tensor, Tensor]:
     """Detail of the scene and its gradient across rows, from the mean of the frames.
 
     Args:
-        warped: (B, G, S, U) spectra along rows of the frames of a group, warped to the scene.
-        seen: (B, G, S) float64, 1 where a frame sees the row.
+        compared: The frames of a group.
         u: (U,) frequencies along rows, cycles/px.
 
     Returns:
         Spectra (B, S, U) each, px^-1 the latter.
     """
-    v = torch.fft.fftfreq(warped.shape[-2], dtype=torch.float64, device=u.device)
+    v = torch.fft.fftfreq(compared.mean.shape[-2], dtype=torch.float64, device=u.device)
     # transforms across rows leave the rows side by side in memory, and all that follows runs along them
-    whole = torch.fft.fft(mean_over_frames(warped, seen), dim=-2).transpose(-2, -1)
-    noise = torch.fft.fft(_noise_of_mean(warped[..., ::_SOME], seen), dim=-2).transpose(-2, -1)
+    whole, noise = (torch.fft.fft(rows, dim=-2).transpose(-2, -1) for rows in (compared.mean, compared.noise))
     torch.view_as_real(whole).mul_(_wiener(whole, noise, u, v)[..., None])
     detail = torch.fft.ifft(whole)
     whole *= (2j * math.pi * v).to(whole.dtype)

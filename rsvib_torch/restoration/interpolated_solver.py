@@ -1,5 +1,6 @@
 """Banded systems that change smoothly with frequency: factors of a few of them, interpolated for all others."""
 
+import itertools
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +15,7 @@ Mixture = list[tuple[slice, slice, Tensor]]
 
 __all__ = ["NodeFactors", "SubstitutionMemory", "chosen_nodes"]
 
+_ALIGNED = 8  # nodes: products of matrices take several times as long where rows do not begin at full cache lines
 _FINER = 4.0  # times the frequency itself: steps between low frequencies, where priors change most, are smaller
 _BLOCK = 96  # systems that one product of matrices interpolates: few nodes count for them
 _ROWS = {"cpu": 160}  # that are interpolated at a time: they stay in the cache
@@ -34,7 +36,11 @@ def chosen_nodes(frequencies: int, step: float, device: torch.device) -> Tensor:
     nodes, last = [0], frequencies - 1
     while nodes[-1] < last:
         nodes.append(min(last, nodes[-1] + max(1, int(min(step, nodes[-1] / _FINER)))))
-    return torch.tensor(nodes, device=device)
+    missing = -len(nodes) % _ALIGNED
+    steps = [after - before for before, after in itertools.pairwise(nodes)]
+    widest = sorted(range(len(steps)), key=lambda k: -steps[k])[:missing]
+    nodes += [nodes[k] + steps[k] // 2 for k in widest if steps[k] > 1]
+    return torch.tensor(sorted(nodes), device=device)
 
 
 @dataclass(frozen=True, eq=False)

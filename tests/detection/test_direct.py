@@ -152,6 +152,18 @@ def test_two_tones_over_four_frames_are_counted(paper_camera):
         assert (found.amplitude[:, k] / truth.amplitude[:, 0] - 1).abs().max() < 5e-3
 
 
+@pytest.mark.parametrize("num_frames", [8, 10])
+def test_uneven_groups_of_frames_know_their_errors(num_frames):
+    """Ten frames make groups of five and six: what the smaller one has no frame for is no error."""
+    camera = SensorTiming(row_time=163e-6, exposure_rows=3, frame_rows=256)
+    motion = Motion(phase=(0.4, -1.9))
+    frames = pair_of(camera, motion, 44, 0.01, 256, 192, num_frames)
+    found = detect_vibration(frames, camera, tones=1)
+    wrong = (found.vibration.amplitude - motion.vibration().amplitude).abs()
+    assert bool((found.std.amplitude < 0.005).all()), found.std.amplitude
+    assert bool((wrong < 4 * found.std.amplitude).all()), (wrong, found.std.amplitude)
+
+
 def test_still_camera_and_blind_frequency_are_refused(paper_camera):
     still = pair_of(paper_camera, Motion((0.0, 0.0), (0.0, 0.0), (0.0, 0.0)), 44, 0.005, columns=256)
     result = detect_vibration(still, paper_camera, method="direct")
@@ -265,7 +277,7 @@ def test_rows_tell_a_known_shift(remaining, num_frames):
     rows = torch.arange(96, dtype=torch.float64).expand(1, num_frames, 96)
     seen = ((rows >= 8) & (rows <= 87)).double()
     none = torch.zeros_like(rows)
-    gradients = row_gradients(spectra, spectra.warped(rows, none), rows, none, seen)
+    gradients = row_gradients(spectra, [spectra.warped(rows, none)], rows, none, seen)
     expected = remaining * (torch.arange(num_frames) - (num_frames - 1) / 2)
 
     def told(shift):
