@@ -41,15 +41,15 @@ def extend_rows(images: Tensor, length: int) -> Tensor:
     if extra <= 0:
         return images
     reach = min(extra, width - 1)
-    steps = torch.arange(1, reach + 1, device=images.device)
-    taper = 0.5 + 0.5 * torch.cos(torch.pi * steps.to(images.dtype) / (reach + 1))
+    steps = torch.arange(1, reach + 1, dtype=images.dtype, device=images.device)
+    taper = 0.5 + 0.5 * torch.cos(steps * (torch.pi / (reach + 1)))
     first, last = images[..., :1], images[..., -1:]
     middle = 0.5 * (first + last)
-    after = (2 * last - images[..., width - 1 - steps] - middle) * taper
-    before = (2 * first - images[..., steps] - middle) * taper
+    after = (2 * last - middle - images[..., width - 1 - reach : width - 1].flip(-1)) * taper
+    before = (2 * first - middle - images[..., 1 : 1 + reach].flip(-1)) * taper.flip(-1)
     gap = middle.expand(*images.shape[:-1], extra).clone()
     gap[..., :reach] += after
-    gap[..., extra - reach :] += before.flip(-1)
+    gap[..., extra - reach :] += before
     return torch.cat([images, gap], dim=-1)
 
 
@@ -78,8 +78,8 @@ def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dt
     tables = []
     for steps in (coarse, fine):
         turns = shift[..., None] * (steps.to(torch.float64) / length)
-        angle = (turns - turns.detach().round()) * (2 * math.pi)
-        tables.append(torch.complex(angle.cos(), angle.sin()).to(dtype))  # several times faster than torch.polar
+        angle = ((turns - turns.detach().round()) * (2 * math.pi)).to(dtype.to_real())
+        tables.append(torch.complex(angle.cos(), angle.sin()))  # several times faster than torch.polar
     product = tables[0][..., :, None] * tables[1][..., None, :]
     return product.flatten(-2)[..., : stop - start]
 

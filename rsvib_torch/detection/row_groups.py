@@ -30,6 +30,7 @@ __all__ = [
 BLOCK = 8  # rows that give one measurement: tones up to 1 / (16 T_row) are told apart
 LARGEST_GROUP = 8  # of a group that shares one mean scene
 _LEAST_OVERLAP = 0.5  # of the frame that the frames of a group share
+_EVERY = 4  # rows of which one tells how bright a frame is
 _CONDITION = 1e-4  # least share of the product of the diagonal that a block's determinant must keep
 
 
@@ -182,7 +183,8 @@ def measure_groups(groups: list[FrameGroup], timing: SensorTiming, motion: Vibra
 
 def _level_and_contrast(frames: Tensor, valid: Tensor | None) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation (B, T, 1, 1) of the pixels of each frame that count."""
-    if valid is None:
+    if valid is None:  # some rows tell them well enough
+        frames = frames[..., ::_EVERY, :]
         weight, level = None, frames.mean((-2, -1), keepdim=True)
         count = level.new_tensor(frames[0, 0].numel())
     else:

@@ -74,7 +74,7 @@ class RowSpectra:
     def warped(self, rows: Tensor, shift: Tensor) -> Tensor:
         """Spectra (B, T, S, U) of frame rows at fractional places ``rows``, moved back by ``shift``, both (B, T, S)."""
         cell = rows.floor()
-        weights = bspline_weights(rows - cell, DEGREE).to(self._all_rows.dtype)
+        weights = bspline_weights((rows - cell).to(self._all_rows.dtype), DEGREE)
         first = cell.to(torch.int64) - DEGREE // 2
         taps = torch.arange(DEGREE + 1, device=rows.device)
         index = self._first_rows[..., None, None] + (first[..., None] + taps).clamp(0, self.height - 1)
