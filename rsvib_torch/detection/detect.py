@@ -15,7 +15,7 @@ from rsvib_torch.detection.door import grey_frames
 from rsvib_torch.detection.freeform import MotionDetection, detect_motion
 from rsvib_torch.detection.inversion import vibration_of_fit
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, VibrationStd, stacked
-from rsvib_torch.detection.row_groups import LARGEST_GROUP, stack_spectra
+from rsvib_torch.detection.row_groups import LARGEST_GROUP, intervals_compared, stack_spectra
 from rsvib_torch.detection.selection import MAX_TONES, find_tones
 from rsvib_torch.detection.swept import SweptTone, detect_swept_tone
 from rsvib_torch.detection.tones import MotionModel, ToneFit, model_displacements
@@ -276,9 +276,8 @@ def _detect(frames: Tensor, valid: Tensor | None, timing: SensorTiming, options:
     later = curve.rows + fitted[..., 1]
     shown = (later >= 0.5 * options.bands.band_rows) & (later <= frames.shape[-2] - 1 - 0.5 * options.bands.band_rows)
     duration = float(curve.later_times.max() - curve.times.min()) + options.bands.band_rows * timing.row_time
-    starts = in_rows.frame_starts(frames.shape[1], frames.device)
-    baselines = 1 if options.method == "bands" else min(len(starts), LARGEST_GROUP) - 1
-    intervals = torch.cat([starts[step:] - starts[:-step] for step in range(1, baselines + 1)])
+    largest = 2 if options.method == "bands" else LARGEST_GROUP
+    intervals = intervals_compared(in_rows, frames.shape[1], largest, frames.device)
     verdicts = [
         judge(
             vibration[index],

@@ -10,12 +10,21 @@ from torch.nn import functional
 
 from rsvib_torch.detection.equal_blur import blurred_unlike
 from rsvib_torch.detection.fit import fit_tones
-from rsvib_torch.detection.inversion import vibration_of_fit
+from rsvib_torch.detection.inversion import known_motion
 from rsvib_torch.detection.leftovers import independent_fraction, slant, unexplained
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import OtherMotion
 from rsvib_torch.detection.robust import of_each, residual_of, robust_fit, shown_size, typical_size
-from rsvib_torch.detection.row_groups import BLOCK, FrameGroup, frame_groups, join_groups, measure_group, warping
+from rsvib_torch.detection.row_groups import (
+    BLOCK,
+    LARGEST_GROUP,
+    FrameGroup,
+    frame_groups,
+    intervals_compared,
+    join_groups,
+    measure_group,
+    warping,
+)
 from rsvib_torch.detection.selection import find_tones, significant_only, strongest_only
 from rsvib_torch.detection.tones import ToneFit
 from rsvib_torch.registration.gradients import RowGradients
@@ -163,7 +172,7 @@ def refine_directly(
     Returns:
         The last measurements and the fit to them.
     """
-    motion, _ = vibration_of_fit(start)
+    motion = known_motion(start)
     groups = frame_groups(spectra, timing, motion, alike=True)
     found = _refine(groups, timing, start, tones, iterations)
     tried = torch.zeros_like(start.active[..., 0])
@@ -176,7 +185,10 @@ def refine_directly(
         tried = tried | rival
         other, _ = robust_fit(found.measurements, frequencies, strongest_only(found.fit).active, start.model)
         found = _better_of_each(found, _refine(groups, timing, other, tones, iterations))
-    return found
+    if tones is not None:
+        return found
+    intervals = intervals_compared(timing, spectra.values.shape[1], LARGEST_GROUP, start.active.device)
+    return replace(found, fit=significant_only(found.measurements, found.fit, intervals))
 
 
 def _refine(
@@ -184,7 +196,7 @@ def _refine(
 ) -> DirectFit:
     """Measure around the motion, fit, repeat."""
     fit, model = start, start.model
-    motion, _ = vibration_of_fit(fit)
+    motion = known_motion(fit)
     gradients: list[RowGradients | None] = [None] * len(groups)
     steps: list[_Step] = []
     cleanings = _CLEANINGS
@@ -204,7 +216,7 @@ def _refine(
             fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual_of(measurements, fit))
             if step > search_at:
                 fit = _without_runaways(measurements, before, fit)
-        motion, _ = vibration_of_fit(fit)
+        motion = known_motion(fit)
         if step == iterations - 1:
             break
         reached = measurements.relative(_displacements(measurements, motion))
@@ -228,11 +240,11 @@ def _refine(
             nearer = _corrected(measurements, steps)
             if nearer is not measurements:
                 fit, _ = robust_fit(nearer, fit.frequencies, fit.active, model, residual_of(nearer, fit))
-                motion, _ = vibration_of_fit(fit)
+                motion = known_motion(fit)
                 reached = measurements.relative(_displacements(measurements, motion))
         if float((reached - placed).abs().amax()) > _NEAR:
             gradients = [None] * len(groups)
-    return _concluded(measurements, fit, tones, gradients)
+    return _concluded(measurements, fit, gradients)
 
 
 def _beyond_blind(found: DirectFit, start: ToneFit, tried: Tensor) -> tuple[Tensor, Tensor]:
@@ -281,14 +293,12 @@ def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:
     return DirectFit(measurements, fit, of_each(better, other.other_motion, one.other_motion))
 
 
-def _concluded(told: Measurements, fit: ToneFit, tones: int | None, gradients: list[RowGradients | None]) -> DirectFit:
+def _concluded(told: Measurements, fit: ToneFit, gradients: list[RowGradients | None]) -> DirectFit:
     """The last fit, to what the rows say themselves."""
     residual = residual_of(told, fit)
     weighed = told.reweighted(residual)
     share = independent_fraction(weighed, residual) * told.share_counted(residual)
     honest = replace(weighed, independent=share)
     fit = fit_tones(honest, fit.frequencies, fit.active, fit.model)
-    if tones is None:
-        fit = significant_only(honest, fit)
     apart = OtherMotion(unexplained(told, residual), slant([g for g in gradients if g is not None]))
     return DirectFit(honest, fit, apart)

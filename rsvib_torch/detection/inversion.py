@@ -1,6 +1,7 @@
 """From the fit to the vibration: amplitude, frequency and phase at the time origin, with standard deviations."""
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -9,58 +10,96 @@ from rsvib_torch.detection.result import VibrationStd
 from rsvib_torch.detection.tones import ToneFit
 from rsvib_torch.vibration import Vibration
 
-__all__ = ["vibration_of_fit"]
+__all__ = ["amplitude_deviation", "known_motion", "motion_of_fit", "vibration_of_fit"]
 
 
-def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
-    """Vibration (B, 2, K) and its standard deviations from a fit (Eqs. 6-8; gain and exposure are in the fit already).
+def _own_covariance(fit: ToneFit) -> tuple[Tensor, Tensor]:
+    """Covariances of each axis by itself: of the parameters of every tone (B, 2, K, 3, 3), of drifts (B, 2, J, J)."""
+    tones = fit.frequencies.shape[-1]
+    size = 3 * tones + fit.drift.shape[-1]
+    own = fit.covariance.reshape(-1, 2, size, 2, size).diagonal(dim1=1, dim2=3).movedim(-1, 1)  # (B, 2, size, size)
+    blocks = torch.stack([own[..., 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(tones)], dim=2)
+    return blocks, own[..., 3 * tones :, 3 * tones :]
 
-    ``A = |C|``, ``phi = arg C + pi/2 - 2 pi f centre``; errors are carried through by their first derivatives, with all
-    covariances. Tones that are not active have amplitude, frequency and standard deviations 0.
+
+def _deviation(fit: ToneFit, blocks: Tensor, *derivative: Tensor) -> Tensor:
+    """Standard deviation (B, 2, K) of what depends on the parameters of a tone by these derivatives (B, 2, K)."""
+    vector = torch.stack(derivative, dim=-1)
+    variance = torch.einsum("bakp,bakpq,bakq->bak", vector, blocks, vector).clamp(min=0.0)
+    return torch.where(fit.active, variance.sqrt(), 0.0)
+
+
+def _direction(fit: ToneFit) -> tuple[Tensor, Tensor, Tensor]:
+    """Real and imaginary part of coefficients over their modulus, and that, 1 where there is no tone."""
+    amplitude = torch.where(fit.active, fit.coefficients.abs(), 0.0)
+    safe = torch.where(amplitude > 0, amplitude, 1.0)
+    return fit.coefficients.real / safe, fit.coefficients.imag / safe, safe
+
+
+def amplitude_deviation(fit: ToneFit) -> Tensor:
+    """Standard deviation (B, 2, K) of the amplitudes in px; 0 for tones that are not active."""
+    real, imaginary, _ = _direction(fit)
+    return _deviation(fit, _own_covariance(fit)[0], real, imaginary, torch.zeros_like(real))
+
+
+def motion_of_fit(fit: ToneFit) -> Vibration:
+    """Vibration (B, 2, K) from a fit: ``A = |C|``, ``phi = arg C + pi/2 - 2 pi f centre`` (Eqs. 6-8).
+
+    Gain and exposure are in the fit already. Tones that are not active have amplitude and frequency 0.
     """
-    batch, _, tones = fit.frequencies.shape
     centre = fit.centre[:, None, None]
     amplitude = torch.where(fit.active, fit.coefficients.abs(), 0.0)
     frequency = torch.where(fit.active, fit.frequencies, 0.0)
     phase = fit.coefficients.angle() + 0.5 * math.pi - 2 * math.pi * frequency * centre
     phase = torch.remainder(phase + math.pi, 2 * math.pi) - math.pi
     phase = torch.where(fit.active, phase, 0.0)
+    motion, acceleration = fit.drift[..., 0], torch.zeros_like(fit.drift[..., 0])
+    if fit.drift.shape[-1] > 1:  # from the middle of the record to the time origin
+        acceleration = fit.drift[..., 1]
+        motion = motion - acceleration * centre[..., 0]
+    return Vibration(amplitude, frequency, phase, motion, acceleration)
 
-    size = 3 * tones + fit.drift.shape[-1]
-    own = fit.covariance.reshape(batch, 2, size, 2, size).diagonal(dim1=1, dim2=3).movedim(-1, 1)  # (B, 2, size, size)
-    blocks = torch.stack([own[..., 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(tones)], dim=2)
-    safe = torch.where(amplitude > 0, amplitude, 1.0)
-    real, imaginary = fit.coefficients.real / safe, fit.coefficients.imag / safe
+
+def known_motion(fit: ToneFit) -> Vibration:
+    """As much of the motion of a fit as its errors leave for sure.
+
+    An amplitude A with deviation s counts for ``A max(0, 1 - s^2 / A^2)`` (positive-part James-Stein estimate): tones
+    near a blind frequency, of which the fit knows next to nothing, must not move frames.
+    """
+    share = (1 - (amplitude_deviation(fit) / fit.coefficients.abs().clamp(min=1e-30)).square()).clamp(min=0.0)
+    return motion_of_fit(replace(fit, coefficients=fit.coefficients * share))
+
+
+def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
+    """Vibration (B, 2, K) from a fit as ``motion_of_fit``, and its standard deviations.
+
+    Errors are carried through by their first derivatives, with all covariances. Tones that are not active have standard
+    deviations 0.
+    """
+    centre = fit.centre[:, None, None]
+    blocks, variance = _own_covariance(fit)
+    real, imaginary, size = _direction(fit)
     zero, one = torch.zeros_like(real), torch.ones_like(real)
-
-    def deviation(*derivative: Tensor) -> Tensor:
-        vector = torch.stack(derivative, dim=-1)
-        variance = torch.einsum("bakp,bakpq,bakq->bak", vector, blocks, vector).clamp(min=0.0)
-        return torch.where(fit.active, variance.sqrt(), 0.0)
-
-    frequency_std = deviation(zero, zero, one)
-    period_std = frequency_std / torch.where(frequency > 0, frequency, 1.0).square()
+    frequency = torch.where(fit.active, fit.frequencies, 0.0)
+    frequency_std = _deviation(fit, blocks, zero, zero, one)
     turn = -2 * math.pi * centre.expand_as(real)
     std = {
-        "amplitude": deviation(real, imaginary, zero),
+        "amplitude": amplitude_deviation(fit),
         "frequency": frequency_std,
-        "period": period_std,
-        "phase": deviation(-imaginary / safe, real / safe, turn),
+        "period": frequency_std / torch.where(frequency > 0, frequency, 1.0).square(),
+        "phase": _deviation(fit, blocks, -imaginary / size, real / size, turn),
     }
-    order = amplitude.argsort(dim=-1, descending=True, stable=True)
+    order = torch.where(fit.active, fit.coefficients.abs(), 0.0).argsort(dim=-1, descending=True, stable=True)
     std = {name: value.take_along_dim(order, -1) for name, value in std.items()}
-    drift, variance = fit.drift, own[..., 3 * tones :, 3 * tones :]
-    motion, acceleration = drift[..., 0], torch.zeros_like(drift[..., 0])
-    motion_variance, acceleration_variance = variance[..., 0, 0], torch.zeros_like(motion)
-    if drift.shape[-1] > 1:  # from the middle of the record to the time origin
-        acceleration, acceleration_variance = drift[..., 1], variance[..., 1, 1]
-        motion = motion - acceleration * centre[..., 0]
+    motion_variance, acceleration_variance = variance[..., 0, 0], torch.zeros_like(variance[..., 0, 0])
+    if fit.drift.shape[-1] > 1:  # from the middle of the record to the time origin
+        acceleration_variance = variance[..., 1, 1]
         motion_variance = (
-            motion_variance - 2 * centre[..., 0] * variance[..., 0, 1] + centre[..., 0].square() * variance[..., 1, 1]
+            motion_variance - 2 * centre[..., 0] * variance[..., 0, 1] + centre[..., 0].square() * acceleration_variance
         )
     deviations = VibrationStd(
         **std,
         image_motion=motion_variance.clamp(min=0.0).sqrt(),
         image_acceleration=acceleration_variance.clamp(min=0.0).sqrt(),
     )
-    return Vibration(amplitude, frequency, phase, motion, acceleration), deviations
+    return motion_of_fit(fit), deviations

@@ -20,6 +20,7 @@ __all__ = [
     "LARGEST_GROUP",
     "FrameGroup",
     "frame_groups",
+    "intervals_compared",
     "join_groups",
     "measure_group",
     "measure_groups",
@@ -55,6 +56,12 @@ def _frames_in_group(motion: Vibration, starts: Tensor, size: tuple[int, int]) -
     extent = torch.tensor([size[1], size[0]], dtype=moved.dtype, device=moved.device)
     fraction = float((moved / extent).amax())
     return int(max(2, min(LARGEST_GROUP, 1 + (1 - _LEAST_OVERLAP) // max(fraction, 1e-9))))
+
+
+def intervals_compared(timing: SensorTiming, num_frames: int, largest_group: int, device: torch.device) -> Tensor:
+    """Times (M,) in seconds between frames that are compared with each other, in groups of so many at most."""
+    starts = timing.frame_starts(num_frames, device)
+    return torch.cat([starts[step:] - starts[:-step] for step in range(1, min(num_frames, largest_group))])
 
 
 def stack_spectra(frames: Tensor, valid: Tensor | None) -> RowSpectra:

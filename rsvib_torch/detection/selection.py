@@ -1,5 +1,6 @@
 """How many tones: added one by one, strongest first, as long as the data ask for them."""
 
+import math
 from dataclasses import replace
 
 import torch
@@ -7,14 +8,26 @@ from torch import Tensor
 
 from rsvib_torch.detection.blind_tones import with_blind_tones
 from rsvib_torch.detection.fit import fit_roughly, fit_tones
+from rsvib_torch.detection.inversion import amplitude_deviation
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.periodogram import BLIND, MAJORITY, strongest_frequencies
 from rsvib_torch.detection.robust import of_each, residual_of, robust_fit, typical_size
 from rsvib_torch.detection.tones import MotionModel, ToneFit, tone_response
 
-__all__ = ["MAX_TONES", "find_tones", "significant_only", "strongest_only"]
+__all__ = [
+    "LEAST_GAIN",
+    "LEAST_SIGNIFICANCE",
+    "LEAST_SWING",
+    "MAX_TONES",
+    "find_tones",
+    "significant_only",
+    "strongest_only",
+]
 
 MAX_TONES = 4
+LEAST_GAIN = 0.1  # |gain| below this multiplies noise more than tenfold
+LEAST_SIGNIFICANCE = 4.0  # amplitude over its standard deviation
+LEAST_SWING = 0.01  # px, offsets that a tone makes: less may be left over from interpolation
 _FADED = 0.1  # of its amplitude is all that an exposure leaves of a tone
 _F_THRESHOLD = 14.0  # of chi-square gained per parameter over noise: chance over a whole frequency grid stays below it
 _LEAST_GAIN = 0.2  # of the residual chi-square that a further tone must explain
@@ -213,21 +226,29 @@ def _resolved(measurements: Measurements, fit: ToneFit) -> Tensor:
     return ~((order[..., 1:] - order[..., :-1]) * span[:, None, None] < _LEAST_APART).any(-1)
 
 
-def significant_only(measurements: Measurements, fit: ToneFit, least: float = 4.0) -> ToneFit:
-    """The fit without the tones, but the strongest of an axis, that are less than ``least`` standard deviations tall.
+def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor) -> ToneFit:
+    """The fit without the tones, but the strongest of an axis, that are not significant or too small.
 
-    With harmonics, a family goes as a whole.
+    Less than four standard deviations may be noise, and less than 0.01 px of offsets what interpolation and blur leave.
+    Where the gain is small that is no small amplitude, and the tone stays for the verdict. With harmonics, a family
+    goes as a whole.
+
+    Args:
+        measurements: What was fitted.
+        fit: With its covariance.
+        intervals: (M,) s, times between the frames compared.
     """
-    harmonics = fit.model.harmonics
-    deviation = fit.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt().unflatten(-1, (2, -1))
-    of_tones = deviation[..., : 3 * fit.active.shape[-1]].unflatten(-1, (-1, 3))[..., :2].amax(-1)
-    size = torch.where(fit.active, fit.coefficients.abs(), 0.0)
-    tall = (size > least * of_tones) & fit.active
-    strongest = size == size.amax(-1, keepdim=True)
-    keep = ((tall | strongest) & fit.active).unflatten(-1, (-1, harmonics)).any(-1).repeat_interleave(harmonics, -1)
-    if bool((keep == fit.active).all()):
-        return fit
-    return fit_tones(measurements, fit.frequencies, keep & fit.active, fit.model)
+    while True:
+        size = torch.where(fit.active, fit.coefficients.abs(), 0.0)
+        gain = 2 * torch.sin(math.pi * fit.frequencies[..., None] * intervals).abs().amax(-1)
+        small = (size * gain < LEAST_SWING) & (gain >= LEAST_GAIN)
+        tall = (size > LEAST_SIGNIFICANCE * amplitude_deviation(fit)) & ~small & fit.active
+        strongest = size == size.amax(-1, keepdim=True)
+        families = ((tall | strongest) & fit.active).unflatten(-1, (-1, fit.model.harmonics)).any(-1)
+        keep = families.repeat_interleave(fit.model.harmonics, -1) & fit.active
+        if bool((keep == fit.active).all()):
+            return fit
+        fit = fit_tones(measurements, fit.frequencies, keep, fit.model)
 
 
 def strongest_only(fit: ToneFit) -> ToneFit:

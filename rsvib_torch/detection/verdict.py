@@ -6,15 +6,13 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.result import OtherMotion, VibrationStd
+from rsvib_torch.detection.selection import LEAST_GAIN, LEAST_SIGNIFICANCE, LEAST_SWING
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
 __all__ = ["judge"]
 
-_LEAST_GAIN = 0.1  # |gain| below this multiplies noise more than tenfold
-_LEAST_SIGNIFICANCE = 4.0  # amplitude over its standard deviation
 _LARGEST_UNCERTAINTY = 0.1  # of a frequency
-_LEAST_SWING = 0.01  # px, offsets that a tone makes: less may be left over from interpolation
 _LEAST_GOOD = 0.5  # of the bands
 _MAJORITY = 0.75  # of the bands: things that move by themselves may cover the others
 _LARGEST_MISFIT = 0.3  # mean absolute residual over mean absolute offset about its mean
@@ -99,13 +97,13 @@ def _against_tone(
     size_std, hertz_std = float(std.amplitude[axis, tone]), float(std.frequency[axis, tone])
     name = f"tone of {hertz:.4g} Hz"
     found = []
-    if size < _LEAST_SIGNIFICANCE * size_std:
+    if size < LEAST_SIGNIFICANCE * size_std:
         found.append(f"{name} not significant: amplitude {size:.3g} +- {size_std:.2g} px")
-    elif size * gain < _LEAST_SWING:
-        found.append(f"{name} too small: offsets of {size * gain:.2g} px, below {_LEAST_SWING} px")
+    elif size * gain < LEAST_SWING:
+        found.append(f"{name} too small: offsets of {size * gain:.2g} px, below {LEAST_SWING} px")
     elif hertz_std > _LARGEST_UNCERTAINTY * hertz:
         found.append(f"{name} not known well enough: frequency {hertz:.4g} +- {hertz_std:.2g} Hz")
-    if gain < _LEAST_GAIN:
+    if gain < LEAST_GAIN:
         found.append(f"{name} nearly blind: gain {gain:.3f} (every frame is displaced alike)")
     if hertz * duration < 1.0:
         found.append(f"{name} has a period longer than the record of {1e3 * duration:.3g} ms")

@@ -110,6 +110,41 @@ def test_long_exposures_of_half_a_frame(paper_camera, seed):
     np.testing.assert_allclose(found.vibration.frequency[:, 0], (50.0, 30.0), rtol=5e-4)
 
 
+def pair_under(camera, exposure_rows, motion, seed, columns, num_frames):
+    """Frames of 768 rows with hardly any noise."""
+    exposed = replace(camera, exposure_rows=exposure_rows)
+    scene = draw_scene(768 + 2 * MARGIN, columns + 2 * MARGIN, seed)
+    frames = take_frames(scene, exposed, motion, num_frames, 0.001, seed=seed, samples=16)
+    return torch.from_numpy(frames).float(), exposed
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_fast_vibration_blurs_each_frame_in_its_own_way(paper_camera, seed):
+    """Paths of 1.7 px that hardly differ between frames: they curve, and what that does to detail is made up for."""
+    motion = Motion((1.2, 0.8), (188.3, 170.7), (0.4, -1.0))
+    found = detect_vibration(*pair_under(paper_camera, 60, motion, seed, 384, 6))
+    wrong = (found.vibration.amplitude[:, 0] - motion.vibration().amplitude[:, 0]).abs()
+    assert found.reliable.all(), found.reasons
+    assert float(wrong.max()) < 0.0015, wrong
+
+
+def test_what_is_too_small_for_a_tone_does_not_refuse_the_one_that_is_there(paper_camera):
+    """Twelve frames tell of tones of 0.005 px, which are left over from blur and interpolation."""
+    motion = Motion((1.2, 0.8), (188.3, 170.7), (0.8, -1.0))
+    found = detect_vibration(*pair_under(paper_camera, 60, motion, 2, 256, 12))
+    assert found.reliable.all(), found.reasons
+
+
+def test_a_tone_of_which_next_to_nothing_is_known_moves_no_frames(paper_camera):
+    """Seven times the frame rate is 166.55 Hz: x is all but blind, and y is found all the same."""
+    motion = Motion((0.57, 0.53), (166.9, 191.5), (0.4, -1.0))
+    for seed in (1, 2):
+        found = detect_vibration(*pair_under(paper_camera, 150, motion, seed, 384, 2))
+        assert not found.reliable[0]
+        assert found.reliable[1], found.reasons
+        assert float(found.vibration.amplitude[0].max()) < 5.0
+
+
 def test_a_tone_taken_for_its_mirror_image_beyond_a_blind_frequency_is_found(paper_camera):
     """The bands of a sharp chart say 44.6 Hz, as far below 2 / (m T_row) = 47.6 Hz as 50 Hz is above."""
     camera = replace(paper_camera, exposure_rows=400)
