@@ -83,6 +83,8 @@ class Recording:
         content = rows - self.motion.mean_displacement(starts, self.timing.exposure_time)[..., 1]
         begin = self.timing.frame_starts(count, starts.device)
         found = rows_showing(content[..., None].expand(-1, -1, count), begin, self.timing, self.motion)
+        own = torch.eye(count, dtype=torch.bool, device=starts.device)[:, None]
+        found = torch.where(own, rows[:, None], found)  # to the last digit, or first and last rows would fall out
         moments = begin + found * self.timing.row_time
         return found, self.motion.mean_displacement(moments, self.timing.exposure_time)[..., 0]
 

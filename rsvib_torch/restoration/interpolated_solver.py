@@ -24,6 +24,8 @@ _ROWS = {"cpu": 160}  # that are interpolated at a time: they stay in the cache
 def chosen_nodes(frequencies: int, step: float, device: torch.device) -> Tensor:
     """Indices (N,) of the frequencies to factor: all of the lowest, then in growing steps of up to ``step``.
 
+    The widest steps are halved until there is a multiple of eight of them.
+
     Args:
         frequencies: How many there are, from 0 on.
         step: Largest step, in frequencies.
@@ -31,7 +33,7 @@ def chosen_nodes(frequencies: int, step: float, device: torch.device) -> Tensor:
 
     Example:
         >>> chosen_nodes(20, 3.0, torch.device("cpu")).tolist()
-        [0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 18, 19]
+        [0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 13, 15, 16, 18, 19]
     """
     nodes, last = [0], frequencies - 1
     while nodes[-1] < last:
