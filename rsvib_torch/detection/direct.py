@@ -172,9 +172,10 @@ def refine_directly(
     Returns:
         The last measurements and the fit to them.
     """
-    motion = known_motion(start)
+    intervals = intervals_compared(timing, spectra.values.shape[1], LARGEST_GROUP, start.active.device)
+    motion = known_motion(start, intervals)
     groups = frame_groups(spectra, timing, motion, alike=True)
-    found = _refine(groups, timing, start, tones, iterations)
+    found = _refine(groups, timing, intervals, start, tones, iterations)
     tried = torch.zeros_like(start.active[..., 0])
     for _ in range(2):
         frequencies, rival = _beyond_blind(found, start, tried)
@@ -184,19 +185,23 @@ def refine_directly(
             break
         tried = tried | rival
         other, _ = robust_fit(found.measurements, frequencies, strongest_only(found.fit).active, start.model)
-        found = _better_of_each(found, _refine(groups, timing, other, tones, iterations))
+        found = _better_of_each(found, _refine(groups, timing, intervals, other, tones, iterations))
     if tones is not None:
         return found
-    intervals = intervals_compared(timing, spectra.values.shape[1], LARGEST_GROUP, start.active.device)
     return replace(found, fit=significant_only(found.measurements, found.fit, intervals))
 
 
 def _refine(
-    groups: list[FrameGroup], timing: SensorTiming, start: ToneFit, tones: int | None, iterations: int
+    groups: list[FrameGroup],
+    timing: SensorTiming,
+    intervals: Tensor,
+    start: ToneFit,
+    tones: int | None,
+    iterations: int,
 ) -> DirectFit:
     """Measure around the motion, fit, repeat."""
     fit, model = start, start.model
-    motion = known_motion(fit)
+    motion = known_motion(fit, intervals)
     gradients: list[RowGradients | None] = [None] * len(groups)
     steps: list[_Step] = []
     cleanings = _CLEANINGS
@@ -216,7 +221,7 @@ def _refine(
             fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual_of(measurements, fit))
             if step > search_at:
                 fit = _without_runaways(measurements, before, fit)
-        motion = known_motion(fit)
+        motion = known_motion(fit, intervals)
         if step == iterations - 1:
             break
         reached = measurements.relative(_displacements(measurements, motion))
@@ -240,7 +245,7 @@ def _refine(
             nearer = _corrected(measurements, steps)
             if nearer is not measurements:
                 fit, _ = robust_fit(nearer, fit.frequencies, fit.active, model, residual_of(nearer, fit))
-                motion = known_motion(fit)
+                motion = known_motion(fit, intervals)
                 reached = measurements.relative(_displacements(measurements, motion))
         if float((reached - placed).abs().amax()) > _NEAR:
             gradients = [None] * len(groups)

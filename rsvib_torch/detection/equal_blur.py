@@ -18,6 +18,7 @@ __all__ = ["Shown", "blurred_unlike", "warp_to_same_blur"]
 # kernels blur a scene alike whose paths differ by less in px, their second moments by less in px^2, and their third
 # ones, which displace fine detail by 0.001 px, by less in px^3
 _ALIKE = (0.5, 0.03, 0.0024)
+_EVERY = 8  # rows of which one is looked at
 _FEWER = 2 / 3  # nodes: 1e-3 of what is blurred twice is enough
 _SLOPE = (2 / 3, -1 / 12)  # of neighbours one and two rows away, later less earlier: first derivative
 _CURVATURE = (-5 / 2, 4 / 3, -1 / 12)  # of a row and its neighbours: second derivative
@@ -61,8 +62,9 @@ def _moments(paths: Tensor, weights: Tensor) -> Tensor:
     return torch.einsum("bgsni,bgsnj,n->bgsij", paths, paths, weights)
 
 
-def _unlike(paths: Tensor, weights: Tensor) -> Tensor:
-    """(B,) whether the frames of a stack are blurred in ways of their own."""
+def _unlike(moments: Tensor, timing: SensorTiming, motion: Vibration) -> Tensor:
+    """(B,) whether frames whose rows are exposed from (B, G, S) s are blurred in ways of their own."""
+    paths, weights = _paths(moments[..., ::_EVERY], timing, motion)
     third = torch.einsum("bgsn,bgsni->bgsi", paths.square().sum(-1) * weights, paths)
     looked_at = zip((paths, _moments(paths, weights), third), _ALIKE, strict=True)
     return torch.stack([(of.amax(1) - of.amin(1)).flatten(1).amax(1) > most for of, most in looked_at]).any(0)
@@ -71,7 +73,7 @@ def _unlike(paths: Tensor, weights: Tensor) -> Tensor:
 def blurred_unlike(starts: Tensor, height: int, timing: SensorTiming, motion: Vibration) -> Tensor:
     """(B,) bool: whether frames of a height that start at (B, G) s are blurred in ways of their own."""
     rows = torch.arange(height, dtype=torch.float64, device=starts.device)
-    return _unlike(*_paths(starts[..., None] + rows * timing.row_time, timing, motion))
+    return _unlike(starts[..., None] + rows * timing.row_time, timing, motion)
 
 
 def warp_to_same_blur(
@@ -101,10 +103,10 @@ def warp_to_same_blur(
 
     if shown.rows.shape[1] != 2:
         return plain
-    paths, weights = _paths(shown.moments, timing, motion)
-    unlike = _unlike(paths, weights)
+    unlike = _unlike(shown.moments, timing, motion)
     if not bool(unlike.any()):
         return plain
+    paths, weights = _paths(shown.moments, timing, motion)
     paths = paths * unlike[:, None, None, None, None]
     real = spectra.values.real.dtype
     change = 0.5 * torch.gradient(_moments(paths, weights), dim=2)[0].to(real)[..., None]

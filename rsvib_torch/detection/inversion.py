@@ -10,7 +10,9 @@ from rsvib_torch.detection.result import VibrationStd
 from rsvib_torch.detection.tones import ToneFit
 from rsvib_torch.vibration import Vibration
 
-__all__ = ["amplitude_deviation", "known_motion", "motion_of_fit", "vibration_of_fit"]
+__all__ = ["BLIND", "amplitude_deviation", "known_motion", "motion_of_fit", "offset_gain", "vibration_of_fit"]
+
+BLIND = 0.1  # gain from displacement to offset that counts as half blind
 
 
 def _own_covariance(fit: ToneFit) -> tuple[Tensor, Tensor]:
@@ -60,13 +62,24 @@ def motion_of_fit(fit: ToneFit) -> Vibration:
     return Vibration(amplitude, frequency, phase, motion, acceleration)
 
 
-def known_motion(fit: ToneFit) -> Vibration:
-    """As much of the motion of a fit as its errors leave for sure.
+def offset_gain(fit: ToneFit, intervals: Tensor) -> Tensor:
+    """Largest gain (B, 2, K) from displacement to offset (Eq. 7) over intervals (M,) in seconds between frames."""
+    return 2 * torch.sin(math.pi * fit.frequencies[..., None] * intervals).abs().amax(-1)
 
-    An amplitude A with deviation s counts for ``A max(0, 1 - s^2 / A^2)`` (positive-part James-Stein estimate): tones
-    near a blind frequency, of which the fit knows next to nothing, must not move frames.
+
+def known_motion(fit: ToneFit, intervals: Tensor) -> Vibration:
+    """As much of the motion of a fit as is known: tones near a blind frequency must not move frames by what may be.
+
+    An amplitude A with deviation s counts for ``A max(0, 1 - s^2 / A^2)`` (positive-part James-Stein estimate) where
+    the gain is small. Where it is large a tone is as good as what rows tell, however hard it is to tell from others.
+
+    Args:
+        fit: With its covariance.
+        intervals: (M,) s, times between the frames compared.
     """
-    share = (1 - (amplitude_deviation(fit) / fit.coefficients.abs().clamp(min=1e-30)).square()).clamp(min=0.0)
+    blindness = 1 / (1 + (offset_gain(fit, intervals) / BLIND).square())
+    noise = (amplitude_deviation(fit) / fit.coefficients.abs().clamp(min=1e-30)).square()
+    share = (1 - blindness * noise).clamp(min=0.0)
     return motion_of_fit(replace(fit, coefficients=fit.coefficients * share))
 
 

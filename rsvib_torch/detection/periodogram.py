@@ -5,13 +5,13 @@ import math
 import torch
 from torch import Tensor
 
+from rsvib_torch.detection.inversion import BLIND
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones import drift_response
 
-__all__ = ["BLIND", "MAJORITY", "strongest_frequencies"]
+__all__ = ["MAJORITY", "strongest_frequencies"]
 
 _OVERSAMPLING = 8  # grid points per 1 / duration
-BLIND = 0.1  # gain from displacement to offset that counts as half blind
 MAJORITY = 0.65  # of the measurements: outliers may be all others
 _APART = 4  # grid points: peaks nearer than half of 1 / duration are one
 _NOTHING = 1e-300  # keeps equations solvable where nothing is known

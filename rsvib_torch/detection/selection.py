@@ -1,6 +1,5 @@
 """How many tones: added one by one, strongest first, as long as the data ask for them."""
 
-import math
 from dataclasses import replace
 
 import torch
@@ -8,9 +7,9 @@ from torch import Tensor
 
 from rsvib_torch.detection.blind_tones import with_blind_tones
 from rsvib_torch.detection.fit import fit_roughly, fit_tones
-from rsvib_torch.detection.inversion import amplitude_deviation
+from rsvib_torch.detection.inversion import BLIND, amplitude_deviation, offset_gain
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.periodogram import BLIND, MAJORITY, strongest_frequencies
+from rsvib_torch.detection.periodogram import MAJORITY, strongest_frequencies
 from rsvib_torch.detection.robust import of_each, residual_of, robust_fit, typical_size
 from rsvib_torch.detection.tones import MotionModel, ToneFit, tone_response
 
@@ -240,7 +239,7 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor
     """
     while True:
         size = torch.where(fit.active, fit.coefficients.abs(), 0.0)
-        gain = 2 * torch.sin(math.pi * fit.frequencies[..., None] * intervals).abs().amax(-1)
+        gain = offset_gain(fit, intervals)
         small = (size * gain < LEAST_SWING) & (gain >= LEAST_GAIN)
         tall = (size > LEAST_SIGNIFICANCE * amplitude_deviation(fit)) & ~small & fit.active
         strongest = size == size.amax(-1, keepdim=True)
