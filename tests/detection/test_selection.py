@@ -12,14 +12,14 @@ from rsvib_torch.detection.measurements import Measurements
 ROWS, ROW_TIME, FRAME_PERIOD = 120, 16 * 20.52e-6, 2048 * 20.52e-6
 
 
-def offsets_of(amplitude, frequency, generator):
-    """Offsets (1, N, 2) between rows of two frames that vibrate, measured with an error of 0.003 px."""
+def offsets_of(amplitude, frequency, generator, noise=0.003):
+    """Offsets (1, N, 2) between rows of two frames that vibrate, measured with an error of ``noise`` px."""
     starts = torch.arange(ROWS, dtype=torch.float64) * ROW_TIME
     turn = 2 * math.pi * torch.tensor(frequency, dtype=torch.float64)
     size = torch.tensor(amplitude, dtype=torch.float64)
     places = [size * torch.cos(turn * (starts + shift)[:, None] + 0.4) for shift in (0, FRAME_PERIOD)]
-    noise = 0.003 * torch.randn(ROWS, 2, dtype=torch.float64, generator=generator)
-    return (places[1] - places[0] + noise)[None]
+    errors = noise * torch.randn(ROWS, 2, dtype=torch.float64, generator=generator)
+    return (places[1] - places[0] + errors)[None]
 
 
 def measured(offsets):
@@ -87,3 +87,27 @@ def test_a_tone_that_the_exposure_fades_does_not_outweigh_one_that_shows():
     assert kept.active.tolist() == [[[True, False], [True, False]]]
     doubled = replace(before, coefficients=torch.tensor([[[5.0, 6.0], [5.2, 0.0]]], dtype=torch.complex128))
     assert direct._without_runaways(measurements, before, doubled) is doubled
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "frequency", "stays"),
+    [
+        (0.05, 341.0, True),
+        (0.003, 341.0, False),  # certain, but interpolation may leave as much
+        (0.0005, 341.0, False),  # may be noise
+    ],
+)
+def test_tones_that_are_not_worth_an_axis_are_dropped(amplitude, frequency, stays):
+    generator = torch.Generator().manual_seed(6)
+    strong, weak = (offsets_of([a, a], [f, f], None, noise=0.0) for a, f in ((3.1, 50.0), (amplitude, frequency)))
+    noise = 0.0006 * torch.randn(strong.shape, dtype=torch.float64, generator=generator)
+    measurements = measured(strong + weak + noise)
+    start = torch.tensor([50.0, frequency], dtype=torch.float64).expand(1, 2, 2)
+    fit = selection.fit_tones(measurements, start, torch.ones(1, 2, 2, dtype=torch.bool))
+    kept = selection.significant_only(measurements, fit, torch.tensor([FRAME_PERIOD], dtype=torch.float64))
+    assert kept.active.tolist() == [[[True, stays]] * 2]
+    assert kept.coefficients[..., 0].abs().flatten().tolist() == pytest.approx([3.1, 3.1], abs=0.02)
+    # all but blind and known all the same: whatever makes so small an offset, the verdict is to see it
+    blind = torch.tensor([50.0, 7 / FRAME_PERIOD + 0.01], dtype=torch.float64).expand(1, 2, 2)
+    certain = replace(fit, frequencies=blind, covariance=1e-12 * torch.eye(14, dtype=torch.float64)[None])
+    assert selection.significant_only(measurements, certain, torch.tensor([FRAME_PERIOD])).active.all()
