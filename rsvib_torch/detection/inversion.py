@@ -62,9 +62,9 @@ def motion_of_fit(fit: ToneFit) -> Vibration:
     return Vibration(amplitude, frequency, phase, motion, acceleration)
 
 
-def offset_gain(fit: ToneFit, intervals: Tensor) -> Tensor:
-    """Largest gain (B, 2, K) from displacement to offset (Eq. 7) over intervals (M,) in seconds between frames."""
-    return 2 * torch.sin(math.pi * fit.frequencies[..., None] * intervals).abs().amax(-1)
+def offset_gain(frequencies: Tensor, intervals: Tensor) -> Tensor:
+    """Largest gain (...) from displacement to offset (Eq. 7) of tones (...) over intervals (M,) s between frames."""
+    return 2 * torch.sin(math.pi * frequencies[..., None] * intervals).abs().amax(-1)
 
 
 def known_motion(fit: ToneFit, intervals: Tensor) -> Vibration:
@@ -77,7 +77,7 @@ def known_motion(fit: ToneFit, intervals: Tensor) -> Vibration:
         fit: With its covariance.
         intervals: (M,) s, times between the frames compared.
     """
-    blindness = 1 / (1 + (offset_gain(fit, intervals) / BLIND).square())
+    blindness = 1 / (1 + (offset_gain(fit.frequencies, intervals) / BLIND).square())
     noise = (amplitude_deviation(fit) / fit.coefficients.abs().clamp(min=1e-30)).square()
     share = (1 - blindness * noise).clamp(min=0.0)
     return motion_of_fit(replace(fit, coefficients=fit.coefficients * share))
@@ -97,7 +97,7 @@ def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
     frequency_std = _deviation(fit, blocks, zero, zero, one)
     turn = -2 * math.pi * centre.expand_as(real)
     std = {
-        "amplitude": amplitude_deviation(fit),
+        "amplitude": _deviation(fit, blocks, real, imaginary, zero),
         "frequency": frequency_std,
         "period": frequency_std / torch.where(frequency > 0, frequency, 1.0).square(),
         "phase": _deviation(fit, blocks, -imaginary / size, real / size, turn),

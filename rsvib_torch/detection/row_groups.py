@@ -136,7 +136,7 @@ def measure_group(
     shown = Shown.of(place, left, group.starts[..., None], timing, motion)
     seen = _seen(shown.rows, group.spectra.height)
     warp = warp_to_same_blur(group.spectra, shown, place, left, timing, motion)
-    warped = (warp(run) for run in group.spectra.runs(place.shape[-1], 2))
+    warped = ((run, warp(run)) for run in group.spectra.runs(place.shape[-1], 2))
     if gradients is None:
         gradients = row_gradients(group.spectra, warped, shown.rows, shown.shift, seen)
         pulls = gradients.pulls
@@ -167,12 +167,10 @@ def join_groups(parts: list[Measurements]) -> Measurements:
     most = max(part.moments.shape[-1] for part in parts)
 
     def padded(values: Tensor) -> Tensor:
-        missing = most - values.shape[2]
-        return functional.pad(values, (0, 0) * (values.ndim - 3) + (0, missing)) if missing else values
+        return functional.pad(values, (0, 0) * (values.ndim - 3) + (0, most - values.shape[2]))
 
     def repeated(moments: Tensor) -> Tensor:
-        missing = most - moments.shape[2]
-        return torch.cat([moments, moments[:, :, :1].expand(-1, -1, missing)], 2) if missing else moments
+        return torch.cat([moments, moments[:, :, :1].expand(-1, -1, most - moments.shape[2])], 2)
 
     return replace(
         parts[0],

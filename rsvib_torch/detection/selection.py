@@ -239,7 +239,7 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor
     """
     while True:
         size = torch.where(fit.active, fit.coefficients.abs(), 0.0)
-        gain = offset_gain(fit, intervals)
+        gain = offset_gain(fit.frequencies, intervals)
         small = (size * gain < LEAST_SWING) & (gain >= LEAST_GAIN)
         tall = (size > LEAST_SIGNIFICANCE * amplitude_deviation(fit)) & ~small & fit.active
         strongest = size == size.amax(-1, keepdim=True)

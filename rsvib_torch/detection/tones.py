@@ -90,7 +90,7 @@ def tone_columns(measurements: Measurements, coefficients: Tensor, frequencies: 
     # derivatives by f: of the attenuation, and of the angle
     start, turn = (slope * coefficients)[:, None, None], (2j * math.pi * attenuation * coefficients)[:, None, None]
     by_frequency = ((start + time * turn) * wave).real
-    by_parts = torch.view_as_real((attenuation[:, None, None] * wave).conj().resolve_conj())
+    by_parts = torch.view_as_real((attenuation[:, None, None] * wave).conj_physical())
     return torch.cat([by_parts, by_frequency[..., None]], dim=-1)
 
 

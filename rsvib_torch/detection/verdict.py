@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor
 
+from rsvib_torch.detection.inversion import offset_gain
 from rsvib_torch.detection.result import OtherMotion, VibrationStd
 from rsvib_torch.detection.selection import LEAST_GAIN, LEAST_SIGNIFICANCE, LEAST_SWING
 from rsvib_torch.sensor import SensorTiming
@@ -56,7 +57,7 @@ def judge(
     # a uniform motion is smeared exactly at any speed: condition (24) is for what changes within a row time
     of_tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
     within_row = of_tones.displacement_within_row_time(timing.row_time).tolist()
-    gain = torch.stack([vibration.gain(float(t)).abs() for t in intervals]).amax(0)
+    gain = offset_gain(vibration.frequency, intervals)
     for axis, found in enumerate(reasons):
         amplitude = vibration.amplitude[axis]
         if share < _LEAST_GOOD:

@@ -72,14 +72,13 @@ class _Rows:
 
 
 def row_gradients(
-    spectra: RowSpectra, warped: Iterable[Tensor], rows: Tensor, shift: Tensor, seen: Tensor
+    spectra: RowSpectra, warped: Iterable[tuple[slice, Tensor]], rows: Tensor, shift: Tensor, seen: Tensor
 ) -> RowGradients:
     """Gradients of the scene, its noise, and the weight of every pixel, from frames warped by a motion.
 
     Args:
         spectra: The frames of a group.
-        warped: Their rows (B, G, s, U) warped to the scene, from ``RowSpectra.warped``: S rows in all, one run of them
-            after the other.
+        warped: Runs of the S rows of the scene with the frames warped to them, (B, G, s, U) from ``RowSpectra.warped``.
         rows: (B, G, S) frame rows that show the S scene rows, in each frame.
         shift: (B, G, S) px, displacement along the rows to be taken out of each.
         seen: (B, G, S) float64, 1 where a frame sees the row.
@@ -257,21 +256,18 @@ def _halves(sums: Tensor, solution: Tensor, seen: Tensor) -> Tensor:
     return torch.cat([own, change], dim=-1) * (seen[:, 0] * seen[:, -1])[..., None, None]
 
 
-def row_pulls(warped: Iterable[Tensor], gradients: RowGradients, seen: Tensor) -> Tensor:
+def row_pulls(warped: Iterable[tuple[slice, Tensor]], gradients: RowGradients, seen: Tensor) -> Tensor:
     """Products (B, S, 3, G) of gradients with what frames differ by, as ``RowGradients.pulls``.
 
     Args:
-        warped: Rows (B, G, s, U) of a group of frames warped to the scene, from ``RowSpectra.warped``: S rows in all,
-            one run of them after the other.
+        warped: As in ``row_gradients``, one run after the other.
         gradients: Gradients of the scene, from a motion near to that of the rows.
         seen: (B, G, S) float64, 1 where a frame sees the row.
     """
-    length, parts, first = gradients.images.shape[-1], [], 0
-    for run in warped:
-        part = slice(first, first + run.shape[2])
+    length, parts = gradients.images.shape[-1], []
+    for part, run in warped:
         left = torch.fft.irfft(differences(run, seen[:, :, part]).transpose(1, 2), n=length)
         parts.append(torch.matmul(gradients.images[:, part], left.transpose(-2, -1)))
-        first = part.stop
     return torch.cat(parts, 1).double()
 
 

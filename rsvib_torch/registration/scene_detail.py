@@ -34,18 +34,17 @@ class Compared:
     differences: Tensor
 
     @classmethod
-    def of(cls, warped: Iterable[Tensor], seen: Tensor) -> "Compared":
+    def of(cls, warped: Iterable[tuple[slice, Tensor]], seen: Tensor) -> "Compared":
         """From frames warped to the scene.
 
         Args:
-            warped: (B, G, s, U) for S rows in all, one run of them after the other: each is forgotten while it is still
-                in the cache.
+            warped: Runs of the S rows with what is seen of them, (B, G, s, U): each is forgotten while it is still in
+                the cache.
             seen: (B, G, S) float64, 1 where a frame sees the row.
         """
         whole: list[Tensor] = []
-        first = 0
-        for run in warped:
-            visible = seen[:, :, first : first + run.shape[2]]
+        for rows, run in warped:
+            visible = seen[:, :, rows]
             of_run = (
                 mean_over_frames(run, visible),
                 _noise_of_mean(run[..., ::_SOME], visible),
@@ -53,8 +52,7 @@ class Compared:
             )
             whole = whole or [one.new_empty(*one.shape[:-2], seen.shape[2], one.shape[-1]) for one in of_run]
             for all_rows, one in zip(whole, of_run, strict=True):
-                all_rows[..., first : first + run.shape[2], :] = one
-            first += run.shape[2]
+                all_rows[..., rows, :] = one
         return cls(*whole)
 
 

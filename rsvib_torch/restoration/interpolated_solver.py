@@ -24,7 +24,7 @@ _ROWS = {"cpu": 160}  # that are interpolated at a time: they stay in the cache
 def chosen_nodes(frequencies: int, step: float, device: torch.device) -> Tensor:
     """Indices (N,) of the frequencies to factor: all of the lowest, then in growing steps of up to ``step``.
 
-    The widest steps are halved until there is a multiple of eight of them.
+    The widest steps are halved until there is a multiple of eight, as long as there are steps to halve.
 
     Args:
         frequencies: How many there are, from 0 on.

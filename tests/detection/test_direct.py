@@ -17,10 +17,10 @@ from rsvib_torch.registration.row_spectra import RowSpectra, differences
 MARGIN = 40
 
 
-def pair_of(camera, motion, seed, noise, rows=2048, columns=512, num_frames=2):
+def pair_of(camera, motion, seed, noise, rows=2048, columns=512, num_frames=2, samples=8):
     """Noisy frames of a scene drawn from the seed."""
     scene = draw_scene(rows + 2 * MARGIN, columns + 2 * MARGIN, seed)
-    frames = take_frames(scene, camera, motion, num_frames, noise, seed=seed, samples=8)
+    frames = take_frames(scene, camera, motion, num_frames, noise, seed=seed, samples=samples)
     return torch.from_numpy(frames).float()
 
 
@@ -111,11 +111,9 @@ def test_long_exposures_of_half_a_frame(paper_camera, seed):
 
 
 def pair_under(camera, exposure_rows, motion, seed, columns, num_frames):
-    """Frames of 768 rows with hardly any noise."""
+    """Frames of 768 rows with hardly any noise, and their camera."""
     exposed = replace(camera, exposure_rows=exposure_rows)
-    scene = draw_scene(768 + 2 * MARGIN, columns + 2 * MARGIN, seed)
-    frames = take_frames(scene, exposed, motion, num_frames, 0.001, seed=seed, samples=16)
-    return torch.from_numpy(frames).float(), exposed
+    return pair_of(exposed, motion, seed, 0.001, 768, columns, num_frames, samples=16), exposed
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -312,19 +310,19 @@ def test_rows_tell_a_known_shift(remaining, num_frames):
     rows = torch.arange(96, dtype=torch.float64).expand(1, num_frames, 96)
     seen = ((rows >= 8) & (rows <= 87)).double()
     none = torch.zeros_like(rows)
-    gradients = row_gradients(spectra, [spectra.warped(rows, none)], rows, none, seen)
+    gradients = row_gradients(spectra, [(slice(None), spectra.warped(rows, none))], rows, none, seen)
     expected = remaining * (torch.arange(num_frames) - (num_frames - 1) / 2)
 
     def told(shift):
         runs = (slice(0, 40), slice(40, 96))
-        warped = (spectra.warped(rows[..., run], shift[..., run]) for run in runs)
+        warped = ((run, spectra.warped(rows[..., run], shift[..., run])) for run in runs)
         matrix, right = row_shifts(row_pulls(warped, gradients, seen), gradients, seen)
         known = matrix[0, :, 0, 0] > 0
         assert known.tolist() == seen[0, 0].bool().tolist()
         total, sums = matrix[0].sum(0), right[0].sum(1)
         return torch.linalg.solve(total, sums[..., None])[..., 0]
 
-    again = row_pulls([spectra.warped(rows, none)], gradients, seen)
+    again = row_pulls([(slice(None), spectra.warped(rows, none))], gradients, seen)
     torch.testing.assert_close(gradients.pulls, again, rtol=1e-9, atol=1e-9)
     shifts = told(none)
     torch.testing.assert_close(shifts[:, 0], expected.double(), rtol=0.1, atol=2e-4)
