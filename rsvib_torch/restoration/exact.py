@@ -1,7 +1,6 @@
 """Exact restoration: all rows of a frame, each with its own PSF, solved together."""
 
-from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -9,7 +8,7 @@ from torch import Tensor
 
 from rsvib_torch.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.pieces import gathered
+from rsvib_torch.parallel import in_parallel
 from rsvib_torch.restoration.disagreement import noise_levels
 from rsvib_torch.restoration.edges import expectation, expectation_precision, stages
 from rsvib_torch.restoration.filling import fill_beyond_ends, fill_unmeasured
@@ -17,12 +16,12 @@ from rsvib_torch.restoration.groups import joint_groups
 from rsvib_torch.restoration.missing import fill_roughly, measured_values
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.partition import Partition
-from rsvib_torch.restoration.prior import brightness, fit_prior
+from rsvib_torch.restoration.prior import RowPrior, brightness, fit_prior
 from rsvib_torch.restoration.row_system import RowKernels, row_kernels
 from rsvib_torch.restoration.rows import continue_rows, period_of_rows
 from rsvib_torch.restoration.scene_problem import SceneProblem
 from rsvib_torch.restoration.seen_scene import SeenScene
-from rsvib_torch.restoration.strength import Strengths
+from rsvib_torch.restoration.strength import Strengths, prior_strength
 
 __all__ = ["ScenePrior", "restore_exact", "scene_period"]
 
@@ -46,17 +45,6 @@ def scene_period(width: int, reach: int, displacement: Tensor) -> int:
     along = displacement[..., 0].detach()
     filled = bool(((along.amax(-1) - along.amin(-1)).flatten(1).amax(1) > 2 * _LONG).all())
     return period_of_rows(width, reach if filled else reach + _REACH)
-
-
-def _alike(members: list[int], reference: int, shift: Tensor) -> list[int]:
-    """Frames of a group that the strength of the prior is chosen by: those that show the same columns.
-
-    Args:
-        members: Of the group.
-        reference: In whose coordinates it is restored.
-        shift: (T, 2) reference shifts of the frames.
-    """
-    return [frame for frame in members if torch.equal(shift[frame], shift[reference])]
 
 
 def _with_edges(problem: SceneProblem, factor: float) -> Tensor:
@@ -89,6 +77,76 @@ def _floor(data: Tensor, clipped: Tensor) -> Tensor:
     width = clipped.shape[-1]
     bottomless[..., :width] = torch.where(clipped, data[..., :width], -torch.inf)
     return bottomless
+
+
+@dataclass(frozen=True, eq=False)
+class _Stack:
+    """One stack of frames, with what the scenes that are restored from it have in common.
+
+    Attributes:
+        frames: (T, C, H, W).
+        displacement: (T, H, N, 2) during the exposures, at N nodes with weights ``node_weights``.
+        node_weights: (N,).
+        shift: (T, 2) reference shifts of the frames.
+        weights: (T,) how much each counts.
+        level: Standard deviation of the noise of a frame of weight 1.
+        mean: (C, 1, 1) brightness, that the prior is for deviations from.
+        prior: Of all frames.
+        length: L, of the period that scenes are restored on.
+        lost: (T, C, H, W) bool, pixels that do not count; None for none.
+        clipped: Likewise, those of them that are saturated.
+    """
+
+    frames: Tensor
+    displacement: Tensor
+    node_weights: Tensor
+    shift: Tensor
+    weights: Tensor
+    level: Tensor
+    mean: Tensor
+    prior: RowPrior
+    length: int
+    lost: Tensor | None
+    clipped: Tensor | None
+
+    @property
+    def noise_power(self) -> Tensor:
+        """Of a frame of weight 1, in the units of the prior."""
+        return self.level.square() * self.length
+
+    def kernels(self, members: list[int], reference: int) -> RowKernels:
+        """How some frames see the scene, in the coordinates of one of them."""
+        moved = self.displacement[members] - self.shift[reference]
+        return row_kernels(moved, self.node_weights, self.weights[members], self.frames.shape[-2], _MARGIN)
+
+    def strength(self, members: list[int], reference: int, known: Strengths, *, certain: bool) -> float:
+        """Factor on the prior, as those frames ask for that show the same columns as the restored one."""
+        alike = [frame for frame in members if torch.equal(self.shift[frame], self.shift[reference])]
+        prior, power = self.prior.of(members), self.noise_power
+
+        def chosen() -> float:
+            kernels = self.kernels(alike, reference)
+            return prior_strength(self.frames[alike], kernels, prior, power, certain=certain)
+
+        return known.of(power / self.weights[alike].mean() + prior.blind.mean(), chosen)
+
+    def problem(self, members: list[int], reference: int, strength: float, partition: Partition) -> SceneProblem:
+        """What is to be solved for a scene, all values of which are measured or filled."""
+        height, width = self.frames.shape[-2:]
+        kernels = self.kernels(members, reference)
+        precision = self.prior.of(members).precision(self.noise_power, strength, kernels.reach)
+        along = self.shift[members, 0] - self.shift[reference, 0]
+        data = continue_rows(self.frames[members[0] : members[-1] + 1], self.length).sub_(self.mean)  # neighbours
+        problem = SceneProblem(data, SeenScene(kernels, height, data.dtype), precision, self.level, partition)
+        hidden = None if self.lost is None else self.lost[members]
+        ends = kernels.reach > _LONG
+        if hidden is None and ends and not bool(along.any()):
+            return replace(problem, data=fill_beyond_ends(problem, width, kernels.reach))
+        measured = measured_values(along, hidden, data.shape, width, ends=ends)
+        if measured is None:
+            return problem
+        floor = None if self.clipped is None else _floor(data, self.clipped[members])
+        return replace(problem, data=fill_unmeasured(problem, measured, floor))
 
 
 def restore_exact(
@@ -142,55 +200,58 @@ def restore_exact(
         None if value is None else check_whole_number(name, value, at_least=1)
         for name, value in (("chunk_frequencies", chunk_frequencies), ("segments", segments))
     )
-    partition = Partition(chunk, split)
     if ignore is not None:
         frames = fill_roughly(frames, ignore)
     lost = ignore if clipped is None else clipped if ignore is None else ignore | clipped
     levels = _noise_levels(frames, motion, noise)
-    mean = brightness(frames).mean(1, keepdim=True)[..., None, None]  # the prior is for deviations from it
+    mean = brightness(frames).mean(1)[..., None, None]
     starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device)).expand(B, T, H)
     displacement, node_weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
     length = scene_period(W, motion.reach(H), displacement)
+    certain = noise != "auto" or T > 1
+    stacks: list[_Stack] = []
+    strengths: list[float] = []
+    for index in range(B):
+        weights = levels[index].square().reciprocal()
+        typical = weights.mean().reciprocal()
+        stack = _Stack(
+            frames[index],
+            displacement[index],
+            node_weights,
+            motion.shift[index],
+            weights * typical,
+            typical.sqrt(),
+            mean[index],
+            fit_prior(frames[index], motion, index, levels[index], length),
+            length,
+            None if lost is None else lost[index],
+            None if clipped is None else clipped[index],
+        )
+        known = Strengths()
+        strengths += [factor * stack.strength(*group, known, certain=certain) for group in groups]
+        stacks.append(stack)
 
-    def scenes() -> Iterator[tuple[slice, Tensor]]:
-        for stack in range(B):
-            weights = levels[stack].square().reciprocal()
-            typical = weights.mean().reciprocal()
-            weights = weights * typical
-            row_prior = fit_prior(frames[stack], motion, stack, levels[stack], length)
+    def restored(number: int, partition: Partition) -> Tensor:
+        index, place = divmod(number, len(groups))
+        problem = stacks[index].problem(*groups[place], strengths[number], partition)
+        scene = _restore_group(problem, factor if prior == "edges" else None, W)
+        return scene.add_(mean[index])  # the prior was for deviations from it
 
-            def system(members: list[int], reference: int, stack: int = stack, weights: Tensor = weights) -> RowKernels:
-                moved = displacement[stack, members] - motion.shift[stack, reference]
-                return row_kernels(moved, node_weights, weights[members], H, _MARGIN)
+    count = B * len(groups)
+    if torch.is_grad_enabled() and (frames.requires_grad or displacement.requires_grad):
+        partition = Partition(chunk, split)
+        images = torch.stack([restored(number, partition) for number in range(count)])
+        return images.view(B, -1, *images.shape[1:])
+    found = frames.new_empty(count, *frames.shape[2:])
+    threads = min(Partition.threads(frames.device), count)
 
-            certain, strengths = noise != "auto" or T > 1, Strengths()
-            power = typical * length
-            for place, (members, reference) in enumerate(groups):
-                kernels, own_prior = system(members, reference), row_prior.of(members)
-                reach = kernels.reach
-                alike = _alike(members, reference, motion.shift[stack])
-                part = kernels if alike == members else system(alike, reference)
-                strength = strengths.of(frames[stack, alike], part, own_prior, power, certain=certain)
-                precision = own_prior.precision(power, factor * strength, reach)
-                along = motion.shift[stack, members, 0] - motion.shift[stack, reference, 0]
-                seen = frames[stack, members[0] : members[-1] + 1]  # neighbours
-                data = continue_rows(seen, length).sub_(mean[stack])
-                problem = SceneProblem(data, SeenScene(kernels, H, frames.dtype), precision, typical.sqrt(), partition)
-                hidden = None if lost is None else lost[stack, members]
-                ends = reach > _LONG
-                if hidden is None and ends and not bool(along.any()):
-                    problem = replace(problem, data=fill_beyond_ends(problem, W, reach))
-                else:
-                    measured = measured_values(along, hidden, problem.data.shape, W, ends=ends)
-                    floor = None if clipped is None else _floor(problem.data, clipped[stack, members])
-                    if measured is not None:
-                        problem = replace(problem, data=fill_unmeasured(problem, measured, floor))
-                scene = _restore_group(problem, factor if prior == "edges" else None, W)
-                number = stack * len(groups) + place
-                yield slice(number, number + 1), scene.add_(mean[stack, 0])[None]
+    def share(thread: int) -> None:
+        partition = Partition(chunk, split)
+        for number in range(thread, count, threads):
+            found[number] = restored(number, partition)
 
-    restored: Tensor = gathered(scenes(), B * len(groups), 0).unflatten(0, (B, len(groups)))
-    return restored
+    in_parallel(share, range(threads), frames.device)
+    return found.view(B, -1, *found.shape[1:])
 
 
 def _noise_levels(frames: Tensor, motion: FrameMotion, noise: float | Literal["auto"]) -> Tensor:

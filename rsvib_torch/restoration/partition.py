@@ -21,7 +21,7 @@ _OVERLAP = 96  # rows of segments on either side: what lies further away does no
 _ALIGNED = 8  # frequencies; rows of bands begin at full cache lines
 _SPARE = 32  # rows that the next scene may be higher
 # between frequencies that are factored, cycles per px: what priors allow, and what a blur of a px allows
-_COARSEST, _OF_BLUR = 1 / 128, 1 / 280
+_COARSEST, _OF_BLUR = 1 / 64, 1 / 140
 _LONGEST = 1.5  # px that kernels may reach to for that: more, and systems are too near to singular
 _FEW = 3  # times fewer, or else all are factored
 

@@ -137,7 +137,7 @@ def _interpolation(reach: float, u: Tensor, precision: float) -> tuple[Tensor, T
 
 
 def _precision(dtype: torch.dtype) -> float:
-    return 1e-8 if dtype == torch.float32 else 1e-15
+    return 1e-5 if dtype == torch.float32 else 1e-15
 
 
 def _stacked(values: Tensor) -> Tensor:

@@ -1,5 +1,7 @@
 """How strong the prior has to be: what predicts pixels best that the scene was not fitted to."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -79,19 +81,21 @@ def prior_strength(
 
 
 class Strengths:
-    """``prior_strength`` of one scene after the other; those with as much noise, and as blind, share one."""
+    """Strengths of one scene after the other; those with as much noise, and as blind, share one."""
 
     def __init__(self) -> None:
         self._known: list[tuple[float, float]] = []
 
-    def of(
-        self, images: Tensor, kernels: RowKernels, prior: RowPrior, noise_power: Tensor, *, certain: bool = True
-    ) -> float:
-        """The strength for one scene; arguments as of ``prior_strength``."""
-        noise = float((noise_power / kernels.weight.mean() + prior.blind.mean()).detach().log())
+    def of(self, noise: Tensor, choose: Callable[[], float]) -> float:
+        """The strength for one scene.
+
+        Args:
+            noise: Power of what counts as noise.
+            choose: Gives a strength where none is known of a scene with as much.
+        """
+        logarithm = float(noise.detach().log())
         for known, strength in self._known:
-            if abs(noise - known) < _ALIKE:
+            if abs(logarithm - known) < _ALIKE:
                 return strength
-        strength = prior_strength(images, kernels, prior, noise_power, certain=certain)
-        self._known.append((noise, strength))
-        return strength
+        self._known.append((logarithm, choose()))
+        return self._known[-1][1]

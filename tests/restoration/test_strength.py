@@ -9,8 +9,8 @@ from scipy import ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
+from rsvib_torch.restoration import exact
 from rsvib_torch.restoration import restore as restore_by_any_method
-from rsvib_torch.restoration import strength
 from rsvib_torch.restoration.motion import frame_motion
 from rsvib_torch.restoration.prior import fit_prior
 
@@ -37,7 +37,7 @@ def without_choice(monkeypatch):
 
     def run(frames, timing, **options):
         with monkeypatch.context() as patch:
-            patch.setattr(strength, "prior_strength", lambda *arguments, **named: 1.0)
+            patch.setattr(exact, "prior_strength", lambda *arguments, **named: 1.0)
             return restore(frames, timing, MOTION.vibration(), **options)
 
     return run
@@ -94,9 +94,9 @@ def test_frames_that_are_alike_share_a_choice(monkeypatch, name, rows, noise, ch
     clean = take_frames(SCENES[name](), timing, MOTION, 2, samples=48)
     frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()
     made = []
-    choose = strength.prior_strength
+    choose = exact.prior_strength
     monkeypatch.setattr(
-        strength, "prior_strength", lambda *arguments, **named: made.append(choose(*arguments, **named)) or made[-1]
+        exact, "prior_strength", lambda *arguments, **named: made.append(choose(*arguments, **named)) or made[-1]
     )
     restore(frames, timing, MOTION.vibration())
     assert len(made) == choices
