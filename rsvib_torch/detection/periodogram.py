@@ -102,7 +102,7 @@ def strongest_frequencies(
     harmonics: int = 1,
     count: int = 1,
     weights: Tensor | None = None,
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
     """Frequencies whose tone, with a uniform motion, explains most of the displacements: the highest peaks.
 
     For every frequency of a grid a tone is fitted with all that lies between it and an offset (gain, exposure, band
@@ -117,7 +117,8 @@ def strongest_frequencies(
         weights: (B, S, N, 2) to search with, one after the other; None for those of the measurements.
 
     Returns:
-        (B, S, 2, count) Hz, the highest peak first.
+        (B, S, 2, count) Hz, the highest peak first, and the weighted squares (B, S, 2) that it explains: of a record
+        that was searched in segments more than that, as each of them has an amplitude of its own.
     """
     batch, rows, _ = measurements.moments.shape
     device = measurements.moments.device
@@ -138,7 +139,7 @@ def strongest_frequencies(
     grid = frequency_grid(longest, sample_interval, device).expand(batch, 2, -1)
     total = _of_families(score(measurements, weights, segments, grid[:, :1]), grid[:, None], harmonics).flatten(0, 1)
     peak = total >= torch.nn.functional.max_pool1d(total, 2 * _APART + 1, 1, _APART)
-    places = torch.where(peak, total, -1.0).topk(min(count, total.shape[-1]), dim=-1).indices
+    heights, places = torch.where(peak, total, -1.0).topk(min(count, total.shape[-1]), dim=-1)
     best = grid.repeat_interleave(weights.shape[1], 0).gather(-1, places)  # (B S, 2, count)
     if segments > 1:  # from here on each has frequencies of its own
         several, by = measurements.repeated(weights.shape[1]), weights.flatten(0, 1)[:, None]
@@ -150,8 +151,7 @@ def strongest_frequencies(
         near_by = (best[..., None] + around).clamp(min=0.0)
         scores = score(several, by, segments, near_by.flatten(-2))[:, 0].unflatten(-1, near_by.shape[-2:])
         best = near_by.gather(-1, scores.argmax(-1, keepdim=True))[..., 0]
-    peaks: Tensor = best.unflatten(0, (batch, -1))
-    return peaks
+    return best.unflatten(0, (batch, -1)), heights[..., 0].unflatten(0, (batch, -1))
 
 
 def _of_families(total: Tensor, grid: Tensor, harmonics: int) -> Tensor:

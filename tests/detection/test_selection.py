@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rsvib_torch.detection import direct, robust, selection
+from rsvib_torch.detection import candidates, direct, robust, selection
 from rsvib_torch.detection.measurements import Measurements
 
 ROWS, ROW_TIME, FRAME_PERIOD = 120, 16 * 20.52e-6, 2048 * 20.52e-6
@@ -34,8 +34,8 @@ def test_stretches_are_left_out_only_where_rows_are_disturbed(monkeypatch):
     cloudy = offsets_of([2.0, 1.1], [50.0, 35.0], generator)
     cloudy[:, 30:58] += torch.linspace(2.0, 9.0, 28)[:, None]  # moves by itself
     searched = []
-    stretches = selection._stretches
-    monkeypatch.setattr(selection, "_stretches", lambda given: searched.append(1) or stretches(given))
+    stretches = candidates._stretches
+    monkeypatch.setattr(candidates, "_stretches", lambda given: searched.append(1) or stretches(given))
     alone = []
     for offsets, careful in ((clean, False), (cloudy, True)):
         searched.clear()
@@ -53,19 +53,22 @@ def test_stretches_are_left_out_only_where_rows_are_disturbed(monkeypatch):
 def test_tones_without_hope_are_not_fitted_to_the_end(monkeypatch):
     """The next candidate explains nothing, or just enough, of what is left."""
     generator = torch.Generator().manual_seed(4)
-    fitted = []
-    robust_fit = selection.robust_fit
+    fitted, tried = [], []
+    robust_fit, best = selection.robust_fit, candidates.Candidates.best
     monkeypatch.setattr(
         selection, "robust_fit", lambda *given, **named: fitted.append(1) or robust_fit(*given, **named)
     )
+    monkeypatch.setattr(candidates.Candidates, "best", lambda *given: tried.append(1) or best(*given))
     one = measured(offsets_of([3.1, 5.2], [50.0, 30.0], generator))
     weak = offsets_of([0.006, 0.005], [88.0, 79.0], generator)
     two = measured(one.displacements[:, :, 1] - one.displacements[:, :, 0] + weak)
     for measurements, tones, fits in ((one, 1, 2), (two, 2, 3)):
         fitted.clear()
+        tried.clear()
         fit = selection.find_tones(measurements, ROW_TIME)
         assert fit.active.sum(-1).tolist() == [[tones, tones]]
         assert len(fitted) == fits  # without tones, and once for each that is there
+        assert len(tried) == tones
     assert fit.frequencies[0, :, 1].tolist() == pytest.approx([88.0, 79.0], rel=0.02)
 
 
