@@ -37,15 +37,30 @@ def in_parallel(work: Callable[[Item], Result], items: Iterable[Item], device: t
         with torch.no_grad():
             return [work(item) for item in items]
     inference = torch.is_inference_mode_enabled()
+    waiting = iter(list(enumerate(items)))  # each of the threads takes the next one
+    results: dict[int, Result] = {}
+    errors: dict[int, BaseException] = {}
 
-    def alone(item: Item) -> Result:
+    def take_part() -> None:
         torch.set_num_threads(allowed // threads)  # of this thread
         with torch.inference_mode(inference), torch.no_grad():
-            return work(item)
+            for place, item in waiting:
+                try:
+                    results[place] = work(item)
+                except BaseException as error:
+                    errors[place] = error
+                    for _ in waiting:  # nobody begins another
+                        pass
 
     try:
-        # a pool of its own: one that is kept would not survive a fork
-        with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(alone, items))
+        # a pool of its own: one that is kept would not survive a fork. This thread does its share: what it frees is
+        # kept for the next call, while the C library may give back what others held
+        with ThreadPoolExecutor(threads - 1) as pool:
+            for _ in range(threads - 1):
+                pool.submit(take_part)
+            take_part()
     finally:
         torch.set_num_threads(allowed)  # what threads begin with that are started later
+    if errors:
+        raise errors[min(errors)]
+    return [results[place] for place in range(len(items))]

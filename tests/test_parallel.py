@@ -47,10 +47,25 @@ def test_one_thread_is_a_loop():
     )
 
 
-def test_errors_come_out(two_threads):
+def test_the_caller_takes_part(two_threads):
+    both = threading.Barrier(2, timeout=20)
+
+    def work(_):
+        both.wait()
+        return threading.current_thread()
+
+    assert threading.main_thread() in in_parallel(work, range(2), CPU)
+
+
+def test_errors_come_out_and_nothing_else_begins(two_threads):
+    both, begun = threading.Barrier(2, timeout=20), []
+
     def fail(item):
+        begun.append(item)
+        both.wait()
         raise ValueError(f"no {item}")
 
     with pytest.raises(ValueError, match="no 0"):
-        in_parallel(fail, range(2), CPU)
+        in_parallel(fail, range(9), CPU)
+    assert sorted(begun) == [0, 1]
     assert torch.get_num_threads() == 2

@@ -15,9 +15,15 @@ from typing import Any
 import torch
 
 # what a process has to be told before it starts: PyTorch to ask for huge pages, as NumPy does by itself; and glibc to
-# keep freed memory for the next call, which systems whose memory is lent to them take long to have back
-HUGE_PAGES, KEPT = "THP_MEM_ALLOC_ENABLE", ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
-ENVIRONMENT = {HUGE_PAGES: "1", **dict.fromkeys(KEPT, str(1 << 40))}
+# keep freed memory for the next call, that of all threads, which systems whose memory is lent to them take long to have
+# back
+HUGE_PAGES = "THP_MEM_ALLOC_ENABLE"
+KEPT = {
+    "MALLOC_MMAP_THRESHOLD_": str(1 << 40),
+    "MALLOC_TRIM_THRESHOLD_": str(1 << 40),
+    "MALLOC_TOP_PAD_": str(1 << 26),
+}
+ENVIRONMENT = {HUGE_PAGES: "1", **KEPT}
 _LIBRARIES = {
     "OpenCV": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
     "SciPy": ("scipy",),
