@@ -16,7 +16,7 @@ Mixture = list[tuple[slice, slice, Tensor]]
 __all__ = ["NodeFactors", "SubstitutionMemory", "chosen_nodes"]
 
 _ALIGNED = 8  # nodes: products of matrices take several times as long where rows do not begin at full cache lines
-_FINER = 4.0  # times the frequency itself: steps between low frequencies, where priors change most, are smaller
+_FINER = 6.0  # times the frequency itself: steps between low frequencies, where priors change most, are smaller
 _BLOCK = 96  # systems that one product of matrices interpolates: few nodes count for them
 _ROWS = {"cpu": 160}  # that are interpolated at a time: they stay in the cache
 
@@ -32,8 +32,8 @@ def chosen_nodes(frequencies: int, step: float, device: torch.device) -> Tensor:
         device: Where the indices are to be.
 
     Example:
-        >>> chosen_nodes(20, 3.0, torch.device("cpu")).tolist()
-        [0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 13, 15, 16, 18, 19]
+        >>> chosen_nodes(28, 3.0, torch.device("cpu")).tolist()
+        [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 18, 19, 21, 22, 24, 25, 27]
     """
     nodes, last = [0], frequencies - 1
     while nodes[-1] < last:

@@ -23,7 +23,7 @@ _SPARE = 32  # rows that the next scene may be higher
 # between frequencies that are factored, cycles per px: what priors allow, and what a blur of a px allows
 _COARSEST, _OF_BLUR = 1 / 64, 1 / 140
 _LONGEST = 1.5  # px that kernels may reach to for that: more, and systems are too near to singular
-_FEW = 3  # times fewer, or else all are factored
+_FEW = 5  # times fewer, or else all are factored
 
 
 def _round_up(value: int, step: int) -> int:
