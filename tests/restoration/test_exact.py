@@ -1,3 +1,4 @@
+import threading
 from functools import partial
 
 import numpy as np
@@ -137,6 +138,39 @@ def test_batch_and_chunks_and_channels_change_nothing(short):
     colour = restore(torch.cat([stacks[0], stacks[0]], dim=1), TIMING, motion.vibration())
     grey = restore(stacks[0, :, 0], TIMING, motion.vibration())
     torch.testing.assert_close(colour[:, 1], grey, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("joint", [False, 2])
+def test_frames_side_by_side_are_frames_one_after_the_other(short, joint, monkeypatch):
+    _, frames, motion = short
+    stack = noisy(np.concatenate([frames, frames[::-1]])[:3, :120, :100], 0.005, dtype=torch.float64)
+    allowed = torch.get_num_threads()
+    asked = {"joint": joint, "check": False}
+    found = []
+    parts = []
+    solver = exact_module._Stack.problem
+
+    def noted(stack, members, reference, *others):
+        parts.append((threading.current_thread(), torch.is_grad_enabled()))
+        return solver(stack, members, reference, *others)
+
+    monkeypatch.setattr(exact_module._Stack, "problem", noted)
+    try:
+        for threads, workers in ((2, 2), (1, 1)):
+            parts.clear()
+            torch.set_num_threads(threads)
+            found.append(restore(stack, TIMING, motion.vibration(), **asked))
+            assert len(parts) == 3
+            assert len({thread for thread, _ in parts}) == workers
+        parts.clear()
+        torch.set_num_threads(2)
+        found.append(restore(stack.requires_grad_(), TIMING, motion.vibration(), **asked))
+        assert parts == [(threading.current_thread(), True)] * 3
+    finally:
+        torch.set_num_threads(allowed)
+    torch.testing.assert_close(found[1], found[0], rtol=0, atol=1e-9)
+    torch.testing.assert_close(found[2].detach(), found[0], rtol=0, atol=1e-9)
+    assert found[2].requires_grad
 
 
 @pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "forward"), (-1, "reverse")])
