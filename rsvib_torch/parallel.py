@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from threading import Lock
+from typing import Generic, TypeVar
 
 import torch
 
-__all__ = ["in_parallel"]
+__all__ = ["MadeOnce", "in_parallel"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -64,3 +65,44 @@ def in_parallel(work: Callable[[Item], Result], items: Iterable[Item], device: t
     if errors:
         raise errors[min(errors)]
     return [results[place] for place in range(len(items))]
+
+
+class MadeOnce(Generic[Result]):
+    """What several threads need, made by the first of them, while the others do what they can without it.
+
+    Made by many short calls from Python, for each of which threads would wait for one another, so that with a lock in
+    common only one of several such things is made at a time.
+
+    Args:
+        make: Makes it.
+        lock: Held meanwhile.
+
+    Example:
+        >>> squares = MadeOnce(lambda: [n * n for n in range(4)], Lock())
+        >>> squares.begin()  # now, unless something else is being made
+        >>> squares.get()
+        [0, 1, 4, 9]
+    """
+
+    def __init__(self, make: Callable[[], Result], lock: Lock) -> None:
+        self._make, self._lock = make, lock
+        self._made: list[Result] = []
+
+    def begin(self) -> None:
+        """Make it, unless the lock is held; then it is made when it is asked for."""
+        if not self._made and self._lock.acquire(blocking=False):
+            try:
+                self._complete()
+            finally:
+                self._lock.release()
+
+    def get(self) -> Result:
+        """The thing, made now if it was not yet."""
+        if not self._made:
+            with self._lock:
+                self._complete()
+        return self._made[0]
+
+    def _complete(self) -> None:
+        if not self._made:
+            self._made.append(self._make())

@@ -1,6 +1,7 @@
 """Exact restoration: all rows of a frame, each with its own PSF, solved together."""
 
 from dataclasses import dataclass, replace
+from threading import Lock
 from typing import Literal
 
 import torch
@@ -243,10 +244,10 @@ def restore_exact(
         images = torch.stack([restored(number, partition) for number in range(count)])
         return images.view(B, -1, *images.shape[1:])
     found = frames.new_empty(count, *frames.shape[2:])
-    threads = min(Partition.threads(frames.device), count)
+    threads, lock = min(Partition.threads(frames.device), count), Lock()
 
     def share(thread: int) -> None:
-        partition = Partition(chunk, split)
+        partition = Partition(chunk, split, lock)
         for number in range(thread, count, threads):
             found[number] = restored(number, partition)
 

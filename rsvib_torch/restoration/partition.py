@@ -1,6 +1,7 @@
 """How much of a scene is solved at a time, and the memory for it."""
 
 from dataclasses import dataclass, field
+from threading import Lock
 
 import torch
 from torch import Tensor
@@ -58,10 +59,12 @@ class Partition:
     Attributes:
         chunk: Frequencies; None: as suits the device.
         segments: Segments of rows at most; None likewise.
+        lock: Held while systems are factored; partitions of several threads share one.
     """
 
     chunk: int | None = None
     segments: int | None = None
+    lock: Lock = field(default_factory=Lock)
     _memories: dict[int | str, BandedMemory | SubstitutionMemory] = field(default_factory=dict)
 
     @staticmethod

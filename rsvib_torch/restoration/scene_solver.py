@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from rsvib_torch.parallel import in_parallel
+from rsvib_torch.parallel import MadeOnce, in_parallel
 from rsvib_torch.pieces import gathered, runs
 from rsvib_torch.restoration.banded_solver import BandedFactor, factor_skewed, solve_factored, solve_skewed
 from rsvib_torch.restoration.interpolated_solver import NodeFactors
@@ -137,18 +137,22 @@ class SceneSolver:
         normal, rows = self._whole.in_segments(segments), segments.size
         batch = len(segments.windows) * len(nodes)
         memory = self._partition.memory("nodes", rows, normal.width, 0, batch, spectra)
-        normal.at(self.u[nodes], self.precision[..., nodes], memory.full[: rows + normal.width])
-        factors = NodeFactors.of(nodes, memory.factor(rows), segments)
-        if not self._segments.whole:
-            factors = factors.in_segments(self._segments)
-        rows = self._segments.size
+
+        def factored() -> NodeFactors:
+            normal.at(self.u[nodes], self.precision[..., nodes], memory.full[: rows + normal.width])
+            found = NodeFactors.of(nodes, memory.factor(rows), segments)
+            return found if self._segments.whole else found.in_segments(self._segments)
+
+        height = self._segments.size
         sizes = (normal.width, spectra.shape[1], len(self._segments.windows), self._shares.chunk)
-        memories = [self._partition.substitution_memory(k, rows, *sizes, spectra) for k in range(threads)]
+        memories = [self._partition.substitution_memory(k, height, *sizes, spectra) for k in range(threads)]
+        factors = MadeOnce(factored, self._partition.lock)
 
         def solve_part(thread: int, part: slice, pull: Tensor | None) -> Tensor:
-            memory, chunk = memories[thread], self._wide(part)
-            self._prepare(memory.right_side[:rows], spectra, part, pull)
-            return self._joined(memory.solve(factors, factors.between(chunk.start, chunk.stop)), part)
+            own, chunk = memories[thread], self._wide(part)
+            factors.begin()
+            self._prepare(own.right_side[:height], spectra, part, pull)
+            return self._joined(own.solve(factors.get(), factors.get().between(chunk.start, chunk.stop)), part)
 
         return solve_part
 
