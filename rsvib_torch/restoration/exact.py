@@ -232,11 +232,11 @@ def restore_exact(
         strengths += [factor * stack.strength(*group, known, certain=certain) for group in groups]
         stacks.append(stack)
 
-    def restored(number: int, partition: Partition) -> Tensor:
+    def restored(number: int, partition: Partition, out: Tensor | None = None) -> Tensor:
         index, place = divmod(number, len(groups))
         problem = stacks[index].problem(*groups[place], strengths[number], partition)
         scene = _restore_group(problem, factor if prior == "edges" else None, W)
-        return scene.add_(mean[index])  # the prior was for deviations from it
+        return torch.add(scene, mean[index], out=out)  # the prior was for deviations from it
 
     count = B * len(groups)
     if torch.is_grad_enabled() and (frames.requires_grad or displacement.requires_grad):
@@ -249,7 +249,7 @@ def restore_exact(
     def share(thread: int) -> None:
         partition = Partition(chunk, split, lock)
         for number in range(thread, count, threads):
-            found[number] = restored(number, partition)
+            restored(number, partition, found[number])
 
     in_parallel(share, range(threads), frames.device)
     return found.view(B, -1, *found.shape[1:])
