@@ -38,7 +38,7 @@ def in_parallel(work: Callable[[Item], Result], items: Iterable[Item], device: t
         with torch.no_grad():
             return [work(item) for item in items]
     inference = torch.is_inference_mode_enabled()
-    waiting = iter(list(enumerate(items)))  # each of the threads takes the next one
+    waiting = enumerate(items)  # each of the threads takes the next one
     results: dict[int, Result] = {}
     errors: dict[int, BaseException] = {}
 

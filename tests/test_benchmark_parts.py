@@ -10,7 +10,6 @@ import pytest
 import torch
 
 import rsvib_torch as rsv
-from rsvib_torch.restoration import partition
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
@@ -196,7 +195,6 @@ def test_roofline(monkeypatch):
 
     monkeypatch.setattr(roofline, "COPIED", 1 << 22)
     monkeypatch.setattr(roofline, "MULTIPLIED", 256)
-    monkeypatch.setattr(partition, "_FEW", 1e9)
     chosen = options()
     results = roofline.rows(chosen)
     (device,) = (row for row in results if row["part"] == "device")
@@ -206,7 +204,7 @@ def test_roofline(monkeypatch):
     # the kernel of six rows, and one more row for what moves from cell to cell: half-width six
     assert (shapes["taps"], shapes["width"]) == (7, 6)
     at_nodes = shapes["unknowns"] * shapes["nodes"]
-    assert shapes["nodes"] == shapes["frequencies"]
+    assert shapes["nodes"] == shapes["frequencies"]  # small frames
     updates = 6 * 6 + 6 + 6  # of the window, of the right side, and scaling of a row
     assert counted["factors"]["operations"] == 8 * updates * at_nodes
     band = 8 * (shapes["unknowns"] + 6) * 13 * shapes["nodes"]

@@ -216,17 +216,17 @@ def restore_exact(
         weights = levels[index].square().reciprocal()
         typical = weights.mean().reciprocal()
         stack = _Stack(
-            frames[index],
-            displacement[index],
-            node_weights,
-            motion.shift[index],
-            weights * typical,
-            typical.sqrt(),
-            mean[index],
-            fit_prior(frames[index], motion, index, levels[index], length),
-            length,
-            None if lost is None else lost[index],
-            None if clipped is None else clipped[index],
+            frames=frames[index],
+            displacement=displacement[index],
+            node_weights=node_weights,
+            shift=motion.shift[index],
+            weights=weights * typical,
+            level=typical.sqrt(),
+            mean=mean[index],
+            prior=fit_prior(frames[index], motion, index, levels[index], length),
+            length=length,
+            lost=None if lost is None else lost[index],
+            clipped=None if clipped is None else clipped[index],
         )
         known = Strengths()
         strengths += [factor * stack.strength(*group, known, certain=certain) for group in groups]

@@ -152,7 +152,8 @@ class SceneSolver:
             own, chunk = memories[thread], self._wide(part)
             factors.begin()
             self._prepare(own.right_side[:height], spectra, part, pull)
-            return self._joined(own.solve(factors.get(), factors.get().between(chunk.start, chunk.stop)), part)
+            made = factors.get()
+            return self._joined(own.solve(made, made.between(chunk.start, chunk.stop)), part)
 
         return solve_part
 

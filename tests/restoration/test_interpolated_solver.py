@@ -147,7 +147,7 @@ def test_frames_are_as_good_as_with_all_factors(exposure, noise, limit, options,
     inner = (slice(None), slice(24, -24), slice(24, -24))
     error, wrong = (float((image - whole)[inner].square().mean().sqrt()) for image in (found, careless))
     assert error < limit * noise + 5e-5
-    assert wrong > 2 * error
+    assert wrong > 3.5 * error
     still = scene[48:-48, 48:-48]
     first = inner[1:]
-    assert psnr(found[0][first], still[first], 1.0) > psnr(whole[0][first], still[first], 1.0) - 0.02
+    assert abs(psnr(found[0][first], still[first], 1.0) - psnr(whole[0][first], still[first], 1.0)) < 0.02
