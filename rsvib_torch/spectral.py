@@ -1,6 +1,7 @@
 """Fourier transforms along rows of images that are not periodic."""
 
 import math
+from functools import cache
 
 import torch
 from scipy.fft import next_fast_len
@@ -41,16 +42,23 @@ def extend_rows(images: Tensor, length: int) -> Tensor:
     if extra <= 0:
         return images
     reach = min(extra, width - 1)
-    steps = torch.arange(1, reach + 1, dtype=images.dtype, device=images.device)
-    taper = 0.5 + 0.5 * torch.cos(steps * (torch.pi / (reach + 1)))
-    first, last = images[..., :1], images[..., -1:]
-    middle = 0.5 * (first + last)
-    after = (2 * last - middle - images[..., width - 1 - reach : width - 1].flip(-1)) * taper
-    before = (2 * first - middle - images[..., 1 : 1 + reach].flip(-1)) * taper.flip(-1)
-    gap = middle.expand(*images.shape[:-1], extra).clone()
-    gap[..., :reach] += after
-    gap[..., extra - reach :] += before
+    ends = torch.cat([images[..., : reach + 1], images[..., width - 1 - reach :]], dim=-1)
+    gap = ends @ _extension(reach, extra, images.dtype, images.device)
     return torch.cat([images, gap], dim=-1)
+
+
+@cache
+@torch.inference_mode(False)
+def _extension(reach: int, extra: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Matrix (2 reach + 2, extra) from the values at both ends of a row to those that ``extend_rows`` adds."""
+    left, right = torch.eye(2 * reach + 2, dtype=torch.float64).chunk(2, dim=1)
+    taper = 0.5 + 0.5 * torch.cos(torch.arange(1, reach + 1, dtype=torch.float64) * (torch.pi / (reach + 1)))
+    first, last = left[:, :1], right[:, -1:]
+    middle = 0.5 * (first + last)
+    gap = middle.repeat(1, extra)
+    gap[:, :reach] += (2 * last - middle - right[:, :-1].flip(-1)) * taper
+    gap[:, extra - reach :] += (2 * first - middle - left[:, 1:].flip(-1)) * taper.flip(-1)
+    return gap.to(device, dtype)
 
 
 def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dtype) -> Tensor:
@@ -74,13 +82,11 @@ def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dt
     """
     start, stop = frequencies.start, frequencies.stop
     coarse = torch.arange(start, stop, _TABLE, device=shift.device)
-    fine = torch.arange(_TABLE, device=shift.device)
-    tables = []
-    for steps in (coarse, fine):
-        turns = shift[..., None] * (steps.to(torch.float64) / length)
-        angle = ((turns - turns.detach().round()) * (2 * math.pi)).to(dtype.to_real())
-        tables.append(torch.complex(angle.cos(), angle.sin()))  # several times faster than torch.polar
-    product = tables[0][..., :, None] * tables[1][..., None, :]
+    steps = torch.cat([coarse, torch.arange(_TABLE, device=shift.device)]).to(torch.float64)
+    turns = shift[..., None] * (steps / length)
+    angle = ((turns - turns.detach().round()) * (2 * math.pi)).to(dtype.to_real())
+    tables = torch.complex(angle.cos(), angle.sin())  # several times faster than torch.polar
+    product = tables[..., : len(coarse), None] * tables[..., None, len(coarse) :]
     return product.flatten(-2)[..., : stop - start]
 
 

@@ -28,7 +28,7 @@ from rsvib_torch.detection.row_groups import (
 from rsvib_torch.detection.selection import find_tones, significant_only, strongest_only
 from rsvib_torch.detection.tones import ToneFit
 from rsvib_torch.registration.gradients import RowGradients
-from rsvib_torch.registration.pattern import column_pattern
+from rsvib_torch.registration.pattern import EVERY, column_pattern
 from rsvib_torch.registration.row_spectra import RowSpectra
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration, blind_frequencies
@@ -229,8 +229,8 @@ def _refine(
         if step >= search_at and _settled(before, fit, taken.share_of(steps[-1]) if steps and same else None):
             pattern = None
             if cleanings:
-                leaves = [known.variance for known in gradients if known is not None]
-                warps = [warping(group, timing, motion) for group in groups]
+                leaves = [known.variance[:, ::EVERY] for known in gradients if known is not None]
+                warps = [warping(group, timing, motion, EVERY) for group in groups]
                 pattern = column_pattern([(*warp, left) for warp, left in zip(warps, leaves, strict=True)])
             if pattern is None:
                 break

@@ -95,10 +95,13 @@ def frame_groups(
     return [FrameGroup(spectra.part(part), starts[:, part]) for part in parts]
 
 
-def warping(group: FrameGroup, timing: SensorTiming, motion: Vibration) -> tuple[RowSpectra, Tensor, Tensor, Tensor]:
-    """A group with what warps its frames back by a motion."""
-    shown = Shown.of(*_place(group, timing, motion), group.starts[..., None], timing, motion)
-    return group.spectra, shown.rows, shown.shift, _seen(shown.rows, group.spectra.height)
+def warping(
+    group: FrameGroup, timing: SensorTiming, motion: Vibration, every: int
+) -> tuple[RowSpectra, Tensor, Tensor, Tensor]:
+    """A group with what warps every so many rows (a part of a block) of its frames back by a motion."""
+    place, left = _place(group, timing, motion)
+    shown = Shown.of(place[..., ::every], left, group.starts[..., None], timing, motion)
+    return group.spectra, shown.rows, shown.shift, _seen(shown.rows, group.spectra.height, BLOCK // every)
 
 
 def _place(group: FrameGroup, timing: SensorTiming, motion: Vibration) -> tuple[Tensor, Tensor]:
@@ -110,12 +113,12 @@ def _place(group: FrameGroup, timing: SensorTiming, motion: Vibration) -> tuple[
     return scene_rows - travelled[..., 1], travelled[..., 0]
 
 
-def _seen(rows: Tensor, height: int) -> Tensor:
+def _seen(rows: Tensor, height: int, block: int = BLOCK) -> Tensor:
     """(B, G, S) float64, 1 for blocks of scene rows that lie well inside the frames that show them at ``rows``."""
-    blocks = height // BLOCK
+    blocks = rows.shape[-1] // block
     inside = ((rows >= MARGIN) & (rows <= height - 1 - MARGIN)).double()
-    whole = inside[..., : blocks * BLOCK].unflatten(-1, (blocks, BLOCK)).amin(-1)
-    return functional.pad(whole.repeat_interleave(BLOCK, dim=-1), (0, height - blocks * BLOCK))
+    whole = inside[..., : blocks * block].unflatten(-1, (blocks, block)).amin(-1)
+    return functional.pad(whole.repeat_interleave(block, dim=-1), (0, rows.shape[-1] - blocks * block))
 
 
 def _blocks(values: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from rsvib_torch.vibration import Vibration
 
 __all__ = ["rows_showing"]
 
-_STEPS, _FEW = 8, 3  # of Newton's method, and those that are mostly enough
+_STEPS, _FEW = 8, 3  # of Newton's method, and those that are mostly enough, the last one with the slope before it
 _TINY = 1e-9  # px: the square of it is what a step as small as that leaves
 
 
@@ -33,8 +33,8 @@ def rows_showing(scene_rows: Tensor, frame_start: Tensor, timing: SensorTiming, 
     for taken in range(1, _STEPS + 1):
         starts = frame_start + rows * timing.row_time
         miss = scene_rows + vibration.mean_displacement(starts, timing.exposure_time)[..., 1] - rows
-        # Newton's step: an image motion of half a frame moves 0.5 px a row time
-        slope = vibration.velocity(starts + 0.5 * timing.exposure_time)[..., 1].detach() * timing.row_time
+        if taken != _FEW:  # Newton's step: an image motion of half a frame moves 0.5 px a row time
+            slope = vibration.velocity(starts + 0.5 * timing.exposure_time)[..., 1].detach() * timing.row_time
         step = miss / (1.0 - slope).clamp(min=0.1)
         rows = rows + step
         if taken == _FEW and bool((step.abs() < _TINY).all()):

@@ -106,7 +106,7 @@ def row_gradients(
             weight = weight * functional.pad(valid[:, part], (0, length - width))
         return _Rows(planes, weight, visible)
 
-    images = inner.new_empty(*detail.shape[:2], 3, length)
+    images = inner.new_empty(len(rows), rows.shape[-1], 3, length)
     results, energies = [], []
     for part in parts:
         some = pixels(part)

@@ -10,9 +10,10 @@ from torch.nn import functional
 from rsvib_torch.registration.row_spectra import RowSpectra, differences, inner_columns
 from rsvib_torch.spectral import squared_modulus
 
-__all__ = ["column_pattern"]
+__all__ = ["EVERY", "column_pattern"]
 
-_ASKED, _TOLD = 8, 4  # every so many rows are asked whether there is a pattern, and what it is
+EVERY = 4  # rows of which one is enough
+_ASKED = 2  # of those, one that tells whether there is a pattern at all
 _LARGEST = 3.0  # variance of a row over the typical one
 _NEIGHBOURS = 17  # frequencies judged together
 _SIGNIFICANT = 3.0  # power over what noise gives
@@ -26,13 +27,13 @@ def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor
 
     Args:
         groups: Spectra of each group of frames with the rows (B, G, S), shifts (B, G, S) and visibility (B, G, S) that
-            warp it, and the variance (B, S) that its rows leave: rows that leave far more than others show something
-            else and are not asked.
+            warp some of it, and the variance (B, S) that these rows leave: those that leave far more than others show
+            something else and are not asked.
 
     Returns:
         (B, U) spectrum of the pattern, shrunk by its noise; None where none stands above it.
     """
-    return None if _pattern_of(groups, _ASKED) is None else _pattern_of(groups, _TOLD)
+    return None if _pattern_of(groups, _ASKED) is None else _pattern_of(groups, 1)
 
 
 def _pattern_of(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor]], step: int) -> Tensor | None:

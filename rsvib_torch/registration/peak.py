@@ -24,15 +24,15 @@ def _polynomial_fit(size: int) -> Tensor:
     return matrix
 
 
-def _powers(position: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Powers 0 ... size - 1 of positions (M,), with their first and second derivatives, each (M, size)."""
+def _powers(position: Tensor, size: int) -> Tensor:
+    """Powers 0 ... size - 1 of positions (M,), with their first and second derivatives, (M, 3, size)."""
     order = torch.arange(size, dtype=position.dtype, device=position.device)
     value = position[:, None] ** order
-    slope = torch.zeros_like(value)
-    bend = torch.zeros_like(value)
-    slope[:, 1:] = value[:, :-1] * order[1:]
-    bend[:, 2:] = value[:, :-2] * (order[2:] * (order[2:] - 1))
-    return value, slope, bend
+    result = value.new_zeros(len(value), 3, size)
+    result[:, 0] = value
+    result[:, 1, 1:] = value[:, :-1] * order[1:]
+    result[:, 2, 2:] = value[:, :-2] * (order[2:] * (order[2:] - 1))
+    return result
 
 
 def subpixel_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
@@ -55,23 +55,15 @@ def subpixel_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
     position = polynomial.new_zeros(count, 2)
     known = torch.ones(count, dtype=torch.bool, device=surface.device)
     for _ in range(_NEWTON_STEPS):
-        vertical, horizontal = _powers(position[:, 0], rows), _powers(position[:, 1], columns)
-        derivative = {
-            (i, j): torch.einsum("mi,mij,mj->m", vertical[i], polynomial, horizontal[j])
-            for i, j in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-        }
-        a = derivative[2, 0] if rows > 1 else -torch.ones_like(position[:, 0])
-        c = derivative[0, 2] if columns > 1 else -torch.ones_like(position[:, 0])
-        b = derivative[1, 1]
+        derivative = _powers(position[:, 0], rows) @ polynomial @ _powers(position[:, 1], columns).mT  # (M, 3, 3)
+        down, right, b = derivative[:, 1, 0], derivative[:, 0, 1], derivative[:, 1, 1]
+        a = derivative[:, 2, 0] if rows > 1 else -torch.ones_like(b)
+        c = derivative[:, 0, 2] if columns > 1 else -torch.ones_like(b)
         determinant = a * c - b * b
         known = known & (determinant > 0) & (a < 0)
-        move = torch.stack(
-            [b * derivative[0, 1] - c * derivative[1, 0], b * derivative[1, 0] - a * derivative[0, 1]], dim=-1
-        )
+        move = torch.stack([b * right - c * down, b * down - a * right], dim=-1)
         step = (move / torch.where(known, determinant, 1.0)[:, None]).clamp(-0.5, 0.5)
         position = position + torch.where(known[:, None], step, 0.0)
-    value = torch.einsum(
-        "mi,mij,mj->m", _powers(position[:, 0], rows)[0], polynomial, _powers(position[:, 1], columns)[0]
-    )
+    value = (_powers(position[:, 0], rows) @ polynomial @ _powers(position[:, 1], columns).mT)[:, 0, 0]
     known = known & (position.abs() <= 1.0).all(-1)
     return torch.where(known[:, None], position, torch.nan), value

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.registration.row_spectra import chunks, combined, differences, mean_over_frames
+from rsvib_torch.spectral import fast_length
 
 __all__ = ["Compared", "scene_detail"]
 
@@ -17,6 +18,7 @@ _PASS_COLUMNS = (0.40, 0.48)  # along rows, where interpolation is exact but det
 _SLOWEST = 1 / 64  # cycles/px: shading and vignetting live below
 _SMOOTH = 16  # values of the spectra that are averaged along each axis
 _SOME = 4  # along rows, of which one tells the noise
+_SAME_PLACE = 128  # complex values: what lies a multiple apart shares a few places of a cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +26,9 @@ class Compared:
     """What the frames of a group show of a scene together, and what they differ by: spectra along its S rows.
 
     Attributes:
-        mean: (B, S, U), over the frames that see a row.
-        noise: (B, S, U / 4), a difference of two frames with the noise of their mean, at every fourth frequency.
+        mean: (B, R, U), over the frames that see a row; R - S rows of zeros follow, so that transforms across rows are
+            fast, and their values for one frequency along rows do not all lie at the same place of a cache.
+        noise: (B, R, U / 4), a difference of two frames with the noise of their mean, at every fourth frequency.
         differences: (B, G, S, U), or (B, 1, S, U) of two frames, as from ``differences``.
     """
 
@@ -43,16 +46,21 @@ class Compared:
             seen: (B, G, S) float64, 1 where a frame sees the row.
         """
         whole: list[Tensor] = []
+        count = seen.shape[2]
+        counts = (_transformed(count), _transformed(count), count)
         for rows, run in warped:
             visible = seen[:, :, rows]
-            of_run = (
-                mean_over_frames(run, visible),
-                _noise_of_mean(run[..., ::_SOME], visible),
-                differences(run, visible),
-            )
-            whole = whole or [one.new_empty(*one.shape[:-2], seen.shape[2], one.shape[-1]) for one in of_run]
+            different = differences(run, visible)
+            # of two frames what they differ by is just that
+            noise = different[:, 0, :, ::_SOME] if run.shape[1] == 2 else _noise_of_mean(run[..., ::_SOME], visible)
+            of_run = (mean_over_frames(run, visible), noise, different)
+            if not whole:
+                sizes = zip(of_run, counts, strict=True)
+                whole = [one.new_empty(*one.shape[:-2], size, one.shape[-1]) for one, size in sizes]
             for all_rows, one in zip(whole, of_run, strict=True):
                 all_rows[..., rows, :] = one
+        for all_rows in whole:
+            all_rows[..., count:, :] = 0
         return cls(*whole)
 
 
@@ -64,15 +72,21 @@ def scene_detail(compared: Compared, u: Tensor) -> tuple[Tensor, Tensor]:
         u: (U,) frequencies along rows, cycles/px.
 
     Returns:
-        Spectra (B, S, U) each, px^-1 the latter.
+        Spectra (B, R, U) each, px^-1 the latter; those of the rows lie side by side in memory.
     """
-    v = torch.fft.fftfreq(compared.mean.shape[-2], dtype=torch.float64, device=u.device)
     # transforms across rows leave the rows side by side in memory, and all that follows runs along them
     whole, noise = (torch.fft.fft(rows, dim=-2).transpose(-2, -1) for rows in (compared.mean, compared.noise))
+    v = torch.fft.fftfreq(whole.shape[-1], dtype=torch.float64, device=u.device)
     torch.view_as_real(whole).mul_(_wiener(whole, noise, u, v)[..., None])
     detail = torch.fft.ifft(whole)
     whole *= (2j * math.pi * v).to(whole.dtype)
     return detail.transpose(-2, -1), torch.fft.ifft(whole).transpose(-2, -1)
+
+
+def _transformed(rows: int) -> int:
+    """Rows that a transform across so many is taken of."""
+    length = fast_length(rows)
+    return length if length % _SAME_PLACE else fast_length(length + 1)
 
 
 def _pass(frequency: Tensor, limits: tuple[float, float]) -> Tensor:

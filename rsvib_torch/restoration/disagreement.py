@@ -13,7 +13,7 @@ from rsvib_torch.restoration.sampled_rows import sample_rows
 
 __all__ = ["noise_levels"]
 
-_ROWS = 512  # at most, from the middle of the frame
+_ROWS = 256  # at most, from the middle of the frame
 _SMALLEST = 64  # rows and columns that two frames have to share
 _FREQUENCIES = 24  # spread over the upper half, where scenes are weakest
 _WEAK = 1e-4  # of the prior that bridges what no frame saw, relative to the data

@@ -1,6 +1,7 @@
 """Banded systems that change smoothly with frequency: factors of a few of them, interpolated for all others."""
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -17,7 +18,8 @@ __all__ = ["NodeFactors", "SubstitutionMemory", "chosen_nodes"]
 
 _ALIGNED = 8  # nodes: products of matrices take several times as long where rows do not begin at full cache lines
 _FINER = 6.0  # times the frequency itself: steps between low frequencies, where priors change most, are smaller
-_BLOCK = 96  # systems that one product of matrices interpolates: few nodes count for them
+_BLOCK, _LEAST = 96, 24  # systems that one product of matrices interpolates, at most and at least:
+_NODES = 6  # not many nodes count for them
 _ROWS = {"cpu": 160}  # that are interpolated at a time: they stay in the cache
 
 
@@ -84,8 +86,7 @@ class NodeFactors:
         bounds = above.tolist()
         uppers: Mixture = []
         inverses: Mixture = []
-        for k in range(0, last - first, _BLOCK):
-            stop = min(k + _BLOCK, last - first)
+        for k, stop in _blocks(bounds):
             few = slice(bounds[k] - 1, bounds[stop - 1] + 1)
             places = self.nodes[few].to(torch.float64)
             here = chosen[k:stop].to(torch.float64)
@@ -175,6 +176,18 @@ class SubstitutionMemory:
             back = slice(block.stop - 1, block.start - 1 if block.start else None, -1)
             subtract_products(self._before[back], self._columns[:count][::-1], self._values[back])
         return self.right_side[:rows]
+
+
+def _blocks(above: list[int]) -> Iterator[tuple[int, int]]:
+    """Blocks of systems that lie below the nodes ``above``, first and last + 1: smaller where nodes lie close."""
+    start = 0
+    while start < len(above):
+        size = _BLOCK
+        while size > _LEAST and above[min(start + size, len(above)) - 1] - above[start] > _NODES:
+            size //= 2
+        stop = min(start + size, len(above))
+        yield start, stop
+        start = stop
 
 
 def _mix(nodes: Tensor, mixture: Mixture, out: Tensor) -> None:

@@ -5,6 +5,7 @@ import pytest
 import torch
 from scipy.linalg import solveh_banded
 
+import rsvib_torch.restoration.exact as exact_module
 import rsvib_torch.restoration.partition as partition_module
 from rsvib_torch import SensorNoise, SensorTiming, Vibration, psnr, restore, simulate_frames
 from rsvib_torch.evaluation.targets import city_and_fields
@@ -116,6 +117,17 @@ def test_rows_looked_up_are_rows_added(first):
         torch.testing.assert_close(sums.of(data, u, out), expected, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("frequencies", [5, 97, 1081])
+def test_blocks_are_all_systems_once_and_smaller_where_nodes_lie_close(frequencies):
+    nodes = chosen_nodes(frequencies, 33.0, torch.device("cpu"))
+    above = torch.searchsorted(nodes, torch.arange(frequencies)).clamp(min=1).tolist()
+    blocks = list(interpolated_solver._blocks(above))
+    assert [system for start, stop in blocks for system in range(start, stop)] == list(range(frequencies))
+    sizes = [stop - start for start, stop in blocks[:-1]]
+    assert sizes == sorted(sizes)
+    assert all(above[stop - 1] - above[start] <= 6 for start, stop in blocks[1:])
+
+
 @pytest.mark.parametrize(("exposure", "noise", "limit"), [(20, 0.005, 0.02), (90, 0.02, 0.02), (20, 0.0, 0.0)])
 @pytest.mark.parametrize("options", [{}, {"joint": True}, {"prior": "edges"}, {"segments": 2}])
 def test_frames_are_as_good_as_with_all_factors(exposure, noise, limit, options, monkeypatch):
@@ -133,6 +145,7 @@ def test_frames_are_as_good_as_with_all_factors(exposure, noise, limit, options,
         return shares
 
     monkeypatch.setattr(partition_module.Partition, "of", noted)
+    monkeypatch.setattr(exact_module, "prior_strength", lambda *_, **__: 1.0)  # without noise, rounding decides
     found = restore(frames, timing, vibration, check=False, **options)
     assert any(nodes)
     with monkeypatch.context() as patched:
