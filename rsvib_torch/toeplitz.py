@@ -7,7 +7,7 @@ from rsvib_torch.pieces import runs
 
 __all__ = ["correlated", "toeplitz"]
 
-_BLOCK, _LARGE_BLOCK = {"cpu": 64}, 256  # samples that one small dense matrix filters
+_BLOCK, _FEW_ROWS, _LARGE_BLOCK = {"cpu": 64}, {"cpu": 8}, 256  # samples that one small dense matrix filters
 
 
 def toeplitz(kernels: Tensor, rows: int, step: int = 1) -> Tensor:
@@ -52,17 +52,32 @@ def correlated(samples: Tensor, kernels: Tensor, dim: int, step: int = 1) -> Ten
         return correlated(samples[None], kernels, 1, step)[:, 0]
     number, taps = kernels.shape
     length = (samples.shape[dim] - taps) // step + 1
+    if dim not in (-1, samples.ndim - 1):
+        found = _across(samples.movedim(dim, -2), kernels, step, length)
+        return found.movedim(-2, dim + 1 if dim >= 0 else dim)
     block = min(_BLOCK.get(samples.device.type, _LARGE_BLOCK), length)
     matrix = toeplitz(kernels, block, step)  # (Q, block, m)
-    last = dim in (-1, samples.ndim - 1)
-    moved = samples if last else samples.movedim(dim, -2)
-    found = []
+    parts = []
     for part in runs(length, block):
         count = part.stop - part.start
         own = matrix[:, :count, : (count - 1) * step + taps].flatten(0, 1)
-        near = slice(part.start * step, (part.stop - 1) * step + taps)
-        values = moved[..., near] @ own.T if last else own @ moved[..., near, :]
-        found.append(values.unflatten(-1 if last else -2, (number, count)))
-    if last:
-        return torch.cat(found, -1).movedim(-2, 0)
-    return torch.cat(found, -2).movedim(-3, 0).movedim(-2, dim + 1 if dim >= 0 else dim)
+        values = samples[..., part.start * step : (part.stop - 1) * step + taps] @ own.T
+        parts.append(values.unflatten(-1, (number, count)))
+    return torch.cat(parts, -1).movedim(-2, 0)
+
+
+def _across(samples: Tensor, kernels: Tensor, step: int, length: int) -> Tensor:
+    """``correlated`` across rows (..., n, W): (Q, ..., length, W). Small matrices, as a batch: few zeros in them."""
+    number, taps = kernels.shape
+    block = min(_FEW_ROWS.get(samples.device.type, _LARGE_BLOCK), length)
+    span = (block - 1) * step + taps
+    count = length // block
+    own = toeplitz(kernels, block, step).flatten(0, 1)
+    windows = samples.unfold(-2, span, block * step).mT  # (..., count, span, W)
+    blocks: Tensor = (own @ windows).unflatten(-2, (number, block)).movedim(-3, 0).flatten(-3, -2)
+    rest = length - count * block
+    if not rest:
+        return blocks
+    last = toeplitz(kernels, rest, step)[(slice(None), *(None,) * (samples.ndim - 2))]
+    near = samples[..., count * block * step : (length - 1) * step + taps, :]
+    return torch.cat([blocks, last @ near], -2)

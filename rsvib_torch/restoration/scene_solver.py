@@ -13,6 +13,7 @@ from rsvib_torch.restoration.partition import Partition
 from rsvib_torch.restoration.row_kernel import SCENE_REACH, scene_weights
 from rsvib_torch.restoration.row_sums import sum_looked_up
 from rsvib_torch.restoration.seen_scene import SeenScene
+from rsvib_torch.toeplitz import correlated
 
 __all__ = ["Coefficients", "SceneSolver"]
 
@@ -52,6 +53,7 @@ class SceneSolver:
         self._partition = partition
         self.parts = shares.parts(len(self.u))
         self._seen, self._sums = seen.smooth, seen.sums
+        self._sampling = torch.tensor([scene_weights()], dtype=seen.dtype, device=precision.device)
         self._factors: list[BandedFactor] | None = None
         moving = self._normal.left.requires_grad or precision.requires_grad
         if keep and not (torch.is_grad_enabled() and moving):
@@ -212,9 +214,11 @@ class SceneSolver:
 
         def take(k: int, solved: Tensor) -> None:
             for rows in blocks:
-                sampled = found[rows, :, self.parts[k]].copy_(self._between_rows(solved, rows))
+                sampled = self._between_rows(solved, rows)
                 if self._shares.nodes is not None:
-                    sampled.conj_physical_()
+                    torch.conj_physical(sampled, out=found[rows, :, self.parts[k]])
+                else:
+                    found[rows, :, self.parts[k]] = sampled
 
         self._solve_in_place(spectra, None, take)
         images = ((rows, torch.fft.irfft(found[rows].movedim(1, 0), n=self.length)[..., :width]) for rows in blocks)
@@ -228,9 +232,6 @@ class SceneSolver:
         """What coefficients (K, C, U') make of some rows of the scene, by default all."""
         chosen = slice(0, self.num_rows) if rows is None else rows
         first = chosen.start - SCENE_REACH - self.rows.top
-        count = chosen.stop - chosen.start
-        weights = scene_weights()
-        sampled = weights[0] * coefficients[first : first + count]
-        for k, weight in enumerate(weights[1:], 1):
-            sampled = sampled.add_(coefficients[first + k : first + k + count], alpha=weight)
-        return sampled
+        near = coefficients[first : first + chosen.stop - chosen.start + 2 * SCENE_REACH]
+        sampled = correlated(torch.view_as_real(near).flatten(1), self._sampling, 0)[0]
+        return torch.view_as_complex(sampled.unflatten(1, (*near.shape[1:], 2)))
