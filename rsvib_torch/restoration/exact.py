@@ -65,11 +65,14 @@ def _with_edges(problem: SceneProblem, factor: float) -> Tensor:
     return solver.scene(coefficients)
 
 
-def _restore_group(problem: SceneProblem, edges: float | None, width: int) -> Tensor:
-    """Restore one scene (C, R, W) from M frames, all values of which are measured or filled."""
+def _restore_group(problem: SceneProblem, edges: float | None, level: Tensor, width: int, out: Tensor | None) -> Tensor:
+    """Restore one scene (C, R, W) from M frames, all values of which are measured or filled.
+
+    The prior is for deviations from a brightness ``level`` (C, 1, 1), which is added where the scene is written.
+    """
     if edges is not None:
-        return _with_edges(problem, edges)[..., :width]
-    return problem.solver().fit_scene(problem.data, width)
+        return torch.add(_with_edges(problem, edges)[..., :width], level, out=out)
+    return problem.solver().fit_scene(problem.data, width, level, out)
 
 
 def _floor(data: Tensor, clipped: Tensor) -> Tensor:
@@ -235,8 +238,7 @@ def restore_exact(
     def restored(number: int, partition: Partition, out: Tensor | None = None) -> Tensor:
         index, place = divmod(number, len(groups))
         problem = stacks[index].problem(*groups[place], strengths[number], partition)
-        scene = _restore_group(problem, factor if prior == "edges" else None, W)
-        return torch.add(scene, mean[index], out=out)  # the prior was for deviations from it
+        return _restore_group(problem, factor if prior == "edges" else None, mean[index], W, out)
 
     count = B * len(groups)
     if torch.is_grad_enabled() and (frames.requires_grad or displacement.requires_grad):

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.parallel import MadeOnce, in_parallel
-from rsvib_torch.pieces import gathered, runs
+from rsvib_torch.pieces import runs
 from rsvib_torch.restoration.banded_solver import BandedFactor, factor_skewed, solve_factored, solve_skewed
 from rsvib_torch.restoration.interpolated_solver import NodeFactors
 from rsvib_torch.restoration.partition import Partition
@@ -203,13 +203,21 @@ class SceneSolver:
         scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=self.length)
         return scene
 
-    def fit_scene(self, data: Tensor, width: int) -> Tensor:
-        """The first ``width`` columns of ``scene(fit(data))``; coefficients are kept only to be differentiated."""
+    def fit_scene(self, data: Tensor, width: int, level: Tensor, out: Tensor | None = None) -> Tensor:
+        """The first ``width`` columns of ``scene(fit(data))`` and a brightness on top.
+
+        Coefficients are kept only to be differentiated.
+
+        Args:
+            data: As in ``fit``.
+            width: Columns.
+            level: (C, 1, 1) the brightness.
+            out: (C, R, width) where to write them; nothing is then differentiated.
+        """
         spectra = torch.fft.rfft(data)
         if self._factors is not None or self._differentiates(spectra):
-            return self.scene(self.fit(data))[..., :width]
+            return torch.add(self.scene(self.fit(data))[..., :width], level, out=out)
         found = spectra.new_empty(self.num_rows, spectra.shape[1], len(self.u))
-
         blocks = runs(self.num_rows, _ROWS.get(found.device.type, self.num_rows))
 
         def take(k: int, solved: Tensor) -> None:
@@ -221,8 +229,11 @@ class SceneSolver:
                     found[rows, :, self.parts[k]] = sampled
 
         self._solve_in_place(spectra, None, take)
-        images = ((rows, torch.fft.irfft(found[rows].movedim(1, 0), n=self.length)[..., :width]) for rows in blocks)
-        return gathered(images, self.num_rows, 1)
+        image = data.new_empty(spectra.shape[1], self.num_rows, width) if out is None else out
+        for rows in blocks:
+            scene = torch.fft.irfft(found[rows].movedim(1, 0), n=self.length)[..., :width]
+            torch.add(scene, level, out=image[:, rows])
+        return image
 
     def _differentiates(self, *values: Tensor) -> bool:
         given = (*values, self._normal.left, self.precision)
