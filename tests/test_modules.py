@@ -253,6 +253,27 @@ def test_blur_is_the_linear_operator_of_a_solver():
     assert after < 0.1 * before
 
 
+def test_blur_is_a_physics_of_deepinv():
+    try:
+        from deepinv.physics import LinearPhysics
+    except (ImportError, RuntimeError) as missing:
+        pytest.skip(f"deepinv cannot be imported: {missing}")
+    scene = torch.rand(1, 1, 104, 104, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
+    scene = torch.nn.functional.avg_pool2d(scene, 9, 1)
+    timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=8, frame_rows=320)
+    psf = rsv.row_psf(
+        MOTIONS[0].vibration(), timing.row_starts(1, 96)[0], timing, interpolation="cubic", quadrature="gauss"
+    )
+    blur = rsv.RowVaryingBlur(psf)
+    physics = LinearPhysics(A=blur.A, A_adjoint=blur.A_adjoint)
+    assert abs(float(physics.adjointness_test(scene))) < 1e-9
+    frame = physics.A(scene)
+    inner = (..., slice(16, -16), slice(16, -16))
+    before, after = ((image - scene)[inner].square().mean().sqrt() for image in (frame, physics.A_dagger(frame)))
+    assert before > 0.01
+    assert after < 0.1 * before
+
+
 def strange_arrays(frames):
     readonly = frames.copy()
     readonly.flags.writeable = False

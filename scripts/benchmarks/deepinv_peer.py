@@ -6,6 +6,7 @@ Tiles are as wide as the frame and blend into each other; the scene is larger th
 import math
 import time
 
+import einops  # noqa: F401 - TiledSpaceVaryingBlur asks for it only when it is used
 import torch
 from benchmarks.restoration_peers import Peer, row_kernels
 from deepinv.optim.linear import least_squares
@@ -15,8 +16,8 @@ from torch import Tensor
 import rsvib_torch as rsv
 
 TILE_ROWS, TILE_STEP = 16, 8
-ITERATIONS = (10, 30)
-DAMPINGS = (1e-3, 2e-2, 0.1, 0.3)
+ITERATIONS = (3, 10, 30, 60)
+DAMPINGS = (1e-3, 1e-2, 2e-2, 0.1, 0.3)
 
 
 def frame_physics(shape: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibration) -> TiledSpaceVaryingBlur:
