@@ -135,15 +135,16 @@ def test_killed_runs_resume_to_the_same_bytes(forks, whole, tmp_path):
 @pytest.mark.slow
 def test_kill_at_twenty_random_moments(forks, whole_zarr, tmp_path):
     whole = whole_zarr
-    start = time.perf_counter()
-    (tmp_path / "timed").mkdir()
-    assert run_apart(forks, whole / "frames.tif", tmp_path / "timed" / "out.tif") == 0
-    duration = time.perf_counter() - start
+    for name in ("first", "timed"):  # whatever is done for the first time takes longer
+        (tmp_path / name).mkdir()
+        start = time.perf_counter()
+        assert run_apart(forks, whole / "frames.tif", tmp_path / name / "out.tif", workers=2) == 0
+        duration = time.perf_counter() - start
     choice = random.Random(6)
     resumed = []
     for trial in range(20):
         name = ("out.tif", "out.npy", "out.zarr")[trial % 3]
-        moment = choice.uniform(0.05, 1.0) * duration
+        moment = choice.uniform(0.3, 1.2) * duration  # windows begin late
         resumed.append(kill_and_resume(forks, whole, tmp_path / f"{trial}", name, seconds=moment, workers=2))
     assert len(set(resumed)) > 2
 
