@@ -9,7 +9,7 @@ from rsvib_torch.vibration import Vibration
 __all__ = ["rows_showing"]
 
 _STEPS, _FEW = 8, 3  # of Newton's method, and those that are mostly enough, the last one with the slope before it
-_TINY = 1e-9  # px: the square of it is what a step as small as that leaves
+_TINY = 1e-9  # px: a step as small as that leaves next to nothing
 
 
 def rows_showing(scene_rows: Tensor, frame_start: Tensor, timing: SensorTiming, vibration: Vibration) -> Tensor:
