@@ -78,6 +78,4 @@ def _across(samples: Tensor, kernels: Tensor, step: int, length: int) -> Tensor:
     rest = length - count * block
     if not rest:
         return blocks
-    last = toeplitz(kernels, rest, step)[(slice(None), *(None,) * (samples.ndim - 2))]
-    near = samples[..., count * block * step : (length - 1) * step + taps, :]
-    return torch.cat([blocks, last @ near], -2)
+    return torch.cat([blocks, _across(samples[..., count * block * step :, :], kernels, step, rest)], -2)

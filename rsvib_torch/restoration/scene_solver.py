@@ -223,10 +223,7 @@ class SceneSolver:
         def take(k: int, solved: Tensor) -> None:
             for rows in blocks:
                 sampled = self._between_rows(solved, rows)
-                if self._shares.nodes is not None:
-                    torch.conj_physical(sampled, out=found[rows, :, self.parts[k]])
-                else:
-                    found[rows, :, self.parts[k]] = sampled
+                found[rows, :, self.parts[k]] = sampled if self._shares.nodes is None else sampled.conj()
 
         self._solve_in_place(spectra, None, take)
         image = data.new_empty(spectra.shape[1], self.num_rows, width) if out is None else out

@@ -144,7 +144,7 @@ def test_kill_at_twenty_random_moments(forks, whole_zarr, tmp_path):
     resumed = []
     for trial in range(20):
         name = ("out.tif", "out.npy", "out.zarr")[trial % 3]
-        moment = choice.uniform(0.3, 1.2) * duration  # windows begin late
+        moment = choice.uniform(0.05, 1.2) * duration
         resumed.append(kill_and_resume(forks, whole, tmp_path / f"{trial}", name, seconds=moment, workers=2))
     assert len(set(resumed)) > 2
 
