@@ -92,18 +92,20 @@ def test_pipeline():
         assert f"| {row['target']} | {row['goal']} | {row['value']:.2f} | " in text
 
 
-def test_optics(tmp_path):
-    """Scenes are blurred until plain unwarping is as good as on the scene of the goals; then goals are comparable."""
-    from benchmarks import optics
+def test_difficulty(tmp_path):
+    """Scenes are made easier until plain unwarping is as good as where goals were set; then goals are comparable."""
+    from benchmarks import difficulty
 
     told = []
-    optics.main(["--size", "160", "--scenes", "city", "--json", str(tmp_path / "found.json")], told.append)
+    difficulty.main(["--grid-size", "160", "--scenes", "city", "--json", str(tmp_path / "found.json")], told.append)
     results = json.loads((tmp_path / "found.json").read_text())
-    assert [(row["exposure_rows"], row["noise"]) for row in results] == list(optics.CASES)
-    assert results[0]["unwarped_db"] == pytest.approx(optics.UNWARPED[0], abs=0.2)
+    cases = [(row["by"], row["exposure_rows"], row["noise"]) for row in results]
+    assert cases == [(way, *case) for way in difficulty.WAYS for case in difficulty.CASES]
     for row in results:
         assert row["two_db"] > row["one_db"] > row["unwarped_db"]
-    assert results[0]["one_db"] > 68
+        if row["noise"] == 0:
+            assert row["unwarped_db"] == pytest.approx(difficulty.UNWARPED[0], abs=0.2)
+            assert row["one_db"] > 68
     (text,) = told
     assert sum(line.startswith("| city, ") for line in text.splitlines()) == len(results)
 
