@@ -31,6 +31,8 @@ def as_tensor(name: str, value: object) -> Tensor:
     """
     if isinstance(value, Tensor):
         return value
+    if isinstance(value, np.ma.MaskedArray):
+        raise TypeError(f"{name} must not be a masked array; give its data, and the mask by itself (ignore=)")
     try:
         if isinstance(value, np.ndarray):
             native = value if value.dtype.isnative else value.astype(value.dtype.newbyteorder("="))
@@ -40,4 +42,5 @@ def as_tensor(name: str, value: object) -> Tensor:
             return torch.from_numpy(native.copy() if strange else native)
         return torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"{name} must be a tensor or array of numbers, got {type(value).__name__}") from error
+        kind = f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(f"{name} must be a tensor or array of numbers, got {type(value).__name__}{kind}") from error

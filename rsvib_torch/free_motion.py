@@ -13,7 +13,7 @@ from rsvib_torch.quadrature import gauss_legendre
 from rsvib_torch.splines import bspline_coefficients, bspline_weights
 from rsvib_torch.vibration import TensorLike, Vibration
 
-__all__ = ["FreeMotion", "rest_path", "rest_reach"]
+__all__ = ["FreeMotion", "moving_axes", "rest_path", "rest_reach"]
 
 _TAPS = 4
 _REACH = 24  # knots after which an end is forgotten
@@ -244,6 +244,17 @@ def rest_reach(vibration: Vibration) -> Tensor:
     if not isinstance(vibration, FreeMotion):
         return torch.zeros_like(vibration.image_motion)
     return vibration.coefficients.detach().abs().amax(-1)
+
+
+def moving_axes(vibration: Vibration) -> Tensor:
+    """Which axes (..., 2) a motion moves at all: by tones, uniform or accelerated motion, or a free rest.
+
+    Example:
+        >>> moving_axes(Vibration([2.0, 0.0], [50.0, 0.0], image_acceleration=[0.0, 3.0])).tolist()
+        [True, True]
+    """
+    tones = (vibration.amplitude > 0).any(-1)
+    return tones | (vibration.image_motion != 0) | (vibration.image_acceleration != 0) | (rest_reach(vibration) > 0)
 
 
 def rest_path(vibration: Vibration, duration: float) -> Tensor:

@@ -83,7 +83,12 @@ def offsets_from_row_order(offsets: Tensor, timing: SensorTiming) -> Tensor:
 
 
 def as_float_frames(
-    frames: ArrayLike, full_scale: float | None = None, *, minimum_frames: int = 1, nan_is_missing: bool = False
+    frames: ArrayLike,
+    full_scale: float | None = None,
+    *,
+    minimum_frames: int = 1,
+    nan_is_missing: bool = False,
+    name: str = "frames",
 ) -> Tensor:
     """Check a stack of frames and turn integers into floats where full scale is 1.
 
@@ -95,6 +100,7 @@ def as_float_frames(
         full_scale: Count that means 1.0, for integer frames.
         minimum_frames: How many frames the stack must have.
         nan_is_missing: NaN marks a pixel that was not measured and is let through; infinity never is.
+        name: What the frames are called in messages.
 
     Returns:
         Floating-point tensor of the same shape.
@@ -108,30 +114,30 @@ def as_float_frames(
         >>> as_float_frames(torch.full((2, 4, 4), 255, dtype=torch.uint8)).max().item()
         1.0
     """
-    frames = as_tensor("frames", frames)
+    frames = as_tensor(name, frames)
     if frames.ndim not in (3, 4, 5):
         raise ValueError(
-            f"frames must have shape (T, H, W), (T, C, H, W) or (B, T, C, H, W), got {tuple(frames.shape)}"
+            f"{name} must have shape (T, H, W), (T, C, H, W) or (B, T, C, H, W), got {tuple(frames.shape)}"
         )
     count = frames.shape[time_axis(frames)]
     if count < minimum_frames:
         raise ValueError(f"at least {minimum_frames} frames are needed, got {count}")
     if min(frames.shape) == 0:
-        raise ValueError(f"frames must not be empty, got shape {tuple(frames.shape)}")
+        raise ValueError(f"{name} must not be empty, got shape {tuple(frames.shape)}")
     if frames.dtype.is_complex or frames.dtype == torch.bool:
-        raise TypeError(f"frames must be real numbers, got {frames.dtype}")
+        raise TypeError(f"{name} must be real numbers, got {frames.dtype}")
     if frames.dtype.is_floating_point:
         if not bool(torch.isfinite(torch.stack(frames.aminmax())).all()):  # one pass: NaN and infinity come through
             wrong = torch.isinf(frames) if nan_is_missing else ~torch.isfinite(frames)
             if not bool(wrong.any()):
                 return frames
             bad = wrong.nonzero()[0].tolist()
-            raise ValueError(f"frames must be finite, but pixel {tuple(bad)} is {frames[tuple(bad)].item()}")
+            raise ValueError(f"{name} must be finite, but pixel {tuple(bad)} is {frames[tuple(bad)].item()}")
         return frames
     if full_scale is None:
         if frames.dtype != torch.uint8:
             raise ValueError(
-                f"{frames.dtype} frames do not say their full scale; state full_scale, e.g. 4095 for 12-bit counts"
+                f"{frames.dtype} {name} do not say their full scale; state full_scale, e.g. 4095 for 12-bit counts"
             )
         full_scale = 255.0
     return frames.to(torch.float32) / check_number("full_scale", full_scale, above=0.0)

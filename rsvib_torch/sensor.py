@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.checks import check_choice, check_number, check_whole_number
 
-__all__ = ["SensorTiming"]
+__all__ = ["SensorTiming", "check_timing"]
 
 _SCAN_AXES: dict[object, int] = {-2: -2, "y": -2, -1: -1, "x": -1}
 
@@ -172,3 +172,9 @@ class SensorTiming:
     def in_row_order(self) -> "SensorTiming":
         """The same timing for frames already turned to row order (rows on axis -2, first row read first)."""
         return replace(self, scan_axis=-2, readout_direction="forward")
+
+
+def check_timing(value: object) -> None:
+    """Raise a ``TypeError`` unless ``value`` is a ``SensorTiming``."""
+    if not isinstance(value, SensorTiming):
+        raise TypeError(f"timing must be a SensorTiming, got {type(value).__name__}")

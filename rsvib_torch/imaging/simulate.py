@@ -65,6 +65,8 @@ def simulate_frames(
         raise TypeError("scene must be a floating-point tensor whose full scale is 1")
     if scene.ndim not in (2, 3) or not bool(torch.isfinite(scene).all()):
         raise ValueError(f"scene must be a finite (H, W) or (C, H, W) tensor, got shape {tuple(scene.shape)}")
+    if noise is not None and not isinstance(noise, SensorNoise):
+        raise TypeError(f"noise must be a SensorNoise, got {type(noise).__name__}")
     if num_frames < 1:
         raise ValueError(f"num_frames must be at least 1, got {num_frames}")
     if vibration.batch_shape:

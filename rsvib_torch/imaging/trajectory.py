@@ -15,6 +15,7 @@ from rsvib_torch.vibration import Vibration
 __all__ = ["Quadrature", "exposure_nodes", "exposure_trajectory", "gauss_node_count"]
 
 Quadrature = Literal["midpoint", "gauss"]
+_MOST_NODES = 4096
 
 
 def gauss_node_count(vibration: Vibration, exposure_time: float) -> int:
@@ -29,7 +30,13 @@ def gauss_node_count(vibration: Vibration, exposure_time: float) -> int:
     path = swing.sum(-1) + vibration.image_motion.detach().abs() * exposure_time + rest_path(vibration, exposure_time)
     seen_cycles = torch.where(vibration.amplitude.detach() > 1e-4, cycles, torch.zeros_like(cycles))
     nodes = torch.stack([2.0 * path.amax(), 4.0 * seen_cycles.amax()]).ceil().sum()
-    return 3 + int(nodes)
+    count = 3 + int(nodes)
+    if count > _MOST_NODES:
+        raise ValueError(
+            f"the image moves {float(path.amax()):.3g} px and through {float(seen_cycles.amax()):.3g} periods while a "
+            f"row is exposed for {exposure_time:g} s, too much to follow; check frequency, amplitude and exposure"
+        )
+    return count
 
 
 def exposure_nodes(

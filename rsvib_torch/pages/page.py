@@ -9,6 +9,7 @@ from torch import Tensor
 
 import rsvib_torch.pages.words as in_words
 from rsvib_torch.detection import DetectionResult
+from rsvib_torch.free_motion import moving_axes
 from rsvib_torch.pages import figures
 from rsvib_torch.pages.inline import Drawing, before_after, drawing, grey
 from rsvib_torch.pages.sharpness import Box, measure_edges, mtf_figure
@@ -115,7 +116,7 @@ def _drawings(report: Report) -> dict[str, list[Drawing]]:
             "bars of two standard deviations.",
         ),
     ]
-    if not bool((undone.amplitude > 0).any() | (undone.image_motion != 0).any()):
+    if not bool(moving_axes(undone).any()):
         return {"offsets": offsets, "tone_figures": vibration}
     rows = [
         drawing(

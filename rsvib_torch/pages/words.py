@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 
 from rsvib_torch.detection import DetectionResult
+from rsvib_torch.free_motion import moving_axes
 from rsvib_torch.pages.figures import smear
 from rsvib_torch.pictures import measured_text
 from rsvib_torch.restoration import RestorationVerdict
@@ -111,7 +112,7 @@ def verdict_words(
     words = [_first_words(mood_of(result, verdict, restored), restored, verdict)]
     words += [_axis_words(result, axis) for axis in range(2)] + _motion_words(result)
     starts = timing.row_starts(1, num_rows)[0]
-    if bool((undone.amplitude > 0).any() | (undone.image_motion != 0).any()):
+    if bool(moving_axes(undone).any()):
         blur = smear(undone, starts, timing).amax(0)
         bent = undone.amplitude.sum(-1)
         words.append(

@@ -16,12 +16,13 @@ _PIECES, _LEAST, _MOST = 64, 25, 256  # of a frame, of a frame of many, and of a
 _EVERY = 8  # rows of a piece, of which the blur is looked at
 _COARSE = 0.12  # cycles per px; below, scenes are so strong that they say nothing of noise
 _BARE, _ENOUGH = 0.05, 0.02  # power that the blur lets through, in so many of the values
+_FEWEST = 4  # pieces that a frame has to show
 _ITERATIONS = 12
 _STEP = 0.5  # of a power at most, downwards
 
 
 @torch.no_grad()
-def noise_beside_blur(frames: Tensor, motion: FrameMotion, stack: int) -> Tensor | None:
+def noise_beside_blur(frames: Tensor, motion: FrameMotion, stack: int, ignore: Tensor | None = None) -> Tensor | None:
     """Power of the white noise in frames whose scene is blurred, more here and less there.
 
     At frequency k, piece p of a frame has the power ``a_p T_pk S_k + noise``: T is what the blur of its rows lets
@@ -33,9 +34,11 @@ def noise_beside_blur(frames: Tensor, motion: FrameMotion, stack: int) -> Tensor
         frames: (T, C, H, W) in row order.
         motion: Motion of the batch of stacks.
         stack: Index of the stack in the batch.
+        ignore: Boolean mask shaped like the frames: pieces with such a pixel do not count.
 
     Returns:
-        Power (T,), float64; None where blur hides too little of the scene to tell.
+        Power (T,), float64, NaN for a frame that has too few pieces which count; None where blur hides too little of
+        the scene to tell.
     """
     shape, device = frames.shape[-2:], frames.device
     if min(shape) < 2 * _PIECE:
@@ -51,24 +54,40 @@ def noise_beside_blur(frames: Tensor, motion: FrameMotion, stack: int) -> Tensor
     if float((transfer < _BARE).double().mean()) < _ENOUGH:
         return None
     taper = _taper(frames)
-    pieces = frames[:, :, rows[:, None, :, None], columns[None, :, None, :]]  # (T, C, pieces, pieces, rows, columns)
+    places = (..., rows[:, None, :, None], columns[None, :, None, :])
+    pieces = frames[places]  # (T, C, pieces, pieces, rows, columns)
     pieces = (pieces - pieces.mean((-2, -1), keepdim=True)) * taper * taper[:, None]
     mean = motion.vibration[stack].mean_displacement(times, motion.timing.exposure_time)[..., 0]
     back = waves(mean, -u).to(frames.dtype.to_complex())  # neighbouring rows are to be alike as in the scene
     power = squared_modulus(torch.fft.fft(torch.fft.rfft(pieces) * back[:, None, :, None], dim=-2)).mean(1)
     power = _pooled(power.transpose(-2, -1).to(torch.float64))[..., fine]
-    return _score(power.flatten(1, 2), transfer[:, :, None].expand_as(power).flatten(1, 2))
+    power, transfer = power.flatten(1, 2), transfer[:, :, None].expand_as(power).flatten(1, 2)
+    usable = (power > 0).any(-1)
+    if ignore is not None:
+        usable = usable & ~ignore[places].any(1).any(-1).any(-1).flatten(1)
+    enough = usable.sum(-1) >= min(_FEWEST, usable.shape[-1])
+    noise = _score(power.where(enough[:, None, None], 1.0), transfer, usable | ~enough[:, None])
+    return noise.masked_fill(~enough, math.nan)
 
 
-def _score(power: Tensor, transfer: Tensor) -> Tensor:
-    """Noise (T,) that explains powers (T, P, K) of pieces, of whose scene the blur lets ``transfer`` through."""
-    noise = power.mean(-2, keepdim=True).amin(-1, keepdim=True)
+def _score(power: Tensor, transfer: Tensor, usable: Tensor) -> Tensor:
+    """Noise (T,) that explains powers (T, P, K) of pieces, of whose scene the blur lets ``transfer`` through.
+
+    Only those pieces count for which ``usable`` (T, P) is true.
+    """
+    share = usable.to(power.dtype)[..., None]
+    share = share / share.sum(-2, keepdim=True)
+
+    def mean(values: Tensor) -> Tensor:
+        return (share * values).sum(-2, keepdim=True)
+
+    noise = mean(power).amin(-1, keepdim=True)
     texture = torch.ones_like(power[..., :1])
-    scene = (power - noise).mean(-2, keepdim=True).clamp(min=0.1 * noise) / transfer.mean(-2, keepdim=True)
+    scene = mean(power - noise).clamp(min=0.1 * noise) / mean(transfer)
     for _ in range(_ITERATIONS):
         shown = texture * transfer
         model = shown * scene + noise
-        weight, rest = model.square().reciprocal(), power - model
+        weight, rest = share / model.square(), power - model
         own, pull = (shown.square() * weight).sum(-2, keepdim=True), (shown * weight * rest).sum(-2, keepdim=True)
         both = (shown * weight).sum(-2, keepdim=True)
         # normal equations of scene and noise, the scene's eliminated
@@ -81,8 +100,8 @@ def _score(power: Tensor, transfer: Tensor) -> Tensor:
         weight, rest = model.square().reciprocal(), power - model
         change = (full * weight * rest).sum(-1, keepdim=True) / (full.square() * weight).sum(-1, keepdim=True)
         texture = torch.maximum(texture + change, _STEP * texture)
-        mean = texture.mean(-2, keepdim=True)
-        texture, scene = texture / mean, scene * mean
+        typical = mean(texture)
+        texture, scene = texture / typical, scene * typical
     return noise[:, 0, 0]
 
 

@@ -1,5 +1,7 @@
 """Noise told from texture by what two frames of one scene do not have in common."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -15,60 +17,89 @@ __all__ = ["noise_levels"]
 
 _ROWS = 256  # at most, from the middle of the frame
 _SMALLEST = 64  # rows and columns that two frames have to share
+_NARROWEST = 8  # rows and columns of frames that are compared at all
 _FREQUENCIES = 24  # spread over the upper half, where scenes are weakest
 _WEAK = 1e-4  # of the prior that bridges what no frame saw, relative to the data
+_MISSING = 0.1  # of the pixels of two frames that are compared, at most
+_EVERY = 8  # rows of which one tells whether a frame shows anything
+_FLAT = 1e-6  # of the largest value: frames that vary by less show nothing, not even noise
 
 
-def noise_levels(frames: Tensor, motion: FrameMotion, stack: int) -> Tensor:
+def noise_levels(frames: Tensor, motion: FrameMotion, stack: int, ignore: Tensor | None = None) -> Tensor:
     """Standard deviation of the noise of each frame of a stack.
 
     Where the scene is blurred, noise is what is not. Elsewhere, what texture adds to the noise estimated from single
     frames is the same in all of them: the excess of that estimate over what the two middle frames disagree by, once the
-    scene that explains them best is taken away.
+    scene that explains them best is taken away. A frame that shows nothing, or too little, is taken to have as much
+    noise as the others.
 
     Args:
-        frames: (T, C, H, W) in row order.
+        frames: (T, C, H, W) in row order, what is to be ignored filled.
         motion: Motion of the batch of stacks.
         stack: Index of the stack in the batch.
+        ignore: Boolean mask shaped like the frames of pixels that were not measured.
 
     Returns:
-        (T,), in the dtype of the frames.
+        (T,), in the dtype of the frames; 0 where no frame tells.
     """
-    power = estimate_noise(frames).square().mean(-1)
-    bare = noise_beside_blur(frames, motion, stack)
+    power = estimate_noise(frames, ignore).square().nanmean(-1).masked_fill(_flat(frames), math.nan)
+    bare = noise_beside_blur(frames, motion, stack, ignore)
     if bare is not None:
-        power = power.minimum(bare.to(power.dtype))
+        power = torch.fmin(power, torch.where(power.isnan(), math.nan, bare.to(power.dtype)))
     elif len(frames) > 1:
-        pair = _shared_part(frames, motion, stack)
+        pair = _shared_part(frames, motion, stack, power.isnan(), ignore)
         if pair is not None:
-            images, rows, members = pair
-            noise = _residual_power(images, motion, stack, rows, members)
-            alone = estimate_noise(images).square().mean(-1)
+            images, hidden, rows, members = pair
+            measured = 1.0 if hidden is None else 1.0 - hidden.any(0).to(power.dtype).mean()
+            noise = _residual_power(images, motion, stack, rows, members) / measured
+            alone = estimate_noise(images, hidden).square().mean(-1)
             texture = (alone.mean() - noise).clamp(min=0.0)
             # neither of two frames has more noise than both; blur may leave one of them more texture than the other
             most = 2.0 * noise + (power - alone.amax()).clamp(min=0.0)
             power = torch.maximum(power - texture, 0.5 * torch.minimum(power, noise)).minimum(most)
-    return power.sqrt()
+    return torch.where(power.isnan(), power.nanmedian(), power).nan_to_num(nan=0.0).sqrt()
 
 
-def _shared_part(frames: Tensor, motion: FrameMotion, stack: int) -> tuple[Tensor, Tensor, list[int]] | None:
-    """Columns and rows that the two middle frames share, (2, C, R, W'), and the first row of each."""
+def _flat(frames: Tensor) -> Tensor:
+    """Which frames (T,) show nothing."""
+    rows = frames[..., ::_EVERY, :].flatten(1)
+    low, high = rows.aminmax(dim=-1)
+    return high - low <= _FLAT * torch.maximum(-low, high)
+
+
+def _shared_part(
+    frames: Tensor, motion: FrameMotion, stack: int, silent: Tensor, ignore: Tensor | None
+) -> tuple[Tensor, Tensor | None, Tensor, list[int]] | None:
+    """Columns and rows (2, C, R, W') that the two middle frames share, of those that are not ``silent`` (T,).
+
+    Moreover the mask of what is to be ignored, the first row of each, and which frames these are.
+    """
     height, width = frames.shape[-2:]
-    members = [(len(frames) - 1) // 2, (len(frames) - 1) // 2 + 1]
+    speaking = (~silent).nonzero().flatten().tolist()
+    middle = (len(speaking) - 1) // 2
+    members = speaking[middle : middle + 2]
+    if len(members) < 2:
+        return None
     x, y = (int(step) for step in (motion.shift[stack, members[1]] - motion.shift[stack, members[0]]).tolist())
     columns, rows = width - abs(x), height - abs(y)
-    if min(columns, rows) < min(_SMALLEST, height, width):
+    if min(columns, rows) < max(min(_SMALLEST, height, width), _NARROWEST):
         return None
     count = min(rows, _ROWS)
     first = [max(-y, 0) + (rows - count) // 2, max(y, 0) + (rows - count) // 2]
     left = [max(-x, 0), max(x, 0)]
-    images = torch.stack(
-        [
-            frames[member, :, top : top + count, begin : begin + columns]
-            for member, top, begin in zip(members, first, left, strict=True)
-        ]
-    )
-    return images, torch.tensor(first, device=frames.device), members
+
+    def shared(values: Tensor) -> Tensor:
+        return torch.stack(
+            [
+                values[member, :, top : top + count, begin : begin + columns]
+                for member, top, begin in zip(members, first, left, strict=True)
+            ]
+        )
+
+    hidden = None if ignore is None else shared(ignore)
+    if hidden is not None and float(hidden.any(0).double().mean()) > _MISSING:
+        return None
+    return shared(frames), hidden, torch.tensor(first, device=frames.device), members
 
 
 @torch.no_grad()

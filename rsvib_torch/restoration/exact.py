@@ -36,15 +36,15 @@ _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
 
 
 def scene_period(width: int, reach: int, displacement: Tensor) -> int:
-    """Length of the period that scenes of ``width`` px are restored on: longer where ends are not filled.
+    """Length of the period that a scene of ``width`` px is restored on: longer where ends are not filled.
 
     Args:
         width: Columns of the frames.
         reach: Bound on the displacement along a row in px.
-        displacement: (B, ..., N, 2) during the exposures.
+        displacement: (..., N, 2) during the exposures.
     """
     along = displacement[..., 0].detach()
-    filled = bool(((along.amax(-1) - along.amin(-1)).flatten(1).amax(1) > 2 * _LONG).all())
+    filled = bool((along.amax(-1) - along.amin(-1)).amax() > 2 * _LONG)
     return period_of_rows(width, reach if filled else reach + _REACH)
 
 
@@ -207,17 +207,18 @@ def restore_exact(
     if ignore is not None:
         frames = fill_roughly(frames, ignore)
     lost = ignore if clipped is None else clipped if ignore is None else ignore | clipped
-    levels = _noise_levels(frames, motion, noise)
+    levels = _noise_levels(frames, motion, noise, ignore)
     mean = brightness(frames).mean(1)[..., None, None]
     starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device)).expand(B, T, H)
     displacement, node_weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
-    length = scene_period(W, motion.reach(H), displacement)
+    reaches = motion.reaches(H)
     certain = noise != "auto" or T > 1
     stacks: list[_Stack] = []
     strengths: list[float] = []
     for index in range(B):
         weights = levels[index].square().reciprocal()
         typical = weights.mean().reciprocal()
+        length = scene_period(W, reaches[index], displacement[index])
         stack = _Stack(
             frames=frames[index],
             displacement=displacement[index],
@@ -257,10 +258,13 @@ def restore_exact(
     return found.view(B, -1, *found.shape[1:])
 
 
-def _noise_levels(frames: Tensor, motion: FrameMotion, noise: float | Literal["auto"]) -> Tensor:
+def _noise_levels(frames: Tensor, motion: FrameMotion, noise: float | Literal["auto"], ignore: Tensor | None) -> Tensor:
     """Noise level of each frame, (B, T)."""
     if noise != "auto":
         level = check_number("noise", noise, at_least=0.0)
         return torch.full(frames.shape[:2], max(level, _QUIETEST), dtype=frames.dtype, device=frames.device)
-    levels = [noise_levels(stack.detach(), motion, index) for index, stack in enumerate(frames)]
+    levels = [
+        noise_levels(stack.detach(), motion, index, None if ignore is None else ignore[index])
+        for index, stack in enumerate(frames)
+    ]
     return torch.stack(levels).clamp(min=_QUIETEST)

@@ -11,6 +11,7 @@ __all__ = ["RIM", "misfit"]
 
 _SMOOTHING = 5.0  # px: reaches displacements of several px, and noise hardly matters
 _STEP = 4  # px between those that count: all others are much the same
+_FLAT = 1e-5  # of the brightest value: gradients and differences below are rounding
 RIM = math.ceil(3 * _SMOOTHING) + 1  # px at the borders that smoothing and gradient spoil
 
 
@@ -36,6 +37,7 @@ def misfit(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         Misfit (2,) and its resolution (2,) in px, axes (x, y), float64: below the resolution it is not told from 0.
+        Where there is nothing to tell it by, 0 and infinity.
     """
     kernels = _kernels(first)
     mean, changed = (0.5 * (first + second), second - first)
@@ -54,4 +56,6 @@ def misfit(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     # where nothing moves, squares scatter by twice their square; neighbours within the smoothing say the same
     spread = (terms * weight.square()) @ terms.T * (4 * math.pi * (_SMOOTHING / _STEP) ** 2 * 2.0 * found[0].square())
     deviation = (inverse @ spread @ inverse).diagonal()[1:3].clamp(min=0.0).sqrt()
-    return found[1:3].clamp(min=0.0).sqrt(), (2.0 * deviation).sqrt()
+    told = energy.amax().sqrt() > _FLAT * torch.maximum(first.abs().amax(), second.abs().amax())
+    size, resolution = found[1:3].clamp(min=0.0).sqrt(), (2.0 * deviation).sqrt()
+    return size.where(told, 0.0), resolution.where(told, math.inf)

@@ -41,14 +41,18 @@ class FrameMotion:
             scene_rows - self.shift[..., 1, None], self.frame_starts[:, None], self.timing, self.vibration
         )
 
-    def reach(self, num_rows: int) -> int:
-        """Bound on the displacement along a row of ``num_rows`` rows, beyond the shift, in whole px."""
+    def reaches(self, num_rows: int) -> list[int]:
+        """For each stack, a bound on the displacement along one of ``num_rows`` rows, beyond the shift, in whole px."""
         half = 0.5 * (num_rows * self.timing.row_time + self.timing.exposure_time)
         swing = (self.vibration.amplitude.detach().sum(-1) + rest_reach(self.vibration))[:, None]
         acceleration = self.vibration.image_acceleration.detach()[:, None]
         speed = self.vibration.image_motion.detach()[:, None] + acceleration * (self.frame_starts + half)[:, None]
         bound = swing + speed.abs() * half + 0.5 * acceleration.abs() * half**2
-        return math.ceil(float(bound[..., 0].amax()) + 0.5)
+        return [math.ceil(reach + 0.5) for reach in bound[..., 0].amax(1).tolist()]
+
+    def reach(self, num_rows: int) -> int:
+        """The largest of ``reaches``."""
+        return max(self.reaches(num_rows))
 
     def row_starts(self, frame_rows: Tensor) -> Tensor:
         """Exposure starts of frame rows (B, T, S) in seconds."""

@@ -17,7 +17,7 @@ _MANY = 2048  # blocks tell as much as all of a larger image
 _VALUES = {"cpu": 1 << 16}  # at a time: they stay in the cache
 
 
-def estimate_noise(frames: Tensor) -> Tensor:
+def estimate_noise(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
     """Standard deviation of white noise in each image.
 
     The outer product of two eighth differences leaves the corner of the spectrum, where optics pass least; of its
@@ -26,9 +26,11 @@ def estimate_noise(frames: Tensor) -> Tensor:
 
     Args:
         frames: (..., H, W).
+        ignore: Boolean mask of the same shape of pixels that hold no noise of their own: blocks with one of them do
+            not count.
 
     Returns:
-        Standard deviation, shape (...).
+        Standard deviation, shape (...); NaN for an image none of whose blocks counts.
 
     Example:
         >>> import torch
@@ -42,23 +44,31 @@ def estimate_noise(frames: Tensor) -> Tensor:
     block = min(_BLOCK, *inner)
     height, width = (extent // block * block for extent in inner)
     every = max(1, height * width // (block**2 * _MANY))
-    inside = frames[..., : height + orders[0], : width + orders[1]]
-    strips = inside.unfold(-2, block + orders[0], every * block).movedim(-3, 0)  # (strips, ..., columns, rows)
-    across = torch.eye(block + orders[0], dtype=frames.dtype, device=frames.device).diff(orders[0], dim=0)
+    windows = [block + order for order in orders]
+
+    def strips_of(images: Tensor) -> Tensor:
+        inside = images[..., : height + orders[0], : width + orders[1]]
+        return inside.unfold(-2, windows[0], every * block).movedim(-3, 0)  # (strips, ..., columns, rows)
+
+    strips = strips_of(frames)
+    across = torch.eye(windows[0], dtype=frames.dtype, device=frames.device).diff(orders[0], dim=0)
     one = frames[..., 0, :].numel() * block
     blocks = [
         _detail(strips[some], across, orders[1]).square().unflatten(-2, (-1, block)).mean((-2, -1))
         for some in runs(len(strips), max(1, _VALUES.get(frames.device.type, frames.numel()) // one))
     ]
-    energy = torch.cat(blocks).movedim(0, -1).flatten(-2) / math.prod(math.comb(2 * order, order) for order in orders)
+    energy = torch.cat(blocks) / math.prod(math.comb(2 * order, order) for order in orders)
+    if ignore is not None:
+        lost = strips_of(ignore).any(-1).unfold(-1, windows[1], block).any(-1)
+        energy = energy.masked_fill(lost, math.nan)
+    energy = energy.movedim(0, -1).flatten(-2)
     # means of pure noise scatter (neighbouring responses of the mask are correlated), so that their low quantile lies
     # below the true mean: by as much as a chi-squared variable's does (Wilson and Hilferty)
     share = min(2.0 * math.prod(_correlation_area(order) for order in orders) / (9.0 * block**2), 0.2)
     expected = (1.0 - share - 1.0364 * share**0.5) ** 3
-    quiet = energy.quantile(_QUANTILE, dim=-1)
-    if energy.shape[-1] < _FEW:
-        quiet, expected = energy.mean(-1), 1.0
-    deviation: Tensor = (quiet / expected).sqrt()
+    quiet = (energy.quantile if ignore is None else energy.nanquantile)(_QUANTILE, dim=-1) / expected
+    few = (~energy.isnan()).sum(-1) < _FEW
+    deviation: Tensor = torch.where(few, energy.nanmean(-1), quiet).sqrt()
     return deviation
 
 
@@ -82,6 +92,6 @@ def gradient_energy(frames: Tensor) -> Tensor:
     Args:
         frames: (..., H, W).
     """
-    across = (frames[..., 1:, :] - frames[..., :-1, :]).square().mean((-2, -1))
-    along = (frames[..., 1:] - frames[..., :-1]).square().mean((-2, -1))
+    across, along = (frames.diff(dim=dim).square() for dim in (-2, -1))
+    across, along = (values.sum((-2, -1)) / max(math.prod(values.shape[-2:]), 1) for values in (across, along))
     return 0.5 * (across + along)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -14,8 +14,9 @@ from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.reblur import reblur
 from rsvib_torch.restoration.verdict import TooLittleInCommonError
 
-__all__ = ["FramePair", "pairs_to_judge", "shared_part"]
+__all__ = ["FramePair", "equally_bright", "pairs_to_judge", "shared_part"]
 
+_BLOCK = 16  # px, large beside displacements: means of such squares tell how bright two frames are
 _MARGIN = 4  # px between the pixels judged and what was made up
 
 
@@ -31,6 +32,8 @@ class FramePair:
         predicted: The later raw frame, from ``restored``.
         changed_later: What the motion of the later frame does to its restored one.
         offset: (2,) px, root-mean-square displacement between the two that the motion predicts, axes (x, y).
+        missing: (2, C, h, w) bool, pixels of the raw frames that were not measured: they hold what the restored ones
+            predict; None for none.
     """
 
     earlier: Tensor
@@ -40,6 +43,7 @@ class FramePair:
     predicted: Tensor
     changed_later: Tensor
     offset: Tensor
+    missing: Tensor | None = None
 
 
 def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> list[tuple[int, int]]:
@@ -55,7 +59,12 @@ def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> li
 
 
 def shared_part(
-    raw: Tensor, restored: Tensor, motion: FrameMotion, frames: tuple[int, int], columns: int | None
+    raw: Tensor,
+    restored: Tensor,
+    motion: FrameMotion,
+    frames: tuple[int, int],
+    columns: int | None,
+    hidden: Tensor | None = None,
 ) -> FramePair:
     """Cut what two frames have in common; rows are those of the later one.
 
@@ -65,6 +74,7 @@ def shared_part(
         motion: Motion of the frames, batch of one.
         frames: Which two.
         columns: Cut to so many columns, those with the most detail; None for all.
+        hidden: Mask shaped like ``raw`` of pixels that were not measured.
 
     Raises:
         TooLittleInCommonError: If hardly any scene is left.
@@ -91,6 +101,13 @@ def shared_part(
     first, second, scene, other = (image[..., strip] for image in (first, second, scene, other))
     formed = reblur(torch.cat([scene, other]), motion, later, first_row=max(y, 0))
     predicted, formed_later = (part[cut] for part in formed.chunk(2))
+    missing = None
+    if hidden is not None:
+        lost = torch.stack([hidden[earlier][before], hidden[later][after]])[..., strip]
+        formed_earlier = reblur(scene, motion, earlier, first_row=max(-y, 0))
+        first = torch.where(lost[0], formed_earlier, first)
+        second = torch.where(lost[1], formed.chunk(2)[0], second)
+        missing = lost[(slice(None), *cut)]
     return FramePair(
         first[cut],
         second[cut],
@@ -99,6 +116,33 @@ def shared_part(
         predicted,
         formed_later - other[cut],
         (moved[1] - moved[0]).square().mean(0).sqrt(),
+        missing,
+    )
+
+
+def equally_bright(pair: FramePair, noise: Tensor) -> FramePair:
+    """The pair with the earlier frame, and what was made of it, as bright and as contrasty as the later one."""
+    side = min(_BLOCK, *pair.later.shape[-2:])
+    shown, seen = (
+        torch.nn.functional.avg_pool2d(image[None], side)[0].to(torch.float64) for image in (pair.predicted, pair.later)
+    )
+    mean, target = (values.mean((-2, -1), keepdim=True) for values in (shown, seen))
+    power = (shown - mean).square().mean() + noise
+    gain = (((shown - mean) * (seen - target)).mean() + noise) / power
+    if float(gain) <= 0.0:
+        return pair
+    mean, target, gain = (value.to(pair.later.dtype) for value in (mean, target, gain))
+
+    def bright(image: Tensor) -> Tensor:
+        return torch.addcmul(target - gain * mean, image, gain)
+
+    single = pair.restored_later is None
+    return replace(
+        pair,
+        earlier=bright(pair.earlier),
+        restored=bright(pair.restored),
+        predicted=bright(pair.predicted),
+        changed_later=gain * pair.changed_later if single else pair.changed_later,
     )
 
 

@@ -50,8 +50,8 @@ def saturated_pixels(frames: Tensor, saturation: Saturation, full_scale: float |
     if saturation == "auto":
         if frames.dtype.is_floating_point:
             return None
-        saturation = 255.0 if full_scale is None and frames.dtype == torch.uint8 else full_scale
-        if saturation is None:
+        if full_scale is None and frames.dtype != torch.uint8:
             return None  # the frames will be refused for it
+        saturation = 255.0 if full_scale is None else check_number("full_scale", full_scale, above=0.0)
     mask = frames >= check_number("saturation", saturation, above=0.0)
     return mask if bool(mask.any()) else None

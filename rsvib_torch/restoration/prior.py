@@ -11,6 +11,7 @@ from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.pieces import runs
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.row_kernel import interpolation_error, kernel_spectrum
+from rsvib_torch.restoration.rows import continue_rows
 from rsvib_torch.spectral import squared_modulus, waves
 from rsvib_torch.splines import mirrored
 
@@ -21,8 +22,11 @@ _PIECE = (64, 256)  # rows and columns of the pieces whose spectra are averaged
 _MOST_PIECES = 128  # of a frame
 _AT_A_TIME = {"cpu": 4}  # rows of pieces: they stay in the cache
 _EVERY = 8  # rows of which one tells how bright a frame is
+_STRIPS = 4  # of whole rows that say what their ends add to the spectrum
+_BEYOND = 25.0  # times what pieces show: as much power of whole rows is that of their ends, and not chance
 _SMOOTHING = 3  # neighbouring frequencies whose statistics are pooled
 _ITERATIONS = 20
+_FAINT, _LEAST = 0.5, 0.002  # of the noise: below, neighbours are pooled to start from; what is always started from
 _ROUNDING = 1e-14  # of the squared modulus of a filter, a sum of terms around 1
 # noise power over variance of e: above, the systems lose digits and nothing is gained; below, rows half a pixel apart
 # from the scene's lose them in single precision. Long exposures see every place of the scene from many of its rows,
@@ -113,6 +117,13 @@ def _levinson(moments: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor], Te
     return reflections, filter_, variance
 
 
+def _pooled(power: Tensor) -> Tensor:
+    """Means over 5 x 5 neighbouring frequencies of (U, V)."""
+    around = torch.nn.functional.pad(power[None, None], (2, 2, 0, 0), mode="circular")
+    around = torch.nn.functional.pad(around, (0, 0, 2, 2), mode="replicate")
+    return torch.nn.functional.avg_pool2d(around, 5, 1)[0, 0]
+
+
 def _pooling(u: Tensor) -> Tensor:
     """Matrix (U, U) that pools what is known at frequencies (U,) over neighbouring ones, mirrored at both ends."""
     half = _SMOOTHING // 2
@@ -154,7 +165,11 @@ def autoregressive_prior(
         return total
 
     through, pooling = transfer * observed, _pooling(observed[:, 0]) / len(v)
-    scene = torch.maximum(observed - noise_power, 0.02 * noise_power) * transfer / (transfer.square() + 1e-2)
+    excess = observed - noise_power
+    # where noise outweighs the scene, steps are small, and should not have to begin from what chance has left over
+    faint = excess < _FAINT * noise_power
+    excess = torch.where(faint, _pooled(excess).minimum(_FAINT * noise_power), excess)
+    scene = torch.maximum(excess, _LEAST * noise_power) * transfer / (transfer.square() + 1e-2)
     for _ in range(_ITERATIONS):
         moments = (pooling @ (scene @ cosine)).unbind(-1)
         reflections, filter_, innovation = _levinson(moments)
@@ -213,6 +228,9 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
         spectra = torch.fft.rfft(pieces.sub_(bright[..., None]).mul_(tapers[1])).mul_(back[:, None, chosen, None])
         found.append(squared_modulus(torch.fft.fft(spectra, dim=-2)).mean((1, 3)).transpose(-2, -1))
     power = torch.cat(found, dim=1).to(torch.float64) * length  # (T, pieces, U, V)
+    few = torch.linspace(0, len(tops) - 1, min(_STRIPS, len(tops)), device=rows.device).round().to(torch.int64)
+    strips_of_rows = (frames[..., rows[few], :] - bright) * tapers[0][:, None]  # (T, C, n, rows, W)
+    whole = _power_of_rows(strips_of_rows, mean.unflatten(1, rows.shape)[:, few], length, len(u))
 
     displacement, weights = exposure_trajectory(
         vibration, times.unflatten(1, rows.shape)[..., size[0] // 2], motion.timing, "gauss"
@@ -220,6 +238,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     along = waves(displacement[..., 0], u) * weights[:, None]
     across = waves(displacement[..., 1], v)
     transfer = squared_modulus(along.transpose(-2, -1) @ across) * kernel_spectrum(v).square()
+    transfer = _smeared(transfer)
     aliases = torch.zeros_like(transfer[:, 0])
     for cycle in (-1, 1):  # all others together are less than 4 % of these
         beyond = across * waves(displacement[..., 1], v.new_tensor([cycle]))
@@ -227,10 +246,34 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
         aliases = aliases + blurred * interpolation_error(v, [cycle])
     weight = transfer / levels.to(torch.float64).square()[:, None, None, None]
     total = weight.sum((0, 1)).clamp(min=torch.finfo(torch.float32).tiny)
-    observed = (weight * power).sum((0, 1)) / total
+    observed = torch.maximum((weight * power).sum((0, 1)) / total, whole / _BEYOND)
     noise_power = transfer.sum((0, 1)) / total * length
     prior = autoregressive_prior(observed, (weight * transfer).sum((0, 1)) / total, aliases, noise_power)
     return prior.resampled(length // 2 + 1)
+
+
+def _smeared(transfer: Tensor) -> Tensor:
+    """Transfer (..., U, V) as pieces show it, whose taper mixes neighbouring frequencies: nowhere quite zero."""
+    count = transfer.shape[-2]
+    near = torch.arange(-1, count + 1, device=transfer.device)
+    wide = transfer[..., mirrored(near, count), :]
+    between = wide[..., :-2, :] + wide[..., 2:, :]
+    return (2.0 / 3.0) * transfer + (1.0 / 6.0) * between
+
+
+def _power_of_rows(strips: Tensor, moved: Tensor, length: int, count: int) -> Tensor:
+    """Power (U, V) of whole rows with what they go on by beyond their ends, pooled to U frequencies along them.
+
+    Args:
+        strips: (T, C, n, R, W), tapered across their rows.
+        moved: (T, n, R) px that the rows are displaced along themselves.
+        length: Period of the rows.
+        count: U.
+    """
+    u = torch.fft.rfftfreq(length, dtype=torch.float64, device=strips.device)
+    back = waves(moved, -u).to(strips.dtype.to_complex())[:, None]
+    power = squared_modulus(torch.fft.fft(torch.fft.rfft(continue_rows(strips, length)) * back, dim=-2))
+    return torch.nn.functional.adaptive_avg_pool1d(power.mean((0, 1, 2)), count).T.to(torch.float64)
 
 
 def _spread_pieces(shape: torch.Size, size: list[int]) -> list[Tensor]:

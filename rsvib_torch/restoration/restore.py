@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from rsvib_torch.arrays import ArrayLike, as_tensor
 from rsvib_torch.checks import check_choice
-from rsvib_torch.free_motion import rest_reach
+from rsvib_torch.free_motion import moving_axes
 from rsvib_torch.orientation import (
     as_float_frames,
     frames_from_row_order,
@@ -27,9 +27,9 @@ from rsvib_torch.restoration.motion import frame_motion
 from rsvib_torch.restoration.pairs import pairs_to_judge
 from rsvib_torch.restoration.pixels import Saturation, hidden_pixels, saturated_pixels
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
-from rsvib_torch.restoration.trust import Detected, trusted_vibration
+from rsvib_torch.restoration.trust import Detected, vibration_to_undo
 from rsvib_torch.restoration.verdict import RestorationWarning, TooLittleInCommonError
-from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.sensor import SensorTiming, check_timing
 from rsvib_torch.vibration import Vibration
 
 __all__ = ["MASKS", "METHODS", "VibrationRestorer", "method_options", "restore"]
@@ -154,6 +154,7 @@ def restore(
     """
     check_choice("method", method, tuple(METHODS))
     _check_options(method, options)
+    check_timing(timing)
     given = as_tensor("frames", frames)
     hidden = hidden_pixels(given, None if ignore is None else as_tensor("ignore", ignore))
     clipped = saturated_pixels(given, saturation, full_scale)
@@ -171,7 +172,9 @@ def restore(
     B, T, _, H, _ = images.shape
     rowwise = timing.in_row_order()
     rowwise.check_rows(H)
-    vibration = _to_undo(vibration, timing, T, H)
+    vibration, left_alone = vibration_to_undo(vibration, timing, T, H)
+    for note in left_alone:
+        warnings.warn(note, RestorationWarning, stacklevel=_CALLER - 1)
     if vibration.batch_shape not in ((), (B,)) or (vibration.batch_shape and given.ndim < 5):
         raise ValueError(
             f"vibration of batch shape {tuple(vibration.batch_shape)} does not fit frames of shape "
@@ -183,24 +186,19 @@ def restore(
     restored = METHODS[method](images, frame_motion(motion, rowwise, T, H), **chosen)
     if check:
         raw = images if hidden is None else fill_roughly(images, hidden)
-        _warn_if_worse(raw.detach(), restored.detach(), motion, timing, options.get("joint", False))
+        _warn_if_worse(raw.detach(), restored.detach(), hidden, motion, timing, options.get("joint", False))
     restored = frames_from_row_order(restored, timing)
     return _without_added_axes(restored, given.ndim).to(dtype)
 
 
-def _to_undo(vibration: Vibration | Detected, timing: SensorTiming, num_frames: int, num_rows: int) -> Vibration:
-    """The vibration to undo: all of one that was given, the trusted part of one that was detected."""
-    if isinstance(vibration, Vibration):
-        return vibration
-    if not all(hasattr(vibration, name) for name in ("vibration", "std", "reliable", "reasons")):
-        raise TypeError(f"vibration must be a Vibration or a detection, got {type(vibration).__name__}")
-    trusted, notes = trusted_vibration(vibration, timing, num_frames, num_rows)
-    for note in notes:
-        warnings.warn(note, RestorationWarning, stacklevel=_CALLER)
-    return trusted
-
-
-def _warn_if_worse(raw: Tensor, restored: Tensor, motion: Vibration, timing: SensorTiming, joint: bool | int) -> None:
+def _warn_if_worse(
+    raw: Tensor,
+    restored: Tensor,
+    hidden: Tensor | None,
+    motion: Vibration,
+    timing: SensorTiming,
+    joint: bool | int,
+) -> None:
     """Judge each stack of a batch in row order on a strip of columns of a few pairs of frames."""
     count = raw.shape[1]
     if count < 2:
@@ -209,12 +207,18 @@ def _warn_if_worse(raw: Tensor, restored: Tensor, motion: Vibration, timing: Sen
     shared = count if joint is True else max(int(joint), 1)
     for stack in range(len(raw)):
         still = motion[stack].detached()
-        if not bool((still.amplitude > 0).any() | (rest_reach(still) > 0).any()):
+        if not bool(moving_axes(still).any()):
             continue
         moved = frame_motion(still.expanded(1), timing.in_row_order(), count, raw.shape[-2])
         try:
             verdict = judge_frames(
-                raw[stack], restored[stack], moved, pairs, shared=min(shared, count), columns=_JUDGED_COLUMNS
+                raw[stack],
+                restored[stack],
+                moved,
+                pairs,
+                shared=min(shared, count),
+                columns=_JUDGED_COLUMNS,
+                hidden=None if hidden is None else hidden[stack],
             )
         except TooLittleInCommonError:
             continue  # frames that share no scene cannot be compared

@@ -16,6 +16,7 @@ from rsvib_torch.restoration.motion import FrameMotion
 __all__ = ["restore_richardson_lucy"]
 
 _LEAST = 1e-4  # of the mean: values that start lower would stay there for long
+_SEEN = 0.1  # of a pixel: what all pixels together see less of stays as it started
 
 
 def restore_richardson_lucy(
@@ -84,7 +85,7 @@ def _climb(counts: Tensor, measured: Tensor, start: Tensor, kernels: RowPSF, ite
     total, pixels = (values.sum((-4, -2, -1), keepdim=True) for values in (counts, measured))
     mean = (total / pixels.clamp(min=1.0)).clamp(min=tiny)
     sensitivity = blur.adjoint(measured, size)
-    seen = sensitivity > torch.finfo(counts.dtype).eps
+    seen = sensitivity > _SEEN
     scene = torch.maximum(start, _LEAST * mean)
     for _ in range(iterations):
         ratio = counts / blur(scene).clamp(min=tiny)

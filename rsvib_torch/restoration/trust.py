@@ -9,7 +9,7 @@ from torch import Tensor
 from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.vibration import Vibration
 
-__all__ = ["Detected", "displacement_uncertainty", "trusted_vibration"]
+__all__ = ["Detected", "displacement_uncertainty", "trusted_vibration", "vibration_to_undo"]
 
 _WORTH_UNDOING = 0.5  # of the mean square displacement; an uncertainty beyond would leave more than it takes
 _MEASURED = 4.0  # standard deviations above which an image motion counts as measured
@@ -123,3 +123,18 @@ def trusted_vibration(
     if "image_acceleration" in rest:
         rest["image_acceleration"] = rest["image_acceleration"] * drift
     return Vibration(**changed, **rest), tuple(notes)
+
+
+def vibration_to_undo(
+    vibration: Vibration | Detected, timing: SensorTiming, num_frames: int, num_rows: int
+) -> tuple[Vibration, tuple[str, ...]]:
+    """All of a vibration that was given; of one that was detected the trusted part, and what is left alone.
+
+    Raises:
+        TypeError: If it is neither.
+    """
+    if isinstance(vibration, Vibration):
+        return vibration, ()
+    if not all(hasattr(vibration, name) for name in ("vibration", "std", "reliable", "reasons")):
+        raise TypeError(f"vibration must be a Vibration or a detection, got {type(vibration).__name__}")
+    return trusted_vibration(vibration, timing, num_frames, num_rows)

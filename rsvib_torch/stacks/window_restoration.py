@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
+from rsvib_torch.free_motion import moving_axes
 from rsvib_torch.restoration import (
     RestorationVerdict,
     TooLittleInCommonError,
@@ -66,7 +67,7 @@ def restore_trusted(
     rows = frames.shape[-1 if timing.scan_axis == -1 else -2]
     vibration, left_alone = trusted_vibration(detected, timing, len(frames), rows)
     frames = frames if first_frames is None else frames[:first_frames]
-    if not bool((vibration.amplitude > 0).any() | (vibration.image_motion != 0).any()):
+    if not bool(moving_axes(vibration).any()):
         return RestoredFrames(frames, False, left_alone, None, False)
     clear = restore(frames, timing, vibration, check=False, **options)
     verdict = None
