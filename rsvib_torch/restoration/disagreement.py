@@ -9,6 +9,7 @@ from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.blurred_noise import noise_beside_blur
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.noise import estimate_noise
+from rsvib_torch.restoration.noise_floor import noise_floor
 from rsvib_torch.restoration.prior import RowPrior
 from rsvib_torch.restoration.row_system import row_kernels
 from rsvib_torch.restoration.sampled_rows import sample_rows
@@ -20,6 +21,8 @@ _SMALLEST = 64  # rows and columns that two frames have to share
 _NARROWEST = 8  # rows and columns of frames that are compared at all
 _FREQUENCIES = 24  # spread over the upper half, where scenes are weakest
 _WEAK = 1e-4  # of the prior that bridges what no frame saw, relative to the data
+_ALIKE = 0.8  # of the noise estimated from one frame: a floor that is not lower says nothing else
+_TEXTURE = 1 / 9  # of the noise estimated from one frame is noise at least: more may be lost than can be gained
 _MISSING = 0.1  # of the pixels of two frames that are compared, at most
 _EVERY = 8  # rows of which one tells whether a frame shows anything
 _FLAT = 1e-6  # of the largest value: frames that vary by less show nothing, not even noise
@@ -30,8 +33,8 @@ def noise_levels(frames: Tensor, motion: FrameMotion, stack: int, ignore: Tensor
 
     Where the scene is blurred, noise is what is not. Elsewhere, what texture adds to the noise estimated from single
     frames is the same in all of them: the excess of that estimate over what the two middle frames disagree by, once the
-    scene that explains them best is taken away. A frame that shows nothing, or too little, is taken to have as much
-    noise as the others.
+    scene that explains them best is taken away. A frame by itself has as much noise as its spectrum flattens to,
+    within bounds. A frame that shows nothing, or too little, is taken to have as much noise as the others.
 
     Args:
         frames: (T, C, H, W) in row order, what is to be ignored filled.
@@ -46,9 +49,12 @@ def noise_levels(frames: Tensor, motion: FrameMotion, stack: int, ignore: Tensor
     bare = noise_beside_blur(frames, motion, stack, ignore)
     if bare is not None:
         power = torch.fmin(power, torch.where(power.isnan(), math.nan, bare.to(power.dtype)))
-    elif len(frames) > 1:
-        pair = _shared_part(frames, motion, stack, power.isnan(), ignore)
-        if pair is not None:
+    else:
+        pair = _shared_part(frames, motion, stack, power.isnan(), ignore) if len(frames) > 1 else None
+        if pair is None:
+            floor = noise_floor(frames, ignore).mean(-1).to(power.dtype)
+            power = torch.where(floor < _ALIKE * power, torch.maximum(floor, _TEXTURE * power), power)
+        else:
             images, hidden, rows, members = pair
             measured = 1.0 if hidden is None else 1.0 - hidden.any(0).to(power.dtype).mean()
             noise = _residual_power(images, motion, stack, rows, members) / measured

@@ -32,6 +32,7 @@ _MARGIN = 16  # rows beyond the frame that it may see
 _LONG = 1.0  # px along the row either way: beyond, ends of rows are worth being continued by what the blur demands
 _REACH = 8  # px beyond the displacement that ends say something of where they are not filled so
 _LOOSE, _REST = 0.3, 0.03  # parts of the quadratic prior that patches start from and keep
+_SHOWN = 0.05  # of its pixels: a frame of which no more was measured is not joined with others
 _QUIETEST = 1e-5  # lowest noise level assumed, of full scale
 
 
@@ -140,7 +141,9 @@ class _Stack:
         kernels = self.kernels(members, reference)
         precision = self.prior.of(members).precision(self.noise_power, strength, kernels.reach)
         along = self.shift[members, 0] - self.shift[reference, 0]
-        data = continue_rows(self.frames[members[0] : members[-1] + 1], self.length).sub_(self.mean)  # neighbours
+        neighbours = members == list(range(members[0], members[-1] + 1))  # need not be copied
+        frames = self.frames[members[0] : members[-1] + 1] if neighbours else self.frames[members]
+        data = continue_rows(frames, self.length).sub_(self.mean)
         problem = SceneProblem(data, SeenScene(kernels, height, data.dtype), precision, self.level, partition)
         hidden = None if self.lost is None else self.lost[members]
         ends = kernels.reach > _LONG
@@ -213,8 +216,7 @@ def restore_exact(
     displacement, node_weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
     reaches = motion.reaches(H)
     certain = noise != "auto" or T > 1
-    stacks: list[_Stack] = []
-    strengths: list[float] = []
+    problems: list[tuple[_Stack, list[int], int, float]] = []
     for index in range(B):
         weights = levels[index].square().reciprocal()
         typical = weights.mean().reciprocal()
@@ -233,15 +235,15 @@ def restore_exact(
             clipped=None if clipped is None else clipped[index],
         )
         known = Strengths()
-        strengths += [factor * stack.strength(*group, known, certain=certain) for group in groups]
-        stacks.append(stack)
+        shown = groups if lost is None else _that_show_something(groups, lost[index])
+        problems += [(stack, *group, factor * stack.strength(*group, known, certain=certain)) for group in shown]
 
     def restored(number: int, partition: Partition, out: Tensor | None = None) -> Tensor:
-        index, place = divmod(number, len(groups))
-        problem = stacks[index].problem(*groups[place], strengths[number], partition)
-        return _restore_group(problem, factor if prior == "edges" else None, mean[index], W, out)
+        stack, members, reference, strength = problems[number]
+        problem = stack.problem(members, reference, strength, partition)
+        return _restore_group(problem, factor if prior == "edges" else None, stack.mean, W, out)
 
-    count = B * len(groups)
+    count = len(problems)
     if torch.is_grad_enabled() and (frames.requires_grad or displacement.requires_grad):
         partition = Partition(chunk, split)
         images = torch.stack([restored(number, partition) for number in range(count)])
@@ -256,6 +258,12 @@ def restore_exact(
 
     in_parallel(share, range(threads), frames.device)
     return found.view(B, -1, *found.shape[1:])
+
+
+def _that_show_something(groups: list[tuple[list[int], int]], lost: Tensor) -> list[tuple[list[int], int]]:
+    """Groups of frames without those hardly any pixel of which was measured, where there are others."""
+    share = (~lost).double().flatten(1).mean(1).tolist()
+    return [([m for m in members if share[m] > _SHOWN] or members, reference) for members, reference in groups]
 
 
 def _noise_levels(frames: Tensor, motion: FrameMotion, noise: float | Literal["auto"], ignore: Tensor | None) -> Tensor:

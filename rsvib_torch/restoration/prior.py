@@ -119,9 +119,9 @@ def _levinson(moments: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor], Te
 
 def _pooled(power: Tensor) -> Tensor:
     """Means over 5 x 5 neighbouring frequencies of (U, V)."""
-    around = torch.nn.functional.pad(power[None, None], (2, 2, 0, 0), mode="circular")
-    around = torch.nn.functional.pad(around, (0, 0, 2, 2), mode="replicate")
-    return torch.nn.functional.avg_pool2d(around, 5, 1)[0, 0]
+    u, v = (torch.arange(-2, extent + 2, device=power.device) for extent in power.shape)
+    around = power[u.clamp(0, len(power) - 1)][:, v % power.shape[1]]
+    return torch.nn.functional.avg_pool2d(around[None, None], 5, 1)[0, 0]
 
 
 def _pooling(u: Tensor) -> Tensor:
@@ -167,8 +167,8 @@ def autoregressive_prior(
     through, pooling = transfer * observed, _pooling(observed[:, 0]) / len(v)
     excess = observed - noise_power
     # where noise outweighs the scene, steps are small, and should not have to begin from what chance has left over
-    faint = excess < _FAINT * noise_power
-    excess = torch.where(faint, _pooled(excess).minimum(_FAINT * noise_power), excess)
+    level = _FAINT * noise_power
+    excess = torch.where(excess < level, _pooled(excess).minimum(level), excess)
     scene = torch.maximum(excess, _LEAST * noise_power) * transfer / (transfer.square() + 1e-2)
     for _ in range(_ITERATIONS):
         moments = (pooling @ (scene @ cosine)).unbind(-1)
@@ -248,7 +248,8 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     total = weight.sum((0, 1)).clamp(min=torch.finfo(torch.float32).tiny)
     observed = torch.maximum((weight * power).sum((0, 1)) / total, whole / _BEYOND)
     noise_power = transfer.sum((0, 1)) / total * length
-    prior = autoregressive_prior(observed, (weight * transfer).sum((0, 1)) / total, aliases, noise_power)
+    passed = (weight * transfer).sum((0, 1)) / total
+    prior = autoregressive_prior(observed, passed, aliases, noise_power)
     return prior.resampled(length // 2 + 1)
 
 

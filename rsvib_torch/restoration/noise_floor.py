@@ -1,0 +1,95 @@
+"""Noise told from texture by the spectrum of one frame: noise is flat, what optics let through falls."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.spectral import squared_modulus
+
+__all__ = ["noise_floor"]
+
+_PIECE = 64  # rows and columns of the pieces whose spectra are averaged
+_PIECES = 36  # of a frame, about
+_COARSE = 0.2  # cycles per px; below, spectra are steeper
+_SECTORS = 6  # of directions, each of which falls in its own way
+_STEEPNESS, _SPREAD = 3.0, 8.0  # of power laws: typical, and its standard deviation
+_ITERATIONS = 14
+_STEP = 0.7  # in logarithms, at most
+
+
+@torch.no_grad()
+def noise_floor(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
+    """Power of the white noise beneath the texture of each image, from how its spectrum flattens.
+
+    At frequency f in direction d the power is ``n + c_d f^(-a_d)``: a power law for the scene and its optics in every
+    direction, and one floor. Fisher scoring finds all of them for powers that scatter exponentially about their means
+    (Whittle 1953). The floor is uncertain where texture outweighs it up to the highest frequencies.
+
+    Args:
+        frames: (..., H, W).
+        ignore: Boolean mask of the same shape: pieces with such a pixel do not count.
+
+    Returns:
+        Power, shape (...), float64; NaN for an image of less than one piece, or none that counts.
+    """
+    height, width = frames.shape[-2:]
+    images = frames.reshape(-1, height, width)
+    if min(height, width) < _PIECE:
+        return images.new_full(frames.shape[:-2], math.nan, dtype=torch.float64)
+    power = _pooled(_spectrum(images, None if ignore is None else ignore.reshape(images.shape)))  # (N, V, U)
+    u = _pooled(torch.fft.rfftfreq(_PIECE, dtype=torch.float64, device=frames.device).expand(2, -1))[0]
+    v = torch.fft.fftfreq(_PIECE, dtype=torch.float64, device=frames.device).unflatten(0, (-1, 2)).mean(-1)
+    far, direction = torch.hypot(u, v[:, None]), torch.atan2(v[:, None], u)
+    fine = far > _COARSE
+    sector = ((direction[fine] / math.pi + 0.5) * _SECTORS).long().clamp(0, _SECTORS - 1)
+    inside = torch.nn.functional.one_hot(sector, _SECTORS).to(torch.float64)  # (K, D)
+    found = _fit(power[:, fine], (far[fine] / 0.4).log(), sector, inside)
+    return found.reshape(frames.shape[:-2])
+
+
+def _spectrum(images: Tensor, ignore: Tensor | None) -> Tensor:
+    """Mean power (N, V, U), of white noise its variance, of pieces of images (N, H, W)."""
+    places = []
+    for extent in images.shape[-2:]:
+        count = min(2 * extent // _PIECE - 1, round(_PIECES**0.5))
+        starts = torch.linspace(0, extent - _PIECE, count, device=images.device).round().long()
+        places.append(starts[:, None] + torch.arange(_PIECE, device=images.device))
+    cut = (..., places[0][:, None, :, None], places[1][None, :, None, :])
+    taper = torch.hann_window(_PIECE + 2, periodic=False, dtype=images.dtype, device=images.device)[1:-1]
+    taper = taper / taper.square().sum().sqrt()
+    pieces = images[cut].flatten(1, 2)
+    pieces = (pieces - pieces.mean((-2, -1), keepdim=True)) * taper * taper[:, None]
+    power = squared_modulus(torch.fft.rfft2(pieces)).to(torch.float64)
+    if ignore is None:
+        return power.mean(1)
+    counts = ~ignore[cut].flatten(1, 2).any(-1).any(-1)
+    return (power * counts[..., None, None]).sum(1) / counts.sum(1)[:, None, None]
+
+
+def _pooled(values: Tensor) -> Tensor:
+    """Means over 2 x 2 neighbouring frequencies of (..., V, U), without the lowest and the two highest u."""
+    pooled: Tensor = values[..., 1:-2].unflatten(-1, (-1, 2)).unflatten(-3, (-1, 2)).mean((-3, -1))
+    return pooled
+
+
+def _fit(power: Tensor, log_frequency: Tensor, sector: Tensor, inside: Tensor) -> Tensor:
+    """Floor (N,) of powers (N, K) at K frequencies, each in one of D sectors."""
+    scale = power.mean(-1, keepdim=True)
+    power = (power / scale).nan_to_num(nan=1.0)
+    low = power.amin(-1, keepdim=True).clamp(min=1e-9)
+    typical = ((power @ inside) / inside.sum(0)).clamp(min=1e-9)
+    count = inside.shape[-1]
+    found = torch.cat([(0.5 * low).log(), (0.5 * typical).log(), torch.full_like(typical, 2.0)], dim=-1)
+    prior = found.new_tensor([1e-3] * (1 + count) + [_SPREAD**-2] * count)
+    for _ in range(_ITERATIONS):
+        floor, level, steepness = found.split([1, count, count], dim=-1)
+        scene = (level[:, sector] - steepness[:, sector] * log_frequency).exp()
+        model = floor.exp() + scene
+        share = (scene / model)[..., None] * inside
+        slopes = torch.cat([(floor.exp() / model)[..., None], share, -share * log_frequency[:, None]], dim=-1)
+        normal = slopes.transpose(-2, -1) @ slopes + torch.diag(prior)
+        pull = (slopes.transpose(-2, -1) @ (power / model - 1.0)[..., None])[..., 0]
+        pull[:, 1 + count :] += (_STEEPNESS - steepness) * prior[1 + count :]
+        found = found + torch.linalg.solve(normal, pull).clamp(-_STEP, _STEP)
+    return found[:, 0].exp() * scale[:, 0]

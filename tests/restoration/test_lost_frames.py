@@ -1,0 +1,123 @@
+"""Frames and pixels that show nothing spoil no others, and are not held against a restoration."""
+
+import warnings
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from truth import Motion, crop, decibel, draw_scene, take_frames
+
+from rsvib_torch import SensorTiming, Vibration
+from rsvib_torch.restoration import judge_restoration, restore
+
+SCENE, MOTION, NOISE = draw_scene(272, 240, seed=12), Motion(), 0.01
+quietly = partial(restore, check=False)
+
+
+def camera(rows=20):
+    return SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
+
+
+def taken(count=3, rows=20):
+    clean = take_frames(SCENE, camera(rows), MOTION, count, samples=24 if rows > 50 else 10)
+    return torch.from_numpy(clean + NOISE * np.random.default_rng(1).standard_normal(clean.shape)).float()
+
+
+@pytest.mark.parametrize("method", ["exact", "banded", "dewarp", "richardson-lucy"])
+@pytest.mark.parametrize("rows", [20, 200])
+@pytest.mark.parametrize("dead", [0.0, 0.3, float("nan")])
+def test_a_dead_frame_harms_no_others(method, rows, dead):
+    frames = taken(rows=rows)
+    whole = quietly(frames, camera(rows), MOTION.vibration(), method=method)
+    frames[1] = dead
+    found = quietly(frames, camera(rows), MOTION.vibration(), method=method)
+    assert torch.isfinite(found).all()
+    for frame in (0, 2):
+        assert decibel(found[frame], crop(SCENE)) > decibel(whole[frame], crop(SCENE)) - 0.4
+
+
+@pytest.mark.parametrize("rows", [20, 200])
+def test_a_frame_without_data_harms_no_joint_restoration(rows):
+    frames = taken(rows=rows)
+    pair = quietly(frames[[0, 1]], camera(rows), MOTION.vibration(), joint=True)
+    frames[2] = float("nan")
+    found = quietly(frames, camera(rows), MOTION.vibration(), joint=True)
+    assert decibel(found, crop(SCENE)) > decibel(pair, crop(SCENE)) - 0.3
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5])
+def test_half_a_frame_tells_as_much_noise_as_a_whole_one(share):
+    frames = taken()
+    columns = round(share * frames.shape[-1])
+    frames[..., :columns] = float("nan")
+    found = quietly(frames, camera(), MOTION.vibration())[..., columns:]
+    told = quietly(frames, camera(), MOTION.vibration(), noise=NOISE)[..., columns:]
+    inner = crop(SCENE)[..., columns:]
+    assert decibel(found, inner) > decibel(told, inner) - 0.15
+    assert (
+        decibel(quietly(frames, camera(), MOTION.vibration(), noise=1e-5)[..., columns:], inner)
+        < decibel(told, inner) - 1
+    )
+
+
+@pytest.mark.parametrize("value", [0.0, 0.3, 0.5])
+@pytest.mark.parametrize("rows", [20, 200, 400])
+@pytest.mark.parametrize("count", [1, 2])
+def test_frames_that_show_nothing_stay_so_without_alarm(value, rows, count):
+    frames = torch.full((count, 160, 140), value)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = restore(frames, camera(rows), MOTION.vibration())
+    torch.testing.assert_close(found, frames, rtol=0, atol=1e-5)
+    if count == 2:
+        verdict = judge_restoration(frames, found, camera(rows), MOTION.vibration())
+        assert verdict.overall == "unknown"
+        assert "nothing to tell it by" in verdict.summary
+
+
+@pytest.mark.parametrize("shape", [(2, 300, 3), (2, 3, 3), (2, 1, 60), (2, 60, 1), (1, 5, 2), (3, 9, 7)])
+@pytest.mark.parametrize("method", ["exact", "banded", "dewarp", "richardson-lucy"])
+def test_narrow_frames(shape, method):
+    frames = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    assert torch.isfinite(quietly(frames, camera(), Vibration([0.4, 0.3], [50.0, 30.0]), method=method)).all()
+
+
+@pytest.mark.parametrize("columns", [5, 15])
+@pytest.mark.parametrize("count", [2, 4])
+def test_missing_columns_raise_no_alarm(columns, count):
+    frames = taken(count)[:, :128, :128]
+    frames[..., 60 : 60 + columns] = float("nan")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = restore(frames, camera(), MOTION.vibration())
+    assert judge_restoration(frames, found, camera(), MOTION.vibration()).overall == "helps"
+    late = Motion(MOTION.amplitude, MOTION.frequency, (MOTION.phase[0] + 3, MOTION.phase[1] + 3)).vibration()
+    wrong = quietly(frames, camera(), late)
+    assert judge_restoration(frames, wrong, camera(), late).overall == "worse"
+
+
+def test_pairs_with_a_frame_without_data_are_not_judged():
+    frames = taken(3)
+    frames[2] = float("nan")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = restore(frames, camera(), MOTION.vibration())
+    verdict = judge_restoration(frames, found, camera(), MOTION.vibration())
+    assert verdict.outcome == ("helps", "unknown")
+    assert "100 % of the pixels are missing" in verdict.reasons[1]
+
+
+def test_a_stack_does_not_depend_on_its_neighbours_in_a_batch():
+    frames = taken(2, rows=100)[None, :, None]
+    calm, wild = Vibration([0.2, 0.1], [50.0, 30.0]), Vibration([40.0, 1.0], [50.0, 30.0])
+    for other in (calm, wild):
+        both = Vibration(
+            *(
+                torch.stack([getattr(v, name) for v in (MOTION.vibration(), other)])
+                for name in ("amplitude", "frequency", "phase")
+            )
+        )
+        together = quietly(torch.cat([frames, frames.flip(-1)]), camera(100), both)
+        alone = quietly(frames[0, :, 0], camera(100), MOTION.vibration())
+        torch.testing.assert_close(together[0, :, 0], alone, rtol=0, atol=2e-4)  # nodes of the exposure are shared
