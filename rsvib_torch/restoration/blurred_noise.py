@@ -7,6 +7,7 @@ from torch import Tensor
 
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.motion import FrameMotion
+from rsvib_torch.restoration.noise import mostly_measured
 from rsvib_torch.spectral import squared_modulus, waves
 
 __all__ = ["noise_beside_blur"]
@@ -34,7 +35,7 @@ def noise_beside_blur(frames: Tensor, motion: FrameMotion, stack: int, ignore: T
         frames: (T, C, H, W) in row order.
         motion: Motion of the batch of stacks.
         stack: Index of the stack in the batch.
-        ignore: Boolean mask shaped like the frames: pieces with such a pixel do not count.
+        ignore: Boolean mask shaped like the frames: pieces with many such pixels do not count.
 
     Returns:
         Power (T,), float64, NaN for a frame that has too few pieces which count; None where blur hides too little of
@@ -64,7 +65,7 @@ def noise_beside_blur(frames: Tensor, motion: FrameMotion, stack: int, ignore: T
     power, transfer = power.flatten(1, 2), transfer[:, :, None].expand_as(power).flatten(1, 2)
     usable = (power > 0).any(-1)
     if ignore is not None:
-        usable = usable & ~ignore[places].any(1).any(-1).any(-1).flatten(1)
+        usable = usable & mostly_measured(ignore[places].any(1).double().mean((-2, -1)).flatten(1), (-1,))
     enough = usable.sum(-1) >= min(_FEWEST, usable.shape[-1])
     noise = _score(power.where(enough[:, None, None], 1.0), transfer, usable | ~enough[:, None])
     return noise.masked_fill(~enough, math.nan)

@@ -185,7 +185,8 @@ def restore_exact(
             motion moves frames, only what they have in common with the restored one is joined.
         prior: ``"gaussian"``: rows predict their neighbours, one fast solution; ``"edges"``: moreover, every patch of
             8 x 8 px is made of few cosines, which keeps edges and flat ground apart from noise; several times slower.
-        noise: Standard deviation of the noise (full scale 1); ``"auto"`` estimates it for every frame.
+        noise: Standard deviation of the noise (full scale 1); ``"auto"`` estimates it for every frame. Two frames, or
+            blur, tell it from texture; one sharp frame does so within bounds only, see ``noise_floor``.
         regularisation: Factor on the prior; 1 is what the frames ask for.
         ignore: Boolean mask shaped like the frames of pixels that do not count; they may hold anything, and are filled
             with what the others say.

@@ -7,11 +7,12 @@ from torch import Tensor
 
 from rsvib_torch.pieces import runs
 
-__all__ = ["estimate_noise", "gradient_energy"]
+__all__ = ["estimate_noise", "gradient_energy", "mostly_measured"]
 
 _BLOCK = 16
 _DIFFERENCES = 8
 _QUANTILE = 0.15
+_LOST = 0.1  # of the pixels of a block, at most, unless all others lost more
 _FEW = 8  # blocks have no quiet part
 _MANY = 2048  # blocks tell as much as all of a larger image
 _VALUES = {"cpu": 1 << 16}  # at a time: they stay in the cache
@@ -26,7 +27,7 @@ def estimate_noise(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
 
     Args:
         frames: (..., H, W).
-        ignore: Boolean mask of the same shape of pixels that hold no noise of their own: blocks with one of them do
+        ignore: Boolean mask of the same shape of pixels that hold no noise of their own: blocks with many of them do
             not count.
 
     Returns:
@@ -59,8 +60,8 @@ def estimate_noise(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
     ]
     energy = torch.cat(blocks) / math.prod(math.comb(2 * order, order) for order in orders)
     if ignore is not None:
-        lost = strips_of(ignore).any(-1).unfold(-1, windows[1], block).any(-1)
-        energy = energy.masked_fill(lost, math.nan)
+        lost = strips_of(ignore.to(frames.dtype)).mean(-1).unfold(-1, windows[1], block).mean(-1)
+        energy = energy.masked_fill(~mostly_measured(lost, (0, -1)), math.nan)
     energy = energy.movedim(0, -1).flatten(-2)
     # means of pure noise scatter (neighbouring responses of the mask are correlated), so that their low quantile lies
     # below the true mean: by as much as a chi-squared variable's does (Wilson and Hilferty)
@@ -70,6 +71,11 @@ def estimate_noise(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
     few = (~energy.isnan()).sum(-1) < _FEW
     deviation: Tensor = torch.where(few, energy.nanmean(-1), quiet).sqrt()
     return deviation
+
+
+def mostly_measured(lost: Tensor, dims: tuple[int, ...]) -> Tensor:
+    """Which parts of images count, of whose pixels a share was ``lost``: those that lost few, or least of all."""
+    return (lost <= lost.amin(dims, keepdim=True).clamp(min=_LOST)) & (lost < 1)
 
 
 def _detail(strips: Tensor, across: Tensor, order: int) -> Tensor:

@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor
 
+from rsvib_torch.restoration.noise import mostly_measured
 from rsvib_torch.spectral import squared_modulus
 
 __all__ = ["noise_floor"]
@@ -28,7 +29,7 @@ def noise_floor(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
 
     Args:
         frames: (..., H, W).
-        ignore: Boolean mask of the same shape: pieces with such a pixel do not count.
+        ignore: Boolean mask of the same shape: pieces with many such pixels do not count.
 
     Returns:
         Power, shape (...), float64; NaN for an image of less than one piece, or none that counts.
@@ -63,7 +64,7 @@ def _spectrum(images: Tensor, ignore: Tensor | None) -> Tensor:
     power = squared_modulus(torch.fft.rfft2(pieces)).to(torch.float64)
     if ignore is None:
         return power.mean(1)
-    counts = ~ignore[cut].flatten(1, 2).any(-1).any(-1)
+    counts = mostly_measured(ignore[cut].flatten(1, 2).double().mean((-2, -1)), (-1,))
     return (power * counts[..., None, None]).sum(1) / counts.sum(1)[:, None, None]
 
 

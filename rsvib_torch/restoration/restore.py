@@ -128,7 +128,8 @@ def restore(
             slabs (Sec. 3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest; ``"richardson-lucy"``: iterated,
             nowhere negative, several frames jointly on demand.
         full_scale: Count that means 1.0, for integer frames other than uint8.
-        ignore: Boolean mask shaped like the frames of pixels that do not count; they may hold anything.
+        ignore: Boolean mask shaped like the frames of pixels that do not count; they may hold anything. Stuck columns,
+            and a rim that never sees light, are to be named here: they show no noise, and do not move with the scene.
         saturation: Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for
             integer frames, none for floats, which do not say where they were cut; None for none.
         check: Judge the result on a part of the frames, and warn where it is no better than what came in; needs two

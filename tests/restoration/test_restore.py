@@ -273,6 +273,11 @@ def test_methods_that_take_saturated_pixels_at_their_level(lamps, method):
         ({"ignore": torch.zeros(2, 16, 8, dtype=torch.bool)}, ValueError, "ignore must be a boolean mask of shape"),
         ({"frames": "frames.tif"}, TypeError, "frames must be a tensor or array of numbers, got str"),
         ({"clipped": True}, TypeError, "method='exact' has no option 'clipped'"),
+        ({"timing": None}, TypeError, "timing must be a SensorTiming, got NoneType"),
+        ({"frames": torch.ones(2, 16, 16).short(), "full_scale": -1}, ValueError, "full_scale must be larger than 0"),
+        ({"frames": np.ma.masked_array(np.ones((2, 16, 16)))}, TypeError, "frames must not be a masked array"),
+        ({"frames": np.ones((2, 16, 16), object)}, TypeError, "got ndarray of object"),
+        ({"vibration": Vibration(1.0, 5e7)}, ValueError, "periods while a row is exposed"),
     ],
 )
 def test_bad_input(change, error, message):

@@ -1,5 +1,6 @@
 import math
 import warnings
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -250,3 +251,78 @@ def test_bad_input(frames, restored, motion, message):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
     with pytest.raises(ValueError, match=message):
         judge_restoration(frames, restored, timing, motion.vibration())
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.05), (1.1, 0.0), (0.8, 0.1)])
+def test_frames_may_differ_in_brightness(scene, joint, gain, offset):
+    timing, motion = camera(), shaking()
+    frames = frames_of(scene("city"), timing, motion, 0.005)
+    frames = torch.stack([frames[0], gain * frames[1] + offset])
+    verdict, _ = judged(frames, timing, motion.vibration(), joint=joint)
+    assert verdict.overall == "helps", verdict.summary
+    for wrong in WRONG.values():
+        assert judged(frames, timing, wrong(motion).vibration(), joint=joint)[0].overall in ("partly", "worse")
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_little_too_much_along_one_axis_is_not_held_against_the_other(scene, axis):
+    timing = camera()
+    large = [3.1, 5.2]
+    large[axis] = 0.0
+    frames = frames_of(scene("city"), timing, Motion(tuple(large), FREQUENCY, (0.4, 1.3)), 0.005)
+    slightly = list(large)
+    slightly[axis] = 0.06
+    verdict, restored = judged(frames, timing, Vibration(slightly, FREQUENCY, (0.4, 1.3)))
+    assert decibel(restored[1], crop(scene("city"))) > decibel(frames[1], crop(scene("city"))) + 10
+    assert verdict.overall in ("helps", "unknown"), verdict.summary
+    much = list(large)
+    much[axis] = 2.0
+    assert judged(frames, timing, Vibration(much, FREQUENCY, (0.4, 1.3)))[0].overall == "worse"
+
+
+@pytest.mark.parametrize(
+    "invented",
+    [{"image_motion": [1500.0, -1000.0]}, {"image_acceleration": [0.0, -4e4]}],
+    ids=["motion", "acceleration"],
+)
+def test_invented_image_motion_is_warned_of(scene, invented):
+    frames = frames_of(scene("city"), camera(), shaking(0.0), 0.005)
+    moving = Vibration([0.0, 0.0], [0.0, 0.0], **invented)
+    with pytest.warns(RestorationWarning, match="restored is no better than raw"):
+        restore(frames, camera(), moving, method="dewarp")
+
+
+def test_whatever_restore_takes_and_gives_is_judged(scene):
+    timing, motion = camera(), shaking()
+    frames, vibration = frames_of(scene("city"), timing, motion, 0.005), motion.vibration()
+    restored = restore(frames, timing, vibration)
+    for raw, clear in ((frames.half(), restored.half()), (frames.double(), restored), (frames, restored.double())):
+        assert judge_restoration(raw, clear, timing, vibration).overall == "helps"
+    counts = [(images.clamp(0, 1) * 4095).round().to(torch.int32) for images in (frames, restored)]
+    assert judge_restoration(*counts, timing, vibration, full_scale=4095).overall == "helps"
+    tiny = {name: 1e-4 * torch.ones_like(getattr(vibration, name)) for name in ("amplitude", "frequency", "phase")}
+    std = SimpleNamespace(**tiny, image_motion=torch.full((2,), 1e-4))
+    detection = SimpleNamespace(vibration=vibration, std=std, reliable=torch.tensor([True, True]), reasons=((), ()))
+    assert judge_restoration(frames, restored, timing, detection).overall == "helps"
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"most_pairs": 0}, ValueError, "most_pairs must be at least 1, got 0"),
+        ({"most_pairs": 1.5}, TypeError, "most_pairs must be a whole number, got 1.5"),
+        ({"joint": 2.7}, TypeError, "joint must be a whole number, got 2.7"),
+        ({"joint": "all"}, TypeError, "joint must be a whole number, got 'all'"),
+        ({"vibration": 3.0}, TypeError, "vibration must be a Vibration or a detection, got float"),
+        ({"vibration": Vibration(1.0, 50.0).expanded(2)}, ValueError, r"vibration must be one for the stack"),
+        ({"timing": Vibration(1.0, 50.0)}, TypeError, "timing must be a SensorTiming, got Vibration"),
+        ({"restored": torch.full((2, 96, 96), math.nan)}, ValueError, "restored must be finite"),
+        ({"frames": torch.full((2, 96, 96), math.nan)}, ValueError, "ignore leaves no pixel"),
+    ],
+)
+def test_bad_input_is_named(change, error, message):
+    arguments = {"frames": torch.rand(2, 96, 96), "restored": torch.rand(2, 96, 96)}
+    arguments |= {"timing": camera(), "vibration": Vibration(1.0, 50.0)}
+    with pytest.raises(error, match=message):
+        judge_restoration(**{**arguments, **change})
