@@ -230,7 +230,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     power = torch.cat(found, dim=1).to(torch.float64) * length  # (T, pieces, U, V)
     few = torch.linspace(0, len(tops) - 1, min(_STRIPS, len(tops)), device=rows.device).round().to(torch.int64)
     strips_of_rows = (frames[..., rows[few], :] - bright) * tapers[0][:, None]  # (T, C, n, rows, W)
-    whole = _power_of_rows(strips_of_rows, mean.unflatten(1, rows.shape)[:, few], length, len(u))
+    whole = _power_of_rows(strips_of_rows, length, len(u))
 
     displacement, weights = exposure_trajectory(
         vibration, times.unflatten(1, rows.shape)[..., size[0] // 2], motion.timing, "gauss"
@@ -262,18 +262,17 @@ def _smeared(transfer: Tensor) -> Tensor:
     return (2.0 / 3.0) * transfer + (1.0 / 6.0) * between
 
 
-def _power_of_rows(strips: Tensor, moved: Tensor, length: int, count: int) -> Tensor:
+def _power_of_rows(strips: Tensor, length: int, count: int) -> Tensor:
     """Power (U, V) of whole rows with what they go on by beyond their ends, pooled to U frequencies along them.
+
+    What ends add lies at low frequencies, where a displacement hardly turns phases: rows are left where they are.
 
     Args:
         strips: (T, C, n, R, W), tapered across their rows.
-        moved: (T, n, R) px that the rows are displaced along themselves.
         length: Period of the rows.
         count: U.
     """
-    u = torch.fft.rfftfreq(length, dtype=torch.float64, device=strips.device)
-    back = waves(moved, -u).to(strips.dtype.to_complex())[:, None]
-    power = squared_modulus(torch.fft.fft(torch.fft.rfft(continue_rows(strips, length)) * back, dim=-2))
+    power = squared_modulus(torch.fft.fft(torch.fft.rfft(continue_rows(strips, length)), dim=-2))
     return torch.nn.functional.adaptive_avg_pool1d(power.mean((0, 1, 2)), count).T.to(torch.float64)
 
 
