@@ -12,10 +12,11 @@ __all__ = ["noise_floor"]
 
 _PIECE = 64  # rows and columns of the pieces whose spectra are averaged
 _PIECES = 36  # of a frame, about
+_TYPICAL = 0.4  # cycles per px
 _COARSE = 0.2  # cycles per px; below, spectra are steeper
 _SECTORS = 6  # of directions, each of which falls in its own way
 _STEEPNESS, _SPREAD = 3.0, 8.0  # of power laws: typical, and its standard deviation
-_ITERATIONS = 14
+_ITERATIONS = 16
 _STEP = 0.7  # in logarithms, at most
 
 
@@ -23,9 +24,9 @@ _STEP = 0.7  # in logarithms, at most
 def noise_floor(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
     """Power of the white noise beneath the texture of each image, from how its spectrum flattens.
 
-    At frequency f in direction d the power is ``n + c_d f^(-a_d)``: a power law for the scene and its optics in every
-    direction, and one floor. Fisher scoring finds all of them for powers that scatter exponentially about their means
-    (Whittle 1953). The floor is uncertain where texture outweighs it up to the highest frequencies.
+    At frequency f in direction d the power is ``n + c_d f^(-a_d) exp(-b f^2)``: a power law for the scene in every
+    direction, Gaussian optics, and one floor. Fisher scoring finds all of them for powers that scatter exponentially
+    about their means (Whittle 1953). The floor is uncertain where texture outweighs it up to the highest frequencies.
 
     Args:
         frames: (..., H, W).
@@ -45,7 +46,7 @@ def noise_floor(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
     fine = far > _COARSE
     sector = ((direction[fine] / math.pi + 0.5) * _SECTORS).long().clamp(0, _SECTORS - 1)
     inside = torch.nn.functional.one_hot(sector, _SECTORS).to(torch.float64)  # (K, D)
-    found = _fit(power[:, fine], (far[fine] / 0.4).log(), sector, inside)
+    found = _fit(power[:, fine], far[fine] / _TYPICAL, sector, inside)
     return found.reshape(frames.shape[:-2])
 
 
@@ -74,23 +75,29 @@ def _pooled(values: Tensor) -> Tensor:
     return pooled
 
 
-def _fit(power: Tensor, log_frequency: Tensor, sector: Tensor, inside: Tensor) -> Tensor:
-    """Floor (N,) of powers (N, K) at K frequencies, each in one of D sectors."""
+def _fit(power: Tensor, frequency: Tensor, sector: Tensor, inside: Tensor) -> Tensor:
+    """Floor (N,) of powers (N, K) at K frequencies, in units of a typical one, each in one of D sectors."""
     scale = power.mean(-1, keepdim=True)
     power = (power / scale).nan_to_num(nan=1.0)
     low = power.amin(-1, keepdim=True).clamp(min=1e-9)
     typical = ((power @ inside) / inside.sum(0)).clamp(min=1e-9)
     count = inside.shape[-1]
-    found = torch.cat([(0.5 * low).log(), (0.5 * typical).log(), torch.full_like(typical, 2.0)], dim=-1)
-    prior = found.new_tensor([1e-3] * (1 + count) + [_SPREAD**-2] * count)
+    level, steepness = (0.5 * typical).log(), torch.full_like(typical, 2.0)
+    found = torch.cat([(0.5 * low).log(), torch.zeros_like(low), level, steepness], dim=-1)
+    expected = found.new_tensor([0.0] * (2 + count) + [_STEEPNESS] * count)
+    prior = found.new_tensor([1e-3] * (2 + count) + [_SPREAD**-2] * count)
+    logarithm, square = frequency.log(), frequency.square()
     for _ in range(_ITERATIONS):
-        floor, level, steepness = found.split([1, count, count], dim=-1)
-        scene = (level[:, sector] - steepness[:, sector] * log_frequency).exp()
+        floor, blur, level, steepness = found.split([1, 1, count, count], dim=-1)
+        scene = (level[:, sector] - steepness[:, sector] * logarithm - blur * square).exp()
         model = floor.exp() + scene
-        share = (scene / model)[..., None] * inside
-        slopes = torch.cat([(floor.exp() / model)[..., None], share, -share * log_frequency[:, None]], dim=-1)
-        normal = slopes.transpose(-2, -1) @ slopes + torch.diag(prior)
-        pull = (slopes.transpose(-2, -1) @ (power / model - 1.0)[..., None])[..., 0]
-        pull[:, 1 + count :] += (_STEEPNESS - steepness) * prior[1 + count :]
+        share = scene / model
+        parts = share[..., None] * inside
+        slopes = [(floor.exp() / model)[..., None], -(share * square)[..., None], parts, -parts * logarithm[:, None]]
+        slope = torch.cat(slopes, dim=-1)
+        normal = slope.transpose(-2, -1) @ slope + torch.diag(prior)
+        pull = (slope.transpose(-2, -1) @ (power / model - 1.0)[..., None])[..., 0]
+        pull[:, 1:] += ((expected - found) * prior)[:, 1:]
         found = found + torch.linalg.solve(normal, pull).clamp(-_STEP, _STEP)
+        found[:, 1].clamp_(min=0.0)  # optics do not sharpen: what flattens is noise
     return found[:, 0].exp() * scale[:, 0]
