@@ -8,11 +8,11 @@ from torch import Tensor
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.motion import FrameMotion
 from rsvib_torch.restoration.noise import mostly_measured
+from rsvib_torch.restoration.squares import SIDE, cut_squares, spread_squares, tapered
 from rsvib_torch.spectral import squared_modulus, waves
 
 __all__ = ["noise_beside_blur"]
 
-_PIECE = 64  # rows and columns of the pieces whose spectra are compared
 _PIECES, _LEAST, _MOST = 64, 25, 256  # of a frame, of a frame of many, and of all, about
 _EVERY = 8  # rows of a piece, of which the blur is looked at
 _COARSE = 0.12  # cycles per px; below, scenes are so strong that they say nothing of noise
@@ -42,22 +42,18 @@ def noise_beside_blur(frames: Tensor, motion: FrameMotion, stack: int, ignore: T
         the scene to tell.
     """
     shape, device = frames.shape[-2:], frames.device
-    if min(shape) < 2 * _PIECE:
+    if min(shape) < 2 * SIDE:
         return None
     counts = _counts(shape, min(max(_MOST // len(frames), _LEAST), _PIECES))
-    starts = [_spread(extent, count).to(device) for extent, count in zip(shape, counts, strict=True)]
-    rows, columns = (begin[:, None] + torch.arange(_PIECE, device=device) for begin in starts)
-    u = torch.fft.rfftfreq(_PIECE, dtype=torch.float64, device=device)
-    v = torch.fft.fftfreq(_PIECE, dtype=torch.float64, device=device)
+    rows, columns = spread_squares(shape, counts, device)
+    u = torch.fft.rfftfreq(SIDE, dtype=torch.float64, device=device)
+    v = torch.fft.fftfreq(SIDE, dtype=torch.float64, device=device)
     fine = _pooled(torch.hypot(u[:, None], v)) > _COARSE
     times = motion.frame_starts[:, None, None] + rows * motion.timing.row_time
     transfer = _pooled(_transfer(motion, stack, times[..., _EVERY // 2 :: _EVERY], u, v))[..., fine]
     if float((transfer < _BARE).double().mean()) < _ENOUGH:
         return None
-    taper = _taper(frames)
-    places = (..., rows[:, None, :, None], columns[None, :, None, :])
-    pieces = frames[places]  # (T, C, pieces, pieces, rows, columns)
-    pieces = (pieces - pieces.mean((-2, -1), keepdim=True)) * taper * taper[:, None]
+    pieces = tapered(cut_squares(frames, rows, columns))  # (T, C, pieces, pieces, rows, columns)
     mean = motion.vibration[stack].mean_displacement(times, motion.timing.exposure_time)[..., 0]
     back = waves(mean, -u).to(frames.dtype.to_complex())  # neighbouring rows are to be alike as in the scene
     power = squared_modulus(torch.fft.fft(torch.fft.rfft(pieces) * back[:, None, :, None], dim=-2)).mean(1)
@@ -65,7 +61,8 @@ def noise_beside_blur(frames: Tensor, motion: FrameMotion, stack: int, ignore: T
     power, transfer = power.flatten(1, 2), transfer[:, :, None].expand_as(power).flatten(1, 2)
     usable = (power > 0).any(-1)
     if ignore is not None:
-        usable = usable & mostly_measured(ignore[places].any(1).double().mean((-2, -1)).flatten(1), (-1,))
+        lost = cut_squares(ignore.any(1), rows, columns).double().mean((-2, -1)).flatten(1)
+        usable = usable & mostly_measured(lost, (-1,))
     enough = usable.sum(-1) >= min(_FEWEST, usable.shape[-1])
     noise = _score(power.where(enough[:, None, None], 1.0), transfer, usable | ~enough[:, None])
     return noise.masked_fill(~enough, math.nan)
@@ -108,19 +105,9 @@ def _score(power: Tensor, transfer: Tensor, usable: Tensor) -> Tensor:
 
 def _counts(shape: torch.Size, most: int) -> list[int]:
     """Pieces along each axis, half overlapping where there are few."""
-    counts = [2 * extent // _PIECE - 1 for extent in shape]
+    counts = [2 * extent // SIDE - 1 for extent in shape]
     excess = max(1.0, math.sqrt(math.prod(counts) / most))
     return [max(1, round(count / excess)) for count in counts]
-
-
-def _spread(extent: int, count: int) -> Tensor:
-    return torch.linspace(0, extent - _PIECE, count).round().to(torch.int64)
-
-
-def _taper(like: Tensor) -> Tensor:
-    """Taper of unit energy for the rows and columns of a piece."""
-    taper = torch.hann_window(_PIECE + 2, periodic=False, dtype=like.dtype, device=like.device)[1:-1]
-    return taper / taper.square().sum().sqrt()
 
 
 def _transfer(motion: FrameMotion, stack: int, times: Tensor, u: Tensor, v: Tensor) -> Tensor:

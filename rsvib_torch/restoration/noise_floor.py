@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.restoration.noise import mostly_measured
+from rsvib_torch.restoration.squares import SIDE, cut_squares, spread_squares, tapered
 from rsvib_torch.spectral import squared_modulus
 
 __all__ = ["noise_floor"]
 
-_PIECE = 64  # rows and columns of the pieces whose spectra are averaged
-_PIECES = 36  # of a frame, about
+_PIECES = 36  # of a frame, about: their spectra are averaged
 _TYPICAL = 0.4  # cycles per px
 _COARSE = 0.2  # cycles per px; below, spectra are steeper
 _SECTORS = 6  # of directions, each of which falls in its own way
@@ -37,11 +37,11 @@ def noise_floor(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
     """
     height, width = frames.shape[-2:]
     images = frames.reshape(-1, height, width)
-    if min(height, width) < _PIECE:
+    if min(height, width) < SIDE:
         return images.new_full(frames.shape[:-2], math.nan, dtype=torch.float64)
     power = _pooled(_spectrum(images, None if ignore is None else ignore.reshape(images.shape)))  # (N, V, U)
-    u = _pooled(torch.fft.rfftfreq(_PIECE, dtype=torch.float64, device=frames.device).expand(2, -1))[0]
-    v = torch.fft.fftfreq(_PIECE, dtype=torch.float64, device=frames.device).unflatten(0, (-1, 2)).mean(-1)
+    u = _pooled(torch.fft.rfftfreq(SIDE, dtype=torch.float64, device=frames.device).expand(2, -1))[0]
+    v = torch.fft.fftfreq(SIDE, dtype=torch.float64, device=frames.device).unflatten(0, (-1, 2)).mean(-1)
     far, direction = torch.hypot(u, v[:, None]), torch.atan2(v[:, None], u)
     fine = far > _COARSE
     sector = ((direction[fine] / math.pi + 0.5) * _SECTORS).long().clamp(0, _SECTORS - 1)
@@ -52,21 +52,15 @@ def noise_floor(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
 
 def _spectrum(images: Tensor, ignore: Tensor | None) -> Tensor:
     """Mean power (N, V, U), of white noise its variance, of pieces of images (N, H, W)."""
-    places = []
-    for extent in images.shape[-2:]:
-        count = min(2 * extent // _PIECE - 1, round(_PIECES**0.5))
-        starts = torch.linspace(0, extent - _PIECE, count, device=images.device).round().long()
-        places.append(starts[:, None] + torch.arange(_PIECE, device=images.device))
-    cut = (..., places[0][:, None, :, None], places[1][None, :, None, :])
-    taper = torch.hann_window(_PIECE + 2, periodic=False, dtype=images.dtype, device=images.device)[1:-1]
-    taper = taper / taper.square().sum().sqrt()
-    pieces = images[cut].flatten(1, 2)
-    pieces = (pieces - pieces.mean((-2, -1), keepdim=True)) * taper * taper[:, None]
+    counts = [min(2 * extent // SIDE - 1, round(_PIECES**0.5)) for extent in images.shape[-2:]]
+    rows, columns = spread_squares(images.shape[-2:], counts, images.device)
+    pieces = tapered(cut_squares(images, rows, columns).flatten(1, 2))
     power = squared_modulus(torch.fft.rfft2(pieces)).to(torch.float64)
     if ignore is None:
         return power.mean(1)
-    counts = mostly_measured(ignore[cut].flatten(1, 2).double().mean((-2, -1)), (-1,))
-    return (power * counts[..., None, None]).sum(1) / counts.sum(1)[:, None, None]
+    lost = cut_squares(ignore, rows, columns).double().mean((-2, -1)).flatten(1)
+    usable = mostly_measured(lost, (-1,))
+    return (power * usable[..., None, None]).sum(1) / usable.sum(1)[:, None, None]
 
 
 def _pooled(values: Tensor) -> Tensor:
