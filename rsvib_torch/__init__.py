@@ -25,9 +25,12 @@ from rsvib_torch.evaluation import (
     slanted_edge_mtf,
     ssim,
 )
-from rsvib_torch.free_motion import FreeMotion
 from rsvib_torch.imaging import Optics, RowVaryingBlur, SensorNoise, row_psf, simulate_frames
-from rsvib_torch.motion_file import read_motion
+from rsvib_torch.io import StackInfo, open_stack, read_stack, read_stack_info, write_stack
+from rsvib_torch.motion.recorded import read_motion
+from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve, register_bands
 from rsvib_torch.restoration import (
     RestorationVerdict,
@@ -39,19 +42,7 @@ from rsvib_torch.restoration import (
     trusted_vibration,
     visible_pixels,
 )
-from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.stacks import (
-    StackInfo,
-    StackReport,
-    iterate_stack,
-    open_stack,
-    process_stack,
-    read_stack,
-    read_stack_info,
-    restore_block,
-    write_stack,
-)
-from rsvib_torch.vibration import Vibration, blind_frequencies
+from rsvib_torch.stacks import StackReport, iterate_stack, process_stack, restore_block
 
 __all__ = [
     "ClockAlignment",

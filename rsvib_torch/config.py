@@ -9,15 +9,15 @@ from typing import Any, Literal
 
 from pydantic import Field, create_model, model_validator
 
-from rsvib_torch.checks import check_number, check_whole_number
+from rsvib_torch.core.checks import check_number, check_whole_number
+from rsvib_torch.core.validation import Section, checked, options_section, validate
 from rsvib_torch.detection import detect_vibration
 from rsvib_torch.imaging import SensorNoise, simulate_frames
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.restoration import restore
 from rsvib_torch.restoration.restore import MASKS, METHODS
-from rsvib_torch.sensor import SensorTiming
 from rsvib_torch.stacks import DEFAULT_WINDOW, BadFrames
-from rsvib_torch.validation import Section, checked, options_section, validate
-from rsvib_torch.vibration import Vibration
 
 __all__ = ["Config", "Simulation", "TimingSection", "VibrationSection", "read_config"]
 

@@ -25,13 +25,13 @@ from rich.table import Table
 from torch import Tensor
 
 import rsvib_torch as rsv
+from rsvib_torch.commands.terminal import warnings_in_one_line, working
 from rsvib_torch.detection.detect import DetectionMethod
 from rsvib_torch.evaluation import city_and_fields, resolution_chart
-from rsvib_torch.pictures import detailed_places, offset_figure, save_figure
-from rsvib_torch.report import write_offsets, write_vibration
+from rsvib_torch.io import whole_folder
+from rsvib_torch.report.plots import detailed_places, offset_figure, save_figure
+from rsvib_torch.report.results import write_offsets, write_vibration
 from rsvib_torch.restoration.restore import METHODS
-from rsvib_torch.stacks import whole_folder
-from rsvib_torch.terminal import warnings_in_one_line, working
 
 TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 AMPLITUDE, FREQUENCY = (3.1, 5.2), (50.0, 30.0)

@@ -17,8 +17,8 @@ from torch import Tensor
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields, resolution_chart
-from rsvib_torch.pages.figures import psf_film
-from rsvib_torch.pictures import offset_figure, save_figure
+from rsvib_torch.report.html.figures import psf_film
+from rsvib_torch.report.plots import offset_figure, save_figure
 
 SEED = 3
 ROW_TIME, FRAME_ROWS = 20.52e-6, 2048

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from rsvib_torch.config import read_config
-from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.vibration import blind_frequencies
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import blind_frequencies
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 SENSOR = "[sensor]\nrow_time = 2e-5\nexposure_rows = 20\nframe_rows = 512\n"

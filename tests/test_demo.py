@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import rsvib_torch as rsv
-from rsvib_torch.report import read_vibration
+from rsvib_torch.report.results import read_vibration
 
 DEMO = Path(__file__).parents[1] / "scripts" / "demo.py"
 

@@ -1,6 +1,7 @@
-"""Imports run one way: a module knows only what lies beneath it."""
+"""Imports run one way: between packages, between the parts of a package, and between modules (no cycles)."""
 
 import ast
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -8,37 +9,51 @@ import pytest
 import rsvib_torch
 
 PACKAGE = Path(rsvib_torch.__file__).parent
-# from the ground up; what shares a floor may not know each other
-FLOORS = (
-    {"pieces", "quadrature"},
-    {"toeplitz"},
-    {"arrays", "checks", "precision", "splines", "spectral", "missing", "parallel", "validation"},
-    {"sensor"},
-    {"vibration"},
-    {"free_motion"},
-    {"orientation"},
-    {"registration", "imaging", "calibration"},
+# From the lowest layer to the highest. A part may import from lower layers only; parts of one layer are independent.
+LAYERS = (
+    {"core"},
+    {"motion"},
+    {"frames"},
+    {"imaging", "registration", "calibration", "io"},
     {"detection", "restoration"},
     {"evaluation", "augmentation"},
-    {"stacks", "motion_file"},
-    {"config", "pictures", "terminal"},
-    {"report", "pages"},
-    {"workflow", "calibrate_command"},
-    {"command_options"},
-    {"stack_commands", "motion_command"},
-    {"cli"},
+    {"stacks"},
+    {"config"},
+    {"report"},
+    {"commands"},
 )
+INNER_LAYERS = {
+    "detection": (
+        {"measurements", "result", "grey_frames"},
+        {"band_curve", "tones"},
+        {"rows", "reliability"},
+        {"shapes"},
+        {"recorded"},
+        {"detect"},
+    ),
+    "evaluation": ({"quality", "mtf", "bound", "scenes"},),
+    "report": ({"results", "plots"}, {"html"}),
+    "restoration": (
+        {"frame_motion", "row_extension", "joint_groups"},
+        {"scene_model"},
+        {"noise"},
+        {"exact", "banded", "dewarp", "verdict"},
+        {"richardson_lucy"},
+        {"restore"},
+        {"noise_gain"},
+    ),
+}
 
 
-def floor_of(room):
-    for floor, rooms in enumerate(FLOORS):
-        if room in rooms:
-            return floor
-    raise AssertionError(f"rsvib_torch.{room} has no floor yet: give it one in {Path(__file__).name}")
+def layer_of(part, layers):
+    for number, parts in enumerate(layers):
+        if part in parts:
+            return number
+    raise AssertionError(f"{part!r} has no layer: add it to LAYERS or INNER_LAYERS in {Path(__file__).name}")
 
 
-def rooms_imported(source, module):
-    """Rooms of the package (first name below it) that a module imports, wherever in the file it does so.
+def imported_modules(source, module):
+    """Modules of rsvib_torch that a module imports anywhere in its file, with the line: [(line, dotted name)].
 
     Functions, classes, ``if TYPE_CHECKING`` and ``try`` are searched as well, and imports by name.
     """
@@ -56,69 +71,109 @@ def rooms_imported(source, module):
             called = getattr(node.func, "id", getattr(node.func, "attr", ""))
             if called in {"import_module", "__import__"} and isinstance(node.args[0].value, str):
                 names = [node.args[0].value]
-        for name in names:
-            parts = name.split(".")
-            if parts[0] == "rsvib_torch":
-                found.append((node.lineno, parts[1] if len(parts) > 1 else ""))
+        found += [(node.lineno, resolved(name)) for name in names if name.split(".")[0] == "rsvib_torch"]
     return found
 
 
+def resolved(name):
+    """The module or package that a dotted name belongs to: ``rsvib_torch.imaging.blur`` for ``...blur.blur_rows``."""
+    parts = name.split(".")
+    while len(parts) > 1:
+        path = PACKAGE.joinpath(*parts[1:])
+        if path.with_suffix(".py").exists() or (path / "__init__.py").exists():
+            break
+        parts.pop()
+    return ".".join(parts)
+
+
 def wrong_imports(source, module):
-    """Lines of a module that import from its own floor or from above, as ``line: importing -> imported``."""
-    room = module.split(".")[1]
+    """Imports of a module from its own layer or from a higher one, as ``line: importing -> imported``."""
+    here = module.split(".")[1:]
     wrong = []
-    for line, name in rooms_imported(source, module):
-        is_room = (PACKAGE / name / "__init__.py").exists() or (PACKAGE / f"{name}.py").exists()
-        other = name if is_room else ""  # a public name comes from the whole package
-        if not other and room == "cli":
-            continue  # the outermost room may look at the whole package, for its version
-        if other != room and (not other or floor_of(other) >= floor_of(room)):
-            wrong.append(f"{line}: {room} -> {other or 'the whole package'}")
+    for line, name in imported_modules(source, module):
+        there = name.split(".")[1:]
+        if not there:  # a public name is imported from the whole package
+            if here[0] != "commands":
+                wrong.append(f"{line}: {module} -> the whole package")
+        elif there[0] != here[0]:
+            if layer_of(there[0], LAYERS) >= layer_of(here[0], LAYERS):
+                wrong.append(f"{line}: {module} -> {name}")
+        elif here[0] in INNER_LAYERS and len(here) > 1:
+            layers = INNER_LAYERS[here[0]]
+            if len(there) == 1 or (there[1] != here[1] and layer_of(there[1], layers) >= layer_of(here[1], layers)):
+                wrong.append(f"{line}: {module} -> {name}")
     return wrong
 
 
 def modules():
     for path in sorted(PACKAGE.rglob("*.py")):
-        parts = path.relative_to(PACKAGE).with_suffix("").parts
-        if parts != ("__init__",):
-            yield pytest.param(path, ".".join(("rsvib_torch", *parts)), id="/".join(parts))
+        if path.name != "__init__.py":
+            yield path, ".".join(("rsvib_torch", *path.relative_to(PACKAGE).with_suffix("").parts))
 
 
-@pytest.mark.parametrize(("path", "module"), list(modules()))
+@pytest.mark.parametrize(("path", "module"), [pytest.param(*both, id=both[1]) for both in modules()])
 def test_imports_run_one_way(path, module):
     assert wrong_imports(path.read_text(encoding="utf-8"), module) == []
+
+
+def test_modules_do_not_import_each_other_in_a_cycle():
+    uses = {module: {name for _, name in imported_modules(path.read_text(), module)} for path, module in modules()}
+    try:
+        order = list(TopologicalSorter(uses).static_order())
+    except CycleError as error:
+        pytest.fail(f"modules import each other: {' -> '.join(error.args[1])}")
+    assert len(order) >= len(uses)
+
+
+def test_every_part_has_a_layer():
+    def parts(folder):
+        return {path.stem for path in folder.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+
+    for part in parts(PACKAGE) - {"__init__"}:
+        layer_of(part, LAYERS)
+    for package, layers in INNER_LAYERS.items():
+        assert parts(PACKAGE / package) - {"__init__"} == set().union(*layers)
+
+
+def test_no_two_modules_share_a_name():
+    names = [path.stem for path, _ in modules()]
+    assert sorted(names) == sorted(set(names))
+
+
+def test_the_top_level_holds_packages_and_the_configuration():
+    assert {path.name for path in PACKAGE.glob("*.py")} == {"__init__.py", "config.py"}
 
 
 @pytest.mark.parametrize(
     ("source", "module"),
     [
-        ("from rsvib_torch.imaging import blur_rows", "rsvib_torch.vibration"),
-        ("import rsvib_torch.cli", "rsvib_torch.stacks.files"),
+        ("from rsvib_torch.imaging import blur_rows", "rsvib_torch.motion.vibration"),
+        ("import rsvib_torch.commands.main", "rsvib_torch.io.files"),
         ("from rsvib_torch import detection", "rsvib_torch.imaging.psf"),
-        ("import rsvib_torch", "rsvib_torch.sensor"),
+        ("import rsvib_torch", "rsvib_torch.motion.timing"),
         ("from rsvib_torch import SensorTiming", "rsvib_torch.imaging.psf"),
         ("from ..restoration import restore", "rsvib_torch.detection.result"),
         ("from .. import stacks", "rsvib_torch.detection.result"),
         ("def late():\n    from rsvib_torch.evaluation import psnr", "rsvib_torch.restoration.restore"),
         ("if TYPE_CHECKING:\n    import rsvib_torch.registration", "rsvib_torch.imaging.simulate"),
-        ("try:\n    from rsvib_torch import report\nexcept ImportError:\n    pass", "rsvib_torch.stacks"),
+        ("try:\n    from rsvib_torch import report\nexcept ImportError:\n    pass", "rsvib_torch.stacks.job"),
         ("module = importlib.import_module('rsvib_torch.config')", "rsvib_torch.evaluation.quality"),
+        ("from rsvib_torch.detection.rows import direct", "rsvib_torch.detection.tones.fit"),
+        ("from rsvib_torch.restoration.exact.exact import restore_exact", "rsvib_torch.restoration.dewarp"),
     ],
 )
-def test_an_import_that_runs_back_is_seen(source, module):
+def test_an_import_in_the_wrong_direction_is_found(source, module):
     line = source.count("\n", 0, max(source.find("rsvib_torch"), source.find("from .."), 0)) + 1
     wrong = wrong_imports(source, module)
     assert len(wrong) == 1
     assert wrong[0].startswith(f"{line}: ")
 
 
-def test_imports_from_beneath_and_beside_are_right():
-    source = "import math\nimport torch\nfrom rsvib_torch.sensor import SensorTiming\nfrom .motion import frame_motion"
-    assert rooms_imported(source, "rsvib_torch.restoration.banded") == [(3, "sensor"), (4, "restoration")]
-    assert wrong_imports(source, "rsvib_torch.restoration.banded") == []
-
-
-def test_every_room_has_a_floor():
-    rooms = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
-    for room in rooms - {"__init__"}:
-        floor_of(room)
+def test_imports_from_lower_layers_and_of_neighbours_are_right():
+    source = "import math\nimport torch\nfrom rsvib_torch.motion.timing import SensorTiming\nfrom .dewarp import x"
+    module = "rsvib_torch.restoration.richardson_lucy"
+    assert imported_modules(source, module) == [
+        (3, "rsvib_torch.motion.timing"),
+        (4, "rsvib_torch.restoration.dewarp"),
+    ]
+    assert wrong_imports(source, module) == []

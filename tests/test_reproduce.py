@@ -8,11 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from edge_truth import draw_edge, gaussian, through_pixels
 
 import rsvib_torch as rsv
-
-sys.path.insert(0, str(Path(__file__).parent / "evaluation"))
-from edge_truth import draw_edge, gaussian, through_pixels
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 

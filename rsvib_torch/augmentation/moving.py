@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor
 
-from rsvib_torch.augmentation.motion import ImageMotion
+from rsvib_torch.augmentation.image_motion import ImageMotion
+from rsvib_torch.core.precision import full_precision
+from rsvib_torch.core.splines import mirrored
 from rsvib_torch.imaging import blur_rows, trajectory_psf
 from rsvib_torch.imaging.psf import Interpolation
-from rsvib_torch.precision import full_precision
-from rsvib_torch.splines import mirrored
 
 __all__ = ["move_boxes", "move_images", "move_masks"]
 

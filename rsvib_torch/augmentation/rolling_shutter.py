@@ -9,14 +9,14 @@ from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 
-from rsvib_torch.augmentation.motion import ImageMotion
+from rsvib_torch.augmentation.image_motion import ImageMotion
 from rsvib_torch.augmentation.moving import move_boxes, move_images, move_masks
 from rsvib_torch.augmentation.ranges import Range, axis_ranges, draw
-from rsvib_torch.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order, vibration_to_row_order
 from rsvib_torch.imaging.psf import Interpolation
-from rsvib_torch.orientation import frames_from_row_order, frames_to_row_order, vibration_to_row_order
-from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.vibration import Vibration
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["RollingShutterVibration"]
 

@@ -12,7 +12,7 @@ from rsvib_torch.calibration.period import BandFit
 from rsvib_torch.calibration.profiles import Profiles, row_profiles
 from rsvib_torch.calibration.search import find_bands
 from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
-from rsvib_torch.checks import check_choice, check_number
+from rsvib_torch.core.checks import check_choice, check_number
 
 __all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_exposure"]
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks import check_number
-from rsvib_torch.orientation import as_float_frames
+from rsvib_torch.core.checks import check_number
+from rsvib_torch.frames.orientation import as_float_frames
 
 __all__ = ["Profiles", "row_profiles"]
 

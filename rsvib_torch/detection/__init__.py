@@ -1,11 +1,12 @@
 """From offsets to a vibration."""
 
-from rsvib_torch.detection.alignment import ClockAlignment, align_motion
 from rsvib_torch.detection.detect import DetectionMethod, VibrationDetector, detect_vibration
-from rsvib_torch.detection.freeform import MotionDetection, detect_motion
-from rsvib_torch.detection.known import MotionCheck, check_motion
-from rsvib_torch.detection.result import DetectionResult, VibrationStd
-from rsvib_torch.detection.swept import SweptTone, detect_swept_tone
+from rsvib_torch.detection.recorded.alignment import ClockAlignment, align_motion
+from rsvib_torch.detection.recorded.motion_check import MotionCheck, check_motion
+from rsvib_torch.detection.result import DetectionResult
+from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
+from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
+from rsvib_torch.motion.vibration import VibrationStd
 
 __all__ = [
     "ClockAlignment",

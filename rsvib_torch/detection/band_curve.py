@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import OffsetCurve, Registration
 from rsvib_torch.registration.register import register_rows
-from rsvib_torch.sensor import SensorTiming
 
 __all__ = ["Bands", "band_curve", "measurements_of_curve"]
 

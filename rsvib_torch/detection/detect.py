@@ -7,27 +7,27 @@ from typing import Literal, TypedDict, Unpack, overload
 import torch
 from torch import Tensor, nn
 
-from rsvib_torch.arrays import ArrayLike
-from rsvib_torch.checks import check_choice, check_whole_number
+from rsvib_torch.core.checks import check_choice, check_whole_number
+from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.detection.band_curve import Bands, band_curve, measurements_of_curve
-from rsvib_torch.detection.direct import refine_directly
-from rsvib_torch.detection.door import grey_frames
-from rsvib_torch.detection.freeform import MotionDetection, detect_motion
-from rsvib_torch.detection.inversion import vibration_of_fit
-from rsvib_torch.detection.result import DetectionResult, OtherMotion, VibrationStd, stacked
-from rsvib_torch.detection.row_groups import LARGEST_GROUP, intervals_compared, stack_spectra
-from rsvib_torch.detection.selection import MAX_TONES, find_tones
-from rsvib_torch.detection.swept import SweptTone, detect_swept_tone
-from rsvib_torch.detection.tones import MotionModel, ToneFit, model_displacements
-from rsvib_torch.detection.verdict import judge
-from rsvib_torch.orientation import (
+from rsvib_torch.detection.grey_frames import grey_frames
+from rsvib_torch.detection.reliability import judge
+from rsvib_torch.detection.result import DetectionResult, OtherMotion, stacked
+from rsvib_torch.detection.rows.direct import refine_directly
+from rsvib_torch.detection.rows.row_groups import LARGEST_GROUP, intervals_compared, stack_spectra
+from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
+from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
+from rsvib_torch.detection.tones.inversion import vibration_of_fit
+from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
+from rsvib_torch.detection.tones.tone_model import MotionModel, ToneFit, model_displacements
+from rsvib_torch.frames.arrays import ArrayLike
+from rsvib_torch.frames.orientation import (
     offsets_from_row_order,
     vibration_from_row_order,
 )
-from rsvib_torch.precision import full_precision, outside_graphs
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import VibrationStd, blind_frequencies
 from rsvib_torch.registration import OffsetCurve, Registration
-from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.vibration import blind_frequencies
 
 __all__ = ["DetectionMethod", "VibrationDetector", "VibrationModel", "detect_vibration"]
 

@@ -6,26 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
-from rsvib_torch.vibration import Vibration
 
-__all__ = ["DetectionResult", "OtherMotion", "VibrationStd", "stacked"]
-
-
-@dataclass(frozen=True, eq=False)
-class VibrationStd:
-    """Standard deviations in the layout of ``Vibration``: px, Hz, s, rad (..., 2, K), px/s and px/s^2 (..., 2)."""
-
-    amplitude: Tensor
-    frequency: Tensor
-    period: Tensor
-    phase: Tensor
-    image_motion: Tensor
-    image_acceleration: Tensor
-
-    def __getitem__(self, index: int) -> "VibrationStd":
-        """The standard deviations of one stack out of a batch."""
-        return VibrationStd(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+__all__ = ["DetectionResult", "OtherMotion", "stacked"]
 
 
 @dataclass(frozen=True, eq=False)

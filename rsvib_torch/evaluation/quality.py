@@ -7,8 +7,8 @@ import torch
 from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
 
-from rsvib_torch.arrays import ArrayLike, as_tensor
-from rsvib_torch.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.frames.arrays import ArrayLike, as_tensor
 
 __all__ = ["offset_endpoint_error", "psnr", "ssim"]
 

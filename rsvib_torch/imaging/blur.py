@@ -5,9 +5,9 @@ import math
 import torch
 from torch import Tensor, nn
 
+from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.splines import bspline_coefficients, bspline_coefficients_adjoint, mirrored
 from rsvib_torch.imaging.psf import RowPSF
-from rsvib_torch.precision import full_precision, outside_graphs
-from rsvib_torch.splines import bspline_coefficients, bspline_coefficients_adjoint, mirrored
 
 __all__ = ["RowVaryingBlur", "blur_rows", "blur_rows_adjoint"]
 

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.vibration import Vibration
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["rows_showing"]
 

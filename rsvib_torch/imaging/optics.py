@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks import check_number
+from rsvib_torch.core.checks import check_number
 
 __all__ = ["Optics"]
 

@@ -6,11 +6,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks import check_choice
+from rsvib_torch.core.checks import check_choice
+from rsvib_torch.core.splines import bspline_weights
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
-from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.splines import bspline_weights
-from rsvib_torch.vibration import Vibration
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["Interpolation", "RowPSF", "row_psf", "trajectory_psf"]
 

@@ -5,14 +5,14 @@ import math
 import torch
 from torch import Tensor
 
-from rsvib_torch.arrays import ArrayLike, as_tensor
-from rsvib_torch.imaging.noise import SensorNoise
+from rsvib_torch.core.fourier import extend_rows, fast_length
+from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored
+from rsvib_torch.frames.arrays import ArrayLike, as_tensor
+from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order, vibration_to_row_order
+from rsvib_torch.imaging.sensor_noise import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.orientation import frames_from_row_order, frames_to_row_order, vibration_to_row_order
-from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.spectral import extend_rows, fast_length
-from rsvib_torch.splines import bspline_coefficients, bspline_weights, mirrored
-from rsvib_torch.vibration import Vibration
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["simulate_frames"]
 

@@ -6,11 +6,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks import check_choice
-from rsvib_torch.free_motion import rest_path
-from rsvib_torch.quadrature import gauss_legendre
-from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.vibration import Vibration
+from rsvib_torch.core.checks import check_choice
+from rsvib_torch.core.quadrature import gauss_legendre
+from rsvib_torch.motion.spline import rest_path
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["Quadrature", "exposure_nodes", "exposure_trajectory", "gauss_node_count"]
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.pieces import runs
+from rsvib_torch.core.chunking import runs
 
 __all__ = ["coarse_offset"]
 

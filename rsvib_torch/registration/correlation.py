@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from rsvib_torch.registration.windows import take_windows
+from rsvib_torch.registration.band_windows import take_windows
 
 __all__ = ["correlate_bands", "correlate_profiles"]
 

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.registration.band_windows import take_windows
 from rsvib_torch.registration.correlation import correlate_bands, correlate_profiles
 from rsvib_torch.registration.peak import integer_peak, subpixel_peak
-from rsvib_torch.registration.windows import take_windows
 
 __all__ = ["BAND_METHODS", "BandTask", "Registration"]
 

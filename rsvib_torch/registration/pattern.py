@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.fourier import squared_modulus
 from rsvib_torch.registration.row_spectra import RowSpectra, differences, inner_columns
-from rsvib_torch.spectral import squared_modulus
 
 __all__ = ["EVERY", "column_pattern"]
 

@@ -5,13 +5,13 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.checks import check_choice, check_whole_number
-from rsvib_torch.orientation import as_float_frames, frames_to_row_order, offsets_from_row_order
+from rsvib_torch.core.checks import check_choice, check_whole_number
+from rsvib_torch.frames.orientation import as_float_frames, frames_to_row_order, offsets_from_row_order
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.registration.band_windows import band_tops
 from rsvib_torch.registration.coarse import coarse_offset
-from rsvib_torch.registration.curve import OffsetCurve
 from rsvib_torch.registration.methods import BAND_METHODS, BandTask, Registration
-from rsvib_torch.registration.windows import band_tops
-from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.registration.offset_curve import OffsetCurve
 
 __all__ = ["register_bands", "register_rows"]
 

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.pieces import gathered, runs
-from rsvib_torch.spectral import extend_rows, fast_length, shift_phases
-from rsvib_torch.splines import bspline_coefficient_rows, bspline_weights
+from rsvib_torch.core.chunking import gathered, runs
+from rsvib_torch.core.fourier import extend_rows, fast_length, shift_phases
+from rsvib_torch.core.splines import bspline_coefficient_rows, bspline_weights
 
 __all__ = ["DEGREE", "MARGIN", "RowSpectra", "chunks", "combined", "differences", "inner_columns", "mean_over_frames"]
 

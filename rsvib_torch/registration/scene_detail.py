@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.fourier import fast_length
 from rsvib_torch.registration.row_spectra import chunks, combined, differences, mean_over_frames
-from rsvib_torch.spectral import fast_length
 
 __all__ = ["Compared", "scene_detail"]
 

@@ -7,12 +7,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.core.splines import bspline_weights, mirrored
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
-from rsvib_torch.restoration.motion import FrameMotion
-from rsvib_torch.restoration.noise import estimate_noise, gradient_energy
-from rsvib_torch.restoration.rows import continue_rows, period_of_rows
-from rsvib_torch.splines import bspline_weights, mirrored
+from rsvib_torch.restoration.frame_motion import FrameMotion
+from rsvib_torch.restoration.noise.single_frame import estimate_noise, gradient_energy
+from rsvib_torch.restoration.row_extension import continue_rows, period_of_rows
 
 __all__ = ["restore_banded"]
 

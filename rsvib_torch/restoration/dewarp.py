@@ -4,12 +4,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from rsvib_torch.checks import check_whole_number
-from rsvib_torch.pieces import gathered, runs
-from rsvib_torch.restoration.motion import FrameMotion
-from rsvib_torch.restoration.rows import period_of_rows, spline_spectra
-from rsvib_torch.spectral import shift_phases
-from rsvib_torch.splines import bspline_weights, mirrored
+from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.chunking import gathered, runs
+from rsvib_torch.core.fourier import shift_phases
+from rsvib_torch.core.splines import bspline_weights, mirrored
+from rsvib_torch.restoration.frame_motion import FrameMotion
+from rsvib_torch.restoration.row_extension import period_of_rows, spline_spectra
 
 __all__ = ["restore_dewarp"]
 

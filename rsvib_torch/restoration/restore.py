@@ -8,29 +8,29 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rsvib_torch.arrays import ArrayLike, as_tensor
-from rsvib_torch.checks import check_choice
-from rsvib_torch.free_motion import moving_axes
-from rsvib_torch.orientation import (
+from rsvib_torch.core.checks import check_choice
+from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.frames.arrays import ArrayLike, as_tensor
+from rsvib_torch.frames.missing import fill_roughly
+from rsvib_torch.frames.orientation import (
     as_float_frames,
     frames_from_row_order,
     frames_to_row_order,
     vibration_to_row_order,
 )
-from rsvib_torch.precision import full_precision, outside_graphs
+from rsvib_torch.frames.pixels import Saturation, hidden_pixels, saturated_pixels
+from rsvib_torch.motion.spline import moving_axes
+from rsvib_torch.motion.timing import SensorTiming, check_timing
+from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
-from rsvib_torch.restoration.exact import restore_exact
-from rsvib_torch.restoration.judging import judge_frames
-from rsvib_torch.restoration.missing import fill_roughly
-from rsvib_torch.restoration.motion import frame_motion
-from rsvib_torch.restoration.pairs import pairs_to_judge
-from rsvib_torch.restoration.pixels import Saturation, hidden_pixels, saturated_pixels
+from rsvib_torch.restoration.exact.exact import restore_exact
+from rsvib_torch.restoration.frame_motion import frame_motion
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
-from rsvib_torch.restoration.trust import Detected, vibration_to_undo
-from rsvib_torch.restoration.verdict import RestorationWarning, TooLittleInCommonError
-from rsvib_torch.sensor import SensorTiming, check_timing
-from rsvib_torch.vibration import Vibration
+from rsvib_torch.restoration.verdict.judge import judge_frames
+from rsvib_torch.restoration.verdict.outcome import RestorationWarning, TooLittleInCommonError
+from rsvib_torch.restoration.verdict.pairs import pairs_to_judge
+from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
 __all__ = ["MASKS", "METHODS", "VibrationRestorer", "method_options", "restore"]
 

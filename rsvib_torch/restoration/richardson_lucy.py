@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks import check_whole_number
+from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.frames.missing import fill_roughly
 from rsvib_torch.imaging.blur import RowVaryingBlur
 from rsvib_torch.imaging.psf import RowPSF, row_psf
 from rsvib_torch.restoration.dewarp import restore_dewarp
-from rsvib_torch.restoration.groups import joint_groups
-from rsvib_torch.restoration.missing import fill_roughly
-from rsvib_torch.restoration.motion import FrameMotion
+from rsvib_torch.restoration.frame_motion import FrameMotion
+from rsvib_torch.restoration.joint_groups import joint_groups
 
 __all__ = ["restore_richardson_lucy"]
 

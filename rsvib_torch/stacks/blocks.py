@@ -8,9 +8,9 @@ import torch
 from numpy.typing import NDArray
 
 from rsvib_torch.detection import detect_vibration
-from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.io.full_scale import check_dtype, counts_to_frames, frames_to_counts, known_full_scale
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.frame_faults import frame_fault
-from rsvib_torch.stacks.scale import check_dtype, counts_to_frames, frames_to_counts, known_full_scale
 from rsvib_torch.stacks.window_restoration import restore_trusted
 
 __all__ = ["restore_block"]

@@ -3,10 +3,10 @@
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.stacks.atomic import whole_file
+from rsvib_torch.io.atomic import whole_file
+from rsvib_torch.io.files import PathLike
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.engines import compute_here
-from rsvib_torch.stacks.files import PathLike
 from rsvib_torch.stacks.fingerprint import fingerprint
 from rsvib_torch.stacks.job_setup import DEFAULT_WINDOW, HOPELESS, job_windows_at_once, make_job
 from rsvib_torch.stacks.manifest import manifest_header, write_manifest

@@ -3,9 +3,9 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.io.files import PathLike
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.engines import compute_here
-from rsvib_torch.stacks.files import PathLike
 from rsvib_torch.stacks.job import WindowResult
 from rsvib_torch.stacks.job_setup import DEFAULT_WINDOW, job_windows_at_once, make_job
 from rsvib_torch.stacks.windows import cut_windows

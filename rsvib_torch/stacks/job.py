@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.detection import DetectionResult, detect_vibration
-from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.stacks.files import open_stack
-from rsvib_torch.stacks.formats import FrameReader
+from rsvib_torch.io.files import open_stack
+from rsvib_torch.io.formats import FrameReader
+from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
+from rsvib_torch.io.stack_info import FrameError, StackInfo
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.frame_faults import frame_fault, placeholder
-from rsvib_torch.stacks.info import FrameError, StackInfo
 from rsvib_torch.stacks.records import DetectedWindow, WindowRecord, detection_record
-from rsvib_torch.stacks.scale import counts_to_frames, frames_to_counts
 from rsvib_torch.stacks.window_restoration import RestoredFrames, restore_trusted
 from rsvib_torch.stacks.windows import Window, window_timing
 

@@ -8,14 +8,14 @@ from typing import Any, get_args
 import numpy as np
 import torch
 
-from rsvib_torch.checks import check_choice, check_whole_number
-from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.stacks.files import PathLike, open_stack
-from rsvib_torch.stacks.frame_times import timing_of_stack
+from rsvib_torch.core.checks import check_choice, check_whole_number
+from rsvib_torch.io.files import PathLike, open_stack
+from rsvib_torch.io.frame_times import timing_of_stack
+from rsvib_torch.io.full_scale import check_full_scale
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.job import BadFrames, StackJob
 from rsvib_torch.stacks.memory import parse_memory, windows_at_once
 from rsvib_torch.stacks.records import DetectedWindow
-from rsvib_torch.stacks.scale import check_full_scale
 
 __all__ = ["DEFAULT_WINDOW", "HOPELESS", "job_windows_at_once", "make_job"]
 

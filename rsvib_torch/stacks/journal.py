@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rsvib_torch.stacks.atomic import whole_file
+from rsvib_torch.io.atomic import whole_file
 
 try:
     import fcntl

@@ -8,10 +8,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
-from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.core.validation import Section, read_json, validate
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.records import DetectedWindow, WindowRecord, detection_record
-from rsvib_torch.validation import Section, read_json, validate
 
 __all__ = ["StackManifest", "manifest_header", "read_manifest", "timing_keys", "write_manifest"]
 

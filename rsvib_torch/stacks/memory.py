@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.restoration import restore
-from rsvib_torch.stacks.info import StackInfo
 
 __all__ = ["available_memory", "memory_needed", "parse_memory", "windows_at_once"]
 

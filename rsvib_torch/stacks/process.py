@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rsvib_torch.sensor import SensorTiming
-from rsvib_torch.stacks.files import PathLike, check_info_target
+from rsvib_torch.io.files import PathLike, check_info_target
+from rsvib_torch.io.frame_times import exposure_times
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.fingerprint import fingerprint
-from rsvib_torch.stacks.frame_times import exposure_times
 from rsvib_torch.stacks.job import BadFrames
 from rsvib_torch.stacks.job_setup import DEFAULT_WINDOW, job_windows_at_once, make_job
 from rsvib_torch.stacks.journal import Journal, describe_difference

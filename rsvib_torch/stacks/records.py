@@ -8,10 +8,10 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.detection import DetectionResult, VibrationStd
+from rsvib_torch.core.validation import Section
+from rsvib_torch.detection import DetectionResult
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.stacks.windows import Window
-from rsvib_torch.validation import Section
-from rsvib_torch.vibration import Vibration
 
 __all__ = ["DetectedWindow", "DetectionRecord", "WindowRecord", "detection_record", "plain"]
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.stacks.atomic import place
-from rsvib_torch.stacks.formats import FrameWriter, StackFormat
-from rsvib_torch.stacks.info import StackInfo
+from rsvib_torch.io.atomic import place
+from rsvib_torch.io.formats import FrameWriter, StackFormat
+from rsvib_torch.io.stack_info import StackInfo
 
 __all__ = ["Sink"]
 

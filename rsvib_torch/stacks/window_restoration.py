@@ -7,7 +7,8 @@ from typing import Any
 
 from torch import Tensor
 
-from rsvib_torch.free_motion import moving_axes
+from rsvib_torch.motion.spline import moving_axes
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration import (
     RestorationVerdict,
     TooLittleInCommonError,
@@ -15,8 +16,7 @@ from rsvib_torch.restoration import (
     restore,
     trusted_vibration,
 )
-from rsvib_torch.restoration.trust import Detected
-from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.restoration.verdict.trust import Detected
 
 __all__ = ["RestoredFrames", "restore_trusted"]
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import torch
 
-from rsvib_torch.checks import check_whole_number
-from rsvib_torch.sensor import SensorTiming
+from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.motion.timing import SensorTiming
 
 __all__ = ["Window", "cut_windows", "window_timing"]
 

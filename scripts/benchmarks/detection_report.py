@@ -6,7 +6,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from rsvib_torch.pictures import save_figure
+from rsvib_torch.report.plots import save_figure
 
 Results = list[dict[str, Any]]
 UNITS = {"amplitude": "px", "frequency": "Hz", "phase": "rad"}

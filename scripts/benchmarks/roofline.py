@@ -19,11 +19,11 @@ import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration import exact, prior
-from rsvib_torch.restoration.interpolated_solver import NodeFactors
-from rsvib_torch.restoration.motion import frame_motion
-from rsvib_torch.restoration.partition import Partition
-from rsvib_torch.restoration.row_kernel import scene_weights
-from rsvib_torch.restoration.row_system import row_kernels, smooth_band, smooth_kernels
+from rsvib_torch.restoration.exact.interpolated_solver import NodeFactors
+from rsvib_torch.restoration.exact.partition import Partition
+from rsvib_torch.restoration.frame_motion import frame_motion
+from rsvib_torch.restoration.scene_model.row_kernel import scene_weights
+from rsvib_torch.restoration.scene_model.row_system import row_kernels, smooth_band, smooth_kernels
 
 REAL, COMPLEX = 4, 8  # bytes
 COPIED = 1 << 28  # bytes copied to measure the bandwidth

@@ -15,7 +15,8 @@ from typing import Any
 
 from benchmarks import streaming
 
-from rsvib_torch.stacks import open_stack, process_stack
+from rsvib_torch.io import open_stack
+from rsvib_torch.stacks import process_stack
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.windows import cut_windows
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks import streaming
 
-from rsvib_torch.stacks import read_stack_info
+from rsvib_torch.io import read_stack_info
 from rsvib_torch.stacks.memory import memory_needed
 
 RESTORATIONS: list[dict[str, Any]] = [

@@ -9,7 +9,7 @@ from reproduction.pictures import Gallery
 from reproduction.work import Found, Plan
 
 import rsvib_torch
-from rsvib_torch.pages import write_page
+from rsvib_torch.report.html import write_page
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _MARKS = {"in every trial": "good", "on average": "doubt", "no": "bad", "yes": "good"}

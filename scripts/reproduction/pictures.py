@@ -16,8 +16,8 @@ from reproduction.trials import FREQUENCY as MTF_FREQUENCY
 from reproduction.trials import METHODS
 from reproduction.work import Found, Plan
 
-from rsvib_torch.pages import BeforeAfter, Drawing, before_after, drawing
-from rsvib_torch.pictures import axis_offset_figure, detailed_places, plain_axes
+from rsvib_torch.report.html import BeforeAfter, Drawing, before_after, drawing
+from rsvib_torch.report.plots import axis_offset_figure, detailed_places, plain_axes
 
 _COLOURS = {"paper": "#c26a00", "default": "#14487a", "still": "#222222", "degraded": "#9a9a9a"}
 _WINDOW = 96  # px, of details

@@ -9,9 +9,9 @@ import torch
 from truth import draw_scene
 
 from rsvib_torch.calibration import calibrate_row_time, calibrate_row_time_by_exposure
-from rsvib_torch.cli import run_command
+from rsvib_torch.commands.main import run_command
 from rsvib_torch.config import read_config
-from rsvib_torch.stacks import write_stack
+from rsvib_torch.io import write_stack
 
 ROW_TIME = 14.578e-6
 HEIGHT, WIDTH = 480, 160

@@ -8,7 +8,7 @@ import torch
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.cli import run_command
+from rsvib_torch.commands.main import run_command
 
 HEIGHT, WIDTH, FRAMES = 224, 160, 4
 TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=300)

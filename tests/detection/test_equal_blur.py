@@ -5,8 +5,8 @@ import torch
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import Vibration
-from rsvib_torch.detection.equal_blur import Shown, warp_to_same_blur
-from rsvib_torch.detection.row_groups import frame_groups, measure_group, stack_spectra
+from rsvib_torch.detection.rows.equal_blur import Shown, warp_to_same_blur
+from rsvib_torch.detection.rows.row_groups import frame_groups, measure_group, stack_spectra
 from rsvib_torch.registration.row_spectra import RowSpectra
 
 MOTION = Motion((3.1, 5.2), (50.0, 30.0), (-1.39, -1.42))

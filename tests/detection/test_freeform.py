@@ -7,8 +7,8 @@ from motion_truth import common_warp, offset_error, rms
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.cli import run_command
-from rsvib_torch.free_motion import FreeMotion
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.motion.spline import FreeMotion
 
 HEIGHT, WIDTH, FRAMES = 256, 160, 9
 TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=270)

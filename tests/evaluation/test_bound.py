@@ -5,8 +5,8 @@ from scipy.interpolate import BSpline
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import information
-from rsvib_torch.evaluation.bound import _parameters, _sensitivity, cramer_rao_bound
-from rsvib_torch.evaluation.information import Recording
+from rsvib_torch.evaluation.bound.cramer_rao import _parameters, _sensitivity, cramer_rao_bound
+from rsvib_torch.evaluation.bound.information import Recording
 
 TIMING = rsv.SensorTiming(row_time=160e-6, exposure_rows=3, frame_rows=300)
 FIELDS = ("amplitude", "frequency", "period", "phase", "image_motion")

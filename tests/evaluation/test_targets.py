@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from rsvib_torch.evaluation.targets import city_and_fields, resolution_chart
-from rsvib_torch.evaluation.targets.drawing import bars, disc, rectangle, rotated, sectors
+from rsvib_torch.evaluation.scenes import city_and_fields, resolution_chart
+from rsvib_torch.evaluation.scenes.drawing import bars, disc, rectangle, rotated, sectors
 
 SCENES = {
     "chart": resolution_chart,

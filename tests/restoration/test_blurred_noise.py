@@ -7,9 +7,9 @@ from scipy import ndimage
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
-from rsvib_torch.restoration.blurred_noise import noise_beside_blur
-from rsvib_torch.restoration.motion import frame_motion
-from rsvib_torch.restoration.noise import estimate_noise
+from rsvib_torch.restoration.frame_motion import frame_motion
+from rsvib_torch.restoration.noise.blurred_noise import noise_beside_blur
+from rsvib_torch.restoration.noise.single_frame import estimate_noise
 
 MOTION = Motion()
 

@@ -7,13 +7,13 @@ import torch
 from scipy import ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
-import rsvib_torch.restoration.exact as exact_module
-import rsvib_torch.restoration.partition as partition_module
+import rsvib_torch.restoration.exact.exact as exact_module
+import rsvib_torch.restoration.exact.partition as partition_module
 from rsvib_torch import SensorTiming, Vibration, psnr, simulate_frames
-from rsvib_torch.evaluation.targets import city_and_fields
+from rsvib_torch.evaluation.scenes import city_and_fields
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
-from rsvib_torch.restoration.partition import Partition
+from rsvib_torch.restoration.exact.partition import Partition
 
 restore = partial(restore_by_any_method, method="exact")
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)

@@ -5,16 +5,16 @@ import pytest
 import torch
 from scipy.linalg import solveh_banded
 
-import rsvib_torch.restoration.exact as exact_module
-import rsvib_torch.restoration.partition as partition_module
+import rsvib_torch.restoration.exact.exact as exact_module
+import rsvib_torch.restoration.exact.partition as partition_module
 from rsvib_torch import SensorNoise, SensorTiming, Vibration, psnr, restore, simulate_frames
-from rsvib_torch.evaluation.targets import city_and_fields
+from rsvib_torch.core.banded_solver import BandedMemory, skew_band
+from rsvib_torch.evaluation.scenes import city_and_fields
 from rsvib_torch.restoration import in_order, interpolated_solver
-from rsvib_torch.restoration.banded_solver import BandedMemory, skew_band
-from rsvib_torch.restoration.interpolated_solver import NodeFactors, SubstitutionMemory, chosen_nodes
-from rsvib_torch.restoration.row_sums import RowSums
-from rsvib_torch.restoration.row_system import RowKernels, smooth_kernels
-from rsvib_torch.restoration.segments import Segments
+from rsvib_torch.restoration.exact.interpolated_solver import NodeFactors, SubstitutionMemory, chosen_nodes
+from rsvib_torch.restoration.scene_model.row_sums import RowSums
+from rsvib_torch.restoration.scene_model.row_system import RowKernels, smooth_kernels
+from rsvib_torch.restoration.scene_model.segments import Segments
 
 
 def smooth_systems(count, width, frequencies, dtype=torch.complex128, seed=0):

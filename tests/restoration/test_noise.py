@@ -4,10 +4,15 @@ import torch
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
-from rsvib_torch.restoration.disagreement import noise_levels
-from rsvib_torch.restoration.motion import frame_motion
-from rsvib_torch.restoration.noise import estimate_noise
-from rsvib_torch.restoration.row_kernel import interpolation_error, kernel_spectrum, kernel_weights, scene_weights
+from rsvib_torch.restoration.frame_motion import frame_motion
+from rsvib_torch.restoration.noise.noise_levels import noise_levels
+from rsvib_torch.restoration.noise.single_frame import estimate_noise
+from rsvib_torch.restoration.scene_model.row_kernel import (
+    interpolation_error,
+    kernel_spectrum,
+    kernel_weights,
+    scene_weights,
+)
 
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 

@@ -6,8 +6,8 @@ import torch
 from scipy import ndimage
 from truth import draw_scene
 
-from rsvib_torch.restoration.noise import estimate_noise
-from rsvib_torch.restoration.noise_floor import noise_floor
+from rsvib_torch.restoration.noise.noise_floor import noise_floor
+from rsvib_torch.restoration.noise.single_frame import estimate_noise
 
 
 def fractal(steepness, optics, size=320, seed=5):

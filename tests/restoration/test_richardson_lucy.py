@@ -64,7 +64,7 @@ def test_agrees_with_a_dense_loop(small, hidden):
     found = lucy(tensor, SHORT, motion.vibration(), iterations=4, **options)[0].numpy()
     known = torch.from_numpy(frame)[None]
     if hidden:
-        from rsvib_torch.restoration.missing import fill_roughly
+        from rsvib_torch.frames.missing import fill_roughly
 
         known = fill_roughly(known, mask)
     start = restore(known, SHORT, motion.vibration(), method="dewarp", check=False)[0].numpy()

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from small_stack import process_small
 
-from rsvib_torch.cli import run_command
+from rsvib_torch.commands.main import run_command
 
 PAGE = 4096
 

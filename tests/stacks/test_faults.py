@@ -15,7 +15,7 @@ import tifffile
 import torch
 from small_stack import CONFIG, FRAMES, OPTIONS, WINDOWS, fork_server, process_small, write_small
 
-from rsvib_torch.cli import run_command
+from rsvib_torch.commands.main import run_command
 from rsvib_torch.stacks import read_manifest
 from rsvib_torch.stacks.journal import work_folder
 

@@ -12,7 +12,8 @@ from small_stack import FRAMES, HEIGHT, MOTION, OPTIONS, STILL, TIMING, WIDTH, W
 from truth import decibel
 
 import rsvib_torch as rsv
-from rsvib_torch.stacks import cut_windows, detect_stack, open_stack, read_manifest, write_stack
+from rsvib_torch.io import open_stack, write_stack
+from rsvib_torch.stacks import cut_windows, detect_stack, read_manifest
 from rsvib_torch.stacks.memory import memory_needed, parse_memory, windows_at_once
 
 

@@ -1,0 +1,1 @@
+"""The ``rsvib`` program: commands, arguments, progress and terminal output."""

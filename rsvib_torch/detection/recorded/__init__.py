@@ -1,0 +1,1 @@
+"""Motions recorded by another instrument: clock alignment and check against the frames."""

@@ -1,0 +1,307 @@
+"""A motion that another instrument recorded, brought to the clock of the frames."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.detection.band_curve import Bands, measurements_of_curve
+from rsvib_torch.detection.grey_frames import grey_frames
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.rows.residuals import independent_fraction, unexplained
+from rsvib_torch.detection.rows.row_groups import frame_groups, measure_groups, stack_spectra
+from rsvib_torch.detection.shapes.free import start_curve
+from rsvib_torch.frames.arrays import ArrayLike
+from rsvib_torch.frames.orientation import vibration_to_row_order
+from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.registration import Registration
+
+__all__ = ["ClockAlignment", "align_motion"]
+
+_MOST_OFFSETS = 20000
+_FEW_ROWS = 400  # scene rows that tell where to start
+_CHUNK = 128  # offsets tried together
+_ROUNDS = 12
+_LOOKS = 3  # rounds of measuring on the images
+_EXPLAINED = 0.25  # of the motion that may be left
+_FINEST = 0.05  # px
+_ALIKE = 2.0  # of the least square that another offset must exceed
+_LEAST_MOTION = 0.05  # px between frames, that an offset shows in
+
+
+@dataclass(frozen=True, eq=False)
+class ClockAlignment:
+    """Where in a recorded motion the frames were taken: at ``scale t + offset`` of its clock.
+
+    Attributes:
+        motion: The motion in image axes on the clock of the frames, with gain and drift.
+        offset: Reading of the recording's clock at time 0 of the frames, in seconds.
+        offset_std: Its standard deviation.
+        scale: Seconds that pass on it in one second of the frames.
+        scale_std: Its standard deviation; 0 where it was not fitted.
+        gain: Factor of the recorded motion of each axis (x, y); 1 where it was not fitted.
+        drift: (2,) px/s that the recording does not have, as gyroscopes drift.
+        unexplained: (2,) px, rms displacement of rows that the aligned motion does not explain, beyond their noise.
+        reliable: Whether the recording explains what the rows show, at this offset only.
+        reasons: Why not.
+    """
+
+    motion: FreeMotion
+    offset: float
+    offset_std: float
+    scale: float
+    scale_std: float
+    gain: tuple[float, float]
+    drift: Tensor
+    unexplained: Tensor
+    reliable: bool
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """Parameters of the fit; ``at`` is the reading of the recording's clock at ``middle`` of the frames' record."""
+
+    at: float
+    scale: float
+    gain: tuple[float, float]
+    drift: tuple[float, float]
+    middle: float
+
+    @property
+    def offset(self) -> float:
+        return self.at - self.scale * self.middle
+
+    def motion(self, recorded: FreeMotion) -> FreeMotion:
+        """The recorded motion on the clock of the frames."""
+        moved = recorded.retimed(self.offset, self.scale, self.gain)
+        knots = moved.knots - self.middle
+        drift = knots.new_tensor(self.drift)[:, None] * knots
+        return FreeMotion(moved.coefficients + drift, moved.start, moved.spacing, moved.tones)
+
+
+@outside_graphs
+@full_precision
+@torch.no_grad()
+def align_motion(
+    frames: ArrayLike,
+    timing: SensorTiming,
+    recorded: FreeMotion,
+    *,
+    offsets: tuple[float, float] | None = None,
+    fit_scale: bool = True,
+    fit_gain: bool = False,
+    registration: Registration = "ncc",
+    band_rows: int = 32,
+    band_step: int = 16,
+    search: int = 16,
+    ignore: ArrayLike | None = None,
+    full_scale: float | None = None,
+) -> ClockAlignment:
+    """Find offset and scale between the clock of a recorded motion and that of the frames.
+
+    The recording (of a gyroscope, of attitude sensors) is held against the displacements of the rows between frames:
+    first at many offsets against those of row bands, then by least squares against those measured on the images
+    around it, row by row. A uniform drift of each axis is fitted as well.
+
+    Args:
+        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames, tensor or NumPy array; NaN marks pixels that
+            were not measured.
+        timing: The sensor.
+        recorded: The motion on its own clock, in image axes.
+        offsets: Least and largest offset to look at, in seconds; by default all for which the recording covers the
+            frames.
+        fit_scale: Whether the clocks may run at different speeds.
+        fit_gain: Whether the recorded motion may be too large or too small, each axis by a factor (focal length).
+        registration: Method of the start.
+        band_rows: Rows of a band of the start.
+        band_step: Rows from one band to the next.
+        search: Search range of the start in px around the whole-frame offset.
+        ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out.
+        full_scale: Count that means 1.0, for integer frames.
+
+    Raises:
+        TypeError: If frames are not numbers.
+        ValueError: If the recording is shorter than the frames or does not cover them at any offset asked for, frames
+            cannot be registered, or an option is out of range.
+    """
+    if recorded.batch_shape:
+        raise ValueError("align_motion takes one motion, not a batch")
+    stack = grey_frames(frames, timing, full_scale, ignore)
+    if stack.batched:
+        raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")
+    grey = stack.images
+    bands = Bands(registration, band_rows, band_step, search)
+    rowwise, curve, (first, last) = start_curve(stack, timing, bands)
+    turned = vibration_to_row_order(recorded, timing)
+    assert isinstance(turned, FreeMotion)
+    turned = turned.to(grey.device)
+    low, high = _offsets(turned, first, last, offsets)
+    measured = measurements_of_curve(curve, rowwise, bands.band_step)
+    offset, other = _best_offset(measured, turned, low, high, rowwise)
+    clock = _Clock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
+    clock, covariance = _refine(measured, turned, clock, False, fit_gain)
+    clock, covariance = _refine(measured.reweighted(_left(measured, turned, clock)), turned, clock, fit_scale, fit_gain)
+    groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, clock.motion(turned).expanded(1))
+    for _ in range(_LOOKS):
+        measured = measure_groups(groups, rowwise, clock.motion(turned).expanded(1))
+        weighed = measured.reweighted(_left(measured, turned, clock))
+        clock, covariance = _refine(weighed, turned, clock, fit_scale, fit_gain)
+    left = _left(measured, turned, clock)
+    honest = independent_fraction(measured, left)
+    std = (covariance.diagonal() / honest).clamp(min=0.0).sqrt()
+    # from the middle of the record to time 0
+    reach = torch.tensor([1.0, -clock.middle], dtype=torch.float64, device=std.device)
+    offset_std = float((reach @ covariance[:2, :2] @ reach / honest).clamp(min=0.0).sqrt())
+    beside = unexplained(measured, left)[0]
+    moved = measured.relative(clock.motion(turned).mean_displacement(measured.moments, rowwise.exposure_time))
+    size = moved[0].square().sum(1).div(measured.differences[0].clamp(min=1.0)[:, None]).mean(0).sqrt()
+    reasons = _reasons(beside, size, other, float(std[0]))
+    swap = timing.scan_axis == -1
+    result = FreeMotion(recorded.coefficients, recorded.start, recorded.spacing, recorded.tones)
+    sign = -1.0 if timing.readout_direction == "reverse" else 1.0
+    drift = (clock.drift[0], sign * clock.drift[1])
+    there = replace(
+        clock,
+        gain=(clock.gain[1], clock.gain[0]) if swap else clock.gain,
+        drift=(drift[1], drift[0]) if swap else drift,
+    )
+    return ClockAlignment(
+        motion=there.motion(result),
+        offset=clock.offset,
+        offset_std=offset_std,
+        scale=clock.scale,
+        scale_std=float(std[1]),
+        gain=there.gain,
+        drift=torch.tensor(there.drift, dtype=torch.float64),
+        unexplained=beside.flip(-1) if swap else beside,
+        reliable=not reasons,
+        reasons=tuple(reasons),
+    )
+
+
+def _offsets(recorded: FreeMotion, first: float, last: float, asked: tuple[float, float] | None) -> tuple[float, float]:
+    """Range of offsets for which the recording covers the frames, within what was asked for."""
+    low, high = recorded.start - first, recorded.end - last
+    if high < low:
+        raise ValueError(
+            f"the recording of {recorded.end - recorded.start:.4g} s is shorter than the frames, {last - first:.4g} s; "
+            "are its times in another unit?"
+        )
+    if asked is not None:
+        bounds = (check_number("offsets", asked[0]), check_number("offsets", asked[1]))
+        if bounds[1] < low or bounds[0] > high or bounds[1] < bounds[0]:
+            raise ValueError(
+                f"offsets {bounds[0]:g} to {bounds[1]:g} s: the recording covers the frames from {low:.6g} to "
+                f"{high:.6g} s"
+            )
+        low, high = max(low, bounds[0]), min(high, bounds[1])
+    return low, high
+
+
+def _left(measured: Measurements, recorded: FreeMotion, clock: _Clock) -> Tensor:
+    """What the recording leaves of the displacements (1, N, G, 2)."""
+    predicted = clock.motion(recorded).mean_displacement(measured.moments, measured.exposure_time)
+    return measured.relative(measured.displacements - predicted)
+
+
+def _best_offset(
+    measured: Measurements, recorded: FreeMotion, low: float, high: float, timing: SensorTiming
+) -> tuple[float, float | None]:
+    """The offset at which the recording explains most, a drift being free, and another that explains as much."""
+    every = max(1, measured.moments.shape[1] // _FEW_ROWS)
+    known = (measured.weights[0] > 0).all(-1).nonzero()[::every, 0]
+    moments = measured.moments[0, known] + 0.5 * measured.exposure_time
+    seen = measured.seen[0, known]
+    values = (measured.displacements[0, known] * seen[..., None]).flatten(0, 1)
+    weight = (measured.weights[0, known, None] * seen[..., None]).flatten(0, 1)
+
+    def relative(of: Tensor) -> Tensor:  # (..., N, G, A)
+        mean = (of * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)
+        return ((of - mean) * seen[..., None]).flatten(-3, -2)
+
+    drift = relative(moments[..., None].expand(-1, -1, 2))
+    norm = (weight * drift.square()).sum(0).clamp(min=1e-300)
+    step = max(0.5 * recorded.spacing, 4 * timing.row_time, (high - low) / _MOST_OFFSETS)
+    grid = torch.linspace(
+        low, high, max(2, math.ceil((high - low) / step) + 1), dtype=torch.float64, device=drift.device
+    )
+    costs = []
+    for part in grid.split(_CHUNK):
+        left = values - relative(recorded.displacement(part[:, None, None] + moments))
+        along = (weight * drift * left).sum(-2) / norm
+        # axes that do not move say nothing: squares of the smallest residuals only, clouds have no say
+        size = (weight * (left - along[:, None] * drift).square()).sum(-1)
+        kept = size.sort(dim=-1).values[:, : math.ceil(0.8 * size.shape[-1])]
+        costs.append(kept.sum(-1))
+    cost = torch.cat(costs)
+    best = int(cost.argmin())
+    padded = torch.nn.functional.pad(cost, (1, 1), value=math.inf)
+    valleys = (padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]) & (cost < _ALIKE * cost[best] + 1e-300)
+    valleys[best] = False
+    others = valleys.nonzero()[:, 0]
+    other = float(grid[others[cost[others].argmin()]]) if len(others) else None
+    return float(grid[best]), other
+
+
+def _refine(
+    measured: Measurements, recorded: FreeMotion, clock: _Clock, fit_scale: bool, fit_gain: bool
+) -> tuple[_Clock, Tensor]:
+    """Gauss-Newton on clock reading, scale, gain and drift (6 parameters), with their covariance (6, 6)."""
+    moments = measured.moments
+    middle = moments + 0.5 * measured.exposure_time - clock.middle
+    free = torch.tensor([True, fit_scale, fit_gain, fit_gain, True, True], device=moments.device)
+    covariance = torch.zeros(6, 6, dtype=torch.float64, device=moments.device)
+    for _ in range(_ROUNDS):
+        own = recorded.retimed(clock.offset, clock.scale)
+        gain = moments.new_tensor(clock.gain)
+        speed = own.velocity(moments + 0.5 * measured.exposure_time) * gain / clock.scale
+        value = own.mean_displacement(moments, measured.exposure_time)
+        zero = torch.zeros_like(value[..., 0])
+        columns = torch.stack(
+            [
+                speed,
+                speed * middle[..., None],
+                torch.stack([value[..., 0], zero], -1),
+                torch.stack([zero, value[..., 1]], -1),
+                torch.stack([middle, zero], -1),
+                torch.stack([zero, middle], -1),
+            ],
+            -1,
+        )
+        columns = measured.relative(columns) * free
+        left = _left(measured, recorded, clock)
+        gram = torch.einsum("bngap,bnac,bngcq->pq", columns, measured.information, columns)
+        right = torch.einsum("bngap,bnac,bngc->p", columns, measured.information, left)
+        scale = torch.where(gram.diagonal() > 0, gram.diagonal(), 1.0).sqrt()
+        inverse = torch.linalg.pinv(gram / scale / scale[:, None], rtol=1e-10, hermitian=True) / scale / scale[:, None]
+        change = inverse @ right
+        known = measured.known.sum().clamp(min=7.0) - free.sum()
+        covariance = inverse * (measured.square(left).sum() / known)
+        at, speedup, gain_x, gain_y, drift_x, drift_y = change.tolist()
+        clock = _Clock(
+            clock.at + at,
+            max(clock.scale + speedup, 0.1 * clock.scale),
+            (clock.gain[0] + gain_x, clock.gain[1] + gain_y),
+            (clock.drift[0] + drift_x, clock.drift[1] + drift_y),
+            clock.middle,
+        )
+        if bool((change.abs() <= 1e-3 * covariance.diagonal().sqrt()).all()):
+            break
+    return clock, covariance
+
+
+def _reasons(unexplained: Tensor, size: Tensor, other: float | None, offset_std: float) -> list[str]:
+    reasons = []
+    if float(size.amax()) < _LEAST_MOTION:
+        reasons.append(f"the recorded motion moves rows by {float(size.amax()):.2g} px between frames: too little")
+    for axis, name in enumerate(("along the rows", "across the rows")):
+        if float(unexplained[axis]) > max(_EXPLAINED * float(size[axis]), _FINEST):
+            reasons.append(f"rows move by {float(unexplained[axis]):.3g} px {name} that the recording does not explain")
+    if other is not None:
+        reasons.append(f"an offset of {other:.6g} s explains the frames as well: the motion repeats")
+    return reasons

@@ -1,0 +1,1 @@
+"""Direct measurement of displacements, row by row, around a motion estimate."""

@@ -1,0 +1,1 @@
+"""Detection of sinusoidal tones in measured displacements."""

@@ -1,0 +1,1 @@
+"""Cramér-Rao bound of the parameters of a vibration."""

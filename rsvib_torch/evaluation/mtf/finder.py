@@ -1,0 +1,254 @@
+"""Slanted edges in a picture of a chart."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from rsvib_torch.core.checks import check_number, check_whole_number
+from rsvib_torch.evaluation.mtf.edge_checks import as_real, check_edge, uneven_patches
+from rsvib_torch.evaluation.mtf.edge_geometry import EdgeFit, Scatter, fit_edge, linearised, start_edge, straighten
+from rsvib_torch.frames.arrays import ArrayLike, as_tensor
+
+__all__ = ["SlantedEdge", "find_slanted_edges"]
+
+_BLUR = 1.2  # px, before gradients
+_TAPS = 5
+_ANGLES = (2.0, 30.0)  # degrees, of edges to look for
+_STRAIGHT = 0.7  # px, of the ridge of the gradient around its line, root mean square
+_ENDS = 5  # px cut off the ends of an edge, where corners are
+_BESIDE = (40, 32, 24, 16, 12, 8)  # px of either side to try, the widest first
+_EXPLAINED = 0.985  # of the variance in the ROI, by the edge
+_NEAR = 5.0  # px from the edge that blur may reach, at a first look
+_EVEN = 0.06  # of the contrast: the sides away from the edge, root mean square, at a first look
+_TEXTURE = 0.01  # of the contrast: patches of the sides, root mean square, beside noise
+_Side = Literal["left", "right", "top", "bottom"]
+
+
+@dataclass(frozen=True)
+class SlantedEdge:
+    """A ROI with one slanted edge.
+
+    Attributes:
+        top: First row.
+        left: First column.
+        height: Rows.
+        width: Columns.
+        angle: Degrees from the nearest image axis, positive clockwise (as ``MtfCurve.angle``).
+        near_vertical: Whether the nearest axis is the vertical one.
+        bright_side: Which side of the edge is bright.
+        contrast: Bright minus dark, in the image's grey values.
+    """
+
+    top: int
+    left: int
+    height: int
+    width: int
+    angle: float
+    near_vertical: bool
+    bright_side: _Side
+    contrast: float
+
+    def crop(self, image: ArrayLike) -> Tensor:
+        """The ROI (..., height, width) of an image of the same size, or of a stack of them."""
+        return as_tensor("image", image)[..., self.top : self.top + self.height, self.left : self.left + self.width]
+
+
+def find_slanted_edges(
+    image: ArrayLike, *, min_length: int = 32, max_length: int = 160, min_contrast: float = 0.1
+) -> list[SlantedEdge]:
+    """Find ROIs for ``slanted_edge_mtf``: straight edges, 2 ... 30 degrees off an axis, between even sides.
+
+    Ridges of the gradient are followed and fitted by lines; around each, the widest ROI is taken in which the edge
+    is all there is.
+
+    Args:
+        image: (H, W), tensor or NumPy array, linear in light; any scale.
+        min_length: px, shortest edge.
+        max_length: px of a longer edge that are used, from its middle.
+        min_contrast: Smallest step, as a part of the range between the image's 1 and 99 % quantiles.
+
+    Returns:
+        The edges, those of the largest contrast times length first; no two of them overlap by more than half.
+
+    Raises:
+        TypeError: If the image does not hold real numbers.
+        ValueError: If it is not one finite image, or an option is out of range.
+
+    Example:
+        >>> from rsvib_torch.evaluation import resolution_chart
+        >>> edges = find_slanted_edges(resolution_chart(512, 512))
+        >>> len(edges), {round(abs(edge.angle), 1) for edge in edges}
+        (16, {5.0})
+    """
+    grey = as_real("image", image)
+    if grey.ndim != 2 or not bool(torch.isfinite(grey).all()):
+        raise ValueError(f"image must be one finite grey image (H, W), got shape {tuple(grey.shape)}")
+    min_length = check_whole_number("min_length", min_length, at_least=16)
+    max_length = check_whole_number("max_length", max_length, at_least=min_length)
+    check_number("min_contrast", min_contrast, above=0.0, at_most=1.0)
+    values = grey.detach().to(torch.float64)
+    if min(values.shape) < 2 * _TAPS + 1:
+        return []
+    low, high = (values.flatten().kthvalue(max(1, int(q * (values.numel() - 1)) + 1)).values for q in (0.01, 0.99))
+    least = min_contrast * float(high - low)
+    if least == 0.0:
+        return []
+    found = []
+    for near_vertical in (True, False):
+        turned = values if near_vertical else values.mT
+        for line, rows in _lines(turned, least, min_length, max_length):
+            edge = _roi_around(turned, line, rows, near_vertical, least)
+            if edge is not None:
+                found.append(edge)
+    found.sort(key=lambda edge: -edge.contrast * (edge.height if edge.near_vertical else edge.width))
+    kept: list[SlantedEdge] = []
+    for edge in found:
+        if all(_overlap(edge, other) < 0.5 for other in kept):
+            kept.append(edge)
+    return kept
+
+
+def _gradients(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives (right, down) of the image behind a Gaussian."""
+    offset = torch.arange(-_TAPS, _TAPS + 1, dtype=values.dtype, device=values.device)
+    smooth = torch.exp(-0.5 * (offset / _BLUR).square())
+    smooth = smooth / smooth.sum()
+    slope = offset * smooth
+    slope = slope / (slope * offset).sum()
+    padded = torch.nn.functional.pad(values[None, None], (_TAPS,) * 4, mode="replicate")
+    right, down = (
+        torch.nn.functional.conv2d(torch.nn.functional.conv2d(padded, x[None, None, None]), y[None, None, :, None])[
+            0, 0
+        ]
+        for x, y in ((slope, smooth), (smooth, slope))
+    )
+    return right, down
+
+
+def _lines(values: Tensor, least: float, min_length: int, max_length: int) -> list[tuple[tuple[float, float], range]]:
+    """Near-vertical lines, ``column = a + b row``, along ridges of the gradient, with the rows that they span."""
+    right, down = _gradients(values)
+    slope = (down.abs() / right.abs().clamp(min=1e-300)).atan().rad2deg()
+    size = right.abs()
+    ridge = torch.zeros_like(size, dtype=torch.bool)
+    ridge[:, 1:-1] = (size[:, 1:-1] > size[:, :-2]) & (size[:, 1:-1] >= size[:, 2:])
+    # a step as blurred as its gradient's peak allows: half of it still counts, for noise and blur
+    ridge &= (size > 0.3 * least / (_BLUR * 2.5)) & (slope < _ANGLES[1] + 10)
+    lines = []
+    for sign in (1, -1):
+        labels, count = ndimage.label((ridge & (sign * right > 0)).cpu().numpy(), structure=[[1, 1, 1]] * 3)
+        for label, window in enumerate(ndimage.find_objects(labels, count), start=1):
+            if window[0].stop - window[0].start < min_length:
+                continue
+            rows, columns = (labels[window] == label).nonzero()
+            rows, columns = rows + window[0].start, columns + window[1].start
+            lines.extend(_split(right, torch.from_numpy(rows), torch.from_numpy(columns), min_length, max_length))
+    return lines
+
+
+def _split(
+    right: Tensor, rows: Tensor, columns: Tensor, min_length: int, max_length: int
+) -> list[tuple[tuple[float, float], range]]:
+    """Fit a line to the pixels of a ridge; bent ridges are split at their farthest point."""
+    if len(rows) < 0.8 * min_length or int(rows[-1] - rows[0]) + 1 < min_length:
+        return []
+    rows, columns = rows.to(right.device), columns.to(right.device)
+    before, at, after = (right[rows, columns + shift].abs() for shift in (-1, 0, 1))
+    place = columns + 0.5 * (after - before) / (2 * at - before - after).clamp(min=1e-12 * float(at.max()))
+    y = rows.to(right.dtype)
+    design = torch.stack([torch.ones_like(y), y], dim=1)
+    line = torch.linalg.lstsq(design, place[:, None]).solution[:, 0]
+    apart = (place - design @ line).abs()
+    if float(apart.square().mean().sqrt()) > _STRAIGHT:
+        # corners pull most: cut at the pixel farthest from the chord between the ends
+        chord = place[0] + (place[-1] - place[0]) * (y - y[0]) / (y[-1] - y[0])
+        cut = int((place - chord).abs().argmax())
+        parts = [slice(None, max(cut - 2, 0)), slice(cut + 3, None)]
+        return [found for part in parts for found in _split(right, rows[part], columns[part], min_length, max_length)]
+    angle = abs(float(line[1].atan().rad2deg()))
+    begin, end = int(rows[0]) + _ENDS, int(rows[-1]) + 1 - _ENDS
+    surplus = max(end - begin - max_length, 0) // 2
+    begin, end = begin + surplus, end - surplus
+    if end - begin < min_length - 2 * _ENDS or end - begin < 16 or not _ANGLES[0] <= angle <= _ANGLES[1]:
+        return []
+    return [((float(line[0]), float(line[1])), range(begin, end))]
+
+
+def _roi_around(
+    values: Tensor, line: tuple[float, float], rows: range, near_vertical: bool, least: float
+) -> SlantedEdge | None:
+    """The widest ROI around a line in which there is nothing but the edge; None where there is none."""
+    ends = sorted(line[0] + line[1] * row for row in (rows[0], rows[-1]))
+    for beside in _BESIDE:
+        begin, end = round(ends[0]) - beside, round(ends[1]) + beside + 1
+        if begin < 0 or end > values.shape[1]:
+            continue
+        roi = values[rows.start : rows.stop, begin:end]
+        if not _even_sides(roi, (line[0] + line[1] * rows.start - begin, line[1]), least):
+            continue
+        scatter, columns, upright, mirrored = straighten(roi)
+        if not upright:
+            continue
+        fit = fit_edge(scatter, start_edge(scatter, columns))
+        if not _alone(fit, scatter, columns, least):
+            continue
+        angle = float(fit.slope(scatter).atan().rad2deg())
+        sides: tuple[_Side, _Side] = ("right", "left") if near_vertical else ("bottom", "top")
+        length, width = roi.shape
+        box = (rows.start, begin, length, width) if near_vertical else (begin, rows.start, width, length)
+        turned = angle if mirrored == near_vertical else -angle
+        return SlantedEdge(*box, turned, near_vertical, sides[int(mirrored)], float(fit.contrast))
+    return None
+
+
+def _even_sides(roi: Tensor, line: tuple[float, float], least: float) -> bool:
+    """Whether both sides of a line are plain: planes fitted to them, but for what is near the line (cheap)."""
+    height, width = roi.shape
+    y, x = (torch.arange(n, dtype=roi.dtype, device=roi.device) for n in (height, width))
+    distance = x - line[0] - line[1] * y[:, None]
+    levels, uneven = [], []
+    for side in (distance < -_NEAR, distance > _NEAR):
+        at = side.nonzero().to(roi.dtype)
+        design = torch.cat([torch.ones_like(at[:, :1]), at / max(height, width) - 0.5], dim=1)
+        normal = design.T @ design
+        normal.diagonal().add_(1e-9 * len(at))
+        plane = torch.linalg.solve(normal, design.T @ roi[side])
+        left = roi[side] - design @ plane
+        levels.append(float(roi[side].mean()))
+        uneven.append(float(left.square().mean().sqrt()))
+    step = abs(levels[1] - levels[0])
+    return step > 0.8 * least and max(uneven) < 1.5 * _EVEN * step
+
+
+def _alone(fit: EdgeFit, scatter: Scatter, columns: int, least: float) -> bool:
+    """Whether the edge explains its ROI, and the sides are even."""
+    try:
+        check_edge(fit, scatter, columns, (-torch.inf, torch.inf))
+    except ValueError:
+        return False
+    model, _, _ = linearised(fit, scatter)
+    left = scatter.value - model
+    contrast = float(fit.contrast)
+    explained = 1 - float(left.var() / scatter.value.var())
+    tilt = float(fit.sides[:, 1:].abs().max())
+    patches, noise = uneven_patches(fit, scatter, columns)
+    uneven = float(patches.square().mean().sqrt())
+    return (
+        contrast >= least
+        and explained >= _EXPLAINED
+        and tilt < 0.5 * contrast
+        and uneven < _TEXTURE * contrast + 1.5 * noise
+    )
+
+
+def _overlap(first: SlantedEdge, second: SlantedEdge) -> float:
+    """Common area of two ROIs of one direction, as a part of the smaller."""
+    if first.near_vertical != second.near_vertical:
+        return 0.0
+    down = min(first.top + first.height, second.top + second.height) - max(first.top, second.top)
+    right = min(first.left + first.width, second.left + second.width) - max(first.left, second.left)
+    smaller = min(first.height * first.width, second.height * second.width)
+    return max(down, 0) * max(right, 0) / smaller

@@ -1,0 +1,268 @@
+"""A landscape from above: towns, fields, woods, roads and a river."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from rsvib_torch.core.checks import check_number, check_whole_number
+from rsvib_torch.evaluation.scenes.buildings import BuildingPlan, draw_buildings
+from rsvib_torch.evaluation.scenes.drawing import fractal_texture, rotated, smoothed
+
+__all__ = ["city_and_fields"]
+
+_DISTRICT = 400.0  # px, mean size of a district
+_OVERSAMPLING = 2  # points per px along each axis, where the ground is laid out
+_STRIP = 96  # rows laid out at a time
+_PIXEL_VARIANCE = 1.0 / 12.0  # px^2, of averaging over a pixel
+_FIELDS, _TOWN, _WORKS, _WOOD = range(4)
+_TABLE = 4096  # random numbers that parcels draw from
+
+
+@dataclass(frozen=True)
+class _Districts:
+    """Districts on a jittered grid: (rows, columns) tables with one ring outside the image."""
+
+    place: Tensor  # (rows, columns, 2), x and y in px
+    angle: Tensor
+    kind: Tensor
+    parcel: Tensor  # (rows, columns, 2), size in px
+    pitch: float
+
+    @property
+    def table(self) -> Tensor:
+        """Place, parcel, cosine and sine of each district, (N, 6)."""
+        angle = self.angle.view(-1, 1)
+        return torch.cat([self.place.view(-1, 2), self.parcel.view(-1, 2), angle.cos(), angle.sin()], dim=-1)
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """Main roads and a river that wind through the image: ``normal . position = level + bend``."""
+
+    angle: Tensor
+    level: Tensor
+    swing: Tensor
+    length: Tensor
+    phase: Tensor
+    half_width: Tensor  # the last line is the river
+
+
+def city_and_fields(height: int, width: int, seed: int, *, sigma: float = 0.6) -> Tensor:
+    """Draw towns and fields as seen from above, through Gaussian optics.
+
+    Fractal ground in districts of different direction: fields with furrows and hedges, streets with rows of small
+    gabled buildings and their shadows, larger works, woods, country roads and a river.
+
+    Args:
+        height: Rows, at least 64.
+        width: Columns, at least 64.
+        seed: Seed of everything random.
+        sigma: Blur of the optics in px (Gaussian, pixel area included).
+
+    Returns:
+        float32 tensor (height, width) with values in 0 ... 1.
+
+    Raises:
+        TypeError: If a size or the seed is not a whole number.
+        ValueError: If the image is too small or the blur too narrow to be sampled (below 0.4 px).
+
+    Example:
+        >>> scene = city_and_fields(128, 96, seed=3)
+        >>> scene.shape, bool(scene.min() >= 0 and scene.max() <= 1)
+        (torch.Size([128, 96]), True)
+    """
+    height = check_whole_number("height", height, at_least=64)
+    width = check_whole_number("width", width, at_least=64)
+    seed = check_whole_number("seed", seed, at_least=0)
+    sigma = check_number("sigma", sigma, at_least=0.4)
+    generator = torch.Generator().manual_seed(seed)
+    districts = _lay_out_districts(height, width, generator)
+    lines = _lay_out_lines(height, width, generator)
+    table = torch.rand(_TABLE, 4, generator=generator)
+    relief = fractal_texture(height, width, generator, exponent=1.3, longest=500.0, sigma=sigma)
+    detail = fractal_texture(height, width, generator, exponent=2.0, longest=7.0, sigma=sigma)
+
+    strips = []
+    for begin in range(0, height, _STRIP):
+        layers = _lay_out_ground((begin, min(begin + _STRIP, height)), width, districts, lines, table)
+        strips.append(functional.avg_pool2d(layers[:, None], _OVERSAMPLING)[:, 0])
+    ground, wildness = smoothed(torch.cat(strips, dim=1), math.sqrt(sigma**2 - _PIXEL_VARIANCE))
+    image = ground * (1.0 + 0.09 * relief + (0.025 + 0.2 * wildness) * detail)
+    plan = _plan_buildings(districts, lines, height, width, generator)
+    return draw_buildings(image, plan, sigma).clamp(0.0, 1.0)
+
+
+def _points(begin: int, end: int) -> Tensor:
+    """Sample positions within the pixels ``begin ... end - 1``."""
+    return (torch.arange(begin * _OVERSAMPLING, end * _OVERSAMPLING) + 0.5) / _OVERSAMPLING - 0.5
+
+
+def _lay_out_districts(height: int, width: int, generator: torch.Generator) -> _Districts:
+    pitch = min(_DISTRICT, 0.5 * min(height, width))
+    rows, columns = (math.ceil(size / pitch) + 2 for size in (height, width))
+
+    def uniform(*size: int) -> Tensor:
+        return torch.rand(*size, generator=generator)
+
+    grid = torch.stack(torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy"), dim=-1)
+    place = (grid - 1 + 0.15 + 0.7 * uniform(rows, columns, 2)) * pitch
+    # Thirds of town and fields, and the rest in equal parts, in an order that mixes them at any size.
+    draw = torch.remainder(torch.arange(rows * columns) * 0.618034 + uniform(1), 1.0).view(rows, columns)
+    kind = torch.bucketize(draw, torch.tensor([0.37, 0.75, 0.87]))
+    sizes = torch.tensor([[110.0, 70.0], [104.0, 64.0], [150.0, 110.0], [1e4, 1e4]])
+    parcel = sizes[kind] * (0.85 + 0.4 * uniform(rows, columns, 2))
+    return _Districts(place, math.pi * uniform(rows, columns), kind, parcel, pitch)
+
+
+def _lay_out_lines(height: int, width: int, generator: torch.Generator) -> _Lines:
+    count = 4
+    angle = math.pi * (torch.arange(count) + 0.8 * torch.rand(count, generator=generator)) / count
+    through = torch.tensor([width, height]) * (0.2 + 0.6 * torch.rand(count, 2, generator=generator))
+    level = through[:, 0] * angle.cos() + through[:, 1] * angle.sin()
+    size = float(max(height, width))
+    random = torch.rand(3, count, generator=generator)
+    half_width = torch.tensor([6.0, 5.0, 5.0, 15.0])
+    swing = size * (0.02 + 0.02 * random[0])
+    return _Lines(angle, level, swing, size * (0.5 + 0.4 * random[1]), 2 * math.pi * random[2], half_width)
+
+
+def _distance_to_line(x: Tensor, y: Tensor, lines: _Lines, index: int) -> Tensor:
+    along, across = rotated(x, y, float(lines.angle[index]) - 0.5 * math.pi)
+    turn = 2 * math.pi / float(lines.length[index])
+    angle = along * turn + float(lines.phase[index])
+    swing = float(lines.swing[index])
+    slope = swing * turn * angle.cos()
+    return (across - float(lines.level[index]) - swing * angle.sin()).abs() * torch.rsqrt(1 + slope.square())
+
+
+def _two_nearest_districts(x: Tensor, y: Tensor, districts: _Districts) -> tuple[Tensor, Tensor]:
+    """Indices of the nearest and the second nearest district at each point."""
+    rows, columns = districts.kind.shape
+    place_x, place_y = districts.place.view(-1, 2).T.contiguous()
+    row = ((y / districts.pitch).floor().long() + 1).clamp(1, rows - 2)
+    column = ((x / districts.pitch).floor().long() + 1).clamp(1, columns - 2)
+    indices = torch.stack([(row + down) * columns + (column + right) for down in (-1, 0, 1) for right in (-1, 0, 1)])
+    squared = (x - place_x[indices]).square_() + (y - place_y[indices]).square_()
+    order = squared.topk(2, dim=0, largest=False).indices
+    first, second = indices.gather(0, order)
+    return first, second
+
+
+def _border_distance(x: Tensor, y: Tensor, first: Tensor, second: Tensor, districts: _Districts) -> Tensor:
+    """Distance in px from the border between two districts, positive on the side of the first."""
+    place_x, place_y = districts.place.view(-1, 2).T.contiguous()
+    to_x, to_y = place_x[second] - place_x[first], place_y[second] - place_y[first]
+    middle_x, middle_y = 0.5 * (place_x[second] + place_x[first]), 0.5 * (place_y[second] + place_y[first])
+    distance: Tensor = ((middle_x - x) * to_x + (middle_y - y) * to_y) / torch.hypot(to_x, to_y)
+    return distance
+
+
+def _borders(strip: tuple[int, int], width: int, districts: _Districts) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Sample points x, y of a strip of rows with their districts, and the distances to the districts' borders.
+
+    The two nearest districts are found for pixels, and which of the two is nearer for each point.
+    """
+    rows, columns = (torch.arange(*limits, dtype=torch.float32) for limits in (strip, (0, width)))
+    pair = _two_nearest_districts(columns[None], rows[:, None], districts)
+    y, x = (_points(*limits) for limits in (strip, (0, width)))
+    x, y = x[None], y[:, None]
+    first, second = (index.repeat_interleave(_OVERSAMPLING, 0).repeat_interleave(_OVERSAMPLING, 1) for index in pair)
+    border = _border_distance(x, y, first, second, districts)
+    return x, y, torch.where(border < 0, second, first), border.abs()
+
+
+def _lay_out_ground(rows: tuple[int, int], width: int, districts: _Districts, lines: _Lines, table: Tensor) -> Tensor:
+    """Tone of the ground and how wildly it is overgrown, (2, points down, points across)."""
+    x, y, nearest, border = _borders(rows, width, districts)
+    kind = districts.kind.view(-1)[nearest]
+    place_x, place_y, size_u, size_v, cosine, sine = districts.table.T.contiguous()[:, nearest]
+    right, down = x - place_x, y - place_y
+    u, v = right * cosine + down * sine, down * cosine - right * sine
+    lot_v = (v / size_v).floor()
+    # fields of one row are set off against those of the next, streets go straight on
+    shifted = (kind == _FIELDS) * table[(lot_v.long() * 37 + nearest).remainder(_TABLE), 0]
+    u = u + shifted * size_u
+    lot_u = (u / size_u).floor()
+    draw = table[((lot_u * 73 + lot_v * 179 + nearest * 283).long() * 2654435761).remainder(_TABLE)].movedim(-1, 0)
+    across_u, across_v = u - lot_u * size_u, v - lot_v * size_v
+    edge_of_lot = torch.minimum(torch.minimum(across_u, size_u - across_u), torch.minimum(across_v, size_v - across_v))
+
+    furrow = torch.sin(2 * math.pi * torch.where(draw[2] < 0.5, u, v) / (4.0 + 7.0 * draw[3]))
+    field = 0.26 + 0.4 * draw[0] + (0.01 + 0.05 * draw[1]) * furrow
+    field = torch.where(edge_of_lot < 1.4, 0.18, field)
+    block = torch.where(edge_of_lot < 4.5, 0.52, 0.3 + 0.1 * draw[0])
+    yard = torch.where(edge_of_lot < 5.5, 0.5, 0.4 + 0.12 * draw[0])
+    tone = torch.where(kind == _FIELDS, field, torch.where(kind == _TOWN, block, yard))
+    tone = torch.where(kind == _WOOD, 0.25, tone)
+    wildness = torch.tensor([0.08, 0.45, 0.05, 1.0])[kind]
+    wildness = torch.where((kind == _TOWN) & (edge_of_lot < 4.5), 0.0, wildness)
+
+    distance, half = _distance_to_line(x, y, lines, -1), float(lines.half_width[-1])
+    for extra, level, wild in ((4.0, 0.3, 0.6), (0.0, 0.15, 0.1)):
+        wet = distance < half + extra
+        tone, wildness = torch.where(wet, level, tone), torch.where(wet, wild, wildness)
+    lane = border < 3.5
+    tone, wildness = torch.where(lane, 0.63, tone), torch.where(lane, 0.0, wildness)
+    for index in range(len(lines.half_width) - 1):
+        distance, half = _distance_to_line(x, y, lines, index), float(lines.half_width[index])
+        road = distance < half
+        tone = torch.where(distance < half + 2.0, 0.36, tone)
+        tone = torch.where(road, torch.where(distance < 0.5, 0.82, 0.56), tone)
+        wildness = torch.where(road, 0.0, wildness)
+    return torch.stack([tone, wildness])
+
+
+def _plan_buildings(
+    districts: _Districts, lines: _Lines, height: int, width: int, generator: torch.Generator
+) -> BuildingPlan:
+    """Rows of buildings along the streets of every town and works district, and a few farms in the fields."""
+    plans = []
+    for index, kind in enumerate(districts.kind.view(-1).tolist()):
+        if kind == _WOOD:
+            continue
+        plans.append(_plan_district(index, kind, districts, lines, generator))
+    plan = BuildingPlan.joined(plans)
+    inside = (plan.centre > -40).all(-1) & (plan.centre[:, 0] < width + 40) & (plan.centre[:, 1] < height + 40)
+    return plan.where(inside)
+
+
+def _plan_district(
+    index: int, kind: int, districts: _Districts, lines: _Lines, generator: torch.Generator
+) -> BuildingPlan:
+    parcel = districts.parcel.view(-1, 2)[index]
+    place, angle = districts.place.view(-1, 2)[index], float(districts.angle.view(-1)[index])
+    street, share = {_FIELDS: (12.0, 0.12), _TOWN: (7.5, 0.93), _WORKS: (10.0, 0.85)}[kind]
+    wanted = {_FIELDS: parcel, _TOWN: torch.tensor([23.0, 27.0]), _WORKS: torch.tensor([62.0, 44.0])}[kind]
+    per_lot = ((parcel - 2 * street) / wanted).round().clamp(min=1.0)
+    lot = (parcel - 2 * street) / per_lot
+    reach = (1.5 * districts.pitch / parcel).ceil()
+    steps = [
+        (torch.arange(-int(n), int(n))[:, None] * size + street + (torch.arange(int(count)) + 0.5) * step).flatten()
+        for n, size, count, step in zip(reach, parcel, per_lot, lot, strict=True)
+    ]
+    u, v = (t.flatten() for t in torch.meshgrid(*steps, indexing="xy"))
+    count = len(u)
+    random = torch.rand(count, 8, generator=generator)
+    largest = torch.minimum(0.5 * lot - 2.0, torch.tensor([24.0, 18.0]))
+    half = largest * (0.62 + 0.38 * random[:, :2])
+    slack = 0.5 * lot - 1.5 - half
+    u = u + slack[:, 0] * (2 * random[:, 2] - 1)
+    v = v + slack[:, 1] * (2 * random[:, 3] - 1)
+    x, y = rotated(u, v, -angle)
+    centre = torch.stack([x, y], dim=-1) + place
+    nearest, second = _two_nearest_districts(centre[:, 0], centre[:, 1], districts)
+    border = _border_distance(centre[:, 0], centre[:, 1], nearest, second, districts)
+    room = torch.linalg.vector_norm(half, dim=-1)
+    keep = (nearest == index) & (border > room + 4.0) & (random[:, 4] < share)
+    for line in range(len(lines.half_width)):
+        distance = _distance_to_line(centre[:, 0], centre[:, 1], lines, line)
+        keep &= distance > lines.half_width[line] + room + 3.0
+    tone = 0.3 + 0.5 * random[:, 5]
+    tone = torch.where(random[:, 6] < 0.12, 0.82, tone)
+    rise = (3.0 + 5.0 * random[:, 7]) * (1.0 if kind == _TOWN else 1.3)
+    return BuildingPlan(
+        centre, half, torch.full((count,), angle), tone, rise, torch.full((count,), float(kind != _WORKS))
+    ).where(keep)

@@ -1,0 +1,122 @@
+"""Single frames in PNG files."""
+
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsvib_torch.io.full_scale import known_full_scale
+from rsvib_torch.io.stack_info import StackInfo
+
+__all__ = ["decode_png", "encode_png", "png_info"]
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}  # by colour type, as decoded
+_LARGEST_RATIO = 1100  # pixel bytes per file byte: deflate reaches 1032
+_HEAD = 1 << 16  # bytes in which what comes before the pixels is looked for
+_FULL_SCALE_KEY = b"full_scale"
+
+
+def _chunks(data: bytes, path: Path, last: bytes) -> dict[bytes, bytes]:
+    """The first chunk of each type up to ``last``; checksums and the end of the file are verified."""
+    if data[:8] != _SIGNATURE:
+        raise ValueError(f"{path}: not a PNG file")
+    chunks: dict[bytes, bytes] = {}
+    place = 8
+    while True:
+        length = struct.unpack(">I", data[place : place + 4])[0] if place + 12 <= len(data) else len(data)
+        kind, end = data[place + 4 : place + 8], place + 12 + length
+        if kind == last and last != b"IEND":
+            return chunks
+        if end > len(data):
+            raise ValueError(f"{path}: truncated PNG file")
+        if zlib.crc32(data[place + 4 : end - 4]) != struct.unpack(">I", data[end - 4 : end])[0]:
+            raise ValueError(f"{path}: damaged PNG file (checksum of chunk {kind!r})")
+        body = data[place + 8 : end - 4]
+        if kind == b"tEXt" and body.startswith(_FULL_SCALE_KEY + b"\0"):
+            chunks[_FULL_SCALE_KEY] = body[len(_FULL_SCALE_KEY) + 1 :]
+        chunks.setdefault(kind, body)
+        place = end
+        if kind == b"IEND":
+            return chunks
+
+
+def _resolution(chunks: dict[bytes, bytes]) -> tuple[float, float, str] | None:
+    body = chunks.get(b"pHYs", b"")
+    if len(body) != 9 or body[8] != 1:
+        return None
+    x, y = struct.unpack(">II", body[:8])
+    return (x / 100.0, y / 100.0, "centimeter") if min(x, y) > 0 else None
+
+
+def _info(chunks: dict[bytes, bytes], size: int, path: Path) -> StackInfo:
+    header = chunks.get(b"IHDR", b"")
+    if len(header) != 13:
+        raise ValueError(f"{path}: damaged PNG file (no header)")
+    width, height, bits, colour = struct.unpack(">IIBB", header[:10])
+    channels = 4 if b"tRNS" in chunks else _CHANNELS.get(colour, 0)
+    if min(width, height, channels) < 1 or width * height * channels * bits // 8 > _LARGEST_RATIO * size:
+        raise ValueError(f"{path}: its header promises {width} x {height} px, which {size} bytes cannot hold")
+    dtype = np.dtype(np.uint16 if bits == 16 else np.uint8)
+    stated = None
+    if _FULL_SCALE_KEY in chunks:
+        try:
+            stated = float(chunks[_FULL_SCALE_KEY])
+        except ValueError as error:
+            raise ValueError(f"{path}: full_scale in the file is {chunks[_FULL_SCALE_KEY]!r}, not a number") from error
+    shape = (1, height, width) if channels == 1 else (1, channels, height, width)
+    full_scale = known_full_scale(dtype, stated)
+    return StackInfo(shape, dtype.name, full_scale, resolution=_resolution(chunks), channels_last=channels > 1)
+
+
+def png_info(path: Path) -> StackInfo:
+    """What one PNG file says of itself, as a stack of one frame."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+        try:
+            chunks = _chunks(head, path, b"IDAT")
+        except ValueError:
+            chunks = _chunks(head + file.read(), path, b"IDAT")
+    return _info(chunks, path.stat().st_size, path)
+
+
+def decode_png(path: Path) -> NDArray[Any]:
+    """Pixels of a PNG file, (H, W) or (C, H, W) with channels RGB or RGBA."""
+    data = path.read_bytes()
+    _info(_chunks(data, path, b"IEND"), len(data), path)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise ValueError(f"{path}: the PNG file cannot be decoded ({error.err})") from error
+    if pixels is None:
+        raise ValueError(f"{path}: the PNG file cannot be decoded")
+    if pixels.ndim == 3:
+        order = (2, 1, 0, 3)[: pixels.shape[-1]]
+        pixels = np.moveaxis(pixels[..., order], -1, 0)
+    return np.asarray(pixels)
+
+
+def encode_png(path: Path, frame: NDArray[Any], info: StackInfo) -> None:
+    """Write one frame (H, W) or (C, H, W); full scale and resolution go into chunks of their own."""
+    if frame.ndim == 3:
+        frame = np.moveaxis(frame, 0, -1)[..., (2, 1, 0, 3)[: frame.shape[0]] if frame.shape[0] > 1 else (0,)]
+    done, encoded = cv2.imencode(".png", np.ascontiguousarray(frame))
+    if not done:
+        raise ValueError(f"{path}: frames of shape {frame.shape} {frame.dtype} cannot be written as PNG")
+    data, added = encoded.tobytes(), b""
+    if info.full_scale is not None:
+        added += _chunk(b"tEXt", _FULL_SCALE_KEY + b"\0" + f"{info.full_scale:.17g}".encode())
+    if info.resolution is not None:
+        per_metre = 100.0 if info.resolution[2] == "centimeter" else 100.0 / 2.54
+        x, y = (round(value * per_metre) for value in info.resolution[:2])
+        added += _chunk(b"pHYs", struct.pack(">IIB", x, y, 1))
+    start = 8 + 25  # signature and header
+    path.write_bytes(data[:start] + added + data[start:])
+
+
+def _chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))

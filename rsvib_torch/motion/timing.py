@@ -1,0 +1,180 @@
+"""When each row of each frame of a rolling-shutter sensor is exposed."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+
+__all__ = ["SensorTiming", "check_timing"]
+
+_SCAN_AXES: dict[object, int] = {-2: -2, "y": -2, -1: -1, "x": -1}
+
+
+@dataclass(frozen=True)
+class SensorTiming:
+    """Timing of a rolling-shutter sensor (Liu et al. 2023, Figure 1).
+
+    Row ``i`` of frame ``p`` starts its exposure at ``frame_start(p) + i row_time``, with
+    ``frame_start(p) = p frame_rows row_time`` unless ``frame_start_times`` says otherwise, and is exposed for
+    ``exposure_rows row_time``. Row 0 is the row that is read first. Nothing has a default that would be a guess:
+    ``frame_rows`` counts blanking rows and is not the image height.
+
+    Args:
+        row_time: Time between the exposure starts of two neighbouring rows, in seconds.
+        exposure_rows: Exposure time in row times (may be fractional).
+        frame_rows: Row times between the exposure starts of one row in consecutive frames.
+        scan_axis: Axis along which rows follow each other in the image: ``-2`` (or ``"y"``, the default: rows are
+            image rows) or ``-1`` (or ``"x"``: image columns are exposed one after another).
+        readout_direction: ``"forward"`` when the row at index 0 of the scan axis is read first, ``"reverse"`` when
+            the last one is.
+        frame_start_times: Exposure start of the first row of each frame in seconds, where frames are not evenly
+            spaced (dropped frames, uneven clocks); strictly increasing.
+
+    Raises:
+        ValueError: If a value is out of range, or looks like another unit (a row time over 10 ms, a frame period
+            over 10 s).
+        TypeError: If a value is not a number.
+
+    Example:
+        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+        >>> round(timing.frame_rate, 2)
+        23.8
+        >>> SensorTiming(row_time=20.52, exposure_rows=20, frame_rows=2048)
+        Traceback (most recent call last):
+        ...
+        ValueError: row_time=20.52 s is longer than 10 ms; row_time is in seconds (20.52 us is 20.52e-6)
+    """
+
+    row_time: float
+    exposure_rows: float
+    frame_rows: float
+    scan_axis: Literal[-2, -1, "y", "x"] = -2
+    readout_direction: Literal["forward", "reverse"] = "forward"
+    frame_start_times: Sequence[float] | Tensor | None = None
+
+    def __post_init__(self) -> None:
+        row_time = check_number("row_time", self.row_time, above=0.0)
+        if row_time > 10e-3:
+            raise ValueError(
+                f"row_time={row_time:g} s is longer than 10 ms; row_time is in seconds "
+                f"({row_time:g} us is {row_time:g}e-6)"
+            )
+        exposure_rows = check_number("exposure_rows", self.exposure_rows, above=0.0)
+        frame_rows = check_number("frame_rows", self.frame_rows, above=0.0)
+        if frame_rows * row_time > 10.0:
+            raise ValueError(
+                f"frame_rows={frame_rows:g} times row_time={row_time:g} s is a frame period of "
+                f"{frame_rows * row_time:g} s, longer than 10 s; row_time is in seconds, frame_rows in row times"
+            )
+        if exposure_rows > frame_rows:
+            raise ValueError(
+                f"exposure_rows={exposure_rows:g} exceeds the frame period of frame_rows={frame_rows:g} row times"
+            )
+        if isinstance(self.scan_axis, bool) or self.scan_axis not in _SCAN_AXES:
+            raise ValueError(f"scan_axis must be -2 ('y') or -1 ('x'), got {self.scan_axis!r}")
+        check_choice("readout_direction", self.readout_direction, ("forward", "reverse"))
+        object.__setattr__(self, "row_time", row_time)
+        object.__setattr__(self, "exposure_rows", exposure_rows)
+        object.__setattr__(self, "frame_rows", frame_rows)
+        object.__setattr__(self, "scan_axis", _SCAN_AXES[self.scan_axis])
+        if self.frame_start_times is not None:
+            times = torch.as_tensor(self.frame_start_times, dtype=torch.float64).flatten().tolist()
+            starts = tuple(check_number("frame_start_times", start) for start in times)
+            if any(later <= earlier for earlier, later in itertools.pairwise(starts)):
+                raise ValueError("frame_start_times must be strictly increasing (seconds)")
+            object.__setattr__(self, "frame_start_times", starts)
+
+    @classmethod
+    def line_sensors(
+        cls, line_time: float, delays: Sequence[float], num_lines: int, exposure_lines: float = 1.0
+    ) -> "SensorTiming":
+        """Timing of images that several lines of a push-broom sensor (or its bands) take of the same ground.
+
+        Every image is taken line by line while the ground moves on; the lines see the same ground one after another.
+        Registered to the ground, their images are frames whose rows are read at the same pace, each begun its delay
+        later: parallax pairs tell the jitter of the platform as frames of a rolling shutter do, and are blind to
+        frequencies that are multiples of one over all delays.
+
+        Args:
+            line_time: Time between lines, in seconds.
+            delays: Time from when the first line sees the ground until each of the lines does, in seconds, increasing;
+                0 for the first.
+            num_lines: Lines of the images.
+            exposure_lines: Exposure in line times; stages of time-delayed integration count.
+
+        Example:
+            >>> pair = SensorTiming.line_sensors(line_time=1e-4, delays=[0.0, 0.04], num_lines=5000)
+            >>> pair.frame_starts(2).tolist()
+            [0.0, 0.04]
+        """
+        lines = check_whole_number("num_lines", num_lines, at_least=1)
+        if len(delays) < 2:
+            raise ValueError(f"delays must name two lines or more, got {list(delays)}")
+        return cls(
+            row_time=line_time,
+            exposure_rows=exposure_lines,
+            frame_rows=max(lines, exposure_lines),
+            frame_start_times=tuple(delays),
+        )
+
+    @property
+    def exposure_time(self) -> float:
+        """Exposure time T_e = N_e T_row in seconds."""
+        return self.exposure_rows * self.row_time
+
+    @property
+    def frame_period(self) -> float:
+        """Time m T_row between the exposure starts of consecutive frames in seconds."""
+        return self.frame_rows * self.row_time
+
+    @property
+    def frame_rate(self) -> float:
+        """Frames per second."""
+        return 1.0 / self.frame_period
+
+    def frame_starts(self, num_frames: int, device: torch.device | str | None = None) -> Tensor:
+        """Exposure start of the first row of the first ``num_frames`` frames, in seconds.
+
+        Returns:
+            float64 tensor of shape (num_frames,).
+
+        Raises:
+            ValueError: If ``frame_start_times`` has fewer entries than frames are asked for.
+        """
+        if self.frame_start_times is None:
+            return torch.arange(num_frames, dtype=torch.float64, device=device) * self.frame_period
+        if len(self.frame_start_times) < num_frames:
+            raise ValueError(f"frame_start_times has {len(self.frame_start_times)} entries for {num_frames} frames")
+        return torch.tensor(self.frame_start_times[:num_frames], dtype=torch.float64, device=device)
+
+    def row_starts(self, num_frames: int, num_rows: int, device: torch.device | str | None = None) -> Tensor:
+        """Exposure start of every row of every frame, in seconds.
+
+        Returns:
+            float64 tensor of shape (num_frames, num_rows); row 0 is the row read first.
+        """
+        rows = torch.arange(num_rows, dtype=torch.float64, device=device)
+        return self.frame_starts(num_frames, device)[:, None] + rows * self.row_time
+
+    def check_rows(self, num_rows: int) -> None:
+        """Raise a ``ValueError`` if a frame of ``num_rows`` rows cannot come from this sensor."""
+        if self.frame_rows < num_rows:
+            raise ValueError(
+                f"frame_rows={self.frame_rows:g} is less than the {num_rows} rows of the frames; it counts the row "
+                "times from one frame to the next, blanking rows included"
+            )
+
+    def in_row_order(self) -> "SensorTiming":
+        """The same timing for frames already turned to row order (rows on axis -2, first row read first)."""
+        return replace(self, scan_axis=-2, readout_direction="forward")
+
+
+def check_timing(value: object) -> None:
+    """Raise a ``TypeError`` unless ``value`` is a ``SensorTiming``."""
+    if not isinstance(value, SensorTiming):
+        raise TypeError(f"timing must be a SensorTiming, got {type(value).__name__}")

@@ -1,0 +1,1 @@
+"""Results on disk: JSON and CSV files, plots and HTML pages."""

@@ -1,0 +1,1 @@
+"""Exact restoration: all rows of all frames are solved together, frequency by frequency."""

@@ -1,0 +1,106 @@
+"""Where the pixels of a restored frame are found: scene coordinates, reference shift, visibility."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order, vibration_to_row_order
+from rsvib_torch.imaging.coupling import rows_showing
+from rsvib_torch.motion.spline import rest_reach
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
+
+__all__ = ["FrameMotion", "frame_motion", "visible_pixels"]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMotion:
+    """Motion of every frame of a batch of stacks, in row order, relative to the frame's own reference shift.
+
+    A restored frame shows the scene at rest, moved by ``shift``: the uniform image motion at the middle of the frame
+    in whole pixels, so that a push-scan frame is restored where it looks. Without image motion the shift is zero.
+
+    Attributes:
+        vibration: The motion, batch shape (B,).
+        timing: The sensor, in row order.
+        frame_starts: (T,) seconds.
+        shift: (B, T, 2) whole px, axes (x, y), float64.
+    """
+
+    vibration: Vibration
+    timing: SensorTiming
+    frame_starts: Tensor
+    shift: Tensor
+
+    def frame_rows(self, scene_rows: Tensor) -> Tensor:
+        """Frame rows (B, T, S) that show rows (S,) of the restored frames."""
+        return rows_showing(
+            scene_rows - self.shift[..., 1, None], self.frame_starts[:, None], self.timing, self.vibration
+        )
+
+    def reaches(self, num_rows: int) -> list[int]:
+        """For each stack, a bound on the displacement along one of ``num_rows`` rows, beyond the shift, in whole px."""
+        half = 0.5 * (num_rows * self.timing.row_time + self.timing.exposure_time)
+        swing = (self.vibration.amplitude.detach().sum(-1) + rest_reach(self.vibration))[:, None]
+        acceleration = self.vibration.image_acceleration.detach()[:, None]
+        speed = self.vibration.image_motion.detach()[:, None] + acceleration * (self.frame_starts + half)[:, None]
+        bound = swing + speed.abs() * half + 0.5 * acceleration.abs() * half**2
+        return [math.ceil(reach + 0.5) for reach in bound[..., 0].amax(1).tolist()]
+
+    def reach(self, num_rows: int) -> int:
+        """The largest of ``reaches``."""
+        return max(self.reaches(num_rows))
+
+    def row_starts(self, frame_rows: Tensor) -> Tensor:
+        """Exposure starts of frame rows (B, T, S) in seconds."""
+        return self.frame_starts[:, None] + frame_rows * self.timing.row_time
+
+
+def frame_motion(vibration: Vibration, timing: SensorTiming, num_frames: int, num_rows: int) -> FrameMotion:
+    """Motion of ``num_frames`` frames of ``num_rows`` rows for a vibration of batch shape (B,) in row order."""
+    starts = timing.frame_starts(num_frames, vibration.device)
+    middle = starts + 0.5 * ((num_rows - 1) * timing.row_time + timing.exposure_time)
+    shift = vibration.drift(middle.expand(len(vibration.amplitude), -1)).detach().round()
+    return FrameMotion(vibration, timing, starts, shift)
+
+
+def visible_pixels(
+    timing: SensorTiming, vibration: Vibration, size: tuple[int, int], num_frames: int
+) -> tuple[Tensor, Tensor]:
+    """Pixels of the restored frames that the frames really show, and where the restored frames look.
+
+    What lies outside was never exposed: restoration continues the frame there by mirroring.
+
+    Args:
+        timing: The sensor.
+        vibration: The motion, in image axes; batch shape () or (B,).
+        size: (height, width) of the frames.
+        num_frames: Number of frames T.
+
+    Returns:
+        Boolean mask (T, H, W) or (B, T, H, W), and the whole-pixel shift (T, 2) or (B, T, 2), axes (x, y), by which
+        content of the scene at rest is moved in each restored frame (zero without image motion).
+
+    Example:
+        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
+        >>> mask, shift = visible_pixels(timing, Vibration(2.0, 50.0), (512, 64), 2)
+        >>> mask.shape, mask[:, 4:-4, 4:-4].all().item(), mask.all().item()
+        (torch.Size([2, 512, 64]), True, False)
+    """
+    check_whole_number("num_frames", num_frames, at_least=1)
+    height, width = size if timing.scan_axis == -2 else (size[1], size[0])
+    batch = vibration.batch_shape
+    rowwise = vibration_to_row_order(vibration, timing)
+    rowwise = rowwise if batch else rowwise.expanded(1)
+    motion = frame_motion(rowwise, timing.in_row_order(), num_frames, height)
+    rows = motion.frame_rows(torch.arange(height, dtype=torch.float64, device=vibration.device))
+    starts = motion.row_starts(rows)
+    displacement = rowwise.mean_displacement(starts, timing.exposure_time)[..., 0] - motion.shift[..., 0, None]
+    columns = torch.arange(width, device=vibration.device) + displacement[..., None]
+    seen_rows = ((rows >= 0) & (rows <= height - 1))[..., None]
+    mask = frames_from_row_order(seen_rows & (columns >= 0) & (columns <= width - 1), timing)
+    shift = offsets_from_row_order(motion.shift, timing)
+    return (mask, shift) if batch else (mask[0], shift[0])

@@ -1,0 +1,65 @@
+"""What restoration makes of noise, found by sending some through it."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.frames.orientation import as_float_frames
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.restoration.noise.single_frame import estimate_noise
+from rsvib_torch.restoration.restore import restore
+
+__all__ = ["predict_noise_gain"]
+
+_RIM = 16  # px that are not counted
+_QUIETEST = 1e-4  # of full scale; below, rounding would be measured
+
+
+def predict_noise_gain(
+    frames: Tensor,
+    timing: SensorTiming,
+    vibration: Vibration,
+    *,
+    columns: int = 256,
+    full_scale: float | None = None,
+    **options: Any,
+) -> Tensor:
+    """Standard deviation of noise after restoration over that before it.
+
+    Restoration is all but linear in the frames: known white noise, half as strong as that of the frames, is added to
+    a strip of them, and the difference that it makes is measured. 1 leaves noise as it is, less smooths it, more is
+    the price of undoing blur.
+
+    Args:
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W).
+        timing: The sensor.
+        vibration: The motion.
+        columns: Width of the strip across the scan, from the middle of the frames.
+        full_scale: As in ``restore``.
+        **options: As in ``restore``, method and options of the method.
+
+    Returns:
+        Scalar, float64.
+
+    Example:
+        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
+        >>> frames = torch.rand(1, 96, 96, generator=torch.Generator().manual_seed(0))
+        >>> round(predict_noise_gain(frames, timing, Vibration.still(), method="dewarp").item(), 1)
+        1.0
+    """
+    count = check_whole_number("columns", columns, at_least=4 * _RIM)
+    images = as_float_frames(frames, full_scale).to(torch.float64)
+    across = -1 if timing.scan_axis == -2 else -2
+    width = images.shape[across]
+    strip = images.narrow(across, max(0, (width - count) // 2), min(count, width))
+    level = 0.5 * estimate_noise(strip).square().mean().sqrt().clamp(min=_QUIETEST)
+    generator = torch.Generator(strip.device).manual_seed(0)
+    probe = level * torch.randn(strip.shape, generator=generator, dtype=strip.dtype, device=strip.device)
+    plain, probed = (
+        restore(images, timing, vibration, check=False, **options)[..., _RIM:-_RIM, _RIM:-_RIM]
+        for images in (strip, strip + probe)
+    )
+    return (probed - plain).square().mean().sqrt() / probe.square().mean().sqrt()

@@ -1,0 +1,132 @@
+"""How a scene that is fitted to frames explains them, at a sample of their rows and frequencies."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.banded_solver import BandedFactor, factor_skewed
+from rsvib_torch.core.fourier import squared_modulus, waves
+from rsvib_torch.restoration.scene_model.row_prior import ORDER
+from rsvib_torch.restoration.scene_model.row_system import (
+    RowKernels,
+    SceneRows,
+    SmoothBand,
+    smooth_band,
+    smooth_kernels,
+)
+
+__all__ = ["Explained", "SampledRows", "sample_rows"]
+
+_STEP = 1.2  # in the strength of a prior, for a derivative
+_SLAB = 128  # rows
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """What fits with n priors leave of the rows, frequency by frequency.
+
+    Attributes:
+        power: (n, F) squared residuals of all rows, mean over channels, in units of the noise of one pixel.
+        freedom: (n, F) how many values the fit follows.
+        count: Rows that count.
+    """
+
+    power: Tensor
+    freedom: Tensor
+    count: int
+
+    def joined(self, other: "Explained") -> "Explained":
+        """With what fits of the same rows with other priors leave."""
+        power, freedom = (torch.cat(pair) for pair in ((self.power, other.power), (self.freedom, other.freedom)))
+        return Explained(power, freedom, self.count)
+
+
+@dataclass(frozen=True, eq=False)
+class SampledRows:
+    """Rows of M images at F frequencies, in n slabs, and the K coefficients of the scene that each slab sees.
+
+    Slabs are explained side by side, each as if there were no other: a step costs little more for all than for one.
+
+    Attributes:
+        u: (F,) frequencies in cycles per px.
+        spectra: (M R, C, F), the phase of each row's middle taken off.
+        taps: Kernels (M R, 1, F), one tap after the other.
+        base: (M R,) first coefficient of each row's kernel, of n K: one slab after the other.
+        weight: (M R, 1, 1) how much each row counts.
+        normal: The normal matrices, one window for each slab.
+        energy: Of the taper and of all channels, that powers are divided by.
+    """
+
+    u: Tensor
+    spectra: Tensor
+    taps: list[Tensor]
+    base: Tensor
+    weight: Tensor
+    normal: SmoothBand
+    energy: Tensor
+
+    def explain(self, precisions: Sequence[Tensor]) -> Explained:
+        """Fit the scene with each of n priors, products (p + 1, p + 1, F) as from ``RowPrior.precision``."""
+        number, many = len(precisions), len(precisions) * len(self.u)
+        slabs, rows = self.normal.left.shape[2], len(self.normal.left) - self.normal.width
+        # each prior once as it is and once a little stronger, all in one batch
+        products = torch.cat([*precisions, *(_STEP * products for products in precisions)], dim=-1)
+        factor = factor_skewed(self.normal.at(self.u.repeat(2 * number), products))
+        logs = factor.pivots.log().to(torch.float64).sum(0).unflatten(-1, (slabs, -1)).sum(0)
+        growth = (logs[many:] - logs[:many]) / math.log(_STEP)
+        right = self.spectra.new_zeros(slabs * rows, *self.spectra.shape[1:])
+        for i, tap in enumerate(self.taps):
+            right.index_add_(0, self.base + i, tap.conj() * self.spectra * self.weight)
+        sides = right.unflatten(0, (slabs, rows)).movedim(0, 2).repeat(1, 1, 1, number).flatten(-2)
+        as_they_are = (
+            values.unflatten(-1, (slabs, -1))[..., :many].flatten(-2) for values in (factor.skewed, factor.inverse)
+        )
+        solved = BandedFactor(*as_they_are).solve(sides).unflatten(-1, (slabs, -1))
+        fitted = solved.movedim(2, 0).flatten(0, 1).unflatten(-1, (number, -1))
+        residual = self.spectra[..., None, :] - sum(
+            tap[..., None, :] * fitted[self.base + i] for i, tap in enumerate(self.taps)
+        )
+        power = (self.weight[..., None] * squared_modulus(residual)).sum((0, 1)).to(torch.float64) / self.energy
+        freedom = (slabs * rows - growth).unflatten(-1, (number, -1))
+        return Explained(power, freedom, int((self.weight > 0).sum()))
+
+
+def sample_rows(images: Tensor, kernels: RowKernels, chosen: Tensor) -> SampledRows:
+    """Take the spectra of tapered rows at a few frequencies, in slabs of rows that are few but enough each.
+
+    Args:
+        images: (M, C, R, W); up to n - 1 rows, which n slabs of one height leave over, do not count.
+        kernels: How their rows see the scene.
+        chosen: (F,) whole numbers of cycles in W px.
+    """
+    slabs = max(1, images.shape[-2] // _SLAB)
+    height, width = images.shape[-2] // slabs, images.shape[-1]
+    count = slabs * height
+    images, kernels = images[..., :count, :], kernels.rows(0, count)
+    taper = torch.hann_window(width + 2, periodic=False, dtype=images.dtype, device=images.device)[1:-1]
+    u = chosen / width
+    angle = (-2 * torch.pi) * (torch.arange(width, device=u.device)[:, None] * chosen % width) / width
+    angle = angle.to(torch.float64)
+    tapered = (taper[:, None] * torch.cat([angle.cos(), angle.sin()], dim=-1)).to(images.dtype)
+    mean = images.mean((-2, -1), keepdim=True)
+    spectra = images @ tapered - mean * tapered.sum(0)
+    spectra = torch.complex(*spectra.chunk(2, dim=-1)).transpose(1, 2)  # (M, R, C, F)
+    spectra = spectra * waves(kernels.middle, -u).to(spectra.dtype)[:, :, None]
+    taps = [tap[:, None] for tap in smooth_kernels(kernels, images.dtype).taps(u)]
+    slab = torch.arange(count, device=u.device) // height
+    place = kernels.first - slab * height
+    rows = int(place.amax() - place.amin()) + len(taps)
+    apart = replace(kernels, first=place - place.amin() + slab * rows)
+    normal = smooth_band(apart, SceneRows(0, slabs * rows), max(len(taps) - 1, ORDER), ORDER, images.dtype)
+    return SampledRows(
+        u,
+        spectra.flatten(0, 1),
+        taps,
+        apart.first.flatten(),
+        kernels.weight.to(images.dtype).flatten()[:, None, None],
+        normal.apart(slabs),
+        images.shape[1] * taper.square().sum().to(torch.float64),
+    )

@@ -1,0 +1,1 @@
+"""Verdict on a restoration, without knowledge of the true scene."""

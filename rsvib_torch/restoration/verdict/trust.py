@@ -1,0 +1,140 @@
+"""Which part of a detected vibration may be undone: an axis that is not known well enough is left alone."""
+
+import math
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
+
+__all__ = ["Detected", "displacement_uncertainty", "trusted_vibration", "vibration_to_undo"]
+
+_WORTH_UNDOING = 0.5  # of the mean square displacement; an uncertainty beyond would leave more than it takes
+_MEASURED = 4.0  # standard deviations above which an image motion counts as measured
+
+
+class Detected(Protocol):
+    """A vibration with its standard deviations and a verdict, as ``detect_vibration`` returns it."""
+
+    @property
+    def vibration(self) -> Vibration:
+        """The vibration in image axes, of batch shape () or (B,)."""
+
+    @property
+    def std(self) -> Any:
+        """Standard deviations ``amplitude``, ``frequency``, ``phase``, ``image_motion``, shaped as the vibration's."""
+
+    @property
+    def reliable(self) -> Any:
+        """(..., 2) verdict for each axis."""
+
+    @property
+    def reasons(self) -> tuple[Any, ...]:
+        """Why not, for each axis (x, y); a tuple of those for a batch."""
+
+
+def displacement_uncertainty(
+    vibration: Vibration, std: Any, timing: SensorTiming, num_frames: int, num_rows: int
+) -> tuple[Tensor, Tensor]:
+    """Root-mean-square error of the rows' displacement that standard deviations imply, and the displacement itself.
+
+    From ``A sinc(f T_e) sin(2 pi f t + phi)``: ``(std_A^2 + A^2 std_angle^2) / 2`` a tone, averaged over its period.
+    The phase is given at the time origin, but is known best in the middle of the record: there, the part of its
+    variance that comes from the frequency is taken off, and grows again with the distance from the middle.
+
+    Args:
+        vibration: What was detected, batch shape () or (B,).
+        std: Its standard deviations.
+        timing: The sensor.
+        num_frames: Frames of the stack.
+        num_rows: Rows of a frame, along the scan axis.
+
+    Returns:
+        Uncertainty and displacement (..., 2) in px, axes (x, y), float64; image motion is not part of either.
+    """
+    starts = timing.frame_starts(num_frames)
+    first, last = float(starts[0]), float(starts[-1]) + num_rows * timing.row_time
+    middle, spread = 0.5 * (first + last), (last - first) ** 2 / 12.0
+    amplitude, moving = vibration.amplitude, vibration.amplitude > 0
+    turn = (2 * math.pi * std.frequency.to(amplitude)).square()
+    angle = (std.phase.to(amplitude).square() - turn * middle**2).clamp(min=0.0) + turn * spread
+    seen = 0.5 * torch.sinc(vibration.frequency * timing.exposure_time).square()
+    variance = seen * (std.amplitude.to(amplitude).square() + amplitude.square() * angle)
+    variance = torch.where(moving, variance.nan_to_num(nan=math.inf), 0.0)
+    return variance.sum(-1).sqrt(), (seen * amplitude.square()).sum(-1).sqrt()
+
+
+def trusted_vibration(
+    detected: Detected, timing: SensorTiming, num_frames: int, num_rows: int
+) -> tuple[Vibration, tuple[str, ...]]:
+    """The part of a detected vibration that is known well enough to be undone.
+
+    An axis that is not reliable, or whose displacement is so uncertain that undoing it would not take away half of
+    its mean square, is taken as not vibrating. Its image motion stays where it was measured (4 standard deviations).
+
+    Args:
+        detected: A detection.
+        timing: The sensor.
+        num_frames: Frames to restore.
+        num_rows: Rows of a frame, along the scan axis.
+
+    Returns:
+        The vibration, and one sentence for each axis that is left alone.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
+        >>> found = Vibration([3.0, 2.0], [50.0, 30.0])
+        >>> small = SimpleNamespace(**{name: 0.01 * torch.ones_like(getattr(found, name)) for name in vars(found)})
+        >>> doubtful = SimpleNamespace(vibration=found, std=small, reliable=(True, False), reasons=((), ("blind",)))
+        >>> vibration, notes = trusted_vibration(doubtful, timing, 2, 512)
+        >>> vibration.amplitude.flatten().tolist(), notes
+        ([3.0, 0.0], ('y is left alone: its vibration is not reliable (blind)',))
+    """
+    vibration, std = detected.vibration, detected.std
+    reliable = torch.as_tensor(detected.reliable, dtype=torch.bool, device=vibration.device)
+    error, size = (
+        value.to(vibration.device) for value in displacement_uncertainty(vibration, std, timing, num_frames, num_rows)
+    )
+    certain = error.square() <= _WORTH_UNDOING * size.square()
+    motion = vibration.image_motion
+    measured = motion.abs() > _MEASURED * std.image_motion.to(motion)
+    batched = len(vibration.batch_shape) > 0
+    notes = []
+    for index in range(vibration.batch_shape[0] if batched else 1):
+        at = (index,) if batched else ()
+        reasons = detected.reasons[index] if batched else detected.reasons
+        where = f"stack {index}: " if batched else ""
+        for axis, name in enumerate("xy"):
+            here = (*at, axis)
+            if not bool(reliable[here]):
+                notes.append(f"{where}{name} is left alone: its vibration is not reliable ({'; '.join(reasons[axis])})")
+            elif not bool(certain[here]):
+                notes.append(
+                    f"{where}{name} is left alone: its displacement of {float(size[here]):.2g} px is only known to "
+                    f"+- {float(error[here]):.2g} px"
+                )
+    keep = reliable & certain
+    drift = keep | measured
+    changed = {"amplitude": vibration.amplitude * keep[..., None], "image_motion": motion * drift}
+    rest = {name: getattr(vibration, name) for name in vibration.__dataclass_fields__ if name not in changed}
+    if "image_acceleration" in rest:
+        rest["image_acceleration"] = rest["image_acceleration"] * drift
+    return Vibration(**changed, **rest), tuple(notes)
+
+
+def vibration_to_undo(
+    vibration: Vibration | Detected, timing: SensorTiming, num_frames: int, num_rows: int
+) -> tuple[Vibration, tuple[str, ...]]:
+    """All of a vibration that was given; of one that was detected the trusted part, and what is left alone.
+
+    Raises:
+        TypeError: If it is neither.
+    """
+    if isinstance(vibration, Vibration):
+        return vibration, ()
+    if not all(hasattr(vibration, name) for name in ("vibration", "std", "reliable", "reasons")):
+        raise TypeError(f"vibration must be a Vibration or a detection, got {type(vibration).__name__}")
+    return trusted_vibration(vibration, timing, num_frames, num_rows)

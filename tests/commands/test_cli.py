@@ -1,0 +1,537 @@
+"""The rsvib command: the whole chain on small frames, and one line for every mistake."""
+
+import csv
+import json
+import math
+import re
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+import torch
+from kornia.filters import gaussian_blur2d
+
+from rsvib_torch import __version__
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.io import read_stack, read_stack_info, write_stack
+
+AMPLITUDE, FREQUENCY, PHASE = (1.6, 1.1), (71.0, 113.0), (0.6, -1.2)
+CONFIG = f"""
+[sensor]
+row_time = 4e-5
+exposure_rows = 12
+frame_rows = 512
+full_scale = 4095
+
+[detection]
+band_rows = 24
+band_step = 8
+search = 8
+
+[simulation]
+frame_size = [448, 256]
+seed = 5
+
+[simulation.vibration]
+amplitude = {list(AMPLITUDE)}
+frequency = {list(FREQUENCY)}
+phase = {list(PHASE)}
+
+[simulation.noise]
+read_noise = 0.003
+"""
+
+
+@pytest.fixture(scope="module", name="place")
+def make_place(tmp_path_factory):
+    """A folder with a config, a scene, and the frames that the camera takes of it."""
+    folder = tmp_path_factory.mktemp("camera")
+    (folder / "camera.toml").write_text(CONFIG)
+    texture = torch.rand(1, 1, 512, 320, generator=torch.Generator().manual_seed(11))
+    scene = gaussian_blur2d(texture, (9, 9), (1.2, 1.2))[0]
+    scene = (scene - scene.min()) / (scene.max() - scene.min())
+    write_stack(folder / "scene.png", scene, dtype="uint16", full_scale=65535)
+    assert run("simulate", folder / "scene.png", folder / "frames.tif", "--config", folder / "camera.toml") == 0
+    return folder
+
+
+def run(*arguments):
+    return run_command([str(argument) for argument in arguments])
+
+
+def still_frame(place):
+    """What a still camera would have seen."""
+    scene = read_stack(place / "scene.png")[0]
+    return scene[32 : 32 + 448, 32 : 32 + 256]
+
+
+def psnr(frames, reference):
+    inner = (..., slice(24, -24), slice(24, -24))
+    return (-10 * torch.log10((frames[inner] - reference[inner]).square().mean((-2, -1)))).tolist()
+
+
+def check_detection(folder):
+    data = json.loads((folder / "vibration.json").read_text())
+    for axis in range(2):
+        assert data["vibration"]["amplitude"][axis][0] == pytest.approx(AMPLITUDE[axis], rel=0.02)
+        assert data["vibration"]["frequency"][axis][0] == pytest.approx(FREQUENCY[axis], rel=0.01)
+        turn = data["vibration"]["phase"][axis][0] - PHASE[axis]
+        assert abs(math.remainder(turn, 2 * math.pi)) < 0.05 * math.pi
+    assert data["reliable"] == [True, True]
+    with (folder / "offsets.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    misfit = [abs(float(line["offset_x_px"]) - float(line["fitted_x_px"])) for line in lines if line["offset_x_px"]]
+    assert len(misfit) > 40
+    assert np.mean(misfit) < 0.05
+    assert cv2.imread(str(folder / "offsets.png")).std() > 5
+
+
+def test_simulated_frames_are_counts_of_the_camera(place):
+    info = read_stack_info(place / "frames.tif")
+    assert (info.shape, info.dtype, info.full_scale) == ((2, 448, 256), "uint16", 4095.0)
+    assert tifffile.imread(place / "frames.tif").max() <= 4095
+    assert all(level < 30 for level in psnr(read_stack(place / "frames.tif"), still_frame(place)))
+
+
+def test_detect_then_restore(place, tmp_path, capsys):
+    frames, config, out = place / "frames.tif", place / "camera.toml", tmp_path / "detection"
+    assert run("detect", frames, "--config", config, "--out", out, "--device", "cpu") == 0
+    assert sorted(path.name for path in out.iterdir()) == ["offsets.csv", "offsets.png", "vibration.json"]
+    check_detection(out)
+    shown = capsys.readouterr()
+    assert shown.err == ""
+    assert "amplitude (px)" in shown.out
+    assert re.search(r"\b7[01]\.\d", shown.out)
+    assert shown.out.count("reliable") == 2
+    restored = tmp_path / "restored.tif"
+    assert run("restore", frames, restored, "--config", config, "--vibration", out / "vibration.json") == 0
+    info = read_stack_info(restored)
+    assert (info.shape, info.dtype, info.full_scale) == ((2, 448, 256), "uint16", 4095.0)
+    before, after = (psnr(read_stack(path), still_frame(place)) for path in (frames, restored))
+    assert min(after) - max(before) > 18
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["detection", "restored.tif"]
+
+
+def test_run_does_all_of_it_and_again(place, tmp_path):
+    out = tmp_path / "out"
+    for _ in range(2):
+        assert run("run", place / "frames.tif", out, "--config", place / "camera.toml") == 0
+    names = [
+        "before_after.png",
+        "manifest.json",
+        "offsets.csv",
+        "offsets.png",
+        "restoration.json",
+        "restored.tif",
+        "vibration.json",
+    ]
+    assert sorted(path.name for path in out.iterdir()) == names
+    check_detection(out)
+    assert min(psnr(read_stack(out / "restored.tif"), still_frame(place))) > 38
+    assert cv2.imread(str(out / "before_after.png")).std() > 5
+
+
+def test_other_formats_and_colour(place, tmp_path):
+    frames = read_stack(place / "frames.tif")
+    colour = torch.stack([frames, 0.5 * frames, 0.8 * frames], dim=1)
+    write_stack(tmp_path / "frames", colour, dtype="uint8")
+    assert run("run", tmp_path / "frames", tmp_path / "out", "--config", place / "camera.toml") == 0
+    check_detection(tmp_path / "out")
+    info = read_stack_info(tmp_path / "out" / "restored.tif")
+    assert (info.shape, info.dtype, info.full_scale) == ((2, 3, 448, 256), "uint8", 255.0)
+    write_stack(tmp_path / "frames.npy", frames, dtype="float32")
+    arguments = ("--config", place / "camera.toml", "--vibration", tmp_path / "out" / "vibration.json")
+    assert run("restore", tmp_path / "frames.npy", tmp_path / "restored.npy", *arguments) == 0
+    assert np.load(tmp_path / "restored.npy").dtype == np.float32
+    assert min(psnr(read_stack(tmp_path / "restored.npy"), still_frame(place))) > 38
+
+
+def test_axis_that_is_not_reliable_is_left_alone(place, tmp_path, capsys):
+    frames, config = place / "frames.tif", place / "camera.toml"
+    assert run("detect", frames, "--config", config, "--out", tmp_path) == 0
+    path = tmp_path / "vibration.json"
+    data = json.loads(path.read_text())
+    data.update(reliable=[False, False], reasons=[["blind"], ["too short", "noisy"]])
+    path.write_text(json.dumps(data))
+    capsys.readouterr()
+    assert run("restore", frames, tmp_path / "restored.tif", "--config", config, "--vibration", path) == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[:2] == [
+        "x is left alone: its vibration is not reliable (blind)",
+        "y is left alone: its vibration is not reliable (too short; noisy)",
+    ]
+    difference = read_stack(tmp_path / "restored.tif") - read_stack(frames)
+    assert difference.abs().mean() < 0.01
+
+
+def spoil_vibration(place, folder, change):
+    """A vibration.json that says something else than what was detected."""
+    assert run("detect", place / "frames.tif", "--config", place / "camera.toml", "--out", folder / "detected") == 0
+    data = json.loads((folder / "detected" / "vibration.json").read_text())
+    change(data)
+    (folder / "v.json").write_text(json.dumps(data))
+
+
+def test_a_wrong_vibration_leaves_the_frames_as_they_are_unless_forced(place, tmp_path, capsys):
+    def turn(data):
+        data["vibration"]["phase"] = [[p + 3.0 for p in axis] for axis in data["vibration"]["phase"]]
+
+    spoil_vibration(place, tmp_path, turn)
+    arguments = restore_arguments(place, tmp_path)
+    capsys.readouterr()
+    assert run(*arguments, "--report", tmp_path / "report.json") == 0
+    shown = capsys.readouterr()
+    assert shown.err.startswith("rsvib: warning: restored is no better than raw")
+    assert "--force restores them all the same" in shown.err
+    assert shown.err.count("\n") == 1
+    assert "2 frames as taken" in shown.out
+    assert (tifffile.imread(tmp_path / "r.tif") == tifffile.imread(place / "frames.tif")).all()
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["frames"], report["outcome"], report["pairs"]["outcome"]) == ("as taken", "worse", ["worse"])
+    assert run(*arguments, "--force", "--report", tmp_path / "report.json") == 0
+    assert "restored is no better than raw" in capsys.readouterr().err
+    assert (tifffile.imread(tmp_path / "r.tif") != tifffile.imread(place / "frames.tif")).any()
+    assert json.loads((tmp_path / "report.json").read_text())["frames"] == "restored"
+
+
+def test_half_of_the_vibration_is_restored_with_a_warning(place, tmp_path, capsys):
+    def halve(data):
+        data["vibration"]["amplitude"] = [[0.5 * a for a in axis] for axis in data["vibration"]["amplitude"]]
+
+    spoil_vibration(place, tmp_path, halve)
+    capsys.readouterr()
+    assert run(*restore_arguments(place, tmp_path)) == 0
+    shown = capsys.readouterr()
+    assert shown.err.startswith("rsvib: warning: restoration helps in part only: x: frames lie ")
+    assert "2 frames restored" in shown.out
+
+
+def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path, capsys):
+    out = tmp_path / "out"
+    config = tmp_path / "dewarp.toml"
+    config.write_text(CONFIG + "[restoration]\nmethod = 'banded'\nhalf_rows = 8\nsaturation = 4000\n")
+    common = ("run", place / "frames.tif", out, "--config", config)
+    assert run(*common) == 0
+    report = json.loads((out / "restoration.json").read_text())
+    assert report["options"] == {"method": "banded", "half_rows": 8, "saturation": 4000 / 4095}
+    assert (report["outcome"], report["frames"], report["left_alone"]) == ("helps", "restored", [])
+    assert "restored frames agree; estimated gain +" in capsys.readouterr().out
+    # options of the config's method go with it
+    assert run(*common, "--method", "exact", "--joint", "all", "--saturation", 4095) == 0
+    report = json.loads((out / "restoration.json").read_text())
+    assert report["options"] == {"method": "exact", "joint": True, "saturation": 1.0}
+    assert read_stack_info(out / "restored.tif").shape == (1, 448, 256)
+    assert min(psnr(read_stack(out / "restored.tif"), still_frame(place))) > 40
+    assert run(*common, "--method", "richardson-lucy", "--joint", "all") == 0
+    assert read_stack_info(out / "restored.tif").shape == (1, 448, 256)
+    assert min(psnr(read_stack(out / "restored.tif"), still_frame(place))) > 40
+    capsys.readouterr()
+    for options, message in (
+        (("--method", "magic"), "method must be one of 'exact', 'banded', 'dewarp'"),
+        (("--method", "dewarp", "--joint", "2"), "method='dewarp' has no option 'joint'; its options are chunk_rows"),
+        (("--method", "exact", "--joint", "many"), "--joint must be 'all' or a number of frames, got 'many'"),
+        (("--saturation", "0"), "saturation must be larger than 0, got 0"),
+    ):
+        assert run(*common, *options) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+
+
+def test_frames_without_a_vibration_are_left_as_they_are(place, tmp_path, capsys):
+    still = still_frame(place).expand(2, -1, -1)
+    noise = 0.003 * torch.randn(still.shape, generator=torch.Generator().manual_seed(1))
+    write_stack(tmp_path / "still.tif", (still + noise).clamp(0, 1), dtype="uint16", full_scale=4095)
+    assert run("run", tmp_path / "still.tif", tmp_path / "out", "--config", place / "camera.toml") == 0
+    shown = capsys.readouterr()
+    assert "there is no vibration to undo: frames are left as they are" in shown.err
+    assert "x is left alone: its vibration is not reliable" in shown.out
+    assert (tifffile.imread(tmp_path / "out" / "restored.tif") == tifffile.imread(tmp_path / "still.tif")).all()
+    assert json.loads((tmp_path / "out" / "restoration.json").read_text())["frames"] == "as taken"
+
+
+def test_saturated_and_missing_pixels(place, tmp_path):
+    frames = read_stack(place / "frames.tif")
+    lamp = frames.clone()
+    lamp[:, 200:204, 100:106] = 1.0
+    write_stack(tmp_path / "lamp.tif", lamp, dtype="uint16", full_scale=4095)
+    lamp[0, 60:63, 60:63] = math.nan
+    write_stack(tmp_path / "holes.npy", lamp, dtype="float32")
+    for name, options in (("lamp.tif", ()), ("holes.npy", ("--saturation", 1.0, "--method", "dewarp"))):
+        out = tmp_path / name.partition(".")[0]
+        assert run("run", tmp_path / name, out, "--config", place / "camera.toml", *options) == 0
+        restored = read_stack(out / "restored.tif")
+        far = restored.clone()
+        far[:, 190:214, 90:116] = still_frame(place)[190:214, 90:116]
+        assert min(psnr(far, still_frame(place))) > 38
+
+
+def test_full_scale_comes_from_option_file_or_config(place, tmp_path, capsys):
+    counts = tifffile.imread(place / "frames.tif")
+    tifffile.imwrite(tmp_path / "plain.tif", counts, photometric="minisblack")
+    arguments = (tmp_path / "plain.tif", "--config", place / "camera.toml", "--out", tmp_path / "out")
+    assert run("detect", *arguments) == 0  # the config knows
+    silent = tmp_path / "silent.toml"
+    silent.write_text(CONFIG.replace("full_scale = 4095", ""))
+    assert run("detect", arguments[0], "--config", silent, "--out", tmp_path / "out", "--full-scale", 4095) == 0
+    capsys.readouterr()
+    assert run("detect", arguments[0], "--config", silent, "--out", tmp_path / "out2") == 2
+    assert "uint16 frames do not say their full scale; state full_scale, e.g. 4095" in capsys.readouterr().err
+    other = tmp_path / "other.toml"
+    other.write_text(CONFIG.replace("4095", "16383"))
+    assert run("detect", place / "frames.tif", "--config", other, "--out", tmp_path / "out2") == 2
+    assert "states full_scale=4095, the config 16383; say which: --full-scale" in capsys.readouterr().err
+    assert run("detect", *arguments, "--full-scale", 100) == 2
+    assert "beyond full_scale=100" in capsys.readouterr().err
+    assert not (tmp_path / "out2").exists()
+
+
+def save_frames(change):
+    def make(place, folder):
+        frames = change(read_stack(place / "frames.tif"))
+        write_stack(folder / "bad.npy", frames)
+        return folder / "bad.npy", place / "camera.toml"
+
+    return make
+
+
+def edit_config(old, new):
+    def make(place, folder):
+        text = (place / "camera.toml").read_text()
+        assert old in text
+        (folder / "bad.toml").write_text(text.replace(old, new))
+        return place / "frames.tif", folder / "bad.toml"
+
+    return make
+
+
+def set_pixel(value):
+    def change(frames):
+        frames[1, 100, 100] = value
+        return frames
+
+    return save_frames(change)
+
+
+def cut_tiff(place, folder):
+    data = (place / "frames.tif").read_bytes()
+    (folder / "bad.tif").write_bytes(data[: len(data) // 2])
+    return folder / "bad.tif", place / "camera.toml"
+
+
+def noise_video(place, folder):
+    (folder / "bad.mp4").write_bytes(np.random.default_rng(1).bytes(4000))
+    return folder / "bad.mp4", place / "camera.toml"
+
+
+def sizes_folder(place, folder):
+    (folder / "bad").mkdir()
+    for index, width in enumerate((256, 250)):
+        cv2.imwrite(str(folder / "bad" / f"{index}.png"), np.zeros((448, width), np.uint8))
+    return folder / "bad", place / "camera.toml"
+
+
+def sizes_tiff(place, folder):
+    with tifffile.TiffWriter(folder / "bad.tif") as tif:
+        for width in (256, 250):
+            tif.write(np.zeros((448, width), np.uint8), metadata=None)
+    return folder / "bad.tif", place / "camera.toml"
+
+
+def missing_frames(place, folder):
+    return folder / "none.tif", place / "camera.toml"
+
+
+def missing_config(place, folder):
+    return place / "frames.tif", folder / "none.toml"
+
+
+BAD_INPUT = {
+    "one frame": (save_frames(lambda f: f[:1]), "at least 2 frames are needed, got 1"),
+    "frame smaller than a band": (save_frames(lambda f: f[:, :20]), "too small for bands of 24 rows"),
+    "Inf pixel": (set_pixel(math.inf), "frames must be finite, but pixel (1, 100, 100) is inf"),
+    "constant frames": (save_frames(lambda f: 0 * f + 0.5), ""),
+    "more rows than the sensor": (save_frames(lambda f: f.repeat(1, 2, 1)), "frame_rows=512 is less than the 896 rows"),
+    "frames of different size, folder": (sizes_folder, "frames of different size or kind"),
+    "frames of different size, TIFF": (sizes_tiff, "frames of different size or kind"),
+    "truncated TIFF": (cut_tiff, "bad.tif: not a readable TIFF stack: "),
+    "unreadable video": (noise_video, "bad.mp4: not a readable video"),
+    "no such frames": (missing_frames, "none.tif does not exist"),
+    "no such config": (missing_config, "none.toml: No such file or directory"),
+    "exposure of 0": (edit_config("exposure_rows = 12", "exposure_rows = 0"), "exposure_rows must be larger than 0"),
+    "row time in ms": (edit_config("4e-5", "0.04"), "row_time=0.04 s is longer than 10 ms; row_time is in seconds"),
+    "frame period": (edit_config("frame_rows = 512", "frame_rows = 512000"), "is a frame period of 20.48 s, longer"),
+    "wrong type": (edit_config("4e-5", "'40 us'"), "sensor.row_time: expected a number, got '40 us'"),
+    "unknown key": (edit_config("band_step", "bandstep"), "detection.bandstep: unknown key; expected one of method"),
+    "missing key": (edit_config("frame_rows = 512", ""), "sensor.frame_rows: missing key; expected a number"),
+    "wrong value": (edit_config("search = 8", "search = 1"), "search must be at least 2, got 1"),
+    "no TOML": (edit_config("[sensor]", "[sensor"), "bad.toml: not a TOML file"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_INPUT)
+@pytest.mark.parametrize("command", ["detect", "run"])
+def test_bad_input_is_one_line_and_leaves_nothing(place, tmp_path, capfd, case, command):
+    make, message = BAD_INPUT[case]
+    frames, config = make(place, tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    target = (tmp_path / "out",) if command == "run" else ("--out", tmp_path / "out")
+    assert run(command, frames, *target, "--config", config) == 2
+    shown = capfd.readouterr()
+    assert shown.err.startswith("rsvib: error: ")
+    assert message in shown.err
+    assert shown.err.count("\n") == 1
+    assert shown.out == ""
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def restore_arguments(place, folder, **change):
+    values = {"frames": place / "frames.tif", "out": folder / "r.tif", "vibration": folder / "v.json", **change}
+    return [
+        "restore",
+        values["frames"],
+        values["out"],
+        "--config",
+        values.get("config", place / "camera.toml"),
+        "--vibration",
+        values["vibration"],
+    ]
+
+
+@pytest.fixture(scope="module", name="vibration_text")
+def detect_once(place):
+    assert run("detect", place / "frames.tif", "--config", place / "camera.toml", "--out", place / "detection") == 0
+    return (place / "detection" / "vibration.json").read_text()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        (
+            '"frame_rows": 512.0',
+            '"frame_rows": 540.0',
+            "the vibration of another camera: detected with frame_rows=540.0",
+        ),
+        ('"scan_axis": "y"', '"scan_axis": "x"', "the vibration of another camera"),
+        ('"phase"', '"phases"', "vibration.phase: missing key"),
+        ('"reliable": [true, true]', '"reliable": [1, true]', "reliable[0]: expected true or false, got 1"),
+        ('"gain": ', '"gain": NaN, "gains": ', "not a vibration.json: NaN is no JSON number"),
+        ("{", "[", "not a vibration.json: "),
+    ],
+)
+def test_bad_vibration_file_is_refused(place, vibration_text, tmp_path, capsys, change):
+    old, new, message = change
+    assert old in vibration_text
+    (tmp_path / "v.json").write_text(vibration_text.replace(old, new, 1))
+    capsys.readouterr()
+    assert run(*restore_arguments(place, tmp_path)) == 2
+    error = capsys.readouterr().err
+    assert f"v.json: {message}" in error
+    assert [path.name for path in tmp_path.iterdir()] == ["v.json"]
+
+
+def test_outputs_that_cannot_be_written(place, vibration_text, tmp_path, capsys, monkeypatch):
+    (tmp_path / "v.json").write_text(vibration_text)
+    (tmp_path / "file").write_text("")
+    frames, config = place / "frames.tif", ("--config", place / "camera.toml")
+    cases = [
+        (restore_arguments(place, tmp_path, out=tmp_path / "none" / "r.tif"), "none does not exist"),
+        (restore_arguments(place, tmp_path, out=tmp_path / "r.xyz"), "unknown file ending '.xyz'"),
+        (restore_arguments(place, tmp_path, out=tmp_path / "r.png"), "a PNG file holds one frame, got 2"),
+        (("detect", frames, *config, "--out", tmp_path / "file"), "a file of that name is there"),
+        (("run", frames, tmp_path / "file" / "out", *config), "file is not writable"),
+        (("simulate", place / "scene.png", tmp_path / "f.mp4", *config), "videos are only read"),
+    ]
+
+    def refuse(*args, **kwargs):
+        raise PermissionError(13, "Permission denied")
+
+    before = sorted(tmp_path.iterdir())
+    capsys.readouterr()
+    for arguments, message in cases:
+        assert run(*arguments) == 2
+        assert message in capsys.readouterr().err
+    monkeypatch.setattr("tempfile.mkdtemp", refuse)
+    for arguments in (("run", frames, tmp_path / "out", *config), restore_arguments(place, tmp_path)):
+        assert run(*arguments) == 2
+        assert f"folder {tmp_path} is not writable (Permission denied)" in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_scenes_that_cannot_be_simulated(place, tmp_path, capsys):
+    silent = tmp_path / "silent.toml"
+    silent.write_text(CONFIG.partition("[simulation]")[0])
+    large = tmp_path / "large.toml"
+    large.write_text(CONFIG.replace("[448, 256]", "[480, 256]"))
+    for scene, config, message in (
+        (place / "frames.tif", place / "camera.toml", "a scene is one image, this file has 2 frames"),
+        (place / "scene.png", silent, "silent.toml: simulation: missing key"),
+        (place / "scene.png", large, "is too small"),
+    ):
+        assert run("simulate", scene, tmp_path / "f.tif", "--config", config) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "f.tif").exists()
+
+
+def test_simulated_noise_has_a_seed(place, tmp_path):
+    for name, seed in (("a", 5), ("b", 6)):
+        arguments = (place / "scene.png", tmp_path / f"{name}.tif", "--config", place / "camera.toml", "--seed", seed)
+        assert run("simulate", *arguments) == 0
+    first, second = (tifffile.imread(tmp_path / f"{name}.tif").astype(float) for name in "ab")
+    assert (first == tifffile.imread(place / "frames.tif")).all()
+    assert np.std(first - second) == pytest.approx(0.003 * 4095 * 2**0.5, rel=0.05)
+
+
+def test_usage_mistakes(capsys, tmp_path):
+    for arguments, message in (
+        (["detect", "f.tif"], "Missing option '--config'"),
+        (["paint"], "No such command 'paint'"),
+        (["detect", "f.tif", "--config", "c.toml", "--out", tmp_path, "--device", "tpu"], "'tpu' is not one of"),
+        (
+            ["detect", "f.tif", "--config", "c.toml", "--out", tmp_path, "--full-scale", "x"],
+            "Invalid value for '--full-scale'",
+        ),
+    ):
+        assert run(*arguments) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("rsvib: error: ")
+        assert message in error
+        assert error.count("\n") == 1
+    assert run() == 0
+    assert "simulate" in capsys.readouterr().out
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"rsvib {__version__}\n"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_gpu_that_is_not_there(place, tmp_path, capsys):
+    arguments = (place / "frames.tif", "--config", place / "camera.toml", "--out", tmp_path / "out")
+    assert run("detect", *arguments, "--device", "cuda") == 2
+    assert capsys.readouterr().err == "rsvib: error: --device cuda: there is no CUDA device here; use auto or cpu\n"
+
+
+def test_warnings_are_one_line(place, tmp_path, capsys, monkeypatch):
+    def warn(*args, **kwargs):
+        warnings.warn("the displacement within a row time\nis large", UserWarning, stacklevel=1)
+        raise ValueError("stopped here")
+
+    monkeypatch.setattr("rsvib_torch.stacks.job.detect_vibration", warn)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert run("run", place / "frames.tif", tmp_path / "out", "--config", place / "camera.toml") == 2
+    assert capsys.readouterr().err == (
+        "rsvib: warning: the displacement within a row time is large\nrsvib: error: stopped here\n"
+    )
+
+
+def test_entry_point():
+    command = Path(sys.executable).with_name("rsvib")
+    done = subprocess.run([command, "detect"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("rsvib: error: ")
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,178 @@
+"""rsvib run, detect and restore of long stacks: in windows, resumed, in memory that is stated."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from scipy import ndimage
+from small_config import CAMERA
+from truth import Motion, take_frames
+
+from rsvib_torch import SensorTiming, read_stack_info
+from rsvib_torch.commands.main import run_command
+
+HEIGHT, WIDTH, FRAMES = 96, 64, 13
+CONFIG = f"""{CAMERA}
+[stack]
+window = 4
+"""
+
+
+def run(*arguments):
+    return run_command([str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module", name="place")
+def make_place(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("long")
+    texture = ndimage.gaussian_filter(np.random.default_rng(4).standard_normal((HEIGHT + 80, WIDTH + 80)), 1.1)
+    scene = np.clip(0.5 + 0.15 * texture / texture.std(), 0, 1)
+    timing = SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
+    motion = Motion(amplitude=(1.2, 0.8), frequency=(130.0, 170.0), phase=(0.3, 0.9))
+    taken = take_frames(scene, timing, motion, FRAMES, noise=0.002, seed=1)
+    counts = np.clip(np.round(taken * 4095), 0, 4095).astype(np.uint16)
+    tifffile.imwrite(folder / "frames.tif", counts, photometric="minisblack", metadata=None)
+    (folder / "camera.toml").write_text(CONFIG)
+    arguments = ("run", folder / "frames.tif", folder / "out", "--config", folder / "camera.toml")
+    assert run(*arguments, "--memory", "2GB", "--workers", 1) == 0
+    return folder
+
+
+def command(place, out, *more):
+    return ("run", place / "frames.tif", out, "--config", place / "camera.toml", *more)
+
+
+def test_run_of_a_long_stack(place, tmp_path, capsys):
+    assert run(*command(place, tmp_path / "out", "--output", "clear.zarr")) == 0
+    shown = capsys.readouterr()
+    assert shown.err == ""
+    assert "13 frames in 4 windows, 4 of them restored, " in shown.out
+    names = ["before_after.png", "clear.zarr", "manifest.json", "windows.csv"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
+    assert read_stack_info(tmp_path / "out" / "clear.zarr").full_scale == 4095
+    with (tmp_path / "out" / "windows.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert [line["first_frame"] for line in lines] == ["0", "3", "6", "9"]
+    for line in lines:
+        assert float(line["amplitude_x"]) == pytest.approx(1.2, rel=0.06)
+        assert float(line["frequency_y"]) == pytest.approx(170, rel=0.03)
+        assert line["frames"] == "restored"
+
+
+def test_detect_in_windows_then_restore(place, tmp_path, capsys):
+    options = ("--config", place / "camera.toml")
+    assert run("detect", place / "frames.tif", *options, "--out", tmp_path / "found", "--memory", "1GB") == 0
+    assert sorted(path.name for path in (tmp_path / "found").iterdir()) == ["manifest.json", "windows.csv"]
+    manifest = tmp_path / "found" / "manifest.json"
+    assert run("restore", place / "frames.tif", tmp_path / "r.tif", *options, "--vibration", manifest) == 0
+    assert (tmp_path / "r.tif").read_bytes() == (place / "out" / "restored.tif").read_bytes()
+    capsys.readouterr()
+    other = tmp_path / "other.toml"
+    other.write_text(CONFIG.replace("frame_rows = 104", "frame_rows = 105"))
+    for config, more, message in (
+        (other, (), "the vibration of another camera: detected with frame_rows=104.0 (here 105.0)"),
+        (place / "camera.toml", ("--report", tmp_path / "report.json"), "--report is for vibration.json"),
+    ):
+        arguments = ("--config", config, "--vibration", manifest, *more)
+        assert run("restore", place / "frames.tif", tmp_path / "o.tif", *arguments) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "o.tif").exists()
+
+
+def test_interrupted_run_says_how_to_go_on(place, tmp_path):
+    counts = np.concatenate([tifffile.imread(place / "frames.tif")] * 8)
+    np.save(tmp_path / "long.npy", counts)
+    out = tmp_path / "out"
+    arguments = ["run", tmp_path / "long.npy", out, "--config", place / "camera.toml", "--workers", "1"]
+    program = Path(sys.executable).with_name("rsvib")
+    journal = out / ".restored.tif.rsvib" / "journal.jsonl"
+    # a shell's background jobs ignore SIGINT, and what they start would inherit that
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    with subprocess.Popen([program, *map(str, arguments)], stderr=subprocess.PIPE, text=True) as process:
+        signal.signal(signal.SIGINT, before)
+        while not journal.exists() or journal.read_bytes().count(b"\n") < 2:
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        error = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    assert error == "rsvib: error: stopped; what is done of a run is kept, --resume goes on with it\n"
+    assert not (out / "restored.tif").exists()
+    done = journal.read_bytes().count(b"\n")
+    assert 2 <= done < 35
+
+
+def test_broken_off_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr("rsvib_torch.stacks.sink.Sink.finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert run(*command(place, out)) == 130
+    assert "--resume goes on with it" in capsys.readouterr().err
+    assert run(*command(place, out)) == 2
+    assert "a run was broken off here after 4 windows; resume it (--resume)" in capsys.readouterr().err
+    assert run(*command(place, out, "--resume", "--window", 5)) == 2
+    assert "cannot resume: settings.window was 4, now it is 5" in capsys.readouterr().err
+    for _ in range(2):  # the second finds it complete
+        assert run(*command(place, out, "--resume")) == 0
+        assert "4 windows were there already" in capsys.readouterr().out
+    assert (out / "restored.tif").read_bytes() == (place / "out" / "restored.tif").read_bytes()
+    assert (out / "manifest.json").read_bytes() == (place / "out" / "manifest.json").read_bytes()
+
+
+def test_bad_frames_are_told(place, tmp_path, capsys):
+    counts = tifffile.imread(place / "frames.tif")
+    counts[4] = 0
+    np.save(tmp_path / "frames.npy", counts)
+    arguments = ("run", tmp_path / "frames.npy", tmp_path / "out", "--config", place / "camera.toml")
+    assert run(*arguments, "--bad-frames", "skip") == 0
+    assert "warning: 1 frames could not be used: see manifest.json" in capsys.readouterr().err
+    assert read_stack_info(tmp_path / "out" / "restored.tif").shape == (FRAMES - 1, HEIGHT, WIDTH)
+    assert list(json.loads((tmp_path / "out" / "manifest.json").read_text())["bad_frames"]) == ["4"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--memory", "much"), "memory must be like '2GB' or '500MB', got 'much'"),
+        (("--memory", "100MB"), "memory of 0.1 GB is too little: a window of 4 frames of 96 x 64 px takes about"),
+        (("--window", 1), "window must be at least 2, got 1"),
+        (("--output", "../restored.tif"), "--output must be a name without a folder, got '../restored.tif'"),
+        (("--output", "restored.mp4"), "videos are only read"),
+        (("--bad-frames", "drop"), "--bad-frames must be one of 'pass', 'skip'; got 'drop'"),
+        (("--compression", "jpeg"), "compression must be one of 'zlib', 'lzma'; got 'jpeg'"),
+        (("--scheduler", "nonsense://x"), "no Dask scheduler answers at nonsense://x"),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_nothing(place, tmp_path, capsys, options, message):
+    capsys.readouterr()
+    assert run(*command(place, tmp_path / "out", *options)) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_names_every_option(capsys):
+    assert run("run", "--help") == 0
+    shown = capsys.readouterr().out
+    for option in ("--window", "--memory", "--resume", "--bad-frames", "--scheduler", "--output", "--compression"):
+        assert option in shown
+
+
+def test_full_disk_is_one_line(place, tmp_path, capsys, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.posix_fallocate", full)
+    assert run(*command(place, tmp_path / "out")) == 2
+    error = capsys.readouterr().err
+    assert "No space left on device" in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,81 @@
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+from scipy.interpolate import BSpline
+
+from rsvib_torch.core.splines import (
+    bspline_coefficients,
+    bspline_coefficients_adjoint,
+    bspline_weights,
+    mirrored,
+)
+
+DEGREES = (1, 3, 5, 9)
+
+
+def noise(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_weights_are_scipys_splines(degree):
+    fraction = np.linspace(0, 1, 11)[:-1]
+    basis = BSpline.basis_element(np.arange(degree + 2) - (degree + 1) / 2, extrapolate=False)
+    taps = np.arange(degree + 1) - degree // 2
+    expected = np.nan_to_num(basis(fraction[:, None] - taps))
+    weights = bspline_weights(torch.from_numpy(fraction), degree).numpy()
+    assert weights == pytest.approx(expected, abs=1e-14)
+    assert weights.sum(-1) == pytest.approx(np.ones(10), abs=1e-14)
+
+
+@pytest.mark.parametrize("degree", [3, 5])
+@pytest.mark.parametrize("length", [2, 7, 40])
+@pytest.mark.parametrize("dim", [-1, -2])
+def test_coefficients_are_scipys_prefilter(degree, length, dim):
+    samples = noise(length, 6) if dim == -2 else noise(6, length)
+    expected = ndimage.spline_filter1d(samples.numpy(), order=degree, axis=dim, mode="mirror")
+    found = bspline_coefficients(samples, degree, dim).numpy()
+    assert found == pytest.approx(expected, abs=1e-7)
+    assert np.abs(found - samples.numpy()).max() > 0.05
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_splines_interpolate(degree):
+    samples = noise(50)
+    coefficients = bspline_coefficients(samples, degree, 0)
+    weights = bspline_weights(torch.zeros((), dtype=torch.float64), degree)
+    for place in (10, 25, 39):
+        taps = torch.arange(degree + 1) - degree // 2 + place
+        assert (weights * coefficients[taps]).sum().item() == pytest.approx(samples[place].item(), abs=1e-7)
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize("length", [1, 2, 9, 64])
+def test_adjoint_of_the_prefilter(degree, length):
+    a, b = noise(length, 3), noise(length, 3, seed=1)
+    forward = (bspline_coefficients(a, degree, 0) * b).sum().item()
+    assert forward == pytest.approx((a * bspline_coefficients_adjoint(b, degree, 0)).sum().item(), rel=1e-11)
+
+
+def test_accuracy_grows_with_the_degree():
+    """A sine of a fifth of a cycle per sample, between the samples."""
+    places = torch.arange(200, dtype=torch.float64)
+    samples = torch.sin(2 * torch.pi * 0.2 * places)
+    errors = []
+    for degree in DEGREES:
+        coefficients = bspline_coefficients(samples, degree, 0)
+        weights = bspline_weights(torch.tensor(0.5, dtype=torch.float64), degree)
+        index = torch.arange(60, 140)[:, None] + torch.arange(degree + 1) - degree // 2
+        value = (coefficients[index] * weights).sum(-1)
+        errors.append((value - torch.sin(2 * torch.pi * 0.2 * (places[60:140] + 0.5))).abs().max().item())
+    assert all(later < 0.25 * earlier for earlier, later in itertools.pairwise(errors))
+    assert errors[-1] < 1e-4
+
+
+@pytest.mark.parametrize("length", [1, 2, 5])
+def test_mirrored(length):
+    expected = np.pad(np.arange(length), 7, mode="reflect") if length > 1 else np.zeros(15)
+    assert mirrored(torch.arange(-7, length + 7), length).tolist() == expected.tolist()

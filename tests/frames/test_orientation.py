@@ -1,0 +1,102 @@
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from rsvib_torch import SensorTiming, Vibration
+from rsvib_torch.frames.orientation import (
+    as_float_frames,
+    frames_from_row_order,
+    frames_to_row_order,
+    offsets_from_row_order,
+    vibration_from_row_order,
+    vibration_to_row_order,
+)
+
+ORIENTATIONS = list(itertools.product((-2, -1), ("forward", "reverse")))
+VIBRATION = Vibration(
+    [[3.1, 0.5], [5.2, 0.2]], [[50.0, 90.0], [30.0, 120.0]], [[0.4, 2.9], [1.3, -3.0]], [120.0, -40.0]
+)
+
+
+def timing(scan_axis, direction):
+    return SensorTiming(20e-6, 20, 2048, scan_axis=scan_axis, readout_direction=direction)
+
+
+@pytest.mark.parametrize(("scan_axis", "direction"), ORIENTATIONS)
+def test_rows_in_read_order(scan_axis, direction):
+    """The row that is read first comes first, whole."""
+    image = torch.arange(12.0).reshape(3, 4)
+    rows = frames_to_row_order(image, timing(scan_axis, direction))
+    index = -1 if direction == "reverse" else 0
+    assert torch.equal(rows[0], image[index] if scan_axis == -2 else image[:, index])
+    assert torch.equal(frames_from_row_order(rows, timing(scan_axis, direction)), image)
+
+
+@pytest.mark.parametrize(("scan_axis", "direction"), ORIENTATIONS)
+def test_displacements_turn_with_the_frames(scan_axis, direction):
+    """A point moved in the image and a point moved in the turned image are the same point."""
+    camera = timing(scan_axis, direction)
+    for x, y in ((2, 1), (-1, 2), (0, -2)):
+        image = torch.zeros(9, 11)
+        moved = torch.zeros(9, 11)
+        image[4, 5] = 1
+        moved[4 + y, 5 + x] = 1
+        before, after = (frames_to_row_order(part, camera).nonzero()[0] for part in (image, moved))
+        in_rows = (after - before).flip(-1).double()
+        assert offsets_from_row_order(in_rows, camera).tolist() == [x, y]
+        constant = Vibration(0.0, 0.0, image_motion=[float(x), float(y)])
+        assert vibration_to_row_order(constant, camera).image_motion.tolist() == in_rows.tolist()
+
+
+@pytest.mark.parametrize(("scan_axis", "direction"), ORIENTATIONS)
+def test_vibration_and_offsets_agree(scan_axis, direction):
+    camera = timing(scan_axis, direction)
+    times = torch.linspace(0, 0.1, 33, dtype=torch.float64)
+    turned = vibration_to_row_order(VIBRATION, camera)
+    torch.testing.assert_close(
+        offsets_from_row_order(turned.displacement(times), camera), VIBRATION.displacement(times), rtol=0, atol=1e-12
+    )
+    if (scan_axis, direction) != (-2, "forward"):
+        assert (turned.displacement(times) - VIBRATION.displacement(times)).abs().max() > 1.0
+    back = vibration_from_row_order(turned, camera)
+    for name in ("amplitude", "frequency", "phase", "image_motion"):
+        torch.testing.assert_close(getattr(back, name), getattr(VIBRATION, name), rtol=0, atol=1e-12)
+    assert bool((turned.amplitude >= 0).all())
+
+
+def test_float_frames_are_left_alone():
+    for dtype in (torch.float16, torch.float32, torch.float64):
+        frames = torch.rand(2, 4, 5, dtype=torch.float64).to(dtype) * 300 - 7
+        assert as_float_frames(frames) is frames
+
+
+def test_integer_frames_are_scaled():
+    counts = torch.tensor([[[0, 51, 255]]], dtype=torch.uint8)
+    assert as_float_frames(counts).flatten().tolist() == pytest.approx([0.0, 0.2, 1.0])
+    deep = np.array([[[0, 4095, 819]]], dtype=np.uint16)
+    scaled = as_float_frames(deep, 4095)
+    assert scaled.dtype == torch.float32
+    assert scaled.flatten().tolist() == pytest.approx([0.0, 1.0, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("frames", "options", "error", "message"),
+    [
+        (torch.zeros(2, 4, 4, dtype=torch.uint16), {}, ValueError, "uint16 frames do not say their full scale"),
+        (torch.zeros(2, 4, 4, dtype=torch.int64), {}, ValueError, "int64 frames do not say their full scale"),
+        (torch.zeros(2, 4, 4, dtype=torch.uint8), {"full_scale": 0}, ValueError, "full_scale must be larger than 0"),
+        (torch.zeros(2, 4, 4, dtype=torch.uint8), {"full_scale": "12 bit"}, TypeError, "full_scale must be a number"),
+        (torch.zeros(4, 4), {}, ValueError, r"frames must have shape .* got \(4, 4\)"),
+        (torch.zeros(2, 0, 4), {}, ValueError, "frames must not be empty"),
+        (torch.zeros(2, 4, 4, dtype=torch.complex64), {}, TypeError, "frames must be real numbers"),
+        ("frames.tif", {}, TypeError, "frames must be a tensor or array of numbers, got str"),
+        (torch.zeros(1, 4, 4), {"minimum_frames": 2}, ValueError, "at least 2 frames are needed, got 1"),
+        (torch.zeros(3, 1, 1, 4, 4), {"minimum_frames": 2}, ValueError, "at least 2 frames are needed, got 1"),
+        (torch.tensor([[[0.0, torch.nan]]]), {}, ValueError, r"pixel \(0, 0, 1\) is nan"),
+    ],
+)
+def test_bad_frames(frames, options, error, message):
+    with pytest.raises(error, match=message):
+        as_float_frames(frames, **options)

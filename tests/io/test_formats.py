@@ -1,0 +1,215 @@
+"""Formats in the registry: what is written comes back, what others wrote is read, what is missing is named."""
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import tifffile
+import torch
+import zarr
+
+from rsvib_torch.io import (
+    FrameError,
+    StackFormat,
+    StackInfo,
+    formats,
+    open_stack,
+    read_stack,
+    read_stack_info,
+    register_format,
+    write_stack,
+)
+
+COUNTS = np.random.default_rng(8).integers(0, 4096, (3, 9, 7)).astype(np.uint16)
+COUNTS.flat[0] = 4095
+
+
+@pytest.mark.parametrize("ending", [".h5", ".zarr", ".raw"])
+@pytest.mark.parametrize("shape", [(3, 9, 7), (2, 3, 9, 7), (1, 5, 9, 7)])
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "int32", "float32", "float64"])
+def test_stacks_come_back(tmp_path, ending, shape, dtype):
+    path = tmp_path / f"frames{ending}"
+    stored = np.random.default_rng(3).integers(0, 256, shape) / 255
+    scale = None if "float" in dtype else 255
+    for _ in range(2):  # the second replaces the first
+        write_stack(path, torch.from_numpy(stored), dtype=dtype, full_scale=scale)
+    assert read_stack_info(path) == StackInfo(shape, dtype, scale)
+    np.testing.assert_allclose(read_stack(path).numpy(), stored, rtol=1e-6, atol=1e-7)
+    assert {item.name for item in tmp_path.iterdir()} <= {path.name, "frames.raw.json"}
+
+
+def test_other_readers_read_ours(tmp_path):
+    frames = torch.from_numpy(COUNTS / 4095.0)
+    for name in ("a.h5", "a.zarr", "a.raw"):
+        write_stack(tmp_path / name, frames, dtype="uint16", full_scale=4095)
+    with h5py.File(tmp_path / "a.h5") as file:
+        np.testing.assert_array_equal(file["frames"][:], COUNTS)
+        assert file["frames"].attrs["full_scale"] == 4095
+    array = zarr.open_array(tmp_path / "a.zarr", mode="r", zarr_format=3)
+    np.testing.assert_array_equal(array[:], COUNTS)
+    assert array.metadata.dimension_names == ("T", "H", "W")
+    np.testing.assert_array_equal(np.fromfile(tmp_path / "a.raw", "<u2").reshape(3, 9, 7), COUNTS)
+
+
+@pytest.mark.parametrize("compression", ["zlib", "lzma", "lzw", "zstd"])
+@pytest.mark.parametrize("big", [False, True])
+def test_compressed_tiff_of_others_is_read(tmp_path, compression, big):
+    path = tmp_path / "frames.tif"
+    tifffile.imwrite(
+        path, COUNTS, photometric="minisblack", compression=compression, bigtiff=big, tile=(16, 16), metadata=None
+    )
+    np.testing.assert_allclose(read_stack(path, full_scale=4095).numpy(), COUNTS / 4095, rtol=1e-6)
+
+
+def test_bigtiff_and_resolution(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", COUNTS, bigtiff=True, photometric="minisblack", resolution=(300, 150, "INCH"))
+    info = read_stack_info(tmp_path / "a.tif")
+    assert info.resolution == (300.0, 150.0, "inch")
+    tifffile.imwrite(tmp_path / "b.tif", COUNTS, photometric="minisblack", byteorder=">", metadata=None)
+    np.testing.assert_allclose(read_stack(tmp_path / "b.tif", full_scale=4095).numpy(), COUNTS / 4095, rtol=1e-6)
+
+
+def test_frames_are_read_one_at_a_time_in_any_order(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", COUNTS, photometric="minisblack", compression="zlib")
+    np.save(tmp_path / "a.npy", COUNTS)
+    np.save(tmp_path / "f.npy", np.asfortranarray(COUNTS))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("scan/counts", data=COUNTS, chunks=(2, 4, 4), compression="gzip")
+        file.create_dataset("temperature", data=np.zeros(3))
+    group = zarr.create_group(tmp_path / "a.zarr")
+    group.create_array("counts", data=COUNTS, chunks=(2, 5, 5))
+    (tmp_path / "tiffs").mkdir()
+    (tmp_path / "pngs").mkdir()
+    for index, frame in enumerate(COUNTS):
+        tifffile.imwrite(tmp_path / "tiffs" / f"{index}.tif", frame)
+        cv2.imwrite(str(tmp_path / "pngs" / f"{index}.png"), frame)
+    for name in ("a.tif", "a.npy", "f.npy", "a.h5", "a.zarr", "tiffs", "pngs"):
+        reader = open_stack(tmp_path / name)
+        assert (reader.info.shape, reader.info.dtype) == ((3, 9, 7), "uint16"), name
+        for index in (2, 0, 1):
+            np.testing.assert_array_equal(reader.frame(index), COUNTS[index])
+        reader.close()
+
+
+def _file_pages():
+    """Memory of this process that is pages of files, in bytes."""
+    line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("RssFile:"))
+    return 1024 * int(line.split()[1])
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell")
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_mapped_pages_do_not_pile_up(tmp_path, order):
+    frames = np.random.default_rng(2).integers(0, 256, (32, 512, 512)).astype(np.uint8)
+    np.save(tmp_path / "a.npy", np.asarray(frames, order=order))
+    reader = open_stack(tmp_path / "a.npy")
+    before = _file_pages()
+    for index in range(32):
+        np.testing.assert_array_equal(reader.frame(index), frames[index])
+    assert _file_pages() - before < 1_000_000
+    reader.close()
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_mapped_file_that_shrinks_is_an_error(tmp_path, order):
+    big_endian = np.asarray(COUNTS.repeat(800, axis=1).astype(">u2"), order=order)
+    np.save(tmp_path / "a.npy", big_endian)
+    reader = open_stack(tmp_path / "a.npy")
+    frame = reader.frame(2)
+    np.testing.assert_array_equal(frame, big_endian[2])
+    assert frame.dtype.isnative
+    with (tmp_path / "a.npy").open("r+b") as file:
+        file.truncate(5000)
+    for index in range(3):
+        with pytest.raises(FrameError, match=f"truncated: frame {index} lies beyond the end of the file"):
+            reader.frame(index)
+    reader.close()
+
+
+def test_floats_go_into_a_folder_of_tiff_files(tmp_path):
+    write_stack(tmp_path / "frames", torch.from_numpy(COUNTS / 4095.0))
+    assert sorted(file.name for file in (tmp_path / "frames").iterdir()) == [f"frame_000{i}.tif" for i in range(3)]
+    np.testing.assert_allclose(read_stack(tmp_path / "frames").numpy(), COUNTS / 4095, rtol=1e-6)
+    cv2.imwrite(str(tmp_path / "frames" / "x.png"), COUNTS[0])
+    with pytest.raises(ValueError, match="holds both PNG and TIFF files"):
+        read_stack(tmp_path / "frames")
+
+
+def test_format_of_ones_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(formats, "_FORMATS", dict(formats._FORMATS))
+
+    class Reader:
+        def __init__(self, path):
+            self.pixels = np.array(json.loads(path.read_text()), dtype=np.uint8)
+            self.info = StackInfo(self.pixels.shape, "uint8", 255.0)
+
+        def frame(self, index):
+            return self.pixels[index]
+
+        def close(self):
+            pass
+
+    def write_all(path, info, frames, compression):
+        path.write_text(json.dumps([frame.tolist() for frame in frames]))
+
+    register_format(StackFormat("listing", (".listing",), Reader, write_all=write_all, dtypes=("uint8",)))
+    frames = torch.rand(2, 5, 4, generator=torch.Generator().manual_seed(1))
+    write_stack(tmp_path / "a.listing", frames, dtype="uint8")
+    torch.testing.assert_close(read_stack(tmp_path / "a.listing"), frames, atol=0.002, rtol=0)
+    with pytest.raises(ValueError, match="listing files hold uint8; got dtype float32"):
+        write_stack(tmp_path / "a.listing", frames)
+
+
+@pytest.mark.parametrize(("ending", "package"), [(".h5", "h5py"), (".zarr", "zarr")])
+def test_missing_package_names_the_extra(tmp_path, monkeypatch, ending, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    (tmp_path / "a.h5").write_bytes(b"")
+    (tmp_path / "a.zarr").mkdir()
+    message = rf"needs the package {package}; install rsvib_torch\[formats\]"
+    with pytest.raises(ModuleNotFoundError, match=message):
+        read_stack(tmp_path / f"a{ending}")
+    with pytest.raises(ModuleNotFoundError, match=message):
+        write_stack(tmp_path / f"b{ending}", torch.rand(2, 4, 4))
+
+
+def test_frames_in_other_files_are_not_followed(tmp_path):
+    np.save(tmp_path / "secret.npy", COUNTS)
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["frames"] = COUNTS
+    with h5py.File(tmp_path / "link.h5", "w") as file:
+        file["frames"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/frames")
+    with h5py.File(tmp_path / "external.h5", "w") as file:
+        file.create_dataset("frames", (3, 9, 7), "u2", external=[(str(tmp_path / "secret.npy"), 128, 378)])
+    layout = h5py.VirtualLayout((3, 9, 7), "u2")
+    layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "frames", shape=(3, 9, 7))
+    with h5py.File(tmp_path / "virtual.h5", "w") as file:
+        file.create_virtual_dataset("frames", layout)
+    for name, message in (("link", "is a link"), ("external", "lies in other files"), ("virtual", "lies in other")):
+        with pytest.raises(ValueError, match=message):
+            read_stack(tmp_path / f"{name}.h5", full_scale=4095)
+
+
+def test_headers_that_promise_too_much(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("frames", (10**6, 4000, 4000), "u2", chunks=(1, 100, 100), compression="gzip")
+    array = zarr.create_array(tmp_path / "a.zarr", shape=(10**6, 4000, 4000), chunks=(1, 100, 100), dtype="u2")
+    array[0, :100, :100] = 1
+    (tmp_path / "a.raw").write_bytes(b"\0" * 100)
+    sidecar = {"format": "rsvib raw", "version": 1, "shape": [9, 10**9, 10**9], "axes": "THW", "dtype": "uint16"}
+    (tmp_path / "a.raw.json").write_text(json.dumps(sidecar))
+    for name in ("a.h5", "a.zarr", "a.raw"):
+        with pytest.raises(ValueError, match=rf"{name}.*header promises"):
+            read_stack_info(tmp_path / name)
+
+
+def test_zarr_codecs_that_could_run_code_are_refused(tmp_path):
+    zarr.create_array(tmp_path / "a.zarr", shape=(2, 4, 4), chunks=(1, 4, 4), dtype="u1")[:] = 3
+    header = json.loads((tmp_path / "a.zarr" / "zarr.json").read_text())
+    header["codecs"] = [{"name": "numcodecs.pickle", "configuration": {}}]
+    (tmp_path / "a.zarr" / "zarr.json").write_text(json.dumps(header))
+    with pytest.raises(ValueError, match=r"codec 'numcodecs\.pickle' is none of the Zarr v3 specification"):
+        read_stack(tmp_path / "a.zarr")

@@ -1,0 +1,129 @@
+"""Frame times that files state: kept, and used by every command; those of videos where they are the camera's."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from small_config import CAMERA
+from small_stack import HEIGHT, MOTION, STILL, TIMING, WIDTH, draw_counts
+from truth import decibel
+
+import rsvib_torch as rsv
+from rsvib_torch import StackInfo, read_stack_info
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.io import exposure_times, timing_from_first_frame, write_stack
+
+KEPT = [0, 1, 2, 4, 5, 9, 10]  # the other frames were dropped
+START = 100.25  # s
+
+
+@pytest.fixture(name="place")
+def write_stack_with_gaps(tmp_path):
+    """Frames with gaps in a file that says when they were taken, and a config that does not."""
+    counts = draw_counts(max(KEPT) + 1)[KEPT]
+    (tmp_path / "frames.raw").write_bytes(counts.tobytes())
+    sidecar = {
+        "format": "rsvib raw",
+        "version": 1,
+        "shape": [len(KEPT), HEIGHT, WIDTH],
+        "axes": "THW",
+        "dtype": "uint16",
+        "full_scale": 4095,
+        "frame_times": [START + index * TIMING.frame_period for index in KEPT],
+        "resolution": [120.0, 60.0, "centimeter"],
+    }
+    (tmp_path / "frames.raw.json").write_text(json.dumps(sidecar))
+    (tmp_path / "camera.toml").write_text(CAMERA)
+    return tmp_path
+
+
+def rsvib(*arguments):
+    return run_command([str(argument) for argument in arguments])
+
+
+def check_restored(path):
+    restored = rsv.read_stack(path).numpy()
+    assert min(decibel(frame, STILL, 12) for frame in restored) > 34
+
+
+def test_commands_use_and_keep_the_times_of_the_file(place):
+    config = ("--config", place / "camera.toml")
+    assert rsvib("detect", place / "frames.raw", *config, "--out", place / "found") == 0
+    found = json.loads((place / "found" / "vibration.json").read_text())
+    assert found["timing"]["frame_start_times"] == pytest.approx([index * TIMING.frame_period for index in KEPT])
+    assert found["vibration"]["frequency"][0][0] == pytest.approx(MOTION.frequency[0], rel=0.01)
+    assert found["vibration"]["phase"][0][0] == pytest.approx(MOTION.phase[0], abs=0.1)
+    vibration = ("--vibration", place / "found" / "vibration.json")
+    assert rsvib("restore", place / "frames.raw", place / "restored.h5", *config, *vibration) == 0
+    assert rsvib("run", place / "frames.raw", place / "out", *config, "--output", "restored.h5") == 0
+    assert (
+        rsvib(
+            "restore",
+            place / "frames.raw",
+            place / "again.tif",
+            *config,
+            "--vibration",
+            place / "out" / "vibration.json",
+        )
+        == 0
+    )
+    for path in (place / "restored.h5", place / "out" / "restored.h5", place / "again.tif"):
+        check_restored(path)
+        info = read_stack_info(path)
+        assert info.frame_times == pytest.approx([START + index * TIMING.frame_period for index in KEPT])
+        assert info.resolution[:2] == pytest.approx((120.0, 60.0))
+
+
+def test_without_its_times_the_stack_is_not_restored(place):
+    """Else the test above would test nothing."""
+    frames = rsv.read_stack(place / "frames.raw")
+    found = rsv.detect_vibration(frames, TIMING, method="bands", band_rows=16, band_step=8, search=6, tones=1)
+    restored = rsv.restore(frames, TIMING, found.vibration, method="dewarp", check=False).numpy()
+    assert min(decibel(frame, STILL, 12) for frame in restored) < 30
+
+
+def info_with(times):
+    return StackInfo((len(times), 8, 8), "uint8", 255.0, tuple(times), times_of_playback=True)
+
+
+def test_times_of_playback_tell_dropped_frames_and_nothing_else():
+    period = TIMING.frame_period
+    gaps = info_with([round(index * period, 3) for index in KEPT])
+    assert exposure_times(gaps, TIMING) == pytest.approx([index * period for index in KEPT], rel=1e-12)
+    assert timing_from_first_frame(TIMING, gaps).frame_start_times == exposure_times(gaps, TIMING)
+    even = info_with([1.0 + 0.99 * index * period for index in range(9)])
+    assert exposure_times(even, TIMING) == pytest.approx([index * period for index in range(9)], rel=1e-12)
+    assert timing_from_first_frame(TIMING, even) is TIMING
+    for times in ([index / 30 for index in range(9)], [0.0, period / 2, period], [0.0, 4 * period, 8 * period]):
+        assert exposure_times(info_with(times), TIMING) is None  # played at another rate than taken
+        assert timing_from_first_frame(TIMING, info_with(times)) is TIMING
+    own = replace(TIMING, frame_start_times=tuple(index * period for index in range(9)))
+    assert timing_from_first_frame(own, gaps) is own
+
+
+def test_video_at_another_rate_is_taken_at_the_camera_s(tmp_path):
+    kind = cv2.VideoWriter.fourcc(*"MJPG")
+    # not through FFmpeg, which would go on writing messages to the terminal
+    writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.CAP_OPENCV_MJPEG, kind, 24, (WIDTH, HEIGHT))
+    for frame in draw_counts(6):
+        writer.write(np.repeat((frame // 16).astype(np.uint8)[..., None], 3, axis=-1))
+    writer.release()
+    (tmp_path / "camera.toml").write_text(CAMERA.replace("full_scale = 4095\n", ""))
+    arguments = ("run", tmp_path / "clip.avi", tmp_path / "out", "--config", tmp_path / "camera.toml")
+    assert rsvib(*arguments, "--output", "restored.h5") == 0
+    found = json.loads((tmp_path / "out" / "vibration.json").read_text())
+    assert found["timing"]["frame_start_times"] is None
+    assert found["vibration"]["frequency"][0][0] == pytest.approx(MOTION.frequency[0], rel=0.02)
+    assert read_stack_info(tmp_path / "out" / "restored.h5").frame_times is None
+
+
+def test_what_a_stack_says_is_kept_on_writing(tmp_path):
+    like = StackInfo((2, 3, 9, 7), "uint16", 4095.0, (0.5, 0.75), (300.0, 300.0, "inch"), channels_last=True)
+    write_stack(tmp_path / "a.zarr", torch.rand(2, 3, 9, 7), dtype="uint16", full_scale=4095, like=like)
+    info = read_stack_info(tmp_path / "a.zarr")
+    assert (info, info.channels_last) == (like, True)
+    write_stack(tmp_path / "b.zarr", torch.rand(1, 3, 9, 7), dtype="uint16", full_scale=4095, like=like)
+    assert read_stack_info(tmp_path / "b.zarr").frame_times is None

@@ -1,0 +1,148 @@
+"""Motion of any shape: splines against SciPy's, and the whole way through simulation and restoration."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import CubicSpline
+from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
+
+import rsvib_torch as rsv
+from rsvib_torch.frames.orientation import vibration_from_row_order, vibration_to_row_order
+from rsvib_torch.motion.spline import FreeMotion
+
+TIMES = np.arange(0, 0.2, 1e-3)
+PATH = np.stack([6 * np.sin(40 * TIMES) * np.exp(-8 * TIMES), 4 * np.cumsum(np.sin(300 * TIMES**2)) / 20], -1)
+TIMING = rsv.SensorTiming(row_time=4e-5, exposure_rows=40, frame_rows=400)
+
+
+def spline():
+    return CubicSpline(TIMES, PATH, bc_type="natural")
+
+
+def motion():
+    return FreeMotion.through(TIMES, PATH)
+
+
+def test_displacement_velocity_and_mean_are_those_of_a_natural_spline():
+    times = np.random.default_rng(0).uniform(0.0, TIMES[-1], 200)
+    given = torch.from_numpy(times)
+    assert np.allclose(motion().displacement(given).numpy(), spline()(times), atol=1e-6)
+    assert np.allclose(motion().velocity(given).numpy(), spline()(times, 1), atol=1e-3)
+    exposure = 1.6e-3
+    starts = np.linspace(0, 0.19, 50)
+    mean = np.stack([spline().integrate(a, a + exposure) / exposure for a in starts])
+    assert np.allclose(motion().mean_displacement(torch.from_numpy(starts), exposure).numpy(), mean, atol=2e-6)
+
+
+def test_ends_are_kept():
+    ends = motion().displacement(torch.tensor([-1.0, 5.0], dtype=torch.float64)).numpy()
+    assert np.allclose(ends, PATH[[0, -1]], atol=1e-6)
+    assert not motion().velocity(torch.tensor([-1.0, 5.0])).any()
+
+
+def test_batch_equals_singles():
+    other = FreeMotion.through(
+        TIMES, PATH[::-1].copy(), rsv.Vibration([1.0, 2.0], [50.0, 30.0], image_motion=[3.0, 4.0])
+    )
+    both = FreeMotion(
+        torch.stack([motion().coefficients, other.coefficients]),
+        0.0,
+        1e-3,
+        rsv.Vibration(
+            [[[0.0], [0.0]], [[1.0], [2.0]]], [[[0.0], [0.0]], [[50.0], [30.0]]], 0.0, [[0.0, 0.0], [3.0, 4.0]]
+        ),
+    )
+    times = torch.rand(2, 7, 5, dtype=torch.float64) * 0.2
+    for name in ("displacement", "velocity"):
+        together = getattr(both, name)(times)
+        assert together.shape == (2, 7, 5, 2)
+        assert torch.allclose(together[0], getattr(motion(), name)(times[0]))
+        assert torch.allclose(together[1], getattr(other, name)(times[1]))
+    common = both.mean_displacement(times[:1], 1e-3)
+    assert torch.allclose(common[1], other.mean_displacement(times[0], 1e-3))
+    assert torch.allclose(both[1].displacement(times[0]), other.displacement(times[0]))
+    assert torch.allclose(motion().expanded(3).displacement(times[:1])[2], motion().displacement(times[0]))
+
+
+def test_tones_add_to_the_rest():
+    tones = rsv.Vibration([1.0, 0.5], [70.0, 90.0], [0.3, 0.4], [10.0, -5.0])
+    whole = FreeMotion.through(TIMES, PATH, tones)
+    times = torch.linspace(0, 0.19, 30, dtype=torch.float64)
+    assert torch.allclose(whole.displacement(times), motion().displacement(times) + tones.displacement(times))
+    assert torch.allclose(whole.velocity(times), motion().velocity(times) + tones.velocity(times))
+    assert (whole.largest_displacement(0, 0.19) >= whole.displacement(times).abs().amax(0)).all()
+    assert (
+        whole.displacement_within_row_time(1e-3)
+        >= whole.displacement(times + 1e-3).sub(whole.displacement(times)).abs().amax(0)
+    ).all()
+
+
+def test_samples_at_uneven_times():
+    times = np.sort(np.random.default_rng(1).uniform(0, 0.199, 300))
+    uneven = FreeMotion.from_samples(times, spline()(times))
+    inside = torch.linspace(0.01, 0.19, 100, dtype=torch.float64)
+    assert (uneven.displacement(inside) - motion().displacement(inside)).abs().amax() < 0.02
+
+
+@pytest.mark.parametrize("scan_axis", [-2, -1])
+@pytest.mark.parametrize("direction", ["forward", "reverse"])
+def test_orientation_is_undone(scan_axis, direction):
+    timing = rsv.SensorTiming(4e-5, 40, 400, scan_axis=scan_axis, readout_direction=direction)
+    tones = rsv.Vibration([1.0, 0.5], [70.0, 90.0])
+    whole = FreeMotion.through(TIMES, PATH, tones)
+    turned = vibration_to_row_order(whole, timing)
+    times = torch.linspace(0, 0.19, 30, dtype=torch.float64)
+    expected = whole.displacement(times)
+    expected = expected.flip(-1) if scan_axis == -1 else expected
+    expected = expected * torch.tensor([1.0, -1.0]) if direction == "reverse" else expected
+    assert torch.allclose(turned.displacement(times), expected)
+    assert torch.allclose(vibration_from_row_order(turned, timing).displacement(times), whole.displacement(times))
+
+
+class Free(Motion):
+    """The same path for the independent simulator."""
+
+    def displacement(self, times):
+        return spline()(times)
+
+
+@pytest.fixture(scope="module", name="taken")
+def make_taken():
+    scene = draw_scene(320 + 2 * MARGIN, 192 + 2 * MARGIN, 2)
+    return scene, take_frames(scene, TIMING, Free(), 3, 0.003)
+
+
+def test_simulated_frames_are_those_of_the_definition(taken):
+    scene, _ = taken
+    frames = rsv.simulate_frames(torch.from_numpy(scene), TIMING, motion(), 2, frame_size=(320, 192))
+    assert decibel(frames.numpy(), take_frames(scene, TIMING, Free(), 2), rim=16) > 60
+
+
+@pytest.mark.parametrize(("method", "least"), [("exact", 38.0), ("dewarp", 33.0)])
+def test_frames_are_restored(taken, method, least):
+    scene, frames = taken
+    restored = rsv.restore(torch.from_numpy(frames).float(), TIMING, motion(), method=method)
+    still = crop(scene)
+    assert decibel(restored.numpy(), still) > least
+    assert decibel(frames, still) < least - 8
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((torch.zeros(2, 3), 0.0, 1e-3), "N >= 4"),
+        ((torch.full((2, 8), torch.nan), 0.0, 1e-3), "finite"),
+        ((torch.zeros(2, 8), 0.0, 0.0), "spacing"),
+        ((torch.zeros(2, 8), 0.0, 1e-3, rsv.Vibration.still((3,))), "batch shape"),
+    ],
+)
+def test_bad_values_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        FreeMotion(*arguments)
+
+
+def test_bad_samples_are_named():
+    with pytest.raises(ValueError, match="evenly spaced"):
+        FreeMotion.through([0.0, 1.0, 2.0, 4.0], torch.zeros(4, 2))
+    with pytest.raises(ValueError, match="strictly increasing"):
+        FreeMotion.from_samples([0.0, 1.0, 1.0, 4.0], torch.zeros(4, 2))

@@ -1,0 +1,329 @@
+"""Pages: nothing from outside, nothing unescaped, pictures of the right places, and words that fit the verdict."""
+
+import base64
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from edge_truth import draw_edge, gaussian, mtf50_of, through_pixels
+
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.detection import DetectionResult
+from rsvib_torch.evaluation import resolution_chart
+from rsvib_torch.imaging import SensorNoise, simulate_frames
+from rsvib_torch.io import write_stack
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.registration import OffsetCurve
+from rsvib_torch.report.html import Report, before_after, write_page, write_report_page
+from rsvib_torch.report.html.figures import gain_figure, psf_film, rows_figure, smear
+from rsvib_torch.report.html.sharpness import measure_edges
+from rsvib_torch.report.html.words import mood_of, verdict_words
+from rsvib_torch.restoration import RestorationVerdict
+
+TIMING = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=512)
+SHAKE = Vibration([1.6, 1.1], [71.0, 113.0], [0.6, -1.2])
+
+
+def result_of(vibration=SHAKE, reliable=(True, True), reasons=((), ())):
+    """A detection that found a vibration exactly."""
+    rows = torch.arange(16, 240, 16).double()
+    times = (rows * TIMING.row_time)[None]
+    later = times + TIMING.frame_period
+    offsets = vibration.offset(times, later, TIMING.exposure_time)
+    curve = OffsetCurve(torch.tensor([[0, 1]]), rows, times, later, offsets, torch.ones_like(times), (32, 32))
+    small = 0.001 * torch.ones_like(vibration.amplitude)
+    std = VibrationStd(small, small, 1e-3 * small, small, small[:, 0], small[:, 0])
+    gain = vibration.gain(TIMING.frame_period)
+    return DetectionResult(
+        vibration, std, curve, offsets, gain, torch.zeros(2).double(), torch.tensor(reliable), reasons
+    )
+
+
+def verdict_of(outcome, reason=""):
+    pair, one = torch.zeros(1, 2), torch.full((1,), 3.0)
+    return RestorationVerdict(one, one, pair, pair, pair, one, one, one, (outcome,), (reason,))
+
+
+def report_of(**changes):
+    scene = resolution_chart(256, 224, sigma=0.7)
+    frames = torch.stack([scene.roll(2, 0), scene.roll(-3, 1)])
+    whole = Report(
+        title="<script>alert(1)</script>",
+        subtitle='a "quoted" & <b>bold</b> name',
+        frames=frames,
+        restored=scene.expand(2, -1, -1),
+        was_restored=True,
+        timing=TIMING,
+        detection=result_of(),
+        verdict=verdict_of("helps"),
+        left_alone=(),
+        options={"method": "<exact>"},
+        version="0",
+    )
+    return replace(whole, **changes)
+
+
+class Reader(HTMLParser):
+    """Tags with their attributes, and the text."""
+
+    def __init__(self):
+        super().__init__()
+        self.tags, self.text = [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def read(path):
+    reader = Reader()
+    reader.feed(path.read_text(encoding="utf-8"))
+    return reader
+
+
+def decoded(uri):
+    kind, content = uri.split(",", 1)
+    assert re.fullmatch(r"data:image/(png|jpeg);base64", kind)
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return image
+
+
+@pytest.fixture(scope="module", name="page")
+def make_page(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page")
+    files = write_report_page(folder, report_of())
+    return folder, files, read(folder / "report.html")
+
+
+def test_page_needs_nothing_from_outside(page):
+    folder, files, reader = page
+    assert sorted(files) == sorted(path.name for path in folder.iterdir())
+    images = [attributes["src"] for tag, attributes in reader.tags if tag == "img"]
+    assert len(images) >= 2 + 2 + 5
+    for uri in images:
+        assert min(decoded(uri).shape[:2]) > 10
+    for _, attributes in reader.tags:
+        assert "href" not in attributes
+        assert "srcset" not in attributes
+        assert not any(name.startswith("on") for name in attributes)
+    style = (folder / "report.html").read_text().split("<style>")[1].split("</style>")[0]
+    assert "url(" not in style
+    assert "@import" not in style
+    for name in files:
+        if name.endswith(".png"):
+            assert min(cv2.imread(str(folder / name)).shape[:2]) > 300
+
+
+def test_what_users_write_is_escaped(page):
+    _, _, reader = page
+    assert [tag for tag, _ in reader.tags].count("script") == 1
+    assert "b" not in [tag for tag, attributes in reader.tags if tag == "b" and attributes]
+    text = "".join(reader.text)
+    assert text.count("<script>alert(1)</script>") == 2  # title and heading
+    assert 'a "quoted" & <b>bold</b> name' in text
+    assert "method = <exact>" in text
+
+
+def test_page_has_all_its_parts(page):
+    text = "".join(page[2].text)
+    assert text.index("The camera shook") < text.index("Before and after")
+    for part in (
+        "Details, pixel by pixel",
+        "Offsets along x",
+        "Offsets along y",
+        "1.600 ± 0.001",
+        "What a pair of frames can see",
+        "Displacement and smear",
+        "Point spread functions down the frame",
+        "Sharpness across slanted edges",
+        "40 µs",
+    ):
+        assert part in text
+    ranges = [attributes for tag, attributes in page[2].tags if tag == "input"]
+    assert len(ranges) == 1
+    assert "aria-label" in ranges[0]
+
+
+def test_unwritable_place_leaves_nothing(tmp_path):
+    with pytest.raises(OSError, match="does not exist"):
+        write_page(tmp_path / "no" / "page.html", "base.html", {"title": "x"})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("shape", [(3000, 700), (3, 700, 3000), (2, 90, 60)])
+def test_pictures_are_bounded_and_share_their_range(shape):
+    ramp = torch.linspace(0, 1, shape[-1]).expand(shape)
+    pair = before_after(0.5 * ramp, ramp, names=("a", "b"), caption="", longest=600, exact=True)
+    first, second = decoded(pair.before).astype(float), decoded(pair.after).astype(float)
+    assert max(first.shape[:2]) <= 600
+    assert (pair.height, pair.width) == first.shape[:2] == second.shape[:2]
+    assert (first.ndim == 3) == (shape[0] == 3)
+    assert first[..., -3:].max() == pytest.approx(0.5 * second.max(), abs=3)
+    assert second.max() == 255
+
+
+def test_colours_keep_their_order():
+    frame = torch.zeros(3, 40, 40)
+    frame[0, :20], frame[2, 20:] = 1.0, 1.0
+    shown = decoded(before_after(frame, frame, names=("a", "b"), caption="", exact=True).after)
+    np.testing.assert_array_equal(shown[5, 5], [0, 0, 255])  # red, as OpenCV orders it
+    np.testing.assert_array_equal(shown[35, 5], [255, 0, 0])
+
+
+def test_missing_pixels_are_drawn():
+    frame = torch.rand(32, 32)
+    frame[3] = torch.nan
+    assert decoded(before_after(frame, frame, names=("a", "b"), caption="", exact=True).after)[3].max() == 0
+
+
+def test_smear_is_the_largest_excursion():
+    starts = torch.arange(0, 0.05, 1e-5, dtype=torch.float64)
+    found = smear(SHAKE, starts, TIMING).amax(0)
+    expected = 2 * SHAKE.amplitude[:, 0] * (math.pi * SHAKE.frequency[:, 0] * TIMING.exposure_time).sin()
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=0)
+    moving = Vibration([0.0, 0.0], [0.0, 0.0], image_motion=[300.0, -200.0])
+    expected = torch.tensor([300.0, 200.0]).double() * TIMING.exposure_time
+    torch.testing.assert_close(smear(moving, starts[:5], TIMING), expected.expand(5, 2))
+
+
+def test_figures_show_what_is_there():
+    figure = gain_figure(result_of(reliable=(True, False), reasons=((), ("x",))), TIMING)
+    upper, lower = figure.axes
+    curve = upper.lines[0].get_xydata()
+    expected = 2 * np.sin(np.pi * curve[:, 0] * TIMING.frame_period) * np.sinc(curve[:, 0] * TIMING.exposure_time)
+    np.testing.assert_allclose(curve[:, 1], np.abs(expected), atol=1e-12)
+    assert [text.get_text() for text in upper.get_legend().get_texts()] == ["x", "y (not reliable)"]
+    bars = [container.lines[0].get_xydata()[0] for container in lower.containers]
+    np.testing.assert_allclose(bars, [[71.0, 1.6], [113.0, 1.1]])
+    place = rows_figure(SHAKE, TIMING, 200).axes[0].lines
+    starts = TIMING.row_starts(1, 200)[0]
+    for axis in range(2):
+        expected = SHAKE.mean_displacement(starts, TIMING.exposure_time)[:, axis]
+        np.testing.assert_allclose(place[axis].get_ydata(), expected)
+
+
+@pytest.mark.parametrize("motion", [SHAKE, Vibration([0.1, 0.2], [60.0, 90.0], 0.3, [3000.0, 0.0])])
+def test_film_centres_kernels_on_their_rows(motion):
+    for panel in psf_film(motion, TIMING, 300).axes:
+        kernel = panel.images[0].get_array()
+        assert kernel.sum() == pytest.approx(1.0)
+        reach = kernel.shape[0] // 2
+        place = np.arange(-reach, reach + 1)
+        centre = np.array([(kernel.sum(0) * place).sum(), (kernel.sum(1) * place).sum()])
+        assert np.abs(centre).max() <= 0.5 + 1e-9
+        np.testing.assert_allclose(panel.lines[0].get_xydata().mean(0), centre, atol=0.02)
+
+
+def test_edges_are_measured_in_both():
+    frames = [torch.from_numpy(np.pad(draw_edge(5.0, sigma, (80, 60)), 6, mode="edge")) for sigma in (0.9, 0.6)]
+    (pair,), notes = measure_edges(*frames, [(6, 6, 80, 60)])
+    assert notes == []
+    for curve, sigma in ((pair.before, 0.9), (pair.after, 0.6)):
+        assert float(curve.mtf50) == pytest.approx(mtf50_of(through_pixels(gaussian(sigma), 5.0)), rel=1e-3)
+    assert pair.axis == "horizontal"
+    flat = torch.full((92, 72), 0.5)
+    pairs, notes = measure_edges(flat, flat, [(0, 0, 40, 40)])
+    assert pairs == []
+    assert notes[0].startswith("Edge 0,0,40,40 was not measured")
+    assert measure_edges(flat, flat) == ([], [])
+    with pytest.raises(ValueError, match=r"edge 60,0,40,40 .* does not lie in a frame of 92 x 72 px"):
+        measure_edges(flat, flat, [(60, 0, 40, 40)])
+
+
+@pytest.mark.parametrize(
+    ("reliable", "verdict", "restored", "mood", "first"),
+    [
+        ((True, True), verdict_of("helps"), True, "good", "undoing it helps"),
+        ((True, False), verdict_of("partly", "y: apart"), True, "doubt", "undone in part"),
+        ((True, True), verdict_of("unknown", "alike"), True, "doubt", "cannot be told"),
+        ((True, True), None, True, "doubt", "cannot be told"),
+        (
+            (True, True),
+            verdict_of("worse", "x: apart"),
+            False,
+            "bad",
+            "does not help; the frames are left as they were",
+        ),
+        ((False, False), None, False, "doubt", "No vibration was found that could be undone"),
+        ((False, False), verdict_of("helps"), True, "bad", "cannot be relied on"),
+    ],
+)
+def test_words_fit_the_verdict(reliable, verdict, restored, mood, first):
+    reasons = tuple(() if good else ("only a third of a period is seen",) for good in reliable)
+    result = result_of(reliable=reliable, reasons=reasons)
+    assert mood_of(result, verdict, restored) == mood
+    words = verdict_words(result, SHAKE, TIMING, 256, restored=restored, left_alone=(), verdict=verdict)
+    assert first in words[0]
+    for name, good in zip("xy", reliable, strict=True):
+        refused = f"Along {name} no vibration can be relied on: only a third of a period is seen."
+        assert (refused in words) != good
+    assert any("smeared by up to" in line for line in words)
+
+
+def test_words_name_a_blind_frequency():
+    near = Vibration([1.0, 1.0], [1 / TIMING.frame_period + 1.5, 75.0])
+    words = verdict_words(result_of(near), near, TIMING, 256, restored=True, left_alone=(), verdict=None)
+    (line,) = [line for line in words if "cannot see" in line]
+    assert "along x is 1.5 Hz from 48.8 Hz" in line
+
+
+def test_a_still_camera_gets_a_page_too(tmp_path):
+    still = Vibration([0.0, 0.0], [0.0, 0.0])
+    reasons = (("no significant tone",),) * 2
+    report = report_of(detection=result_of(still, (False, False), reasons), verdict=None, was_restored=False)
+    files = write_report_page(tmp_path, replace(report, restored=report.frames), [(0, 0, 30, 30)])
+    text = "".join(read(tmp_path / "report.html").text)
+    assert "No vibration was found that could be undone" in text
+    assert "No tone was found." in text
+    assert "No two frames" not in text
+    assert "restored with" not in text
+    assert "psf_film.png" not in files
+
+
+@pytest.fixture(scope="module", name="place")
+def make_place(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("camera")
+    (folder / "camera.toml").write_text(
+        "[sensor]\nrow_time = 4e-5\nexposure_rows = 12\nframe_rows = 512\nfull_scale = 4095\n"
+    )
+    scene = resolution_chart(512, 320, sigma=0.7)
+    noise = SensorNoise(read_noise=0.003, bits=12)
+    frames = simulate_frames(
+        scene, TIMING, SHAKE, 2, frame_size=(448, 256), noise=noise, generator=torch.Generator().manual_seed(3)
+    )
+    write_stack(folder / "chart & <co>.tif", frames, dtype="uint16", full_scale=4095)
+    return folder
+
+
+def test_command_writes_a_page(place, capsys):
+    frames, config, out = (str(place / name) for name in ("chart & <co>.tif", "camera.toml", "out"))
+    assert run_command(["report", frames, out, "--config", config]) == 0
+    capsys.readouterr()
+    reader = read(place / "out" / "report.html")
+    text = "".join(reader.text)
+    assert "Vibration in chart & <co>.tif" in text
+    assert "The camera shook, the vibration was measured, and undoing it helps." in text
+    found = re.search(r"Along x the image vibrates by ([\d.]+) ± [\d.]+ px at ([\d.]+)", text)
+    assert float(found[1]) == pytest.approx(1.6, rel=0.01)
+    assert float(found[2]) == pytest.approx(71.0, rel=0.002)
+    assert (place / "out" / "psf_film.png").exists()
+
+
+@pytest.mark.parametrize("edge", ["1,2,3", "a,b,c,d", "-1,0,40,40", "0,0,4000,40"])
+def test_command_refuses_edges_in_one_line(place, capsys, edge):
+    frames, config = (str(place / name) for name in ("chart & <co>.tif", "camera.toml"))
+    out = place / f"out {edge}"
+    assert run_command(["report", frames, str(out), "--config", config, f"--edge={edge}"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "edge" in error
+    assert not out.exists()

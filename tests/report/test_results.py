@@ -1,0 +1,256 @@
+"""vibration.json, offsets.csv and the pictures."""
+
+import csv
+import json
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from rsvib_torch.commands.terminal import show_result
+from rsvib_torch.detection import DetectionResult
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.registration import OffsetCurve
+from rsvib_torch.report.plots import comparison_figure, detailed_places, offset_figure, save_figure
+from rsvib_torch.report.results import read_vibration, write_offsets, write_restoration, write_vibration
+from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
+
+TIMING = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
+
+
+@pytest.fixture(name="result")
+def draw_result() -> DetectionResult:
+    """A detection of two tones along x and one along y from three frames, with one band that failed."""
+    vibration = Vibration(
+        [[2.0, 0.5], [1.0, 0.0]], [[60.0, 145.0], [130.0, 0.0]], [[0.3, 2.0], [-1.0, 0.0]], [20.0, 0.0]
+    )
+    std = VibrationStd(
+        *(0.01 * torch.ones_like(vibration.amplitude) for _ in range(4)),
+        0.1 * torch.ones(2).double(),
+        torch.zeros(2).double(),
+    )
+    std.period[1, 1] = math.inf
+    rows = torch.arange(16, 480, 16).double()
+    times = torch.arange(2)[:, None] * TIMING.frame_period + rows * TIMING.row_time
+    later = times + TIMING.frame_period
+    fitted = vibration.offset(times, later, TIMING.exposure_time)
+    offsets = fitted + 0.02 * torch.randn(fitted.shape, generator=torch.Generator().manual_seed(2)).double()
+    offsets[1, 3] = torch.nan
+    quality = torch.full_like(times, 0.9)
+    quality[1, 3] = 0.0
+    curve = OffsetCurve(torch.tensor([[0, 1], [1, 2]]), rows, times, later, offsets, quality, (32, 32))
+    residual = (offsets - fitted).abs().nanmean((0, 1))
+    gain = vibration.gain(TIMING.frame_period)
+    reasons = ((), ("only one period is seen",))
+    return DetectionResult(vibration, std, curve, fitted, gain, residual, torch.tensor([True, False]), reasons)
+
+
+def test_vibration_comes_back_exactly(tmp_path, result):
+    write_vibration(tmp_path / "vibration.json", result, TIMING)
+    back = read_vibration(tmp_path / "vibration.json", TIMING)
+    for name in ("amplitude", "frequency", "phase", "image_motion"):
+        torch.testing.assert_close(getattr(back.vibration, name), getattr(result.vibration, name), rtol=0, atol=0)
+    assert back.timing == TIMING
+    assert back.reliable == (True, False)
+    assert back.reasons == ((), ("only one period is seen",))
+
+
+def test_vibration_file_is_plain_json(tmp_path, result):
+    write_vibration(tmp_path / "vibration.json", result, TIMING)
+    text = (tmp_path / "vibration.json").read_text()
+    assert "NaN" not in text
+    assert "Infinity" not in text
+    data = json.loads(text)
+    assert data["period"] == [[1 / 60, 1 / 145], [1 / 130, None]]
+    assert data["std"]["period"][1] == [0.01, None]
+    assert data["timing"]["frame_rows"] == 512
+    assert data["reliable"] == [True, False]
+
+
+@pytest.mark.parametrize(
+    "timing",
+    [
+        replace(TIMING, row_time=2.01e-5),
+        replace(TIMING, exposure_rows=21),
+        replace(TIMING, frame_rows=513),
+        replace(TIMING, scan_axis="x"),
+        replace(TIMING, readout_direction="reverse"),
+        replace(TIMING, frame_start_times=[0.0, 0.01, 0.03]),
+    ],
+)
+def test_vibration_of_another_camera_is_refused(tmp_path, result, timing):
+    write_vibration(tmp_path / "vibration.json", result, timing)
+    assert read_vibration(tmp_path / "vibration.json", timing).timing == timing
+    with pytest.raises(ValueError, match=r"the vibration of another camera: detected with .*here") as caught:
+        read_vibration(tmp_path / "vibration.json", TIMING)
+    assert str(caught.value).count("(here") == 1
+
+
+def drop(data, *keys):
+    for key in keys[:-1]:
+        data = data[key]
+    del data[keys[-1]]
+
+
+def put(data, value, *keys):
+    for key in keys[:-1]:
+        data = data[key]
+    data[keys[-1]] = value
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: drop(d, "vibration"), "vibration: missing key"),
+        (lambda d: drop(d, "vibration", "phase"), "vibration.phase: missing key"),
+        (lambda d: drop(d, "timing", "frame_rows"), "timing.frame_rows: missing key; expected a number"),
+        (lambda d: drop(d, "reliable"), "reliable: missing key"),
+        (lambda d: put(d, math.nan, "vibration", "amplitude", 0, 0), "not a vibration.json: NaN is no JSON number"),
+        (lambda d: put(d, None, "vibration", "amplitude", 0, 0), "vibration.amplitude: expected a list of"),
+        (lambda d: put(d, "3", "vibration", "frequency", 0, 0), "vibration.frequency: expected a list of"),
+        (lambda d: put(d, -3.0, "vibration", "amplitude", 0, 0), "vibration: amplitude must not be negative"),
+        (lambda d: put(d, [True], "reliable"), "reliable and reasons must have two entries"),
+        (lambda d: put(d, 2, "version"), "version: expected 1, got 2"),
+        (lambda d: put(d, 0.0, "timing", "row_time"), "timing: row_time must be larger than 0"),
+        (lambda d: put(d, 1, "colour"), "colour: unknown key"),
+    ],
+)
+def test_malformed_vibration_files_are_refused(tmp_path, result, change, message):
+    path = tmp_path / "vibration.json"
+    write_vibration(path, result, TIMING)
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+    with pytest.raises(ValueError) as caught:
+        read_vibration(path, TIMING)
+    assert str(caught.value).startswith(f"{path}: {message}")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", '"x"', "\x00", '{"vibration": 1e999}', "[" * 100_000])
+def test_files_that_are_no_vibration(tmp_path, text):
+    (tmp_path / "vibration.json").write_text(text)
+    with pytest.raises(ValueError, match=r"vibration\.json: "):
+        read_vibration(tmp_path / "vibration.json", TIMING)
+
+
+def test_standard_deviations_come_back(tmp_path, result):
+    write_vibration(tmp_path / "vibration.json", result, TIMING)
+    back = read_vibration(tmp_path / "vibration.json", TIMING)
+    for name in ("amplitude", "frequency", "period", "phase", "image_motion", "image_acceleration"):
+        torch.testing.assert_close(getattr(back.std, name), getattr(result.std, name), rtol=0, atol=0)
+    assert back.std.period[1, 1] == math.inf
+    vibration, notes = trusted_vibration(back, TIMING, 3, 512)
+    assert vibration.amplitude.tolist() == [[2.0, 0.5], [0.0, 0.0]]
+    assert notes == ("y is left alone: its vibration is not reliable (only one period is seen)",)
+
+
+def test_what_was_restored_is_plain_json(tmp_path):
+    pair = torch.tensor([[0.1, math.nan]], dtype=torch.float64)
+    one = torch.tensor([math.nan], dtype=torch.float64)
+    verdict = RestorationVerdict(one, one, pair, pair, pair, one, one, one, ("worse",), ("x: frames lie apart",))
+    options = {"method": "exact", "joint": True}
+    path = tmp_path / "restoration.json"
+    write_restoration(path, verdict, restored=False, options=options, left_alone=("y is left alone",))
+    data = json.loads(path.read_text())
+    assert data["frames"] == "as taken"
+    assert data["options"] == options
+    assert data["left_alone"] == ["y is left alone"]
+    assert data["outcome"] == "worse"
+    assert data["summary"] == "restored is no better than raw: x: frames lie apart"
+    assert data["pairs"]["misfit_before"] == [[0.1, None]]
+    assert data["pairs"]["reasons"] == ["x: frames lie apart"]
+    write_restoration(path, None, restored=True, options={}, left_alone=())
+    assert json.loads(path.read_text())["outcome"] is None
+
+
+def test_offsets_are_written_one_line_a_band(tmp_path, result):
+    write_offsets(tmp_path / "offsets.csv", result)
+    with (tmp_path / "offsets.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == result.offsets.times.numel() == 58
+    assert [line["offset_x_px"] for line in lines].count("") == 1
+    failed = lines[29 + 3]
+    assert (failed["earlier_frame"], failed["later_frame"], failed["row"], failed["offset_y_px"]) == (
+        "1",
+        "2",
+        "64.0",
+        "",
+    )
+    for name, values in (("time_s", result.offsets.times), ("fitted_y_px", result.fitted[..., 1])):
+        np.testing.assert_array_equal([float(line[name]) for line in lines], values.flatten())
+    good = [float(line["offset_x_px"]) for line in lines if line["offset_x_px"]]
+    np.testing.assert_array_equal(good, result.offsets.offsets[..., 0][result.offsets.good])
+
+
+def test_offset_figure_shows_what_was_measured(tmp_path, result):
+    figure = offset_figure(result)
+    panels = {axes.get_title(loc="left"): axes for axes in figure.axes}
+    for axis, name in enumerate("xy"):
+        upper = panels[f"Offset along {name}"]
+        shown = upper.collections[0].get_offsets()
+        good = result.offsets.good
+        np.testing.assert_allclose(shown[:, 0], 1e3 * result.offsets.times[good])
+        np.testing.assert_allclose(shown[:, 1], result.offsets.offsets[..., axis][good])
+        assert len(upper.collections[1].get_offsets()) == 1  # the band that failed
+        for pair, line in enumerate(upper.lines):
+            np.testing.assert_allclose(line.get_ydata(), result.fitted[pair, :, axis])
+        assert "(px)" in upper.get_ylabel()
+    below = panels[f"mean |residual| {result.residual[1]:.4f} px"]
+    np.testing.assert_allclose(
+        below.collections[0].get_offsets()[:, 1], (result.offsets.offsets - result.fitted)[..., 1][good]
+    )
+    assert "(ms)" in below.get_xlabel()
+    texts = " ".join(text.get_text() for axes in figure.axes for text in axes.texts)
+    assert "2.000 ± 0.010 px at 60.00 ± 0.01 Hz" in texts
+    assert "not reliable: only one period is seen" in texts
+    save_figure(figure, tmp_path / "offsets.png", dpi=50)
+    assert cv2.imread(str(tmp_path / "offsets.png")).std() > 5
+
+
+def test_crops_lie_where_detail_is_and_do_not_overlap():
+    image = torch.full((90, 120), 0.4)
+    image[10:30, 70:90] = torch.rand(20, 20, generator=torch.Generator().manual_seed(1))
+    image[60:80, 20:40] = 0.5 * torch.rand(20, 20, generator=torch.Generator().manual_seed(2))
+    (first, second) = detailed_places(image, 20, 2)
+    assert max(abs(first[0] - 10), abs(first[1] - 70)) <= 1
+    assert max(abs(second[0] - 60), abs(second[1] - 20)) <= 1
+    places = detailed_places(image, 40, 50)
+    assert 2 <= len(places) <= 6
+    assert all(max(abs(a[0] - b[0]), abs(a[1] - b[1])) >= 40 for i, a in enumerate(places) for b in places[:i])
+    assert detailed_places(image, 90, 3)[0][0] == 0
+
+
+@pytest.mark.parametrize("shape", [(96, 130), (3, 96, 130), (2, 40, 30)])
+def test_comparison_shows_the_same_crop_of_both(tmp_path, shape):
+    raw = torch.rand(shape, generator=torch.Generator().manual_seed(1))
+    figure = comparison_figure(raw, raw * 0.5, count=2, size=32)
+    pictures = [axes.images[0] for axes in figure.axes]
+    half = len(pictures) // 2
+    for before, after in zip(pictures[:half], pictures[half:], strict=True):
+        assert before.get_extent() == after.get_extent()
+        left, _, _, top = before.get_extent()
+        row, column = int(top + 0.5), int(left + 0.5)
+        grey = raw if raw.ndim == 2 else raw.mean(0) if raw.shape[0] == 2 else raw[0]
+        crop = grey[row : row + 30, column : column + 30].flatten()
+        shown = before.get_array()[:30, :30, 0].flatten()
+        assert np.corrcoef(shown, crop)[0, 1] > 0.99
+        assert after.get_array().mean() < before.get_array().mean()  # one scale of grey for both
+    save_figure(figure, tmp_path / "before_after.png", dpi=40)
+    assert (tmp_path / "before_after.png").stat().st_size > 1000
+
+
+def test_result_in_words(capsys, result):
+    show_result(result)
+    out = capsys.readouterr().out
+    assert "2.000 ± 0.010" in out  # amplitude to the digits that its standard deviation leaves
+    assert "60.000 ± 0.010" in out
+    assert out.count("∞") == 0
+    words = " ".join(out.split())
+    assert "image motion 20.00 ± 0.10 px/s; reliable" in words
+    assert "y: residual" in words
+    assert words.endswith("not reliable: only one period is seen")
