@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.imaging import exposure_nodes, gauss_node_count
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["ImageMotion"]
@@ -23,13 +23,13 @@ class ImageMotion:
         vibration: Of batch shape (B,).
         starts: (B,) exposure start of the first row of each image, seconds.
         exposure_time: (B,) seconds.
-        timing: The sensor, in row order; its exposure is not used.
+        timing: The sensor; its exposure is not used.
     """
 
     vibration: Vibration
     starts: Tensor
     exposure_time: Tensor
-    timing: SensorTiming
+    timing: RowTiming
 
     def trajectory(self, num_rows: int) -> tuple[Tensor, Tensor]:
         """Displacement (B, R, N, 2) in px at the Gauss-Legendre nodes of the rows' exposures, and weights (N,)."""

@@ -25,7 +25,7 @@ from rsvib_torch.frames.orientation import (
     offsets_from_row_order,
     vibration_from_row_order,
 )
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import VibrationStd, blind_frequencies
 from rsvib_torch.registration import OffsetCurve, Registration
 
@@ -71,7 +71,7 @@ class _Options:
     bands: Bands
 
 
-def _tones_of_bands(curve: OffsetCurve, timing: SensorTiming, options: _Options, enough: float = 0.0) -> ToneFit:
+def _tones_of_bands(curve: OffsetCurve, timing: RowTiming, options: _Options, enough: float = 0.0) -> ToneFit:
     """A fit of tones to the offsets of row bands."""
     measurements = measurements_of_curve(curve, timing, options.bands.band_step)
     interval = options.bands.band_step * timing.row_time
@@ -80,14 +80,14 @@ def _tones_of_bands(curve: OffsetCurve, timing: SensorTiming, options: _Options,
 
 
 def _detect_bands(
-    curve: OffsetCurve, frames: Tensor, valid: Tensor | None, timing: SensorTiming, options: _Options
+    curve: OffsetCurve, frames: Tensor, valid: Tensor | None, timing: RowTiming, options: _Options
 ) -> tuple[ToneFit, OtherMotion | None]:
     """The paper's method."""
     return _tones_of_bands(curve, timing, options), None
 
 
 def _detect_direct(
-    curve: OffsetCurve, frames: Tensor, valid: Tensor | None, timing: SensorTiming, options: _Options
+    curve: OffsetCurve, frames: Tensor, valid: Tensor | None, timing: RowTiming, options: _Options
 ) -> tuple[ToneFit, OtherMotion | None]:
     """The bands' result, refined on the images themselves, row by row."""
     start = _tones_of_bands(curve, timing, options, _NEAR)
@@ -98,7 +98,7 @@ def _detect_direct(
 _METHODS: dict[
     str,
     Callable[
-        [OffsetCurve, Tensor, Tensor | None, SensorTiming, _Options],
+        [OffsetCurve, Tensor, Tensor | None, RowTiming, _Options],
         tuple[ToneFit, OtherMotion | None],
     ],
 ] = {"direct": _detect_direct, "bands": _detect_bands}

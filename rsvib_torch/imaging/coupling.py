@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["rows_showing"]
@@ -12,7 +12,7 @@ _STEPS, _FEW = 8, 3  # of Newton's method, and those that are mostly enough, the
 _TINY = 1e-9  # px: a step as small as that leaves next to nothing
 
 
-def rows_showing(scene_rows: Tensor, frame_start: Tensor, timing: SensorTiming, vibration: Vibration) -> Tensor:
+def rows_showing(scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Vibration) -> Tensor:
     """Frame rows r(s) that show scene rows s: the solution of ``r = s + Y(t(r))``.
 
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
@@ -22,7 +22,7 @@ def rows_showing(scene_rows: Tensor, frame_start: Tensor, timing: SensorTiming, 
     Args:
         scene_rows: Scene rows s, float64, shape S (batch dimensions of the vibration lead).
         frame_start: Exposure start of the frame's first row in seconds, broadcastable to S.
-        timing: The sensor.
+        timing: The sensor, in row order.
         vibration: The motion, in row order.
 
     Returns:

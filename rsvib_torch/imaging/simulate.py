@@ -11,7 +11,7 @@ from rsvib_torch.frames.arrays import ArrayLike, as_tensor
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order, vibration_to_row_order
 from rsvib_torch.imaging.sensor_noise import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["simulate_frames"]
@@ -96,7 +96,7 @@ def simulate_frames(
     return frames if noise is None else noise.apply(frames, generator)
 
 
-def _form_rows(scene: Tensor, starts: Tensor, timing: SensorTiming, motion: Vibration, width: int) -> Tensor:
+def _form_rows(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Vibration, width: int) -> Tensor:
     """Form frames (T, ..., R, width) whose rows are exposed from ``starts`` (T, R) on, centred on the scene."""
     height, scene_width = scene.shape[-2:]
     num_rows = starts.shape[-1]

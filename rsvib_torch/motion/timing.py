@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
 
-__all__ = ["SensorTiming", "check_timing"]
+__all__ = ["RowTiming", "SensorTiming", "check_timing"]
 
 _SCAN_AXES: dict[object, int] = {-2: -2, "y": -2, -1: -1, "x": -1}
 
@@ -169,9 +169,31 @@ class SensorTiming:
                 "times from one frame to the next, blanking rows included"
             )
 
-    def in_row_order(self) -> "SensorTiming":
+    def in_row_order(self) -> "RowTiming":
         """The same timing for frames already turned to row order (rows on axis -2, first row read first)."""
-        return replace(self, scan_axis=-2, readout_direction="forward")
+        return RowTiming(self.row_time, self.exposure_rows, self.frame_rows, frame_start_times=self.frame_start_times)
+
+
+@dataclass(frozen=True)
+class RowTiming(SensorTiming):
+    """Timing of frames in row order: rows lie on axis -2, and row 0 is read first.
+
+    ``SensorTiming.in_row_order`` returns it. Functions that work on frames, offsets or motions in row order take it
+    instead of a ``SensorTiming``, so that a type checker refuses a timing whose frames have not been turned.
+
+    Raises:
+        ValueError: If ``scan_axis`` is not -2 or ``readout_direction`` is not ``"forward"``, in addition to the errors
+            of ``SensorTiming``.
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.scan_axis, self.readout_direction) != (-2, "forward"):
+            raise ValueError(
+                "RowTiming must have scan_axis=-2 and readout_direction='forward', got "
+                f"scan_axis={self.scan_axis}, readout_direction={self.readout_direction!r}; "
+                "SensorTiming.in_row_order() converts a timing"
+            )
 
 
 def check_timing(value: object) -> None:

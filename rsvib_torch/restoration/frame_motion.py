@@ -10,7 +10,7 @@ from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order, vibration_to_row_order
 from rsvib_torch.imaging.coupling import rows_showing
 from rsvib_torch.motion.spline import rest_reach
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["FrameMotion", "frame_motion", "visible_pixels"]
@@ -31,7 +31,7 @@ class FrameMotion:
     """
 
     vibration: Vibration
-    timing: SensorTiming
+    timing: RowTiming
     frame_starts: Tensor
     shift: Tensor
 
@@ -59,7 +59,7 @@ class FrameMotion:
         return self.frame_starts[:, None] + frame_rows * self.timing.row_time
 
 
-def frame_motion(vibration: Vibration, timing: SensorTiming, num_frames: int, num_rows: int) -> FrameMotion:
+def frame_motion(vibration: Vibration, timing: RowTiming, num_frames: int, num_rows: int) -> FrameMotion:
     """Motion of ``num_frames`` frames of ``num_rows`` rows for a vibration of batch shape (B,) in row order."""
     starts = timing.frame_starts(num_frames, vibration.device)
     middle = starts + 0.5 * ((num_rows - 1) * timing.row_time + timing.exposure_time)

@@ -1,9 +1,14 @@
 import math
+from dataclasses import replace
+from pathlib import Path
 
+import mypy.api
 import pytest
 import torch
 
+import rsvib_torch
 from rsvib_torch import SensorTiming
+from rsvib_torch.motion.timing import RowTiming
 
 GOOD = {"row_time": 20.52e-6, "exposure_rows": 20, "frame_rows": 2048}
 
@@ -84,3 +89,37 @@ def test_nothing_has_a_default_that_is_a_guess(name):
 def test_bad_values(values, error, message):
     with pytest.raises(error, match=message):
         SensorTiming(**{**GOOD, **values})
+
+
+def test_row_timing_is_in_row_order():
+    timing = SensorTiming(**GOOD, frame_start_times=[0.0, 0.05])
+    rows = timing.in_row_order()
+    assert isinstance(rows, RowTiming)
+    assert rows == rows.in_row_order() == RowTiming(**GOOD, frame_start_times=(0.0, 0.05))
+    assert replace(rows, frame_rows=3000).frame_rows == 3000
+    for image_order in ({"scan_axis": "x"}, {"readout_direction": "reverse"}):
+        with pytest.raises(ValueError, match=r"must have scan_axis=-2 .*; SensorTiming.in_row_order\(\) converts"):
+            RowTiming(**GOOD, **image_order)
+        assert SensorTiming(**GOOD, **image_order).in_row_order() == RowTiming(**GOOD)
+
+
+def test_type_checker_requires_row_order(tmp_path):
+    snippet = tmp_path / "snippet.py"
+    call = "rows_showing(torch.zeros(1), torch.zeros(1), {}, Vibration(1.0, 50.0))\n"
+    head = (
+        "import torch\n"
+        "from rsvib_torch.imaging.coupling import rows_showing\n"
+        "from rsvib_torch.motion.timing import SensorTiming\n"
+        "from rsvib_torch.motion.vibration import Vibration\n"
+        "timing = SensorTiming(2e-5, 20, 512, scan_axis='x')\n"
+    )
+    package = Path(rsvib_torch.__file__).parent
+    files = [str(package / name) for name in ("motion/timing.py", "imaging/coupling.py")]
+    for argument, accepted in (("timing.in_row_order()", True), ("timing", False)):
+        snippet.write_text(head + call.format(argument))
+        # modules that are not listed count as Any, so that torch need not be analysed
+        output, _, status = mypy.api.run(
+            ["--follow-imports=skip", "--config-file=", f"--cache-dir={tmp_path / 'cache'}", *files, str(snippet)]
+        )
+        assert (status == 0) == accepted, output
+        assert accepted or 'has incompatible type "SensorTiming"; expected "RowTiming"' in output

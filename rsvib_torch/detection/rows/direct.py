@@ -27,7 +27,7 @@ from rsvib_torch.detection.tones.inversion import known_motion
 from rsvib_torch.detection.tones.robust import of_each, residual_of, robust_fit, shown_size, typical_size
 from rsvib_torch.detection.tones.selection import find_tones, significant_only, strongest_only
 from rsvib_torch.detection.tones.tone_model import ToneFit
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.pattern import EVERY, column_pattern
@@ -152,7 +152,7 @@ def _without_runaways(measurements: Measurements, before: ToneFit, after: ToneFi
 
 
 def refine_directly(
-    spectra: RowSpectra, timing: SensorTiming, start: ToneFit, tones: int | None, iterations: int = 12
+    spectra: RowSpectra, timing: RowTiming, start: ToneFit, tones: int | None, iterations: int = 12
 ) -> DirectFit:
     """Refine a detected motion on the images themselves.
 
@@ -193,7 +193,7 @@ def refine_directly(
 
 def _refine(
     groups: list[FrameGroup],
-    timing: SensorTiming,
+    timing: RowTiming,
     intervals: Tensor,
     start: ToneFit,
     tones: int | None,

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.equal_blur import Shown, blurred_unlike, warp_to_same_blur
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration.gradients import RowGradients, row_gradients, row_pulls, row_shifts
 from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra, chunks
@@ -58,7 +58,7 @@ def _frames_in_group(motion: Vibration, starts: Tensor, size: tuple[int, int]) -
     return int(max(2, min(LARGEST_GROUP, 1 + (1 - _LEAST_OVERLAP) // max(fraction, 1e-9))))
 
 
-def intervals_compared(timing: SensorTiming, num_frames: int, largest_group: int, device: torch.device) -> Tensor:
+def intervals_compared(timing: RowTiming, num_frames: int, largest_group: int, device: torch.device) -> Tensor:
     """Times (M,) in seconds between frames that are compared with each other, in groups of so many at most."""
     starts = timing.frame_starts(num_frames, device)
     return torch.cat([starts[step:] - starts[:-step] for step in range(1, min(num_frames, largest_group))])
@@ -74,9 +74,7 @@ def stack_spectra(frames: Tensor, valid: Tensor | None) -> RowSpectra:
     return RowSpectra(frames, valid, *_level_and_contrast(frames, valid))
 
 
-def frame_groups(
-    spectra: RowSpectra, timing: SensorTiming, motion: Vibration, *, alike: bool = False
-) -> list[FrameGroup]:
+def frame_groups(spectra: RowSpectra, timing: RowTiming, motion: Vibration, *, alike: bool = False) -> list[FrameGroup]:
     """Frames in groups that share enough of the scene when it moves by ``motion``.
 
     Args:
@@ -96,7 +94,7 @@ def frame_groups(
 
 
 def warping(
-    group: FrameGroup, timing: SensorTiming, motion: Vibration, every: int
+    group: FrameGroup, timing: RowTiming, motion: Vibration, every: int
 ) -> tuple[RowSpectra, Tensor, Tensor, Tensor]:
     """A group with what warps every so many rows (a part of a block) of its frames back by a motion."""
     place, left = _place(group, timing, motion)
@@ -104,7 +102,7 @@ def warping(
     return group.spectra, shown.rows, shown.shift, _seen(shown.rows, group.spectra.height, BLOCK // every)
 
 
-def _place(group: FrameGroup, timing: SensorTiming, motion: Vibration) -> tuple[Tensor, Tensor]:
+def _place(group: FrameGroup, timing: RowTiming, motion: Vibration) -> tuple[Tensor, Tensor]:
     """Scene rows (B, 1, S) that a group sees, and px (B, 1, 1) that the columns it sees have moved by."""
     scene_rows = torch.arange(group.spectra.height, dtype=torch.float64, device=group.starts.device)
     # whole pixels of an image motion move both
@@ -129,7 +127,7 @@ def _blocks(values: Tensor) -> Tensor:
 
 
 def measure_group(
-    group: FrameGroup, timing: SensorTiming, motion: Vibration, gradients: RowGradients | None
+    group: FrameGroup, timing: RowTiming, motion: Vibration, gradients: RowGradients | None
 ) -> tuple[Measurements, RowGradients]:
     """Displacements of blocks of scene rows in the frames of a group, measured around a motion.
 
@@ -184,7 +182,7 @@ def join_groups(parts: list[Measurements]) -> Measurements:
     )
 
 
-def measure_groups(groups: list[FrameGroup], timing: SensorTiming, motion: Vibration) -> Measurements:
+def measure_groups(groups: list[FrameGroup], timing: RowTiming, motion: Vibration) -> Measurements:
     """``measure_group`` of all groups, with gradients of their own, as one record."""
     return join_groups([measure_group(group, timing, motion, None)[0] for group in groups])
 

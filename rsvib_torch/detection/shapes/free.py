@@ -17,7 +17,7 @@ from rsvib_torch.detection.shapes.spline_fit import SplineFit, fit_spline
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import offsets_from_row_order, vibration_from_row_order
 from rsvib_torch.motion.spline import FreeMotion
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration import OffsetCurve, Registration
 
@@ -160,7 +160,7 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: Bands, knot_rows: in
 
 def start_curve(
     stack: GreyFrames, timing: SensorTiming, bands: Bands
-) -> tuple[SensorTiming, OffsetCurve, tuple[float, float]]:
+) -> tuple[RowTiming, OffsetCurve, tuple[float, float]]:
     """Timing in row order, the offsets of the row bands of one stack, start and end of the record.
 
     Raises:

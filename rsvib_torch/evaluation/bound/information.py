@@ -12,7 +12,7 @@ from rsvib_torch.core.banded_solver import solve_banded
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored
 from rsvib_torch.imaging import exposure_nodes, exposure_trajectory, rows_showing
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
 
 __all__ = [
@@ -48,7 +48,7 @@ class Recording:
     """
 
     scene: Tensor
-    timing: SensorTiming
+    timing: RowTiming
     motion: Vibration
     num_frames: int
     size: tuple[int, int]
