@@ -1,9 +1,9 @@
 #!/usr/bin/env python
-"""Build the documentation as a site: README, the pages in docs/, and a reference of the public API from its docstrings.
+"""Build the documentation as a site: the pages in docs/, and references of the public names and of the commands.
 
 Needs the extra ``docs``: ``.venv/bin/python -m pip install -c scripts/constraints.txt -e '.[docs]'``. Warnings are
-errors: a link that leads nowhere, or a docstring that names a parameter which its function does not have, fails the
-build. The site is left in out/site.
+errors: a broken link, or a docstring with a parameter that its function does not have, fails the build. The site works
+without a network and has a search; it is written to out/site.
 """
 
 import argparse
@@ -19,35 +19,40 @@ from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
+from typer.testing import CliRunner
+
 import rsvib_torch as rsv
+from rsvib_torch.commands.main import app
 
 ROOT = Path(__file__).resolve().parents[1]
-# the order to read them in; others follow
-ROOMS = (
-    "sensor",
-    "vibration",
-    "free_motion",
-    "motion_file",
-    "calibration",
-    "imaging",
-    "registration",
+# Order of the packages in the reference; others follow in alphabetical order.
+PACKAGES = (
+    "motion",
     "detection",
     "restoration",
+    "imaging",
+    "registration",
+    "calibration",
+    "io",
+    "stacks",
     "evaluation",
     "augmentation",
-    "stacks",
 )
-PAGES = (
-    "method.md",
-    "conventions.md",
-    "accuracy.md",
-    "bound.md",
-    "measuring.md",
-    "gallery.md",
-    "your_own_camera.md",
-    "stacks.md",
-    "ml_pipeline.md",
-)
+# Sections of the site and the order of their pages; pages that are missing here are added to the last section.
+SECTIONS = {
+    "Guides": (
+        "quickstart.md",
+        "concepts.md",
+        "your_own_camera.md",
+        "stacks.md",
+        "ml_pipeline.md",
+        "measuring.md",
+        "gallery.md",
+    ),
+    "Method": ("method.md", "conventions.md", "bound.md", "accuracy.md", "benchmarks.md"),
+    "Development": ("architecture.md", "ablation.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"),
+}
+OUTSIDE_DOCS = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")  # pages that lie at the top level of the project
 
 
 def ordered(names: Iterable[str], order: Sequence[str]) -> list[str]:
@@ -55,26 +60,32 @@ def ordered(names: Iterable[str], order: Sequence[str]) -> list[str]:
     return sorted(names, key=lambda name: (order.index(name) if name in order else len(order), name))
 
 
-def rooms() -> dict[str, list[str]]:
-    """Public names with their full paths, by the part of the package they come from."""
+def public_names() -> dict[str, list[str]]:
+    """Public names with their full paths, by package."""
     found: dict[str, list[str]] = defaultdict(list)
     for name in rsv.__all__:
         thing = getattr(rsv, name)
         found[thing.__module__.split(".")[1]].append(f"{thing.__module__}.{name}")
-    return {room: found[room] for room in ordered(found, ROOMS)}
+    return {package: found[package] for package in ordered(found, PACKAGES)}
 
 
-def title(room: str) -> str:
-    """Heading of a part of the package."""
-    return room.replace("_", " ").capitalize()
-
-
-def reference_page(room: str, paths: list[str]) -> str:
+def reference_page(package: str, paths: list[str]) -> str:
     """Markdown of one page of the reference."""
-    package = sys.modules[f"rsvib_torch.{room}"]
-    lines = [f"# {title(room)}", "", inspect.getdoc(package) or "", ""]
+    module = sys.modules[f"rsvib_torch.{package}"]
+    lines = [f"# {package}", "", inspect.getdoc(module) or "", ""]
     for path in sorted(paths, key=str.casefold):
         lines += [f"::: {path}", ""]
+    return "\n".join(lines)
+
+
+def command_page() -> str:
+    """Markdown of the command reference: what ``rsvib COMMAND --help`` prints."""
+    runner = CliRunner(env={"COLUMNS": "110", "NO_COLOR": "1", "TERM": "dumb"})
+    names = [command.name or command.callback.__name__ for command in app.registered_commands if command.callback]
+    lines = ["# Commands", "", "The output of `rsvib COMMAND --help`.", ""]
+    for name in names:
+        printed = "\n".join(line.rstrip() for line in runner.invoke(app, [name, "--help"]).stdout.strip().splitlines())
+        lines += [f"## rsvib {name}", "", "```text", printed, "```", ""]
     return "\n".join(lines)
 
 
@@ -92,18 +103,27 @@ def without_outer_links(text: str, folder: Path) -> str:
 def write_sources(folder: Path) -> list[object]:
     """Fill a folder with the pages of the site; returns its navigation."""
     shutil.copytree(ROOT / "docs", folder, dirs_exist_ok=True)
-    for name, page in (("README.md", "index.md"), ("CHANGELOG.md", "CHANGELOG.md")):
+    for name, page in (("README.md", "index.md"), *((name, name) for name in OUTSIDE_DOCS)):
         shutil.copy(ROOT / name, folder / page)
     for page in folder.glob("*.md"):
         text = page.read_text(encoding="utf-8").replace("](docs/", "](").replace("](../README.md", "](index.md")
         page.write_text(without_outer_links(text, folder), encoding="utf-8")
     (folder / "api").mkdir()
-    reference = []
-    for room, paths in rooms().items():
-        (folder / "api" / f"{room}.md").write_text(reference_page(room, paths), encoding="utf-8")
-        reference.append({title(room): f"api/{room}.md"})
-    guide = ordered((page.name for page in (ROOT / "docs").glob("*.md")), PAGES)
-    return [{"Home": "index.md"}, {"Guide": guide}, {"Reference": reference}, {"Changes": "CHANGELOG.md"}]
+    reference: list[object] = [{"Configuration": "configuration.md"}, {"Commands": "commands.md"}]
+    (folder / "commands.md").write_text(command_page(), encoding="utf-8")
+    for package, paths in public_names().items():
+        (folder / "api" / f"{package}.md").write_text(reference_page(package, paths), encoding="utf-8")
+        reference.append({f"rsvib_torch.{package}": f"api/{package}.md"})
+    existing = {page.name for page in folder.glob("*.md")} - {"index.md", "commands.md", "configuration.md"}
+    sections = {title: [page for page in pages if page in existing] for title, pages in SECTIONS.items()}
+    sections["Development"] += sorted(existing - {page for pages in sections.values() for page in pages})
+    return [
+        {"Home": "index.md"},
+        {"Guides": sections["Guides"]},
+        {"Reference": reference},
+        {"Method": sections["Method"]},
+        {"Development": sections["Development"]},
+    ]
 
 
 def settings(sources: Path, navigation: list[object], site: Path) -> dict[str, object]:
@@ -127,9 +147,13 @@ def settings(sources: Path, navigation: list[object], site: Path) -> dict[str, o
         "site_dir": str(site),
         "nav": navigation,
         "validation": {"unrecognized_links": "warn", "anchors": "warn", "absolute_links": "warn"},
-        "theme": {"name": "readthedocs"},
-        "markdown_extensions": ["tables", "fenced_code"],
-        "plugins": [{"mkdocstrings": {"handlers": {"python": {"paths": [str(ROOT)], "options": options}}}}],
+        # without highlightjs the theme loads nothing from the network
+        "theme": {"name": "readthedocs", "highlightjs": False, "navigation_depth": 3},
+        "markdown_extensions": ["tables", "fenced_code", {"codehilite": {"noclasses": True, "guess_lang": False}}],
+        "plugins": [
+            "search",
+            {"mkdocstrings": {"handlers": {"python": {"paths": [str(ROOT)], "options": options}}}},
+        ],
     }
 
 

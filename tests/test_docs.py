@@ -1,10 +1,12 @@
-"""The site of the documentation: every page and every public name has its place; it builds where MkDocs is there."""
+"""The documentation: every page, public name and command is in the site; it builds without warnings."""
 
 import importlib.util
+import re
 import runpy
 from pathlib import Path
 
 import pytest
+from test_imports import LAYERS
 
 import rsvib_torch as rsv
 
@@ -16,20 +18,46 @@ def docs():
     return runpy.run_path(str(ROOT / "scripts" / "docs.py"))
 
 
-def test_pages_come_in_order_and_none_is_left_out(docs, tmp_path):
-    _, guide, reference, _ = docs["write_sources"](tmp_path / "sources")
-    pages = guide["Guide"]
-    assert sorted(pages) == sorted(path.name for path in (ROOT / "docs").glob("*.md"))
-    assert pages[0] == "method.md"
-    assert {page for entry in reference["Reference"] for page in entry.values()} == {
-        f"api/{room}.md" for room in docs["rooms"]()
-    }
+def test_every_page_is_in_the_navigation(docs, tmp_path):
+    navigation = docs["write_sources"](tmp_path / "sources")
+    sections = {title: pages for section in navigation for title, pages in section.items()}
+    listed = [page for title in ("Guides", "Method", "Development") for page in sections[title]]
+    reference = [page for entry in sections["Reference"] for page in entry.values()]
+    outside = {"CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "commands.md"}
+    pages = {path.name for path in (ROOT / "docs").glob("*.md")} | outside
+    assert sorted(listed) == sorted(pages - {"commands.md", "configuration.md"})
+    assert sections["Guides"][0] == "quickstart.md"
+    assert set(reference) == {"configuration.md", "commands.md"} | {f"api/{name}.md" for name in docs["public_names"]()}
+
+
+def test_names_in_a_given_order_come_first(docs):
     assert docs["ordered"](["new", "b", "a"], ("b", "a")) == ["b", "a", "new"]
 
 
 def test_every_public_name_is_in_the_reference(docs):
-    paths = [path for room in docs["rooms"]().values() for path in room]
+    paths = [path for package in docs["public_names"]().values() for path in package]
     assert sorted(path.rsplit(".", 1)[1] for path in paths) == sorted(rsv.__all__)
+
+
+def test_every_command_is_in_the_reference(docs):
+    page = docs["command_page"]()
+    for command in ("simulate", "detect", "restore", "run", "report", "calibrate", "motion", "known"):
+        assert f"## rsvib {command}\n" in page
+    assert page.count("--config") >= 6
+
+
+def test_drawing_of_the_architecture_has_the_layers_of_the_import_test():
+    drawn = runpy.run_path(str(ROOT / "scripts" / "drawings.py"))["ARCHITECTURE"]
+    assert [{name for name, _ in packages} for packages in reversed(drawn)] == [set(layer) for layer in LAYERS]
+
+
+def test_drawings_are_files_of_the_documentation(tmp_path):
+    drawings = runpy.run_path(str(ROOT / "scripts" / "drawings.py"))
+    drawings["main"](["--out", str(tmp_path)])
+    drawn = {path.name for path in tmp_path.iterdir()}
+    assert drawn == {path.name for path in (ROOT / "docs" / "drawings").iterdir()}
+    used = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").glob("*.md"))
+    assert all(f"](drawings/{name})" in used for name in drawn)
 
 
 def test_links_out_of_the_site_are_plain_text(docs, tmp_path):
@@ -39,16 +67,19 @@ def test_links_out_of_the_site_are_plain_text(docs, tmp_path):
     assert docs["without_outer_links"](text, tmp_path) == expected
 
 
-@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is not None, reason="MkDocs is there")
+@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is not None, reason="MkDocs is installed")
 def test_missing_builder_is_named(docs, capsys):
     with pytest.raises(SystemExit, match="2"):
         docs["main"]([])
     assert "pip install -c scripts/constraints.txt -e '.[docs]'" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(importlib.util.find_spec("mkdocstrings") is None, reason="MkDocs is not there (extra docs)")
+@pytest.mark.skipif(importlib.util.find_spec("mkdocstrings") is None, reason="MkDocs is not installed (extra docs)")
 def test_site_builds_without_a_warning(docs, tmp_path):
     docs["main"](["--out", str(tmp_path / "site")])
     page = (tmp_path / "site" / "api" / "augmentation" / "index.html").read_text(encoding="utf-8")
     assert "RollingShutterVibration" in page
+    assert (tmp_path / "site" / "search" / "search_index.json").stat().st_size > 100_000
+    home = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
+    assert not re.findall(r'<(?:script|link)[^>]*(?:src|href)="(?:https?:)?//', home)  # nothing from the network
     assert (tmp_path / "site" / "ml_pipeline" / "index.html").exists()
