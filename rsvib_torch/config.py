@@ -5,7 +5,7 @@ import os
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import Field, create_model, model_validator
 
@@ -13,13 +13,14 @@ from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.validation import Section, checked, options_section, validate
 from rsvib_torch.detection import detect_vibration
 from rsvib_torch.imaging import SensorNoise, simulate_frames
+from rsvib_torch.io.schema import TimingRecord, VibrationRecord
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.restoration import restore
 from rsvib_torch.restoration.restore import MASKS, METHODS
 from rsvib_torch.stacks import DEFAULT_WINDOW, BadFrames
 
-__all__ = ["Config", "Simulation", "TimingSection", "VibrationSection", "read_config"]
+__all__ = ["Config", "Simulation", "read_config"]
 
 
 @dataclass(frozen=True)
@@ -62,59 +63,26 @@ class Config:
     stack: dict[str, Any]
 
 
-class TimingSection(Section):
-    """Fields of ``SensorTiming``, which checks them."""
+class SensorSection(TimingRecord):
+    """``[sensor]``: the timing, and the full scale of the camera's counts."""
 
-    row_time: float
-    exposure_rows: float
-    frame_rows: float
     scan_axis: Literal["y", "x"] = "y"
     readout_direction: Literal["forward", "reverse"] = "forward"
     frame_start_times: list[float] | None = None
-
-    @model_validator(mode="after")
-    def _check(self) -> "TimingSection":
-        checked(self.timing)
-        return self
-
-    def timing(self) -> SensorTiming:
-        """The sensor."""
-        return SensorTiming(**{name: getattr(self, name) for name in TimingSection.model_fields})
-
-
-class _SensorSection(TimingSection):
-    """``[sensor]``: the timing, and the full scale of the camera's counts."""
-
     full_scale: float | None = None
 
     @model_validator(mode="after")
-    def _check_full_scale(self) -> "_SensorSection":
+    def _check_full_scale(self) -> Self:
         if self.full_scale is not None:
             check_number("full_scale", self.full_scale, above=0.0)
         return self
 
 
-class VibrationSection(Section):
-    """Fields of ``Vibration``, which checks them: two numbers (x, y), or two lists for several tones an axis."""
+class VibrationSection(VibrationRecord):
+    """``[simulation.vibration]``: phase and image motion are optional."""
 
-    amplitude: list[float] | list[list[float]]
-    frequency: list[float] | list[list[float]]
     phase: list[float] | list[list[float]] = Field(default_factory=lambda: [0.0, 0.0])
     image_motion: list[float] = Field(default_factory=lambda: [0.0, 0.0])
-    image_acceleration: list[float] = Field(default_factory=lambda: [0.0, 0.0])
-
-    @model_validator(mode="after")
-    def _check(self) -> "VibrationSection":
-        for name in ("amplitude", "frequency", "phase"):
-            rows = getattr(self, name)
-            if len(rows) != 2 or len({len(row) if isinstance(row, list) else 1 for row in rows}) != 1:
-                raise ValueError(f"{name} must be two numbers (x, y), or two lists of the same length, got {rows}")
-        checked(self.vibration)
-        return self
-
-    def vibration(self) -> Vibration:
-        """The vibration."""
-        return Vibration(self.amplitude, self.frequency, self.phase, self.image_motion, self.image_acceleration)
 
 
 _NoiseSection = options_section("_NoiseSection", SensorNoise)
@@ -142,7 +110,7 @@ class _SimulationSection(Section):
         """What to simulate."""
         size = None if self.frame_size is None else (self.frame_size[0], self.frame_size[1])
         noise = None if self.noise is None else SensorNoise(**dict(self.noise))
-        return Simulation(self.vibration.vibration(), self.num_frames, size, noise, self.seed)
+        return Simulation(self.vibration.to_vibration(), self.num_frames, size, noise, self.seed)
 
 
 _DetectionSection = options_section(
@@ -192,7 +160,7 @@ def read_config(path: str | os.PathLike[str]) -> Config:
     root: Any = create_model(
         "_Root",
         __base__=Section,
-        sensor=(_SensorSection, ...),
+        sensor=(SensorSection, ...),
         detection=(_DetectionSection | None, None),
         restoration=(_restoration_section(method) | None, None),
         simulation=(_SimulationSection | None, None),
@@ -201,7 +169,7 @@ def read_config(path: str | os.PathLike[str]) -> Config:
     checked_data = validate(root, data, str(path))
     sensor, simulation = checked_data.sensor, checked_data.simulation
     return Config(
-        timing=sensor.timing(),
+        timing=sensor.to_timing(),
         full_scale=sensor.full_scale,
         detection=_given(checked_data.detection),
         restoration=_given(checked_data.restoration),

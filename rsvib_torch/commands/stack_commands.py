@@ -35,9 +35,11 @@ from rsvib_torch.commands.workflow import (
 )
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.core.checks import check_choice
+from rsvib_torch.core.validation import validate
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.io import check_writable, open_stack, read_stack_info, timing_from_first_frame, whole_folder
 from rsvib_torch.io.full_scale import counts_to_frames
+from rsvib_torch.io.schema import TimingRecord, check_same_timing
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.report.plots import comparison_figure, save_figure
 from rsvib_torch.stacks import (
@@ -49,7 +51,6 @@ from rsvib_torch.stacks import (
     iterate_stack,
     process_stack,
     read_manifest,
-    timing_keys,
 )
 
 __all__ = ["detect_windows", "restore_windows", "run", "window_of"]
@@ -280,13 +281,11 @@ def restore_windows(
     Raises:
         ValueError: If the windows are those of another camera.
     """
-    ours, theirs = timing_keys(config.timing), dict(manifest.settings.get("sensor", {}))
-    if config.timing.frame_start_times is None and theirs.get("frame_start_times") is not None:
-        ours["frame_start_times"] = theirs["frame_start_times"]  # those of the file
-    different = [name for name, value in ours.items() if theirs.get(name) != value]
-    if different:
-        names = ", ".join(f"{name}={theirs.get(name)!r} (here {ours[name]!r})" for name in different)
-        raise ValueError(f"the vibration of another camera: detected with {names}")
+    stored = validate(TimingRecord, manifest.settings.get("sensor", {}), "manifest.json: settings.sensor")
+    if config.timing.frame_start_times is None:  # the frames' file may hold their times
+        check_same_timing("manifest.json", stored, replace(config.timing, frame_start_times=stored.frame_start_times))
+    else:
+        check_same_timing("manifest.json", stored, config.timing)
     window = manifest.settings.get("window")
     if not isinstance(window, int):
         raise ValueError("manifest.json: settings.window: missing key; expected a whole number")

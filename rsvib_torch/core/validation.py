@@ -1,4 +1,4 @@
-"""Tables from files checked against types: one line a mistake, naming the key, the value and what was expected."""
+"""Checks of tables from TOML and JSON files against types, with one line per mistake."""
 
 import inspect
 import json
@@ -13,23 +13,23 @@ __all__ = ["Section", "checked", "options_section", "read_json", "validate"]
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _Result = TypeVar("_Result")
-_WORDS = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
-_PLURALS: dict[Any, str] = {float: "numbers", int: "whole numbers", str: "texts"}
+_TYPE_NAMES = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
+_LIST_NAMES: dict[Any, str] = {float: "numbers", int: "whole numbers", str: "texts", bool: "true or false"}
 
 
 class Section(BaseModel):
-    """A table with known keys and strict types: text is no number, and a key too many is a mistake."""
+    """Table with a fixed set of keys and strict types: unknown keys are refused, and values are not converted."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
 
 
 def options_section(name: str, function: Callable[..., Any], *, skip: tuple[str, ...] = (), **more: Any) -> Any:
-    """Section whose keys, types and defaults are the options of a function: they are written down only there.
+    """Create a section whose keys, types and defaults are the options of a function.
 
     Args:
         name: Name of the section class.
-        function: Function (its keyword-only parameters count) or dataclass (all of its fields do).
-        skip: Parameters that are no keys.
+        function: Function (its keyword-only parameters) or dataclass (all of its fields).
+        skip: Parameters that are not keys of the section.
         **more: Further fields as pydantic takes them, ``(type, default)``.
 
     Returns:
@@ -45,7 +45,7 @@ def options_section(name: str, function: Callable[..., Any], *, skip: tuple[str,
 
 
 def checked(build: Callable[..., _Result], *args: Any, **kwargs: Any) -> _Result:
-    """Call ``build`` within a validator: its ``TypeError`` becomes the ``ValueError`` that pydantic reports."""
+    """Call ``build`` in a validator: pydantic reports ``ValueError`` only, so a ``TypeError`` becomes one."""
     try:
         return build(*args, **kwargs)
     except TypeError as error:
@@ -58,10 +58,11 @@ def validate(model: type[_Model], data: Mapping[str, Any], source: str) -> _Mode
     Args:
         model: A ``Section``.
         data: Parsed TOML or JSON.
-        source: The file, for the messages.
+        source: Name of the file, for the messages.
 
     Raises:
-        ValueError: If anything is wrong: one line a mistake.
+        ValueError: If a key is missing or unknown, or a value has a wrong type or value: one line for each key, with
+            its path, its value and what was expected.
     """
     try:
         return model.model_validate(data)
@@ -74,67 +75,72 @@ def validate(model: type[_Model], data: Mapping[str, Any], source: str) -> _Mode
 
 
 def _describe(model: type[BaseModel], data: Any, mistake: Any) -> tuple[str, str]:
-    """Key path of a mistake, and what is wrong there."""
+    """Path of the key that a mistake of pydantic belongs to, and the message."""
     path = ""
     value: Any = data
     expected: Any = model
-    unknown = mistake["type"] == "extra_forbidden"
+    kind, context = mistake["type"], mistake.get("ctx", {})
     for step in mistake["loc"]:
         if isinstance(value, Mapping) and isinstance(step, str):
-            known = _table(expected)
-            if step not in value and step not in known:
-                break  # it names a member of a union
+            keys = _keys(expected)
+            if step not in value and step not in keys:
+                break  # the rest of the location names a member of a union
             path = f"{path}.{step}" if path else step
             if step not in value:
-                return path, f"missing key; expected {_words(known[step])}"
-            if unknown and step not in known:
-                return path, f"unknown key; expected one of {', '.join(known)}"
-            value, expected = value[step], known.get(step, Any)
+                return path, f"missing key; expected {_expected(keys[step])}"
+            if kind == "extra_forbidden" and step not in keys:
+                return path, f"unknown key; expected one of {', '.join(keys)}"
+            value, expected = value[step], keys.get(step, Any)
         elif isinstance(value, list) and isinstance(step, int) and step < len(value):
             path, value = f"{path}[{step}]", value[step]
-            expected = next((get_args(kind)[0] for kind in _kinds(expected) if get_origin(kind) is list), Any)
+            expected = next((get_args(member)[0] for member in _members(expected) if get_origin(member) is list), Any)
         else:
-            break  # what remains names a member of a union
-    if mistake["type"] == "value_error":
-        return path, str(mistake["ctx"]["error"])
-    return path, f"expected {_words(expected)}, got {value!r}"
+            break  # the rest of the location names a member of a union
+    if kind == "value_error":
+        return path, str(context["error"])
+    if kind == "greater_than_equal":
+        return path, f"expected at least {context['ge']}, got {value!r}"
+    if kind in ("too_short", "too_long"):
+        return path, f"expected {context.get('min_length', context.get('max_length'))} entries, got {value!r}"
+    return path, f"expected {_expected(expected)}, got {value!r}"
 
 
-def _kinds(annotation: Any) -> tuple[Any, ...]:
+def _members(annotation: Any) -> tuple[Any, ...]:
     """Members of a union, without None."""
     members = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
-    return tuple(kind for kind in members if kind is not type(None))
+    return tuple(member for member in members if member is not type(None))
 
 
-def _table(annotation: Any) -> dict[str, Any]:
-    """Keys of a section with their types; those of the values of a free table are empty."""
-    for kind in _kinds(annotation):
-        if isinstance(kind, type) and issubclass(kind, BaseModel):
-            return {name: field.annotation for name, field in kind.model_fields.items()}
+def _keys(annotation: Any) -> dict[str, Any]:
+    """Keys of a section with their types; empty for a table with arbitrary keys."""
+    for member in _members(annotation):
+        if isinstance(member, type) and issubclass(member, BaseModel):
+            return {name: field.annotation for name, field in member.model_fields.items()}
     return {}
 
 
-def _words(annotation: Any) -> str:
-    """What a type is called in a message."""
+def _expected(annotation: Any) -> str:
+    """Description of a type in a message."""
     words: list[str] = []
-    for kind in _kinds(annotation):
-        if get_origin(kind) is Literal:
-            words.extend(repr(choice) for choice in get_args(kind))
-        elif get_origin(kind) is list:
-            words.append(f"a list of {_PLURALS.get(get_args(kind)[0], 'lists of numbers')}")
-        elif isinstance(kind, type) and issubclass(kind, BaseModel):
-            words.append(f"a table with {', '.join(kind.model_fields)}")
+    for member in _members(annotation):
+        if get_origin(member) is Literal:
+            words.extend(repr(choice) for choice in get_args(member))
+        elif get_origin(member) is list:
+            item = _members(get_args(member)[0])[0]
+            words.append(f"a list of {_LIST_NAMES.get(item, 'lists' if get_origin(item) is list else 'tables')}")
+        elif isinstance(member, type) and issubclass(member, BaseModel):
+            words.append(f"a table with {', '.join(member.model_fields)}")
         else:
-            words.append(_WORDS.get(kind, str(kind)))
+            words.append(_TYPE_NAMES.get(member, str(member)))
     return " or ".join(dict.fromkeys(words))
 
 
 def read_json(path: Path, what: str) -> dict[str, Any]:
-    """A table from a JSON file.
+    """Read a table from a JSON file.
 
     Args:
         path: The file.
-        what: What it should be, for the messages.
+        what: Name of the kind of file, for the messages.
 
     Raises:
         OSError: If the file cannot be opened.
@@ -150,4 +156,4 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 
 
 def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is no JSON number")
+    raise ValueError(f"{name} is not a JSON number")

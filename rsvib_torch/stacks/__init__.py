@@ -5,7 +5,7 @@ from rsvib_torch.stacks.detect_windows import detect_stack
 from rsvib_torch.stacks.iterate import iterate_stack
 from rsvib_torch.stacks.job import BadFrames, WindowResult
 from rsvib_torch.stacks.job_setup import DEFAULT_WINDOW
-from rsvib_torch.stacks.manifest import StackManifest, read_manifest, timing_keys
+from rsvib_torch.stacks.manifest import StackManifest, read_manifest
 from rsvib_torch.stacks.process import process_stack
 from rsvib_torch.stacks.run import StackReport
 from rsvib_torch.stacks.window_restoration import RestoredFrames, restore_trusted
@@ -26,5 +26,4 @@ __all__ = [
     "read_manifest",
     "restore_block",
     "restore_trusted",
-    "timing_keys",
 ]

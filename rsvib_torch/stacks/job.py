@@ -14,10 +14,11 @@ from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.io.files import open_stack
 from rsvib_torch.io.formats import FrameReader
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
+from rsvib_torch.io.schema import DetectedVibration, detection_to_json
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.frame_faults import frame_fault, placeholder
-from rsvib_torch.stacks.records import DetectedWindow, WindowRecord, detection_record
+from rsvib_torch.stacks.records import WindowRecord
 from rsvib_torch.stacks.window_restoration import RestoredFrames, restore_trusted
 from rsvib_torch.stacks.windows import Window, window_timing
 
@@ -47,7 +48,7 @@ class WindowResult:
     indices: tuple[int, ...]
     frames: Tensor
     restored: bool
-    detection: DetectionResult | DetectedWindow | None
+    detection: DetectionResult | DetectedVibration | None
     restoration: RestoredFrames | None
     error: str | None
     bad_frames: Mapping[int, str]
@@ -84,7 +85,7 @@ class StackJob:
     full_scale: float | None
     detection: Mapping[str, Any] = field(default_factory=dict)
     restoration: Mapping[str, Any] | None = field(default_factory=dict)
-    given: Mapping[int, DetectedWindow | None] | None = None
+    given: Mapping[int, DetectedVibration | None] | None = None
     bad_frames: BadFrames = "pass"
     force: bool = False
     device: str = "cpu"
@@ -121,7 +122,7 @@ class StackJob:
             reason = next(fault for fault in faults.values() if fault is not None)
             return WindowResult(window, kept, taken[: len(kept)], False, None, None, reason, bad)
         timing = window_timing(self.timing, window, good)
-        detection: DetectionResult | DetectedWindow | None = None
+        detection: DetectionResult | DetectedVibration | None = None
         try:
             detection = self._detect(window, taken, timing)
             if detection is None or self.restoration is None:
@@ -146,7 +147,9 @@ class StackJob:
             window, kept, restored.frames[: len(kept)], restored.restored, detection, restored, None, bad
         )
 
-    def _detect(self, window: Window, frames: Tensor, timing: SensorTiming) -> DetectionResult | DetectedWindow | None:
+    def _detect(
+        self, window: Window, frames: Tensor, timing: SensorTiming
+    ) -> DetectionResult | DetectedVibration | None:
         if self.given is not None:
             return self.given[window.index]
         found: DetectionResult = detect_vibration(frames, timing, **self.detection)
@@ -178,7 +181,7 @@ class StackJob:
             float(self.timing.frame_starts(result.window.first + 1)[-1]),
             written=written,
             frames="restored" if result.restored else "as taken",
-            detection=None if result.detection is None else detection_record(result.detection),
+            detection=detection_to_json(result.detection),
             left_alone=[] if restoration is None else list(restoration.left_alone),
             outcome=None if verdict is None else verdict.overall,
             summary=None if verdict is None else verdict.summary,

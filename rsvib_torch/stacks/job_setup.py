@@ -12,10 +12,10 @@ from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.io.files import PathLike, open_stack
 from rsvib_torch.io.frame_times import timing_of_stack
 from rsvib_torch.io.full_scale import check_full_scale
+from rsvib_torch.io.schema import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.job import BadFrames, StackJob
 from rsvib_torch.stacks.memory import parse_memory, windows_at_once
-from rsvib_torch.stacks.records import DetectedWindow
 
 __all__ = ["DEFAULT_WINDOW", "HOPELESS", "job_windows_at_once", "make_job"]
 
@@ -36,7 +36,7 @@ def make_job(
     *,
     detection: Mapping[str, Any] | None,
     restoration: Mapping[str, Any] | None,
-    given: Sequence[DetectedWindow | None] | None,
+    given: Sequence[DetectedVibration | None] | None,
     full_scale: float | None,
     bad_frames: BadFrames,
     force: bool,

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rsvib_torch.core.validation import Section, read_json, validate
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.io.schema import DetectedVibration, TimingRecord, detection_to_json
 from rsvib_torch.stacks.job import StackJob
-from rsvib_torch.stacks.records import DetectedWindow, WindowRecord, detection_record
+from rsvib_torch.stacks.records import WindowRecord
 
-__all__ = ["StackManifest", "manifest_header", "read_manifest", "timing_keys", "write_manifest"]
+__all__ = ["StackManifest", "manifest_header", "read_manifest", "write_manifest"]
 
 _FORMAT = "rsvib stack"
 _UNITS = {
@@ -57,26 +57,13 @@ class StackManifest(Section):
         """All that was known before the first window."""
         return {"input": self.input, "settings": self.settings, "versions": self.versions, "output": self.output}
 
-    def detections(self) -> list[DetectedWindow | None]:
+    def detections(self) -> list[DetectedVibration | None]:
         """What was detected in every window; None where nothing could be."""
-        return [None if record.detection is None else record.detection.detected() for record in self.windows]
+        return [None if record.detection is None else record.detection.to_detection() for record in self.windows]
 
 
-def timing_keys(timing: SensorTiming) -> dict[str, Any]:
-    """The sensor as JSON."""
-    starts = timing.frame_start_times
-    return {
-        "row_time": timing.row_time,
-        "exposure_rows": timing.exposure_rows,
-        "frame_rows": timing.frame_rows,
-        "scan_axis": {-2: "y", -1: "x"}[int(timing.scan_axis)],
-        "readout_direction": timing.readout_direction,
-        "frame_start_times": None if starts is None else [float(start) for start in starts],
-    }
-
-
-def _given_keys(given: Iterable[DetectedWindow | None]) -> str:
-    records = [None if detected is None else detection_record(detected) for detected in given]
+def _given_keys(given: Iterable[DetectedVibration | None]) -> str:
+    records = [detection_to_json(detected) for detected in given]
     return hashlib.sha256(json.dumps(records).encode()).hexdigest()
 
 
@@ -86,7 +73,7 @@ def manifest_header(
     """Everything that the result depends on: a run goes on only where it is the same."""
     shape = {"shape": list(job.info.shape), "dtype": job.info.dtype}
     settings = {
-        "sensor": timing_keys(job.timing),
+        "sensor": TimingRecord.from_timing(job.timing).model_dump(),
         "full_scale": job.full_scale,
         "window": window,
         "detection": dict(job.detection),

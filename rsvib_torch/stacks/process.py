@@ -9,13 +9,13 @@ from typing import Any
 
 from rsvib_torch.io.files import PathLike, check_info_target
 from rsvib_torch.io.frame_times import exposure_times
+from rsvib_torch.io.schema import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.fingerprint import fingerprint
 from rsvib_torch.stacks.job import BadFrames
 from rsvib_torch.stacks.job_setup import DEFAULT_WINDOW, job_windows_at_once, make_job
 from rsvib_torch.stacks.journal import Journal, describe_difference
 from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_manifest
-from rsvib_torch.stacks.records import DetectedWindow
 from rsvib_torch.stacks.run import StackReport, StackRun, disk_trouble_named
 from rsvib_torch.stacks.sink import Sink
 from rsvib_torch.stacks.windows import cut_windows
@@ -31,7 +31,7 @@ def process_stack(
     window: int = DEFAULT_WINDOW,
     detection: Mapping[str, Any] | None = None,
     restoration: Mapping[str, Any] | None = None,
-    given: Sequence[DetectedWindow | None] | None = None,
+    given: Sequence[DetectedVibration | None] | None = None,
     full_scale: float | None = None,
     bad_frames: BadFrames = "pass",
     force: bool = False,

@@ -415,12 +415,12 @@ def detect_once(place):
         (
             '"frame_rows": 512.0',
             '"frame_rows": 540.0',
-            "the vibration of another camera: detected with frame_rows=540.0",
+            "the vibration was detected with another timing: frame_rows=540.0",
         ),
-        ('"scan_axis": "y"', '"scan_axis": "x"', "the vibration of another camera"),
+        ('"scan_axis": "y"', '"scan_axis": "x"', "the vibration was detected with another timing"),
         ('"phase"', '"phases"', "vibration.phase: missing key"),
         ('"reliable": [true, true]', '"reliable": [1, true]', "reliable[0]: expected true or false, got 1"),
-        ('"gain": ', '"gain": NaN, "gains": ', "not a vibration.json: NaN is no JSON number"),
+        ('"gain": ', '"gain": NaN, "gains": ', "not a vibration.json: NaN is not a JSON number"),
         ("{", "[", "not a vibration.json: "),
     ],
 )

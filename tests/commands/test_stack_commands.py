@@ -77,7 +77,7 @@ def test_detect_in_windows_then_restore(place, tmp_path, capsys):
     other = tmp_path / "other.toml"
     other.write_text(CONFIG.replace("frame_rows = 104", "frame_rows = 105"))
     for config, more, message in (
-        (other, (), "the vibration of another camera: detected with frame_rows=104.0 (here 105.0)"),
+        (other, (), "the vibration was detected with another timing: frame_rows=104.0 (here 105.0)"),
         (place / "camera.toml", ("--report", tmp_path / "report.json"), "--report is for vibration.json"),
     ):
         arguments = ("--config", config, "--vibration", manifest, *more)

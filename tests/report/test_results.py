@@ -16,7 +16,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.report.plots import comparison_figure, detailed_places, offset_figure, save_figure
-from rsvib_torch.report.results import read_vibration, write_offsets, write_restoration, write_vibration
+from rsvib_torch.report.results import VibrationFile, read_vibration, write_offsets, write_restoration, write_vibration
 from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
 
 TIMING = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
@@ -54,8 +54,11 @@ def test_vibration_comes_back_exactly(tmp_path, result):
     back = read_vibration(tmp_path / "vibration.json", TIMING)
     for name in ("amplitude", "frequency", "phase", "image_motion"):
         torch.testing.assert_close(getattr(back.vibration, name), getattr(result.vibration, name), rtol=0, atol=0)
-    assert back.timing == TIMING
-    assert back.reliable == (True, False)
+    record = VibrationFile.model_validate(json.loads((tmp_path / "vibration.json").read_text()))
+    assert record.timing.to_timing() == TIMING
+    assert back.reliable.tolist() == [True, False]
+    torch.testing.assert_close(back.gain, result.gain, rtol=0, atol=0)
+    torch.testing.assert_close(back.residual, result.residual, rtol=0, atol=0)
     assert back.reasons == ((), ("only one period is seen",))
 
 
@@ -84,8 +87,8 @@ def test_vibration_file_is_plain_json(tmp_path, result):
 )
 def test_vibration_of_another_camera_is_refused(tmp_path, result, timing):
     write_vibration(tmp_path / "vibration.json", result, timing)
-    assert read_vibration(tmp_path / "vibration.json", timing).timing == timing
-    with pytest.raises(ValueError, match=r"the vibration of another camera: detected with .*here") as caught:
+    read_vibration(tmp_path / "vibration.json", timing)
+    with pytest.raises(ValueError, match=r"the vibration was detected with another timing: .*here") as caught:
         read_vibration(tmp_path / "vibration.json", TIMING)
     assert str(caught.value).count("(here") == 1
 
@@ -109,11 +112,11 @@ def put(data, value, *keys):
         (lambda d: drop(d, "vibration", "phase"), "vibration.phase: missing key"),
         (lambda d: drop(d, "timing", "frame_rows"), "timing.frame_rows: missing key; expected a number"),
         (lambda d: drop(d, "reliable"), "reliable: missing key"),
-        (lambda d: put(d, math.nan, "vibration", "amplitude", 0, 0), "not a vibration.json: NaN is no JSON number"),
+        (lambda d: put(d, math.nan, "vibration", "amplitude", 0, 0), "not a vibration.json: NaN is not a JSON number"),
         (lambda d: put(d, None, "vibration", "amplitude", 0, 0), "vibration.amplitude: expected a list of"),
         (lambda d: put(d, "3", "vibration", "frequency", 0, 0), "vibration.frequency: expected a list of"),
         (lambda d: put(d, -3.0, "vibration", "amplitude", 0, 0), "vibration: amplitude must not be negative"),
-        (lambda d: put(d, [True], "reliable"), "reliable and reasons must have two entries"),
+        (lambda d: put(d, [True], "reliable"), "reliable: expected 2 entries, got [True]"),
         (lambda d: put(d, 2, "version"), "version: expected 1, got 2"),
         (lambda d: put(d, 0.0, "timing", "row_time"), "timing: row_time must be larger than 0"),
         (lambda d: put(d, 1, "colour"), "colour: unknown key"),

@@ -68,7 +68,7 @@ def test_workers_that_are_killed_are_replaced(place, tmp_path):
                 done_at_death.append(done)
                 os.kill(pids.pop(), signal.SIGKILL)
 
-        given = [record.detection.detected() for record in read_manifest(place / "out.tif.manifest.json").windows]
+        given = [record.detection.to_detection() for record in read_manifest(place / "out.tif.manifest.json").windows]
         options = {"given": given, "detection": None, "scheduler": cluster.scheduler_address}
         process_small(place / "frames.tif", tmp_path / "out.tif", **options, progress=kill)
         assert len(done_at_death) == 2

@@ -1,0 +1,262 @@
+"""JSON schema of timing, vibration, standard deviations and detections, shared by all files that the package writes.
+
+``vibration.json``, ``manifest.json`` and the journal of a stack, and the TOML configuration use these records. Lists
+are ordered (x, y), with one list of tones for each axis; null stands for a value that is unknown or not finite.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, Self
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from rsvib_torch.core.validation import Section, checked
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
+
+__all__ = [
+    "DetectedVibration",
+    "DetectionRecord",
+    "StdRecord",
+    "TimingRecord",
+    "VibrationRecord",
+    "check_same_timing",
+    "detection_to_json",
+    "to_json",
+]
+
+Tones = list[float] | list[list[float]]
+Numbers = list[float | None]
+
+
+def to_json(values: Tensor) -> Any:
+    """Nested lists of the values of a tensor, with None where a value is not finite."""
+
+    def convert(value: Any) -> Any:
+        if isinstance(value, list):
+            return [convert(item) for item in value]
+        return value if math.isfinite(value) else None
+
+    return convert(values.detach().cpu().tolist())
+
+
+def _to_tensor(values: Any, missing: float) -> Tensor:
+    """Inverse of ``to_json``: a float64 tensor with ``missing`` in place of None."""
+
+    def convert(value: Any) -> Any:
+        if isinstance(value, list):
+            return [convert(item) for item in value]
+        return missing if value is None else value
+
+    return torch.tensor(convert(values), dtype=torch.float64)
+
+
+class TimingRecord(Section):
+    """Fields of ``SensorTiming``, which checks their values."""
+
+    row_time: float
+    exposure_rows: float
+    frame_rows: float
+    scan_axis: Literal["y", "x"]
+    readout_direction: Literal["forward", "reverse"]
+    frame_start_times: list[float] | None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        checked(self.to_timing)
+        return self
+
+    @classmethod
+    def from_timing(cls, timing: SensorTiming) -> Self:
+        """The record of a timing."""
+        starts = timing.frame_start_times
+        return cls(
+            row_time=timing.row_time,
+            exposure_rows=timing.exposure_rows,
+            frame_rows=timing.frame_rows,
+            scan_axis="x" if timing.scan_axis == -1 else "y",
+            readout_direction=timing.readout_direction,
+            frame_start_times=None if starts is None else [float(start) for start in starts],
+        )
+
+    def to_timing(self) -> SensorTiming:
+        """The timing."""
+        return SensorTiming(**{name: getattr(self, name) for name in TimingRecord.model_fields})
+
+
+class VibrationRecord(Section):
+    """Fields of ``Vibration``, which checks their values.
+
+    An axis is one number (one tone) or a list of tones.
+    """
+
+    amplitude: Tones
+    frequency: Tones
+    phase: Tones
+    image_motion: list[float]
+    image_acceleration: list[float] = Field(default_factory=lambda: [0.0, 0.0])
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for name in ("amplitude", "frequency", "phase"):
+            rows = getattr(self, name)
+            if len(rows) != 2 or len({len(row) if isinstance(row, list) else 1 for row in rows}) != 1:
+                raise ValueError(f"{name} must be two numbers (x, y), or two lists of the same length, got {rows}")
+        checked(self.to_vibration)
+        return self
+
+    @classmethod
+    def from_vibration(cls, vibration: Vibration) -> Self:
+        """The record of one vibration (not a batch)."""
+        return cls(**{name: to_json(getattr(vibration, name)) for name in VibrationRecord.model_fields})
+
+    def to_vibration(self) -> Vibration:
+        """The vibration."""
+        return Vibration(**{name: getattr(self, name) for name in VibrationRecord.model_fields})
+
+
+class StdRecord(Section):
+    """Fields of ``VibrationStd``; null where a standard deviation is unknown."""
+
+    amplitude: list[Numbers]
+    frequency: list[Numbers]
+    period: list[Numbers]
+    phase: list[Numbers]
+    image_motion: Numbers
+    image_acceleration: Numbers = Field(default_factory=lambda: list[float | None]([None, None]))
+
+    @classmethod
+    def from_std(cls, std: VibrationStd) -> Self:
+        """The record of the standard deviations of one vibration."""
+        return cls(**{name: to_json(getattr(std, name)) for name in cls.model_fields})
+
+    def to_std(self) -> VibrationStd:
+        """The standard deviations, infinite where unknown."""
+        return VibrationStd(**{name: _to_tensor(getattr(self, name), math.inf) for name in StdRecord.model_fields})
+
+
+class Detection(Protocol):
+    """What a ``DetectionRecord`` stores of a detection (not a batch), as ``detect_vibration`` returns it."""
+
+    @property
+    def vibration(self) -> Vibration:
+        """The vibration in image axes."""
+
+    @property
+    def std(self) -> VibrationStd:
+        """Standard deviations of its parameters."""
+
+    @property
+    def gain(self) -> Tensor:
+        """(2, K) gain of Eq. (7) from displacement to offset."""
+
+    @property
+    def residual(self) -> Tensor:
+        """(2,) px, mean absolute difference of measured and fitted offsets."""
+
+    @property
+    def reliable(self) -> Tensor:
+        """(2,) bool, verdict for each axis."""
+
+    @property
+    def reasons(self) -> tuple[Any, ...]:
+        """Why an axis is not reliable, for each axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class DetectedVibration:
+    """A detection without its offset curve: everything that restoration needs.
+
+    Attributes:
+        vibration: The vibration in image axes.
+        std: Standard deviations of its parameters, infinite where unknown.
+        gain: (2, K) gain of Eq. (7) from displacement to offset.
+        residual: (2,) px, mean absolute difference of measured and fitted offsets.
+        reliable: (2,) bool, verdict for each axis (x, y).
+        reasons: Why an axis is not reliable, for each axis.
+    """
+
+    vibration: Vibration
+    std: VibrationStd
+    gain: Tensor
+    residual: Tensor
+    reliable: Tensor
+    reasons: tuple[Any, ...]
+
+
+class DetectionRecord(Section):
+    """Fields of ``DetectedVibration``."""
+
+    vibration: VibrationRecord
+    std: StdRecord
+    gain: list[Numbers]
+    residual: Numbers
+    reliable: list[bool] = Field(min_length=2, max_length=2)
+    reasons: list[list[str]] = Field(min_length=2, max_length=2)
+
+    @classmethod
+    def from_detection(cls, detection: Detection, **fields: Any) -> Self:
+        """The record of a detection (not a batch); ``fields`` are those of a derived record."""
+        return cls(
+            vibration=VibrationRecord.from_vibration(detection.vibration),
+            std=StdRecord.from_std(detection.std),
+            gain=to_json(detection.gain),
+            residual=to_json(detection.residual),
+            reliable=detection.reliable.tolist(),
+            reasons=[list(axis) for axis in detection.reasons],
+            **fields,
+        )
+
+    def to_detection(self) -> DetectedVibration:
+        """The detection.
+
+        Raises:
+            ValueError: If vibration and standard deviations have different numbers of tones.
+        """
+        vibration, std = self.vibration.to_vibration(), self.std.to_std()
+        if any(values.shape != vibration.amplitude.shape for values in (std.amplitude, std.frequency, std.phase)):
+            raise ValueError("std must have as many tones as the vibration")
+        return DetectedVibration(
+            vibration,
+            std,
+            _to_tensor(self.gain, math.nan),
+            _to_tensor(self.residual, math.nan),
+            torch.tensor(self.reliable),
+            tuple(tuple(axis) for axis in self.reasons),
+        )
+
+
+def detection_to_json(detection: Detection | None) -> dict[str, Any] | None:
+    """Content of the ``DetectionRecord`` of a detection; None for None."""
+    return None if detection is None else DetectionRecord.from_detection(detection).model_dump()
+
+
+def check_same_timing(source: str, stored: TimingRecord, timing: SensorTiming) -> None:
+    """Check that a stored detection was made with the timing of the frames that are to be restored.
+
+    Args:
+        source: File of the detection, for the message.
+        stored: Timing in that file.
+        timing: Timing of the frames.
+
+    Raises:
+        ValueError: If they differ by more than rounding.
+    """
+    theirs, ours = stored.model_dump(), TimingRecord.from_timing(timing).model_dump()
+    different = [name for name in ours if not _equal(theirs[name], ours[name])]
+    if different:
+        values = ", ".join(f"{name}={theirs[name]!r} (here {ours[name]!r})" for name in different)
+        raise ValueError(
+            f"{source}: the vibration was detected with another timing: {values}; detect it again, or correct [sensor]"
+        )
+
+
+def _equal(first: Any, second: Any) -> bool:
+    """Whether two values of a record are equal up to rounding."""
+    if isinstance(first, list) and isinstance(second, list):
+        return len(first) == len(second) and all(map(_equal, first, second))
+    if isinstance(first, float) and isinstance(second, float):
+        return math.isclose(first, second, rel_tol=1e-9)
+    return bool(first == second)
