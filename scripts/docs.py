@@ -52,6 +52,7 @@ SECTIONS = {
     "Method": ("method.md", "conventions.md", "bound.md", "accuracy.md", "benchmarks.md"),
     "Development": ("architecture.md", "ablation.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"),
 }
+STYLE = "site.css"  # wide pages, and tables that wrap
 OUTSIDE_DOCS = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")  # pages that lie at the top level of the project
 
 
@@ -80,7 +81,7 @@ def reference_page(package: str, paths: list[str]) -> str:
 
 def command_page() -> str:
     """Markdown of the command reference: what ``rsvib COMMAND --help`` prints."""
-    runner = CliRunner(env={"COLUMNS": "110", "NO_COLOR": "1", "TERM": "dumb"})
+    runner = CliRunner(env={"COLUMNS": "96", "NO_COLOR": "1", "TERM": "dumb"})
     names = [command.name or command.callback.__name__ for command in app.registered_commands if command.callback]
     lines = ["# Commands", "", "The output of `rsvib COMMAND --help`.", ""]
     for name in names:
@@ -108,6 +109,7 @@ def write_sources(folder: Path) -> list[object]:
     for page in folder.glob("*.md"):
         text = page.read_text(encoding="utf-8").replace("](docs/", "](").replace("](../README.md", "](index.md")
         page.write_text(without_outer_links(text, folder), encoding="utf-8")
+    (folder / STYLE).write_text(".wy-nav-content {max-width: 60rem} .wy-table-responsive table td {white-space: normal}")
     (folder / "api").mkdir()
     reference: list[object] = [{"Configuration": "configuration.md"}, {"Commands": "commands.md"}]
     (folder / "commands.md").write_text(command_page(), encoding="utf-8")
@@ -149,6 +151,7 @@ def settings(sources: Path, navigation: list[object], site: Path) -> dict[str, o
         "validation": {"unrecognized_links": "warn", "anchors": "warn", "absolute_links": "warn"},
         # without highlightjs the theme loads nothing from the network
         "theme": {"name": "readthedocs", "highlightjs": False, "navigation_depth": 3},
+        "extra_css": [STYLE],
         "markdown_extensions": ["tables", "fenced_code", {"codehilite": {"noclasses": True, "guess_lang": False}}],
         "plugins": [
             "search",
