@@ -1,4 +1,4 @@
-"""See and undo the vibration of a rolling-shutter camera."""
+"""Measure and remove the vibration of a rolling-shutter camera."""
 
 from rsvib_torch.augmentation import RollingShutterVibration
 from rsvib_torch.calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure

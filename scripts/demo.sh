@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Sets up .venv, then simulates, detects and restores two drawn scenes into out/demo/. Options go to demo.py.
+# Creates .venv, then simulates, detects and restores two drawn scenes into out/demo/. Options are passed to demo.py.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 bash scripts/setup.sh
-export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive} # threads that wait by spinning crawl where cores are shared
+export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive} # busy-waiting threads are slow on shared cores
 exec .venv/bin/python scripts/demo.py "$@"

@@ -109,7 +109,9 @@ def write_sources(folder: Path) -> list[object]:
     for page in folder.glob("*.md"):
         text = page.read_text(encoding="utf-8").replace("](docs/", "](").replace("](../README.md", "](index.md")
         page.write_text(without_outer_links(text, folder), encoding="utf-8")
-    (folder / STYLE).write_text(".wy-nav-content {max-width: 60rem} .wy-table-responsive table td {white-space: normal}")
+    (folder / STYLE).write_text(
+        ".wy-nav-content {max-width: 60rem} .wy-table-responsive table td {white-space: normal}"
+    )
     (folder / "api").mkdir()
     reference: list[object] = [{"Configuration": "configuration.md"}, {"Commands": "commands.md"}]
     (folder / "commands.md").write_text(command_page(), encoding="utf-8")

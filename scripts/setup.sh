@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes .venv in the project's root with the tested versions of everything; does nothing when it is up to date.
+# Creates or updates .venv with the tested versions of all packages; does nothing if it is up to date.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-}
@@ -19,6 +19,6 @@ stamp=$(cat pyproject.toml scripts/constraints.txt | cksum)
 if [ "$(cat .venv/installed 2>/dev/null)" != "$stamp" ] || ! .venv/bin/rsvib --version >/dev/null 2>&1; then
   echo "setup: installing into .venv (a few minutes the first time)"
   [ -x .venv/bin/python ] || "$python" -m venv .venv
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt -e '.[test,benchmark]'
+  .venv/bin/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt -e '.[test,benchmark,docs]'
   printf '%s' "$stamp" > .venv/installed
 fi

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Sets up .venv, then checks format, lint and types and runs the tests. --slow runs the long checks too.
+# Creates .venv, checks format, lint and types, and runs the tests. --slow also runs the long tests.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 marker="not slow"
@@ -10,7 +10,7 @@ for argument in "$@"; do
   esac
 done
 bash scripts/setup.sh
-export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive} # threads that wait by spinning crawl where cores are shared
+export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive} # busy-waiting threads are slow on shared cores
 .venv/bin/python -m ruff format --check .
 .venv/bin/python -m ruff check .
 .venv/bin/python -m mypy
