@@ -17,9 +17,8 @@ from rsvib_torch.detection.rows.direct import refine_directly
 from rsvib_torch.detection.rows.row_groups import LARGEST_GROUP, intervals_compared, stack_spectra
 from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
-from rsvib_torch.detection.tones.inversion import vibration_of_fit
+from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, model_displacements, vibration_of_fit
 from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
-from rsvib_torch.detection.tones.tone_model import MotionModel, ToneFit, model_displacements
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import (
     offsets_from_row_order,
@@ -76,7 +75,7 @@ def _tones_of_bands(curve: OffsetCurve, timing: RowTiming, options: _Options, en
     measurements = measurements_of_curve(curve, timing, options.bands.band_step)
     interval = options.bands.band_step * timing.row_time
     blind = blind_frequencies(timing, 0.5 / interval).to(curve.offsets.device)
-    return find_tones(measurements, interval, options.tones, options.model, blind=blind, enough=enough)
+    return find_tones(measurements, interval, options.tones, options.model, blind=blind, accuracy=enough)
 
 
 def _detect_bands(

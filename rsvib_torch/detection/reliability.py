@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.result import OtherMotion
-from rsvib_torch.detection.tones.inversion import offset_gain
-from rsvib_torch.detection.tones.selection import LEAST_GAIN, LEAST_SIGNIFICANCE, LEAST_SWING
+from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
+from rsvib_torch.detection.tones.selection import MIN_OFFSET, MIN_SIGNIFICANCE
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
@@ -98,13 +98,13 @@ def _against_tone(
     size_std, hertz_std = float(std.amplitude[axis, tone]), float(std.frequency[axis, tone])
     name = f"tone of {hertz:.4g} Hz"
     found = []
-    if size < LEAST_SIGNIFICANCE * size_std:
+    if size < MIN_SIGNIFICANCE * size_std:
         found.append(f"{name} not significant: amplitude {size:.3g} +- {size_std:.2g} px")
-    elif size * gain < LEAST_SWING:
-        found.append(f"{name} too small: offsets of {size * gain:.2g} px, below {LEAST_SWING} px")
+    elif size * gain < MIN_OFFSET:
+        found.append(f"{name} too small: offsets of {size * gain:.2g} px, below {MIN_OFFSET} px")
     elif hertz_std > _LARGEST_UNCERTAINTY * hertz:
         found.append(f"{name} not known well enough: frequency {hertz:.4g} +- {hertz_std:.2g} Hz")
-    if gain < LEAST_GAIN:
+    if gain < MIN_GAIN:
         found.append(f"{name} nearly blind: gain {gain:.3f} (every frame is displaced alike)")
     if hertz * duration < 1.0:
         found.append(f"{name} has a period longer than the record of {1e3 * duration:.3g} ms")

@@ -8,8 +8,7 @@ from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, VibrationDetector, detect_vibration, simulate_frames
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones.fit import fit_tones
-from rsvib_torch.detection.tones.inversion import vibration_of_fit
+from rsvib_torch.detection.tones.fit import fit_tones, vibration_of_fit
 
 METHODS = ("projection", "ncc", "phase")
 ROW_TIME = 20.52e-6

@@ -8,8 +8,8 @@ from scipy import ndimage
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, detect_vibration, register_bands, simulate_frames
-from rsvib_torch.detection import direct
-from rsvib_torch.detection.tones.tone_model import MotionModel, ToneFit
+from rsvib_torch.detection.rows import direct
+from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
 from rsvib_torch.evaluation import resolution_chart
 from rsvib_torch.registration.gradients import row_gradients, row_pulls, row_shifts
 from rsvib_torch.registration.row_spectra import RowSpectra, differences

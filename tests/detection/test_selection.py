@@ -1,4 +1,4 @@
-"""Which tones are found, and how carefully they are searched."""
+"""Search for tones: outliers, significance, number of fits."""
 
 import math
 from dataclasses import replace
@@ -6,8 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rsvib_torch.detection import candidates, direct, robust, selection
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.rows import direct
+from rsvib_torch.detection.tones import periodogram, selection
+from rsvib_torch.detection.tones.fit import MotionModel, fit_tones
 
 ROWS, ROW_TIME, FRAME_PERIOD = 120, 16 * 20.52e-6, 2048 * 20.52e-6
 
@@ -33,14 +35,14 @@ def test_stretches_are_left_out_only_where_rows_are_disturbed(monkeypatch):
     clean = offsets_of([3.1, 5.2], [50.0, 30.0], generator)
     cloudy = offsets_of([2.0, 1.1], [50.0, 35.0], generator)
     cloudy[:, 30:58] += torch.linspace(2.0, 9.0, 28)[:, None]  # moves by itself
-    searched = []
-    stretches = candidates._stretches
-    monkeypatch.setattr(candidates, "_stretches", lambda given: searched.append(1) or stretches(given))
+    calls = []
+    without_stretches = periodogram.without_stretches
+    monkeypatch.setattr(periodogram, "without_stretches", lambda given: calls.append(1) or without_stretches(given))
     alone = []
-    for offsets, careful in ((clean, False), (cloudy, True)):
-        searched.clear()
+    for offsets, disturbed in ((clean, False), (cloudy, True)):
+        calls.clear()
         alone.append(selection.find_tones(measured(offsets), ROW_TIME, 1))
-        assert bool(searched) == careful
+        assert bool(calls) == disturbed
     for fit, amplitude, frequency in zip(alone, ([3.1, 5.2], [2.0, 1.1]), ([50.0, 30.0], [50.0, 35.0]), strict=True):
         assert fit.coefficients.abs().flatten().tolist() == pytest.approx(amplitude, rel=0.01)
         assert fit.frequencies.flatten().tolist() == pytest.approx(frequency, rel=0.003)
@@ -50,30 +52,19 @@ def test_stretches_are_left_out_only_where_rows_are_disturbed(monkeypatch):
         torch.testing.assert_close(together.coefficients[index], fit.coefficients[0], rtol=1e-7, atol=0)
 
 
-def test_tones_without_hope_are_not_fitted_to_the_end(monkeypatch):
-    """The next candidate explains nothing, or just enough, of what is left."""
+def test_a_weak_tone_beside_a_strong_one_is_found_and_noise_is_not():
     generator = torch.Generator().manual_seed(4)
-    fitted, tried = [], []
-    robust_fit, best = selection.robust_fit, candidates.Candidates.best
-    monkeypatch.setattr(
-        selection, "robust_fit", lambda *given, **named: fitted.append(1) or robust_fit(*given, **named)
-    )
-    monkeypatch.setattr(candidates.Candidates, "best", lambda *given: tried.append(1) or best(*given))
     one = measured(offsets_of([3.1, 5.2], [50.0, 30.0], generator))
     weak = offsets_of([0.006, 0.005], [88.0, 79.0], generator)
     two = measured(one.displacements[:, :, 1] - one.displacements[:, :, 0] + weak)
-    for measurements, tones, fits in ((one, 1, 2), (two, 2, 3)):
-        fitted.clear()
-        tried.clear()
+    for measurements, tones in ((one, 1), (two, 2)):
         fit = selection.find_tones(measurements, ROW_TIME)
         assert fit.active.sum(-1).tolist() == [[tones, tones]]
-        assert len(fitted) == fits  # without tones, and once for each that is there
-        assert len(tried) == tones
     assert fit.frequencies[0, :, 1].tolist() == pytest.approx([88.0, 79.0], rel=0.02)
 
 
-def test_a_tone_that_the_exposure_fades_does_not_outweigh_one_that_shows():
-    """It is larger than the true one from the start, and grows; 121.8 Hz leave nothing in an exposure of 400 rows."""
+def test_a_tone_that_the_exposure_averages_out_is_dropped_when_it_grows():
+    """Its amplitude is larger than that of the true one; an exposure of 400 rows averages out 121.8 Hz."""
     exposure = 400 * 20.52e-6
     starts = (torch.arange(ROWS, dtype=torch.float64) * ROW_TIME).expand(1, -1)
     offsets = offsets_of([3.1, 5.2], [50.0, 30.0], torch.Generator().manual_seed(5))
@@ -81,11 +72,11 @@ def test_a_tone_that_the_exposure_fades_does_not_outweigh_one_that_shows():
     measurements = Measurements.of_pairs(starts, starts + FRAME_PERIOD, offsets, information, exposure)
     frequencies = torch.tensor([[[50.0, 121.9], [30.0, 121.9]]], dtype=torch.float64)
     active = torch.tensor([[[True, True], [True, False]]])
-    fit, _ = robust.robust_fit(measurements, frequencies, active, selection.MotionModel())
+    fit, _ = selection.robust_fit(measurements, frequencies, active, MotionModel())
     before = replace(fit, coefficients=torch.tensor([[[3.1, 6.0], [5.2, 0.0]]], dtype=torch.complex128))
     after = replace(before, coefficients=torch.tensor([[[3.0, 600.0], [5.2, 0.0]]], dtype=torch.complex128))
-    shown = robust.shown_size(measurements, before)
-    assert shown[0, 0, 1] < 0.1 * shown[0, 0, 0]
+    size = selection.visible_size(measurements, before)
+    assert size[0, 0, 1] < 0.1 * size[0, 0, 0]
     kept = direct._without_runaways(measurements, before, after)
     assert kept.active.tolist() == [[[True, False], [True, False]]]
     doubled = replace(before, coefficients=torch.tensor([[[5.0, 6.0], [5.2, 0.0]]], dtype=torch.complex128))
@@ -96,21 +87,21 @@ def test_a_tone_that_the_exposure_fades_does_not_outweigh_one_that_shows():
     ("amplitude", "frequency", "stays"),
     [
         (0.05, 341.0, True),
-        (0.003, 341.0, False),  # certain, but interpolation may leave as much
+        (0.003, 341.0, False),  # significant, but as small as residuals of interpolation
         (0.0005, 341.0, False),  # may be noise
     ],
 )
-def test_tones_that_are_not_worth_an_axis_are_dropped(amplitude, frequency, stays):
+def test_insignificant_and_small_tones_are_dropped(amplitude, frequency, stays):
     generator = torch.Generator().manual_seed(6)
     strong, weak = (offsets_of([a, a], [f, f], None, noise=0.0) for a, f in ((3.1, 50.0), (amplitude, frequency)))
     noise = 0.0006 * torch.randn(strong.shape, dtype=torch.float64, generator=generator)
     measurements = measured(strong + weak + noise)
     start = torch.tensor([50.0, frequency], dtype=torch.float64).expand(1, 2, 2)
-    fit = selection.fit_tones(measurements, start, torch.ones(1, 2, 2, dtype=torch.bool))
+    fit = fit_tones(measurements, start, torch.ones(1, 2, 2, dtype=torch.bool))
     kept = selection.significant_only(measurements, fit, torch.tensor([FRAME_PERIOD], dtype=torch.float64))
     assert kept.active.tolist() == [[[True, stays]] * 2]
     assert kept.coefficients[..., 0].abs().flatten().tolist() == pytest.approx([3.1, 3.1], abs=0.02)
-    # all but blind and known all the same: whatever makes so small an offset, the verdict is to see it
+    # small offsets near a blind frequency: the tone is kept for the verdict
     blind = torch.tensor([50.0, 7 / FRAME_PERIOD + 0.01], dtype=torch.float64).expand(1, 2, 2)
     certain = replace(fit, frequencies=blind, covariance=1e-12 * torch.eye(14, dtype=torch.float64)[None])
     assert selection.significant_only(measurements, certain, torch.tensor([FRAME_PERIOD])).active.all()

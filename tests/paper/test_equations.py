@@ -6,8 +6,7 @@ import torch
 
 from rsvib_torch import SensorTiming, Vibration
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones.fit import fit_tones
-from rsvib_torch.detection.tones.inversion import vibration_of_fit
+from rsvib_torch.detection.tones.fit import fit_tones, vibration_of_fit
 
 CAMERA = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 ROWS = np.arange(2048)

@@ -22,11 +22,15 @@ from rsvib_torch.detection.rows.row_groups import (
     measure_group,
     warping,
 )
-from rsvib_torch.detection.tones.fit import fit_tones
-from rsvib_torch.detection.tones.inversion import known_motion
-from rsvib_torch.detection.tones.robust import of_each, residual_of, robust_fit, shown_size, typical_size
-from rsvib_torch.detection.tones.selection import find_tones, significant_only, strongest_only
-from rsvib_torch.detection.tones.tone_model import ToneFit
+from rsvib_torch.detection.tones.fit import ToneFit, fit_tones, residual_of, select_stacks, shrunk_motion
+from rsvib_torch.detection.tones.selection import (
+    find_tones,
+    robust_fit,
+    significant_only,
+    strongest_only,
+    typical_size,
+    visible_size,
+)
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration.gradients import RowGradients
@@ -143,7 +147,7 @@ def _without_runaways(measurements: Measurements, before: ToneFit, after: ToneFi
     may ask for one, and for a larger one when frames were warped by it.
     """
     size, grown = before.coefficients.abs(), after.coefficients.abs()
-    shown = shown_size(measurements, before)
+    shown = visible_size(measurements, before)
     strongest = shown == shown.amax(-1, keepdim=True)
     running = after.active & ~strongest & (grown > _RUNAWAY * size.clamp(min=_NEAR))
     if not bool(running.any()):
@@ -173,7 +177,7 @@ def refine_directly(
         The last measurements and the fit to them.
     """
     intervals = intervals_compared(timing, spectra.values.shape[1], LARGEST_GROUP, start.active.device)
-    motion = known_motion(start, intervals)
+    motion = shrunk_motion(start, intervals)
     groups = frame_groups(spectra, timing, motion, alike=True)
     found = _refine(groups, timing, intervals, start, tones, iterations)
     tried = torch.zeros_like(start.active[..., 0])
@@ -201,7 +205,7 @@ def _refine(
 ) -> DirectFit:
     """Measure around the motion, fit, repeat."""
     fit, model = start, start.model
-    motion = known_motion(fit, intervals)
+    motion = shrunk_motion(fit, intervals)
     gradients: list[RowGradients | None] = [None] * len(groups)
     steps: list[_Step] = []
     cleanings = _CLEANINGS
@@ -221,7 +225,7 @@ def _refine(
             fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual_of(measurements, fit))
             if step > search_at:
                 fit = _without_runaways(measurements, before, fit)
-        motion = known_motion(fit, intervals)
+        motion = shrunk_motion(fit, intervals)
         if step == iterations - 1:
             break
         reached = measurements.relative(_displacements(measurements, motion))
@@ -245,7 +249,7 @@ def _refine(
             nearer = _corrected(measurements, steps)
             if nearer is not measurements:
                 fit, _ = robust_fit(nearer, fit.frequencies, fit.active, model, residual_of(nearer, fit))
-                motion = known_motion(fit, intervals)
+                motion = shrunk_motion(fit, intervals)
                 reached = measurements.relative(_displacements(measurements, motion))
         if float((reached - placed).abs().amax()) > _NEAR:
             gradients = [None] * len(groups)
@@ -286,7 +290,7 @@ def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:
         return one
     if bool(better.all()):
         return other
-    measurements = of_each(better, other.measurements, one.measurements)
+    measurements = select_stacks(better, other.measurements, one.measurements)
     most = max(one.fit.active.shape[-1], other.fit.active.shape[-1])
 
     def tones(name: str) -> Tensor:
@@ -295,7 +299,7 @@ def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:
         return torch.where(better[:, None, None], mine, yours)
 
     fit = fit_tones(measurements, tones("frequencies"), tones("active"), one.fit.model)
-    return DirectFit(measurements, fit, of_each(better, other.other_motion, one.other_motion))
+    return DirectFit(measurements, fit, select_stacks(better, other.other_motion, one.other_motion))
 
 
 def _concluded(told: Measurements, fit: ToneFit, gradients: list[RowGradients | None]) -> DirectFit:

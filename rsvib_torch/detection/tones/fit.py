@@ -1,96 +1,199 @@
-"""Weighted fit of tones and an image motion to measured displacements (Eqs. 5-8, generalised)."""
+"""Tones and image motion: model, weighted least-squares fit, and inversion to amplitude, frequency and phase.
 
-from dataclasses import dataclass, replace
+The paper fits one sine to the offset curve of an axis (Eq. 5 of Liu et al. 2023) and inverts the result for the
+exposure (Eq. 2) and for the gain from displacement to offset (Eqs. 4, 6-8). Here exposure, gain, band average and the
+coupling of the scan with motion along it are part of the model, and all tones of both axes are fitted together.
+"""
+
+import math
+from dataclasses import dataclass, fields, replace
 from functools import cache
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones.tone_model import MotionModel, ToneFit, drift_response, tone_columns
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
-__all__ = ["fit_roughly", "fit_tones"]
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
-_ITERATIONS, _FEW_ITERATIONS = 30, 5  # of a fit, and of one that another follows
-_TOLERANCE, _ROUGH_TOLERANCE = 1e-7, 1e-4  # of the cost, of either: steps that promise less are not worth taking
-_PARAMETERS = 3  # of a tone: real and imaginary part of its amplitude, and its frequency
+__all__ = [
+    "MIN_GAIN",
+    "MotionModel",
+    "ToneFit",
+    "amplitude_std",
+    "drift_response",
+    "fit_roughly",
+    "fit_tones",
+    "model_displacements",
+    "motion_of_fit",
+    "offset_gain",
+    "residual_of",
+    "select_stacks",
+    "shrunk_motion",
+    "tone_response",
+    "vibration_of_fit",
+]
+
+MIN_GAIN = 0.1  # px of offset per px of displacement; below it, amplitudes are ten times noisier than offsets
+
+Result = TypeVar("Result", bound="DataclassInstance")
+
+
+# --- Model ---
+
+
+@dataclass(frozen=True)
+class MotionModel:
+    """Structure of the motion that is fitted.
+
+    Attributes:
+        harmonics: Tones come in families of a fundamental and its multiples up to this one, with one common frequency;
+            1 leaves all frequencies independent.
+        drift_order: 1 for a uniform image motion, 2 for a uniformly accelerated one.
+    """
+
+    harmonics: int = 1
+    drift_order: int = 1
 
 
 @dataclass(frozen=True, eq=False)
-class _Unknowns:
-    """How parameters are laid out: (B, 2, 3 K + J) of all tones and drifts, (B, M) of those that are free.
+class ToneFit:
+    """Fitted motion ``D(t) = Re sum_k C_k exp(2 pi i f_k s) + sum_j d_j s^j / j!`` of each axis, s = t - centre.
 
     Attributes:
-        tones: K.
-        model: What is fitted beside the tones.
-        tie: (2 (3 K + J), M) matrix from free parameters to all.
-        free: (B, M) bool, parameters of tones that exist.
-        linear: (B, M) bool, those of them that are no frequencies.
-        is_frequency: (3 K + J,) bool.
+        coefficients: (B, 2, K) complex128 C in px.
+        frequencies: (B, 2, K) float64 f in Hz.
+        active: (B, 2, K) bool, tones that exist.
+        drift: (B, 2, J) float64 d in px/s^j.
+        covariance: (B, 2 P, 2 P) float64 of the P = 3 K + J parameters [Re C, Im C, f of each tone, d] of x, then of y.
+        centre: (B,) float64 s, the middle of the record, where phase and frequency are least correlated.
+        model: Structure of the motion.
     """
 
-    tones: int
+    coefficients: Tensor
+    frequencies: Tensor
+    active: Tensor
+    drift: Tensor
+    covariance: Tensor
+    centre: Tensor
     model: MotionModel
-    tie: Tensor
-    free: Tensor
-    linear: Tensor
-    is_frequency: Tensor
 
-    @classmethod
-    def of(cls, active: Tensor, model: MotionModel) -> "_Unknowns":
-        """Layout for tones that are ``active`` (B, 2, K)."""
-        tones, order = active.shape[-1], model.drift_order
-        tie = torch.block_diag(*[_tie(model, tones, active.device)] * 2)
-        of_tones = active[..., None].expand(-1, -1, -1, _PARAMETERS).flatten(-2)
-        exist = torch.cat([of_tones, torch.ones_like(of_tones[..., :1]).expand(-1, -1, order)], -1)
-        place = torch.arange(exist.shape[-1], device=active.device)
-        is_frequency = (place < _PARAMETERS * tones) & (place % _PARAMETERS == _PARAMETERS - 1)
-        free = exist.flatten(1).double() @ tie > 0
-        linear = (exist & ~is_frequency).flatten(1).double() @ tie > 0
-        return cls(tones, model, tie, free, linear, is_frequency)
+    @property
+    def amplitude(self) -> Tensor:
+        """(B, 2, K) px, 0 for tones that are not active."""
+        return torch.where(self.active, self.coefficients.abs(), 0.0)
 
-    def unpack(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Coefficients (B, 2, K), frequencies (B, 2, K) and drifts (B, 2, J)."""
-        end = _PARAMETERS * self.tones
-        parts = values[..., :end].unflatten(-1, (self.tones, _PARAMETERS))
-        return torch.complex(parts[..., 0], parts[..., 1]), parts[..., 2], values[..., end:]
 
-    def pack(self, fit: ToneFit) -> Tensor:
-        """The parameters (B, 2, 3 K + J) of a fit, of which ``unpack`` makes three."""
-        tones = torch.stack([fit.coefficients.real, fit.coefficients.imag, fit.frequencies], -1).flatten(-2)
-        return torch.cat([tones, fit.drift], -1)
+def tone_response(measurements: Measurements, frequencies: Tensor) -> Tensor:
+    """Relative displacements that unit tones cause at the measurements.
 
-    def moved(self, values: Tensor, step: Tensor) -> Tensor:
-        """Parameters after a step (B, M) of the free ones; frequencies stay positive."""
-        values = values + (step @ self.tie.T).unflatten(1, (2, -1))
-        return torch.where(self.is_frequency, values.abs(), values)
+    ``S(f) exp(2 pi i f (t - centre))`` at the mid-exposures t of the rows, less the mean over the frames of the group.
+    ``S(f) = sinc(f T_e) sinc(f h T_row)`` is the attenuation by exposure (Eq. 2) and by a band of h rows; the
+    difference from the group mean is the gain of Eq. (4). The times t contain the coupling of the scan with motion
+    along it.
+
+    Args:
+        measurements: The displacements.
+        frequencies: (B, 2, K) Hz.
+
+    Returns:
+        complex128 (B, N, G, 2, K).
+    """
+    attenuation = torch.sinc(frequencies * measurements.smearing_times).prod(0)[:, None, None]
+    angle = 2 * math.pi * frequencies[:, None, None] * measurements.middles
+    return measurements.relative(torch.complex(attenuation * angle.cos(), attenuation * angle.sin()))
+
+
+def drift_response(measurements: Measurements, order: int) -> Tensor:
+    """Relative displacements (B, N, G, J) of unit drifts s^j / j!, averaged over the exposure."""
+    time = measurements.middles[..., 0, 0]
+    powers = [time, 0.5 * time.square() + measurements.exposure_time**2 / 24.0]
+    return measurements.relative(torch.stack(powers[:order], dim=-1))
+
+
+def model_displacements(measurements: Measurements, fit: ToneFit) -> Tensor:
+    """Displacements (B, N, G, 2) in px that the fitted motion predicts at the measurements."""
+    moved = measurements.centre - fit.centre
+    turn = 2 * math.pi * fit.frequencies * moved[:, None, None]
+    phasor = fit.coefficients * torch.polar(torch.ones_like(turn), turn)
+    tones = phasor[:, None, None] * tone_response(measurements, fit.frequencies)
+    drift = fit.drift.clone()
+    if fit.drift.shape[-1] > 1:  # the constant of (s + moved)^2 / 2 cancels within the group
+        drift[..., 0] += fit.drift[..., 1] * moved[:, None]
+    response = drift_response(measurements, fit.drift.shape[-1])
+    return tones.real.sum(-1) + torch.einsum("bngj,baj->bnga", response, drift)
+
+
+def residual_of(measurements: Measurements, fit: ToneFit) -> Tensor:
+    """Residual displacements (B, N, G, 2) in px of a fit."""
+    return measurements.relative(measurements.displacements - model_displacements(measurements, fit))
+
+
+def select_stacks(where: Tensor, one: Result, other: Result) -> Result:
+    """Dataclass of batched tensors with the stacks of ``one`` where ``where`` (B,) is true, else those of ``other``."""
+    chosen = {}
+    for field in fields(one):
+        first, second = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(first, Tensor):
+            chosen[field.name] = torch.where(where.reshape(-1, *(1,) * (first.ndim - 1)), first, second)
+    return replace(one, **chosen)
+
+
+# --- Weighted least squares ---
+
+
+def _jacobian_of_tones(measurements: Measurements, coefficients: Tensor, frequencies: Tensor) -> Tensor:
+    """Derivatives (B, N, G, 2, 3 K) of the displacements by Re C, Im C and f (B, 2, K) of each tone."""
+    times = measurements.smearing_times
+    smeared, smeared_slope = _sinc(frequencies * times)
+    attenuation = smeared[0] * smeared[1]
+    slope = (smeared_slope * times * smeared.flip(0)).sum(0)
+    time = measurements.middles
+    angle = 2 * math.pi * frequencies[:, None, None] * time
+    wave = torch.complex(angle.cos(), angle.sin())
+    # the frequency changes the attenuation and the angle
+    by_attenuation = (slope * coefficients)[:, None, None]
+    by_angle = (2j * math.pi * attenuation * coefficients)[:, None, None]
+    by_frequency = ((by_attenuation + time * by_angle) * wave).real
+    by_parts = torch.view_as_real((attenuation[:, None, None] * wave).conj_physical())
+    return measurements.relative(torch.cat([by_parts, by_frequency[..., None]], dim=-1).flatten(-2))
+
+
+def _sinc(x: Tensor) -> tuple[Tensor, Tensor]:
+    """sin(pi x) / (pi x) and its derivative."""
+    value = torch.sinc(x)
+    small = x.abs() < 1e-4
+    slope = (torch.cos(math.pi * x) - value) / torch.where(small, 1.0, x)
+    return value, torch.where(small, -(math.pi**2) * x / 3, slope)
 
 
 @cache
-def _tie(model: MotionModel, tones: int, device: torch.device) -> Tensor:
-    """Matrix (3 K + J, M) from free parameters of an axis to all: harmonics share a frequency."""
+def _constraints(model: MotionModel, tones: int, device: torch.device) -> Tensor:
+    """Matrix (3 K + J, M) from the free parameters of an axis to all: harmonics share a frequency."""
     families = tones // model.harmonics
-    size = _PARAMETERS * tones + model.drift_order
-    matrix = torch.zeros(size, 2 * tones + families + model.drift_order, dtype=torch.float64, device=device)
+    matrix = torch.zeros(3 * tones + model.drift_order, 2 * tones + families + model.drift_order, dtype=torch.float64)
     for tone in range(tones):
-        matrix[_PARAMETERS * tone, 2 * tone] = matrix[_PARAMETERS * tone + 1, 2 * tone + 1] = 1.0
         family, harmonic = divmod(tone, model.harmonics)
-        matrix[_PARAMETERS * tone + 2, 2 * tones + family] = harmonic + 1.0
+        matrix[3 * tone, 2 * tone] = matrix[3 * tone + 1, 2 * tone + 1] = 1.0
+        matrix[3 * tone + 2, 2 * tones + family] = harmonic + 1.0
     for power in range(model.drift_order):
-        matrix[_PARAMETERS * tones + power, 2 * tones + families + power] = 1.0
-    return matrix
+        matrix[3 * tones + power, 2 * tones + families + power] = 1.0
+    return matrix.to(device)
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
-    """Parameters with what they leave.
+class _Estimate:
+    """Parameters with their residual and normal equations.
 
     Attributes:
-        values: (B, 2, 3 K + J) parameters.
-        residual: (B, N, G, 2) px, what they leave of the displacements.
-        cost: (B,) its weighted square.
-        matrix: (B, M, M), normal matrix of the free parameters.
-        right: (B, M), their right-hand side.
+        values: (B, 2, P) all parameters.
+        residual: (B, N, G, 2) px.
+        cost: (B,) weighted square of the residual.
+        matrix: (B, M, M) normal matrix of the free parameters.
+        right: (B, M) its right-hand side.
     """
 
     values: Tensor
@@ -99,135 +202,244 @@ class _State:
     matrix: Tensor
     right: Tensor
 
-    def replaced(self, where: Tensor, other: "_State") -> "_State":
-        """This state, but the other's for the stacks (B,) where that is told."""
 
-        def pick(name: str) -> Tensor:
-            new, old = getattr(other, name), getattr(self, name)
-            return torch.where(where.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
-
-        return _State(*(pick(name) for name in self.__dataclass_fields__))
-
-
-@dataclass(frozen=True, eq=False)
 class _Problem:
-    """Measurements as least squares of unit variance.
+    """Nonlinear least squares ``min sum_n r_n^T W_n r_n``, r the residual and W the information of scene row n.
 
-    Attributes:
+    Args:
         measurements: The displacements.
-        drift_columns: (B, N, G, 2, J), what they see of unit drifts.
-        root: (B, N, 1, 2, 2), upper triangle U with U^T U the information of a row.
+        active: (B, 2, K) bool, tones to fit.
+        model: Structure of the motion.
     """
 
-    measurements: Measurements
-    drift_columns: Tensor
-    root: Tensor
-
-    @classmethod
-    def of(cls, measurements: Measurements, model: MotionModel) -> "_Problem":
-        """The problem that measurements pose."""
+    def __init__(self, measurements: Measurements, active: Tensor, model: MotionModel) -> None:
+        self.measurements, self.active, self.model = measurements, active, model
+        self.tones, order = active.shape[-1], model.drift_order
+        self.to_all = torch.block_diag(*[_constraints(model, self.tones, active.device)] * 2)  # (2 P, M)
+        of_tones = active[..., None].expand(-1, -1, -1, 3).flatten(-2)
+        exists = torch.cat([of_tones, torch.ones_like(of_tones[..., :1]).expand(-1, -1, order)], -1)
+        place = torch.arange(exists.shape[-1], device=active.device)
+        self.is_frequency = (place < 3 * self.tones) & (place % 3 == 2)  # (P,)
+        self.free = exists.flatten(1).double() @ self.to_all > 0  # (B, M)
+        self.linear = (exists & ~self.is_frequency).flatten(1).double() @ self.to_all > 0
+        self.drift_columns = drift_response(measurements, order)[..., None, :].expand(-1, -1, -1, 2, -1)
+        # Cholesky factor of the information, zero where nothing was measured
         first, both, second = (measurements.information[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
         size = first.clamp(min=0.0).sqrt()
         slant = torch.where(size > 0, both / torch.where(size > 0, size, 1.0), 0.0)
         rest = (second - slant.square()).clamp(min=0.0).sqrt()
-        root = torch.stack([size, slant, torch.zeros_like(size), rest], -1).unflatten(-1, (2, 2))[:, :, None]
-        drifts = drift_response(measurements, model.drift_order)[..., None, :]
-        return cls(measurements, drifts.expand(-1, -1, -1, 2, -1), root)
+        root = torch.stack([size, slant, torch.zeros_like(size), rest], -1)
+        self.root = root.unflatten(-1, (2, 2))[:, :, None]  # (B, N, 1, 2, 2)
 
-    def evaluate(self, unknowns: _Unknowns, values: Tensor) -> _State:
-        """The state at parameters ``values`` (B, 2, 3 K + J)."""
-        coefficients, hertz, _ = unknowns.unpack(values)
-        columns = self.measurements.relative(tone_columns(self.measurements, coefficients, hertz).flatten(-2))
-        jacobian = torch.cat([columns, self.drift_columns], dim=-1)  # (B, N, G, axis, parameter of the axis)
-        linear = torch.where(unknowns.is_frequency, 0.0, values)[:, None, None]
+    def unpack(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Coefficients (B, 2, K), frequencies (B, 2, K) and drifts (B, 2, J) of parameters (B, 2, P)."""
+        tones = values[..., : 3 * self.tones].unflatten(-1, (self.tones, 3))
+        return torch.complex(tones[..., 0], tones[..., 1]), tones[..., 2], values[..., 3 * self.tones :]
+
+    def fit(self, values: Tensor, covariance: Tensor) -> ToneFit:
+        """The parameters (B, 2, P) as a ``ToneFit``."""
+        coefficients, frequencies, drift = self.unpack(values)
+        centre = self.measurements.centre
+        return ToneFit(coefficients, frequencies, self.active, drift, covariance, centre, self.model)
+
+    def evaluate(self, values: Tensor) -> _Estimate:
+        """Residual and normal equations at the parameters ``values`` (B, 2, P)."""
+        coefficients, frequencies, _ = self.unpack(values)
+        tones = _jacobian_of_tones(self.measurements, coefficients, frequencies)
+        jacobian = torch.cat([tones, self.drift_columns], dim=-1)  # (B, N, G, 2, P)
+        linear = torch.where(self.is_frequency, 0.0, values)[:, None, None]
         residual = self.measurements.displacements - (jacobian * linear).sum(-1)
-        # (B, 2 N G, parameter of any axis)
-        whole = (self.root[..., None] * jacobian[..., None, :, :]).flatten(-2).flatten(1, 3)
-        told = (self.root @ residual[..., None]).flatten(1)
-        matrix = unknowns.tie.T @ (whole.mT @ whole) @ unknowns.tie
-        right = (whole.mT @ told[..., None])[..., 0] @ unknowns.tie
-        return _State(values, residual, told.square().sum(-1), matrix, right)
+        whitened = (self.root @ residual[..., None]).flatten(1)
+        columns = (self.root[..., None] * jacobian[..., None, :, :]).flatten(-2).flatten(1, 3)  # (B, 2 N G, 2 P)
+        matrix = self.to_all.T @ (columns.mT @ columns) @ self.to_all
+        right = (columns.mT @ whitened[..., None])[..., 0] @ self.to_all
+        return _Estimate(values, residual, whitened.square().sum(-1), matrix, right)
+
+    def moved(self, values: Tensor, step: Tensor) -> Tensor:
+        """Parameters after a step (B, M) of the free ones; frequencies stay positive."""
+        values = values + (step @ self.to_all.T).unflatten(1, (2, -1))
+        return torch.where(self.is_frequency, values.abs(), values)
+
+    def solve(self, start: Tensor | ToneFit, iterations: int, tolerance: float) -> _Estimate:
+        """Levenberg-Marquardt from start frequencies or another fit, each stack on its own.
+
+        Args:
+            start: As in ``fit_tones``.
+            iterations: At most.
+            tolerance: Relative decrease of the cost that a step must promise.
+        """
+        if isinstance(start, ToneFit):
+            tones = torch.stack([start.coefficients.real, start.coefficients.imag, start.frequencies], -1)
+            state = self.evaluate(torch.cat([tones.flatten(-2), start.drift], -1))
+        else:  # amplitudes, phases and drifts are linear once the frequencies are given
+            values = start.new_zeros(len(start), 2, len(self.is_frequency))
+            values[..., self.is_frequency] = torch.where(self.active, start, 0.0)
+            state = self.evaluate(values)
+            step, _ = _step(state, self.linear, torch.zeros_like(state.cost))
+            state = self.evaluate(self.moved(values, step))
+        damping = torch.full_like(state.cost, 1e-3)
+        done = torch.zeros_like(state.cost, dtype=torch.bool)
+        for _ in range(iterations):
+            step, _ = _step(state, self.free, damping)
+            done = done | ((step * state.right).sum(-1) <= tolerance * state.cost)
+            if bool(done.all()):
+                break
+            trial = self.evaluate(self.moved(state.values, step))
+            better = trial.cost <= state.cost
+            state = select_stacks(better & ~done, trial, state)
+            damping = torch.where(better, damping * 0.1, damping * 10.0).clamp(1e-12, 1e6)
+        return state
 
 
-def _step(state: _State, keep: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
-    """Step (B, M) of the parameters to ``keep`` (B, M), and the inverse of the damped normal matrix."""
+def _step(state: _Estimate, free: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+    """Step (B, M) of the ``free`` (B, M) parameters, and the inverse of the damped normal matrix."""
     size = state.matrix.diagonal(dim1=-2, dim2=-1)
-    scale = torch.where(keep & (size > 1e-200), size.clamp(min=1e-200).rsqrt(), 0.0)
+    scale = torch.where(free & (size > 1e-200), size.clamp(min=1e-200).rsqrt(), 0.0)
     matrix = state.matrix * scale[:, :, None] * scale[:, None]
-    matrix = matrix + torch.diag_embed(torch.where(keep, 1e-12 + damping[:, None], 1.0))
+    matrix = matrix + torch.diag_embed(torch.where(free, 1e-12 + damping[:, None], 1.0))
     inverse = torch.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
     return (inverse @ state.right[..., None])[..., 0], inverse
-
-
-def _solved(
-    measurements: Measurements, start: Tensor | ToneFit, active: Tensor, model: MotionModel, *, rough: bool
-) -> tuple[_Unknowns, _State]:
-    """The least squares solution from start frequencies, or from another solution, as in ``fit_tones``."""
-    iterations, tolerance = (_FEW_ITERATIONS, _ROUGH_TOLERANCE) if rough else (_ITERATIONS, _TOLERANCE)
-    unknowns = _Unknowns.of(active, model)
-    problem = _Problem.of(measurements, model)
-    if isinstance(start, ToneFit):
-        state = problem.evaluate(unknowns, unknowns.pack(start))
-    else:
-        values = start.new_zeros(len(start), 2, len(unknowns.is_frequency))
-        values[..., unknowns.is_frequency] = torch.where(active, start, 0.0)
-        state = problem.evaluate(unknowns, values)
-        step, _ = _step(state, unknowns.linear, torch.zeros_like(state.cost))
-        state = problem.evaluate(unknowns, unknowns.moved(values, step))
-    damping = torch.full_like(state.cost, 1e-3)
-    done = torch.zeros_like(state.cost, dtype=torch.bool)  # each stack stops by itself, whatever it is in a batch with
-    for _ in range(iterations):
-        step, _ = _step(state, unknowns.free, damping)
-        done = done | ((step * state.right).sum(-1) <= tolerance * state.cost)  # what the step promises
-        if bool(done.all()):
-            break
-        trial = problem.evaluate(unknowns, unknowns.moved(state.values, step))
-        better = trial.cost <= state.cost
-        state = state.replaced(better & ~done, trial)
-        damping = torch.where(better, damping * 0.1, damping * 10.0).clamp(1e-12, 1e6)
-    return unknowns, state
 
 
 def fit_roughly(
     measurements: Measurements, frequencies: Tensor, active: Tensor, model: MotionModel
 ) -> tuple[ToneFit, Tensor]:
-    """A few steps of ``fit_tones``, which another fit will follow.
+    """A few steps of ``fit_tones``, as a start for another fit.
 
     Returns:
-        The fit, whose covariance has no meaning, and what it leaves of the displacements, (B, N, G, 2).
+        The fit, whose covariance has no meaning, and its residual displacements (B, N, G, 2).
     """
-    unknowns, state = _solved(measurements, frequencies, active, model, rough=True)
-    coefficients, hertz, drift = unknowns.unpack(state.values)
-    fit = ToneFit(coefficients, hertz, active, drift, state.matrix, measurements.centre, model)
-    return fit, state.residual
+    problem = _Problem(measurements, active, model)
+    state = problem.solve(frequencies, iterations=5, tolerance=1e-4)
+    return problem.fit(state.values, state.matrix), state.residual
 
 
 def fit_tones(
     measurements: Measurements, start: Tensor | ToneFit, active: Tensor, model: MotionModel | None = None
 ) -> ToneFit:
-    """Fit all tones of both axes and the image motion from start frequencies (weighted Levenberg-Marquardt).
+    """Fit all tones of both axes and the image motion by weighted least squares (Levenberg-Marquardt).
 
-    Amplitudes and phases need no start: they are linear once the frequencies are given. Inverting the offsets to the
-    vibration (Eqs. 6-8 with the sign rule) is part of the model, so that a negative gain needs no special case.
+    The gain of Eq. (7) is part of the model, so that a negative gain needs no special case.
 
     Args:
         measurements: The displacements.
-        start: (B, 2, K) start frequencies in Hz; with harmonics, K a multiple of their number, each family base
-            first. Or a fit of the same tones to these measurements, weighted otherwise: this one lies near it.
+        start: (B, 2, K) start frequencies in Hz; with harmonics, K is a multiple of their number, each family with its
+            fundamental first. Or a fit of the same tones to these measurements with other weights.
         active: (B, 2, K) bool, tones to fit; the others stay at zero.
-        model: What is fitted beside the tones.
+        model: Structure of the motion.
 
     Returns:
-        The fit with its covariance, scaled by the observed residual.
+        The fit with its covariance, scaled by the observed residual variance of each axis.
     """
-    model = model or MotionModel()
-    unknowns, state = _solved(measurements, start, active, model, rough=False)
-    _, inverse = _step(state, unknowns.free, torch.zeros_like(state.cost))
-    spent = unknowns.free.unflatten(1, (2, -1)).sum(-1)
-    coefficients, hertz, drift = unknowns.unpack(state.values)
-    fit = ToneFit(coefficients, hertz, active, drift, inverse, measurements.centre, model)
-    # overlapping bands repeat themselves: the information is that of the independent ones
+    problem = _Problem(measurements, active, model or MotionModel())
+    state = problem.solve(start, iterations=30, tolerance=1e-7)
+    _, inverse = _step(state, problem.free, torch.zeros_like(state.cost))
+    spent = problem.free.unflatten(1, (2, -1)).sum(-1)
+    # `known` counts independent measurements only: overlapping bands repeat each other
     variance = measurements.square(state.residual).clamp(min=0.0) / (measurements.known - spent).clamp(min=1.0)
     deviation = variance.sqrt().repeat_interleave(state.values.shape[-1], dim=1)
-    covariance = (unknowns.tie @ inverse @ unknowns.tie.T) * deviation[:, :, None] * deviation[:, None]
-    return replace(fit, covariance=covariance)
+    covariance = (problem.to_all @ inverse @ problem.to_all.T) * deviation[:, :, None] * deviation[:, None]
+    return problem.fit(state.values, covariance)
+
+
+# --- Inversion ---
+
+
+def offset_gain(frequencies: Tensor, intervals: Tensor) -> Tensor:
+    """Largest gain (...) from displacement to offset (Eq. 7) of tones (...) over intervals (M,) s between frames."""
+    return 2 * torch.sin(math.pi * frequencies[..., None] * intervals).abs().amax(-1)
+
+
+def motion_of_fit(fit: ToneFit) -> Vibration:
+    """Vibration (B, 2, K) of a fit: ``A = |C|``, ``phi = arg C + pi/2 - 2 pi f centre`` (Eqs. 6-8).
+
+    Gain and exposure are part of the fit. Tones that are not active have amplitude and frequency 0.
+    """
+    centre = fit.centre[:, None, None]
+    frequency = torch.where(fit.active, fit.frequencies, 0.0)
+    phase = fit.coefficients.angle() + 0.5 * math.pi - 2 * math.pi * frequency * centre
+    phase = torch.remainder(phase + math.pi, 2 * math.pi) - math.pi
+    phase = torch.where(fit.active, phase, 0.0)
+    motion, acceleration = fit.drift[..., 0], torch.zeros_like(fit.drift[..., 0])
+    if fit.drift.shape[-1] > 1:  # speed at the time origin instead of the middle of the record
+        acceleration = fit.drift[..., 1]
+        motion = motion - acceleration * centre[..., 0]
+    return Vibration(fit.amplitude, frequency, phase, motion, acceleration)
+
+
+def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
+    """Vibration (B, 2, K) of a fit as in ``motion_of_fit``, and its standard deviations.
+
+    Errors are propagated to first order with all covariances. Tones that are not active have standard deviation 0.
+    """
+    centre = fit.centre[:, None, None]
+    real, imaginary, amplitude = _direction(fit)
+    zero, one = torch.zeros_like(real), torch.ones_like(real)
+    frequency_std = _propagated(fit, zero, zero, one)
+    std = {
+        "amplitude": amplitude_std(fit),
+        "frequency": frequency_std,
+        "period": frequency_std / torch.where(fit.active & (fit.frequencies > 0), fit.frequencies, 1.0).square(),
+        "phase": _propagated(fit, -imaginary / amplitude, real / amplitude, -2 * math.pi * centre.expand_as(real)),
+    }
+    order = fit.amplitude.argsort(dim=-1, descending=True, stable=True)  # that of the tones of a Vibration
+    std = {name: value.take_along_dim(order, -1) for name, value in std.items()}
+    drift = _covariance_of_axes(fit)[..., 3 * fit.frequencies.shape[-1] :, 3 * fit.frequencies.shape[-1] :]
+    motion_variance, acceleration_variance = drift[..., 0, 0], torch.zeros_like(drift[..., 0, 0])
+    if fit.drift.shape[-1] > 1:
+        acceleration_variance = drift[..., 1, 1]
+        to_origin = centre[..., 0]
+        motion_variance = (
+            motion_variance - 2 * to_origin * drift[..., 0, 1] + to_origin.square() * acceleration_variance
+        )
+    deviations = VibrationStd(
+        **std,
+        image_motion=motion_variance.clamp(min=0.0).sqrt(),
+        image_acceleration=acceleration_variance.clamp(min=0.0).sqrt(),
+    )
+    return motion_of_fit(fit), deviations
+
+
+def amplitude_std(fit: ToneFit) -> Tensor:
+    """Standard deviation (B, 2, K) of the amplitudes in px; 0 for tones that are not active."""
+    real, imaginary, _ = _direction(fit)
+    return _propagated(fit, real, imaginary, torch.zeros_like(real))
+
+
+def shrunk_motion(fit: ToneFit, intervals: Tensor) -> Vibration:
+    """Motion of a fit with uncertain amplitudes near blind frequencies reduced, for warping frames by it.
+
+    An amplitude A of standard deviation s becomes ``A max(0, 1 - s^2 / A^2)`` (positive-part James-Stein estimate)
+    where the gain is small. Where the gain is large, the tone moves the frames by what was measured, and stays.
+
+    Args:
+        fit: With its covariance.
+        intervals: (M,) s, times between the frames compared.
+    """
+    blindness = 1 / (1 + (offset_gain(fit.frequencies, intervals) / MIN_GAIN).square())
+    noise = (amplitude_std(fit) / fit.coefficients.abs().clamp(min=1e-30)).square()
+    share = (1 - blindness * noise).clamp(min=0.0)
+    return motion_of_fit(replace(fit, coefficients=fit.coefficients * share))
+
+
+def _covariance_of_axes(fit: ToneFit) -> Tensor:
+    """Covariances (B, 2, P, P) of the parameters of each axis."""
+    size = fit.covariance.shape[-1] // 2
+    return fit.covariance.reshape(-1, 2, size, 2, size).diagonal(dim1=1, dim2=3).movedim(-1, 1)
+
+
+def _direction(fit: ToneFit) -> tuple[Tensor, Tensor, Tensor]:
+    """Real and imaginary part of the coefficients over their modulus, and the modulus, 1 where there is no tone."""
+    amplitude = fit.amplitude
+    modulus = torch.where(amplitude > 0, amplitude, 1.0)
+    return fit.coefficients.real / modulus, fit.coefficients.imag / modulus, modulus
+
+
+def _propagated(fit: ToneFit, *gradient: Tensor) -> Tensor:
+    """Standard deviation (B, 2, K) of a function with this gradient (B, 2, K) by Re C, Im C and f of each tone."""
+    tones = fit.frequencies.shape[-1]
+    covariance = _covariance_of_axes(fit)
+    blocks = torch.stack([covariance[..., 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(tones)], dim=2)
+    vector = torch.stack(gradient, dim=-1)
+    variance = torch.einsum("bakp,bakpq,bakq->bak", vector, blocks, vector).clamp(min=0.0)
+    return torch.where(fit.active, variance.sqrt(), 0.0)

@@ -1,139 +1,79 @@
-"""How many tones: added one by one, strongest first, as long as the data ask for them."""
+"""Number of tones: added one by one, strongest first, while they are significant, with weights against outliers."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones.blind_tones import with_blind_tones
-from rsvib_torch.detection.tones.candidates import Candidates, sighted
-from rsvib_torch.detection.tones.fit import fit_tones
-from rsvib_torch.detection.tones.inversion import amplitude_deviation, offset_gain
-from rsvib_torch.detection.tones.robust import of_each, residual_of, robust_fit, typical_size
-from rsvib_torch.detection.tones.tone_model import MotionModel, ToneFit
+from rsvib_torch.detection.tones.fit import (
+    MIN_GAIN,
+    MotionModel,
+    ToneFit,
+    amplitude_std,
+    fit_roughly,
+    fit_tones,
+    offset_gain,
+    residual_of,
+    select_stacks,
+    tone_response,
+)
+from rsvib_torch.detection.tones.periodogram import best_candidate, visibility
 
 __all__ = [
-    "LEAST_GAIN",
-    "LEAST_SIGNIFICANCE",
-    "LEAST_SWING",
     "MAX_TONES",
+    "MIN_OFFSET",
+    "MIN_SIGNIFICANCE",
     "find_tones",
+    "robust_fit",
     "significant_only",
     "strongest_only",
+    "typical_size",
+    "visible_size",
 ]
 
-MAX_TONES = 4
-LEAST_GAIN = 0.1  # |gain| below this multiplies noise more than tenfold
-LEAST_SIGNIFICANCE = 4.0  # amplitude over its standard deviation
-LEAST_SWING = 0.01  # px, offsets that a tone makes: less may be left over from interpolation
-_F_THRESHOLD = 14.0  # of chi-square gained per parameter over noise: chance over a whole frequency grid stays below it
-_LEAST_GAIN = 0.2  # of the residual chi-square that a further tone must explain
-# of what a tone has to explain: by itself in the periodogram, and before outliers are weighed anew; with less it need
-# not be fitted at all, or not to the end
-_PROMISING, _HOPEFUL = 0.35, 0.5
-_LEAST_APART = 0.7  # of one over the record: tones nearer than this are one that the noise has split
-_NEARLY_ALL, _LITTLE = 0.9, 0.05  # of the rows, and of their typical displacement: what is left when none pulls
+MAX_TONES = 4  # of each axis
+MIN_SIGNIFICANCE = 4.0  # amplitude over its standard deviation
+MIN_OFFSET = 0.01  # px, amplitude of the offsets of a tone; interpolation and unequal blur leave up to this
+_F_THRESHOLD = 14.0  # decrease of chi-square per parameter: the maximum of noise over a frequency grid stays below
 
 
-def _undisturbed(measurements: Measurements, left: Tensor) -> Tensor:
-    """(B,) bool: a fit has left so little of nearly all rows that no stretch of them can have pulled it away."""
-    most = measurements.sizes(left).nanquantile(_NEARLY_ALL, dim=1)
-    whole = measurements.sizes(measurements.relative(measurements.displacements)).nanmedian(1).values
-    return (most < _LITTLE * whole).all(-1)
-
-
-def _farthest(measurements: Measurements, left: Tensor) -> Tensor:
-    """(B, 2) px, more than a fit that has ``left`` (B, N, G, 2) is off at nearly all rows which tell of an axis."""
-    return measurements.distances(left).nanquantile(_NEARLY_ALL, dim=1).nan_to_num(torch.inf)
-
-
-def _better_where(
-    where: Tensor, measurements: Measurements, one: tuple[ToneFit, Measurements], other: tuple[ToneFit, Measurements]
+def robust_fit(
+    measurements: Measurements,
+    frequencies: Tensor,
+    active: Tensor,
+    model: MotionModel,
+    residual: Tensor | None = None,
 ) -> tuple[ToneFit, Measurements]:
-    """Fit and weights of the one for the stacks (B,) where that is asked for and leaves the typical row less."""
-    better = where & (typical_size(measurements, one[0]) < typical_size(measurements, other[0]))
-    return of_each(better, one[0], other[0]), of_each(better, one[1], other[1])
+    """Fit with the weights of outliers reduced in two steps (Tukey's biweight).
 
-
-@dataclass(frozen=True, eq=False)
-class _Search:
-    """What a search for tones goes by.
-
-    Attributes:
+    Args:
         measurements: The displacements.
-        sample_interval: Seconds between neighbouring rows or bands.
-        tones: Of each axis; None to choose their number.
-        model: What is fitted beside the tones.
-        least_gain: Share of the residual that a further tone must explain.
-        reckon: With stretches of outliers.
+        frequencies: (B, 2, K) Hz to start from.
+        active: (B, 2, K) bool.
+        model: Structure of the motion.
+        residual: (B, N, G, 2) px of an earlier fit; None to start with a fit of equal weights.
+
+    Returns:
+        The fit and the measurements with its weights.
     """
+    if residual is None:
+        fit = fit_tones(measurements, frequencies, active, model)
+        frequencies, residual = fit.frequencies, residual_of(measurements, fit)
+    rough, residual = fit_roughly(measurements.reweighted(residual), frequencies, active, model)
+    weighed = measurements.reweighted(residual)
+    return fit_tones(weighed, rough, active, model), weighed
 
-    measurements: Measurements
-    sample_interval: float
-    tones: int | None
-    model: MotionModel
-    least_gain: float
-    reckon: bool
 
-    def one_more(self, keep: Tensor, going: Tensor) -> Tensor:
-        """Tones to keep (B, 2, K), and one more (or family) of the axes (B, 2) that go on."""
-        return torch.cat([keep, going[..., None].expand(-1, -1, self.model.harmonics)], -1)
+def visible_size(measurements: Measurements, fit: ToneFit) -> Tensor:
+    """Root-mean-square displacement (B, 2, K) in px that each tone causes in the measurements; small for blind ones."""
+    response = tone_response(measurements, fit.frequencies).abs().square().mean((1, 2)).sqrt()
+    return fit.amplitude * response
 
-    def asked(self, before: Tensor, after: Tensor, active: Tensor) -> Tensor:
-        """(B, 2) weighted squares, of those before, that the last of the active tones has to explain: an F-test."""
-        parameters = 2 * self.model.harmonics + 1
-        spare = self.measurements.known - parameters * active.sum(-1) // self.model.harmonics - 1
-        noise = after / spare.clamp(min=1.0)
-        return torch.maximum(_F_THRESHOLD * parameters * noise, self.least_gain * before)
 
-    def further(
-        self, keep: Tensor, going: Tensor, fit: ToneFit, weighed: Measurements, left: Tensor
-    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """The axes (B, 2) on which one more tone is worth being fitted to the end, and ``Candidates.best``."""
-        candidates = self.candidates(weighed, left, reckon=False)
-        if self.tones is not None or keep.shape[-1] == 0:
-            return going, candidates.best(fit, self.one_more(keep, going))
-        before, one_more = weighed.square(left), self.one_more(keep, torch.ones_like(going))
-        pulled = torch.zeros_like(going)
-        if self.reckon:
-            pulled = ~_undisturbed(self.measurements, left)[:, None]
-
-        def hopeful(explained: Tensor, share: float) -> Tensor:
-            return (explained > share * self.asked(before, before - explained, one_more)) | pulled
-
-        going = going & hopeful(candidates.explained, _PROMISING)
-        if not bool(going.any()):
-            return going, (fit.frequencies, left)
-        best = candidates.best(fit, self.one_more(keep, going))
-        return going & hopeful(before - weighed.square(best[1]), _HOPEFUL), best
-
-    def candidates(self, weighed: Measurements, left: Tensor, *, reckon: bool) -> Candidates:
-        """Candidates for one more tone to explain what a fit has left."""
-        return Candidates.of(
-            self.measurements, weighed, left, self.sample_interval, self.model.harmonics, reckon=reckon
-        )
-
-    def fitted(
-        self,
-        keep: Tensor,
-        going: Tensor,
-        fit: ToneFit,
-        weighed: Measurements,
-        left: Tensor,
-        best: tuple[Tensor, Tensor],
-    ) -> tuple[ToneFit, Measurements]:
-        """A fit with one more tone of the axes that go on, and its weights."""
-        active = self.one_more(keep, going)
-        trial = robust_fit(self.measurements, best[0], active, self.model, best[1])
-        if not self.reckon:
-            return trial
-        disturbed = ~_undisturbed(self.measurements, residual_of(self.measurements, trial[0]))
-        if not bool(disturbed.any()):
-            return trial
-        frequencies, residual = self.candidates(weighed, left, reckon=True).best(fit, active)
-        careful = robust_fit(self.measurements, frequencies, active, self.model, residual)
-        return _better_where(disturbed, self.measurements, careful, trial)
+def typical_size(measurements: Measurements, fit: ToneFit) -> Tensor:
+    """(B,) median square of the normalised residual of both axes, which stretches of outliers hardly raise."""
+    return measurements.sizes(residual_of(measurements, fit)).nanmedian(1).values.square().sum(-1)
 
 
 def find_tones(
@@ -141,98 +81,160 @@ def find_tones(
     sample_interval: float,
     tones: int | None = None,
     model: MotionModel | None = None,
-    least_gain: float = _LEAST_GAIN,
+    least_gain: float = 0.2,
     start: ToneFit | None = None,
     blind: Tensor | None = None,
-    enough: float = 0.0,
+    accuracy: float = 0.0,
 ) -> ToneFit:
-    """Find and fit the tones of both axes without start values.
+    """Find and fit the tones of both axes; no initial guess is needed.
 
     The strongest tone of the gain-aware periodogram is added and all parameters are fitted again, until ``tones`` are
-    there, or until the next one is not significant: it must lower the weighted sum of squares by far more than noise
-    would over all frequencies tried (an F-test), and explain ``least_gain`` of what is left.
+    found, or until the next one is not significant: it must pass an F-test and explain ``least_gain`` of the residual.
 
     Args:
         measurements: The displacements.
         sample_interval: Seconds between neighbouring rows or bands.
         tones: Number of tones of each axis (of families, where harmonics are tied); None to choose it from the data.
-        model: What is fitted beside the tones.
-        least_gain: Share of the residual that a further tone must explain.
-        start: Tones that are known to be there; without it the search reckons with stretches of outliers.
-        blind: (F,) Hz that the frames cannot see, so that side tones of such a tone are known for what they are.
-        enough: An axis with a tone that leaves nearly all rows less than so many px needs no further one.
+        model: Structure of the motion.
+        least_gain: Share of the residual sum of squares that a further tone must explain.
+        start: Fit whose tones are accepted. Without it, the search allows for stretches of outliers.
+        blind: (F,) Hz, blind frequencies of the frames, to recognise side tones of blind tones.
+        accuracy: px; an axis with a tone needs no further one once nearly all residuals are smaller.
 
     Returns:
         The fit, with K the largest number of tones of any axis (at least 1).
     """
     model = model or MotionModel()
-    search = _Search(measurements, sample_interval, tones, model, least_gain, start is None)
     none = measurements.moments.new_zeros(len(measurements.moments), 2, model.harmonics, dtype=torch.bool)
     if start is None:
-        keep, (fit, weighed) = none[..., :0], robust_fit(measurements, none.double(), none, model)
+        accepted, (fit, weighed) = none[..., :0], robust_fit(measurements, none.double(), none, model)
     else:
-        keep, given = start.active, residual_of(measurements, start)
-        fit, weighed = robust_fit(measurements, start.frequencies, keep, model, given)
+        accepted, given = start.active, residual_of(measurements, start)
+        fit, weighed = robust_fit(measurements, start.frequencies, accepted, model, given)
 
-    def not_invented(trial: ToneFit) -> Tensor:
-        """(B, 2) whether the last tone may stand: what the record hardly sees may be refused, but not beside others."""
-        shown = sighted(measurements, trial.frequencies[..., -model.harmonics :]) > 0.5
-        return shown if keep.shape[-1] > 0 else torch.ones_like(shown)
+    def with_one_more(axes: Tensor) -> Tensor:
+        """Accepted tones and a further one (or family) of the axes (B, 2) that need it."""
+        return torch.cat([accepted, axes[..., None].expand(-1, -1, model.harmonics)], -1)
 
-    going = torch.ones_like(none[..., 0])  # an axis that stopped stays stopped
-    for _ in range(keep.shape[-1] // model.harmonics, MAX_TONES if tones is None else tones):
-        left = residual_of(measurements, fit)
-        if enough and keep.shape[-1] > 0:
-            going = going & (_farthest(measurements, left) > enough)
-        if bool(going.any()):
-            going, best = search.further(keep, going, fit, weighed, left)
-        if not bool(going.any()):
+    def visible(trial: ToneFit) -> Tensor:
+        """(B, 2) bool; the first tone of an axis is kept even if nearly blind, for the verdict."""
+        seen = visibility(measurements, trial.frequencies[..., -model.harmonics :]) > 0.5
+        return seen if accepted.shape[-1] > 0 else torch.ones_like(seen)
+
+    open_axes = torch.ones_like(none[..., 0])  # (B, 2), those that may need a further tone
+    for _ in range(accepted.shape[-1] // model.harmonics, MAX_TONES if tones is None else tones):
+        residual = residual_of(measurements, fit)
+        if accuracy and accepted.shape[-1] > 0:
+            most = measurements.distances(residual).nanquantile(0.9, dim=1).nan_to_num(torch.inf)
+            open_axes = open_axes & (most > accuracy)
+        if not bool(open_axes.any()):
             break
-        trial, trial_weighed = search.fitted(keep, going, fit, weighed, left, best)
+        active = with_one_more(open_axes)
+        candidate = best_candidate(measurements, weighed, fit, residual, active, sample_interval, leave_out=False)
+        trial, trial_weighed = robust_fit(measurements, candidate[0], active, model, candidate[1])
+        if start is None and bool((disturbed := _disturbed(measurements, trial)).any()):
+            candidate = best_candidate(measurements, weighed, fit, residual, active, sample_interval, leave_out=True)
+            other, other_weighed = robust_fit(measurements, candidate[0], active, model, candidate[1])
+            better = disturbed & (typical_size(measurements, other) < typical_size(measurements, trial))
+            trial = select_stacks(better, other, trial)
+            trial_weighed = select_stacks(better, other_weighed, trial_weighed)
         if tones is None:
-            # both fits are judged with the weights of the richer one
-            before = trial_weighed.square(left)
+            # both fits are compared with the weights of the richer one
+            before = trial_weighed.square(residual)
             after = trial_weighed.square(residual_of(measurements, trial))
-            gained = before - after > search.asked(before, after, search.one_more(keep, going))
-            accepted = going & gained & _resolved(measurements, trial) & not_invented(trial)
-            while bool(accepted.any()) and not bool((accepted == going).all()):
-                going = accepted
-                active = search.one_more(keep, going)
-                trial, trial_weighed = robust_fit(measurements, trial.frequencies, active, model)
-                accepted = accepted & not_invented(trial)
-            if not bool(accepted.any()):
+            parameters = 2 * model.harmonics + 1
+            spare = measurements.known - parameters * active.sum(-1) // model.harmonics - 1
+            needed = torch.maximum(_F_THRESHOLD * parameters * after / spare.clamp(min=1.0), least_gain * before)
+            passed = open_axes & (before - after > needed) & _resolved(measurements, trial) & visible(trial)
+            while bool(passed.any()) and not bool((passed == open_axes).all()):
+                open_axes = passed
+                trial, trial_weighed = robust_fit(measurements, trial.frequencies, with_one_more(open_axes), model)
+                passed = passed & visible(trial)
+            if not bool(passed.any()):
                 break
-        fit, weighed = trial, trial_weighed
-        keep = fit.active
-    return fit if blind is None or tones is not None else with_blind_tones(measurements, weighed, fit, blind)
+        fit, weighed, accepted = trial, trial_weighed, trial.active
+    return fit if blind is None or tones is not None else _with_blind_tones(measurements, weighed, fit, blind)
+
+
+def _disturbed(measurements: Measurements, fit: ToneFit) -> Tensor:
+    """(B,) bool: a stretch of outliers may have biased a fit, which leaves more than 5 % of the motion of some rows."""
+    most = measurements.sizes(residual_of(measurements, fit)).nanquantile(0.9, dim=1)
+    whole = measurements.sizes(measurements.relative(measurements.displacements)).nanmedian(1).values
+    return ~(most < 0.05 * whole).all(-1)
 
 
 def _resolved(measurements: Measurements, fit: ToneFit) -> Tensor:
-    """(B, 2) bool: whether all tones of an axis are far enough apart for the record to tell them from one."""
+    """(B, 2) bool: all tones of an axis are at least 0.7 of 1 / duration apart; closer ones fit one tone and noise."""
     span = measurements.moments.amax((1, 2)) - measurements.moments.amin((1, 2))
     order = torch.where(fit.active, fit.frequencies, torch.nan).sort(dim=-1).values
-    return ~((order[..., 1:] - order[..., :-1]) * span[:, None, None] < _LEAST_APART).any(-1)
+    return ~((order[..., 1:] - order[..., :-1]) * span[:, None, None] < 0.7).any(-1)
+
+
+def _with_blind_tones(measurements: Measurements, weighed: Measurements, fit: ToneFit, blind: Tensor) -> ToneFit:
+    """The fit with a tone of a blind frequency in place of its side tones, where that explains no less.
+
+    With motion of frequency f_m along the scan, rows are not exactly one frame apart when they are compared. A tone of
+    a blind frequency f_b then appears as weak tones at f_b + f_m and |f_b - f_m|. The tone itself, which the verdict
+    recognises as blind, is the simpler explanation.
+    """
+    if fit.model.harmonics > 1 or len(blind) == 0:
+        return fit
+    size = fit.amplitude
+    weak_limit = 0.2 * size[:, 1].amax(
+        -1, keepdim=True
+    )  # px, of the largest tone along the scan: side tones are smaller
+    carrier = torch.where(size[:, 1] > weak_limit, fit.frequencies[:, 1], torch.nan)[:, None, None, None]  # (B,1,1,1,K)
+    span = (measurements.moments.amax((1, 2)) - measurements.moments.amin((1, 2)))[:, None, None, None, None]
+    tone, middle = fit.frequencies[..., None, None], blind[:, None]
+    sides = torch.stack([middle + carrier, (middle - carrier).abs()], -1)  # (B, 1, 1, F, K, 2)
+    distance = ((tone[..., None] - sides).abs() * span[..., None]).nan_to_num(torch.inf).amin((-2, -1))  # (B, 2, K, F)
+    weak = fit.active & (size > 0) & (size < weak_limit[:, None])
+    near = (distance < 1.0) & weak[..., None]  # within 1 / duration
+    score = near.sum(2) + 0.5 / (1 + distance.amin(2))  # most side tones first, then the nearest
+    best = score.argmax(-1)  # (B, 2)
+    side = near.gather(-1, best[:, :, None, None].expand(-1, -1, near.shape[2], 1))[..., 0]  # (B, 2, K)
+    suspected = side.any(-1)
+    if not bool(suspected.any()):
+        return fit
+    place = side & (side.cumsum(-1) == 1)  # the blind tone takes the place of the first of them
+
+    def replaced(axes: Tensor) -> tuple[Tensor, Tensor]:
+        changed = axes[..., None]
+        frequencies = torch.where(place & changed, blind[best][..., None], fit.frequencies)
+        return frequencies, fit.active & ~(side & ~place & changed)
+
+    frequencies, active = replaced(suspected)
+    other = fit_tones(weighed, frequencies, active, fit.model)
+    before = weighed.square(residual_of(measurements, fit))
+    after = weighed.square(residual_of(measurements, other))
+    spare = measurements.known - 3 * fit.active.sum(-1)
+    fewer = 3 * (fit.active.sum(-1) - active.sum(-1))
+    better = suspected & (after / (spare + fewer).clamp(min=1.0) <= before / spare.clamp(min=1.0))
+    if not bool(better.any()):
+        return fit
+    frequencies, active = replaced(better)
+    return robust_fit(measurements, frequencies, active, fit.model)[0]
 
 
 def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor) -> ToneFit:
-    """The fit without the tones, but the strongest of an axis, that are not significant or too small.
+    """The fit without the tones, other than the strongest of an axis, that are not significant or too small.
 
-    Less than four standard deviations may be noise, and less than 0.01 px of offsets what interpolation and blur leave.
-    Where the gain is small that is no small amplitude, and the tone stays for the verdict. With harmonics, a family
-    goes as a whole.
+    Tones of large gain whose offsets are below ``MIN_OFFSET`` may be residuals of interpolation and blur. Where the
+    gain is small, small offsets do not mean a small amplitude, and the tone stays for the verdict. A family of
+    harmonics is kept or dropped as a whole.
 
     Args:
-        measurements: What was fitted.
+        measurements: The measurements of the fit.
         fit: With its covariance.
         intervals: (M,) s, times between the frames compared.
     """
     while True:
-        size = torch.where(fit.active, fit.coefficients.abs(), 0.0)
+        size = fit.amplitude
         gain = offset_gain(fit.frequencies, intervals)
-        small = (size * gain < LEAST_SWING) & (gain >= LEAST_GAIN)
-        tall = (size > LEAST_SIGNIFICANCE * amplitude_deviation(fit)) & ~small & fit.active
+        small = (size * gain < MIN_OFFSET) & (gain >= MIN_GAIN)
+        significant = (size > MIN_SIGNIFICANCE * amplitude_std(fit)) & ~small & fit.active
         strongest = size == size.amax(-1, keepdim=True)
-        families = ((tall | strongest) & fit.active).unflatten(-1, (-1, fit.model.harmonics)).any(-1)
+        families = ((significant | strongest) & fit.active).unflatten(-1, (-1, fit.model.harmonics)).any(-1)
         keep = families.repeat_interleave(fit.model.harmonics, -1) & fit.active
         if bool((keep == fit.active).all()):
             return fit
@@ -240,13 +242,13 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor
 
 
 def strongest_only(fit: ToneFit) -> ToneFit:
-    """The fit with the strongest tone (or family) of each axis alone."""
+    """The fit with only the strongest tone (or family) of each axis."""
     harmonics = fit.model.harmonics
-    size = torch.where(fit.active, fit.coefficients.abs(), 0.0).unflatten(-1, (-1, harmonics))
-    family = size.sum(-1).argmax(-1)[..., None, None].expand(-1, -1, 1, harmonics)
+    family = fit.amplitude.unflatten(-1, (-1, harmonics)).sum(-1).argmax(-1)[..., None, None]
+    place = family.expand(-1, -1, 1, harmonics)
 
     def pick(values: Tensor) -> Tensor:
-        picked: Tensor = values.unflatten(-1, (-1, harmonics)).gather(2, family)[:, :, 0]
+        picked: Tensor = values.unflatten(-1, (-1, harmonics)).gather(2, place)[:, :, 0]
         return picked
 
     return replace(fit, coefficients=pick(fit.coefficients), frequencies=pick(fit.frequencies), active=pick(fit.active))
