@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.frames.orientation import as_float_frames
+from rsvib_torch.frames.prepare import as_float_frames
 
 __all__ = ["Profiles", "row_profiles"]
 

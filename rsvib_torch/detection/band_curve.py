@@ -1,45 +1,24 @@
 """Where detection starts: the offsets of row bands between frames, and what they tell a fit."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.registration import OffsetCurve, Registration
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.registration import OffsetCurve, RegistrationOptions
 from rsvib_torch.registration.register import register_rows
 
-__all__ = ["Bands", "band_curve", "measurements_of_curve"]
+__all__ = ["band_curve", "measurements_of_curve"]
 
 _LEAST_VALID = 0.5  # of the pixels of a band
 _ENOUGH_COLUMNS = 512  # px for a start
 _LEAST_START = 0.8  # of the bands
 
 
-@dataclass(frozen=True)
-class Bands:
-    """How row bands are registered; the options of ``register_bands``."""
-
-    registration: Registration
-    band_rows: int
-    band_step: int
-    search: int
-
-    def offsets(self, frames: Tensor, timing: SensorTiming) -> OffsetCurve:
-        """Offsets of the bands of grey frames (B, T, H, W) in row order."""
-        return register_rows(
-            frames[:, :, None],
-            timing,
-            method=self.registration,
-            band_rows=self.band_rows,
-            band_step=self.band_step,
-            search=self.search,
-        )
-
-
 def band_curve(
-    frames: Tensor, valid: Tensor | None, timing: SensorTiming, bands: Bands, *, mere_start: bool
+    frames: Tensor, valid: Tensor | None, timing: RowTiming, options: RegistrationOptions, *, mere_start: bool
 ) -> OffsetCurve:
     """Offsets of the bands of grey frames (B, T, H, W) in row order, those without enough pixels left out.
 
@@ -47,17 +26,17 @@ def band_curve(
         frames: The frames.
         valid: (B, T, H, W) bool, pixels that count; None for all.
         timing: The sensor, in row order.
-        bands: How to register.
+        options: How bands are registered.
         mere_start: Whether the columns in the middle of wide frames do, if they show enough.
     """
     width = frames.shape[-1]
     if not mere_start or width <= _ENOUGH_COLUMNS:
-        curve = bands.offsets(frames, timing)
+        curve = register_rows(frames, timing, options)
     else:
         first = (width - _ENOUGH_COLUMNS) // 2
-        curve = bands.offsets(frames[..., first : first + _ENOUGH_COLUMNS], timing)
+        curve = register_rows(frames[..., first : first + _ENOUGH_COLUMNS], timing, options)
         if float(curve.good.double().mean((1, 2)).amin()) <= _LEAST_START:
-            curve = bands.offsets(frames, timing)
+            curve = register_rows(frames, timing, options)
     return curve if valid is None else _without_spoilt_bands(curve, valid)
 
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.detection.band_curve import Bands, band_curve, measurements_of_curve
+from rsvib_torch.detection.band_curve import band_curve, measurements_of_curve
 from rsvib_torch.detection.grey_frames import grey_frames
 from rsvib_torch.detection.reliability import judge
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, stacked
@@ -26,7 +26,7 @@ from rsvib_torch.frames.orientation import (
 )
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import VibrationStd, blind_frequencies
-from rsvib_torch.registration import OffsetCurve, Registration
+from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOptions
 
 __all__ = ["DetectionMethod", "VibrationDetector", "VibrationModel", "detect_vibration"]
 
@@ -67,7 +67,7 @@ class _Options:
     method: DetectionMethod
     tones: int | None
     model: MotionModel
-    bands: Bands
+    bands: RegistrationOptions
 
 
 def _tones_of_bands(curve: OffsetCurve, timing: RowTiming, options: _Options, enough: float = 0.0) -> ToneFit:
@@ -229,7 +229,7 @@ def detect_vibration(
     stacks = grey_frames(frames, timing, full_scale, ignore)
     stacks = stacks if columns is None else stacks.narrowed(columns)
     grey, valid, batched = stacks.images, stacks.valid, stacks.batched
-    bands = Bands(registration, band_rows, band_step, search)
+    bands = RegistrationOptions(registration, band_rows, band_step, search)
     options = _Options(
         method, None if tones == "auto" else tones, MotionModel(harmonics, 2 if image_acceleration else 1), bands
     )

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rsvib_torch.frames.arrays import ArrayLike, as_tensor
+from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.columns import detailed_columns
 from rsvib_torch.frames.missing import fill_roughly
-from rsvib_torch.frames.orientation import as_float_frames, frames_to_row_order
+from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.motion.timing import SensorTiming
 
 __all__ = ["GreyFrames", "grey_frames"]
@@ -64,21 +64,18 @@ def grey_frames(frames: ArrayLike, timing: SensorTiming, full_scale: float | Non
         ValueError: If there are fewer than two frames, a frame has no detail or hardly a pixel that counts, or
             ``ignore`` does not fit.
     """
-    images = as_float_frames(frames, full_scale, minimum_frames=2, nan_is_missing=True)
-    valid = _valid_pixels(images, ignore)
-    images = frames_to_row_order(images, timing)
-    batched = images.ndim == 5
-    images = images if batched else images[None] if images.ndim == 4 else images[None, :, None]
-    if valid is not None:
-        valid = frames_to_row_order(valid, timing)
-        valid = valid if batched else valid[None]
-        share = valid.float().mean((-2, -1))
+    prepared = prepare_frames(frames, timing, full_scale=full_scale, ignore=ignore, minimum_frames=2)
+    images, valid = prepared.images, None
+    if prepared.missing is not None:
+        missing = prepared.missing.any(2)
+        share = 1.0 - missing.float().mean((-2, -1))
         if bool((share < _LEAST_FRAME).any()):
             where = (share < _LEAST_FRAME).nonzero()[0].tolist()
             raise ValueError(f"frame {where[-1]} has only {share[*where]:.1%} of pixels that count")
-        images = fill_roughly(images, ~valid[:, :, None].expand(images.shape))
+        images = fill_roughly(images, missing[:, :, None].expand(images.shape))
+        valid = ~missing if bool(missing.any()) else None
     _check_detail(images)
-    return GreyFrames(images.mean(-3) if images.shape[-3] > 1 else images[:, :, 0], valid, batched)
+    return GreyFrames(images.mean(2) if images.shape[2] > 1 else images[:, :, 0], valid, prepared.batched)
 
 
 def _check_detail(frames: Tensor) -> None:
@@ -93,20 +90,3 @@ def _flat(frames: Tensor) -> Tensor:
     """(B, T) bool, frames whose pixels are all alike."""
     low, high = frames.amin((-3, -2, -1)), frames.amax((-3, -2, -1))
     return high - low <= 1e-6 * torch.maximum(low.abs(), high.abs())
-
-
-def _valid_pixels(frames: Tensor, ignore: object) -> Tensor | None:
-    """Pixels (..., T, H, W) that count, in image orientation; None where all do."""
-    if ignore is None and not bool(torch.isnan(frames.sum())):
-        return None
-    missing = torch.isnan(frames)
-    missing = missing if frames.ndim == 3 else missing.any(-3)
-    if ignore is not None:
-        mask = as_tensor("ignore", ignore).to(frames.device)
-        if mask.dtype != torch.bool:
-            raise TypeError(f"ignore must be a bool tensor, got {mask.dtype}")
-        try:
-            missing = missing | mask
-        except RuntimeError as error:
-            raise ValueError(f"ignore {tuple(mask.shape)} does not fit frames {tuple(missing.shape)}") from error
-    return ~missing if bool(missing.any()) else None

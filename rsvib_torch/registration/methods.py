@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.registration.band_windows import take_windows
 from rsvib_torch.registration.correlation import correlate_bands, correlate_profiles
 from rsvib_torch.registration.peak import integer_peak, subpixel_peak
 
-__all__ = ["BAND_METHODS", "BandTask", "Registration"]
+__all__ = ["BAND_METHODS", "BandTask", "Registration", "RegistrationOptions"]
 
 Registration = Literal["projection", "ncc", "phase"]
 
@@ -343,3 +344,29 @@ BAND_METHODS: dict[str, Callable[[BandTask], tuple[Tensor, Tensor]]] = {
     "ncc": register_ncc,
     "phase": register_phase,
 }
+
+
+@dataclass(frozen=True)
+class RegistrationOptions:
+    """How the offsets of row bands between frames are measured.
+
+    Args:
+        method: ``"projection"`` (gray projection), ``"ncc"`` or ``"phase"``: a name of ``BAND_METHODS``.
+        band_rows: Rows of a band, at least 4.
+        band_step: Rows from one band to the next, at least 1.
+        search: Search range in px around the whole-frame offset, at least 2.
+
+    Raises:
+        TypeError: If a number is not a whole number.
+        ValueError: If the method is unknown or a number is too small.
+    """
+
+    method: Registration = "ncc"
+    band_rows: int = 32
+    band_step: int = 16
+    search: int = 16
+
+    def __post_init__(self) -> None:
+        check_choice("registration", self.method, tuple(BAND_METHODS))
+        for name, least in (("band_rows", 4), ("band_step", 1), ("search", 2)):
+            check_whole_number(name, getattr(self, name), at_least=least)

@@ -5,12 +5,12 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.checks import check_choice, check_whole_number
-from rsvib_torch.frames.orientation import as_float_frames, frames_to_row_order, offsets_from_row_order
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.frames.orientation import offsets_from_row_order
+from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.registration.band_windows import band_tops
 from rsvib_torch.registration.coarse import coarse_offset
-from rsvib_torch.registration.methods import BAND_METHODS, BandTask, Registration
+from rsvib_torch.registration.methods import BAND_METHODS, BandTask, Registration, RegistrationOptions
 from rsvib_torch.registration.offset_curve import OffsetCurve
 
 __all__ = ["register_bands", "register_rows"]
@@ -50,32 +50,27 @@ def register_bands(
     Raises:
         ValueError: If there are fewer than two frames, or the frames are too small for the bands and search range.
     """
-    frames = frames_to_row_order(as_float_frames(frames, full_scale, minimum_frames=2), timing)
-    curve = register_rows(
-        frames, timing.in_row_order(), method=method, band_rows=band_rows, band_step=band_step, search=search
-    )
+    options = RegistrationOptions(method, band_rows, band_step, search)
+    prepared = prepare_frames(frames, timing, full_scale=full_scale, minimum_frames=2, allow_missing=False)
+    batch = register_rows(prepared.images.mean(2), prepared.timing, options)
+    curve = batch if prepared.batched else batch[0]
     offsets = offsets_from_row_order(curve.offsets, timing)
     heights = (curve.heights[1], curve.heights[0]) if timing.scan_axis == -1 else curve.heights
     return OffsetCurve(curve.pairs, curve.rows, curve.times, curve.later_times, offsets, curve.quality, heights)
 
 
-def register_rows(
-    frames: Tensor,
-    timing: SensorTiming,
-    *,
-    method: Registration = "ncc",
-    band_rows: int = 32,
-    band_step: int = 16,
-    search: int = 16,
-) -> OffsetCurve:
-    """``register_bands`` behind the door: float frames in row order; arguments as there."""
-    check_choice("registration", method, tuple(BAND_METHODS))
-    for name, value, least in (("band_rows", band_rows, 4), ("band_step", band_step, 1), ("search", search, 2)):
-        check_whole_number(name, value, at_least=least)
-    batched = frames.ndim == 5
-    grey = frames if frames.ndim == 3 else frames.mean(-3)
-    grey = grey if batched else grey[None]
-    grey = grey.to(torch.float32) if grey.dtype in (torch.float16, torch.bfloat16) else grey
+def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions) -> OffsetCurve:
+    """``register_bands`` of prepared frames.
+
+    Args:
+        grey: (B, T, H, W) float32 or float64 in row order.
+        timing: The sensor.
+        options: How bands are registered.
+
+    Returns:
+        A batch of B offset curves, axes (x, y) in row order.
+    """
+    band_rows, search = options.band_rows, options.search
     batch, num_frames, num_rows, width = grey.shape
     timing.check_rows(num_rows)
     needed = (band_rows + 2 * search, 4 * (search + 8))
@@ -85,7 +80,7 @@ def register_rows(
             f"{band_rows} rows searched over {search} px: at least {needed[0]} x {needed[1]} are needed"
         )
     grey = _flatten_rows(gaussian_blur2d(grey, (7, 7), (_SMOOTHING, _SMOOTHING)))
-    tops = band_tops(num_rows, band_rows, band_step, grey.device)
+    tops = band_tops(num_rows, band_rows, options.band_step, grey.device)
     first, second = grey[:, :-1].flatten(0, 1), grey[:, 1:].flatten(0, 1)
     cost = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4
     chunk = max(1, _MEMORY // cost)
@@ -95,11 +90,10 @@ def register_rows(
         task = BandTask(first[pair], second[pair], coarse_offset(first[pair], second[pair]), tops, band_rows, search)
         if task.width < search:
             raise ValueError(f"frames {width} px wide overlap too little after their whole-frame offset")
-        measured, correlation = BAND_METHODS[method](task)
+        measured, correlation = BAND_METHODS[options.method](task)
         failed = ~(correlation > _LOWEST_QUALITY)
         offsets.append(torch.where(failed[..., None], torch.nan, measured))
         quality.append(torch.where(failed, 0.0, correlation))
-    shape = (batch, num_frames - 1) if batched else (num_frames - 1,)
     rows = tops.to(torch.float64) + 0.5 * (band_rows - 1)
     starts = timing.frame_starts(num_frames, grey.device)[:, None] + rows * timing.row_time
     index = torch.arange(num_frames, device=grey.device)
@@ -108,8 +102,8 @@ def register_rows(
         rows=rows,
         times=starts[:-1],
         later_times=starts[1:],
-        offsets=torch.cat(offsets).to(torch.float64).unflatten(0, shape),
-        quality=torch.cat(quality).to(torch.float64).unflatten(0, shape),
+        offsets=torch.cat(offsets).to(torch.float64).unflatten(0, (batch, num_frames - 1)),
+        quality=torch.cat(quality).to(torch.float64).unflatten(0, (batch, num_frames - 1)),
         heights=(band_rows, band_rows),
     )
 

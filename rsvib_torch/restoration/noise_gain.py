@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.frames.orientation import as_float_frames
+from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.restoration.noise.single_frame import estimate_noise
-from rsvib_torch.restoration.restore import restore
+from rsvib_torch.restoration.restore import restore_prepared
+from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
 __all__ = ["predict_noise_gain"]
 
@@ -21,8 +22,9 @@ _QUIETEST = 1e-4  # of full scale; below, rounding would be measured
 def predict_noise_gain(
     frames: Tensor,
     timing: SensorTiming,
-    vibration: Vibration,
+    vibration: Vibration | Detected,
     *,
+    method: str = "exact",
     columns: int = 256,
     full_scale: float | None = None,
     **options: Any,
@@ -36,10 +38,11 @@ def predict_noise_gain(
     Args:
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W).
         timing: The sensor.
-        vibration: The motion.
+        vibration: The motion, or a detection, as in ``restore``.
+        method: As in ``restore``.
         columns: Width of the strip across the scan, from the middle of the frames.
         full_scale: As in ``restore``.
-        **options: As in ``restore``, method and options of the method.
+        **options: Options of the method.
 
     Returns:
         Scalar, float64.
@@ -51,15 +54,15 @@ def predict_noise_gain(
         1.0
     """
     count = check_whole_number("columns", columns, at_least=4 * _RIM)
-    images = as_float_frames(frames, full_scale).to(torch.float64)
-    across = -1 if timing.scan_axis == -2 else -2
-    width = images.shape[across]
-    strip = images.narrow(across, max(0, (width - count) // 2), min(count, width))
+    prepared = prepare_frames(frames, timing, full_scale=full_scale, allow_missing=False)
+    first = max(0, (prepared.images.shape[-1] - count) // 2)
+    strip = prepared.images[..., first : first + count].to(torch.float64)
+    vibration, _ = vibration_to_undo(vibration, timing, strip.shape[1], strip.shape[-2])
     level = 0.5 * estimate_noise(strip).square().mean().sqrt().clamp(min=_QUIETEST)
     generator = torch.Generator(strip.device).manual_seed(0)
     probe = level * torch.randn(strip.shape, generator=generator, dtype=strip.dtype, device=strip.device)
     plain, probed = (
-        restore(images, timing, vibration, check=False, **options)[..., _RIM:-_RIM, _RIM:-_RIM]
+        restore_prepared(prepared.with_images(images), vibration, method, options)[..., _RIM:-_RIM, _RIM:-_RIM]
         for images in (strip, strip + probe)
     )
     return (probed - plain).square().mean().sqrt() / probe.square().mean().sqrt()

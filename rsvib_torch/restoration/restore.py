@@ -1,26 +1,19 @@
-"""The door to restoration: orientation, batches and dtypes resolved once, then one of the methods."""
+"""Restoration of frames: input preparation, one of the methods, and a check of the result."""
 
 import inspect
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.frames.arrays import ArrayLike, as_tensor
-from rsvib_torch.frames.missing import fill_roughly
-from rsvib_torch.frames.orientation import (
-    as_float_frames,
-    frames_from_row_order,
-    frames_to_row_order,
-    vibration_to_row_order,
-)
-from rsvib_torch.frames.pixels import Saturation, hidden_pixels, saturated_pixels
+from rsvib_torch.frames.arrays import ArrayLike
+from rsvib_torch.frames.orientation import vibration_to_row_order
+from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
 from rsvib_torch.motion.spline import moving_axes
-from rsvib_torch.motion.timing import SensorTiming, check_timing
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
@@ -32,7 +25,7 @@ from rsvib_torch.restoration.verdict.outcome import RestorationWarning, TooLittl
 from rsvib_torch.restoration.verdict.pairs import pairs_to_judge
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
-__all__ = ["MASKS", "METHODS", "VibrationRestorer", "method_options", "restore"]
+__all__ = ["MASKS", "METHODS", "VibrationRestorer", "method_options", "restore", "restore_prepared"]
 
 MASKS = ("ignore", "clipped")  # what a method is told of pixels; no options of the user's
 _CALLER = 5  # levels up from where a warning is given: helper, restore and its two decorators
@@ -68,30 +61,14 @@ def _check_options(method: str, options: dict[str, Any]) -> None:
             raise TypeError(f"method={method!r} has no option {name!r}; its options are {', '.join(known)}")
 
 
-def _with_added_axes(frames: Tensor) -> Tensor:
-    """A stack as (B, T, C, H, W)."""
-    frames = frames[None] if frames.ndim < 5 else frames
-    return frames[:, :, None] if frames.ndim < 5 else frames
-
-
-def _without_lost_pixels(
-    images: Tensor, hidden: Tensor | None, clipped: Tensor | None, method: str, options: dict[str, Any]
-) -> tuple[Tensor, dict[str, Any]]:
-    """Hand the masks (B, T, C, H, W) to a method that knows them; fill what is missing for one that does not."""
-    known = inspect.signature(METHODS[method]).parameters
-    if clipped is not None and "clipped" in known:
-        options = {**options, "clipped": clipped}
-    if hidden is None:
-        return images, options
-    if "ignore" in known:
-        return images, {**options, "ignore": hidden}
-    return fill_roughly(images, hidden), options
-
-
-def _without_added_axes(restored: Tensor, ndim: int) -> Tensor:
-    """Take the batch and channel axes away that a stack of ``ndim`` axes came without."""
-    restored = restored if ndim == 5 else restored[0]
-    return restored[:, 0] if ndim == 3 else restored
+def _method_input(frames: PreparedFrames, method: str, options: dict[str, Any]) -> tuple[Tensor, dict[str, Any]]:
+    """Images and options for a method: masks if it takes them, otherwise images with missing pixels filled."""
+    parameters = inspect.signature(METHODS[method]).parameters
+    if frames.saturated is not None and "clipped" in parameters:
+        options = {**options, "clipped": frames.saturated}
+    if frames.missing is not None and "ignore" in parameters:
+        return frames.images, {**options, "ignore": frames.missing}
+    return frames.filled, options
 
 
 @outside_graphs
@@ -155,77 +132,85 @@ def restore(
     """
     check_choice("method", method, tuple(METHODS))
     _check_options(method, options)
-    check_timing(timing)
-    given = as_tensor("frames", frames)
-    hidden = hidden_pixels(given, None if ignore is None else as_tensor("ignore", ignore))
-    clipped = saturated_pixels(given, saturation, full_scale)
-    for mask, message in ((hidden, "ignore leaves no pixel"), (clipped, "every pixel is saturated")):
-        if mask is not None and bool(mask.all()):
-            raise ValueError(message)
-    images = as_float_frames(given if hidden is None else given.masked_fill(hidden, 0), full_scale)
-    dtype = images.dtype
-    if dtype not in (torch.float32, torch.float64):
-        images = images.to(torch.float32)
-    images = frames_to_row_order(_with_added_axes(images), timing)
-    hidden, clipped = (
-        None if mask is None else frames_to_row_order(_with_added_axes(mask), timing) for mask in (hidden, clipped)
-    )
-    B, T, _, H, _ = images.shape
-    rowwise = timing.in_row_order()
-    rowwise.check_rows(H)
-    vibration, left_alone = vibration_to_undo(vibration, timing, T, H)
+    prepared = prepare_frames(frames, timing, full_scale=full_scale, ignore=ignore, saturation=saturation)
+    _, count, _, height, _ = prepared.images.shape
+    vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
     for note in left_alone:
         warnings.warn(note, RestorationWarning, stacklevel=_CALLER - 1)
-    if vibration.batch_shape not in ((), (B,)) or (vibration.batch_shape and given.ndim < 5):
-        raise ValueError(
-            f"vibration of batch shape {tuple(vibration.batch_shape)} does not fit frames of shape "
-            f"{tuple(given.shape)}; one vibration, or one per stack of a (B, T, C, H, W) batch"
-        )
-    motion = vibration_to_row_order(vibration, timing).to(images.device)
-    motion = motion if motion.batch_shape else motion.expanded(B)
-    images, chosen = _without_lost_pixels(images, hidden, clipped, method, options)
-    restored = METHODS[method](images, frame_motion(motion, rowwise, T, H), **chosen)
+    restored = restore_prepared(prepared, vibration, method, options)
     if check:
-        raw = images if hidden is None else fill_roughly(images, hidden)
-        _warn_if_worse(raw.detach(), restored.detach(), hidden, motion, timing, options.get("joint", False))
-    restored = frames_from_row_order(restored, timing)
-    return _without_added_axes(restored, given.ndim).to(dtype)
+        _warn_if_worse(prepared, restored.detach(), vibration, options.get("joint", False))
+    return prepared.from_row_order(restored)
 
 
-def _warn_if_worse(
-    raw: Tensor,
-    restored: Tensor,
-    hidden: Tensor | None,
-    motion: Vibration,
-    timing: SensorTiming,
-    joint: bool | int,
-) -> None:
-    """Judge each stack of a batch in row order on a strip of columns of a few pairs of frames."""
+@outside_graphs
+@full_precision
+def restore_prepared(
+    frames: PreparedFrames, vibration: Vibration, method: str = "exact", options: Mapping[str, Any] | None = None
+) -> Tensor:
+    """``restore`` of frames that are already prepared, without a check of the result.
+
+    Args:
+        frames: The frames.
+        vibration: The motion in image axes, batch shape () or (B,).
+        method: As in ``restore``.
+        options: Options of the method.
+
+    Returns:
+        Restored frames (B, T, C, H, W) in row order.
+    """
+    options = dict(options or {})
+    check_choice("method", method, tuple(METHODS))
+    _check_options(method, options)
+    images, chosen = _method_input(frames, method, options)
+    motion = _motion_in_row_order(frames, vibration)
+    return METHODS[method](images, frame_motion(motion, frames.timing, images.shape[1], images.shape[-2]), **chosen)
+
+
+def _motion_in_row_order(frames: PreparedFrames, vibration: Vibration) -> Vibration:
+    """The vibration in row order on the frames' device, batch shape (B,).
+
+    Raises:
+        ValueError: If there is neither one vibration nor one for each stack of a batch.
+    """
+    batch = frames.images.shape[0]
+    if vibration.batch_shape not in ((), (batch,)) or (vibration.batch_shape and not frames.batched):
+        raise ValueError(
+            f"vibration of batch shape {tuple(vibration.batch_shape)} does not fit frames of shape {frames.shape}; "
+            "one vibration, or one per stack of a (B, T, C, H, W) batch"
+        )
+    motion = vibration_to_row_order(vibration, frames.image_timing).to(frames.images.device)
+    return motion if motion.batch_shape else motion.expanded(batch)
+
+
+def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Vibration, joint: bool | int) -> None:
+    """Judge each stack of a batch on a strip of columns of a few pairs of frames."""
+    raw = frames.filled.detach()
     count = raw.shape[1]
     if count < 2:
         return
+    motion = _motion_in_row_order(frames, vibration)
     pairs = pairs_to_judge(count, joint, _JUDGED_PAIRS)
     shared = count if joint is True else max(int(joint), 1)
     for stack in range(len(raw)):
         still = motion[stack].detached()
         if not bool(moving_axes(still).any()):
             continue
-        moved = frame_motion(still.expanded(1), timing.in_row_order(), count, raw.shape[-2])
         try:
             verdict = judge_frames(
                 raw[stack],
                 restored[stack],
-                moved,
+                frame_motion(still.expanded(1), frames.timing, count, raw.shape[-2]),
                 pairs,
                 shared=min(shared, count),
                 columns=_JUDGED_COLUMNS,
-                hidden=None if hidden is None else hidden[stack],
+                hidden=None if frames.missing is None else frames.missing[stack],
             )
         except TooLittleInCommonError:
             continue  # frames that share no scene cannot be compared
         if verdict.overall in ("partly", "worse"):
             where = f"stack {stack}: " if len(raw) > 1 else ""
-            summary = verdict.in_image_axes(timing).summary
+            summary = verdict.in_image_axes(frames.image_timing).summary
             warnings.warn(f"{where}{summary}", RestorationWarning, stacklevel=_CALLER)
 
 

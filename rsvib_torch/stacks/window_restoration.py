@@ -7,15 +7,12 @@ from typing import Any
 
 from torch import Tensor
 
+from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.motion.spline import moving_axes
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration import (
-    RestorationVerdict,
-    TooLittleInCommonError,
-    judge_restoration,
-    restore,
-    trusted_vibration,
-)
+from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError, trusted_vibration
+from rsvib_torch.restoration.restore import restore_prepared
+from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.restoration.verdict.trust import Detected
 
 __all__ = ["RestoredFrames", "restore_trusted"]
@@ -69,11 +66,13 @@ def restore_trusted(
     frames = frames if first_frames is None else frames[:first_frames]
     if not bool(moving_axes(vibration).any()):
         return RestoredFrames(frames, False, left_alone, None, False)
-    clear = restore(frames, timing, vibration, check=False, **options)
+    chosen = {name: value for name, value in options.items() if name not in ("method", "saturation")}
+    prepared = prepare_frames(frames, timing, saturation=options.get("saturation", "auto"))
+    restored = restore_prepared(prepared, vibration, options.get("method", "exact"), chosen)
     verdict = None
     with suppress(TooLittleInCommonError):
         if len(frames) > 1:
             joint = options.get("joint", False)
-            verdict = judge_restoration(frames, clear, timing, vibration, joint=joint, most_pairs=most_pairs)
+            verdict = judge_prepared(prepared, restored, vibration, joint=joint, most_pairs=most_pairs)
     keep = verdict is None or verdict.overall != "worse" or force
-    return RestoredFrames(clear if keep else frames, keep, left_alone, verdict, True)
+    return RestoredFrames(prepared.from_row_order(restored) if keep else frames, keep, left_alone, verdict, True)

@@ -6,13 +6,13 @@ import torch
 
 from rsvib_torch import SensorTiming, Vibration
 from rsvib_torch.frames.orientation import (
-    as_float_frames,
     frames_from_row_order,
     frames_to_row_order,
     offsets_from_row_order,
     vibration_from_row_order,
     vibration_to_row_order,
 )
+from rsvib_torch.frames.prepare import as_float_frames
 
 ORIENTATIONS = list(itertools.product((-2, -1), ("forward", "reverse")))
 VIBRATION = Vibration(

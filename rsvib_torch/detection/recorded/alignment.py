@@ -8,7 +8,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.detection.band_curve import Bands, measurements_of_curve
+from rsvib_torch.detection.band_curve import measurements_of_curve
 from rsvib_torch.detection.grey_frames import grey_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.residuals import independent_fraction, unexplained
@@ -18,7 +18,7 @@ from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import vibration_to_row_order
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.registration import Registration
+from rsvib_torch.registration import Registration, RegistrationOptions
 
 __all__ = ["ClockAlignment", "align_motion"]
 
@@ -135,7 +135,7 @@ def align_motion(
     if stack.batched:
         raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")
     grey = stack.images
-    bands = Bands(registration, band_rows, band_step, search)
+    bands = RegistrationOptions(registration, band_rows, band_step, search)
     rowwise, curve, (first, last) = start_curve(stack, timing, bands)
     turned = vibration_to_row_order(recorded, timing)
     assert isinstance(turned, FreeMotion)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.detection.band_curve import Bands, measurements_of_curve
+from rsvib_torch.detection.band_curve import measurements_of_curve
 from rsvib_torch.detection.grey_frames import grey_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.shapes.free import start_curve
@@ -15,7 +15,7 @@ from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import offsets_from_row_order, vibration_to_row_order
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.registration import Registration
+from rsvib_torch.registration import Registration, RegistrationOptions
 
 __all__ = ["MotionCheck", "check_motion"]
 
@@ -81,7 +81,7 @@ def check_motion(
     stack = grey_frames(frames, timing, full_scale, ignore)
     if stack.batched or motion.batch_shape:
         raise ValueError("check_motion takes one stack and one motion, not a batch")
-    bands = Bands(registration, band_rows, band_step, search)
+    bands = RegistrationOptions(registration, band_rows, band_step, search)
     rowwise, curve, _ = start_curve(stack, timing, bands)
     measured = measurements_of_curve(curve, rowwise, band_step)
     turned = vibration_to_row_order(motion.to(stack.images.device), timing)

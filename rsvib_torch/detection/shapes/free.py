@@ -8,7 +8,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.detection.band_curve import Bands, band_curve, measurements_of_curve
+from rsvib_torch.detection.band_curve import band_curve, measurements_of_curve
 from rsvib_torch.detection.grey_frames import GreyFrames, grey_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.residuals import independent_fraction, unexplained
@@ -19,7 +19,7 @@ from rsvib_torch.frames.orientation import offsets_from_row_order, vibration_fro
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.registration import OffsetCurve, Registration
+from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOptions
 
 __all__ = ["MotionDetection", "detect_motion", "start_curve"]
 
@@ -117,7 +117,7 @@ def detect_motion(
     check_whole_number("knot_rows", knot_rows, at_least=4)
     check_whole_number("iterations", iterations, at_least=1)
     stacks = grey_frames(frames, timing, full_scale, ignore)
-    bands = Bands(registration, band_rows, band_step, search)
+    bands = RegistrationOptions(registration, band_rows, band_step, search)
     found = [_detect(stacks.one(i), timing, bands, knot_rows, iterations) for i in range(len(stacks.images))]
     return _stacked(found) if stacks.batched else found[0]
 
@@ -133,7 +133,9 @@ def _stacked(found: list[MotionDetection]) -> MotionDetection:
     )
 
 
-def _detect(stack: GreyFrames, timing: SensorTiming, bands: Bands, knot_rows: int, iterations: int) -> MotionDetection:
+def _detect(
+    stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions, knot_rows: int, iterations: int
+) -> MotionDetection:
     """``detect_motion`` of one stack."""
     grey, valid = stack.images, stack.valid
     rowwise, curve, record = start_curve(stack, timing, bands)
@@ -159,7 +161,7 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: Bands, knot_rows: in
 
 
 def start_curve(
-    stack: GreyFrames, timing: SensorTiming, bands: Bands
+    stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions
 ) -> tuple[RowTiming, OffsetCurve, tuple[float, float]]:
     """Timing in row order, the offsets of the row bands of one stack, start and end of the record.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.quadrature import gauss_legendre
-from rsvib_torch.detection.band_curve import Bands, measurements_of_curve
+from rsvib_torch.detection.band_curve import measurements_of_curve
 from rsvib_torch.detection.grey_frames import GreyFrames, grey_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.residuals import independent_fraction, unexplained
@@ -22,7 +22,7 @@ from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import vibration_from_row_order
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.registration import Registration
+from rsvib_torch.registration import Registration, RegistrationOptions
 
 __all__ = ["SweptTone", "detect_swept_tone"]
 
@@ -115,7 +115,7 @@ def detect_swept_tone(
     """
     check_whole_number("iterations", iterations, at_least=1)
     stacks = grey_frames(frames, timing, full_scale, ignore)
-    bands = Bands(registration, band_rows, band_step, search)
+    bands = RegistrationOptions(registration, band_rows, band_step, search)
     found = [_detect(stacks.one(index), timing, bands, iterations) for index in range(len(stacks.images))]
     return _stacked(found, timing) if stacks.batched else found[0].tone
 
@@ -150,7 +150,7 @@ def _in_image(motion: FreeMotion, timing: SensorTiming) -> FreeMotion:
     return turned
 
 
-def _detect(stack: GreyFrames, timing: SensorTiming, bands: Bands, iterations: int) -> _Found:
+def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions, iterations: int) -> _Found:
     """``detect_swept_tone`` of one stack."""
     rowwise, curve, record = start_curve(stack, timing, bands)
     measured = measurements_of_curve(curve, rowwise, bands.band_step)

@@ -9,11 +9,10 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.frames.arrays import as_tensor
-from rsvib_torch.frames.missing import fill_roughly
-from rsvib_torch.frames.orientation import as_float_frames, frames_to_row_order, time_axis, vibration_to_row_order
-from rsvib_torch.frames.pixels import hidden_pixels
+from rsvib_torch.frames.orientation import vibration_to_row_order
+from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.motion.spline import moving_axes
-from rsvib_torch.motion.timing import SensorTiming, check_timing
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
 from rsvib_torch.restoration.joint_groups import joint_groups
@@ -23,7 +22,7 @@ from rsvib_torch.restoration.verdict.outcome import OUTCOMES, Outcome, Restorati
 from rsvib_torch.restoration.verdict.pairs import FramePair, equally_bright, pairs_to_judge, shared_part
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
-__all__ = ["judge_frames", "judge_restoration"]
+__all__ = ["judge_frames", "judge_prepared", "judge_restoration"]
 
 _EXPLAINED = 0.35  # of the displacement between the raw frames may remain
 _UNCHANGED = 0.9  # of it remaining means that nothing was gained
@@ -226,35 +225,52 @@ def judge_restoration(
         TypeError: If an argument has the wrong type.
         ValueError: If there is one frame only, shapes differ, or two frames have too little in common.
     """
-    check_timing(timing)
-    pairs_at_most = None if most_pairs is None else check_whole_number("most_pairs", most_pairs, at_least=1)
-    frames, restored = as_tensor("frames", frames), as_tensor("restored", restored)
-    hidden = hidden_pixels(frames, None if ignore is None else as_tensor("ignore", ignore))
-    raw = as_float_frames(frames if hidden is None else frames.masked_fill(hidden, 0), full_scale, minimum_frames=2)
-    if hidden is not None:
-        if bool(hidden.all()):
-            raise ValueError("ignore leaves no pixel")
-        raw = fill_roughly(raw, hidden)
-    if raw.ndim == 5 or time_axis(raw) != 0:
-        raise ValueError(f"frames must be one stack (T, H, W) or (T, C, H, W), got shape {tuple(raw.shape)}")
-    wanted = (1, *raw.shape[1:]) if joint is True else tuple(raw.shape)
-    if tuple(restored.shape) != wanted:
-        raise ValueError(f"restored must have the shape {wanted}, got {tuple(restored.shape)}")
-    count, rows = len(raw), raw.shape[-1 if timing.scan_axis == -1 else -2]
-    shared = len(joint_groups(count, joint)[0][0])
-    vibration, _ = vibration_to_undo(vibration, timing, count, rows)
+    prepared = prepare_frames(frames, timing, full_scale=full_scale, ignore=ignore, minimum_frames=2)
+    if prepared.batched:
+        raise ValueError(f"frames must be one stack (T, H, W) or (T, C, H, W), got shape {prepared.shape}")
+    restored = as_tensor("restored", restored)
+    expected = (1, *prepared.shape[1:]) if joint is True else prepared.shape
+    if tuple(restored.shape) != expected:
+        raise ValueError(f"restored must have the shape {expected}, got {tuple(restored.shape)}")
+    count, height = prepared.images.shape[1], prepared.images.shape[-2]
+    vibration, _ = vibration_to_undo(vibration, timing, count, height)
+    images = prepare_frames(restored, timing, full_scale=full_scale, allow_missing=False, name="restored").images
+    return judge_prepared(prepared, images, vibration, joint=joint, most_pairs=most_pairs)
+
+
+def judge_prepared(
+    frames: PreparedFrames,
+    restored: Tensor,
+    vibration: Vibration,
+    *,
+    joint: bool | int = False,
+    most_pairs: int | None = None,
+) -> RestorationVerdict:
+    """``judge_restoration`` of one stack that is already prepared.
+
+    Args:
+        frames: The raw frames.
+        restored: (1, T, C, H, W), or (1, 1, C, H, W), in row order.
+        vibration: The vibration that was undone, in image axes.
+        joint: As in ``judge_restoration``.
+        most_pairs: As in ``judge_restoration``.
+
+    Returns:
+        The verdict in image axes.
+    """
+    limit = None if most_pairs is None else check_whole_number("most_pairs", most_pairs, at_least=1)
     if vibration.batch_shape:
         raise ValueError(f"vibration must be one for the stack, got batch shape {tuple(vibration.batch_shape)}")
-    restored = as_float_frames(restored, full_scale, name="restored")
-    dtype = torch.promote_types(torch.promote_types(raw.dtype, restored.dtype), torch.float32)
-
-    def in_rows(images: Tensor) -> Tensor:
-        return frames_to_row_order(images if images.ndim == 4 else images[:, None], timing)
-
-    raw, restored = (in_rows(images.to(dtype)) for images in (raw, restored))
-    hidden = None if hidden is None else in_rows(hidden)
-    rowwise = vibration_to_row_order(vibration, timing).to(raw.device).expanded(1)
-    motion = frame_motion(rowwise, timing.in_row_order(), count, raw.shape[-2])
-    pairs = pairs_to_judge(count, joint, pairs_at_most)
-    verdict = judge_frames(raw, restored, motion, pairs, shared=shared, hidden=hidden)
-    return verdict.in_image_axes(timing)
+    count, height = frames.images.shape[1], frames.images.shape[-2]
+    shared = len(joint_groups(count, joint)[0][0])
+    dtype = torch.promote_types(frames.images.dtype, restored.dtype)
+    motion = vibration_to_row_order(vibration, frames.image_timing).to(frames.images.device).expanded(1)
+    verdict = judge_frames(
+        frames.filled[0].to(dtype),
+        restored[0].to(dtype),
+        frame_motion(motion, frames.timing, count, height),
+        pairs_to_judge(count, joint, limit),
+        shared=shared,
+        hidden=None if frames.missing is None else frames.missing[0],
+    )
+    return verdict.in_image_axes(frames.image_timing)

@@ -1,0 +1,219 @@
+"""Input preparation, once for all entry points: from the user's frames to floating-point images in row order.
+
+``prepare_frames`` is the only place that converts dtypes, applies the full scale, builds masks, turns images and adds
+batch and channel axes; ``PreparedFrames.from_row_order`` is the way back. Code behind it relies on two invariants:
+rows lie on axis -2 in readout order, and images are float32 (float64 where the user gave float64).
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.checks import check_number
+from rsvib_torch.frames.arrays import ArrayLike, as_tensor
+from rsvib_torch.frames.missing import fill_roughly
+from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
+from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
+
+__all__ = ["PreparedFrames", "Saturation", "as_float_frames", "prepare_frames"]
+
+Saturation = float | Literal["auto"] | None
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedFrames:
+    """Frames in the form that core code expects, with what is needed to return to the user's form.
+
+    Attributes:
+        images: (B, T, C, H, W) float32 or float64 in row order, full scale 1; 0 at missing pixels.
+        missing: Bool of that shape, True at pixels without data; None if there are none.
+        saturated: Bool of that shape, True at pixels at or above the saturation level; None if there are none.
+        timing: The sensor in row order.
+        image_timing: The sensor as given by the user, in image orientation.
+        shape: Shape of the user's frames.
+        dtype: Floating-point dtype of results for the user.
+    """
+
+    images: Tensor
+    missing: Tensor | None
+    saturated: Tensor | None
+    timing: RowTiming
+    image_timing: SensorTiming
+    shape: tuple[int, ...]
+    dtype: torch.dtype
+
+    @property
+    def batched(self) -> bool:
+        """Whether the user gave a batch of stacks (B, T, C, H, W)."""
+        return len(self.shape) == 5
+
+    @cached_property
+    def filled(self) -> Tensor:
+        """The images with local means at missing pixels."""
+        return self.images if self.missing is None else fill_roughly(self.images, self.missing)
+
+    def with_images(self, images: Tensor) -> "PreparedFrames":
+        """The same frames with other pixel values (B, T, C, H, W') in row order; masks must be None or fit them."""
+        return replace(self, images=images)
+
+    def from_row_order(self, images: Tensor) -> Tensor:
+        """Images (B, T', C, H', W') in row order with the axes, orientation and dtype of the user's frames."""
+        turned = frames_from_row_order(images, self.image_timing)
+        turned = turned if self.batched else turned[0]
+        return (turned[:, 0] if len(self.shape) == 3 else turned).to(self.dtype)
+
+
+def prepare_frames(
+    frames: ArrayLike,
+    timing: SensorTiming,
+    *,
+    full_scale: float | None = None,
+    ignore: object = None,
+    saturation: Saturation = None,
+    minimum_frames: int = 1,
+    allow_missing: bool = True,
+    name: str = "frames",
+) -> PreparedFrames:
+    """Check frames and turn them into floating-point images (B, T, C, H, W) in row order, with their masks.
+
+    Args:
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation; tensor or array.
+        timing: The sensor.
+        full_scale: Count that means 1.0, for integer frames other than uint8.
+        ignore: Boolean mask of the frames' shape, or one that broadcasts to that shape without the channel axis: True
+            at pixels without data, which may hold any value. None for no mask; NaN marks missing pixels as well.
+        saturation: Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for
+            integer frames, none for floating-point frames, whose level is unknown; None for none.
+        minimum_frames: Number of frames that the stack must have.
+        allow_missing: Whether NaN marks missing pixels; if not, NaN is refused.
+        name: Name of the argument in error messages.
+
+    Returns:
+        The prepared frames.
+
+    Raises:
+        TypeError: If an argument has the wrong type.
+        ValueError: If the shape is not that of a stack, there are too few frames or more rows than the sensor reads,
+            a pixel is infinite, no pixel has data, all are saturated, or the full scale is unknown.
+
+    Example:
+        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")
+        >>> prepared = prepare_frames(torch.zeros(2, 48, 64, dtype=torch.uint8), timing)
+        >>> tuple(prepared.images.shape), prepared.images.dtype, prepared.missing
+        ((1, 2, 1, 64, 48), torch.float32, None)
+        >>> tuple(prepared.from_row_order(prepared.images).shape)
+        (2, 48, 64)
+    """
+    check_timing(timing)
+    given = as_tensor(name, frames)
+    missing = _missing_pixels(given, ignore, allow_missing)
+    if missing is not None:
+        if bool(missing.all()):
+            raise ValueError("ignore leaves no pixel: frame 0 has only 0.0% of pixels with data")
+        given = given.masked_fill(missing, 0)
+    images = as_float_frames(given, full_scale, minimum_frames=minimum_frames, name=name)
+    saturated = _saturated_pixels(given, saturation, full_scale)
+    dtype = images.dtype
+    images = images if dtype in (torch.float32, torch.float64) else images.to(torch.float32)
+
+    def in_row_order(values: Tensor) -> Tensor:
+        values = values if values.ndim == 5 else values[None]
+        return frames_to_row_order(values if values.ndim == 5 else values[:, :, None], timing)
+
+    images = in_row_order(images)
+    row_timing = timing.in_row_order()
+    row_timing.check_rows(images.shape[-2])
+    missing, saturated = (None if mask is None else in_row_order(mask) for mask in (missing, saturated))
+    return PreparedFrames(images, missing, saturated, row_timing, timing, tuple(given.shape), dtype)
+
+
+def as_float_frames(
+    frames: ArrayLike, full_scale: float | None = None, *, minimum_frames: int = 1, name: str = "frames"
+) -> Tensor:
+    """Check a stack of frames and convert integers to floating point with full scale 1.
+
+    Floating-point frames keep their values and dtype. 8-bit integers have full scale 255; the full scale of other
+    integers must be given, because a 16-bit file may hold 12-bit counts.
+
+    Args:
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W); tensor or array.
+        full_scale: Count that means 1.0, for integer frames.
+        minimum_frames: Number of frames that the stack must have.
+        name: Name of the argument in error messages.
+
+    Returns:
+        Floating-point tensor of the same shape.
+
+    Raises:
+        TypeError: If the frames are not a tensor or array of real numbers.
+        ValueError: If the shape is not that of a stack, there are too few frames, a pixel is NaN or infinite, or the
+            full scale of integer frames is unknown.
+
+    Example:
+        >>> as_float_frames(torch.full((2, 4, 4), 255, dtype=torch.uint8)).max().item()
+        1.0
+    """
+    frames = as_tensor(name, frames)
+    if frames.ndim not in (3, 4, 5):
+        raise ValueError(
+            f"{name} must have shape (T, H, W), (T, C, H, W) or (B, T, C, H, W), got {tuple(frames.shape)}"
+        )
+    count = frames.shape[1 if frames.ndim == 5 else 0]
+    if count < minimum_frames:
+        raise ValueError(f"at least {minimum_frames} frames are needed, got {count}")
+    if min(frames.shape) == 0:
+        raise ValueError(f"{name} must not be empty, got shape {tuple(frames.shape)}")
+    if frames.dtype.is_complex or frames.dtype == torch.bool:
+        raise TypeError(f"{name} must be real numbers, got {frames.dtype}")
+    if frames.dtype.is_floating_point:
+        if not bool(torch.isfinite(torch.stack(frames.aminmax())).all()):  # one pass; propagates NaN and infinity
+            pixel = tuple((~torch.isfinite(frames)).nonzero()[0].tolist())
+            raise ValueError(f"{name} must be finite, but pixel {pixel} is {frames[pixel].item()}")
+        return frames
+    if full_scale is None:
+        if frames.dtype != torch.uint8:
+            raise ValueError(
+                f"{frames.dtype} {name} do not say their full scale; state full_scale, e.g. 4095 for 12-bit counts"
+            )
+        full_scale = 255.0
+    return frames.to(torch.float32) / check_number("full_scale", full_scale, above=0.0)
+
+
+def _missing_pixels(frames: Tensor, ignore: object, allow_missing: bool) -> Tensor | None:
+    """Mask of the frames' shape of ignored and NaN pixels; None if there are none."""
+    missing = None
+    if allow_missing and frames.dtype.is_floating_point and bool(torch.isnan(frames.sum())):
+        missing = torch.isnan(frames)
+        missing = missing if bool(missing.any()) else None  # the sum of +inf and -inf is NaN as well
+    if ignore is None:
+        return missing
+    mask = as_tensor("ignore", ignore).to(frames.device)
+    shape, target = tuple(mask.shape), tuple(frames.shape)
+    planes = target if frames.ndim < 4 else (*target[:-3], *target[-2:])
+    if shape != target:
+        try:
+            mask = mask.expand(planes)
+        except RuntimeError as error:
+            raise ValueError(
+                f"ignore {shape} does not fit the frames: ignore must be a boolean mask of shape {target}, or one "
+                f"that broadcasts to {planes}"
+            ) from error
+        mask = mask if frames.ndim < 4 else mask.unsqueeze(-3).expand(target)
+    if mask.dtype != torch.bool:
+        raise TypeError(f"ignore must be a bool tensor, got {mask.dtype}")
+    return mask if missing is None else mask | missing
+
+
+def _saturated_pixels(frames: Tensor, saturation: Saturation, full_scale: float | None) -> Tensor | None:
+    """Mask of the pixels at the saturation level or above, in the unit of the user's frames; None if there are none."""
+    if saturation == "auto":
+        saturation = None if frames.dtype.is_floating_point else 255.0 if full_scale is None else full_scale
+    if saturation is None:
+        return None
+    mask = frames >= check_number("saturation", saturation, above=0.0)
+    if bool(mask.all()):
+        raise ValueError("every pixel is saturated")
+    return mask if bool(mask.any()) else None
