@@ -1,4 +1,4 @@
-"""Files damaged at random, and what reading them may do: give frames, or say in one line what is wrong."""
+"""Randomly damaged files; reading them must give frames or a one-line error."""
 
 import json
 import random
@@ -84,7 +84,7 @@ def _write_zarr(path):
 
 
 def write_originals(folder):
-    """Good files; gives, for each kind, the file to damage, what reads it, and whether it is text."""
+    """Write undamaged files; returns for each file to damage: the stack, the reading function, whether it is text."""
     tifffile.imwrite(folder / "pages.tif", COUNTS, photometric="minisblack", metadata=None)
     tifffile.imwrite(folder / "packed.tif", COUNTS, photometric="minisblack", compression="zlib", bigtiff=True)
     _write_hdf5(folder / "plain.h5")
@@ -147,7 +147,7 @@ def damage(data, seed, text):
         elif kind == "copy":
             other = choice.randrange(len(data))
             data[place : place + 8] = data[other : other + 8]
-        elif text:  # a number becomes something else
+        elif text:  # replace a number
             digits = [i for i, byte in enumerate(data) if chr(byte).isdigit()] or [0]
             start = choice.choice(digits)
             data[start : start + 1] = choice.choice(_TOKENS)
@@ -162,7 +162,7 @@ def damage(data, seed, text):
 
 @contextmanager
 def at_most(seconds):
-    """Raise ``TimeoutError`` in the main thread after so long."""
+    """Raise ``TimeoutError`` in the main thread after ``seconds``."""
 
     def stop(*_):
         raise TimeoutError(f"took more than {seconds} s")
@@ -177,7 +177,7 @@ def at_most(seconds):
 
 
 def try_damaged(folder, seeds, seconds=10):
-    """Read damaged files; gives how many were read and refused, and what went wrong otherwise."""
+    """Read damaged files; returns the numbers of files read and refused, and a list of all other outcomes."""
     originals = write_originals(folder)
     names = list(originals)
     read, refused, wrong = 0, 0, []
@@ -195,7 +195,7 @@ def try_damaged(folder, seeds, seconds=10):
         except (ValueError, OSError) as error:
             refused += 1
             lines = str(error).splitlines()
-            # configs say one line a mistake
+            # configs have one line per mistake
             if not lines or (len(lines) > 1 and not all(str(folder) in line for line in lines)):
                 wrong.append(f"{seed} {name}: message {error!s}")
         except Exception as error:  # everything else would be a traceback

@@ -1,10 +1,9 @@
-"""Files of frames: one module per format, the registry of formats, and atomic writes."""
+"""Stacks of frames in files: the registry of formats, one module per format, and atomic writes."""
 
 from rsvib_torch.io.atomic import check_writable, whole_file, whole_folder
 from rsvib_torch.io.files import check_stack_target, open_stack, read_stack, read_stack_info, write_stack
 from rsvib_torch.io.formats import FrameReader, FrameWriter, StackFormat, register_format
-from rsvib_torch.io.frame_times import exposure_times, timing_from_first_frame
-from rsvib_torch.io.stack_info import FrameError, StackInfo
+from rsvib_torch.io.stack_info import FrameError, StackInfo, exposure_times, timing_from_first_frame
 
 __all__ = [
     "FrameError",

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all."""
+"""Atomic writes: files and folders get their names when they are complete."""
 
 import glob
 import os
@@ -11,17 +11,23 @@ from typing import Literal
 
 try:
     import fcntl
-except ImportError:  # systems without it keep what a killed process leaves
+except ImportError:  # without it temporary folders of killed processes are not removed
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["check_writable", "place", "whole_file", "whole_folder", "workplace"]
+__all__ = [
+    "check_writable",
+    "move_into_place",
+    "nearest_folder",
+    "temporary_folder",
+    "whole_file",
+    "whole_folder",
+]
 
-_ENDING = ".part"
-_DRAWN = "?" * 8  # characters that ``tempfile`` puts between
+_SUFFIX = ".part"
 
 
-def _nearest_folder(path: Path) -> Path:
-    """The folder in which ``path``, or the first missing folder above it, would be made."""
+def nearest_folder(path: Path) -> Path:
+    """The lowest existing folder above ``path``."""
     parent = path.absolute().parent
     while not parent.exists() and parent != parent.parent:
         parent = parent.parent
@@ -29,8 +35,9 @@ def _nearest_folder(path: Path) -> Path:
 
 
 def _remove_abandoned(parent: Path, name: str) -> None:
-    """Remove the temporary folders of processes that were killed: nobody has their lock any more."""
-    for folder in parent.glob(f".{glob.escape(name)}.{_DRAWN}{_ENDING}"):
+    """Remove temporary folders of killed processes: the operating system has released their locks."""
+    random_part = "?" * 8  # as made by ``tempfile``
+    for folder in parent.glob(f".{glob.escape(name)}.{random_part}{_SUFFIX}"):
         try:
             file = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY)
         except OSError:
@@ -44,16 +51,16 @@ def _remove_abandoned(parent: Path, name: str) -> None:
             os.close(file)
 
 
-def _made_and_locked(parent: Path, name: str) -> tuple[Path, int | None]:
-    """A new temporary folder and its lock, where the file system knows locks; the system opens it with the process."""
+def _make_locked_folder(parent: Path, name: str) -> tuple[Path, int | None]:
+    """A new temporary folder, and its lock if the file system supports locks."""
     while True:
-        folder = Path(tempfile.mkdtemp(prefix=f".{name}.", suffix=_ENDING, dir=parent))
+        folder = Path(tempfile.mkdtemp(prefix=f".{name}.", suffix=_SUFFIX, dir=parent))
         if fcntl is None:
             return folder, None
         try:
             file = os.open(folder, os.O_RDONLY)
         except FileNotFoundError:
-            continue  # another process took it for abandoned
+            continue  # another process removed it before it was locked
         try:
             fcntl.flock(file, fcntl.LOCK_EX)
         except OSError:
@@ -65,125 +72,125 @@ def _made_and_locked(parent: Path, name: str) -> tuple[Path, int | None]:
 
 
 @contextmanager
-def workplace(path: Path) -> Iterator[Path]:
-    """A temporary folder on the file system of ``path``, gone afterwards; what killed processes left there goes too."""
-    parent = _nearest_folder(path)
+def temporary_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder on the file system of ``path``; those that killed processes left for it are removed."""
+    parent = nearest_folder(path)
     if fcntl is not None:
         _remove_abandoned(parent, path.name)
     try:
-        work, lock = _made_and_locked(parent, path.name)
+        folder, lock = _make_locked_folder(parent, path.name)
     except OSError as error:
         raise OSError(f"cannot write {path}: folder {parent} is not writable ({error.strerror})") from error
     try:
-        yield work
+        yield folder
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
         if lock is not None:
             os.close(lock)
 
 
-def _check_file_place(path: Path, *, parent_exists: bool = True) -> None:
+def _check_file_target(path: Path, *, parent_exists: bool = True) -> None:
     if path.is_dir():
         raise IsADirectoryError(f"cannot write {path}: it is a folder")
     if parent_exists and not path.absolute().parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: folder {path.absolute().parent} does not exist")
 
 
-def _check_folder_place(path: Path) -> None:
+def _check_folder_target(path: Path) -> None:
     if path.exists() and not path.is_dir():
-        raise NotADirectoryError(f"cannot write folder {path}: a file of that name is there")
+        raise NotADirectoryError(f"cannot write folder {path}: a file of that name exists")
     if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
         raise PermissionError(f"cannot write into folder {path}: it is not writable")
 
 
 def check_writable(path: Path, *, folder: bool = False) -> None:
-    """Raise an ``OSError`` that says why if ``path`` could not be written; leaves nothing behind.
+    """Raise an ``OSError`` with the reason if ``path`` cannot be written; creates nothing.
 
     Args:
-        path: File, or folder, to be written later.
+        path: File or folder to be written later.
         folder: Whether it will be a folder.
     """
-    (_check_folder_place if folder else _check_file_place)(path)
-    with workplace(path):
+    (_check_folder_target if folder else _check_file_target)(path)
+    with temporary_folder(path):
         pass
 
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path to write to; the file gets its own name only when all went well.
+    """Write a file under a temporary name; it gets its own name when the block ends without an exception.
 
     Args:
         path: The file to write; its folder must exist. An existing file is replaced.
 
     Yields:
-        A path with the same file ending in the same folder.
+        A temporary path with the same file ending.
 
     Raises:
         OSError: If the folder does not exist or is not writable.
     """
     target = Path(path)
-    _check_file_place(target)
-    with workplace(target) as work:
-        part = work / target.name
+    _check_file_target(target)
+    with temporary_folder(target) as folder:
+        part = folder / target.name
         yield part
         os.replace(part, target)
 
 
 @contextmanager
 def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary folder to write into; its files get their place only when all went well.
+    """Write files into a temporary folder; they are moved when the block ends without an exception.
 
-    A folder that exists keeps its other files; files of the same names are replaced.
+    An existing folder keeps its other files; files of the same names are replaced.
 
     Args:
-        path: The folder to write; it is made, with the folders above it, if it does not exist.
+        path: The folder to write; it is created, with the folders above it, if it does not exist.
 
     Yields:
         A temporary folder on the same file system.
 
     Raises:
-        OSError: If the folder cannot be made or written to.
+        OSError: If the folder cannot be created or written to.
     """
     target = Path(path)
-    _check_folder_place(target)
-    with workplace(target) as work:
-        part = work / "new"
+    _check_folder_target(target)
+    with temporary_folder(target) as folder:
+        part = folder / "new"
         part.mkdir()
         yield part
-        files = sorted(part.iterdir())
-        for file in files:
-            _check_file_place(target / file.name, parent_exists=False)
-        target.mkdir(parents=True, exist_ok=True)
-        for file in files:
-            os.replace(file, target / file.name)
+        _move_files(part, target)
 
 
-def place(
+def _move_files(part: Path, target: Path) -> None:
+    files = sorted(part.iterdir())
+    for file in files:
+        _check_file_target(target / file.name, parent_exists=False)
+    target.mkdir(parents=True, exist_ok=True)
+    for file in files:
+        os.replace(file, target / file.name)
+
+
+def move_into_place(
     part: Path, target: Path, kind: Literal["file", "folder", "tree"] = "file", companions: tuple[str, ...] = ()
 ) -> None:
-    """Give what was written under a temporary name its own; may be called again after it was broken off.
+    """Rename a complete stack from its temporary name; may be repeated after an interruption.
 
     Args:
-        part: What was written; a name on the file system of ``target``.
-        target: Where it belongs. A file or tree there is replaced, a folder keeps its other files.
+        part: Temporary name on the file system of ``target``.
+        target: Final name. An existing file or tree is replaced, an existing folder keeps its other files.
         kind: As in ``StackFormat``.
         companions: As in ``StackFormat``.
     """
     for ending in companions:
-        beside = part.with_name(part.name + ending)
-        if beside.exists():
-            os.replace(beside, target.with_name(target.name + ending))
+        companion = part.with_name(part.name + ending)
+        if companion.exists():
+            os.replace(companion, target.with_name(target.name + ending))
     if kind == "folder" and target.is_dir():
-        for file in sorted(part.iterdir()):
-            _check_file_place(target / file.name, parent_exists=False)
-        for file in sorted(part.iterdir()):
-            os.replace(file, target / file.name)
+        _move_files(part, target)
         part.rmdir()
-        return
-    if kind == "tree" and target.is_dir():
+    elif kind == "tree" and target.is_dir():
         old = part.with_name(f"{part.name}.old")
         os.replace(target, old)
         os.replace(part, target)
         shutil.rmtree(old)
-        return
-    os.replace(part, target)
+    else:
+        os.replace(part, target)

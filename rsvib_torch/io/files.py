@@ -1,36 +1,67 @@
-"""Reading and writing whole stacks: the file ending chooses the format."""
+"""Reading and writing whole stacks: the file ending selects the format."""
 
 import os
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.frames.arrays import ArrayLike, as_tensor
 from rsvib_torch.io import hdf5, image_folder, npy, raw, tiff, video, zarr_store
-from rsvib_torch.io.atomic import check_writable, place, workplace
-from rsvib_torch.io.formats import FrameReader, StackFormat, find_format, target_format
-from rsvib_torch.io.full_scale import check_full_scale, counts_to_frames, frames_to_counts, known_full_scale
+from rsvib_torch.io.atomic import check_writable, move_into_place, temporary_folder
+from rsvib_torch.io.formats import FrameReader, StackFormat, find_format, register_format, target_format
+from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.stack_info import StackInfo
 
-__all__ = ["check_info_target", "check_stack_target", "open_stack", "read_stack", "read_stack_info", "write_stack"]
+__all__ = [
+    "PathLike",
+    "check_info_target",
+    "check_stack_target",
+    "open_stack",
+    "read_stack",
+    "read_stack_info",
+    "write_frames",
+    "write_stack",
+]
 
 PathLike = str | os.PathLike[str]
-BUILT_IN = (npy, hdf5, image_folder, raw, tiff, video, zarr_store)  # these modules enter themselves into the registry
+
+for _form in (
+    npy.FORMAT,
+    hdf5.FORMAT,
+    image_folder.PNG_FORMAT,
+    image_folder.FOLDER_FORMAT,
+    raw.FORMAT,
+    tiff.FORMAT,
+    video.FORMAT,
+    zarr_store.FORMAT,
+):
+    register_format(_form)
 
 
 def open_stack(path: PathLike) -> FrameReader:
-    """Open a stack to read its frames one at a time; its ``close`` lets go of the file.
+    """Open a stack to read its frames one at a time; call ``close`` on the result.
 
     Args:
         path: As in ``read_stack``.
 
+    Returns:
+        An object with ``info``, ``frame(index)`` and ``close()``.
+
     Raises:
         OSError: If the file cannot be opened.
         ModuleNotFoundError: If an optional package is missing, with the extra to install.
-        ValueError: If it is not a readable stack. Single frames that are damaged are found when they are read.
+        ValueError: If it is not a readable stack. Damage of single frames is detected when they are read.
+
+    Example:
+        >>> reader = open_stack("frames.tif")  # doctest: +SKIP
+        >>> reader.frame(0).shape == reader.info.shape[1:]  # doctest: +SKIP
+        True
     """
     path = Path(path)
     if not path.exists():
@@ -45,11 +76,16 @@ def read_stack_info(path: PathLike) -> StackInfo:
         path: As in ``read_stack``.
 
     Returns:
-        What the file says of itself; ``full_scale`` is None where it does not say.
+        What the file states; unknown values are None.
 
     Raises:
         OSError: If the file cannot be opened.
+        ModuleNotFoundError: If an optional package is missing, with the extra to install.
         ValueError: If it is not a readable stack.
+
+    Example:
+        >>> read_stack_info("frames.tif").shape  # doctest: +SKIP
+        (8, 1024, 1024)
     """
     reader = open_stack(path)
     reader.close()
@@ -59,18 +95,18 @@ def read_stack_info(path: PathLike) -> StackInfo:
 def read_stack(path: PathLike, *, full_scale: float | None = None) -> Tensor:
     """Read a stack of frames from a file.
 
-    The ending chooses the format: TIFF (``.tif``, ``.tiff``; BigTIFF and compressed ones too), ``.npy`` with (H, W),
-    (T, H, W) or (T, C, H, W), HDF5 (``.h5``, ``.hdf5``), Zarr v3 (``.zarr``), raw frames with a sidecar (``.raw``), a
-    video (three channels always, RGB), a single ``.png``, or a folder of PNG or TIFF files in natural order (frame9
-    before frame10). Colour images have their channels in the order of the file, RGB or RGBA.
+    The ending selects the format: TIFF (``.tif``, ``.tiff``; also BigTIFF and compressed), ``.npy`` with (H, W),
+    (T, H, W) or (T, C, H, W), HDF5 (``.h5``, ``.hdf5``), Zarr v3 (``.zarr``), raw frames with a sidecar (``.raw``),
+    videos (always three channels, RGB), a single ``.png``, or a folder of PNG or TIFF files in natural order (frame9
+    before frame10). Channels keep the order of the file, RGB or RGBA.
 
-    Integers become floats whose full scale is 1. ``full_scale`` given here comes first, then what ``write_stack``
-    stated in the file, then 255 for ``uint8``; other integers do not say theirs (16 bits may hold 12-bit counts).
-    Floats keep their values, whatever ``full_scale`` says, and may be NaN or infinite here: processing refuses them.
+    Integers are divided by the full scale: ``full_scale`` if given, else the value stated in the file, else 255 for
+    ``uint8``. The full scale of other integers is unknown (16 bits may hold 12-bit counts). Floats keep their values
+    and may be NaN or infinite here.
 
     Args:
         path: The file or folder.
-        full_scale: Count that means 1.0.
+        full_scale: Count that corresponds to 1.0.
 
     Returns:
         float32 frames, (T, H, W) or (T, C, H, W).
@@ -79,6 +115,9 @@ def read_stack(path: PathLike, *, full_scale: float | None = None) -> Tensor:
         OSError: If the file cannot be opened.
         ModuleNotFoundError: If an optional package is missing, with the extra to install.
         ValueError: If it is damaged, its frames differ in size, or the full scale is unknown or exceeded.
+
+    Example:
+        >>> frames = read_stack("frames.tif", full_scale=4095)  # doctest: +SKIP
     """
     reader = open_stack(path)
     try:
@@ -92,32 +131,32 @@ def read_stack(path: PathLike, *, full_scale: float | None = None) -> Tensor:
 
 
 def check_info_target(
-    path: Path, info: StackInfo, compression: str | None = None, *, try_folder: bool = True
+    path: Path, info: StackInfo, compression: str | None = None, *, check_folder: bool = True
 ) -> StackFormat:
-    """The format that ``path`` is written in; raises what would be raised on writing.
+    """The format in which ``path`` is written; raises the error that writing would raise.
 
     Args:
         path: The stack to write.
-        info: What it is to hold.
+        info: Its content.
         compression: As in ``write_stack``.
-        try_folder: Whether to see if its folder is there and can be written to.
+        check_folder: Whether to check that the folder exists and is writable.
     """
     form = target_format(path)
     if not form.writable:
-        raise ValueError(f"{path}: {form.name}s are only read; write .tif, .png, .npy or a folder of PNG files")
+        raise ValueError(f"{path}: {form.name} files can only be read; write .tif, .png, .npy or a folder of PNG files")
     if info.dtype not in form.dtypes:
         raise ValueError(f"{path}: {form.name} files hold {', '.join(form.dtypes)}; got dtype {info.dtype}")
     if len(info.shape) not in (3, 4) or min(info.shape) < 1:
         raise ValueError(f"frames must have shape (T, H, W) or (T, C, H, W), got {tuple(info.shape)}")
     if compression is not None:
         if not form.compressions:
-            raise ValueError(f"{path}: compression is a choice for TIFF files only")
+            raise ValueError(f"{path}: compression={compression!r} is only available for TIFF files; omit it")
         check_choice("compression", compression, form.compressions)
     if form.check is not None:
         form.check(path, info)
-    if form.kind == "tree" and path.exists() and not (path / "zarr.json").is_file():
-        raise FileExistsError(f"cannot write {path}: something else of that name is there")
-    if try_folder:
+    if form.kind == "tree" and path.exists() and not (path / form.marker).is_file():
+        raise FileExistsError(f"cannot write {path}: it exists and is not a {form.name} stack; choose another name")
+    if check_folder:
         check_writable(path, folder=form.kind != "file")
     elif form.kind == "file" and path.is_dir():
         raise IsADirectoryError(f"cannot write {path}: it is a folder")
@@ -127,7 +166,7 @@ def check_info_target(
 def check_stack_target(
     path: PathLike, shape: tuple[int, ...], *, dtype: str | None = None, full_scale: float | None = None
 ) -> float | None:
-    """Raise what ``write_stack`` would raise for frames of this shape, before there are any.
+    """Raise the error that ``write_stack`` would raise for frames of this shape, before they are computed.
 
     Args:
         path: The file or folder to write.
@@ -142,10 +181,32 @@ def check_stack_target(
     check_info_target(Path(path), StackInfo(tuple(shape), kind.name, None))
     if kind.kind == "f":
         return None
-    scale = known_full_scale(kind) if full_scale is None else check_full_scale(full_scale, kind)
-    if scale is None:
-        raise ValueError(f"full_scale must be stated to write {kind} frames, e.g. 4095 for 12-bit counts")
-    return scale
+    return required_full_scale(known_full_scale(kind) if full_scale is None else full_scale, kind, path)
+
+
+def write_frames(
+    form: StackFormat, path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None
+) -> None:
+    """Write a complete stack, which is on the disk when the function returns.
+
+    Args:
+        form: Its format.
+        path: Temporary name of the file or folder.
+        info: Its content.
+        frames: Pixels as stored, one frame at a time.
+        compression: As in ``write_stack``.
+    """
+    if form.write_all is not None and (compression is not None or form.create is None):
+        form.write_all(path, info, frames, compression)
+        return
+    assert form.create is not None
+    writer = form.create(path, info, True)
+    try:
+        for index, frame in enumerate(frames):
+            writer.write(index, frame)
+        writer.sync()
+    finally:
+        writer.close()
 
 
 def write_stack(
@@ -159,25 +220,28 @@ def write_stack(
 ) -> None:
     """Write a stack of frames whose full scale is 1.
 
-    The ending chooses the format as in ``read_stack``; a path without one is a folder of PNG files (frame_0000.png
-    ...), or of TIFF files where PNG cannot hold the type. Integers are scaled by the full scale, rounded and clipped to
-    0 ... full scale, so that 12-bit counts come back as 12-bit counts; all formats but ``.npy`` state the full scale
-    for the next reader. The file appears whole or not at all.
+    The ending selects the format as in ``read_stack``; a path without an ending is a folder of PNG files
+    (frame_0000.png ...), or of TIFF files if PNG does not support the data type. Integers are multiplied by the full
+    scale, rounded and clipped to 0 ... full scale; all formats except ``.npy`` store the full scale. The file replaces
+    an existing one when it is complete; after an error nothing has changed.
 
     Args:
         path: The file or folder to write.
         frames: (T, H, W) or (T, C, H, W), floating point.
-        dtype: NumPy name of the type in the file, by default ``"float32"``.
-        full_scale: Count to write for 1.0; 255 for ``"uint8"`` if not given, to be stated for other integers. Floats
+        dtype: NumPy name of the data type in the file, by default ``"float32"``.
+        full_scale: Count that corresponds to 1.0; 255 for ``"uint8"`` if not given, required for other integers. Floats
             keep their values.
-        compression: ``"zlib"`` or ``"lzma"`` for TIFF files; None for none.
-        like: The stack that the frames come from, whose resolution, order of channels and, if it has as many frames,
-            frame times are kept as far as the format has room for them.
+        compression: ``"zlib"`` or ``"lzma"`` for TIFF files; None for no compression.
+        like: The stack from which the frames were computed: its resolution, channel order and, if the number of frames
+            is the same, frame times are stored if the format supports them.
 
     Raises:
         OSError: If the file cannot be written.
         TypeError: If the frames are not a floating-point tensor.
-        ValueError: If the format cannot hold them, or the full scale is not stated.
+        ValueError: If the format does not support them, or the full scale is unknown.
+
+    Example:
+        >>> write_stack("restored.tif", restored, dtype="uint16", full_scale=4095)  # doctest: +SKIP
     """
     path = Path(path)
     frames = as_tensor("frames", frames)
@@ -187,21 +251,12 @@ def write_stack(
     pixels = frames_to_counts(frames, np.dtype(dtype or np.float32), full_scale)
     info = StackInfo(tuple(pixels.shape), pixels.dtype.name, full_scale)
     if like is not None:
-        times = like.frame_times if like.shape[0] == info.shape[0] and not like.times_of_playback else None
+        times = None if like.times_of_playback else like.with_frames(len(pixels)).frame_times
         info = replace(info, frame_times=times, resolution=like.resolution, channels_last=like.channels_last)
     form = check_info_target(path, info, compression)
-    with workplace(path) as work:
-        part = work / path.name
-        if form.create is None or (compression is not None and form.write_all is not None):
-            assert form.write_all is not None
-            form.write_all(part, info, iter(pixels), compression)
-        else:
-            writer = form.create(part, info, True)
-            try:
-                for index, frame in enumerate(pixels):
-                    writer.write(index, frame)
-            finally:
-                writer.close()
+    with temporary_folder(path) as folder:
+        part = folder / path.name
+        write_frames(form, part, info, iter(pixels), compression)
         if form.kind == "folder":
             path.parent.mkdir(parents=True, exist_ok=True)
-        place(part, path, form.kind, form.companions)
+        move_into_place(part, path, form.kind, form.companions)

@@ -1,7 +1,7 @@
-"""The registry of formats: who reads and writes which file ending."""
+"""The registry of stack formats: their contract, and the choice of a format by the ending of a file name."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -11,18 +11,17 @@ from numpy.typing import NDArray
 from rsvib_torch.io.stack_info import StackInfo
 
 __all__ = [
+    "FORMATS",
     "FrameReader",
     "FrameWriter",
     "StackFormat",
     "find_format",
     "needed_package",
-    "of_frames",
     "register_format",
     "target_format",
 ]
 
 Frame = NDArray[Any]
-ALL_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64")
 
 
 class FrameReader(Protocol):
@@ -30,45 +29,63 @@ class FrameReader(Protocol):
 
     @property
     def info(self) -> StackInfo:
-        """What the file says of itself."""
+        """What the file states."""
 
     def frame(self, index: int) -> Frame:
-        """Pixels of a frame as stored, (H, W) or (C, H, W); ``FrameError`` if this one cannot be read."""
+        """Pixels of a frame as stored: (H, W) or (C, H, W), in ``info.dtype``; ``FrameError`` if it is damaged."""
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
 
 
 class FrameWriter(Protocol):
     """A stack being written; any frame may be written at any time, and again."""
 
     def write(self, index: int, frame: Frame) -> None:
-        """Put a frame, (H, W) or (C, H, W), in its place."""
+        """Write a frame, (H, W) or (C, H, W)."""
 
     def sync(self) -> None:
-        """See that what was written is on the disk."""
+        """Return when all written frames are on the disk."""
 
     def close(self) -> None:
         """Finish the file."""
 
 
+# Contract of a format. All functions are called with the path of the stack; ``create`` and ``write_all`` with that of a
+# temporary file or folder, which the caller renames when it is complete (``rsvib_torch/io/atomic.py``).
+#
+# Shapes:      frames are (H, W) or (C, H, W), channels RGB or RGBA; ``StackInfo.shape`` is (T, H, W) or (T, C, H, W),
+#              also if the file stores channels last (``StackInfo.from_stored``, ``to_stored``).
+# Data types:  one of ``dtypes`` in native byte order; pixels are returned as stored, without scaling.
+# Full scale:  ``info.full_scale`` is the count that corresponds to 1.0, or None if the file does not state it; formats
+#              that have room for it store it (``known_full_scale`` supplies 255 for uint8).
+# Frame times: exposure starts in seconds, or None; presentation times need ``times_of_playback=True``.
+# Reading:     ``open`` must not allocate memory by sizes in a header before it has compared them with the size of the
+#              file, must not execute code or follow links to other files, and raises an ``OSError`` if the file cannot
+#              be opened, a one-line ``ValueError`` that names the file if it is not a stack (``readable_stack``), and
+#              ``ModuleNotFoundError`` if a package is missing (``needed_package``). A reader raises ``FrameError`` for
+#              a damaged frame (``readable_frame``); opening fails if more than half of the frames are missing.
+# Writing:     a format defines ``create``, ``write_all``, or neither (it is then only read).
+#              After ``create(path, info, False)`` on an unfinished stack all frames that were synced are still there.
 @dataclass(frozen=True)
 class StackFormat:
-    """How stacks are kept under some file endings.
+    """How stacks are stored in files with certain endings.
 
     Attributes:
-        name: What the format is called in messages.
-        endings: File endings, lower case with the dot.
-        open: Opens a stack for reading. Sizes in headers must be checked against the file before memory is taken.
-        create: Makes a whole file of a stack whose frames are then written in any order (``fresh=True``), or opens
-            one that was made so to go on with it; None where frames can only be written one after another.
-        write_all: Writes a stack from an iterator of its frames; None where ``create`` does. The last argument is the
-            compression asked for, or None.
-        dtypes: NumPy names of the pixel types that can be written.
-        check: Raises a ``ValueError`` if a stack of this kind cannot be written to that path.
-        kind: ``"file"``, a ``"folder"`` that other files may share, or a ``"tree"`` that is replaced as one.
-        companions: Endings of files beside it, added to its name.
-        compressions: What ``write_all`` knows.
+        name: Name in messages.
+        endings: File endings, lower case with the dot; ``""`` is a name without an ending.
+        open: Opens a stack for reading.
+        create: ``create(path, info, fresh)`` makes a file of full size whose frames are then written in any order
+            (``fresh=True``), or opens an unfinished one to continue it (``fresh=False``); None if frames can only be
+            written one after another.
+        write_all: ``write_all(path, info, frames, compression)`` writes a stack from an iterator of its frames; None if
+            ``create`` writes every stack.
+        dtypes: NumPy names of the data types that can be written.
+        check: Raises an error if a stack cannot be written to a path.
+        kind: ``"file"``; ``"folder"``, which may contain other files; or ``"tree"``, a folder that is replaced as one.
+        marker: File that identifies a folder of any name as a stack of this format.
+        companions: Endings of additional files, which are appended to the file name.
+        compressions: Values of ``compression`` besides None.
     """
 
     name: str
@@ -76,9 +93,12 @@ class StackFormat:
     open: Callable[[Path], FrameReader]
     create: Callable[[Path, StackInfo, bool], FrameWriter] | None = None
     write_all: Callable[[Path, StackInfo, Iterator[Frame], str | None], None] | None = None
-    dtypes: tuple[str, ...] = ALL_TYPES
+    dtypes: tuple[str, ...] = (
+        "uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64",
+    )  # fmt: skip
     check: Callable[[Path, StackInfo], None] | None = None
     kind: Literal["file", "folder", "tree"] = "file"
+    marker: str = ""
     companions: tuple[str, ...] = ()
     compressions: tuple[str, ...] = ()
 
@@ -88,14 +108,15 @@ class StackFormat:
         return self.create is not None or self.write_all is not None
 
 
-_FORMATS: dict[str, StackFormat] = {}
+FORMATS: dict[str, StackFormat] = {}
+"""Format of every file ending; ``rsvib_torch/io/files.py`` registers those of the package."""
 
 
 def register_format(form: StackFormat) -> None:
-    """Add a format to those that stacks are read from and written to; an ending that is known already changes hands.
+    """Register a format for reading and writing stacks; it replaces earlier formats of the same endings.
 
     Args:
-        form: The format.
+        form: The format; see the contract above ``StackFormat``.
 
     Raises:
         ValueError: If it has no ending, or one without a dot or in upper case.
@@ -107,42 +128,47 @@ def register_format(form: StackFormat) -> None:
         ValueError: endings must be like '.tif', got 'pgm'
     """
     if not form.endings:
-        raise ValueError(f"format {form.name!r} has no file ending")
+        raise ValueError(f"format {form.name!r} has no file ending; expected at least one, like '.tif'")
     for ending in form.endings:
         if ending and (not ending.startswith(".") or ending != ending.lower()):
             raise ValueError(f"endings must be like '.tif', got {ending!r}")
-    for ending in form.endings:
-        _FORMATS[ending] = form
+    FORMATS.update(dict.fromkeys(form.endings, form))
 
 
 def find_format(path: Path) -> StackFormat:
-    """The format of a path: by its ending; a folder of another ending, or a name without one, is a folder of images.
+    """The format of an existing stack: by its ending, of a folder also by its marker file, else a folder of images.
 
     Raises:
-        ValueError: If nobody knows the ending.
+        ValueError: If the ending is not registered.
     """
-    form = _FORMATS.get(path.suffix.lower())
-    if form is not None and (form.kind != "file" or not path.is_dir()):
-        return form
-    if path.is_dir():
-        return _FORMATS[".zarr" if (path / "zarr.json").is_file() else ""]
-    return target_format(path)
+    if not path.is_dir():
+        return target_format(path)
+    by_ending = FORMATS.get(path.suffix.lower())
+    if by_ending is not None and by_ending.kind != "file":
+        return by_ending
+    marked = (form for form in FORMATS.values() if form.marker and (path / form.marker).is_file())
+    return next(marked, FORMATS[""])
 
 
 def target_format(path: Path) -> StackFormat:
-    """The format to write a path in: its ending tells, whatever is there now.
+    """The format in which a path is written, by its ending only.
 
     Raises:
-        ValueError: If nobody knows the ending.
+        ValueError: If the ending is not registered.
     """
-    if path.suffix.lower() in _FORMATS:
-        return _FORMATS[path.suffix.lower()]
-    known = ", ".join(ending for ending in _FORMATS if ending)
+    if path.suffix.lower() in FORMATS:
+        return FORMATS[path.suffix.lower()]
+    known = ", ".join(ending for ending in FORMATS if ending)
     raise ValueError(f"{path}: unknown file ending {path.suffix!r}; expected {known} or a folder of PNG or TIFF files")
 
 
-def needed_package(name: str, what: str, extra: str) -> Any:
-    """Import a package that is not always installed.
+def needed_package(name: str, purpose: str, extra: str) -> Any:
+    """Import an optional package.
+
+    Args:
+        name: Module to import.
+        purpose: What needs it, for the message.
+        extra: Extra of this package that installs it.
 
     Raises:
         ModuleNotFoundError: If it is missing, naming the extra to install.
@@ -153,11 +179,5 @@ def needed_package(name: str, what: str, extra: str) -> Any:
         if error.name is not None and error.name.partition(".")[0] != name.partition(".")[0]:
             raise
         raise ModuleNotFoundError(
-            f"{what} needs the package {name.partition('.')[0]}; install rsvib_torch[{extra}]", name=error.name
+            f"{purpose} needs the package {name.partition('.')[0]}; install rsvib_torch[{extra}]", name=error.name
         ) from error
-
-
-def of_frames(info: StackInfo, count: int) -> StackInfo:
-    """The same kind of stack with another number of frames."""
-    times = info.frame_times if count == info.shape[0] else None
-    return replace(info, shape=(count, *info.shape[1:]), frame_times=times)

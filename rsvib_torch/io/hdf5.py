@@ -6,52 +6,68 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.attributes import attributes_of, info_from_attributes
-from rsvib_torch.io.formats import StackFormat, needed_package, register_format
+from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
+from rsvib_torch.io.formats import StackFormat, needed_package
 from rsvib_torch.io.full_scale import check_dtype
-from rsvib_torch.io.placed import PlacedReader, PlacedWriter, frame_from_file_order
-from rsvib_torch.io.stack_info import FrameError, StackInfo
+from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_from_attributes, readable_frame, readable_stack
 
-__all__ = ["create_hdf5", "open_hdf5"]
+__all__ = ["FORMAT"]
 
-_NAME = "frames"  # of our own dataset
-_LARGEST_RATIO = 5000  # pixel bytes per stored byte of compressed data
+_DATASET = "frames"  # name of the dataset that is written
 
 
 def _h5py() -> Any:
     return needed_package("h5py", "reading and writing HDF5", "formats")
 
 
-def _dataset(file: Any) -> Any:
-    """The one dataset of frames; what lies in other files is not followed."""
+def _find_dataset(file: Any) -> Any:
+    """The only dataset of frames, or the one called ``frames``; links and external data are not followed."""
     h5py = _h5py()
     found = []
 
-    def look(group: Any, depth: int) -> None:
+    def search(group: Any, depth: int) -> None:
         for name in group:
-            link = group.get(name, getlink=True)
-            if not isinstance(link, h5py.HardLink):
-                if name == _NAME:
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                if name == _DATASET:
                     raise ValueError(f"its dataset {name!r} is a link; frames must be in the file itself")
                 continue
             member = group[name]
             if isinstance(member, h5py.Group) and depth < 4:
-                look(member, depth + 1)
+                search(member, depth + 1)
             elif isinstance(member, h5py.Dataset) and member.ndim in (2, 3, 4) and member.dtype.kind in "iuf":
                 found.append(member)
 
-    look(file, 0)
-    own = [member for member in found if member.name == f"/{_NAME}"]
-    stacks = own or [member for member in found if member.ndim > 2] or found
+    search(file, 0)
+    named = [member for member in found if member.name == f"/{_DATASET}"]
+    stacks = named or [member for member in found if member.ndim > 2] or found
     if len(stacks) != 1:
         names = ", ".join(sorted(member.name for member in stacks))
-        raise ValueError(f"expected one dataset of frames, or one called {_NAME!r}; found {names or 'none'}")
+        raise ValueError(f"expected one dataset of frames, or one called {_DATASET!r}; found {names or 'none'}")
     if stacks[0].external or stacks[0].is_virtual:
         raise ValueError(f"its dataset {stacks[0].name} lies in other files; frames must be in the file itself")
     return stacks[0]
 
 
-class Hdf5Reader:
+def _check_sizes(dataset: Any, file_size: int, *, largest_ratio: int = 5000, largest_chunk: int = 1 << 26) -> None:
+    """Raise a ``ValueError`` if the pixels cannot be in the file.
+
+    Args:
+        dataset: The dataset.
+        file_size: Size of the file in bytes.
+        largest_ratio: Largest accepted ratio of pixels to compressed data; gzip reaches 1032.
+        largest_chunk: Size of a chunk in bytes that is accepted even if the stack is smaller.
+    """
+    stored = dataset.id.get_storage_size()
+    needed = int(np.prod(dataset.shape, dtype=object)) * dataset.dtype.itemsize
+    compressed = dataset.compression or dataset.id.get_create_plist().get_nfilters()
+    if stored > file_size or needed > (largest_ratio if compressed else 1) * stored:
+        raise ValueError(f"its header states {needed} bytes of pixels, the file holds {stored}")
+    chunk = int(np.prod(dataset.chunks or (1,), dtype=object)) * dataset.dtype.itemsize
+    if chunk > max(needed, largest_chunk):
+        raise ValueError(f"its chunks of {chunk} bytes are larger than the stack of {needed}")
+
+
+class _ChunkReader:
     """Frames of a dataset that is stored in chunks."""
 
     def __init__(self, path: Path, file: Any, dataset: Any, info: StackInfo) -> None:
@@ -60,74 +76,51 @@ class Hdf5Reader:
 
     def frame(self, index: int) -> NDArray[Any]:
         """Pixels of a frame as stored."""
-        try:
-            stored = self._dataset[index] if self._dataset.ndim > 2 else self._dataset[()]
-        except (OSError, RuntimeError, ValueError) as error:
-            raise FrameError(f"{self._path}: frame {index} cannot be read: {' '.join(str(error).split())}") from error
-        frame = frame_from_file_order(stored, self.info)
-        return frame.astype(frame.dtype.newbyteorder("="), copy=False)
+        with readable_frame(self._path, index):
+            return self.info.from_stored(self._dataset[index] if self._dataset.ndim > 2 else self._dataset[()])
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._file.close()
 
 
-def _checked(path: Path, file: Any) -> Hdf5Reader | PlacedReader:
-    dataset = _dataset(file)
-    check_dtype(dataset.dtype)
-    info = info_from_attributes(dict(dataset.attrs), tuple(dataset.shape), dataset.dtype)
-    stored = dataset.id.get_storage_size()
-    needed = int(np.prod(dataset.shape, dtype=object)) * dataset.dtype.itemsize
-    plain = not dataset.compression and not dataset.id.get_create_plist().get_nfilters()
-    if stored > path.stat().st_size or needed > (1 if plain else _LARGEST_RATIO) * stored:
-        raise ValueError(f"its header promises {needed} bytes of pixels, the file holds {stored}")
-    offset = dataset.id.get_offset()
-    if dataset.chunks is None and offset is not None:
-        return PlacedReader(path, info, int(offset), dataset.dtype)
-    chunk = int(np.prod(dataset.chunks or (1,), dtype=object)) * dataset.dtype.itemsize
-    if chunk > max(needed, 1 << 26):
-        raise ValueError(f"its chunks of {chunk} bytes are larger than the stack of {needed}")
-    return Hdf5Reader(path, file, dataset, info)
-
-
-def open_hdf5(path: Path) -> Hdf5Reader | PlacedReader:
-    """Open the one dataset of frames of an HDF5 file, or the one called ``frames``."""
+def _open(path: Path) -> _ChunkReader | ContiguousReader:
     h5py = _h5py()
-    with path.open("rb"):
-        pass  # a file that may not be read is an OSError of its own
-    file = None
-    try:
+    with readable_stack(path, "HDF5"):
         file = h5py.File(path, "r", locking=False)
-        reader = _checked(path, file)
-    except MemoryError:
-        raise
-    except Exception as error:
-        if file is not None:
-            file.close()
-        raise ValueError(f"{path}: not a readable HDF5 stack: {' '.join(str(error).split())}") from error
-    if isinstance(reader, PlacedReader):
-        file.close()
-    return reader
+        keep_open = False
+        try:
+            dataset = _find_dataset(file)
+            check_dtype(dataset.dtype)
+            info = info_from_attributes(dict(dataset.attrs), tuple(dataset.shape), dataset.dtype)
+            _check_sizes(dataset, path.stat().st_size)
+            offset = dataset.id.get_offset()
+            if dataset.chunks is None and offset is not None:
+                return ContiguousReader(path, info, int(offset), dataset.dtype)
+            keep_open = True
+            return _ChunkReader(path, file, dataset, info)
+        finally:
+            if not keep_open:
+                file.close()
 
 
-def create_hdf5(path: Path, info: StackInfo, fresh: bool) -> PlacedWriter:
-    """Make an HDF5 file with the dataset ``frames`` in one piece, or go on with one."""
+def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
+    """Create a file whose dataset is contiguous, or open one; h5py's high-level interface cannot allocate it early."""
     h5py = _h5py()
     if fresh:
         with h5py.File(path, "w", locking=False, libver="v110") as file:
-            space = h5py.h5s.create_simple(info.stored_shape)
             layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
             layout.set_layout(h5py.h5d.CONTIGUOUS)
             layout.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
             layout.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
             layout.set_obj_track_times(False)
+            space = h5py.h5s.create_simple(info.stored_shape)
             kind = h5py.h5t.py_create(np.dtype(info.dtype).newbyteorder("<"))
-            made = h5py.h5d.create(file.id, _NAME.encode(), kind, space, layout)
-            h5py.Dataset(made).attrs.update(attributes_of(info))
+            dataset = h5py.h5d.create(file.id, _DATASET.encode(), kind, space, layout)
+            h5py.Dataset(dataset).attrs.update(attributes_of(info))
     with h5py.File(path, "r", locking=False) as file:
-        offset = int(file[_NAME].id.get_offset())
-    writer = PlacedWriter(path, info, offset)
-    return writer.reserve() if fresh else writer
+        offset = int(file[_DATASET].id.get_offset())
+    return ContiguousWriter(path, info, offset, reserve=fresh)
 
 
-register_format(StackFormat("hdf5", (".h5", ".hdf5", ".hdf"), open_hdf5, create_hdf5))
+FORMAT = StackFormat("hdf5", (".h5", ".hdf5", ".hdf"), _open, _create)

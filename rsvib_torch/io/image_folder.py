@@ -1,4 +1,4 @@
-"""Stacks of images, one file a frame: folders of PNG or TIFF files in natural order, or a single PNG file."""
+"""Stacks with one file per frame: folders of PNG or TIFF files in natural order, or a single PNG file."""
 
 import os
 import re
@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.formats import ALL_TYPES, StackFormat, register_format
+from rsvib_torch.io.formats import StackFormat
 from rsvib_torch.io.png import decode_png, encode_png, png_info
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 
-__all__ = ["open_images"]
+__all__ = ["FOLDER_FORMAT", "PNG_FORMAT"]
 
 _PNG, _TIFF = (".png",), (".tif", ".tiff")
 _PNG_TYPES = ("uint8", "uint16")
@@ -32,23 +32,23 @@ def _frame_files(path: Path) -> list[Path]:
     visible = [file for file in path.iterdir() if not file.name.startswith(".") and file.is_file()]
     png, tiff = ([file for file in visible if file.suffix.lower() in endings] for endings in (_PNG, _TIFF))
     if png and tiff:
-        raise ValueError(f"{path}: the folder holds both PNG and TIFF files; one kind is a stack")
+        raise ValueError(f"{path}: the folder contains both PNG and TIFF files; expected one kind")
     if not png and not tiff:
-        raise ValueError(f"{path}: the folder holds no PNG files and no TIFF files")
+        raise ValueError(f"{path}: the folder contains no PNG files and no TIFF files")
     return sorted(png or tiff, key=_natural_key)
 
 
-def _image_info(file: Path) -> StackInfo:
+def _read_info(file: Path) -> StackInfo:
     if file.suffix.lower() in _PNG:
         return png_info(file)
     reader = open_tiff(file)
     reader.close()
     if reader.info.shape[0] != 1:
-        raise ValueError(f"{file}: a frame is one image, this file has {reader.info.shape[0]}")
+        raise ValueError(f"{file}: expected one image per file, this file contains {reader.info.shape[0]}")
     return reader.info
 
 
-def _decode(file: Path) -> NDArray[Any]:
+def _read_frame(file: Path) -> NDArray[Any]:
     if file.suffix.lower() in _PNG:
         return decode_png(file)
     reader = open_tiff(file)
@@ -63,18 +63,18 @@ def _describe(info: StackInfo) -> str:
     return f"{info.shape[1:]} {info.dtype}{scale}"
 
 
-class ImagesReader:
-    """Frames of files that are decoded when they are asked for."""
+class _ImagesReader:
+    """Frames of files that are decoded on access."""
 
     def __init__(self, path: Path) -> None:
         self._files = _frame_files(path)
-        self._broken: dict[int, ValueError] = {}
+        self._damaged: dict[int, ValueError] = {}
         first: tuple[StackInfo, Path] | None = None
         for index, file in enumerate(self._files):
             try:
-                info = _image_info(file)
+                info = _read_info(file)
             except ValueError as error:
-                self._broken[index] = error
+                self._damaged[index] = error
                 continue
             first = first or (info, file)
             if replace(info, resolution=None) != replace(first[0], resolution=None):
@@ -82,29 +82,23 @@ class ImagesReader:
                     f"frames of different size or kind: {first[1].name} is {_describe(first[0])}, "
                     f"{file.name} is {_describe(info)}"
                 )
-        if first is None or len(self._broken) > len(self._files) // 2:
-            raise next(iter(self._broken.values()))
-        self.info = replace(first[0], shape=(len(self._files), *first[0].shape[1:]))
+        if first is None or len(self._damaged) > len(self._files) // 2:
+            raise next(iter(self._damaged.values()))
+        self.info = first[0].with_frames(len(self._files))
 
     def frame(self, index: int) -> NDArray[Any]:
         """Pixels of a frame as stored."""
-        if index in self._broken:
-            raise FrameError(str(self._broken[index]))
+        if index in self._damaged:
+            raise FrameError(str(self._damaged[index]))
         file = self._files[index]
         try:
-            pixels = _decode(file).reshape(self.info.shape[1:])
+            return _read_frame(file).reshape(self.info.shape[1:])
         except ValueError as error:
             message = str(error) if str(error).startswith(str(file)) else f"{file}: {error}"
             raise FrameError(message) from error
-        return pixels
 
     def close(self) -> None:
-        """Let go of the files."""
-
-
-def open_images(path: Path) -> ImagesReader:
-    """Open a folder of PNG or TIFF files, or a single PNG file."""
-    return ImagesReader(path)
+        """Nothing is open."""
 
 
 def _ending(info: StackInfo) -> str:
@@ -116,8 +110,8 @@ def _frame_names(info: StackInfo) -> list[str]:
     return [f"frame_{index:0{digits}d}{_ending(info)}" for index in range(info.shape[0])]
 
 
-class ImagesWriter:
-    """One file a frame; a file appears whole."""
+class _ImagesWriter:
+    """One file per frame, each written atomically."""
 
     def __init__(self, files: list[Path], info: StackInfo) -> None:
         self._files, self._info = files, info
@@ -133,46 +127,43 @@ class ImagesWriter:
         os.replace(part, file)
 
     def sync(self) -> None:
-        """Nothing is kept back."""
+        """Files are not buffered."""
 
     def close(self) -> None:
-        """Nothing is left to do."""
+        """Nothing is open."""
 
 
-def _create_folder(path: Path, info: StackInfo, fresh: bool) -> ImagesWriter:
+def _create_folder(path: Path, info: StackInfo, fresh: bool) -> _ImagesWriter:
     path.mkdir(exist_ok=True)
-    return ImagesWriter([path / name for name in _frame_names(info)], info)
+    return _ImagesWriter([path / name for name in _frame_names(info)], info)
 
 
-def _create_image(path: Path, info: StackInfo, fresh: bool) -> ImagesWriter:
-    return ImagesWriter([path], info)
+def _create_image(path: Path, info: StackInfo, fresh: bool) -> _ImagesWriter:
+    return _ImagesWriter([path], info)
 
 
 def _check_channels(path: Path, info: StackInfo) -> None:
     if _ending(info) == ".png" and len(info.shape) == 4 and info.shape[1] not in (1, 3, 4):
-        raise ValueError(f"{path}: PNG files hold 1, 3 or 4 channels, got {info.shape[1]}")
+        raise ValueError(f"{path}: PNG files hold 1, 3 or 4 channels, got {info.shape[1]}; write .tif")
 
 
 def _check_image(path: Path, info: StackInfo) -> None:
     _check_channels(path, info)
     if info.shape[0] != 1:
-        raise ValueError(f"{path}: a PNG file holds one frame, got {info.shape[0]}; name a folder instead")
+        raise ValueError(f"{path}: a PNG file holds one frame, got {info.shape[0]}; write a folder")
 
 
 def _check_folder(path: Path, info: StackInfo) -> None:
     _check_channels(path, info)
     if path.is_dir():
-        endings = (*_PNG, *_TIFF)
-        others = {f.name for f in path.iterdir() if f.suffix.lower() in endings and not f.name.startswith(".")}
-        others -= set(_frame_names(info))
+        images = {f.name for f in path.iterdir() if f.suffix.lower() in (*_PNG, *_TIFF) and not f.name.startswith(".")}
+        others = images - set(_frame_names(info))
         if others:
             kind = "TIFF" if Path(min(others)).suffix.lower() in _TIFF else "PNG"
-            raise ValueError(f"{path}: the folder holds other {kind} files, e.g. {min(others)}; choose another folder")
+            raise ValueError(
+                f"{path}: the folder contains other {kind} files, e.g. {min(others)}; choose another folder"
+            )
 
 
-register_format(StackFormat("png", _PNG, open_images, _create_image, dtypes=_PNG_TYPES, check=_check_image))
-register_format(
-    StackFormat(
-        "image folder", ("",), open_images, _create_folder, dtypes=ALL_TYPES, check=_check_folder, kind="folder"
-    )
-)
+PNG_FORMAT = StackFormat("png", _PNG, _ImagesReader, _create_image, dtypes=_PNG_TYPES, check=_check_image)
+FOLDER_FORMAT = StackFormat("image folder", ("",), _ImagesReader, _create_folder, check=_check_folder, kind="folder")

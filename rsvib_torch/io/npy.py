@@ -1,68 +1,106 @@
-"""Stacks in NumPy ``.npy`` files, mapped into memory to be read."""
+"""Stacks in NumPy ``.npy`` files; the file has no room for the full scale."""
 
+import mmap
+import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rsvib_torch.io.formats import StackFormat, register_format
+from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter, check_frames_held
+from rsvib_torch.io.formats import StackFormat
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
-from rsvib_torch.io.mapped import MappedReader
-from rsvib_torch.io.placed import PlacedWriter
-from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 
-__all__ = ["create_array", "open_array"]
+__all__ = ["FORMAT"]
 
 
-def _stack_shape(shape: tuple[int, ...], path: Path) -> tuple[int, ...]:
-    if len(shape) == 2:
-        return (1, *shape)
-    if len(shape) not in (3, 4) or min(shape) < 1:
-        raise ValueError(f"{path}: array has shape {shape}; expected (H, W), (T, H, W) or (T, C, H, W)")
-    if len(shape) == 4 and shape[-1] <= 4 < shape[1]:
-        raise ValueError(f"{path}: array has shape {shape}; channels go second, (T, C, H, W)")
-    return shape
+class _FortranOrderReader:
+    """Frames of an array whose first axis varies fastest, in a file that is mapped into memory.
+
+    Args:
+        path: The file.
+        info: The stack, which the file must hold completely.
+        offset: Position of the first pixel in bytes.
+        dtype: Data type in the file, with its byte order.
+    """
+
+    def __init__(self, path: Path, info: StackInfo, offset: int, dtype: np.dtype[Any]) -> None:
+        self.info, self._path = info, path
+        check_frames_held(info, offset, path.stat().st_size, fraction=1.0)
+        self._file = path.open("rb", buffering=0)
+        try:
+            self._map = mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ)
+            self._pixels: NDArray[Any] | None = np.ndarray(info.shape, dtype, self._map, offset, order="F")
+        except BaseException:
+            self._file.close()
+            raise
+        self._end = offset + self._pixels.nbytes
+
+    def frame(self, index: int) -> NDArray[Any]:
+        """Pixels of a frame as stored."""
+        # reading a mapped page beyond the end of the file would end the process
+        if self._pixels is None or os.fstat(self._file.fileno()).st_size < self._end:
+            raise FrameError(f"{self._path}: truncated: frame {index} lies beyond the end of the file")
+        frame: NDArray[Any] = np.array(self._pixels[index], dtype=self._pixels.dtype.newbyteorder("="), order="C")
+        if hasattr(mmap, "MADV_DONTNEED"):
+            self._map.madvise(mmap.MADV_DONTNEED)  # else the pages read so far stay in memory
+        return frame
+
+    def close(self) -> None:
+        """Close the file."""
+        self._pixels = None
+        self._map.close()
+        self._file.close()
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
-    """Shape, whether the first axis runs fastest, dtype, and where the pixels begin."""
-    try:
-        version = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, columns_first, dtype = read(file)
-        check_dtype(dtype)
-        if any(not isinstance(size, int) or size < 0 for size in shape):
-            raise ValueError(f"its shape is {shape}")
-    except Exception as error:  # a damaged header can fail anywhere in its parser
-        raise ValueError(f"{path}: not a readable .npy file ({' '.join(str(error).split())})") from error
-    return shape, columns_first, dtype, file.tell()
+def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
+    """Shape, whether the first axis varies fastest, data type, and position of the first pixel."""
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran_order, dtype = read(file)
+    check_dtype(dtype)
+    if any(not isinstance(size, int) or size < 0 for size in shape):
+        raise ValueError(f"its shape is {shape}")
+    return shape, fortran_order, dtype, file.tell()
 
 
-def open_array(path: Path) -> MappedReader:
-    """Map a ``.npy`` file: (H, W), (T, H, W) or (T, C, H, W). Pickled objects are refused."""
-    with path.open("rb") as file:
-        shape, columns_first, dtype, offset = _read_header(file, path)
-    info = StackInfo(_stack_shape(shape, path), dtype.name, known_full_scale(dtype))
-    try:
-        return MappedReader(path, info, offset, dtype, "F" if columns_first else "C")
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+def _channels_ambiguous(shape: tuple[int, ...]) -> bool:
+    """Whether an array is more likely (T, H, W, C) than (T, C, H, W)."""
+    return len(shape) == 4 and shape[-1] <= 4 < shape[1]
 
 
-def create_array(path: Path, info: StackInfo, fresh: bool) -> PlacedWriter:
-    """Make a ``.npy`` file, or go on with one; it has no room for the full scale."""
+def _open(path: Path) -> ContiguousReader | _FortranOrderReader:
+    """Open (H, W), (T, H, W) or (T, C, H, W). Pickled objects are refused."""
+    with readable_stack(path, ".npy"):
+        with path.open("rb") as file:
+            shape, fortran_order, dtype, offset = _read_header(file)
+        if len(shape) == 2:
+            shape = (1, *shape)
+        if len(shape) not in (3, 4) or min(shape) < 1:
+            raise ValueError(f"array has shape {shape}; expected (H, W), (T, H, W) or (T, C, H, W)")
+        if _channels_ambiguous(shape):
+            raise ValueError(f"array has shape {shape}; expected (T, C, H, W), move the channels to axis 1")
+        info = StackInfo(shape, dtype.name, known_full_scale(dtype))
+        return (_FortranOrderReader if fortran_order else ContiguousReader)(path, info, offset, dtype)
+
+
+def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
     if fresh:
         header = {"descr": np.lib.format.dtype_to_descr(np.dtype(info.dtype)), "fortran_order": False}
         with path.open("wb") as file:
             np.lib.format.write_array_header_1_0(file, {**header, "shape": info.shape})
-            return PlacedWriter(path, info, file.tell()).reserve()
     with path.open("rb") as file:
-        return PlacedWriter(path, info, _read_header(file, path)[3])
+        offset = _read_header(file)[3]
+    # channels are always stored second, whatever the input was
+    return ContiguousWriter(path, replace(info, channels_last=False), offset, reserve=fresh)
 
 
 def _check(path: Path, info: StackInfo) -> None:
-    if len(info.shape) == 4 and info.shape[-1] <= 4 < info.shape[1]:
-        raise ValueError(f"{path}: array of shape {info.shape} would be taken for one with channels last")
+    if _channels_ambiguous(info.shape):
+        raise ValueError(f"{path}: array of shape {info.shape} would be read as one with channels last; write .tif")
 
 
-register_format(StackFormat("npy", (".npy",), open_array, create_array, check=_check))
+FORMAT = StackFormat("npy", (".npy",), _open, _create, check=_check)

@@ -1,4 +1,4 @@
-"""Single frames in PNG files."""
+"""Frames in PNG files: decoding, encoding, and what the file states."""
 
 import struct
 import zlib
@@ -14,53 +14,52 @@ from rsvib_torch.io.stack_info import StackInfo
 
 __all__ = ["decode_png", "encode_png", "png_info"]
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}  # by colour type, as decoded
-_LARGEST_RATIO = 1100  # pixel bytes per file byte: deflate reaches 1032
-_HEAD = 1 << 16  # bytes in which what comes before the pixels is looked for
 _FULL_SCALE_KEY = b"full_scale"
 
 
 def _chunks(data: bytes, path: Path, last: bytes) -> dict[bytes, bytes]:
-    """The first chunk of each type up to ``last``; checksums and the end of the file are verified."""
-    if data[:8] != _SIGNATURE:
+    """The first chunk of each type before ``last``; checksums and the end of the file are verified."""
+    if data[:8] != b"\x89PNG\r\n\x1a\n":
         raise ValueError(f"{path}: not a PNG file")
     chunks: dict[bytes, bytes] = {}
-    place = 8
+    start = 8
     while True:
-        length = struct.unpack(">I", data[place : place + 4])[0] if place + 12 <= len(data) else len(data)
-        kind, end = data[place + 4 : place + 8], place + 12 + length
+        length = struct.unpack(">I", data[start : start + 4])[0] if start + 12 <= len(data) else len(data)
+        kind, end = data[start + 4 : start + 8], start + 12 + length
         if kind == last and last != b"IEND":
             return chunks
         if end > len(data):
             raise ValueError(f"{path}: truncated PNG file")
-        if zlib.crc32(data[place + 4 : end - 4]) != struct.unpack(">I", data[end - 4 : end])[0]:
+        if zlib.crc32(data[start + 4 : end - 4]) != struct.unpack(">I", data[end - 4 : end])[0]:
             raise ValueError(f"{path}: damaged PNG file (checksum of chunk {kind!r})")
-        body = data[place + 8 : end - 4]
+        body = data[start + 8 : end - 4]
         if kind == b"tEXt" and body.startswith(_FULL_SCALE_KEY + b"\0"):
             chunks[_FULL_SCALE_KEY] = body[len(_FULL_SCALE_KEY) + 1 :]
         chunks.setdefault(kind, body)
-        place = end
         if kind == b"IEND":
             return chunks
+        start = end
 
 
 def _resolution(chunks: dict[bytes, bytes]) -> tuple[float, float, str] | None:
     body = chunks.get(b"pHYs", b"")
     if len(body) != 9 or body[8] != 1:
         return None
-    x, y = struct.unpack(">II", body[:8])
+    x, y = struct.unpack(">II", body[:8])  # pixels per metre
     return (x / 100.0, y / 100.0, "centimeter") if min(x, y) > 0 else None
 
 
-def _info(chunks: dict[bytes, bytes], size: int, path: Path) -> StackInfo:
+def _info(chunks: dict[bytes, bytes], size: int, path: Path, *, largest_ratio: int = 1100) -> StackInfo:
+    """The frame that a header states; ``largest_ratio`` of pixels to bytes of the file: deflate reaches 1032."""
     header = chunks.get(b"IHDR", b"")
     if len(header) != 13:
         raise ValueError(f"{path}: damaged PNG file (no header)")
     width, height, bits, colour = struct.unpack(">IIBB", header[:10])
-    channels = 4 if b"tRNS" in chunks else _CHANNELS.get(colour, 0)
-    if min(width, height, channels) < 1 or width * height * channels * bits // 8 > _LARGEST_RATIO * size:
-        raise ValueError(f"{path}: its header promises {width} x {height} px, which {size} bytes cannot hold")
+    channels = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}.get(colour, 0)  # of the decoded image, by colour type
+    if b"tRNS" in chunks:
+        channels = 4
+    if min(width, height, channels) < 1 or width * height * channels * bits // 8 > largest_ratio * size:
+        raise ValueError(f"{path}: its header states {width} x {height} px, which {size} bytes cannot hold")
     dtype = np.dtype(np.uint16 if bits == 16 else np.uint8)
     stated = None
     if _FULL_SCALE_KEY in chunks:
@@ -74,9 +73,9 @@ def _info(chunks: dict[bytes, bytes], size: int, path: Path) -> StackInfo:
 
 
 def png_info(path: Path) -> StackInfo:
-    """What one PNG file says of itself, as a stack of one frame."""
+    """The stack of one frame in a PNG file."""
     with path.open("rb") as file:
-        head = file.read(_HEAD)
+        head = file.read(1 << 16)  # almost always contains all chunks before the pixels
         try:
             chunks = _chunks(head, path, b"IDAT")
         except ValueError:
@@ -101,7 +100,7 @@ def decode_png(path: Path) -> NDArray[Any]:
 
 
 def encode_png(path: Path, frame: NDArray[Any], info: StackInfo) -> None:
-    """Write one frame (H, W) or (C, H, W); full scale and resolution go into chunks of their own."""
+    """Write one frame (H, W) or (C, H, W); full scale and resolution are stored as ``tEXt`` and ``pHYs`` chunks."""
     if frame.ndim == 3:
         frame = np.moveaxis(frame, 0, -1)[..., (2, 1, 0, 3)[: frame.shape[0]] if frame.shape[0] > 1 else (0,)]
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(frame))
@@ -114,7 +113,7 @@ def encode_png(path: Path, frame: NDArray[Any], info: StackInfo) -> None:
         per_metre = 100.0 if info.resolution[2] == "centimeter" else 100.0 / 2.54
         x, y = (round(value * per_metre) for value in info.resolution[:2])
         added += _chunk(b"pHYs", struct.pack(">IIB", x, y, 1))
-    start = 8 + 25  # signature and header
+    start = 8 + 25  # after signature and header
     path.write_bytes(data[:start] + added + data[start:])
 
 

@@ -1,23 +1,22 @@
-"""Raw frames one after another, with a small JSON file beside them that says what they are."""
+"""Stacks of raw frames, described by a JSON file with ``.json`` appended to the name (the sidecar)."""
 
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from rsvib_torch.core.validation import Section, read_json, validate
-from rsvib_torch.io.formats import StackFormat, register_format
-from rsvib_torch.io.full_scale import known_full_scale
-from rsvib_torch.io.placed import PlacedReader, PlacedWriter
-from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
+from rsvib_torch.io.formats import StackFormat
+from rsvib_torch.io.stack_info import StackInfo, info_from_attributes, readable_stack
 
-__all__ = ["create_raw", "open_raw", "sidecar"]
+__all__ = ["FORMAT"]
 
 
 class _Sidecar(Section):
-    """Keys of the file beside the frames."""
+    """Content of the sidecar."""
 
     format: Literal["rsvib raw"]
     version: Literal[1]
@@ -31,55 +30,41 @@ class _Sidecar(Section):
     resolution: tuple[float, float, str] | None = Field(default=None, strict=False)
 
 
-def sidecar(path: Path) -> Path:
-    """The file that says what the frames of ``path`` are: its name with ``.json`` added."""
+def _sidecar_path(path: Path) -> Path:
     return path.with_name(path.name + ".json")
 
 
-def _read_sidecar(path: Path) -> tuple[StackInfo, int, np.dtype[Any]]:
-    beside = sidecar(path)
+def _open(path: Path) -> ContiguousReader:
+    beside = _sidecar_path(path)
     if not beside.exists():
-        raise FileNotFoundError(f"{path}: raw frames need {beside.name} beside them, which does not exist")
-    content = validate(_Sidecar, read_json(beside, "sidecar of raw frames"), str(beside))
-    if len(content.shape) != len(content.axes) or min(content.shape) < 1:
-        raise ValueError(f"{beside}: shape: expected {len(content.axes)} positive sizes, got {content.shape}")
-    last = content.axes == "THWC"
-    T, *rest = content.shape
-    shape = (T, rest[2], rest[0], rest[1]) if last else (T, *rest)
-    times = None if content.frame_times is None else tuple(content.frame_times)
-    dtype = np.dtype(content.dtype).newbyteorder(content.byte_order)
-    scale = known_full_scale(np.dtype(content.dtype), content.full_scale)
-    return StackInfo(shape, content.dtype, scale, times, content.resolution, last), content.offset, dtype
+        raise FileNotFoundError(f"{path}: raw frames need the sidecar {beside.name}, which does not exist")
+    sidecar = validate(_Sidecar, read_json(beside, "sidecar of raw frames"), str(beside))
+    attributes = sidecar.model_dump(include={"axes", "full_scale", "frame_times"})
+    if sidecar.resolution is not None:
+        attributes |= {"resolution": sidecar.resolution[:2], "resolution_unit": sidecar.resolution[2]}
+    dtype = np.dtype(sidecar.dtype)
+    with readable_stack(path, "raw"):
+        info = info_from_attributes(attributes, tuple(sidecar.shape), dtype)
+        return ContiguousReader(path, info, sidecar.offset, dtype.newbyteorder(sidecar.byte_order))
 
 
-def open_raw(path: Path) -> PlacedReader:
-    """Open raw frames."""
-    info, offset, dtype = _read_sidecar(path)
-    try:
-        return PlacedReader(path, info, offset, dtype)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
+    if fresh:
+        content = {
+            "format": "rsvib raw",
+            "version": 1,
+            "shape": info.stored_shape,
+            "axes": info.stored_axes,
+            "dtype": info.dtype,
+            "byte_order": "little",
+            "offset": 0,
+            "full_scale": info.full_scale,
+            "frame_times": info.frame_times,
+            "resolution": info.resolution,
+        }
+        _sidecar_path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        path.write_bytes(b"")
+    return ContiguousWriter(path, info, 0, reserve=fresh)
 
 
-def create_raw(path: Path, info: StackInfo, fresh: bool) -> PlacedWriter:
-    """Make a file of raw frames with its sidecar, or go on with one."""
-    if not fresh:
-        return PlacedWriter(path, info, 0)
-    content = {
-        "format": "rsvib raw",
-        "version": 1,
-        "shape": list(info.stored_shape),
-        "axes": info.stored_axes,
-        "dtype": info.dtype,
-        "byte_order": "little",
-        "offset": 0,
-        "full_scale": info.full_scale,
-        "frame_times": None if info.frame_times is None else list(info.frame_times),
-        "resolution": None if info.resolution is None else list(info.resolution),
-    }
-    sidecar(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    path.write_bytes(b"")
-    return PlacedWriter(path, info, 0).reserve()
-
-
-register_format(StackFormat("raw", (".raw",), open_raw, create_raw, companions=(".json",)))
+FORMAT = StackFormat("raw", (".raw",), _open, _create, companions=(".json",))

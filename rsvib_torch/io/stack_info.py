@@ -1,12 +1,32 @@
-"""What is known about a stack before its pixels are read."""
+"""What a file states about a stack: shape, data type, full scale, frame times; errors of unreadable files."""
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
-__all__ = ["FrameError", "StackInfo"]
+import numpy as np
+from numpy.typing import NDArray
+
+from rsvib_torch.io.full_scale import known_full_scale
+from rsvib_torch.motion.timing import SensorTiming
+
+__all__ = [
+    "FrameError",
+    "StackInfo",
+    "attributes_of",
+    "exposure_times",
+    "info_from_attributes",
+    "readable_frame",
+    "readable_stack",
+    "timing_from_first_frame",
+    "timing_of_stack",
+]
 
 
 class FrameError(ValueError):
-    """One frame of a stack cannot be read; the others may be all right."""
+    """One frame of a stack cannot be read; the other frames may be readable."""
 
 
 @dataclass(frozen=True)
@@ -15,14 +35,14 @@ class StackInfo:
 
     Attributes:
         shape: (T, H, W) or (T, C, H, W).
-        dtype: NumPy name of the pixels' type in the file, e.g. ``"uint16"``.
-        full_scale: Count that means 1.0: stated in the file, or 255 for ``uint8``; None for other integers, and for
-            floats, whose values are left as they are.
-        frame_times: Exposure start of the first row of every frame in seconds, where the file states it.
-        resolution: Pixels per unit along x and y, and the unit (``"inch"``, ``"centimeter"``), where stated.
-        channels_last: Whether the file keeps the channels of a pixel next to each other.
-        times_of_playback: Whether ``frame_times`` are when frames are to be shown, as in videos: rounded, and perhaps
-            at another rate than they were taken.
+        dtype: NumPy name of the data type in the file, e.g. ``"uint16"``.
+        full_scale: Count that corresponds to 1.0: stated in the file, or 255 for ``uint8``; None if unknown, and for
+            floats, whose values are not scaled.
+        frame_times: Exposure start of the first row of every frame in seconds, if the file states it.
+        resolution: Pixels per unit along x and y, and the unit (``"inch"``, ``"centimeter"``), if the file states it.
+        channels_last: Whether the file stores the channels of a pixel next to each other.
+        times_of_playback: Whether ``frame_times`` are presentation times of a video: rounded, and possibly at another
+            rate than the exposures.
     """
 
     shape: tuple[int, ...]
@@ -39,18 +59,153 @@ class StackInfo:
         return "THW" if len(self.shape) == 3 else "TCHW"
 
     @property
-    def stored_shape(self) -> tuple[int, ...]:
-        """Shape in the order of the file: channels go last where they lie next to each other."""
-        if self.axes == "TCHW" and self.channels_last:
-            return (self.shape[0], *self.shape[2:], self.shape[1])
-        return self.shape
+    def stored_axes(self) -> str:
+        """Axes in the order of the file: ``"THW"``, ``"TCHW"`` or ``"THWC"``."""
+        return "THWC" if self.axes == "TCHW" and self.channels_last else self.axes
 
     @property
-    def stored_axes(self) -> str:
-        """Axes in the order of the file."""
-        return "THWC" if self.axes == "TCHW" and self.channels_last else self.axes
+    def stored_shape(self) -> tuple[int, ...]:
+        """Shape in the order of the file."""
+        return tuple(self.shape[self.axes.index(axis)] for axis in self.stored_axes)
 
     @property
     def is_integer(self) -> bool:
         """Whether the pixels are counts."""
         return "int" in self.dtype
+
+    @property
+    def frame_bytes(self) -> int:
+        """Size of a frame in bytes."""
+        return int(np.prod(self.shape[1:], dtype=object)) * np.dtype(self.dtype).itemsize
+
+    def with_frames(self, count: int) -> "StackInfo":
+        """The same kind of stack with ``count`` frames; frame times are kept only if their number is unchanged."""
+        times = self.frame_times if count == self.shape[0] else None
+        return replace(self, shape=(count, *self.shape[1:]), frame_times=times)
+
+    def from_stored(self, frame: NDArray[Any]) -> NDArray[Any]:
+        """Convert a frame from the axis order and byte order of the file to (H, W) or (C, H, W) in native order."""
+        if self.stored_axes == "THWC":
+            frame = np.moveaxis(frame, -1, 0)
+        return frame.astype(frame.dtype.newbyteorder("="), copy=False)
+
+    def to_stored(self, frame: NDArray[Any]) -> NDArray[Any]:
+        """Convert a frame (H, W) or (C, H, W) to the axis order and data type of the file."""
+        if self.stored_axes == "THWC":
+            frame = np.moveaxis(frame, 0, -1)
+        return np.ascontiguousarray(frame, dtype=self.dtype)
+
+
+@contextmanager
+def readable_stack(path: Path, kind: str) -> Iterator[None]:
+    """Convert any exception of a decoder into a one-line ``ValueError``: a damaged file can raise every type.
+
+    Args:
+        path: The file or folder that is opened. A file without read permission remains an ``OSError``.
+        kind: Name of the format for the message.
+    """
+    if not path.is_dir():
+        with path.open("rb"):
+            pass
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: not a readable {kind} stack: {' '.join(str(error).split())}") from error
+
+
+@contextmanager
+def readable_frame(path: Path, index: int) -> Iterator[None]:
+    """Convert any exception of a decoder into a one-line ``FrameError`` of frame ``index``."""
+    try:
+        yield
+    except (MemoryError, FrameError):
+        raise
+    except Exception as error:
+        raise FrameError(f"{path}: frame {index} cannot be read: {' '.join(str(error).split())}") from error
+
+
+def attributes_of(info: StackInfo) -> dict[str, Any]:
+    """Attributes of an HDF5 dataset or Zarr array that state ``info``; unknown values are omitted."""
+    attributes: dict[str, Any] = {"axes": info.stored_axes}
+    if info.full_scale is not None:
+        attributes["full_scale"] = float(info.full_scale)
+    if info.frame_times is not None:
+        attributes["frame_times"] = [float(time) for time in info.frame_times]
+    if info.resolution is not None:
+        attributes["resolution"] = [float(value) for value in info.resolution[:2]]
+        attributes["resolution_unit"] = info.resolution[2]
+    return attributes
+
+
+def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> StackInfo:
+    """Interpret a stored array as a stack.
+
+    Args:
+        attributes: As made by ``attributes_of``; all may be missing.
+        shape: Shape of the array in the file: (H, W), (T, H, W), (T, C, H, W), or (T, H, W, C) if ``axes`` states it.
+        dtype: Data type in the file.
+
+    Raises:
+        ValueError: If shape and attributes contradict each other.
+    """
+    axes = str(attributes.get("axes", {2: "HW", 3: "THW", 4: "TCHW"}.get(len(shape), "")))
+    if len(axes) != len(shape) or axes not in ("HW", "THW", "TCHW", "THWC") or min(shape) < 1:
+        raise ValueError(f"array of shape {shape} with axes {axes!r}; expected HW, THW, TCHW or THWC")
+    if axes == "HW":
+        shape = (1, *shape)
+    elif axes == "THWC":
+        shape = (shape[0], shape[3], shape[1], shape[2])
+    elif axes == "TCHW" and "axes" not in attributes and shape[-1] <= 4 < shape[1]:
+        raise ValueError(f"array has shape {shape}; expected (T, C, H, W), or the attribute axes='THWC'")
+    times = attributes.get("frame_times")
+    if times is not None:
+        times = tuple(float(time) for time in np.asarray(times, dtype=np.float64).ravel())
+    resolution = attributes.get("resolution")
+    if resolution is not None:
+        x, y = (float(value) for value in resolution)
+        resolution = (x, y, str(attributes.get("resolution_unit", "centimeter")))
+    full_scale = attributes.get("full_scale")
+    full_scale = known_full_scale(dtype, None if full_scale is None else float(full_scale))
+    return StackInfo(shape, dtype.name, full_scale, times, resolution, axes == "THWC")
+
+
+def exposure_times(info: StackInfo, timing: SensorTiming, *, tolerance: float = 0.25) -> tuple[float, ...] | None:
+    """Exposure start of every frame as stated by its file, in seconds; None if it is not stated.
+
+    Presentation times of a video are rounded and may run at another rate than the exposures. They are used only if
+    they are whole frame periods apart and most of them one period: gaps are then dropped frames, and the result
+    consists of multiples of the camera's frame period.
+
+    Args:
+        info: What the file states.
+        timing: The sensor.
+        tolerance: Largest deviation of the interval between two presentation times from a whole number of frame
+            periods, in periods; below 0.5, where rounding is ambiguous.
+    """
+    if info.frame_times is None or not info.times_of_playback:
+        return info.frame_times
+    periods = np.diff(np.array(info.frame_times)) / timing.frame_period
+    whole = np.round(periods)
+    if not len(whole) or whole.min() < 1 or np.abs(periods - whole).max() > tolerance or np.median(whole) != 1:
+        return None
+    return tuple(float(count) * timing.frame_period for count in (0.0, *np.cumsum(whole)))
+
+
+def timing_of_stack(timing: SensorTiming, info: StackInfo) -> SensorTiming:
+    """The sensor with the frame times of a file, unless it has its own or these are evenly spaced playback times."""
+    if timing.frame_start_times is not None or (times := exposure_times(info, timing)) is None:
+        return timing
+    if info.times_of_playback and np.ptp(np.diff(times)) < 1e-9 * timing.frame_period:
+        return timing
+    return replace(timing, frame_start_times=times)
+
+
+def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTiming:
+    """As ``timing_of_stack``, with the frame times of the file relative to the first frame."""
+    of_stack = timing_of_stack(timing, info)
+    if timing.frame_start_times is not None or of_stack.frame_start_times is None:
+        return of_stack
+    times = [float(time) for time in of_stack.frame_start_times]
+    return replace(of_stack, frame_start_times=tuple(time - times[0] for time in times))

@@ -12,15 +12,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.formats import StackFormat, register_format
+from rsvib_torch.io.formats import StackFormat
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 
-__all__ = ["open_video"]
+__all__ = ["FORMAT"]
 
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """The decoder's own messages are kept off the terminal."""
+    """Suppress messages that the decoder writes to the terminal."""
     level = cv2.utils.logging.getLogLevel()
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -30,9 +30,9 @@ def _silent() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(level)
 
 
-def _opened(path: Path) -> Any:
+def _open_decoder(path: Path) -> Any:
     with path.open("rb"):
-        pass  # a file that may not be read is an OSError of its own
+        pass  # a file that cannot be opened is an OSError
     with _silent():
         video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         if not video.isOpened():
@@ -42,39 +42,37 @@ def _opened(path: Path) -> Any:
 
 
 def _playback_times(path: Path) -> list[float]:
-    """When each frame that can be decoded is to be shown, in seconds: containers only estimate their number."""
-    video = _opened(path)
+    """Presentation time in seconds of every frame that can be decoded; containers state their number only roughly."""
+    video = _open_decoder(path)
     times = []
     with _silent():
         promised = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         while video.grab():
             times.append(1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC)))
         video.release()
-    count = len(times)
-    if count == 0:
-        raise ValueError(f"{path}: no frame of the video can be read")
-    if count < promised - max(1, promised // 10):
-        raise ValueError(f"{path}: truncated: {count} of {promised} frames can be read")
+    if not times:
+        raise ValueError(f"{path}: no frame of the video can be decoded")
+    if len(times) < promised - max(1, promised // 10):
+        raise ValueError(f"{path}: truncated: {len(times)} of {promised} frames can be decoded")
     return times
 
 
-class VideoReader:
-    """Frames (3, H, W), uint8 RGB, of a video: always three channels, grey videos too.
+class _VideoReader:
+    """Frames (3, H, W), uint8 RGB, of a video, also of grey ones.
 
-    Frames are decoded one after another; going back starts over.
+    Frames are decoded in sequence; reading an earlier frame starts again at the beginning.
     """
 
     def __init__(self, path: Path) -> None:
         self._path, times = path, _playback_times(path)
-        self._video: Any = _opened(path)
-        self._next = 0
+        self._video, self._next = _open_decoder(path), 0
         height, width = (int(self._video.get(key)) for key in (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH))
-        rising = all(0.0 <= a < b < math.inf for a, b in itertools.pairwise(times))
+        rising = len(times) > 1 and all(0.0 <= a < b < math.inf for a, b in itertools.pairwise(times))
         self.info = StackInfo(
             (len(times), 3, height, width),
             "uint8",
             255.0,
-            tuple(times) if rising and len(times) > 1 else None,
+            tuple(times) if rising else None,
             channels_last=True,
             times_of_playback=True,
         )
@@ -84,7 +82,7 @@ class VideoReader:
         with _silent():
             if index < self._next:
                 self._video.release()
-                self._video, self._next = _opened(self._path), 0
+                self._video, self._next = _open_decoder(self._path), 0
             while self._next < index and self._video.grab():
                 self._next += 1
             pixels = self._video.read()[1] if self._next == index else None
@@ -93,16 +91,11 @@ class VideoReader:
         self._next += 1
         if pixels.shape != (*self.info.shape[2:], 3):
             raise FrameError(f"{self._path}: frames of different size: frame {index} is {pixels.shape[:2]}")
-        return np.ascontiguousarray(np.moveaxis(pixels[..., ::-1], -1, 0))
+        return np.ascontiguousarray(np.moveaxis(pixels[..., ::-1], -1, 0))  # OpenCV decodes to BGR
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._video.release()
 
 
-def open_video(path: Path) -> VideoReader:
-    """Open a video and count its frames."""
-    return VideoReader(path)
-
-
-register_format(StackFormat("video", (".avi", ".mp4", ".m4v", ".mov", ".mkv", ".webm"), open_video))
+FORMAT = StackFormat("video", (".avi", ".mp4", ".m4v", ".mov", ".mkv", ".webm"), _VideoReader)

@@ -10,9 +10,9 @@ import torch
 
 from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.io.files import PathLike, open_stack
-from rsvib_torch.io.frame_times import timing_of_stack
 from rsvib_torch.io.full_scale import check_full_scale
 from rsvib_torch.io.schema import DetectedVibration
+from rsvib_torch.io.stack_info import timing_of_stack
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.job import BadFrames, StackJob
 from rsvib_torch.stacks.memory import parse_memory, windows_at_once

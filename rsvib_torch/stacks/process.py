@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from rsvib_torch.io.files import PathLike, check_info_target
-from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.schema import DetectedVibration
+from rsvib_torch.io.stack_info import exposure_times
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.fingerprint import fingerprint
 from rsvib_torch.stacks.job import BadFrames
@@ -109,7 +109,7 @@ def process_stack(
         full_scale=job.full_scale,
         frame_times=exposure_times(job.info, timing) if count == job.info.shape[0] else None,
     )
-    form = check_info_target(sink, out, compression, try_folder=False)
+    form = check_info_target(sink, out, compression, check_folder=False)
     target = sink.with_name(sink.name + ".manifest.json") if manifest is None else Path(manifest)
     if Path(source).exists() and sink.exists() and os.path.samefile(source, sink):
         raise ValueError(f"{sink}: a stack cannot be written over itself")

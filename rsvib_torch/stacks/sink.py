@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.atomic import place
+from rsvib_torch.io.atomic import move_into_place
 from rsvib_torch.io.formats import FrameWriter, StackFormat
 from rsvib_torch.io.stack_info import StackInfo
 
@@ -91,7 +91,7 @@ class Sink:
         elif self._staged.is_dir():
             self._assemble(count)
         if self._part.exists():  # else it had its name already when the run was broken off
-            place(self._part, self._path, self._form.kind, self._form.companions)
+            move_into_place(self._part, self._path, self._form.kind, self._form.companions)
 
     def _assemble(self, count: int) -> None:
         times = self._info.frame_times if count == self._info.shape[0] else None

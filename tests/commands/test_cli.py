@@ -281,7 +281,7 @@ def test_full_scale_comes_from_option_file_or_config(place, tmp_path, capsys):
     assert run("detect", arguments[0], "--config", silent, "--out", tmp_path / "out", "--full-scale", 4095) == 0
     capsys.readouterr()
     assert run("detect", arguments[0], "--config", silent, "--out", tmp_path / "out2") == 2
-    assert "uint16 frames do not say their full scale; state full_scale, e.g. 4095" in capsys.readouterr().err
+    assert "full scale of uint16 frames unknown: pass full_scale, e.g. full_scale=4095" in capsys.readouterr().err
     other = tmp_path / "other.toml"
     other.write_text(CONFIG.replace("4095", "16383"))
     assert run("detect", place / "frames.tif", "--config", other, "--out", tmp_path / "out2") == 2
@@ -445,7 +445,7 @@ def test_outputs_that_cannot_be_written(place, vibration_text, tmp_path, capsys,
         (restore_arguments(place, tmp_path, out=tmp_path / "r.png"), "a PNG file holds one frame, got 2"),
         (("detect", frames, *config, "--out", tmp_path / "file"), "a file of that name is there"),
         (("run", frames, tmp_path / "file" / "out", *config), "file is not writable"),
-        (("simulate", place / "scene.png", tmp_path / "f.mp4", *config), "videos are only read"),
+        (("simulate", place / "scene.png", tmp_path / "f.mp4", *config), "video files can only be read"),
     ]
 
     def refuse(*args, **kwargs):

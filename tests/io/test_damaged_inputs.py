@@ -1,4 +1,4 @@
-"""Damaged inputs: a clear error or a result every time, never a traceback, a hang or a half-written output."""
+"""Damaged inputs: a one-line error or a result, never a traceback, a hang or an incomplete output."""
 
 import resource
 import shutil
@@ -22,11 +22,11 @@ def _try(folder, seeds, found):
 
 
 @pytest.mark.parametrize("seeds", [range(200), pytest.param(range(200, 5000), marks=pytest.mark.slow)])
-def test_damaged_files_are_refused_in_a_line_or_read(tmp_path, seeds):
+def test_damaged_files_are_read_or_refused_with_a_one_line_error(tmp_path, seeds):
     context = fork_server()
     found = context.SimpleQueue()
     write_small(tmp_path / "good.tif", 3)
-    process = context.Process(target=_try, args=(tmp_path, seeds, found))  # a crash of a library is seen here
+    process = context.Process(target=_try, args=(tmp_path, seeds, found))  # detects crashes of libraries
     process.start()
     process.join(timeout=300)
     assert process.exitcode == 0
@@ -39,7 +39,7 @@ def test_damaged_files_are_refused_in_a_line_or_read(tmp_path, seeds):
 
 
 @pytest.mark.parametrize("kind", ["pages.tif", "packed.tif", "packed.h5", "frames.zarr/zarr.json"])
-def test_runs_on_damaged_stacks_write_all_or_nothing(tmp_path, kind):
+def test_processing_a_damaged_stack_writes_all_or_nothing(tmp_path, kind):
     write_small(tmp_path / "good.tif", 3)
     target, _, text = write_originals(tmp_path)[kind]
     good = (tmp_path / kind).read_bytes()
@@ -60,7 +60,7 @@ def test_runs_on_damaged_stacks_write_all_or_nothing(tmp_path, kind):
         assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_command_says_one_line_about_damaged_input(tmp_path, capfd):
+def test_command_prints_one_line_about_damaged_input(tmp_path, capfd):
     write_small(tmp_path / "good.tif", 3)
     write_originals(tmp_path)
     good = (tmp_path / "camera.toml").read_text()

@@ -1,4 +1,4 @@
-"""Formats in the registry: what is written comes back, what others wrote is read, what is missing is named."""
+"""The registry of formats: round trips, files of other programs, refused files, additional formats."""
 
 import json
 import sys
@@ -23,6 +23,7 @@ from rsvib_torch.io import (
     register_format,
     write_stack,
 )
+from rsvib_torch.io.stack_info import readable_stack
 
 COUNTS = np.random.default_rng(8).integers(0, 4096, (3, 9, 7)).astype(np.uint16)
 COUNTS.flat[0] = 4095
@@ -31,18 +32,18 @@ COUNTS.flat[0] = 4095
 @pytest.mark.parametrize("ending", [".h5", ".zarr", ".raw"])
 @pytest.mark.parametrize("shape", [(3, 9, 7), (2, 3, 9, 7), (1, 5, 9, 7)])
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "int32", "float32", "float64"])
-def test_stacks_come_back(tmp_path, ending, shape, dtype):
+def test_stacks_are_read_as_written(tmp_path, ending, shape, dtype):
     path = tmp_path / f"frames{ending}"
     stored = np.random.default_rng(3).integers(0, 256, shape) / 255
     scale = None if "float" in dtype else 255
-    for _ in range(2):  # the second replaces the first
+    for _ in range(2):  # the second call replaces the file of the first
         write_stack(path, torch.from_numpy(stored), dtype=dtype, full_scale=scale)
     assert read_stack_info(path) == StackInfo(shape, dtype, scale)
     np.testing.assert_allclose(read_stack(path).numpy(), stored, rtol=1e-6, atol=1e-7)
     assert {item.name for item in tmp_path.iterdir()} <= {path.name, "frames.raw.json"}
 
 
-def test_other_readers_read_ours(tmp_path):
+def test_files_can_be_read_by_other_libraries(tmp_path):
     frames = torch.from_numpy(COUNTS / 4095.0)
     for name in ("a.h5", "a.zarr", "a.raw"):
         write_stack(tmp_path / name, frames, dtype="uint16", full_scale=4095)
@@ -57,7 +58,7 @@ def test_other_readers_read_ours(tmp_path):
 
 @pytest.mark.parametrize("compression", ["zlib", "lzma", "lzw", "zstd"])
 @pytest.mark.parametrize("big", [False, True])
-def test_compressed_tiff_of_others_is_read(tmp_path, compression, big):
+def test_compressed_tiff_of_other_programs_is_read(tmp_path, compression, big):
     path = tmp_path / "frames.tif"
     tifffile.imwrite(
         path, COUNTS, photometric="minisblack", compression=compression, bigtiff=big, tile=(16, 16), metadata=None
@@ -96,14 +97,14 @@ def test_frames_are_read_one_at_a_time_in_any_order(tmp_path):
 
 
 def _file_pages():
-    """Memory of this process that is pages of files, in bytes."""
+    """Memory of this process that is mapped from files, in bytes."""
     line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("RssFile:"))
     return 1024 * int(line.split()[1])
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell")
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_mapped_pages_do_not_pile_up(tmp_path, order):
+def test_reading_frames_of_npy_does_not_accumulate_memory(tmp_path, order):
     frames = np.random.default_rng(2).integers(0, 256, (32, 512, 512)).astype(np.uint8)
     np.save(tmp_path / "a.npy", np.asarray(frames, order=order))
     reader = open_stack(tmp_path / "a.npy")
@@ -115,7 +116,7 @@ def test_mapped_pages_do_not_pile_up(tmp_path, order):
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_mapped_file_that_shrinks_is_an_error(tmp_path, order):
+def test_npy_file_that_shrinks_while_open_is_an_error(tmp_path, order):
     big_endian = np.asarray(COUNTS.repeat(800, axis=1).astype(">u2"), order=order)
     np.save(tmp_path / "a.npy", big_endian)
     reader = open_stack(tmp_path / "a.npy")
@@ -130,38 +131,78 @@ def test_mapped_file_that_shrinks_is_an_error(tmp_path, order):
     reader.close()
 
 
-def test_floats_go_into_a_folder_of_tiff_files(tmp_path):
+def test_folder_of_float_frames_contains_tiff_files(tmp_path):
     write_stack(tmp_path / "frames", torch.from_numpy(COUNTS / 4095.0))
     assert sorted(file.name for file in (tmp_path / "frames").iterdir()) == [f"frame_000{i}.tif" for i in range(3)]
     np.testing.assert_allclose(read_stack(tmp_path / "frames").numpy(), COUNTS / 4095, rtol=1e-6)
     cv2.imwrite(str(tmp_path / "frames" / "x.png"), COUNTS[0])
-    with pytest.raises(ValueError, match="holds both PNG and TIFF files"):
+    with pytest.raises(ValueError, match="contains both PNG and TIFF files"):
         read_stack(tmp_path / "frames")
 
 
-def test_format_of_ones_own(tmp_path, monkeypatch):
-    monkeypatch.setattr(formats, "_FORMATS", dict(formats._FORMATS))
+class ToyReader:
+    """A stack as a JSON list."""
 
-    class Reader:
-        def __init__(self, path):
+    def __init__(self, path):
+        with readable_stack(path, "toy"):
             self.pixels = np.array(json.loads(path.read_text()), dtype=np.uint8)
-            self.info = StackInfo(self.pixels.shape, "uint8", 255.0)
+        self.info = StackInfo(self.pixels.shape, "uint8", 255.0)
 
-        def frame(self, index):
-            return self.pixels[index]
+    def frame(self, index):
+        return self.pixels[index]
 
-        def close(self):
-            pass
+    def close(self):
+        pass
 
-    def write_all(path, info, frames, compression):
-        path.write_text(json.dumps([frame.tolist() for frame in frames]))
 
-    register_format(StackFormat("listing", (".listing",), Reader, write_all=write_all, dtypes=("uint8",)))
+class ToyWriter:
+    def __init__(self, path, info, fresh):
+        self.path = path
+        self.pixels = np.zeros(info.shape, np.uint8) if fresh else ToyReader(path).pixels
+
+    def write(self, index, frame):
+        self.pixels[index] = frame
+
+    def sync(self):
+        self.path.write_text(json.dumps(self.pixels.tolist()))
+
+    close = sync
+
+
+def write_toy(path, info, frames, compression):
+    path.write_text(json.dumps([frame.tolist() for frame in frames]))
+
+
+@pytest.mark.parametrize("writing", [{"create": ToyWriter}, {"write_all": write_toy}])
+def test_format_can_be_added_and_removed(tmp_path, monkeypatch, writing):
+    monkeypatch.setattr(formats, "FORMATS", dict(formats.FORMATS))
+    register_format(StackFormat("toy", (".toy",), ToyReader, dtypes=("uint8",), **writing))
     frames = torch.rand(2, 5, 4, generator=torch.Generator().manual_seed(1))
-    write_stack(tmp_path / "a.listing", frames, dtype="uint8")
-    torch.testing.assert_close(read_stack(tmp_path / "a.listing"), frames, atol=0.002, rtol=0)
-    with pytest.raises(ValueError, match="listing files hold uint8; got dtype float32"):
-        write_stack(tmp_path / "a.listing", frames)
+    write_stack(tmp_path / "a.toy", frames, dtype="uint8")
+    torch.testing.assert_close(read_stack(tmp_path / "a.toy"), frames, atol=0.002, rtol=0)
+    reader = open_stack(tmp_path / "a.toy")
+    np.testing.assert_array_equal(reader.frame(1), (frames[1] * 255).round())
+    reader.close()
+    with pytest.raises(ValueError, match="toy files hold uint8; got dtype float32"):
+        write_stack(tmp_path / "a.toy", frames)
+    (tmp_path / "a.toy").write_text("[[")
+    with pytest.raises(ValueError, match=r"a\.toy: not a readable toy stack: Expecting value"):
+        open_stack(tmp_path / "a.toy")
+    del formats.FORMATS[".toy"]
+    with pytest.raises(ValueError, match=r"unknown file ending '\.toy'"):
+        open_stack(tmp_path / "a.toy")
+
+
+@pytest.mark.parametrize(("ending", "message"), [(".TOY", "endings must be like '.tif'"), (None, "has no file ending")])
+def test_format_without_a_valid_ending_is_refused(ending, message):
+    with pytest.raises(ValueError, match=message):
+        register_format(StackFormat("toy", () if ending is None else (ending,), ToyReader))
+
+
+def test_npy_of_a_stack_with_channels_last_has_channels_second(tmp_path):
+    frames = torch.rand(2, 3, 9, 7, generator=torch.Generator().manual_seed(1))
+    write_stack(tmp_path / "a.npy", frames, like=StackInfo((2, 3, 9, 7), "uint8", 255.0, channels_last=True))
+    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), frames)
 
 
 @pytest.mark.parametrize(("ending", "package"), [(".h5", "h5py"), (".zarr", "zarr")])
@@ -176,7 +217,7 @@ def test_missing_package_names_the_extra(tmp_path, monkeypatch, ending, package)
         write_stack(tmp_path / f"b{ending}", torch.rand(2, 4, 4))
 
 
-def test_frames_in_other_files_are_not_followed(tmp_path):
+def test_hdf5_links_to_other_files_are_refused(tmp_path):
     np.save(tmp_path / "secret.npy", COUNTS)
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["frames"] = COUNTS
@@ -193,7 +234,7 @@ def test_frames_in_other_files_are_not_followed(tmp_path):
             read_stack(tmp_path / f"{name}.h5", full_scale=4095)
 
 
-def test_headers_that_promise_too_much(tmp_path):
+def test_headers_larger_than_the_file_are_refused(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("frames", (10**6, 4000, 4000), "u2", chunks=(1, 100, 100), compression="gzip")
     array = zarr.create_array(tmp_path / "a.zarr", shape=(10**6, 4000, 4000), chunks=(1, 100, 100), dtype="u2")
@@ -202,14 +243,14 @@ def test_headers_that_promise_too_much(tmp_path):
     sidecar = {"format": "rsvib raw", "version": 1, "shape": [9, 10**9, 10**9], "axes": "THW", "dtype": "uint16"}
     (tmp_path / "a.raw.json").write_text(json.dumps(sidecar))
     for name in ("a.h5", "a.zarr", "a.raw"):
-        with pytest.raises(ValueError, match=rf"{name}.*header promises"):
+        with pytest.raises(ValueError, match=rf"{name}.*header states"):
             read_stack_info(tmp_path / name)
 
 
-def test_zarr_codecs_that_could_run_code_are_refused(tmp_path):
+def test_zarr_codecs_that_could_execute_code_are_refused(tmp_path):
     zarr.create_array(tmp_path / "a.zarr", shape=(2, 4, 4), chunks=(1, 4, 4), dtype="u1")[:] = 3
     header = json.loads((tmp_path / "a.zarr" / "zarr.json").read_text())
     header["codecs"] = [{"name": "numcodecs.pickle", "configuration": {}}]
     (tmp_path / "a.zarr" / "zarr.json").write_text(json.dumps(header))
-    with pytest.raises(ValueError, match=r"codec 'numcodecs\.pickle' is none of the Zarr v3 specification"):
+    with pytest.raises(ValueError, match=r"codec 'numcodecs\.pickle' is not part of the Zarr v3 specification"):
         read_stack(tmp_path / "a.zarr")

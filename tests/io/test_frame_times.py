@@ -1,4 +1,4 @@
-"""Frame times that files state: kept, and used by every command; those of videos where they are the camera's."""
+"""Frame times stated by files: used and kept by every command; playback times of videos only if they are plausible."""
 
 import json
 from dataclasses import replace
@@ -22,7 +22,7 @@ START = 100.25  # s
 
 @pytest.fixture(name="place")
 def write_stack_with_gaps(tmp_path):
-    """Frames with gaps in a file that says when they were taken, and a config that does not."""
+    """Frames with gaps in a file that states their times, and a config without frame times."""
     counts = draw_counts(max(KEPT) + 1)[KEPT]
     (tmp_path / "frames.raw").write_bytes(counts.tobytes())
     sidecar = {
@@ -78,7 +78,7 @@ def test_commands_use_and_keep_the_times_of_the_file(place):
 
 
 def test_without_its_times_the_stack_is_not_restored(place):
-    """Else the test above would test nothing."""
+    """Shows that the test above depends on the times."""
     frames = rsv.read_stack(place / "frames.raw")
     found = rsv.detect_vibration(frames, TIMING, method="bands", band_rows=16, band_step=8, search=6, tones=1)
     restored = rsv.restore(frames, TIMING, found.vibration, method="dewarp", check=False).numpy()
@@ -89,7 +89,7 @@ def info_with(times):
     return StackInfo((len(times), 8, 8), "uint8", 255.0, tuple(times), times_of_playback=True)
 
 
-def test_times_of_playback_tell_dropped_frames_and_nothing_else():
+def test_playback_times_are_only_used_to_find_dropped_frames():
     period = TIMING.frame_period
     gaps = info_with([round(index * period, 3) for index in KEPT])
     assert exposure_times(gaps, TIMING) == pytest.approx([index * period for index in KEPT], rel=1e-12)
@@ -98,15 +98,15 @@ def test_times_of_playback_tell_dropped_frames_and_nothing_else():
     assert exposure_times(even, TIMING) == pytest.approx([index * period for index in range(9)], rel=1e-12)
     assert timing_from_first_frame(TIMING, even) is TIMING
     for times in ([index / 30 for index in range(9)], [0.0, period / 2, period], [0.0, 4 * period, 8 * period]):
-        assert exposure_times(info_with(times), TIMING) is None  # played at another rate than taken
+        assert exposure_times(info_with(times), TIMING) is None  # playback at another rate
         assert timing_from_first_frame(TIMING, info_with(times)) is TIMING
     own = replace(TIMING, frame_start_times=tuple(index * period for index in range(9)))
     assert timing_from_first_frame(own, gaps) is own
 
 
-def test_video_at_another_rate_is_taken_at_the_camera_s(tmp_path):
+def test_video_with_another_playback_rate_has_evenly_spaced_frames(tmp_path):
     kind = cv2.VideoWriter.fourcc(*"MJPG")
-    # not through FFmpeg, which would go on writing messages to the terminal
+    # FFmpeg would write messages to the terminal
     writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.CAP_OPENCV_MJPEG, kind, 24, (WIDTH, HEIGHT))
     for frame in draw_counts(6):
         writer.write(np.repeat((frame // 16).astype(np.uint8)[..., None], 3, axis=-1))
@@ -120,7 +120,7 @@ def test_video_at_another_rate_is_taken_at_the_camera_s(tmp_path):
     assert read_stack_info(tmp_path / "out" / "restored.h5").frame_times is None
 
 
-def test_what_a_stack_says_is_kept_on_writing(tmp_path):
+def test_writing_keeps_times_resolution_and_channel_order(tmp_path):
     like = StackInfo((2, 3, 9, 7), "uint16", 4095.0, (0.5, 0.75), (300.0, 300.0, "inch"), channels_last=True)
     write_stack(tmp_path / "a.zarr", torch.rand(2, 3, 9, 7), dtype="uint16", full_scale=4095, like=like)
     info = read_stack_info(tmp_path / "a.zarr")

@@ -1,4 +1,4 @@
-"""Stacks in files: what is written comes back, whoever wrote it, with its full scale."""
+"""Stacks in files: round trips with full scale, and files of other programs."""
 
 import json
 import struct
@@ -26,7 +26,7 @@ SHAPES = [(1, 9, 7), (3, 9, 7), (2, 3, 9, 7), (2, 4, 9, 7), (1, 3, 9, 7)]
 
 @pytest.mark.parametrize("shape", [*SHAPES, (2, 2, 9, 7), (2, 5, 9, 7)])
 @pytest.mark.parametrize(("dtype", "largest"), [*COUNTS, ("int16", 4095), ("uint32", 100000)])
-def test_tiff_counts_come_back_with_their_full_scale(tmp_path, shape, dtype, largest):
+def test_tiff_round_trip_keeps_counts_and_full_scale(tmp_path, shape, dtype, largest):
     stored = draw_counts(shape, largest, dtype)
     path = tmp_path / "frames.tif"
     write_stack(path, torch.from_numpy(stored / largest), dtype=dtype, full_scale=largest)
@@ -45,7 +45,7 @@ def test_tiff_counts_come_back_with_their_full_scale(tmp_path, shape, dtype, lar
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(("dtype", "largest"), COUNTS)
-def test_png_folder_counts_come_back_with_their_full_scale(tmp_path, shape, dtype, largest):
+def test_png_folder_round_trip_keeps_counts_and_full_scale(tmp_path, shape, dtype, largest):
     stored = draw_counts(shape, largest, dtype)
     path = tmp_path / "frames"
     write_stack(path, torch.from_numpy(stored / largest), dtype=dtype, full_scale=largest)
@@ -72,7 +72,7 @@ def test_npy_and_single_png(tmp_path):
 
 @pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
 @pytest.mark.parametrize("ending", [".tif", ".npy"])
-def test_floats_keep_their_values_even_those_that_are_no_numbers(tmp_path, dtype, ending):
+def test_floats_keep_their_values_also_nan_and_infinity(tmp_path, dtype, ending):
     frames = torch.tensor([[[0.5, -2.0], [1e4, 0.25]], [[np.nan, np.inf], [0.0, 1.0]]])
     path = tmp_path / f"frames{ending}"
     write_stack(path, frames, dtype=dtype)
@@ -86,7 +86,7 @@ def test_values_are_rounded_and_clipped_to_full_scale(tmp_path):
     assert tifffile.imread(tmp_path / "frames.tif").tolist() == [[[0, 4095, 0, 1, 4095]]]
 
 
-def test_full_scale_given_by_the_caller_comes_first(tmp_path):
+def test_full_scale_argument_has_priority(tmp_path):
     write_stack(tmp_path / "frames.tif", torch.full((2, 4, 4), 0.5), dtype="uint16", full_scale=1000)
     assert read_stack(tmp_path / "frames.tif").unique().tolist() == [0.5]
     assert read_stack(tmp_path / "frames.tif", full_scale=2000).unique().tolist() == [0.25]
@@ -109,7 +109,7 @@ def test_tiff_files_of_other_programs(tmp_path):
     np.testing.assert_allclose(read_stack(tmp_path / "colour.tif")[0].numpy(), np.moveaxis(colour, -1, 0) / 255)
 
 
-def test_png_files_are_taken_in_natural_order(tmp_path):
+def test_png_files_are_read_in_natural_order(tmp_path):
     for index in (2, 10, 1, 9):
         cv2.imwrite(str(tmp_path / f"shot{index}.png"), np.full((4, 5), index, np.uint8))
     (tmp_path / "notes.txt").write_text("not a frame")
@@ -137,7 +137,7 @@ def test_axes():
     assert not StackInfo((2, 9, 7), "float32", None).is_integer
 
 
-def test_description_of_a_tiff_file_is_small_json(tmp_path):
+def test_description_of_a_tiff_file_is_json(tmp_path):
     write_stack(tmp_path / "frames.tif", torch.zeros(2, 4, 5), dtype="uint16", full_scale=4095)
     with tifffile.TiffFile(tmp_path / "frames.tif") as tif:
         assert json.loads(tif.pages[0].description) == {"shape": [2, 4, 5], "axes": "TYX", "full_scale": 4095}
@@ -148,9 +148,9 @@ def png_chunk(kind, body):
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
-def test_png_header_that_promises_too_much_is_refused(tmp_path):
+def test_png_header_larger_than_the_file_is_refused(tmp_path):
     header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", 2_000_000, 2_000_000, 16, 0, 0, 0, 0))
     data = b"\x89PNG\r\n\x1a\n" + header + png_chunk(b"IDAT", zlib.compress(b"\0" * 99)) + png_chunk(b"IEND", b"")
     (tmp_path / "huge.png").write_bytes(data)
-    with pytest.raises(ValueError, match=r"huge\.png: its header promises 2000000 x 2000000 px"):
+    with pytest.raises(ValueError, match=r"huge\.png: its header states 2000000 x 2000000 px"):
         read_stack(tmp_path / "huge.png")

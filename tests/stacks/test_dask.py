@@ -121,5 +121,5 @@ def test_blocks_that_cannot_be_restored(place):
     uneven = rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 0.1, 0.3])
     with pytest.raises(ValueError, match="must not have frame_start_times"):
         rsv.restore_block(counts, uneven, full_scale=4095)
-    with pytest.raises(ValueError, match="do not say their full scale"):
+    with pytest.raises(ValueError, match="full scale of uint16 frames unknown"):
         rsv.restore_block(counts, TIMING)

@@ -93,7 +93,7 @@ def test_compressed_tiff(place, tmp_path):
     with tifffile.TiffFile(tmp_path / "restored.tif") as tif:
         assert tif.pages[0].compression.name == "ADOBE_DEFLATE"
     np.testing.assert_array_equal(*(tifffile.imread(folder / "restored.tif") for folder in (place, tmp_path)))
-    with pytest.raises(ValueError, match="compression is a choice for TIFF files only"):
+    with pytest.raises(ValueError, match="compression='zlib' is only available for TIFF files"):
         process_small(place / "frames.tif", tmp_path / "restored.npy", compression="zlib")
 
 
