@@ -13,7 +13,7 @@ from rsvib_torch.augmentation.image_motion import ImageMotion
 from rsvib_torch.augmentation.moving import move_boxes, move_images, move_masks
 from rsvib_torch.augmentation.ranges import Range, axis_ranges, draw
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
-from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order, vibration_to_row_order
+from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.psf import Interpolation
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
@@ -192,7 +192,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         drawn = {name: params[name].to(dtype=torch.float64, device=like.device) for name in _DRAWN}
         exposure_rows = drawn.pop("exposure_rows")
         count = len(exposure_rows)
-        vibration = vibration_to_row_order(Vibration(**drawn), self.timing)
+        vibration = Vibration(**drawn).to_row_order(self.timing)
         self.timing.check_rows(self._num_rows(params))
         return ImageMotion(
             vibration=vibration,

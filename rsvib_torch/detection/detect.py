@@ -22,7 +22,6 @@ from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import (
     offsets_from_row_order,
-    vibration_from_row_order,
 )
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import VibrationStd, blind_frequencies
@@ -294,7 +293,7 @@ def _detect(frames: Tensor, valid: Tensor | None, timing: SensorTiming, options:
     reliable = torch.stack([verdict[0] for verdict in verdicts])
     swap = timing.scan_axis == -1
     reasons = tuple((r[1], r[0]) if swap else r for _, r in verdicts)
-    in_image = vibration_from_row_order(vibration, timing)
+    in_image = vibration.from_row_order(timing)
     return DetectionResult(
         vibration=in_image,
         std=_swap_std(std) if swap else std,

@@ -56,7 +56,7 @@ def judge(
     share = float(good.double().sum() / shown.double().sum().clamp(min=1))
     # a uniform motion is smeared exactly at any speed: condition (24) is for what changes within a row time
     of_tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
-    within_row = of_tones.displacement_within_row_time(timing.row_time).tolist()
+    within_row = of_tones.displacement_within(timing.row_time).tolist()
     gain = offset_gain(vibration.frequency, intervals)
     for axis, found in enumerate(reasons):
         amplitude = vibration.amplitude[axis]

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["rows_showing"]
 
@@ -12,7 +12,7 @@ _STEPS, _FEW = 8, 3  # of Newton's method, and those that are mostly enough, the
 _TINY = 1e-9  # px: a step as small as that leaves next to nothing
 
 
-def rows_showing(scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Vibration) -> Tensor:
+def rows_showing(scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion) -> Tensor:
     """Frame rows r(s) that show scene rows s: the solution of ``r = s + Y(t(r))``.
 
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).

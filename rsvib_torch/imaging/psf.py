@@ -9,8 +9,8 @@ from torch import Tensor
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.splines import bspline_weights
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["Interpolation", "RowPSF", "row_psf", "trajectory_psf"]
 
@@ -74,7 +74,7 @@ def _axis_weights(displacement: Tensor, degree: int) -> tuple[Tensor, Tensor]:
 
 
 def row_psf(
-    vibration: Vibration,
+    vibration: Motion,
     starts: Tensor,
     timing: SensorTiming,
     *,
@@ -100,6 +100,7 @@ def row_psf(
         The kernels of all rows.
 
     Example:
+        >>> from rsvib_torch import Vibration
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
         >>> psf = row_psf(Vibration(2.0, 50.0), timing.row_starts(2, 512), timing)
         >>> psf.weights.shape[:2]

@@ -8,11 +8,11 @@ from torch import Tensor
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored
 from rsvib_torch.frames.arrays import ArrayLike, as_tensor
-from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order, vibration_to_row_order
+from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.sensor_noise import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["simulate_frames"]
 
@@ -24,7 +24,7 @@ _CHUNK = 64  # rows formed at a time
 def simulate_frames(
     scene: ArrayLike,
     timing: SensorTiming,
-    vibration: Vibration,
+    vibration: Motion,
     num_frames: int = 2,
     *,
     frame_size: tuple[int, int] | None = None,
@@ -56,6 +56,7 @@ def simulate_frames(
         ValueError: If the scene is too small for the frame and motion, or is not finite.
 
     Example:
+        >>> from rsvib_torch import Vibration
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
         >>> simulate_frames(torch.rand(128, 256), timing, Vibration(2.0, 50.0)).shape
         torch.Size([2, 92, 220])
@@ -71,7 +72,7 @@ def simulate_frames(
         raise ValueError(f"num_frames must be at least 1, got {num_frames}")
     if vibration.batch_shape:
         raise ValueError("simulate_frames takes one vibration, not a batch")
-    motion = vibration_to_row_order(vibration, timing).to(scene.device)
+    motion = vibration.to_row_order(timing).to(scene.device)
     if timing.scan_axis == -1 and frame_size is not None:
         frame_size = (frame_size[1], frame_size[0])
     scene = frames_to_row_order(scene, timing)
@@ -96,7 +97,7 @@ def simulate_frames(
     return frames if noise is None else noise.apply(frames, generator)
 
 
-def _form_rows(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Vibration, width: int) -> Tensor:
+def _form_rows(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion, width: int) -> Tensor:
     """Form frames (T, ..., R, width) whose rows are exposed from ``starts`` (T, R) on, centred on the scene."""
     height, scene_width = scene.shape[-2:]
     num_rows = starts.shape[-1]

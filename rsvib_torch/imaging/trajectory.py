@@ -8,9 +8,8 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.quadrature import gauss_legendre
-from rsvib_torch.motion.spline import rest_path
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["Quadrature", "exposure_nodes", "exposure_trajectory", "gauss_node_count"]
 
@@ -18,22 +17,18 @@ Quadrature = Literal["midpoint", "gauss"]
 _MOST_NODES = 4096
 
 
-def gauss_node_count(vibration: Vibration, exposure_time: float) -> int:
+def gauss_node_count(vibration: Motion, exposure_time: float) -> int:
     """Gauss-Legendre nodes that integrate the image over this motion to about 1e-6 of full scale.
 
     The integrand is ``exp(-2 pi i (u X(t) + v Y(t)))`` with frequencies up to half a cycle per pixel, so the count
     grows with the path length in px (two nodes a px) and with the vibration periods in the exposure.
     """
-    frequency = vibration.frequency.detach()
-    cycles = frequency * exposure_time
-    swing = vibration.amplitude.detach() * torch.where(cycles < 0.5, 2 * torch.sin(math.pi * cycles), 4 * cycles)
-    path = swing.sum(-1) + vibration.image_motion.detach().abs() * exposure_time + rest_path(vibration, exposure_time)
-    seen_cycles = torch.where(vibration.amplitude.detach() > 1e-4, cycles, torch.zeros_like(cycles))
-    nodes = torch.stack([2.0 * path.amax(), 4.0 * seen_cycles.amax()]).ceil().sum()
-    count = 3 + int(nodes)
+    path = float(vibration.displacement_within(exposure_time).amax())
+    periods = float(vibration.periods_within(exposure_time).amax())
+    count = 3 + math.ceil(2.0 * path) + math.ceil(4.0 * periods)
     if count > _MOST_NODES:
         raise ValueError(
-            f"the image moves {float(path.amax()):.3g} px and through {float(seen_cycles.amax()):.3g} periods while a "
+            f"the image moves {path:.3g} px and through {periods:.3g} periods while a "
             f"row is exposed for {exposure_time:g} s, too much to follow; check frequency, amplitude and exposure"
         )
     return count
@@ -60,7 +55,7 @@ def exposure_nodes(
 
 
 def exposure_trajectory(
-    vibration: Vibration,
+    vibration: Motion,
     starts: Tensor,
     timing: SensorTiming,
     quadrature: Quadrature = "midpoint",

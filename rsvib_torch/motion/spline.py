@@ -1,8 +1,9 @@
-"""Motion of any shape: a spline in time beside tones and image motion, used wherever a vibration is."""
+"""Motion of any shape: a cubic spline in time, with tones and image motion."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import torch
@@ -11,20 +12,19 @@ from torch import Tensor
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.quadrature import gauss_legendre
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.vibration import TensorLike, Vibration
 
-__all__ = ["FreeMotion", "moving_axes", "rest_path", "rest_reach"]
-
-_TAPS = 4
-_REACH = 24  # knots after which an end is forgotten
+__all__ = ["FreeMotion"]
 
 
 @dataclass(frozen=True, eq=False)
-class FreeMotion(Vibration):
-    """A vibration with a free rest: ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t + a t^2 / 2 + R(t)``.
+class FreeMotion(Motion):
+    """A free spline with tones: ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t + a t^2 / 2 + R(t)``.
 
     ``R(t) = sum_n c_n B((t - start) / spacing - n + 1)`` is a cubic B-spline; before its first and after its last knot
-    it keeps its end values. Whatever takes a ``Vibration`` takes this, and the tones may be none.
+    it keeps its end values. It is accepted wherever a ``Vibration`` is accepted. ``amplitude``, ``frequency``,
+    ``period``, ``phase``, ``image_motion`` and ``image_acceleration`` are those of ``tones``.
 
     Args:
         coefficients: c in px, (2, N) or (..., 2, N), N >= 4, axes (x, y).
@@ -46,10 +46,11 @@ class FreeMotion(Vibration):
     coefficients: Tensor
     start: float
     spacing: float
+    tones: Vibration
 
     def __init__(self, coefficients: TensorLike, start: float, spacing: float, tones: Vibration | None = None) -> None:
         values = torch.as_tensor(coefficients, dtype=torch.float64)
-        if values.ndim < 2 or values.shape[-2] != 2 or values.shape[-1] < _TAPS:
+        if values.ndim < 2 or values.shape[-2] != 2 or values.shape[-1] < 4:
             raise ValueError(f"coefficients must have shape (..., 2, N) with N >= 4, got {tuple(values.shape)}")
         if not bool(torch.isfinite(values).all()):
             raise ValueError("coefficients must be finite")
@@ -58,10 +59,10 @@ class FreeMotion(Vibration):
             raise ValueError(
                 f"tones of batch shape {tuple(tones.batch_shape)} do not fit coefficients {tuple(values.shape)}"
             )
-        super().__init__(*(getattr(tones, name) for name in Vibration.__dataclass_fields__))
         object.__setattr__(self, "coefficients", values)
         object.__setattr__(self, "start", check_number("start", start))
         object.__setattr__(self, "spacing", check_number("spacing", spacing, above=0.0))
+        object.__setattr__(self, "tones", tones)
 
     @classmethod
     def through(cls, times: TensorLike, displacement: TensorLike, tones: Vibration | None = None) -> "FreeMotion":
@@ -72,23 +73,16 @@ class FreeMotion(Vibration):
         """
         grid = torch.as_tensor(times, dtype=torch.float64)
         values = torch.as_tensor(displacement, dtype=torch.float64)
-        if grid.ndim != 1 or len(grid) < _TAPS or values.shape != (len(grid), 2):
-            raise ValueError(
-                "times must be (N,) and displacement (N, 2) with N >= 4, got "
-                f"{tuple(grid.shape)}, {tuple(values.shape)}"
-            )
-        if not bool(torch.isfinite(values).all()):
-            raise ValueError("displacement must be finite")
+        _check_samples(grid, values)
         steps = grid.diff()
         spacing = float(steps.mean())
         if spacing <= 0 or float((steps - spacing).abs().amax()) > 1e-6 * spacing:
-            raise ValueError("times must be evenly spaced and increasing; FreeMotion.from_samples takes others")
-        # turned about its ends the curve goes on straight there: a natural spline
-        reach = min(_REACH, len(grid) - 1)
-        before = 2 * values[:1] - values[1 : reach + 1].flip(0)
-        after = 2 * values[-1:] - values[-reach - 1 : -1].flip(0)
-        whole = bspline_coefficients(torch.cat([before, values, after]).T, 3, -1)
-        return cls(whole[:, reach - 1 : reach + len(grid) + 1], float(grid[0]), spacing, tones)
+            raise ValueError("times must be evenly spaced and increasing; FreeMotion.from_samples accepts other times")
+        # point reflection at both ends makes the second derivative 0 there: a natural spline
+        before = 2 * values[:1] - values[1:].flip(0)
+        after = 2 * values[-1:] - values[:-1].flip(0)
+        coefficients = bspline_coefficients(torch.cat([before, values, after]).T, 3, -1)
+        return cls(coefficients[:, len(grid) - 2 : 2 * len(grid)], float(grid[0]), spacing, tones)
 
     @classmethod
     def from_samples(
@@ -109,36 +103,68 @@ class FreeMotion(Vibration):
         """
         from scipy.interpolate import CubicSpline  # noqa: PLC0415
 
-        grid = torch.as_tensor(times, dtype=torch.float64).cpu().numpy()
-        values = torch.as_tensor(displacement, dtype=torch.float64).cpu().numpy()
-        if grid.ndim != 1 or len(grid) < _TAPS or values.shape != (len(grid), 2):
-            raise ValueError(
-                f"times must be (N,) and displacement (N, 2) with N >= 4, got {grid.shape}, {values.shape}"
-            )
-        if not (np.isfinite(grid).all() and np.isfinite(values).all()):
-            raise ValueError("times and displacement must be finite")
-        if (np.diff(grid) <= 0).any():
+        grid = torch.as_tensor(times, dtype=torch.float64).cpu()
+        values = torch.as_tensor(displacement, dtype=torch.float64).cpu()
+        _check_samples(grid, values)
+        steps = np.diff(grid.numpy())
+        if (steps <= 0).any():
             raise ValueError("times must be strictly increasing")
-        step = 0.5 * float(np.median(np.diff(grid))) if spacing is None else check_number("spacing", spacing, above=0.0)
-        count = max(_TAPS, math.ceil((grid[-1] - grid[0]) / step) + 1)
-        even = np.linspace(grid[0], grid[-1], count)
-        return cls.through(torch.from_numpy(even), torch.from_numpy(CubicSpline(grid, values)(even)), tones)
+        step = 0.5 * float(np.median(steps)) if spacing is None else check_number("spacing", spacing, above=0.0)
+        first, last = float(grid[0]), float(grid[-1])
+        even = np.linspace(first, last, max(4, math.ceil((last - first) / step) + 1))
+        interpolated = CubicSpline(grid.numpy(), values.numpy())(even)
+        return cls.through(torch.from_numpy(even), torch.from_numpy(interpolated), tones)
 
     @classmethod
     def stacked(cls, motions: Sequence["FreeMotion"]) -> "FreeMotion":
-        """Motions of equal knots and equally many tones as a batch; its first dimension counts them."""
+        """Motions with the same knots and number of tones as a batch; the new dimension is the first."""
         first = motions[0]
         knots = {(m.start, m.spacing, m.coefficients.shape) for m in motions}
         if len(knots) > 1:
             raise ValueError(f"motions of different knots cannot be stacked: {sorted(knots)}")
-        fields = ([getattr(m, name) for m in motions] for name in Vibration.__dataclass_fields__)
+        fields = ([getattr(m.tones, name) for m in motions] for name in Vibration.__dataclass_fields__)
         tones = Vibration(*(torch.stack(values) for values in fields))
         return cls(torch.stack([m.coefficients for m in motions]), first.start, first.spacing, tones)
 
     @property
-    def tones(self) -> Vibration:
-        """Tones and image motion alone."""
-        return Vibration(*(getattr(self, name) for name in Vibration.__dataclass_fields__))
+    def batch_shape(self) -> torch.Size:
+        """Leading dimensions: empty for one motion, (B,) for a batch of stacks."""
+        return self.coefficients.shape[:-2]
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the parameters."""
+        return self.coefficients.device
+
+    @property
+    def amplitude(self) -> Tensor:
+        """Amplitude of the tones in px, (..., 2, K)."""
+        return self.tones.amplitude
+
+    @property
+    def frequency(self) -> Tensor:
+        """Frequency of the tones in Hz, (..., 2, K)."""
+        return self.tones.frequency
+
+    @property
+    def period(self) -> Tensor:
+        """Period of the tones in seconds, (..., 2, K)."""
+        return self.tones.period
+
+    @property
+    def phase(self) -> Tensor:
+        """Phase of the tones in rad, (..., 2, K)."""
+        return self.tones.phase
+
+    @property
+    def image_motion(self) -> Tensor:
+        """Velocity of the image motion in px/s, (..., 2)."""
+        return self.tones.image_motion
+
+    @property
+    def image_acceleration(self) -> Tensor:
+        """Acceleration of the image motion in px/s^2, (..., 2)."""
+        return self.tones.image_acceleration
 
     @property
     def end(self) -> float:
@@ -151,17 +177,12 @@ class FreeMotion(Vibration):
         count = self.coefficients.shape[-1]
         return self.start + self.spacing * (torch.arange(count, dtype=torch.float64, device=self.device) - 1.0)
 
-    def with_tones(self, tones: Vibration, signs: Sequence[float] = (1.0, 1.0), *, swap: bool = False) -> "FreeMotion":
-        """The same rest, with axes turned by ``signs`` or swapped, beside other tones."""
-        rest = self.coefficients * self.coefficients.new_tensor(signs)[:, None]
-        return FreeMotion(rest.flip(-2) if swap else rest, self.start, self.spacing, tones)
-
     def retimed(self, offset: float, scale: float = 1.0, gain: tuple[float, float] = (1.0, 1.0)) -> "FreeMotion":
-        """The motion of another clock: ``gain D(scale t + offset)`` at time t.
+        """The motion on another clock: ``gain D(scale t + offset)`` at time t.
 
         Args:
             offset: Reading of this motion's clock at time 0, in seconds.
-            scale: Seconds that pass on it in one second.
+            scale: Seconds that pass on this motion's clock in one second.
             gain: Factor of each axis (x, y), not negative where there are tones.
         """
         check_number("offset", offset)
@@ -178,13 +199,18 @@ class FreeMotion(Vibration):
         rest = (self.coefficients + moved[..., None]) * size[:, None]
         return FreeMotion(rest, (self.start - offset) / scale, self.spacing / scale, tones)
 
+    def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
+        """The motion whose component k is ``signs[k]`` (1 or -1) times component ``order[k]`` of this motion."""
+        coefficients = self.coefficients[..., list(order), :] * self.coefficients.new_tensor(signs)[:, None]
+        return type(self)(coefficients, self.start, self.spacing, self.tones.with_axes(order, signs))
+
     def _taps(self, times: Tensor) -> tuple[Tensor, Tensor]:
         """The four coefficients (S, 2, 4) about times S, and the fraction (S,) of a knot spacing."""
         batch = self.batch_shape
         knots = self.coefficients.shape[-1]
         place = ((times - self.start) / self.spacing).clamp(0.0, knots - 3.0)
         cell = place.detach().floor().clamp(max=knots - 4.0)
-        index = cell.to(torch.int64)[..., None] + torch.arange(_TAPS, device=times.device)
+        index = cell.to(torch.int64)[..., None] + torch.arange(4, device=times.device)
         if not batch:
             return self.coefficients.movedim(-2, -1)[index].movedim(-1, -2), place - cell
         index = index.expand(*batch, *index.shape[len(batch) :])
@@ -199,16 +225,25 @@ class FreeMotion(Vibration):
         value: Tensor = (taps * bspline_weights(fraction, 3)[..., None, :]).sum(-1)
         return value
 
+    def drift(self, times: Tensor) -> Tensor:
+        """Displacement of the image motion alone in px; arguments and shapes as in ``displacement``."""
+        return self.tones.drift(times)
+
     def displacement(self, times: Tensor) -> Tensor:
         """Displacement D(t) in px; arguments and shapes as in ``Vibration.displacement``."""
-        return super().displacement(times) + self.rest(times)
+        return self.tones.displacement(times) + self.rest(times)
 
-    def mean_displacement(self, starts: Tensor, exposure_time: float) -> Tensor:
-        """Mean displacement over exposures in px; arguments and shapes as in ``Vibration.mean_displacement``."""
+    def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
+        """Mean displacement over exposures in px; arguments and shapes as in ``Vibration.mean_displacement``.
+
+        The spline is integrated with Gauss-Legendre nodes: exactly within a knot spacing, closely beyond.
+        """
         starts = starts.to(dtype=torch.float64, device=self.device)
-        mean = super().mean_displacement(starts, exposure_time)
-        for node, weight in zip(*_nodes(exposure_time, self.spacing), strict=True):
-            mean = mean + weight * self.rest(starts + node)
+        mean = self.tones.mean_displacement(starts, exposure_time)
+        longest = float(exposure_time.amax()) if isinstance(exposure_time, Tensor) else exposure_time
+        nodes, weights = gauss_legendre(3 + math.ceil(2 * longest / self.spacing))
+        for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
+            mean = mean + weight * self.rest(starts + node * exposure_time)
         return mean
 
     def velocity(self, times: Tensor) -> Tensor:
@@ -221,45 +256,28 @@ class FreeMotion(Vibration):
         )
         inside = ((times > self.start) & (times < self.end))[..., None]
         moving = (taps.diff(dim=-1) * slopes[..., None, :]).sum(-1) / self.spacing
-        return super().velocity(times) + torch.where(inside, moving, 0.0)
+        return self.tones.velocity(times) + torch.where(inside, moving, 0.0)
 
-    def largest_displacement(self, first: float, last: float) -> Tensor:
-        """Bound on |D(t)| for ``first <= t <= last``, (..., 2), in px."""
-        return super().largest_displacement(first, last) + rest_reach(self)
+    def largest_oscillation(self) -> Tensor:
+        """Bound on the tones and the spline, (..., 2), in px: the sum of amplitudes and the largest coefficient."""
+        return self.tones.largest_oscillation() + self.coefficients.detach().abs().amax(-1)
 
-    def displacement_within_row_time(self, row_time: float) -> Tensor:
-        """Largest displacement within one row time, (..., 2), in px (Eq. 24)."""
-        return super().displacement_within_row_time(row_time) + rest_path(self, row_time)
+    def displacement_within(self, duration: float) -> Tensor:
+        """Bound on the path of the image within ``duration`` seconds, (..., 2), in px."""
+        speed = self.coefficients.detach().diff(dim=-1).abs().amax(-1) / self.spacing
+        return self.tones.displacement_within(duration) + speed * duration
 
-
-def _nodes(exposure_time: float, spacing: float) -> tuple[list[float], list[float]]:
-    """Gauss-Legendre nodes over an exposure and their weights: exact within a knot spacing, close beyond."""
-    count = 3 + math.ceil(2 * exposure_time / spacing)
-    nodes, weights = gauss_legendre(count)
-    return (nodes * exposure_time).tolist(), weights.tolist()
+    def periods_within(self, duration: float) -> Tensor:
+        """Periods of the fastest tone in ``duration`` seconds, (..., 2)."""
+        return self.tones.periods_within(duration)
 
 
-def rest_reach(vibration: Vibration) -> Tensor:
-    """Bound (..., 2) in px on the free rest of a motion; 0 for a vibration that has none."""
-    if not isinstance(vibration, FreeMotion):
-        return torch.zeros_like(vibration.image_motion)
-    return vibration.coefficients.detach().abs().amax(-1)
-
-
-def moving_axes(vibration: Vibration) -> Tensor:
-    """Which axes (..., 2) a motion moves at all: by tones, uniform or accelerated motion, or a free rest.
-
-    Example:
-        >>> moving_axes(Vibration([2.0, 0.0], [50.0, 0.0], image_acceleration=[0.0, 3.0])).tolist()
-        [True, True]
-    """
-    tones = (vibration.amplitude > 0).any(-1)
-    return tones | (vibration.image_motion != 0) | (vibration.image_acceleration != 0) | (rest_reach(vibration) > 0)
-
-
-def rest_path(vibration: Vibration, duration: float) -> Tensor:
-    """Bound (..., 2) in px on how far the free rest of a motion moves within ``duration`` seconds."""
-    if not isinstance(vibration, FreeMotion):
-        return torch.zeros_like(vibration.image_motion)
-    speed = vibration.coefficients.detach().diff(dim=-1).abs().amax(-1) / vibration.spacing
-    return speed * duration
+def _check_samples(times: Tensor, displacement: Tensor) -> None:
+    """Raise a ValueError unless times are (N,), displacements (N, 2), N >= 4, and all values finite."""
+    if times.ndim != 1 or len(times) < 4 or displacement.shape != (len(times), 2):
+        raise ValueError(
+            "times must be (N,) and displacement (N, 2) with N >= 4, got "
+            f"{tuple(times.shape)}, {tuple(displacement.shape)}"
+        )
+    if not bool(torch.isfinite(times).all() and torch.isfinite(displacement).all()):
+        raise ValueError("times and displacement must be finite")

@@ -1,26 +1,23 @@
-"""The vibration model: displacement, mean displacement over an exposure, offset between frames."""
+"""Sinusoidal vibration with an image motion (Eqs. 1-8 and 24 of Liu et al. 2023)."""
 
 import math
-from collections.abc import Callable, Sequence
-from copy import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import torch
 from torch import Tensor
 
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 
 __all__ = ["Vibration", "VibrationStd", "blind_frequencies"]
 
 TensorLike = Tensor | float | Sequence[float] | Sequence[Sequence[float]]
 
-_SAME_PLACE = 1e-6  # of a turn
-_NOT_NEGATIVE = ("amplitude", "frequency")
 
-
-def _tones(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
-    """Turn a float, (2,), (2, K) or (..., 2, K) value into a (..., 2, K) float64 tensor."""
+def _per_tone(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
+    """Convert a float, (2,), (2, K) or (..., 2, K) value to a (..., 2, K) float64 tensor."""
     tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
     if tensor.ndim == 0:
         tensor = tensor.expand(2)
@@ -33,8 +30,8 @@ def _tones(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
     return tensor
 
 
-def _of_axes(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
-    """Turn a float, (2,) or (..., 2) value into a (..., 2) float64 tensor."""
+def _per_axis(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
+    """Convert a float, (2,) or (..., 2) value to a (..., 2) float64 tensor."""
     tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
     tensor = tensor.expand(2) if tensor.ndim == 0 else tensor
     if tensor.shape[-1] != 2:
@@ -42,31 +39,37 @@ def _of_axes(name: str, value: TensorLike, device: torch.device | None) -> Tenso
     return tensor
 
 
+def _with_trailing(value: float | Tensor, dimensions: int) -> float | Tensor:
+    """A number as it is, a tensor (S) with trailing dimensions of size 1."""
+    return value[(..., *(None,) * dimensions)] if isinstance(value, Tensor) else value
+
+
 def _check_values(values: dict[str, Tensor]) -> None:
-    """Raise ValueError for values that are not finite, or negative where they must not be."""
+    """Raise a ValueError for values that are not finite, and for negative amplitudes or frequencies."""
+    not_negative = ("amplitude", "frequency")
     wrong = [~torch.isfinite(tensor).all() for tensor in values.values()]
-    wrong += [(values[name] < 0).any() for name in _NOT_NEGATIVE]
-    if not bool(torch.stack(wrong).any()):  # a device is waited for once
+    wrong += [(values[name] < 0).any() for name in not_negative]
+    if not bool(torch.stack(wrong).any()):  # synchronises the device only once
         return
     for name, tensor in values.items():
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{name} must be finite")
-    for name in _NOT_NEGATIVE:
+    for name in not_negative:
         if bool((values[name] < 0).any()):
             raise ValueError(f"{name} must not be negative, got {values[name].min().item():g}")
 
 
 @dataclass(frozen=True, eq=False)
-class Vibration:
+class Vibration(Motion):
     """Sinusoidal displacement of the image on the sensor, with an image motion.
 
     ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t + a t^2 / 2`` per axis (Eq. 1 of Liu et al. 2023, several tones,
     Sec. 2.3; the paper's image motion is uniform, a = 0): scene content at ``s`` appears at ``s + D(t)``. Axes are
-    ordered (x, y). Tones are kept sorted by amplitude, largest first; an axis with fewer tones than the other has
-    amplitude 0 in the rest.
+    ordered (x, y). Tones are sorted by amplitude, largest first; an axis with fewer tones than the other has
+    amplitude 0 for the remaining ones.
 
     Args:
-        amplitude: A >= 0 in px: a float, ``(2,)`` (one tone an axis), ``(2, K)`` or ``(..., 2, K)`` for a batch.
+        amplitude: A >= 0 in px: a float, ``(2,)`` (one tone per axis), ``(2, K)`` or ``(..., 2, K)`` for a batch.
         frequency: f >= 0 in Hz, same shape.
         phase: phi in rad at the time origin (exposure start of the first row of frame 0), same shape.
         image_motion: v in px/s at the time origin, ``(2,)`` or ``(..., 2)``.
@@ -100,11 +103,11 @@ class Vibration:
         given = (amplitude, frequency, phase, image_motion, image_acceleration)
         device = next((value.device for value in given if isinstance(value, Tensor)), None)
         tones = [
-            _tones(name, value, device)
+            _per_tone(name, value, device)
             for name, value in (("amplitude", amplitude), ("frequency", frequency), ("phase", phase))
         ]
-        motion = _of_axes("image_motion", image_motion, device)
-        acceleration = _of_axes("image_acceleration", image_acceleration, device)
+        motion = _per_axis("image_motion", image_motion, device)
+        acceleration = _per_axis("image_acceleration", image_acceleration, device)
         try:
             tones = list(torch.broadcast_tensors(*tones))
             batch = torch.broadcast_shapes(tones[0].shape[:-2], motion.shape[:-1], acceleration.shape[:-1])
@@ -119,10 +122,11 @@ class Vibration:
         object.__setattr__(self, "image_motion", motion.expand(*batch, 2))
         object.__setattr__(self, "image_acceleration", acceleration.expand(*batch, 2))
 
-    @property
-    def period(self) -> Tensor:
-        """Period T = 1/f in seconds, (..., 2, K); infinite where the frequency is 0."""
-        return 1.0 / self.frequency
+    @classmethod
+    def still(cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None) -> Self:
+        """No vibration and no image motion: the camera stands still."""
+        zeros = torch.zeros(*batch_shape, 2, 1, dtype=torch.float64, device=device)
+        return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0])
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -134,43 +138,13 @@ class Vibration:
         """Device of the parameters."""
         return self.amplitude.device
 
-    def mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
-        """The same motion with every parameter put through a function that leaves its values as they are.
-
-        Nothing is checked anew: a device need not be waited for.
-        """
-        result = copy(self)
-        for name, value in vars(self).items():
-            if isinstance(value, Tensor):
-                object.__setattr__(result, name, function(value))
-        return result
-
-    def to(self, device: torch.device | str) -> Self:
-        """The same motion on another device."""
-        return self.mapped(lambda values: values.to(device))
-
-    def detached(self) -> Self:
-        """The same motion without gradients."""
-        return self.mapped(Tensor.detach)
-
-    def expanded(self, size: int) -> Self:
-        """The same motion as a batch of ``size`` equal ones, whose dimension leads."""
-        return self.mapped(lambda values: values.expand(size, *values.shape))
-
-    def __getitem__(self, index: int) -> Self:
-        """One motion out of a batch."""
-        if not self.batch_shape:
-            raise IndexError("this vibration is not a batch")
-        return self.mapped(lambda values: values[index])
-
-    @classmethod
-    def still(cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None) -> Self:
-        """No vibration and no image motion: the camera stands still."""
-        zeros = torch.zeros(*batch_shape, 2, 1, dtype=torch.float64, device=device)
-        return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0])
+    @property
+    def period(self) -> Tensor:
+        """Period T = 1/f in seconds, (..., 2, K); infinite where the frequency is 0."""
+        return 1.0 / self.frequency
 
     def _angle(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Tone angles (..., S, 2, K) with amplitude and frequency shaped to match, for times (..., S)."""
+        """Angles (S, 2, K) of the tones at times S, with amplitude and frequency reshaped to broadcast with them."""
         steps = times.ndim - len(self.batch_shape)
         if steps < 0:
             raise ValueError(
@@ -180,16 +154,16 @@ class Vibration:
         amplitude, frequency, phase = (t.reshape(shape) for t in (self.amplitude, self.frequency, self.phase))
         return 2 * math.pi * frequency * times[..., None, None] + phase, amplitude, frequency
 
+    def _image_motion(self, times: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocity and acceleration (S, 2) of the image motion at the time origin, to broadcast with times (S, 1)."""
+        shape = (*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), 2)
+        return self.image_motion.reshape(shape), self.image_acceleration.reshape(shape)
+
     def drift(self, times: Tensor) -> Tensor:
         """Displacement v t + a t^2 / 2 of the image motion alone in px; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)[..., None]
-        return (
-            self._per_axis(self.image_motion, times) + 0.5 * self._per_axis(self.image_acceleration, times) * times
-        ) * times
-
-    def _per_axis(self, values: Tensor, times: Tensor) -> Tensor:
-        """(..., 2) values shaped to match times (..., S, 1)."""
-        return values.reshape(*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), 2)
+        velocity, acceleration = self._image_motion(times)
+        return (velocity + 0.5 * acceleration * times) * times
 
     def displacement(self, times: Tensor) -> Tensor:
         """Displacement D(t) in px (Eq. 1).
@@ -204,45 +178,32 @@ class Vibration:
         angle, amplitude, _ = self._angle(times)
         return (amplitude * angle.sin()).sum(-1) + self.drift(times)
 
-    def mean_displacement(self, starts: Tensor, exposure_time: float) -> Tensor:
+    def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
         """Mean displacement over exposures [start, start + T_e] in px (Eq. 2).
 
         A tone keeps its angle at mid-exposure and is attenuated by sinc(f T_e).
 
         Args:
             starts: Exposure starts in seconds, any shape S (batch dimensions lead as in ``displacement``).
-            exposure_time: T_e in seconds.
+            exposure_time: T_e in seconds, a number or a tensor that broadcasts against ``starts``.
 
         Returns:
             float64 tensor of shape (S, 2), axes (x, y).
         """
         middle = starts.to(dtype=torch.float64, device=self.device) + 0.5 * exposure_time
         angle, amplitude, frequency = self._angle(middle)
-        bend = self._per_axis(self.image_acceleration, middle[..., None]) * (exposure_time**2 / 24.0)
-        return (amplitude * torch.sinc(frequency * exposure_time) * angle.sin()).sum(-1) + self.drift(middle) + bend
-
-    def offset(self, starts: Tensor, later_starts: Tensor, exposure_time: float) -> Tensor:
-        """Offset: mean displacement of the later exposure minus that of the earlier one, in px (Eq. 4).
-
-        Eq. (4) as printed gives this sign on its right-hand side, and the opposite one on its left-hand side.
-
-        Args:
-            starts: Exposure starts in frame p, seconds, shape S.
-            later_starts: Exposure starts of the same scene rows in frame p + 1, shape S.
-            exposure_time: T_e in seconds.
-
-        Returns:
-            float64 tensor of shape (S, 2), axes (x, y).
-        """
-        return self.mean_displacement(later_starts, exposure_time) - self.mean_displacement(starts, exposure_time)
+        attenuation = torch.sinc(frequency * _with_trailing(exposure_time, 2))
+        _, acceleration = self._image_motion(middle[..., None])
+        curvature = acceleration * (_with_trailing(exposure_time, 1) ** 2 / 24.0)
+        return (amplitude * attenuation * angle.sin()).sum(-1) + self.drift(middle) + curvature
 
     def velocity(self, times: Tensor) -> Tensor:
         """Velocity dD/dt in px/s; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
         angle, amplitude, frequency = self._angle(times)
-        span = times[..., None]
-        drift = self._per_axis(self.image_motion, span) + self._per_axis(self.image_acceleration, span) * span
-        return (2 * math.pi * frequency * amplitude * angle.cos()).sum(-1) + drift
+        velocity, acceleration = self._image_motion(times[..., None])
+        oscillation = (2 * math.pi * frequency * amplitude * angle.cos()).sum(-1)
+        return oscillation + velocity + acceleration * times[..., None]
 
     def gain(self, interval: float) -> Tensor:
         """Gain 2 sin(pi f m T_row) from displacement to offset over ``interval`` seconds (Eq. 7), (..., 2, K).
@@ -251,22 +212,40 @@ class Vibration:
         """
         return 2.0 * torch.sin(math.pi * self.frequency * interval)
 
-    def largest_displacement(self, first: float, last: float) -> Tensor:
-        """Bound on |D(t)| for ``first <= t <= last``, (..., 2), in px."""
-        longest = max(abs(first), abs(last))
-        return (
-            self.amplitude.sum(-1)
-            + self.image_motion.abs() * longest
-            + 0.5 * self.image_acceleration.abs() * longest**2
-        )
+    def largest_oscillation(self) -> Tensor:
+        """Sum of the amplitudes of the tones, (..., 2), in px."""
+        return self.amplitude.detach().sum(-1)
 
-    def displacement_within_row_time(self, row_time: float) -> Tensor:
-        """Largest displacement within one row time, (..., 2), in px (Eq. 24, summed over tones, with motion).
+    def displacement_within(self, duration: float) -> Tensor:
+        """Bound on the path of the image within ``duration`` seconds, (..., 2), in px (Eq. 24, summed over tones).
 
-        Condition (24): the discrete point spread function of Eqs. (25)-(39) wants this below 0.1 px.
+        Condition (24): the discrete point spread function of Eqs. (25)-(39) requires less than 0.1 px in a row time.
         """
-        step = 2.0 * self.amplitude * torch.sin(math.pi * (self.frequency * row_time).clamp(max=0.5))
-        return step.sum(-1) + self.image_motion.abs() * row_time
+        cycles = self.frequency.detach() * duration
+        path = torch.where(cycles < 0.5, 2.0 * torch.sin(math.pi * cycles), 4.0 * cycles)
+        return (self.amplitude.detach() * path).sum(-1) + self.image_motion.detach().abs() * duration
+
+    def periods_within(self, duration: float) -> Tensor:
+        """Periods of the fastest tone in ``duration`` seconds, (..., 2); tones below 1e-4 px do not count."""
+        visible = self.amplitude.detach() > 1e-4
+        return torch.where(visible, self.frequency.detach() * duration, 0.0).amax(-1)
+
+    def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
+        """The vibration whose component k is ``signs[k]`` times component ``order[k]`` of this one.
+
+        A negative sign changes the phase by pi and returns it in [-pi, pi); amplitudes stay positive.
+        """
+        sign = torch.tensor(signs, dtype=torch.float64, device=self.device)
+        axes = list(order)
+        phase = self.phase[..., axes, :]
+        opposite = torch.remainder(phase + 2 * math.pi, 2 * math.pi) - math.pi
+        return type(self)(
+            self.amplitude[..., axes, :],
+            self.frequency[..., axes, :],
+            torch.where(sign[:, None] < 0, opposite, phase),
+            self.image_motion[..., axes] * sign,
+            self.image_acceleration[..., axes] * sign,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,16 +260,16 @@ class VibrationStd:
     image_acceleration: Tensor
 
     def __getitem__(self, index: int) -> "VibrationStd":
-        """The standard deviations of one stack out of a batch."""
+        """The standard deviations of one stack of a batch."""
         return VibrationStd(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
 def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
-    """Frequencies up to ``highest`` Hz that the frames cannot see.
+    """Frequencies up to ``highest`` Hz that cannot be measured from the frames.
 
     ``j / (m T_row)``: every frame is displaced alike (the gain of Eq. 7 is zero). ``j / T_e``: the exposure averages
-    the tone out (the sinc of Eq. 2 is zero). With frame start times of its own, a camera is blind to what returns in
-    all of its frames; a pair, to ``j`` over the time between the two.
+    the tone out (the sinc of Eq. 2 is zero). With individual frame start times, only frequencies for which all frames
+    are displaced alike are blind; for two frames, ``j`` over the time between them.
 
     Returns:
         Sorted float64 tensor.
@@ -307,7 +286,7 @@ def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
         return torch.arange(1, math.floor(highest * interval) + 1, dtype=torch.float64) / interval
 
     alike = multiples(float(intervals[0])) if len(intervals) else starts[:0]
-    turns = alike[:, None] * intervals
-    alike = alike[((turns - turns.round()).abs() < _SAME_PLACE).all(-1)]
+    cycles = alike[:, None] * intervals
+    alike = alike[((cycles - cycles.round()).abs() < 1e-6).all(-1)]  # whole cycles to the rounding of the start times
     frequencies: Tensor = torch.cat([alike, multiples(timing.exposure_time)]).unique(sorted=True)
     return frequencies

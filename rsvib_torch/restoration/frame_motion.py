@@ -7,11 +7,10 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order, vibration_to_row_order
+from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
 from rsvib_torch.imaging.coupling import rows_showing
-from rsvib_torch.motion.spline import rest_reach
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["FrameMotion", "frame_motion", "visible_pixels"]
 
@@ -30,7 +29,7 @@ class FrameMotion:
         shift: (B, T, 2) whole px, axes (x, y), float64.
     """
 
-    vibration: Vibration
+    vibration: Motion
     timing: RowTiming
     frame_starts: Tensor
     shift: Tensor
@@ -44,10 +43,12 @@ class FrameMotion:
     def reaches(self, num_rows: int) -> list[int]:
         """For each stack, a bound on the displacement along one of ``num_rows`` rows, beyond the shift, in whole px."""
         half = 0.5 * (num_rows * self.timing.row_time + self.timing.exposure_time)
-        swing = (self.vibration.amplitude.detach().sum(-1) + rest_reach(self.vibration))[:, None]
-        acceleration = self.vibration.image_acceleration.detach()[:, None]
-        speed = self.vibration.image_motion.detach()[:, None] + acceleration * (self.frame_starts + half)[:, None]
-        bound = swing + speed.abs() * half + 0.5 * acceleration.abs() * half**2
+        first, middle, last = (
+            self.vibration.drift((self.frame_starts + delay).expand(len(self.shift), -1)).detach()
+            for delay in (0.0, half, 2 * half)
+        )
+        drift = torch.maximum((first - middle).abs(), (last - middle).abs())
+        bound = self.vibration.largest_oscillation()[:, None] + drift
         return [math.ceil(reach + 0.5) for reach in bound[..., 0].amax(1).tolist()]
 
     def reach(self, num_rows: int) -> int:
@@ -59,16 +60,16 @@ class FrameMotion:
         return self.frame_starts[:, None] + frame_rows * self.timing.row_time
 
 
-def frame_motion(vibration: Vibration, timing: RowTiming, num_frames: int, num_rows: int) -> FrameMotion:
+def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows: int) -> FrameMotion:
     """Motion of ``num_frames`` frames of ``num_rows`` rows for a vibration of batch shape (B,) in row order."""
     starts = timing.frame_starts(num_frames, vibration.device)
     middle = starts + 0.5 * ((num_rows - 1) * timing.row_time + timing.exposure_time)
-    shift = vibration.drift(middle.expand(len(vibration.amplitude), -1)).detach().round()
+    shift = vibration.drift(middle.expand(*vibration.batch_shape, -1)).detach().round()
     return FrameMotion(vibration, timing, starts, shift)
 
 
 def visible_pixels(
-    timing: SensorTiming, vibration: Vibration, size: tuple[int, int], num_frames: int
+    timing: SensorTiming, vibration: Motion, size: tuple[int, int], num_frames: int
 ) -> tuple[Tensor, Tensor]:
     """Pixels of the restored frames that the frames really show, and where the restored frames look.
 
@@ -85,6 +86,7 @@ def visible_pixels(
         content of the scene at rest is moved in each restored frame (zero without image motion).
 
     Example:
+        >>> from rsvib_torch import Vibration
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
         >>> mask, shift = visible_pixels(timing, Vibration(2.0, 50.0), (512, 64), 2)
         >>> mask.shape, mask[:, 4:-4, 4:-4].all().item(), mask.all().item()
@@ -93,7 +95,7 @@ def visible_pixels(
     check_whole_number("num_frames", num_frames, at_least=1)
     height, width = size if timing.scan_axis == -2 else (size[1], size[0])
     batch = vibration.batch_shape
-    rowwise = vibration_to_row_order(vibration, timing)
+    rowwise = vibration.to_row_order(timing)
     rowwise = rowwise if batch else rowwise.expanded(1)
     motion = frame_motion(rowwise, timing.in_row_order(), num_frames, height)
     rows = motion.frame_rows(torch.arange(height, dtype=torch.float64, device=vibration.device))

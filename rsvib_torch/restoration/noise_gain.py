@@ -7,8 +7,8 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.restoration.noise.single_frame import estimate_noise
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
@@ -22,7 +22,7 @@ _QUIETEST = 1e-4  # of full scale; below, rounding would be measured
 def predict_noise_gain(
     frames: Tensor,
     timing: SensorTiming,
-    vibration: Vibration | Detected,
+    vibration: Motion | Detected,
     *,
     method: str = "exact",
     columns: int = 256,
@@ -48,6 +48,7 @@ def predict_noise_gain(
         Scalar, float64.
 
     Example:
+        >>> from rsvib_torch import Vibration
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
         >>> frames = torch.rand(1, 96, 96, generator=torch.Generator().manual_seed(0))
         >>> round(predict_noise_gain(frames, timing, Vibration.still(), method="dewarp").item(), 1)

@@ -10,11 +10,9 @@ from torch import Tensor, nn
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.frames.arrays import ArrayLike
-from rsvib_torch.frames.orientation import vibration_to_row_order
 from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
-from rsvib_torch.motion.spline import moving_axes
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact.exact import restore_exact
@@ -76,7 +74,7 @@ def _method_input(frames: PreparedFrames, method: str, options: dict[str, Any]) 
 def restore(
     frames: ArrayLike,
     timing: SensorTiming,
-    vibration: Vibration | Detected,
+    vibration: Motion | Detected,
     *,
     method: str = "exact",
     full_scale: float | None = None,
@@ -126,6 +124,7 @@ def restore(
         RestorationWarning: If an axis is left alone, or the restored frames are no better than the raw ones.
 
     Example:
+        >>> from rsvib_torch import Vibration
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
         >>> round(restore(torch.full((2, 64, 48), 0.5), timing, Vibration(2.0, 50.0)).mean().item(), 5)
         0.5
@@ -146,7 +145,7 @@ def restore(
 @outside_graphs
 @full_precision
 def restore_prepared(
-    frames: PreparedFrames, vibration: Vibration, method: str = "exact", options: Mapping[str, Any] | None = None
+    frames: PreparedFrames, vibration: Motion, method: str = "exact", options: Mapping[str, Any] | None = None
 ) -> Tensor:
     """``restore`` of frames that are already prepared, without a check of the result.
 
@@ -167,7 +166,7 @@ def restore_prepared(
     return METHODS[method](images, frame_motion(motion, frames.timing, images.shape[1], images.shape[-2]), **chosen)
 
 
-def _motion_in_row_order(frames: PreparedFrames, vibration: Vibration) -> Vibration:
+def _motion_in_row_order(frames: PreparedFrames, vibration: Motion) -> Motion:
     """The vibration in row order on the frames' device, batch shape (B,).
 
     Raises:
@@ -179,11 +178,11 @@ def _motion_in_row_order(frames: PreparedFrames, vibration: Vibration) -> Vibrat
             f"vibration of batch shape {tuple(vibration.batch_shape)} does not fit frames of shape {frames.shape}; "
             "one vibration, or one per stack of a (B, T, C, H, W) batch"
         )
-    motion = vibration_to_row_order(vibration, frames.image_timing).to(frames.images.device)
+    motion = vibration.to_row_order(frames.image_timing).to(frames.images.device)
     return motion if motion.batch_shape else motion.expanded(batch)
 
 
-def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Vibration, joint: bool | int) -> None:
+def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Motion, joint: bool | int) -> None:
     """Judge each stack of a batch on a strip of columns of a few pairs of frames."""
     raw = frames.filled.detach()
     count = raw.shape[1]
@@ -194,7 +193,7 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Vibratio
     shared = count if joint is True else max(int(joint), 1)
     for stack in range(len(raw)):
         still = motion[stack].detached()
-        if not bool(moving_axes(still).any()):
+        if not bool(still.moving_axes().any()):
             continue
         try:
             verdict = judge_frames(
@@ -251,6 +250,6 @@ class VibrationRestorer(nn.Module):
             **options,
         }
 
-    def forward(self, frames: Tensor, vibration: Vibration | Detected, ignore: Tensor | None = None) -> Tensor:
+    def forward(self, frames: Tensor, vibration: Motion | Detected, ignore: Tensor | None = None) -> Tensor:
         """Restore a stack of frames."""
         return restore(frames, self.timing, vibration, ignore=ignore, **self.options)

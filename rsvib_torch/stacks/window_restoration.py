@@ -8,7 +8,6 @@ from typing import Any
 from torch import Tensor
 
 from rsvib_torch.frames.prepare import prepare_frames
-from rsvib_torch.motion.spline import moving_axes
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError, trusted_vibration
 from rsvib_torch.restoration.restore import restore_prepared
@@ -64,7 +63,7 @@ def restore_trusted(
     rows = frames.shape[-1 if timing.scan_axis == -1 else -2]
     vibration, left_alone = trusted_vibration(detected, timing, len(frames), rows)
     frames = frames if first_frames is None else frames[:first_frames]
-    if not bool(moving_axes(vibration).any()):
+    if not bool(vibration.moving_axes().any()):
         return RestoredFrames(frames, False, left_alone, None, False)
     chosen = {name: value for name, value in options.items() if name not in ("method", "saturation")}
     prepared = prepare_frames(frames, timing, saturation=options.get("saturation", "auto"))

@@ -9,8 +9,6 @@ from rsvib_torch.frames.orientation import (
     frames_from_row_order,
     frames_to_row_order,
     offsets_from_row_order,
-    vibration_from_row_order,
-    vibration_to_row_order,
 )
 from rsvib_torch.frames.prepare import as_float_frames
 
@@ -47,20 +45,20 @@ def test_displacements_turn_with_the_frames(scan_axis, direction):
         in_rows = (after - before).flip(-1).double()
         assert offsets_from_row_order(in_rows, camera).tolist() == [x, y]
         constant = Vibration(0.0, 0.0, image_motion=[float(x), float(y)])
-        assert vibration_to_row_order(constant, camera).image_motion.tolist() == in_rows.tolist()
+        assert constant.to_row_order(camera).image_motion.tolist() == in_rows.tolist()
 
 
 @pytest.mark.parametrize(("scan_axis", "direction"), ORIENTATIONS)
 def test_vibration_and_offsets_agree(scan_axis, direction):
     camera = timing(scan_axis, direction)
     times = torch.linspace(0, 0.1, 33, dtype=torch.float64)
-    turned = vibration_to_row_order(VIBRATION, camera)
+    turned = VIBRATION.to_row_order(camera)
     torch.testing.assert_close(
         offsets_from_row_order(turned.displacement(times), camera), VIBRATION.displacement(times), rtol=0, atol=1e-12
     )
     if (scan_axis, direction) != (-2, "forward"):
         assert (turned.displacement(times) - VIBRATION.displacement(times)).abs().max() > 1.0
-    back = vibration_from_row_order(turned, camera)
+    back = turned.from_row_order(camera)
     for name in ("amplitude", "frequency", "phase", "image_motion"):
         torch.testing.assert_close(getattr(back, name), getattr(VIBRATION, name), rtol=0, atol=1e-12)
     assert bool((turned.amplitude >= 0).all())

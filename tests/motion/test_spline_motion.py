@@ -7,7 +7,6 @@ from scipy.interpolate import CubicSpline
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.frames.orientation import vibration_from_row_order, vibration_to_row_order
 from rsvib_torch.motion.spline import FreeMotion
 
 TIMES = np.arange(0, 0.2, 1e-3)
@@ -72,8 +71,7 @@ def test_tones_add_to_the_rest():
     assert torch.allclose(whole.velocity(times), motion().velocity(times) + tones.velocity(times))
     assert (whole.largest_displacement(0, 0.19) >= whole.displacement(times).abs().amax(0)).all()
     assert (
-        whole.displacement_within_row_time(1e-3)
-        >= whole.displacement(times + 1e-3).sub(whole.displacement(times)).abs().amax(0)
+        whole.displacement_within(1e-3) >= whole.displacement(times + 1e-3).sub(whole.displacement(times)).abs().amax(0)
     ).all()
 
 
@@ -90,13 +88,13 @@ def test_orientation_is_undone(scan_axis, direction):
     timing = rsv.SensorTiming(4e-5, 40, 400, scan_axis=scan_axis, readout_direction=direction)
     tones = rsv.Vibration([1.0, 0.5], [70.0, 90.0])
     whole = FreeMotion.through(TIMES, PATH, tones)
-    turned = vibration_to_row_order(whole, timing)
+    turned = whole.to_row_order(timing)
     times = torch.linspace(0, 0.19, 30, dtype=torch.float64)
     expected = whole.displacement(times)
     expected = expected.flip(-1) if scan_axis == -1 else expected
     expected = expected * torch.tensor([1.0, -1.0]) if direction == "reverse" else expected
     assert torch.allclose(turned.displacement(times), expected)
-    assert torch.allclose(vibration_from_row_order(turned, timing).displacement(times), whole.displacement(times))
+    assert torch.allclose(turned.from_row_order(timing).displacement(times), whole.displacement(times))
 
 
 class Free(Motion):

@@ -84,6 +84,6 @@ def test_equation_24(amplitude, frequency, phase):
     step = np.sin(2 * np.pi * frequency * (times + CAMERA.row_time) + phase) - np.sin(
         2 * np.pi * frequency * times + phase
     )
-    largest = Vibration(amplitude, frequency, phase).displacement_within_row_time(CAMERA.row_time)
+    largest = Vibration(amplitude, frequency, phase).displacement_within(CAMERA.row_time)
     assert largest.tolist() == pytest.approx([amplitude * np.abs(step).max()] * 2, rel=1e-6)
     assert bool((largest < 0.1).all())

@@ -15,7 +15,6 @@ from rsvib_torch.detection.rows.residuals import independent_fraction, unexplain
 from rsvib_torch.detection.rows.row_groups import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import start_curve
 from rsvib_torch.frames.arrays import ArrayLike
-from rsvib_torch.frames.orientation import vibration_to_row_order
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
@@ -137,9 +136,7 @@ def align_motion(
     grey = stack.images
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     rowwise, curve, (first, last) = start_curve(stack, timing, bands)
-    turned = vibration_to_row_order(recorded, timing)
-    assert isinstance(turned, FreeMotion)
-    turned = turned.to(grey.device)
+    turned = recorded.to_row_order(timing).to(grey.device)
     low, high = _offsets(turned, first, last, offsets)
     measured = measurements_of_curve(curve, rowwise, bands.band_step)
     offset, other = _best_offset(measured, turned, low, high, rowwise)

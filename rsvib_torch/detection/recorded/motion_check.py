@@ -12,9 +12,9 @@ from rsvib_torch.detection.grey_frames import grey_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.shapes.free import start_curve
 from rsvib_torch.frames.arrays import ArrayLike
-from rsvib_torch.frames.orientation import offsets_from_row_order, vibration_to_row_order
+from rsvib_torch.frames.orientation import offsets_from_row_order
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration import Registration, RegistrationOptions
 
 __all__ = ["MotionCheck", "check_motion"]
@@ -48,7 +48,7 @@ class MotionCheck:
 def check_motion(
     frames: ArrayLike,
     timing: SensorTiming,
-    motion: Vibration,
+    motion: Motion,
     *,
     registration: Registration = "ncc",
     band_rows: int = 32,
@@ -84,7 +84,7 @@ def check_motion(
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     rowwise, curve, _ = start_curve(stack, timing, bands)
     measured = measurements_of_curve(curve, rowwise, band_step)
-    turned = vibration_to_row_order(motion.to(stack.images.device), timing)
+    turned = motion.to(stack.images.device).to_row_order(timing)
     offsets = _offsets(measured.displacements)
     left = offsets - _offsets(_averaged(turned, measured))
     known = measured.weights[0].amin(-1) > 0
@@ -107,7 +107,7 @@ def _offsets(displacements: Tensor) -> Tensor:
     return displacements[0, :, 1] - displacements[0, :, 0]
 
 
-def _averaged(motion: Vibration, measured: Measurements) -> Tensor:
+def _averaged(motion: Motion, measured: Measurements) -> Tensor:
     """Mean displacement (1, N, 2, 2) over exposure and rows of the bands."""
     duration = measured.average_times[1]
     places = [0.5 * duration * math.sqrt(0.6) * place for place in (-1, 0, 1)]

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from rsvib_torch.imaging.coupling import rows_showing
 from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration.row_spectra import RowSpectra
 
 __all__ = ["Shown", "blurred_unlike", "warp_to_same_blur"]
@@ -42,14 +42,14 @@ class Shown:
     moments: Tensor
 
     @classmethod
-    def of(cls, place: Tensor, left: Tensor, starts: Tensor, timing: RowTiming, motion: Vibration) -> "Shown":
+    def of(cls, place: Tensor, left: Tensor, starts: Tensor, timing: RowTiming, motion: Motion) -> "Shown":
         """Scene rows ``place`` in frames that start at ``starts``, whose columns are moved by ``left`` px anyway."""
         rows = rows_showing(place, starts, timing, motion)
         moments = starts + rows * timing.row_time
         return cls(rows, motion.mean_displacement(moments, timing.exposure_time)[..., 0] - left, moments)
 
 
-def _paths(moments: Tensor, timing: RowTiming, motion: Vibration) -> tuple[Tensor, Tensor]:
+def _paths(moments: Tensor, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor]:
     """Paths (B, G, S, N, 2) about their means during exposures from ``moments``, at nodes with weights (N,)."""
     count = math.ceil(_FEWER * gauss_node_count(motion, timing.exposure_time))
     path, weights = exposure_trajectory(motion, moments, timing, "gauss", count)
@@ -62,7 +62,7 @@ def _moments(paths: Tensor, weights: Tensor) -> Tensor:
     return torch.einsum("bgsni,bgsnj,n->bgsij", paths, paths, weights)
 
 
-def _unlike(moments: Tensor, timing: RowTiming, motion: Vibration) -> Tensor:
+def _unlike(moments: Tensor, timing: RowTiming, motion: Motion) -> Tensor:
     """(B,) whether frames whose rows are exposed from (B, G, S) s are blurred in ways of their own."""
     paths, weights = _paths(moments[..., ::_EVERY], timing, motion)
     third = torch.einsum("bgsn,bgsni->bgsi", paths.square().sum(-1) * weights, paths)
@@ -70,14 +70,14 @@ def _unlike(moments: Tensor, timing: RowTiming, motion: Vibration) -> Tensor:
     return torch.stack([(of.amax(1) - of.amin(1)).flatten(1).amax(1) > most for of, most in looked_at]).any(0)
 
 
-def blurred_unlike(starts: Tensor, height: int, timing: RowTiming, motion: Vibration) -> Tensor:
+def blurred_unlike(starts: Tensor, height: int, timing: RowTiming, motion: Motion) -> Tensor:
     """(B,) bool: whether frames of a height that start at (B, G) s are blurred in ways of their own."""
     rows = torch.arange(height, dtype=torch.float64, device=starts.device)
     return _unlike(starts[..., None] + rows * timing.row_time, timing, motion)
 
 
 def warp_to_same_blur(
-    spectra: RowSpectra, shown: Shown, place: Tensor, left: Tensor, timing: RowTiming, motion: Vibration
+    spectra: RowSpectra, shown: Shown, place: Tensor, left: Tensor, timing: RowTiming, motion: Motion
 ) -> Warp:
     """What warps the frames of a group to some rows of the scene, those of a pair to the same blur.
 

@@ -10,8 +10,8 @@ from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.equal_blur import Shown, blurred_unlike, warp_to_same_blur
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration.gradients import RowGradients, row_gradients, row_pulls, row_shifts
 from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra, chunks
 
@@ -50,7 +50,7 @@ def _members(num_frames: int, most: int) -> list[range]:
     return [range(first, last + 1) for first, last in itertools.pairwise(ends)]
 
 
-def _frames_in_group(motion: Vibration, starts: Tensor, size: tuple[int, int]) -> int:
+def _frames_in_group(motion: Motion, starts: Tensor, size: tuple[int, int]) -> int:
     """How many frames of (H, W) px still share enough of the scene when the image moves."""
     moved = (motion.drift(starts[:, 1:]) - motion.drift(starts[:, :-1])).abs().amax((0, 1))
     extent = torch.tensor([size[1], size[0]], dtype=moved.dtype, device=moved.device)
@@ -74,7 +74,7 @@ def stack_spectra(frames: Tensor, valid: Tensor | None) -> RowSpectra:
     return RowSpectra(frames, valid, *_level_and_contrast(frames, valid))
 
 
-def frame_groups(spectra: RowSpectra, timing: RowTiming, motion: Vibration, *, alike: bool = False) -> list[FrameGroup]:
+def frame_groups(spectra: RowSpectra, timing: RowTiming, motion: Motion, *, alike: bool = False) -> list[FrameGroup]:
     """Frames in groups that share enough of the scene when it moves by ``motion``.
 
     Args:
@@ -94,7 +94,7 @@ def frame_groups(spectra: RowSpectra, timing: RowTiming, motion: Vibration, *, a
 
 
 def warping(
-    group: FrameGroup, timing: RowTiming, motion: Vibration, every: int
+    group: FrameGroup, timing: RowTiming, motion: Motion, every: int
 ) -> tuple[RowSpectra, Tensor, Tensor, Tensor]:
     """A group with what warps every so many rows (a part of a block) of its frames back by a motion."""
     place, left = _place(group, timing, motion)
@@ -102,7 +102,7 @@ def warping(
     return group.spectra, shown.rows, shown.shift, _seen(shown.rows, group.spectra.height, BLOCK // every)
 
 
-def _place(group: FrameGroup, timing: RowTiming, motion: Vibration) -> tuple[Tensor, Tensor]:
+def _place(group: FrameGroup, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor]:
     """Scene rows (B, 1, S) that a group sees, and px (B, 1, 1) that the columns it sees have moved by."""
     scene_rows = torch.arange(group.spectra.height, dtype=torch.float64, device=group.starts.device)
     # whole pixels of an image motion move both
@@ -127,7 +127,7 @@ def _blocks(values: Tensor) -> Tensor:
 
 
 def measure_group(
-    group: FrameGroup, timing: RowTiming, motion: Vibration, gradients: RowGradients | None
+    group: FrameGroup, timing: RowTiming, motion: Motion, gradients: RowGradients | None
 ) -> tuple[Measurements, RowGradients]:
     """Displacements of blocks of scene rows in the frames of a group, measured around a motion.
 
@@ -182,7 +182,7 @@ def join_groups(parts: list[Measurements]) -> Measurements:
     )
 
 
-def measure_groups(groups: list[FrameGroup], timing: RowTiming, motion: Vibration) -> Measurements:
+def measure_groups(groups: list[FrameGroup], timing: RowTiming, motion: Motion) -> Measurements:
     """``measure_group`` of all groups, with gradients of their own, as one record."""
     return join_groups([measure_group(group, timing, motion, None)[0] for group in groups])
 

@@ -15,7 +15,7 @@ from rsvib_torch.detection.rows.residuals import independent_fraction, unexplain
 from rsvib_torch.detection.rows.row_groups import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.spline_fit import SplineFit, fit_spline
 from rsvib_torch.frames.arrays import ArrayLike
-from rsvib_torch.frames.orientation import offsets_from_row_order, vibration_from_row_order
+from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
@@ -250,14 +250,12 @@ def _report(
             found.append(f"rows tell the motion to {sure:.3g} px only: they may show different scenes")
         reasons.append(tuple(found))
     reliable = torch.tensor([not found for found in reasons], device=beside.device)
-    turned = vibration_from_row_order(motion[0], timing)
-    assert isinstance(turned, FreeMotion)
     swap = timing.scan_axis == -1
     per_axis = [torch.stack(values, -1) for values in (stds, seen, unseen)]
     per_axis += [beside, reliable]
     spread, seen_std, unseen_std, rest, good = ((v.flip(-1) if swap else v) for v in per_axis)
     return MotionDetection(
-        motion=turned,
+        motion=motion[0].from_row_order(timing),
         times=times,
         displacement=offsets_from_row_order(value, timing),
         std=spread,

@@ -19,7 +19,6 @@ from rsvib_torch.detection.rows.row_groups import frame_groups, measure_groups, 
 from rsvib_torch.detection.shapes.free import start_curve
 from rsvib_torch.detection.shapes.spline_fit import precision_of_axis
 from rsvib_torch.frames.arrays import ArrayLike
-from rsvib_torch.frames.orientation import vibration_from_row_order
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
@@ -145,9 +144,7 @@ def _stacked(found: list[_Found], timing: SensorTiming) -> SweptTone:
 
 def _in_image(motion: FreeMotion, timing: SensorTiming) -> FreeMotion:
     """A batch of one motion in row order as a single one in image axes."""
-    turned = vibration_from_row_order(motion[0], timing)
-    assert isinstance(turned, FreeMotion)
-    return turned
+    return motion[0].from_row_order(timing)
 
 
 def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions, iterations: int) -> _Found:

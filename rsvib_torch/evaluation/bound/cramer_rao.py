@@ -15,7 +15,7 @@ from rsvib_torch.evaluation.bound.information import (
     random_information,
     scale_of_information,
 )
-from rsvib_torch.frames.orientation import frames_to_row_order, vibration_to_row_order
+from rsvib_torch.frames.orientation import frames_to_row_order
 from rsvib_torch.imaging import simulate_frames
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
@@ -135,7 +135,7 @@ def cramer_rao_bound(
         raise ValueError(f"num_frames must be at least 2, got {num_frames}")
     # what the frames are like, and whether there can be any, is for the simulation to say
     frames = simulate_frames(scene.double(), timing, vibration, num_frames, frame_size=frame_size)
-    motion = vibration_to_row_order(vibration, timing).to(scene.device)
+    motion = vibration.to_row_order(timing).to(scene.device)
     parameters = _parameters(motion, acceleration)
     frames = frames_to_row_order(frames, timing)
     recording = Recording(

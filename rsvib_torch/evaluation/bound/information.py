@@ -12,8 +12,8 @@ from rsvib_torch.core.banded_solver import solve_banded
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored
 from rsvib_torch.imaging import exposure_nodes, exposure_trajectory, rows_showing
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.motion.vibration import Vibration
 
 __all__ = [
     "Recording",
@@ -49,7 +49,7 @@ class Recording:
 
     scene: Tensor
     timing: RowTiming
-    motion: Vibration
+    motion: Motion
     num_frames: int
     size: tuple[int, int]
     axes: tuple[int, ...]

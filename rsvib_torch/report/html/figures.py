@@ -10,8 +10,9 @@ from torch import Tensor
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration, blind_frequencies
+from rsvib_torch.motion.vibration import blind_frequencies
 from rsvib_torch.report.plots import plain_axes
 
 __all__ = ["gain_figure", "psf_film", "rows_figure", "smear"]
@@ -82,7 +83,7 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     return figure
 
 
-def smear(vibration: Vibration, starts: Tensor, timing: SensorTiming) -> Tensor:
+def smear(vibration: Motion, starts: Tensor, timing: SensorTiming) -> Tensor:
     """How far the image moves on the sensor while each row is exposed, (..., 2) in px: its largest excursion.
 
     Args:
@@ -97,7 +98,7 @@ def smear(vibration: Vibration, starts: Tensor, timing: SensorTiming) -> Tensor:
     return path.amax(-2) - path.amin(-2)
 
 
-def rows_figure(vibration: Vibration, timing: SensorTiming, num_rows: int) -> Figure:
+def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure:
     """Draw displacement and smear of every row of frame 0.
 
     Args:
@@ -124,7 +125,7 @@ def rows_figure(vibration: Vibration, timing: SensorTiming, num_rows: int) -> Fi
     return figure
 
 
-def psf_film(vibration: Vibration, timing: SensorTiming, num_rows: int) -> Figure:
+def psf_film(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure:
     """Draw the point spread functions of rows down frame 0, with the path that the image takes while they are exposed.
 
     Each kernel is centred on the mean displacement of its row, to whole px; the grey scale is common to all.

@@ -9,7 +9,6 @@ from torch import Tensor
 
 import rsvib_torch.report.html.words as in_words
 from rsvib_torch.detection import DetectionResult
-from rsvib_torch.motion.spline import moving_axes
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report.html import figures
@@ -116,7 +115,7 @@ def _drawings(report: Report) -> dict[str, list[Drawing]]:
             "bars of two standard deviations.",
         ),
     ]
-    if not bool(moving_axes(undone).any()):
+    if not bool(undone.moving_axes().any()):
         return {"offsets": offsets, "tone_figures": vibration}
     rows = [
         drawing(

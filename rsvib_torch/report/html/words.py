@@ -7,7 +7,6 @@ from typing import Literal
 import torch
 
 from rsvib_torch.detection import DetectionResult
-from rsvib_torch.motion.spline import moving_axes
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.report.html.figures import smear
@@ -112,7 +111,7 @@ def verdict_words(
     words = [_first_words(mood_of(result, verdict, restored), restored, verdict)]
     words += [_axis_words(result, axis) for axis in range(2)] + _motion_words(result)
     starts = timing.row_starts(1, num_rows)[0]
-    if bool(moving_axes(undone).any()):
+    if bool(undone.moving_axes().any()):
         blur = smear(undone, starts, timing).amax(0)
         bent = undone.amplitude.sum(-1)
         words.append(

@@ -9,11 +9,9 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.frames.arrays import as_tensor
-from rsvib_torch.frames.orientation import vibration_to_row_order
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
-from rsvib_torch.motion.spline import moving_axes
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
 from rsvib_torch.restoration.joint_groups import joint_groups
 from rsvib_torch.restoration.noise.single_frame import estimate_noise
@@ -40,7 +38,7 @@ def _mean_square(difference: Tensor) -> Tensor:
 
 def _moves(motion: FrameMotion) -> tuple[bool, bool]:
     """Whether the vibration claims to move the image along x, y."""
-    x, y = moving_axes(motion.vibration)[0].tolist()
+    x, y = motion.vibration.moving_axes()[0].tolist()
     return x, y
 
 
@@ -192,7 +190,7 @@ def judge_restoration(
     frames: Tensor,
     restored: Tensor,
     timing: SensorTiming,
-    vibration: Vibration | Detected,
+    vibration: Motion | Detected,
     *,
     joint: bool | int = False,
     full_scale: float | None = None,
@@ -241,7 +239,7 @@ def judge_restoration(
 def judge_prepared(
     frames: PreparedFrames,
     restored: Tensor,
-    vibration: Vibration,
+    vibration: Motion,
     *,
     joint: bool | int = False,
     most_pairs: int | None = None,
@@ -264,7 +262,7 @@ def judge_prepared(
     count, height = frames.images.shape[1], frames.images.shape[-2]
     shared = len(joint_groups(count, joint)[0][0])
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
-    motion = vibration_to_row_order(vibration, frames.image_timing).to(frames.images.device).expanded(1)
+    motion = vibration.to_row_order(frames.image_timing).to(frames.images.device).expanded(1)
     verdict = judge_frames(
         frames.filled[0].to(dtype),
         restored[0].to(dtype),

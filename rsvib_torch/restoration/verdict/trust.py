@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 
@@ -118,22 +119,25 @@ def trusted_vibration(
                 )
     keep = reliable & certain
     drift = keep | measured
-    changed = {"amplitude": vibration.amplitude * keep[..., None], "image_motion": motion * drift}
-    rest = {name: getattr(vibration, name) for name in vibration.__dataclass_fields__ if name not in changed}
-    if "image_acceleration" in rest:
-        rest["image_acceleration"] = rest["image_acceleration"] * drift
-    return Vibration(**changed, **rest), tuple(notes)
+    trusted = Vibration(
+        vibration.amplitude * keep[..., None],
+        vibration.frequency,
+        vibration.phase,
+        motion * drift,
+        vibration.image_acceleration * drift,
+    )
+    return trusted, tuple(notes)
 
 
 def vibration_to_undo(
-    vibration: Vibration | Detected, timing: SensorTiming, num_frames: int, num_rows: int
-) -> tuple[Vibration, tuple[str, ...]]:
+    vibration: Motion | Detected, timing: SensorTiming, num_frames: int, num_rows: int
+) -> tuple[Motion, tuple[str, ...]]:
     """All of a vibration that was given; of one that was detected the trusted part, and what is left alone.
 
     Raises:
         TypeError: If it is neither.
     """
-    if isinstance(vibration, Vibration):
+    if isinstance(vibration, Motion):
         return vibration, ()
     if not all(hasattr(vibration, name) for name in ("vibration", "std", "reliable", "reasons")):
         raise TypeError(f"vibration must be a Vibration or a detection, got {type(vibration).__name__}")

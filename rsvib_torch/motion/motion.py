@@ -1,0 +1,180 @@
+"""The base class of motions: what code outside this package may use of a motion of any type."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.motion.timing import SensorTiming
+
+__all__ = ["Motion"]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion(ABC):
+    """Motion of the image on the sensor as a function of time: scene content at ``s`` appears at ``s + D(t)``.
+
+    Contract of a motion type. It is a frozen dataclass (``eq=False``) whose fields are float64 tensors that begin with
+    the batch dimensions, other motions of the same batch shape, and plain numbers that hold for the whole batch. It
+    implements the abstract members below; everything else follows from them. The last axis of every result counts the
+    components of the displacement, today (x, y) in px, positive to the right and down. Methods that take times accept
+    tensors of any shape S whose leading dimensions are the batch dimensions (or 1), in seconds since the exposure start
+    of row 0 of frame 0, return float64 tensors (S, axes), and are differentiable with respect to tensors that require
+    gradients. Bounds are not differentiable. A motion is an immutable value: methods that change it return another one.
+    """
+
+    @property
+    @abstractmethod
+    def batch_shape(self) -> torch.Size:
+        """Leading dimensions: empty for one motion, (B,) for a batch of stacks."""
+
+    @property
+    @abstractmethod
+    def device(self) -> torch.device:
+        """Device of the parameters."""
+
+    @abstractmethod
+    def displacement(self, times: Tensor) -> Tensor:
+        """Displacement D(t) in px.
+
+        Args:
+            times: Seconds, any shape S; for a batch the batch dimensions (or 1) lead: (B, ...).
+
+        Returns:
+            float64 tensor of shape (S, axes).
+        """
+
+    @abstractmethod
+    def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
+        """Mean displacement over exposures [start, start + T_e] in px (Eq. 2 of Liu et al. 2023).
+
+        Args:
+            starts: Exposure starts in seconds, shape S as in ``displacement``.
+            exposure_time: T_e in seconds, a number or a tensor that broadcasts against ``starts``.
+
+        Returns:
+            float64 tensor of shape (S, axes).
+        """
+
+    @abstractmethod
+    def velocity(self, times: Tensor) -> Tensor:
+        """Velocity dD/dt in px/s; arguments and shapes as in ``displacement``."""
+
+    @abstractmethod
+    def drift(self, times: Tensor) -> Tensor:
+        """Part of the displacement that grows with time, in px: a polynomial of degree 2 that is 0 at time 0.
+
+        Arguments and shapes as in ``displacement``.
+        """
+
+    @abstractmethod
+    def largest_oscillation(self) -> Tensor:
+        """Bound on ``|D(t) - drift(t)|`` at all times, (..., axes), in px."""
+
+    @abstractmethod
+    def displacement_within(self, duration: float) -> Tensor:
+        """Bound on the length of the path that the image covers within ``duration`` seconds, (..., axes), in px.
+
+        For less than half a period of a tone it is the largest displacement between two times (Eq. 24).
+        """
+
+    @abstractmethod
+    def periods_within(self, duration: float) -> Tensor:
+        """Periods of the fastest tone in ``duration`` seconds, (..., axes); 0 for a motion without tones."""
+
+    @abstractmethod
+    def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
+        """The motion whose component k is ``signs[k]`` (1 or -1) times component ``order[k]`` of this motion."""
+
+    @property
+    def num_axes(self) -> int:
+        """Number of components of the displacement."""
+        return self.largest_oscillation().shape[-1]
+
+    def offset(self, starts: Tensor, later_starts: Tensor, exposure_time: float) -> Tensor:
+        """Offset: mean displacement of the later exposure minus that of the earlier one, in px (Eq. 4).
+
+        Eq. (4) as printed gives this sign on its right-hand side, and the opposite one on its left-hand side.
+
+        Args:
+            starts: Exposure starts in frame p, seconds, shape S.
+            later_starts: Exposure starts of the same scene rows in frame p + 1, shape S.
+            exposure_time: T_e in seconds.
+
+        Returns:
+            float64 tensor of shape (S, axes).
+        """
+        return self.mean_displacement(later_starts, exposure_time) - self.mean_displacement(starts, exposure_time)
+
+    def largest_displacement(self, first: float, last: float) -> Tensor:
+        """Bound on ``|D(t)|`` for ``first <= t <= last``, (..., axes), in px."""
+        longest = max(abs(first), abs(last))
+        # a quadratic without constant term is largest at one of the ends of a symmetric interval
+        ends = torch.tensor([-longest, longest], dtype=torch.float64).expand(*self.batch_shape, 2)
+        return self.largest_oscillation() + self.drift(ends).detach().abs().amax(-2)
+
+    def moving_axes(self) -> Tensor:
+        """Whether the motion moves the image along each axis, (..., axes) bool.
+
+        Example:
+            >>> from rsvib_torch import Vibration
+            >>> Vibration([2.0, 0.0], [50.0, 0.0], image_acceleration=[0.0, 3.0]).moving_axes().tolist()
+            [True, True]
+        """
+        return self.largest_displacement(-1.0, 1.0) > 0
+
+    def to_row_order(self, timing: SensorTiming) -> Self:
+        """The motion, given in image axes, as it appears in frames in row order.
+
+        Transposing frames exchanges x and y; flipping them along the rows changes the sign of y.
+        """
+        order, signs = self._row_axes(timing)
+        return self.with_axes(order, signs)
+
+    def from_row_order(self, timing: SensorTiming) -> Self:
+        """The motion, given in row order, in image axes: the inverse of ``to_row_order``."""
+        order, signs = self._row_axes(timing)
+        return self.with_axes(order, [signs[axis] for axis in order])
+
+    def _row_axes(self, timing: SensorTiming) -> tuple[list[int], list[float]]:
+        order, signs = list(range(self.num_axes)), [1.0] * self.num_axes
+        if timing.scan_axis == -1:
+            order[:2] = [1, 0]
+        if timing.readout_direction == "reverse":
+            signs[1] = -1.0
+        return order, signs
+
+    def mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
+        """The same motion with ``function``, which must preserve values, applied to every tensor.
+
+        Values are not checked again, so that no device is synchronised.
+        """
+        result = copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                object.__setattr__(result, name, function(value))
+            elif isinstance(value, Motion):
+                object.__setattr__(result, name, value.mapped(function))
+        return result
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same motion on another device."""
+        return self.mapped(lambda values: values.to(device))
+
+    def detached(self) -> Self:
+        """The same motion without gradients."""
+        return self.mapped(Tensor.detach)
+
+    def expanded(self, size: int) -> Self:
+        """A batch of ``size`` copies of the motion; the new dimension is the first."""
+        return self.mapped(lambda values: values.expand(size, *values.shape))
+
+    def __getitem__(self, index: int) -> Self:
+        """One motion of a batch."""
+        if not self.batch_shape:
+            raise IndexError("this motion is not a batch")
+        return self.mapped(lambda values: values[index])

@@ -1,0 +1,92 @@
+"""What every motion type guarantees: the contract of ``Motion``, checked for each of them."""
+
+import math
+
+import pytest
+import torch
+
+from rsvib_torch import FreeMotion, Vibration
+from rsvib_torch.motion.motion import Motion
+
+TONES = Vibration(
+    [[3.1, 0.4], [5.2, 0.7]], [[50.0, 155.0], [30.0, 88.0]], [[0.4, -1.0], [1.3, 2.2]], [90.0, -40.0], [30.0, 400.0]
+)
+KNOTS = torch.linspace(0, 0.2, 101, dtype=torch.float64)
+PATH = torch.stack([2 * torch.sin(60 * KNOTS) * torch.exp(-9 * KNOTS), (400 * KNOTS).cos()], -1)
+MOTIONS = {
+    "vibration": TONES,
+    "spline": FreeMotion.through(KNOTS, PATH),
+    "spline with tones": FreeMotion.through(KNOTS, PATH, TONES),
+}
+TIMES = torch.linspace(0, 0.2, 4001, dtype=torch.float64)
+
+
+@pytest.fixture(name="motion", params=MOTIONS)
+def make_motion(request):
+    return MOTIONS[request.param]
+
+
+def test_velocity_is_the_derivative(motion):
+    inside, step = TIMES[50:-50], 1e-6
+    expected = (motion.displacement(inside + step) - motion.displacement(inside - step)) / (2 * step)
+    torch.testing.assert_close(motion.velocity(inside), expected, rtol=1e-5, atol=1e-2)
+
+
+def test_bounds_hold(motion):
+    displacement = motion.displacement(TIMES)
+    assert bool((displacement.abs() <= motion.largest_displacement(0.0, 0.2)).all())
+    assert bool(((displacement - motion.drift(TIMES)).abs() <= motion.largest_oscillation()).all())
+    # without its acceleration, which displacement_within leaves out
+    for steps in (1, 20, 400):
+        slope = motion.drift(TIMES) - motion.image_motion * TIMES[:, None]
+        moved = (displacement - slope)[steps:] - (displacement - slope)[:-steps]
+        bound = motion.displacement_within(float(TIMES[steps]))
+        assert bool((moved.abs() <= bound + 1e-9).all())
+
+
+def test_exposure_times_may_differ(motion):
+    starts = torch.linspace(0.0, 0.15, 7, dtype=torch.float64)
+    exposures = torch.linspace(1e-4, 1e-2, 7, dtype=torch.float64)
+    together = motion.mean_displacement(starts, exposures)
+    for index, (start, exposure) in enumerate(zip(starts, exposures.tolist(), strict=True)):
+        # splines are integrated with nodes for the longest exposure: quadrature errors differ
+        torch.testing.assert_close(together[index], motion.mean_displacement(start, exposure), rtol=0, atol=1e-5)
+
+
+def test_batches_of_equal_motions(motion):
+    batch = motion.expanded(3)
+    assert batch.batch_shape == (3,)
+    assert batch.device == motion.device
+    torch.testing.assert_close(batch.displacement(TIMES.expand(3, -1))[2], motion.displacement(TIMES))
+    torch.testing.assert_close(batch[1].velocity(TIMES), motion.velocity(TIMES))
+    with pytest.raises(IndexError, match="not a batch"):
+        motion[0]
+
+
+def test_moving_axes():
+    still = Vibration([0.0, 0.0], [50.0, 50.0])
+    assert still.moving_axes().tolist() == [False, False]
+    assert Vibration([0.0, 1e-3], 50.0).moving_axes().tolist() == [False, True]
+    assert Vibration(0.0, 0.0, image_motion=[1.0, 0.0], image_acceleration=[-2.0, 0.0]).moving_axes().tolist() == [
+        True,
+        False,
+    ]
+    curve = FreeMotion(torch.tensor([[0.0] * 5, [0.0, 0.0, 1.0, 0.0, 0.0]]), 0.0, 1e-3)
+    assert curve.moving_axes().tolist() == [False, True]
+
+
+def test_free_motion_has_the_attributes_of_its_tones():
+    motion = MOTIONS["spline with tones"]
+    assert isinstance(motion, Motion)
+    assert not isinstance(motion, Vibration)
+    for name in ("amplitude", "frequency", "period", "phase", "image_motion", "image_acceleration"):
+        assert torch.equal(getattr(motion, name), getattr(TONES, name))
+
+
+def test_detached_motion_has_no_gradients():
+    amplitude = torch.tensor([2.0, 3.0], dtype=torch.float64, requires_grad=True)
+    coefficients = torch.zeros(2, 8, dtype=torch.float64, requires_grad=True)
+    motion = FreeMotion(coefficients, 0.0, 1e-3, Vibration(amplitude, math.pi))
+    assert motion.displacement(TIMES).requires_grad
+    assert not motion.detached().displacement(TIMES).requires_grad
+    assert not motion.largest_displacement(0.0, 1.0).requires_grad
