@@ -16,6 +16,7 @@ __all__ = [
     "bspline_coefficients_adjoint",
     "bspline_weights",
     "mirrored",
+    "spread_taps",
 ]
 
 _PRECISION = 1e-9  # of the largest tap, below which the prefilter is cut off
@@ -46,6 +47,28 @@ def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
     for lower in others:
         weights = torch.addcmul(lower, weights, fraction[..., None])
     return weights
+
+
+def spread_taps(cells: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Arrange the taps of several nodes, each at a cell of its own, on one grid of taps per row.
+
+    Args:
+        cells: Position (..., N) of the first tap of each node, whole numbers.
+        weights: (..., N, K) weights of consecutive taps.
+
+    Returns:
+        Lowest cell (...) of the nodes, int64, and weights (..., N, J) of the J taps from there on, 0 where a node has
+        no tap.
+
+    Example:
+        >>> first, taps = spread_taps(torch.tensor([3.0, 4.0]), torch.tensor([[0.5, 0.5], [0.75, 0.25]]))
+        >>> first.item(), taps.tolist()
+        (3, [[0.5, 0.5, 0.0], [0.0, 0.75, 0.25]])
+    """
+    first = cells.detach().amin(-1)
+    index = (cells - first[..., None]).to(torch.int64)[..., None] + torch.arange(weights.shape[-1], device=cells.device)
+    count = int(index.amax()) + 1
+    return first.to(torch.int64), weights.new_zeros(*weights.shape[:-1], count).scatter(-1, index, weights)
 
 
 @cache

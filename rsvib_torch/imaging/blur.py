@@ -11,11 +11,11 @@ from rsvib_torch.imaging.psf import RowPSF
 
 __all__ = ["RowVaryingBlur", "blur_rows", "blur_rows_adjoint"]
 
-_MEANING = ("degree", "frame_width", "origin", "scene_size")  # of the kernels, beside the buffers
+_EXTRA_STATE = ("degree", "frame_width", "origin", "scene_size")  # attributes in state_dict besides the buffers
 
 
 def _gather_index(psf: RowPSF, tap: int, scene_size: tuple[int, int], width: int, origin: tuple[int, int]) -> Tensor:
-    """Flat scene index (..., R, width + KW - 1) of the pixels that kernel row ``tap`` of each row may touch."""
+    """Flat scene index (..., R, width + KW - 1) of the pixels that kernel row ``tap`` of each row uses."""
     device = psf.weights.device
     num_rows, kernel_width = psf.weights.shape[-3], psf.weights.shape[-1]
     rows = origin[0] + torch.arange(num_rows, device=device) - psf.first_tap[..., 1] - tap
@@ -39,14 +39,13 @@ def blur_rows(
 ) -> Tensor:
     """Form frames: every output row is the scene convolved with that row's kernel (Eq. 38).
 
-    The output row selects the kernel: convolve, then take the row. Where a kernel looks past the edge of the scene,
-    the scene is mirrored.
+    The output row selects the kernel: convolve, then take the row. Beyond its edges the scene is mirrored.
 
     Args:
         scene: (..., Hs, Ws); leading dimensions broadcast against those of the kernels.
         psf: Kernels of R rows.
         frame_width: Width W of the frame, by default that of the scene.
-        origin: Scene pixel (row, column) that frame pixel (0, 0) shows at rest; by default the frame is centred.
+        origin: Scene pixel (row, column) at frame pixel (0, 0) without motion; by default the frame is centred.
 
     Returns:
         Frames (..., R, W).
@@ -73,7 +72,7 @@ def blur_rows(
 def blur_rows_adjoint(
     frames: Tensor, psf: RowPSF, scene_shape: tuple[int, ...], *, origin: tuple[int, int] | None = None
 ) -> Tensor:
-    """Apply the exact adjoint (transpose) of the operator that forms frames.
+    """Apply the exact adjoint (transpose) of ``blur_rows``.
 
     Args:
         frames: (..., R, W).
@@ -103,8 +102,8 @@ def blur_rows_adjoint(
 class RowVaryingBlur(nn.Module):
     """``blur_rows`` with fixed kernels as a module, with its adjoint.
 
-    ``A`` and ``A_adjoint`` are the pair that solvers of linear inverse problems ask for, as deepinv's
-    ``LinearPhysics(A=blur.A, A_adjoint=blur.A_adjoint)`` does.
+    ``A`` and ``A_adjoint`` are the pair that solvers of linear inverse problems require, for example
+    ``deepinv.physics.LinearPhysics(A=blur.A, A_adjoint=blur.A_adjoint)``.
 
     Args:
         psf: Kernels of all rows (kept as buffers).
@@ -152,20 +151,20 @@ class RowVaryingBlur(nn.Module):
         """Apply the exact adjoint to frames (..., R, W)."""
         return blur_rows_adjoint(frames, self.psf, scene_shape, origin=self.origin)
 
-    def A(self, x: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - the name that solvers call
-        """``forward`` under the name that solvers call; their further keywords are ignored."""
+    def A(self, x: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
+        """``forward`` under the name that solvers use; their further keywords are ignored."""
         return self(x)  # type: ignore[no-any-return]
 
-    def A_adjoint(self, y: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - the name that solvers call
+    def A_adjoint(self, y: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
         """``adjoint`` for scenes with the leading dimensions of the frames and ``scene_size``."""
         size = (y.shape[-2], y.shape[-1]) if self.scene_size is None else self.scene_size
         return self.adjoint(y, (*y.shape[:-2], *size))
 
     def get_extra_state(self) -> dict[str, object]:
-        """What the kernels mean, for ``state_dict``."""
-        return {name: getattr(self, name) for name in _MEANING}
+        """Attributes that define the kernels, for ``state_dict``."""
+        return {name: getattr(self, name) for name in _EXTRA_STATE}
 
     def set_extra_state(self, state: dict[str, object]) -> None:
-        """Take over what ``get_extra_state`` gave."""
-        for name in _MEANING:
+        """Restore the attributes of ``get_extra_state``."""
+        for name in _EXTRA_STATE:
             setattr(self, name, state[name])

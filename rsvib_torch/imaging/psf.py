@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.splines import bspline_weights
+from rsvib_torch.core.splines import bspline_weights, spread_taps
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
@@ -22,7 +22,7 @@ SPLINE_DEGREES: dict[str, int] = {"linear": 1, "cubic": 3}
 class RowPSF:
     """Kernels of all rows: ``g(r, c) = sum_jk weights[r, j, k] f(r - y_r - j, c - x_r - k)`` (Eqs. 38, 39).
 
-    Every row has a small kernel at a place of its own, so that large displacements cost nothing. With cubic
+    Every row has a small kernel at its own position, so that large displacements cost nothing. With cubic
     interpolation the kernel acts on the B-spline coefficients of the scene instead of its samples.
 
     Attributes:
@@ -44,7 +44,7 @@ class RowPSF:
         return torch.stack([x, y], dim=-1) + self.first_tap
 
     def dense(self) -> tuple[Tensor, tuple[int, int]]:
-        """All kernels on one common grid, for looking at them or convolving whole frames.
+        """All kernels on one common grid, to plot them or to convolve whole frames.
 
         Returns:
             Kernels (..., R, KH', KW') and the displacement (x, y) in px of tap [0, 0].
@@ -62,15 +62,10 @@ class RowPSF:
 
 
 def _axis_weights(displacement: Tensor, degree: int) -> tuple[Tensor, Tensor]:
-    """Spline weights of displacements (..., R, N) on one axis: first tap (..., R) and weights (..., R, N, K)."""
+    """First tap (..., R) and spline weights (..., R, N, K) of displacements (..., R, N) along one axis."""
     cell = displacement.detach().floor()
-    weights = bspline_weights(displacement - cell, degree)
-    first = cell.amin(-1)
-    place = (cell - first[..., None]).to(torch.int64)
-    size = int(place.amax()) + degree + 1
-    index = place[..., None] + torch.arange(degree + 1, device=place.device)
-    spread = weights.new_zeros(*weights.shape[:-1], size).scatter(-1, index, weights)
-    return first.to(torch.int64) - degree // 2, spread
+    first, weights = spread_taps(cell, bspline_weights(displacement - cell, degree))
+    return first - degree // 2, weights
 
 
 def row_psf(
@@ -86,15 +81,15 @@ def row_psf(
 
     Each node of the exposure is a displaced copy of the scene, interpolated with 2 x 2 (linear, Eqs. 26-34) or 4 x 4
     (cubic B-spline) taps; the kernel is their weighted mean (Eq. 39). Linear interpolation adds a blur that is not
-    in the optics; cubic does not.
+    part of the image formation; cubic interpolation does not.
 
     Args:
-        vibration: The motion, in row order.
+        vibration: The motion.
         starts: Exposure starts of the rows in seconds, (..., R); batch dimensions of the vibration lead.
         timing: The sensor.
         interpolation: ``"linear"`` (the paper) or ``"cubic"``.
         quadrature: ``"midpoint"`` (the paper: N_e nodes) or ``"gauss"``.
-        num_nodes: Number of nodes, by default what the quadrature asks for.
+        num_nodes: Number of nodes; by default N_e, or what the motion requires for ``"gauss"``.
 
     Returns:
         The kernels of all rows.

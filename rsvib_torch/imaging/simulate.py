@@ -1,4 +1,4 @@
-"""Frames of a vibrating rolling-shutter camera from a still scene."""
+"""Simulation of the frames that a vibrating rolling-shutter camera takes of a still scene (Eq. 9)."""
 
 import math
 
@@ -6,19 +6,18 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.fourier import extend_rows, fast_length
-from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored
+from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
 from rsvib_torch.frames.arrays import ArrayLike, as_tensor
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
-from rsvib_torch.imaging.sensor_noise import SensorNoise
+from rsvib_torch.imaging.sensor_model import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 
 __all__ = ["simulate_frames"]
 
-_DEGREE = 9  # of the spline across rows: off by 2e-5 of the amplitude at a quarter cycle per pixel
-_MARGIN = 16  # px between what a frame sees and the edge of the scene
-_CHUNK = 64  # rows formed at a time
+_DEGREE = 9  # degree of the spline across rows; its error is 2e-5 of the amplitude at a quarter cycle per pixel
+_MARGIN = 16  # px between the visible part and the edge of the scene; the prefilter of the spline decays within it
 
 
 def simulate_frames(
@@ -35,17 +34,17 @@ def simulate_frames(
 
     ``g(x, y) = 1/T_e int f[x - X(t), y - Y(t)] dt`` for every row over its own exposure. Displacement along rows is
     a phase ramp on the row's Fourier transform, across rows a B-spline of degree 9, the integral a Gauss-Legendre
-    sum: accurate for any band-limited scene. The scene has to be larger than the frame, so that no pixel is made up.
+    sum: accurate for any band-limited scene. The scene must be larger than the frame, so that no pixel is extrapolated.
 
     Args:
         scene: (H, W) or (C, H, W), floating point, full scale 1.
         timing: The sensor.
         vibration: One vibration (not a batch), in image axes.
-        num_frames: Frames to take.
-        frame_size: (height, width) of the frames, centred on the scene; by default the largest that never comes
-            nearer than 16 px to the edge of the scene and has no more rows than ``timing.frame_rows``.
+        num_frames: Number of frames.
+        frame_size: (height, width) of the frames, centred on the scene; by default the largest that stays at least
+            16 px from the edge of the scene and has no more rows than ``timing.frame_rows``.
         noise: Noise of the sensor, by default none.
-        generator: Source of the noise.
+        generator: Random number generator of the noise.
 
     Returns:
         Frames (T, h, w) or (T, C, h, w) in the dtype and on the device of the scene. Frame pixel (r, c) shows, at
@@ -97,7 +96,9 @@ def simulate_frames(
     return frames if noise is None else noise.apply(frames, generator)
 
 
-def _form_rows(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion, width: int) -> Tensor:
+def _form_rows(
+    scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion, width: int, chunk_rows: int = 64
+) -> Tensor:
     """Form frames (T, ..., R, width) whose rows are exposed from ``starts`` (T, R) on, centred on the scene."""
     height, scene_width = scene.shape[-2:]
     num_rows = starts.shape[-1]
@@ -105,26 +106,21 @@ def _form_rows(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion,
     length = fast_length(scene_width + 2 * _MARGIN)
     spectra = torch.fft.rfft(extend_rows(bspline_coefficients(scene, _DEGREE, -2), length))
     frequencies = torch.fft.rfftfreq(length, dtype=torch.float64, device=scene.device)
-    taps = torch.arange(_DEGREE + 1, device=scene.device) - _DEGREE // 2
 
     rows = torch.arange(num_rows, device=scene.device)
     formed = []
-    for begin in range(0, num_rows, _CHUNK):
-        chunk = rows[begin : begin + _CHUNK]
+    for begin in range(0, num_rows, chunk_rows):
+        chunk = rows[begin : begin + chunk_rows]
         displacement, node_weights = exposure_trajectory(motion, starts[:, chunk], timing, "gauss")
         cell = displacement[..., 1].floor()
-        spline = bspline_weights(displacement[..., 1] - cell, _DEGREE) * node_weights[:, None]
-        base = cell.amin(-1, keepdim=True)
-        place = (cell - base).long()[..., None] + torch.arange(_DEGREE + 1, device=scene.device)
-        count = int(place.amax()) + 1
-        spread = spline.new_zeros(*spline.shape[:-1], count).scatter(-1, place, spline)
+        first, taps = spread_taps(cell, bspline_weights(displacement[..., 1] - cell, _DEGREE) * node_weights[:, None])
         ramps = torch.polar(
             torch.ones((), dtype=torch.float64, device=scene.device).expand(*displacement.shape[:-1], len(frequencies)),
             -2 * math.pi * displacement[..., 0, None] * frequencies,
         ).to(spectra.dtype)
-        transfer = spread.transpose(-2, -1).to(spectra.dtype) @ ramps  # (T, rows, taps, frequencies)
-        source = top + chunk[:, None] - base.long() - taps[0] - torch.arange(count, device=scene.device)
-        source = mirrored(source, height)  # (T, rows, taps)
+        transfer = taps.transpose(-2, -1).to(spectra.dtype) @ ramps  # (T, rows, taps, frequencies)
+        tap = torch.arange(taps.shape[-1], device=scene.device) - _DEGREE // 2
+        source = mirrored(top + chunk[:, None] - first[..., None] - tap, height)  # (T, rows, taps)
         if scene.ndim == 3:
             picked = spectra[:, source].movedim(0, 1)
             row_spectra = (picked * transfer[:, None]).sum(-2)

@@ -1,4 +1,4 @@
-"""Displacement of the image within an exposure, sampled at quadrature nodes."""
+"""Motion during exposures: quadrature nodes within an exposure, and the frame rows that show given scene rows."""
 
 import math
 from typing import Literal
@@ -9,27 +9,30 @@ from torch import Tensor
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.quadrature import gauss_legendre
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
 
-__all__ = ["Quadrature", "exposure_nodes", "exposure_trajectory", "gauss_node_count"]
+__all__ = ["Quadrature", "exposure_nodes", "exposure_trajectory", "gauss_node_count", "rows_showing"]
 
 Quadrature = Literal["midpoint", "gauss"]
-_MOST_NODES = 4096
 
 
-def gauss_node_count(vibration: Motion, exposure_time: float) -> int:
+def gauss_node_count(vibration: Motion, exposure_time: float, *, at_most: int = 4096) -> int:
     """Gauss-Legendre nodes that integrate the image over this motion to about 1e-6 of full scale.
 
     The integrand is ``exp(-2 pi i (u X(t) + v Y(t)))`` with frequencies up to half a cycle per pixel, so the count
-    grows with the path length in px (two nodes a px) and with the vibration periods in the exposure.
+    grows with the path length (two nodes per px) and with the periods of the fastest tone (four nodes each).
+
+    Raises:
+        ValueError: If more than ``at_most`` nodes are necessary.
     """
     path = float(vibration.displacement_within(exposure_time).amax())
     periods = float(vibration.periods_within(exposure_time).amax())
     count = 3 + math.ceil(2.0 * path) + math.ceil(4.0 * periods)
-    if count > _MOST_NODES:
+    if count > at_most:
         raise ValueError(
-            f"the image moves {path:.3g} px and through {periods:.3g} periods while a "
-            f"row is exposed for {exposure_time:g} s, too much to follow; check frequency, amplitude and exposure"
+            f"the image moves {path:.3g} px and through {periods:.3g} periods while a row is exposed for "
+            f"{exposure_time:g} s, which needs {count} quadrature nodes and not at most {at_most}; check frequency, "
+            "amplitude and exposure"
         )
     return count
 
@@ -40,7 +43,7 @@ def exposure_nodes(
     """Times within an exposure, from its start, with their weights.
 
     ``"midpoint"`` is Eq. (25): N_e samples at (i - 1/2) T_row, weight 1/N_e each (a fractional N_e is rounded up and
-    the samples spread evenly). ``"gauss"`` takes Gauss-Legendre nodes, which give the same integral with far fewer.
+    the samples are spread evenly). ``"gauss"`` uses Gauss-Legendre nodes, which give the same integral with far fewer.
 
     Returns:
         Times in seconds and weights that sum to 1, both float64 of shape (N,).
@@ -64,11 +67,11 @@ def exposure_trajectory(
     """Displacement at the nodes of exposures that begin at ``starts``.
 
     Args:
-        vibration: The motion, in row order.
+        vibration: The motion.
         starts: Exposure starts in seconds, any shape S (batch dimensions of the vibration lead).
         timing: The sensor.
         quadrature: ``"midpoint"`` (Eq. 25) or ``"gauss"``.
-        num_nodes: Number of nodes; by default N_e, or what the motion needs.
+        num_nodes: Number of nodes; by default N_e, or ``gauss_node_count``.
 
     Returns:
         Displacement (S, N, 2) in px, axes (x, y), and weights (N,), both float64.
@@ -79,3 +82,46 @@ def exposure_trajectory(
     starts = starts.to(dtype=torch.float64, device=vibration.device)
     times, weights = times.to(vibration.device), weights.to(vibration.device)
     return vibration.displacement(starts[..., None] + times), weights
+
+
+def rows_showing(
+    scene_rows: Tensor,
+    frame_start: Tensor,
+    timing: RowTiming,
+    vibration: Motion,
+    *,
+    exposure_time: float | Tensor | None = None,
+) -> Tensor:
+    """Frame rows r(s) that show scene rows s: the solution of ``r = s + Y(t(r))``.
+
+    Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
+    Newton's method; ``|dY/dt| T_row`` is 0.02 for 5 px at 30 Hz, and must stay below 1: content that moves along the
+    scan as fast as the rows is never passed.
+
+    Args:
+        scene_rows: Scene rows s, float64, shape S (batch dimensions of the vibration lead).
+        frame_start: Exposure start of the frame's first row in seconds, broadcastable to S.
+        timing: The sensor.
+        vibration: The motion, in row order.
+        exposure_time: Exposure time in seconds, broadcastable to S; by default that of the sensor.
+
+    Returns:
+        Frame rows, float64, broadcast shape of S and ``frame_start``.
+    """
+    exposure_time = timing.exposure_time if exposure_time is None else exposure_time
+    scene_rows = scene_rows.to(torch.float64)
+    rows = scene_rows + torch.zeros_like(frame_start)
+    slope = torch.zeros_like(rows)
+    for iteration in range(8):
+        starts = frame_start + rows * timing.row_time
+        residual = scene_rows + vibration.mean_displacement(starts, exposure_time)[..., 1] - rows
+        last_of_three = (
+            iteration == 2
+        )  # three steps are enough for most motions; the third keeps the slope of the second
+        if not last_of_three:
+            slope = vibration.velocity(starts + 0.5 * exposure_time)[..., 1].detach() * timing.row_time
+        step = residual / (1.0 - slope).clamp(min=0.1)  # the limit keeps steps finite near slope 1
+        rows = rows + step
+        if last_of_three and bool((step.abs() < 1e-9).all()):  # px, far below any measurement
+            break
+    return rows

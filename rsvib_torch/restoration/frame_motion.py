@@ -8,7 +8,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
-from rsvib_torch.imaging.coupling import rows_showing
+from rsvib_torch.imaging.trajectory import rows_showing
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 

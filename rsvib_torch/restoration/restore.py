@@ -124,6 +124,7 @@ def restore(
         RestorationWarning: If an axis is left alone, or the restored frames are no better than the raw ones.
 
     Example:
+        >>> import torch
         >>> from rsvib_torch import Vibration
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
         >>> round(restore(torch.full((2, 64, 48), 0.5), timing, Vibration(2.0, 50.0)).mean().item(), 5)

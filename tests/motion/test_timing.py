@@ -108,13 +108,13 @@ def test_type_checker_requires_row_order(tmp_path):
     call = "rows_showing(torch.zeros(1), torch.zeros(1), {}, Vibration(1.0, 50.0))\n"
     head = (
         "import torch\n"
-        "from rsvib_torch.imaging.coupling import rows_showing\n"
+        "from rsvib_torch.imaging.trajectory import rows_showing\n"
         "from rsvib_torch.motion.timing import SensorTiming\n"
         "from rsvib_torch.motion.vibration import Vibration\n"
         "timing = SensorTiming(2e-5, 20, 512, scan_axis='x')\n"
     )
     package = Path(rsvib_torch.__file__).parent
-    files = [str(package / name) for name in ("motion/timing.py", "imaging/coupling.py")]
+    files = [str(package / name) for name in ("motion/timing.py", "imaging/trajectory.py")]
     for argument, accepted in (("timing.in_row_order()", True), ("timing", False)):
         snippet.write_text(head + call.format(argument))
         # modules that are not listed count as Any, so that torch need not be analysed

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rsvib_torch.imaging.coupling import rows_showing
-from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count
+from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.registration.row_spectra import RowSpectra

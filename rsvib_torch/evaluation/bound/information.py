@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from rsvib_torch.core.banded_solver import solve_banded
 from rsvib_torch.core.fourier import extend_rows, fast_length
-from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored
+from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
 from rsvib_torch.imaging import exposure_nodes, exposure_trajectory, rows_showing
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
@@ -168,15 +168,13 @@ class _Places:
         taps = bspline_weights(place - cell, _DEGREE)
         lower = bspline_weights(place - cell, _DEGREE - 1)
         slopes = functional.pad(lower, (1, 0)) - functional.pad(lower, (0, 1))
-        first = cell.amin(-1)
-        offset = (cell - first[..., None]).long()[..., None] + torch.arange(_DEGREE + 1, device=place.device)
-        count = int(offset.amax()) + 1
-        spread = [taps.new_zeros(*offset.shape[:-1], count).scatter(-1, offset, value) for value in (taps, slopes)]
+        first, taps = spread_taps(cell, taps)
+        _, slopes = spread_taps(cell, slopes)
         sensitivity = recording.sensitivity(starts[..., None] + times.to(starts.device))
         return cls(
-            first.long() - _DEGREE // 2,
-            spread[0],
-            spread[1],
+            first - _DEGREE // 2,
+            taps,
+            slopes,
             displacement[..., 0],
             weights,
             sensitivity,

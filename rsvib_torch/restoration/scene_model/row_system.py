@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.fourier import shift_phases
+from rsvib_torch.core.splines import spread_taps
 from rsvib_torch.restoration.scene_model.row_kernel import REACH, SCENE_REACH, TAPS, kernel_weights
 from rsvib_torch.restoration.scene_model.segments import Segments
 
@@ -98,12 +99,8 @@ def row_kernels(displacement: Tensor, node_weights: Tensor, weight: Tensor, num_
     rows = torch.arange(displacement.shape[-3], dtype=displacement.dtype, device=displacement.device)
     place = rows[:, None] - displacement[..., 1]
     cell = place.detach().floor()
-    first = cell.amin(-1)
-    weights = kernel_weights(place - cell) * node_weights[:, None]
-    offset = (cell - first[..., None]).to(torch.int64)[..., None] + torch.arange(TAPS, device=place.device)
-    count = int(offset.amax()) + 1
-    taps = weights.new_zeros(*weights.shape[:-1], count).scatter(-1, offset, weights).transpose(-2, -1)
-    first = first.to(torch.int64) - (REACH - 1)
+    first, taps = spread_taps(cell, kernel_weights(place - cell) * node_weights[:, None])
+    taps, count, first = taps.transpose(-2, -1), taps.shape[-1], first - (REACH - 1)
     near = (first > -margin - count) & (first < num_rows + margin)
     first = first.clamp(-margin - count, num_rows + margin)
     x = displacement[..., 0]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.splines import bspline_weights, mirrored
+from rsvib_torch.core.splines import bspline_weights, mirrored, spread_taps
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.row_extension import period_of_rows, spline_spectra
@@ -44,14 +44,11 @@ def reblur(scene: Tensor, motion: FrameMotion, frame: int, *, first_row: int = 0
 
     place = rows[:, None] - displacement[..., 1]
     cell = place.floor()
-    first = cell.amin(-1)
-    spline = bspline_weights(place - cell, _DEGREE) * node_weights[:, None]
-    offset = (cell - first[:, None]).to(torch.int64)[..., None] + torch.arange(_DEGREE + 1, device=scene.device)
-    count = int(offset.amax()) + 1
-    taps = spline.new_zeros(*spline.shape[:-1], count).scatter(-1, offset, spline).transpose(-2, -1)
+    first, taps = spread_taps(cell, bspline_weights(place - cell, _DEGREE) * node_weights[:, None])
     angle = displacement[..., 0, None].to(scene.dtype) * (-2 * math.pi * u).to(scene.dtype)
-    taps = taps.to(scene.dtype)
-    source = first.to(torch.int64) - _DEGREE // 2
+    taps = taps.transpose(-2, -1).to(scene.dtype)
+    count = taps.shape[-2]
+    source = first - _DEGREE // 2
     seen = mirrored(source[:, None] + torch.arange(count, device=scene.device), height)  # (H, count)
     step = max(1, _VALUES.get(scene.device.type, height * count * len(u)) // (count * len(u)))
     formed = []

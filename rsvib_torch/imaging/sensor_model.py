@@ -1,0 +1,146 @@
+"""Optics in front of a sensor as a transfer function, and the noise and fixed pattern of the sensor."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.checks import check_number, check_whole_number
+
+__all__ = ["Optics", "SensorNoise"]
+
+
+@dataclass(frozen=True)
+class Optics:
+    """Transfer function of a lens and of square pixels.
+
+    ``H(u, v) = exp(-2 pi^2 sigma^2 rho^2) D(rho / cutoff) sinc(pixel u) sinc(pixel v)``, ``rho^2 = u^2 + v^2``, with
+    the transfer of a round diffraction-limited pupil ``D(s) = 2 (arccos s - s sqrt(1 - s^2)) / pi``, 0 beyond s = 1.
+
+    Args:
+        sigma: Standard deviation of the Gaussian blur of aberrations in px.
+        cutoff: Diffraction cutoff frequency in cycles/px (pixel pitch over wavelength and f-number); None for no
+            diffraction.
+        pixel: Width of the light-sensitive square in px; 0 for none, for a scene that was recorded by pixels before.
+
+    Example:
+        >>> optics = Optics(sigma=0.5, pixel=1.0)
+        >>> f"{optics.transfer(torch.tensor(0.5), torch.tensor(0.0)):.4f}"
+        '0.1854'
+    """
+
+    sigma: float = 0.0
+    cutoff: float | None = None
+    pixel: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_number("sigma", self.sigma, at_least=0.0)
+        if self.cutoff is not None:
+            check_number("cutoff", self.cutoff, above=0.0)
+        check_number("pixel", self.pixel, at_least=0.0)
+
+    def transfer(self, u: Tensor, v: Tensor) -> Tensor:
+        """Transfer function at horizontal and vertical frequencies in cycles/px, in their broadcast shape."""
+        squared = u.square() + v.square()
+        transfer = torch.exp(-2 * (math.pi * self.sigma) ** 2 * squared)
+        if self.cutoff is not None:
+            s = (squared.sqrt() / self.cutoff).clamp(max=1.0)
+            transfer = transfer * (2 / math.pi) * (s.arccos() - s * (1 - s.square()).sqrt())
+        return transfer * torch.sinc(self.pixel * u) * torch.sinc(self.pixel * v)
+
+    def apply(self, scene: Tensor) -> Tensor:
+        """Scene (..., H, W) as imaged by the optics, with mirrored boundaries; same shape and dtype.
+
+        Raises:
+            TypeError: If the scene is not a floating-point tensor.
+        """
+        if not isinstance(scene, Tensor) or not scene.dtype.is_floating_point:
+            raise TypeError("scene must be a floating-point tensor (..., H, W)")
+        height, width = scene.shape[-2:]
+        mirrored = torch.cat([scene, scene.flip(-1)], dim=-1)
+        mirrored = torch.cat([mirrored, mirrored.flip(-2)], dim=-2)
+        u = torch.fft.rfftfreq(2 * width, dtype=scene.dtype, device=scene.device)
+        v = torch.fft.fftfreq(2 * height, dtype=scene.dtype, device=scene.device)[:, None]
+        image: Tensor = torch.fft.irfft2(torch.fft.rfft2(mirrored) * self.transfer(u, v), s=(2 * height, 2 * width))
+        return image[..., :height, :width].contiguous()
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Shot noise, read noise, fixed pattern and quantisation of a sensor whose full scale is 1.
+
+    A pixel with irradiance f has the value ``Poisson(F f (1 + p)) / F + c + r + read noise``, then quantised, with the
+    full well F, the gain error p of the pixel and the offsets c and r of its column and row: p, c and r are Gaussian,
+    drawn once from ``pattern_seed``, and the same in all frames.
+
+    Args:
+        full_well: Electrons at full scale, for shot noise; None for no shot noise.
+        read_noise: Standard deviation of the Gaussian noise as a fraction of full scale.
+        bits: Bits of the converter (values are then clipped to 0 ... 1); None for no quantisation.
+        gain_spread: Standard deviation of the gain of the pixels (photo response non-uniformity), as a fraction.
+        column_offset: Standard deviation of the offsets of the columns as a fraction of full scale.
+        row_offset: Standard deviation of the offsets of the rows as a fraction of full scale.
+        pattern_seed: Seed of the fixed pattern; each seed is another sensor.
+
+    Example:
+        >>> SensorNoise(bits=1).apply(torch.tensor([[0.2, 0.7, 1.3]])).tolist()
+        [[0.0, 1.0, 1.0]]
+    """
+
+    full_well: float | None = None
+    read_noise: float = 0.0
+    bits: int | None = None
+    gain_spread: float = 0.0
+    column_offset: float = 0.0
+    row_offset: float = 0.0
+    pattern_seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.full_well is not None:
+            check_number("full_well", self.full_well, above=0.0)
+        check_number("read_noise", self.read_noise, at_least=0.0)
+        if self.bits is not None:
+            if isinstance(self.bits, bool) or self.bits != math.floor(self.bits):
+                raise TypeError(f"bits must be a whole number, got {self.bits!r}")
+            check_number("bits", self.bits, at_least=1, at_most=32)
+        for name in ("gain_spread", "column_offset", "row_offset"):
+            check_number(name, getattr(self, name), at_least=0.0, at_most=1.0)
+        check_whole_number("pattern_seed", self.pattern_seed, at_least=0)
+
+    def fixed_pattern(self, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """Gain and offset of every pixel, float64 (height, width), the same in every call.
+
+        Args:
+            height: Rows of the sensor.
+            width: Columns of the sensor.
+        """
+        generator = torch.Generator().manual_seed(self.pattern_seed)
+        columns, rows, pixels = (
+            torch.randn(shape, generator=generator, dtype=torch.float64)
+            for shape in ((1, width), (height, 1), (height, width))
+        )
+        return 1 + self.gain_spread * pixels, self.column_offset * columns + self.row_offset * rows
+
+    def apply(self, frames: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Return noisy frames of the same shape and dtype.
+
+        Args:
+            frames: Noise-free frames (..., H, W) of the whole sensor, full scale 1.
+            generator: Source of randomness, on the device of the frames.
+        """
+        patterned = self.gain_spread > 0 or self.column_offset > 0 or self.row_offset > 0
+        if patterned:
+            gain, offset = (part.to(frames) for part in self.fixed_pattern(*frames.shape[-2:]))
+            frames = frames * gain
+        if self.full_well is not None:
+            frames = torch.poisson(frames.clamp(min=0.0) * self.full_well, generator=generator) / self.full_well
+        if patterned:
+            frames = frames + offset
+        if self.read_noise > 0:
+            noise = torch.randn(frames.shape, generator=generator, dtype=frames.dtype, device=frames.device)
+            frames = frames + self.read_noise * noise
+        if self.bits is not None:
+            levels = 2.0**self.bits - 1
+            frames = (frames.clamp(0.0, 1.0) * levels).round() / levels
+        return frames
