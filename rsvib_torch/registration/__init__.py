@@ -1,7 +1,6 @@
-"""Offsets of row bands between frames."""
+"""Displacements of row bands and of single rows between frames, measured on the images."""
 
 from rsvib_torch.registration.methods import Registration, RegistrationOptions
-from rsvib_torch.registration.offset_curve import OffsetCurve
-from rsvib_torch.registration.register import register_bands
+from rsvib_torch.registration.register import OffsetCurve, register_bands
 
 __all__ = ["OffsetCurve", "Registration", "RegistrationOptions", "register_bands"]

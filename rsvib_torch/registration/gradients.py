@@ -1,10 +1,17 @@
-"""What every scene row tells of its place in each frame, once the frames are warped back by a known motion.
+"""Displacement of every scene row in every frame, by weighted least squares on image gradients.
 
-With s the scene and d the displacement that is still missing in a frame, the frame less the scene is ``-s' d`` plus
-noise. The scene itself is unknown; the mean of the warped frames stands for it, and its gradient, cleaned by a Wiener
-filter, weighs what remains: ``H = sum w g g^T`` and ``b = -sum w g e`` per row. Noise of the mean and noise of the
-differences from it are independent, so that the sums have no bias from it, and the filter keeps them near the
-Cramer-Rao bound.
+Frames are first warped to the scene by a known motion. With the scene s, its gradient g = (ds/dx, ds/dy) and the
+residual displacement d of a row in one frame, the warped frame differs from the scene by ``e = -g . d`` plus noise of
+variance sigma^2. The weighted least-squares estimate of d solves, for each row,
+
+    ``H d = b``,  ``H = sum_x w g g^T / sigma^2``,  ``b = -sum_x w g e / sigma^2``
+
+and H is the information matrix (inverse covariance) of d. The scene is unknown. The mean of the warped frames replaces
+it, cleaned by a Wiener filter, and e is the difference of a frame from that mean. The noise of the mean is independent
+of the noise of these differences, so that b has no bias, and the filter brings the variance close to the Cramer-Rao
+bound. Detail of the scene is a third regressor beside the gradients, which removes differences in contrast.
+
+The displacement is assumed to depend on the row only; rows lie on axis -2 in readout order.
 """
 
 import math
@@ -15,79 +22,62 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.registration.row_spectra import RowSpectra, chunks, differences, inner_columns
-from rsvib_torch.registration.scene_detail import Compared, scene_detail
+from rsvib_torch.core.fourier import fast_length
+from rsvib_torch.registration.row_spectra import (
+    RowSpectra,
+    chunks,
+    combined,
+    differences,
+    inner_columns,
+    mean_over_frames,
+)
 
-__all__ = ["RowGradients", "row_gradients", "row_pulls", "row_shifts"]
+__all__ = ["FrameComparison", "RowGradients", "residual_products", "row_equations", "row_gradients", "scene_detail"]
 
-_BLOCK = 16  # px, side of the blocks that are judged together
-_LARGEST_NOISE = 9.0  # mean square of a block over the typical one before it loses weight
-_LARGEST_SHIFT = 0.15  # px, part of a block's residual that the gradient excuses
+_BLOCK = 16  # px, side of the blocks of pixels that share a weight
+_SMOOTH = 16  # spectral values averaged along each axis for the power of scene and noise
+_NOISE_STEP = 4  # along the rows, every fourth frequency gives the noise power
 
 
 @dataclass(frozen=True, eq=False)
 class RowGradients:
-    """Gradients of the scene as seen by the rows of a group of frames, ready to weigh residuals.
+    """Gradients of the scene for the rows of a group of G frames, and their products with the frames' differences.
 
     Attributes:
-        images: (B, S, 3, L) weight times gradient along x, along y, and detail of the scene, without their means.
-        products: (B, S, 3, 3) float64 sums of their products; detail takes out changes of contrast.
-        pulls: (B, S, 3, G) float64 sums of their products with what the frames differ by that they were taken from; of
-            two frames (B, S, 3, 1), from the first.
+        images: (B, S, 3, L) weight times gradient along x, gradient along y and detail of the scene, less their means.
+        products: (B, S, 3, 3) float64 sums of their products.
+        residual_products: (B, S, 3, G) float64 sums of their products with the differences of the frames; of two
+            frames (B, S, 3, 1), of the first.
         variance: (B, S) float64, noise variance of a pixel in a frame.
         halves: (B, S, 2, 5) float64, sums gx gx, gx gy, gy gy, gx e and gy e over the left and the right half of each
-            row, with e what is left between the outer frames: halves that move apart are no vibration.
+            row, with e the residual difference between the last and the first frame. A displacement that depends on
+            the row only is equal in both halves.
     """
 
     images: Tensor
     products: Tensor
-    pulls: Tensor
+    residual_products: Tensor
     variance: Tensor
     halves: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Some rows of the scene as pixels.
-
-    Attributes:
-        planes: (B, s, 3 + G, L) gradients along x and y, detail, and what the frames differ by (``differences``).
-        weight: (B, s, L) of the pixels.
-        seen: (B, G, s), 1 where a frame sees the row.
-    """
-
-    planes: Tensor
-    weight: Tensor
-    seen: Tensor
-
-    @property
-    def images(self) -> Tensor:
-        """Gradients along x and y, detail."""
-        return self.planes[:, :, :3]
-
-    @property
-    def residual(self) -> Tensor:
-        """What the frames differ by."""
-        return self.planes[:, :, 3:]
-
-
 def row_gradients(
-    spectra: RowSpectra, warped: Iterable[tuple[slice, Tensor]], rows: Tensor, shift: Tensor, seen: Tensor
+    spectra: RowSpectra, warped: Iterable[tuple[slice, Tensor]], rows: Tensor, shift: Tensor, visible: Tensor
 ) -> RowGradients:
-    """Gradients of the scene, its noise, and the weight of every pixel, from frames warped by a motion.
+    """Gradients of the scene, noise, and the weight of every pixel, from frames warped by a motion.
 
     Args:
         spectra: The frames of a group.
         warped: Runs of the S rows of the scene with the frames warped to them, (B, G, s, U) from ``RowSpectra.warped``.
-        rows: (B, G, S) frame rows that show the S scene rows, in each frame.
-        shift: (B, G, S) px, displacement along the rows to be taken out of each.
-        seen: (B, G, S) float64, 1 where a frame sees the row.
+        rows: (B, G, S) frame rows of the S scene rows in each frame.
+        shift: (B, G, S) px, displacement along the rows by which each was moved back.
+        visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
 
     Returns:
         The gradients.
     """
     length, width = spectra.length, spectra.width
-    compared = Compared.of(warped, seen)
+    compared = FrameComparison.of(warped, visible)
     detail, across = scene_detail(compared, spectra.frequencies)
     along = (2j * math.pi * spectra.frequencies).to(detail.dtype)
     inner = functional.pad(inner_columns(width, shift, detail.real), (0, length - width))
@@ -96,66 +86,122 @@ def row_gradients(
     memory = inner.new_empty(len(rows), parts[0].stop, 3 + (1 if rows.shape[1] == 2 else rows.shape[1]), length)
 
     def pixels(part: slice) -> _Rows:
-        own, visible = detail[:, part].contiguous(), seen[:, :, part]
-        spectra = [own * along, across[:, part], own, *compared.differences[:, :, part].unbind(1)]
+        own, shown = detail[:, part].contiguous(), visible[:, :, part]
         planes = memory[:, : own.shape[1]]
-        for place, one in enumerate(spectra):
+        for place, one in enumerate((own * along, across[:, part], own, *compared.differences[:, :, part].unbind(1))):
             planes[:, :, place] = torch.fft.irfft(one, n=length)
-        weight = inner * (visible.sum(1) > 1)[..., None].to(inner.dtype)
+        weight = inner * (shown.sum(1) > 1)[..., None].to(inner.dtype)
         if valid is not None:
             weight = weight * functional.pad(valid[:, part], (0, length - width))
-        return _Rows(planes, weight, visible)
+        return _Rows(planes, weight, shown)
 
     images = inner.new_empty(len(rows), rows.shape[-1], 3, length)
-    results, energies = [], []
+    fits, blocks = [], []
     for part in parts:
-        some = pixels(part)
-        found, blocks = _explained_rows(some, width // 2, images[:, part])
-        results.append(found)
-        energies.append(blocks)
-    trust = _trust(*(torch.cat(values, 1) for values in zip(*energies, strict=True)))
-    doubtful = (trust < 1).any(-1).any(0).tolist()
-    for place, part in enumerate(parts):
+        fit, block = _fit_rows(pixels(part), width // 2, images[:, part])
+        fits.append(fit)
+        blocks.append(block)
+    block_weight = _block_weight(*(torch.cat(values, 1) for values in zip(*blocks, strict=True)))
+    reweighted = (block_weight < 1).any(-1).any(0).tolist()
+    for place, part in enumerate(parts):  # the fit is repeated where blocks lost weight
         within = slice(part.start // _BLOCK, -(-part.stop // _BLOCK))
-        if any(doubtful[within]):
+        if any(reweighted[within]):
             some = pixels(part)
-            spread = trust[:, within].repeat_interleave(_BLOCK, 1).repeat_interleave(_BLOCK, 2)
+            spread = block_weight[:, within].repeat_interleave(_BLOCK, 1).repeat_interleave(_BLOCK, 2)
             weight = some.weight * spread[:, : some.weight.shape[1], :length]
-            results[place], _ = _explained_rows(replace(some, weight=weight), width // 2, images[:, part])
-    sums, solution, square = (torch.cat(values, 1) for values in zip(*results, strict=True))
+            fits[place], _ = _fit_rows(replace(some, weight=weight), width // 2, images[:, part])
+    sums, solution, square = (torch.cat(values, 1) for values in zip(*fits, strict=True))
     products, right = _products(sums.sum(2))
     means = _means(products)
     return RowGradients(
         images,
         products=products[..., :3, :3] - means * products[..., 3:, :3],
-        pulls=right[..., :3, :] - means * right[..., 3:, :],
+        residual_products=right[..., :3, :] - means * right[..., 3:, :],
         variance=square / (products[..., 3, 3] - 4).clamp(min=1.0),
-        halves=_halves(sums, solution, seen),
+        halves=_halves(sums, solution, visible),
     )
 
 
-def _explained_rows(rows: _Rows, middle: int, out: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """What some rows tell.
+def residual_products(warped: Iterable[tuple[slice, Tensor]], gradients: RowGradients, visible: Tensor) -> Tensor:
+    """Products (B, S, 3, G) of gradients with the differences of frames, as ``RowGradients.residual_products``.
+
+    Args:
+        warped: As in ``row_gradients``, one run after the other.
+        gradients: Gradients of the scene, from a similar motion.
+        visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
+    """
+    length, parts = gradients.images.shape[-1], []
+    for part, run in warped:
+        pixels = torch.fft.irfft(differences(run, visible[:, :, part]).transpose(1, 2), n=length)
+        parts.append(torch.matmul(gradients.images[:, part], pixels.transpose(-2, -1)))
+    return torch.cat(parts, 1).double()
+
+
+def row_equations(products: Tensor, gradients: RowGradients, visible: Tensor) -> tuple[Tensor, Tensor]:
+    """Normal equations ``H d = b`` of the residual displacement d of every scene row in each frame.
+
+    With the products P of the gradients g and the detail q, the detail is eliminated (Schur complement):
+    ``H = (P_gg - P_gq P_qg / P_qq) / sigma^2``, and b likewise.
+
+    Args:
+        products: ``gradients.residual_products``, or those of other frames from ``residual_products``.
+        gradients: Gradients of the scene.
+        visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
+
+    Returns:
+        H (B, S, 2, 2) in px^-2 and b (B, G, S, 2) in px^-1, axes (x, y), float64. ``H^-1 b`` is the displacement in px
+        relative to the mean over the group, and H its information matrix in one frame. Both are 0 for rows that are
+        visible in fewer than two frames or have no detail.
+    """
+    right = -(torch.cat([products, -products], -1) if visible.shape[1] == 2 else products).permute(0, 3, 1, 2)
+    own = gradients.products
+    detail = own[..., 2, 2]
+    safe = detail.clamp(min=1e-300)
+    usable = (detail > 0) & (gradients.variance > 0)
+    matrix = own[..., :2, :2] - own[..., :2, 2:] * own[..., 2:, :2] / safe[..., None, None]
+    right = right[..., :2] - own[:, None, :, :2, 2] * (right[..., 2:] / safe[:, None, :, None])
+    factor = torch.where(usable, 1 / torch.where(usable, gradients.variance, 1.0), 0.0)
+    return matrix * factor[..., None, None], right * factor[:, None, :, None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Some rows of the scene as pixels.
+
+    Attributes:
+        planes: (B, s, 3 + G, L) gradients along x and y, detail, and the differences of the frames (``differences``).
+        weight: (B, s, L) of the pixels.
+        visible: (B, G, s), 1 where a row is visible in a frame.
+    """
+
+    planes: Tensor
+    weight: Tensor
+    visible: Tensor
+
+
+def _fit_rows(rows: _Rows, middle: int, out: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Least-squares fit of the differences of the frames by gradients, detail and a constant, row by row.
 
     Args:
         rows: The rows.
-        middle: Column where the right half begins.
-        out: (B, s, 3, L) for the images of ``RowGradients``.
+        middle: First column of the right half.
+        out: (B, s, 3, L), filled with the images of ``RowGradients``.
 
     Returns:
-        Products from ``_sums_of_halves``, the factors that explain the rows, and the weighted sum (B, s) of the squares
-        of what is left, in one frame; and what ``_trust`` asks for.
+        Products from ``_sums_of_halves``, the coefficients (B, s, G, 4) of the fit and the weighted sum (B, s) of its
+        squared residuals in one frame; and the arguments of ``_block_weight``.
     """
-    weighted = torch.mul(rows.images, rows.weight[:, :, None], out=out)
+    images, residual = rows.planes[:, :, :3], rows.planes[:, :, 3:]
+    weighted = torch.mul(images, rows.weight[:, :, None], out=out)
     sums = _sums_of_halves(weighted, rows, middle)
     products, right = _products(sums.sum(2))
-    solution = _explanation(products, right.transpose(-2, -1))
+    solution = _solve(products, right.transpose(-2, -1))
     factors = solution.to(weighted.dtype)
-    explained = torch.matmul(factors[..., :3], rows.images).add_(factors[..., 3:])
-    energy = torch.sub(rows.residual, explained, out=explained).square_().sum(2) * rows.weight
-    spare = (rows.seen.sum(1) - 1).clamp(min=1.0) * (explained.shape[2] / rows.seen.shape[1])
-    energy /= spare[..., None].to(energy.dtype)
-    slope = (weighted[:, :, 0] * rows.planes[:, :, 0]).addcmul_(weighted[:, :, 1], rows.planes[:, :, 1])
+    fitted = torch.matmul(factors[..., :3], images).add_(factors[..., 3:])
+    energy = torch.sub(residual, fitted, out=fitted).square_().sum(2) * rows.weight
+    freedom = (rows.visible.sum(1) - 1).clamp(min=1.0) * (residual.shape[2] / rows.visible.shape[1])
+    energy /= freedom[..., None].to(energy.dtype)
+    slope = (weighted[:, :, 0] * images[:, :, 0]).addcmul_(weighted[:, :, 1], images[:, :, 1])
     blocks = _sum_of_blocks(energy), _sum_of_blocks(slope), _sum_of_blocks(rows.weight)
     means = _means(products).to(weighted.dtype)
     for image, mean, weight in zip(weighted, means, rows.weight, strict=True):
@@ -165,7 +211,7 @@ def _explained_rows(rows: _Rows, middle: int, out: Tensor) -> tuple[tuple[Tensor
 
 
 def _products(sums: Tensor) -> tuple[Tensor, Tensor]:
-    """Products (B, s, 4, 4) of images and ones, and (B, s, 4, G) with what the frames differ by, of whole rows."""
+    """Products (B, s, 4, 4) of images and ones, and (B, s, 4, G) with the differences of the frames, of whole rows."""
     return torch.cat([sums[..., :3], sums[..., -1:]], -1), sums[..., 3:-1]
 
 
@@ -176,38 +222,37 @@ def _means(products: Tensor) -> Tensor:
 
 
 def _sums_of_halves(weighted: Tensor, rows: _Rows, middle: int) -> Tensor:
-    """Products (B, s, 2, 4, 4 + G) float64 over both halves of each row of weighted images and ones.
-
-    Those with the images, with what the frames differ by, and with ones.
+    """Products (B, s, 2, 4, 4 + G) float64 of weighted images and ones with images, differences and ones.
 
     Args:
-        weighted: (B, s, 3, L) images.
-        rows: What they belong to.
-        middle: Column where the right half begins.
+        weighted: (B, s, 3, L) weight times images.
+        rows: The rows they belong to.
+        middle: First column of the right half; sums over both halves of each row.
     """
     sums = weighted.new_empty(*weighted.shape[:2], 2, 4, 1 + rows.planes.shape[2], dtype=torch.float64)
     for half, columns in enumerate((slice(0, middle), slice(middle, None))):
         images, weight = weighted[..., columns], rows.weight[..., columns]
-        seen = rows.planes[..., columns].transpose(-2, -1)
+        planes = rows.planes[..., columns].transpose(-2, -1)
         own = sums[:, :, half]
-        own[..., :3, :-1] = torch.matmul(images, seen)
-        own[..., 3:, :-1] = torch.matmul(weight[:, :, None], seen)
+        own[..., :3, :-1] = torch.matmul(images, planes)
+        own[..., 3:, :-1] = torch.matmul(weight[:, :, None], planes)
         own[..., :3, -1] = own[..., 3, :3]
         own[..., 3, -1] = weight.sum(-1)
     return sums
 
 
-def _explanation(products: Tensor, right: Tensor) -> Tensor:
-    """Factors (B, s, G, 4) of images and ones that explain most of what the frames differ by.
+def _solve(products: Tensor, right: Tensor) -> Tensor:
+    """Coefficients (B, s, G, 4) of the fit, with a relative regularisation of 1e-6; 0 for rows without detail.
 
     Args:
         products: (B, s, 4, 4) of the images and ones.
-        right: (B, s, G, 4) of what the frames differ by with them.
+        right: (B, s, G, 4) of the differences of the frames with them.
     """
-    known = (products.diagonal(dim1=-2, dim2=-1) > 0).all(-1)[..., None]
-    scale = torch.where(known, products.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt(), 0.0)
+    diagonal = products.diagonal(dim1=-2, dim2=-1)
+    usable = (diagonal > 0).all(-1)[..., None]
+    scale = torch.where(usable, diagonal.clamp(min=1e-300).rsqrt(), 0.0)
     eye = torch.eye(4, dtype=scale.dtype, device=scale.device)
-    unit = products * scale[..., :, None] * scale[..., None, :] + torch.where(known, 1e-6, 1.0)[..., None] * eye
+    unit = products * scale[..., :, None] * scale[..., None, :] + torch.where(usable, 1e-6, 1.0)[..., None] * eye
     solution = torch.linalg.solve(unit, (right * scale[..., None, :]).transpose(-2, -1)).transpose(-2, -1)
     factors: Tensor = solution * scale[..., None, :]
     return factors
@@ -216,81 +261,168 @@ def _explanation(products: Tensor, right: Tensor) -> Tensor:
 def _sum_of_blocks(values: Tensor) -> Tensor:
     """Sums (B, N, M) over blocks of values (B, s, L); the last ones of either axis may be smaller."""
     rows, columns = values.shape[1:]
-    rest = -rows % _BLOCK, -columns % _BLOCK
-    if rest[0]:
-        values = functional.pad(values, (0, 0, 0, rest[0]))
+    if -rows % _BLOCK:
+        values = functional.pad(values, (0, 0, 0, -rows % _BLOCK))
     strips = values.unflatten(1, (-1, _BLOCK)).sum(2)
-    sums: Tensor = functional.pad(strips, (0, rest[1])).unflatten(2, (-1, _BLOCK)).sum(3)
+    sums: Tensor = functional.pad(strips, (0, -columns % _BLOCK)).unflatten(2, (-1, _BLOCK)).sum(3)
     return sums
 
 
-def _trust(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
-    """Weight in 0 ... 1 of blocks whose residual neither noise nor a small shift explains.
+def _block_weight(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
+    """Weight (B, N, M) in 0 ... 1 of blocks, small where the residual exceeds noise and a small shift.
 
-    Things that move by themselves, clouds and parallax leave such blocks.
+    Objects that move by themselves, clouds and parallax leave such residuals. The weight is ``1 / (1 + (r - 1)^2)``
+    for r > 1, with r the mean square of the residual over ``9 median + (0.15 px)^2 |g|^2``.
 
     Args:
-        energy: (B, N, M) weighted sum over each block of what is left.
-        slope: The same of the square of the gradient.
+        energy: (B, N, M) weighted sum of squared residuals over each block.
+        slope: The same of the squared gradient.
         share: Sum of the weights.
     """
     used = share > 0
     mean, slope = energy / share.clamp(min=1e-6), slope / share.clamp(min=1e-6)
     typical = torch.where(used, mean, torch.nan).flatten(1).nanmedian(1).values[:, None, None]
-    ratio = mean / (_LARGEST_NOISE * typical + _LARGEST_SHIFT**2 * slope).clamp(min=1e-30)
+    ratio = mean / (9.0 * typical + 0.15**2 * slope).clamp(min=1e-30)
     return 1 / (1 + (ratio - 1).clamp(min=0.0).square())
 
 
-def _halves(sums: Tensor, solution: Tensor, seen: Tensor) -> Tensor:
+def _halves(sums: Tensor, solution: Tensor, visible: Tensor) -> Tensor:
     """Sums over the halves of each row, as in ``RowGradients.halves``.
 
     Args:
         sums: From ``_sums_of_halves``.
-        solution: (B, s, G, 4) what explains the rows.
-        seen: (B, G, S), 1 where a frame sees the row.
+        solution: (B, s, G, 4) coefficients of the fit.
+        visible: (B, G, S), 1 where a scene row is visible in a frame.
     """
     images, ones = solution[:, :, None].transpose(-2, -1).split((3, 1), dim=-2)
-    pulls = sums[..., :2, 3:-1] - sums[..., :2, :3] @ images - sums[..., :2, -1:] @ ones  # (B, s, 2, 2, G)
-    change = pulls[..., -1] - pulls[..., 0] if pulls.shape[-1] > 1 else -2 * pulls[..., 0]
+    right = sums[..., :2, 3:-1] - sums[..., :2, :3] @ images - sums[..., :2, -1:] @ ones  # (B, s, 2, 2, G)
+    change = right[..., -1] - right[..., 0] if right.shape[-1] > 1 else -2 * right[..., 0]
     own = torch.stack([sums[..., 0, 0], sums[..., 0, 1], sums[..., 1, 1]], dim=-1)
-    return torch.cat([own, change], dim=-1) * (seen[:, 0] * seen[:, -1])[..., None, None]
+    return torch.cat([own, change], dim=-1) * (visible[:, 0] * visible[:, -1])[..., None, None]
 
 
-def row_pulls(warped: Iterable[tuple[slice, Tensor]], gradients: RowGradients, seen: Tensor) -> Tensor:
-    """Products (B, S, 3, G) of gradients with what frames differ by, as ``RowGradients.pulls``.
+@dataclass(frozen=True, eq=False)
+class FrameComparison:
+    """Mean of the frames of a group, its noise and the differences of the frames: spectra along S scene rows.
 
-    Args:
-        warped: As in ``row_gradients``, one run after the other.
-        gradients: Gradients of the scene, from a motion near to that of the rows.
-        seen: (B, G, S) float64, 1 where a frame sees the row.
+    Attributes:
+        mean: (B, R, U), over the frames in which a row is visible. R - S rows of zeros follow, so that transforms
+            across rows are fast.
+        noise: (B, R, U / 4), a difference of two frames with the noise of their mean, at every fourth frequency.
+        differences: (B, G, S, U), or (B, 1, S, U) of two frames, as from ``differences``.
     """
-    length, parts = gradients.images.shape[-1], []
-    for part, run in warped:
-        left = torch.fft.irfft(differences(run, seen[:, :, part]).transpose(1, 2), n=length)
-        parts.append(torch.matmul(gradients.images[:, part], left.transpose(-2, -1)))
-    return torch.cat(parts, 1).double()
+
+    mean: Tensor
+    noise: Tensor
+    differences: Tensor
+
+    @classmethod
+    def of(cls, warped: Iterable[tuple[slice, Tensor]], visible: Tensor) -> "FrameComparison":
+        """Compare frames warped to the scene.
+
+        Args:
+            warped: Runs of the S rows with the frames warped to them, (B, G, s, U), each processed while in the cache.
+            visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
+        """
+        whole: list[Tensor] = []
+        count = visible.shape[2]
+        counts = (_transform_length(count), _transform_length(count), count)
+        for rows, run in warped:
+            shown = visible[:, :, rows]
+            different = differences(run, shown)
+            # half the difference of two frames has the noise of their mean
+            noise = (
+                different[:, 0, :, ::_NOISE_STEP]
+                if run.shape[1] == 2
+                else _noise_of_mean(run[..., ::_NOISE_STEP], shown)
+            )
+            of_run = (mean_over_frames(run, shown), noise, different)
+            if not whole:
+                sizes = zip(of_run, counts, strict=True)
+                whole = [one.new_empty(*one.shape[:-2], size, one.shape[-1]) for one, size in sizes]
+            for all_rows, one in zip(whole, of_run, strict=True):
+                all_rows[..., rows, :] = one
+        for all_rows in whole:
+            all_rows[..., count:, :] = 0
+        return cls(*whole)
 
 
-def row_shifts(pulls: Tensor, gradients: RowGradients, seen: Tensor) -> tuple[Tensor, Tensor]:
-    """Normal equations of the displacement that every row still misses in each frame.
+def scene_detail(compared: FrameComparison, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Detail of the scene and its gradient across rows, by a Wiener filter ``1 - N / P`` of the mean of the frames.
+
+    P is the power spectrum of the mean and N that of its noise, both smoothed over 16 x 16 frequencies. The pass band
+    excludes shading (below 1/64 cycles/px) and the frequencies that interpolation attenuates.
 
     Args:
-        pulls: Those of the gradients, or from ``row_pulls``.
-        gradients: Gradients of the scene.
-        seen: (B, G, S) float64, 1 where a frame sees the row.
+        compared: The frames of a group.
+        u: (U,) frequencies along rows, cycles/px.
 
     Returns:
-        Matrix (B, S, 2, 2) and right-hand sides (B, G, S, 2), axes (x, y), float64: their quotient is the displacement
-        in px relative to the mean over the group, the matrix its inverse covariance in one frame. Both are 0 for rows
-        that fewer than two frames see or that have no detail.
+        Spectra (B, R, U) of the detail and of its derivative in px^-1; neighbours in memory belong to one frequency.
     """
-    right = -(torch.cat([pulls, -pulls], -1) if seen.shape[1] == 2 else pulls).permute(0, 3, 1, 2)  # (B, G, S, 3)
-    products = gradients.products
-    detail = products[..., 2, 2]
-    safe = detail.clamp(min=1e-300)
-    known = (detail > 0) & (gradients.variance > 0)
-    # contrast that differs from frame to frame is taken out of the rows' say
-    matrix = products[..., :2, :2] - products[..., :2, 2:] * products[..., 2:, :2] / safe[..., None, None]
-    right = right[..., :2] - products[:, None, :, :2, 2] * (right[..., 2:] / safe[:, None, :, None])
-    factor = torch.where(known, 1 / torch.where(known, gradients.variance, 1.0), 0.0)
-    return matrix * factor[..., None, None], right * factor[:, None, :, None]
+    # transforms across rows leave the rows contiguous in memory, and all later loops run along them
+    whole, noise = (torch.fft.fft(rows, dim=-2).transpose(-2, -1) for rows in (compared.mean, compared.noise))
+    v = torch.fft.fftfreq(whole.shape[-1], dtype=torch.float64, device=u.device)
+    torch.view_as_real(whole).mul_(_wiener_filter(whole, noise, u, v)[..., None])
+    detail = torch.fft.ifft(whole)
+    whole *= (2j * math.pi * v).to(whole.dtype)
+    return detail.transpose(-2, -1), torch.fft.ifft(whole).transpose(-2, -1)
+
+
+def _transform_length(rows: int) -> int:
+    """Length of a fast transform across rows; no multiple of 128, at which columns would share few cache lines."""
+    length = fast_length(rows)
+    return length if length % 128 else fast_length(length + 1)
+
+
+def _wiener_filter(mean: Tensor, noise: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Wiener filter (B, U, S) times the pass band.
+
+    Args:
+        mean: (B, U, S) two-dimensional spectrum of the mean of the frames.
+        noise: (B, U / 4, S) spectrum of a difference with the noise of the mean, at every fourth frequency.
+        u: Frequencies along rows, cycles/px.
+        v: Frequencies across rows, cycles/px.
+    """
+    total, noise_power = _smoothed(mean, _SMOOTH), _smoothed(noise, _SMOOTH // _NOISE_STEP)
+    share = (1 - noise_power / total.clamp(min=torch.finfo(total.dtype).tiny)).clamp(min=0.0)
+    # along rows, interpolation is exact, but detail near 0.5 cycles/px may be aliased; across rows, the spline
+    # attenuates it earlier. High pass: 1 - exp(-(u^2 + v^2) / (1/64)^2)
+    along, across = _low_pass(u, 0.40, 0.48), _low_pass(v, 0.24, 0.34)
+    slow_along, slow_across = along * torch.exp(-((64 * u) ** 2)), across * torch.exp(-((64 * v) ** 2))
+    along, across, slow_along, slow_across = (x.to(share.dtype) for x in (along, across, slow_along, slow_across))
+    passed = torch.outer(along, across).addr_(slow_along, slow_across, alpha=-1)
+    blocks = share[:, :, None, :, None].expand(-1, -1, _SMOOTH, -1, _SMOOTH).flatten(3).flatten(1, 2)
+    return blocks[:, : len(u), : len(v)] * passed
+
+
+def _low_pass(frequency: Tensor, low: float, high: float) -> Tensor:
+    """1 below ``low``, 0 above ``high`` (cycles/px), half a cosine between."""
+    return 0.5 + 0.5 * torch.cos(math.pi * ((frequency.abs() - low) / (high - low)).clamp(0.0, 1.0))
+
+
+def _smoothed(spectrum: Tensor, frequencies: int) -> Tensor:
+    """Mean power (B, U / frequencies, S / 16) of blocks of a spectrum (B, U, S), up to a factor."""
+    parts = torch.view_as_real(spectrum).flatten(-2)
+    blocks = []
+    for part in chunks(parts.shape[1], 4 * parts.shape[2] * len(parts), frequencies, parts.device):
+        power = parts[:, part].square()
+        whole = power.shape[1] // frequencies * frequencies
+        blocks.append(power[:, :whole].unflatten(1, (-1, frequencies)).mean(2))
+        if whole < power.shape[1]:
+            blocks.append(power[:, whole:].mean(1, keepdim=True))
+    return functional.avg_pool1d(torch.cat(blocks, 1), 2 * _SMOOTH, ceil_mode=True)
+
+
+def _noise_of_mean(warped: Tensor, visible: Tensor) -> Tensor:
+    """Difference (B, S, U) of the first and last frame in which a row is visible, with the noise of their mean.
+
+    It is 0 where a row is visible in one frame only.
+    """
+    count = visible.shape[1]
+    order = torch.arange(count, device=visible.device)[:, None]
+    first = torch.where(visible > 0, order, count).amin(1, keepdim=True)
+    last = torch.where(visible > 0, order, -1).amax(1, keepdim=True)
+    sign = ((order == last).double() - (order == first).double()) * (last > first)
+    # the difference of two frames has twice the noise variance of a frame, the mean of n frames 1/n of it
+    return combined(warped, sign * (0.5 / visible.sum(1, keepdim=True).clamp(min=1.0)).sqrt())

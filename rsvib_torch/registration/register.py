@@ -1,27 +1,68 @@
-"""Offsets of all bands of all frame pairs of a stack."""
+"""Offsets of row bands between consecutive frames: the offset curve (Sec. 2.2 of Liu et al. 2023).
+
+The whole-frame offset comes first, then the offset of every band by one of ``BAND_METHODS``. One offset per band
+assumes that the displacement depends on the row only.
+"""
+
+from dataclasses import dataclass, replace
 
 import torch
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.chunking import runs
+from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.registration.band_windows import band_tops
-from rsvib_torch.registration.coarse import coarse_offset
-from rsvib_torch.registration.methods import BAND_METHODS, BandTask, Registration, RegistrationOptions
-from rsvib_torch.registration.offset_curve import OffsetCurve
+from rsvib_torch.registration.bands import BandTask
+from rsvib_torch.registration.methods import BAND_METHODS, Registration, RegistrationOptions
 
-__all__ = ["register_bands", "register_rows"]
+__all__ = ["OffsetCurve", "register_bands", "register_rows"]
 
-_LOWEST_QUALITY = 0.1  # correlation below this is chance
-_SMOOTHING = 1.0  # px, sigma: lets the peak between pixels be found from whole-pixel lags, and damps noise
-_MEMORY = 2**28  # bytes of windows at a time
+
+@dataclass(frozen=True, eq=False)
+class OffsetCurve:
+    """Offsets of row bands between frames.
+
+    The content of the band around row r of the earlier frame lies at r plus the offset in the later frame
+    (displacement in the later frame minus that in the earlier one). A batch of stacks has a leading dimension B in
+    ``offsets`` and ``quality``, windows of a stack also in ``times`` and ``later_times``.
+
+    Attributes:
+        pairs: (P, 2) int64, indices of the earlier and the later frame.
+        rows: (N,) float64, centre row of each band in the earlier frame, in readout order.
+        times: (..., P, N) float64, exposure start of the centre row in the earlier frame, s.
+        later_times: (..., P, N) float64, exposure start of the same row in the later frame, s.
+        offsets: (..., P, N, 2) float64 px, axes (x, y); NaN where registration failed.
+        quality: (..., P, N) float64 in 0 ... 1; correlation of the matched bands, 0 where registration failed.
+        heights: Rows averaged for the offset along x and y, (x, y).
+    """
+
+    pairs: Tensor
+    rows: Tensor
+    times: Tensor
+    later_times: Tensor
+    offsets: Tensor
+    quality: Tensor
+    heights: tuple[int, int]
+
+    @property
+    def good(self) -> Tensor:
+        """(..., P, N) bool: bands whose offset was measured."""
+        return torch.isfinite(self.offsets).all(-1)
+
+    def __getitem__(self, index: int) -> "OffsetCurve":
+        """The curve of one stack of a batch."""
+        if self.offsets.ndim == 3:
+            raise IndexError("this offset curve is not a batch")
+        names = ("offsets", "quality", *(("times", "later_times") if self.times.ndim > 2 else ()))
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
 
 
 def register_bands(
-    frames: Tensor,
+    frames: ArrayLike,
     timing: SensorTiming,
     *,
     method: Registration = "ncc",
@@ -32,11 +73,10 @@ def register_bands(
 ) -> OffsetCurve:
     """Measure the offset of every row band between consecutive frames (Sec. 2.2 of Liu et al. 2023).
 
-    A whole-frame offset is found first, so that image motion of hundreds of px is no obstacle; the search range
-    counts from there.
+    The whole-frame offset is found first and may be hundreds of px (image motion); the search range counts from it.
 
     Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) with T >= 2.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) with T >= 2, tensor or array.
         timing: The sensor.
         method: ``"projection"`` (gray projection, the paper), ``"ncc"`` or ``"phase"``.
         band_rows: Rows of a band (the paper's window size).
@@ -45,18 +85,26 @@ def register_bands(
         full_scale: Count that means 1.0, for integer frames.
 
     Returns:
-        The offset curve, axes (x, y) of the image, rows in read order.
+        The offset curve, axes (x, y) of the image, rows in readout order.
 
     Raises:
-        ValueError: If there are fewer than two frames, or the frames are too small for the bands and search range.
+        TypeError: If an argument has the wrong type.
+        ValueError: If there are fewer than two frames, a pixel is NaN or infinite, an option is out of range, or the
+            frames are too small for the bands and the search range.
+
+    Example:
+        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
+        >>> scene = torch.rand(96, 132, generator=torch.Generator().manual_seed(0))
+        >>> curve = register_bands(torch.stack([scene[:, 4:], scene[:, :-4]]), timing)
+        >>> curve.offsets.nanmean((0, 1)).round(decimals=2).tolist()
+        [4.0, 0.0]
     """
     options = RegistrationOptions(method, band_rows, band_step, search)
     prepared = prepare_frames(frames, timing, full_scale=full_scale, minimum_frames=2, allow_missing=False)
     batch = register_rows(prepared.images.mean(2), prepared.timing, options)
     curve = batch if prepared.batched else batch[0]
-    offsets = offsets_from_row_order(curve.offsets, timing)
     heights = (curve.heights[1], curve.heights[0]) if timing.scan_axis == -1 else curve.heights
-    return OffsetCurve(curve.pairs, curve.rows, curve.times, curve.later_times, offsets, curve.quality, heights)
+    return replace(curve, offsets=offsets_from_row_order(curve.offsets, timing), heights=heights)
 
 
 def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions) -> OffsetCurve:
@@ -79,19 +127,18 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
             f"frames of {num_rows} x {width} px (rows in read order x px a row) are too small for bands of "
             f"{band_rows} rows searched over {search} px: at least {needed[0]} x {needed[1]} are needed"
         )
-    grey = _flatten_rows(gaussian_blur2d(grey, (7, 7), (_SMOOTHING, _SMOOTHING)))
-    tops = band_tops(num_rows, band_rows, options.band_step, grey.device)
+    # a Gaussian of 1 px band-limits the correlation, so that whole-pixel lags determine its peak, and damps noise
+    grey = _without_row_means(gaussian_blur2d(grey, (7, 7), (1.0, 1.0)))
+    tops = torch.arange(0, num_rows - band_rows + 1, options.band_step, device=grey.device)
     first, second = grey[:, :-1].flatten(0, 1), grey[:, 1:].flatten(0, 1)
-    cost = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4
-    chunk = max(1, _MEMORY // cost)
+    bytes_of_pair = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4
     offsets, quality = [], []
-    for begin in range(0, len(first), chunk):
-        pair = slice(begin, begin + chunk)
+    for pair in runs(len(first), max(1, 2**28 // bytes_of_pair)):  # 256 MiB of windows at a time
         task = BandTask(first[pair], second[pair], coarse_offset(first[pair], second[pair]), tops, band_rows, search)
         if task.width < search:
             raise ValueError(f"frames {width} px wide overlap too little after their whole-frame offset")
         measured, correlation = BAND_METHODS[options.method](task)
-        failed = ~(correlation > _LOWEST_QUALITY)
+        failed = ~(correlation > 0.1)  # chance reaches correlations of 0.1
         offsets.append(torch.where(failed[..., None], torch.nan, measured))
         quality.append(torch.where(failed, 0.0, correlation))
     rows = tops.to(torch.float64) + 0.5 * (band_rows - 1)
@@ -108,9 +155,95 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     )
 
 
-def _flatten_rows(images: Tensor) -> Tensor:
-    """Take out the slow course of the row means: products of windows then keep their precision in float32."""
+def _without_row_means(images: Tensor) -> Tensor:
+    """Images less the row means smoothed over 65 rows, so that products of windows keep their digits in float32."""
     course = images.mean(-1)
     size = min(65, (course.shape[-1] - 1) // 2 * 2 + 1)
     padded = functional.pad(course, (size // 2, size // 2), mode="replicate")
     return images - functional.avg_pool1d(padded, size, stride=1)[..., None]
+
+
+def coarse_offset(first: Tensor, second: Tensor) -> Tensor:
+    """Offset of whole frames of any size, to about two pixels of frames reduced to 256 px along the longer side.
+
+    The phase correlation of the reduced frames gives four candidates, each with its periodic images. The candidate
+    with the largest correlation of the overlapping parts is taken, up to shifts of 70 % of the frame.
+
+    Args:
+        first: (L, H, W) earlier frames.
+        second: (L, H, W) later frames.
+
+    Returns:
+        (L, 2) int64 px, axes (x, y): displacement in the second frame minus that in the first.
+    """
+    height, width = first.shape[-2:]
+    factor = max(1, round(max(height, width) / 256))
+    a, b = (
+        _standardised(
+            functional.avg_pool2d(frames[:, None, : height // factor * factor, : width // factor * factor], factor)
+        )[:, 0]
+        for frames in (first, second)
+    )
+    rows, columns = a.shape[-2:]
+    window = (
+        torch.hann_window(rows, periodic=False, dtype=a.dtype, device=a.device)[:, None]
+        * torch.hann_window(columns, periodic=False, dtype=a.dtype, device=a.device)
+    ).sqrt()
+    cross = torch.fft.rfft2(b * window) * torch.fft.rfft2(a * window).conj()
+    magnitude = cross.abs()
+    floor = magnitude.mean((-2, -1), keepdim=True).clamp(min=torch.finfo(magnitude.dtype).tiny)
+    surface = torch.fft.irfft2(cross / (magnitude + 0.1 * floor), s=(rows, columns))
+    # local maxima within 5 x 5 px, so that neighbours of a peak are not candidates of their own; and no offset
+    largest = functional.max_pool2d(surface[:, None], 5, stride=1, padding=2)[:, 0]
+    peaks = torch.where(surface == largest, surface, -torch.inf).flatten(1).topk(4, dim=1).indices
+    places = torch.cat([peaks, torch.zeros_like(peaks[:, :1])], dim=1)
+    y, x = places // columns, places % columns
+    candidates_y = torch.cat([y, y - rows], dim=1).repeat(1, 2)
+    candidates_x = torch.cat([x.repeat(1, 2), x.repeat(1, 2) - columns], dim=1)
+    scores = torch.cat(
+        [
+            _overlap_correlation(a[:, None], b[:, None], candidates_x[:, part], candidates_y[:, part])
+            for part in runs(candidates_x.shape[1], max(1, 2**20 // a.numel()))  # a million pixels at a time
+        ],
+        dim=1,
+    )
+    best = scores.argmax(1, keepdim=True)
+    return factor * torch.cat([candidates_x.gather(1, best), candidates_y.gather(1, best)], dim=1)
+
+
+def _standardised(images: Tensor) -> Tensor:
+    """Images (L, 1, H, W) less their mean over 31 x 31 px (light, vignetting, fixed shading), with unit variance."""
+    size = min(31, (min(images.shape[-2:]) - 1) // 2 * 2 + 1)
+    mean = functional.pad(images, [size // 2] * 4, mode="reflect")
+    for kernel in ((size, 1), (1, size)):
+        mean = functional.avg_pool2d(mean, kernel, stride=1)
+    detail = images - mean
+    scale = detail.square().mean((-2, -1), keepdim=True).sqrt()
+    return detail / scale.clamp(min=torch.finfo(scale.dtype).tiny)
+
+
+def _overlap_correlation(a: Tensor, b: Tensor, shift_x: Tensor, shift_y: Tensor) -> Tensor:
+    """Correlation (L, C) of a with b moved back by shifts, over their overlap; -1 for overlaps under 30 %.
+
+    Args:
+        a: (L, 1, H, W).
+        b: (L, 1, H, W).
+        shift_x: (L, C) px.
+        shift_y: (L, C) px.
+    """
+    rows, columns = a.shape[-2:]
+    y = torch.arange(rows, device=a.device) + shift_y[..., None]
+    x = torch.arange(columns, device=a.device) + shift_x[..., None]
+    inside_y, inside_x = (y >= 0) & (y < rows), (x >= 0) & (x < columns)
+    size = (*shift_x.shape, rows, columns)
+    moved = b.expand(size).gather(2, y.clamp(0, rows - 1)[..., None].expand(size))
+    moved = moved.gather(3, x.clamp(0, columns - 1)[..., None, :].expand(size))
+    weight = (inside_y[..., None] & inside_x[..., None, :]).to(a.dtype)
+    total = weight.sum((-2, -1)).clamp(min=1)
+    centre_a = a - ((a * weight).sum((-2, -1)) / total)[..., None, None]
+    centre_b = moved - ((moved * weight).sum((-2, -1)) / total)[..., None, None]
+    energy = (weight * centre_a.square()).sum((-2, -1)) * (weight * centre_b.square()).sum((-2, -1))
+    correlation = (weight * centre_a * centre_b).sum((-2, -1)) * energy.clamp(min=1e-30).rsqrt()
+    share = total / (rows * columns)
+    # of two overlaps that correlate equally well the larger one is taken
+    return torch.where(share >= 0.3, correlation * share**0.25, -torch.ones_like(correlation))

@@ -1,4 +1,8 @@
-"""Fourier transforms along the rows of frames, and the frames warped by a motion in them."""
+"""Fourier transforms along the rows of frames: warping by a motion, differences of frames, fixed column patterns.
+
+The displacement is assumed to depend on the row only: a row is then displaced by a phase factor of its spectrum.
+Frames have rows on axis -2 in readout order.
+"""
 
 import math
 from copy import copy
@@ -8,32 +12,42 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.chunking import gathered, runs
-from rsvib_torch.core.fourier import extend_rows, fast_length, shift_phases
+from rsvib_torch.core.fourier import extend_rows, fast_length, shift_phases, squared_modulus
 from rsvib_torch.core.splines import bspline_coefficient_rows, bspline_weights
 
-__all__ = ["DEGREE", "MARGIN", "RowSpectra", "chunks", "combined", "differences", "inner_columns", "mean_over_frames"]
+__all__ = [
+    "EVERY",
+    "MARGIN",
+    "RowSpectra",
+    "chunks",
+    "column_pattern",
+    "combined",
+    "differences",
+    "inner_columns",
+    "mean_over_frames",
+]
 
-DEGREE = 7  # of the spline across rows: what it smooths, and the noise it colours, lie above the pass band
-MARGIN = 8  # px from the ends of rows and columns that do not count
-_EXTENSION = 32  # px that rows are continued by, so that their Fourier transform closes smoothly
-_CHUNK = {"cpu": 2**23}  # bytes that stay in a cache
-_LARGE_CHUNK = 2**30  # bytes at a time elsewhere
+DEGREE = 7  # of the B-spline across rows: its smoothing and the noise it correlates lie above the pass band in use
+MARGIN = 8  # px; rows and columns this close to an edge have no weight: they are interpolated from extended values
 
 
-def chunks(count: int, bytes_of_one: int, multiple: int, device: torch.device) -> list[slice]:
-    """Slices of consecutive rows or columns, a multiple of ``multiple`` each, that are worked on at a time."""
-    size = max(1, _CHUNK.get(device.type, _LARGE_CHUNK) // (bytes_of_one * multiple)) * multiple
-    return runs(count, size)
+def chunks(count: int, bytes_per_item: int, multiple: int, device: torch.device) -> list[slice]:
+    """Slices of consecutive rows or columns, a multiple of ``multiple`` each, to be processed at a time.
+
+    On a CPU a chunk fills 8 MiB, which stay in its cache; elsewhere 1 GiB, which limits the memory.
+    """
+    limit = 2**23 if device.type == "cpu" else 2**30
+    return runs(count, max(1, limit // (bytes_per_item * multiple)) * multiple)
 
 
 class RowSpectra:
-    """Fourier transforms along the rows of frames, of spline coefficients across rows.
+    """Fourier transforms along the rows of frames, of their B-spline coefficients across rows.
 
     Args:
         frames: (B, T, H, W) in row order.
-        valid: (B, T, H, W) bool, pixels that count; None for all.
-        level: (B, T, 1, 1) to take off each frame.
-        contrast: (B, T, 1, 1) to divide what is left by.
+        valid: (B, T, H, W) bool, pixels with weight; None for all.
+        level: (B, T, 1, 1) to subtract from each frame.
+        contrast: (B, T, 1, 1) to divide the difference by.
     """
 
     def __init__(
@@ -44,78 +58,78 @@ class RowSpectra:
         contrast: Tensor | float = 1.0,
     ) -> None:
         self.height, self.width = frames.shape[-2:]
-        self.length = fast_length(self.width + 2 * _EXTENSION)
+        self.length = fast_length(self.width + 64)  # 32 px of boundary extension per end close the period smoothly
         pieces = (
             (rows, torch.fft.rfft(extend_rows(coefficients.sub_(level).div_(contrast), self.length)))
             for rows, coefficients in bspline_coefficient_rows(frames, DEGREE)
         )
         self.values = gathered(pieces, self.height, frames.ndim - 2)
-        self._point_at_rows()
+        self._index_rows()
         self.frequencies = torch.fft.rfftfreq(self.length, dtype=torch.float64, device=frames.device)
         self.valid = None
         if valid is not None and not bool(valid.all()):
-            # what interpolation takes from a bad pixel does not count either
-            spoilt = functional.max_pool2d((~valid).to(frames.dtype), 2 * (DEGREE // 2) + 1, 1, DEGREE // 2)
-            self.valid = spoilt == 0
+            # pixels that are interpolated from an invalid one are invalid as well
+            invalid = functional.max_pool2d((~valid).to(frames.dtype), 2 * (DEGREE // 2) + 1, 1, DEGREE // 2)
+            self.valid = invalid == 0
 
-    def _point_at_rows(self) -> None:
-        """All rows of all frames one after the other, and the first of each frame, which parts share."""
+    def _index_rows(self) -> None:
+        """Set the table of all rows of all frames (shared by parts) and the index of each frame's first row in it."""
         frames = self.values.shape[:2]
         self._all_rows = torch.view_as_real(self.values).view(-1, 2 * self.values.shape[-1])
         self._first_rows = self.height * torch.arange(frames.numel(), device=self.values.device).view(frames)
 
     def part(self, frames: slice) -> "RowSpectra":
-        """Those of some of the frames."""
+        """The spectra of some of the frames."""
         part = copy(self)
         part.values, part._first_rows = self.values[:, frames], self._first_rows[:, frames]
         part.valid = None if self.valid is None else self.valid[:, frames]
         return part
 
     def warped(self, rows: Tensor, shift: Tensor) -> Tensor:
-        """Spectra (B, T, S, U) of frame rows at fractional places ``rows``, moved back by ``shift``, both (B, T, S)."""
+        """Spectra (B, T, S, U) of frames at fractional rows, moved back by ``shift`` px; both (B, T, S)."""
         cell = rows.floor()
         weights = bspline_weights((rows - cell).to(self._all_rows.dtype), DEGREE)
         first = cell.to(torch.int64) - DEGREE // 2
         taps = torch.arange(DEGREE + 1, device=rows.device)
         index = self._first_rows[..., None, None] + (first[..., None] + taps).clamp(0, self.height - 1)
-        picked = functional.embedding_bag(
+        interpolated = functional.embedding_bag(  # weighted sums of rows of the table
             index.flatten(0, 2), self._all_rows, per_sample_weights=weights.flatten(0, 2), mode="sum"
         )
-        result: Tensor = torch.view_as_complex(picked.unflatten(-1, (-1, 2))).unflatten(0, rows.shape)
+        result: Tensor = torch.view_as_complex(interpolated.unflatten(-1, (-1, 2))).unflatten(0, rows.shape)
         for part in self.runs(rows.shape[-1], 1):
             result[..., part, :] *= self.ramp(shift[..., part])
         return result
 
     def runs(self, count: int, arrays: int) -> list[slice]:
-        """Runs of ``count`` rows of which so many arrays like these spectra are worked on at a time."""
+        """Runs of ``count`` rows for computations that hold ``arrays`` arrays of the size of these spectra."""
         row = self.values[:, :, 0]
         return chunks(count, arrays * row.element_size() * row.numel(), 1, row.device)
 
     def ramp(self, shift: Tensor) -> Tensor:
-        """exp(2 pi i u shift) for all frequencies u (..., U)."""
+        """exp(2 pi i u shift) for all frequencies u, (..., U)."""
         return shift_phases(shift, self.length, slice(0, len(self.frequencies)), self.values.dtype)
 
     def subtract(self, pattern: Tensor) -> None:
-        """Take a pattern (B, U) out of every row of these frames; those of other parts stay as they are."""
+        """Subtract a pattern (B, U) from every row of these frames; the spectra of other parts stay unchanged."""
         self.values = self.values - pattern[:, None, None].to(self.values.dtype)
-        self._point_at_rows()
+        self._index_rows()
 
     def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None:
-        """(B, S, W) bool, pixels of the scene that count in all frames; None for all."""
+        """(B, S, W) bool, pixels of the scene that are valid in all frames; None for all."""
         if self.valid is None:
             return None
         place = rows.round().to(torch.int64).clamp(0, self.height - 1)
         columns = torch.arange(self.width, device=rows.device)
         result = torch.ones(1, dtype=torch.bool, device=rows.device)
         for frame in range(rows.shape[1]):  # one at a time: indices take eight times the memory of the flags
-            picked = self.valid[:, frame].gather(1, place[:, frame, :, None].expand(-1, -1, self.width))
+            rows_of_frame = self.valid[:, frame].gather(1, place[:, frame, :, None].expand(-1, -1, self.width))
             column = (columns + shift[:, frame, :, None].round().to(torch.int64)).clamp(0, self.width - 1)
-            result = result & picked.gather(2, column)
+            result = result & rows_of_frame.gather(2, column)
         return result
 
 
 def combined(spectra: Tensor, factors: Tensor) -> Tensor:
-    """Sum (B, S, U) over the frames of spectra (B, G, S, U), each row with its factor (B, G, S)."""
+    """Sum (B, S, U) over the frames of spectra (B, G, S, U), each row times its factor (B, G, S)."""
     parts = torch.view_as_real(spectra)
     factors = factors.to(parts.dtype)[..., None, None]
     total = parts[:, 0] * factors[:, 0]
@@ -124,31 +138,81 @@ def combined(spectra: Tensor, factors: Tensor) -> Tensor:
     return torch.view_as_complex(total)
 
 
-def mean_over_frames(spectra: Tensor, seen: Tensor) -> Tensor:
-    """Mean (B, S, U) of spectra (B, G, S, U) over the frames that see a row."""
-    return combined(spectra, seen / seen.sum(1, keepdim=True).clamp(min=1.0))
+def mean_over_frames(spectra: Tensor, visible: Tensor) -> Tensor:
+    """Mean (B, S, U) of spectra (B, G, S, U) over the frames in which a row is visible (B, G, S)."""
+    return combined(spectra, visible / visible.sum(1, keepdim=True).clamp(min=1.0))
 
 
-def differences(spectra: Tensor, seen: Tensor) -> Tensor:
-    """What rows of each frame differ by from their mean over the frames that see them, (B, G, S, U).
+def differences(spectra: Tensor, visible: Tensor) -> Tensor:
+    """Differences (B, G, S, U) of the rows of each frame from their mean over the frames in which they are visible.
 
-    Of two frames the first alone, (B, 1, S, U): the other differs by the opposite. A frame that does not see a row does
-    not differ.
+    Of two frames, only the difference of the first, (B, 1, S, U): that of the second is its negative. The difference
+    is 0 where a row is not visible.
 
     Args:
         spectra: (B, G, S, U).
-        seen: (B, G, S) float64, 1 where a frame sees the row.
+        visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
     """
     if spectra.shape[1] == 2:
-        half = 0.5 * seen.prod(1, keepdim=True)
+        half = 0.5 * visible.prod(1, keepdim=True)
         return combined(spectra, torch.cat([half, -half], 1))[:, None]
-    different = spectra - mean_over_frames(spectra, seen)[:, None]
-    return different.mul_(seen[..., None].to(spectra.real.dtype))
+    different = spectra - mean_over_frames(spectra, visible)[:, None]
+    return different.mul_(visible[..., None].to(spectra.real.dtype))
 
 
 def inner_columns(width: int, shift: Tensor, like: Tensor) -> Tensor:
-    """(1, 1, W) weight of columns that all frames of the group show, falling to 0 over a few px."""
+    """(1, 1, W) weight of columns: 1 where all frames of the group show the scene, falling to 0 over 8 px."""
     edge = math.ceil(float(shift.abs().amax())) + MARGIN
     place = torch.arange(width, dtype=like.dtype, device=like.device)
     inside = torch.minimum(place, width - 1 - place) - edge
     return (inside / MARGIN).clamp(0.0, 1.0)[None, None]
+
+
+EVERY = 4  # rows; every fourth row is enough to estimate a column pattern
+_Group = tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor]
+
+
+def column_pattern(groups: list[_Group]) -> Tensor | None:
+    """Spectrum of a pattern that is added to every row of every frame at the same columns.
+
+    Such a pattern is fixed to the sensor and biases displacements towards zero. In frames warped back by the motion,
+    the pattern p appears as ``p(x + shift)`` while the scene stands still. For each frequency u, the differences of
+    the frames d are therefore regressed on the differences r of ``exp(2 pi i u shift)``, which excludes the scene:
+    ``p(u) = sum conj(r) d / sum |r|^2``.
+
+    Args:
+        groups: Spectra of each group of frames with the rows, shifts and visibility (B, G, S each) that warp some of
+            its rows, and the residual variance (B, S) of these rows. Rows whose variance exceeds three times the
+            median (objects that move by themselves) are left out.
+
+    Returns:
+        (B, U) spectrum of the pattern, shrunk by its noise; None if none is significant.
+    """
+    # half of the rows are enough to find out that there is no pattern
+    return None if _pattern_of(groups, 2) is None else _pattern_of(groups, 1)
+
+
+def _pattern_of(groups: list[_Group], step: int) -> Tensor | None:
+    """``column_pattern`` from every ``step``-th row."""
+    correlation, power, energy, count = (torch.zeros(()) for _ in range(4))
+    for spectra, *places in groups:
+        rows, shift, visible, variance = (values[..., ::step] for values in places)
+        typical = torch.where(variance > 0, variance, torch.nan).nanmedian(dim=-1, keepdim=True).values
+        visible = visible * ((variance > 0) & (variance < 3.0 * typical))[:, None]
+        visible = visible * (visible.sum(1, keepdim=True) > 1)
+        inner = inner_columns(spectra.width, shift, spectra.values.real)[0]  # the ends of rows stay in place as well
+        for run in spectra.runs(rows.shape[-1], 5):
+            warped, ramp = spectra.warped(rows[..., run], shift[..., run]), spectra.ramp(shift[..., run])
+            pixels = torch.fft.irfft(differences(warped, visible[..., run]), n=spectra.length)
+            difference = torch.fft.rfft(pixels[..., : spectra.width] * inner, n=spectra.length)
+            regressor = differences(ramp, visible[..., run])
+            correlation = correlation + (regressor.conj() * difference).sum((1, 2))
+            power = power + squared_modulus(regressor).sum((1, 2))
+            energy = energy + squared_modulus(difference).sum((1, 2))
+        count = count + (visible.sum((1, 2)) - (visible.sum(1) > 0).sum(-1)).to(energy.dtype)[:, None]
+    pattern = correlation / power.clamp(min=1e-6)
+    # power of the pattern over that of its noise, a mean over 17 neighbouring frequencies; 3 is beyond chance
+    strength = pattern.abs().square() * power / (energy / count.clamp(min=1.0)).clamp(min=1e-30)
+    strength = functional.avg_pool1d(functional.pad(strength[:, None], (8, 8), mode="replicate"), 17, 1)[:, 0]
+    share = torch.where(strength > 3.0, 1 - 1 / strength.clamp(min=1.0), 0.0)
+    return pattern * share if bool((share > 0).any()) else None

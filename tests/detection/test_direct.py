@@ -11,7 +11,7 @@ from rsvib_torch import SensorTiming, Vibration, detect_vibration, register_band
 from rsvib_torch.detection.rows import direct
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
 from rsvib_torch.evaluation import resolution_chart
-from rsvib_torch.registration.gradients import row_gradients, row_pulls, row_shifts
+from rsvib_torch.registration.gradients import residual_products, row_equations, row_gradients
 from rsvib_torch.registration.row_spectra import RowSpectra, differences
 
 MARGIN = 40
@@ -316,14 +316,14 @@ def test_rows_tell_a_known_shift(remaining, num_frames):
     def told(shift):
         runs = (slice(0, 40), slice(40, 96))
         warped = ((run, spectra.warped(rows[..., run], shift[..., run])) for run in runs)
-        matrix, right = row_shifts(row_pulls(warped, gradients, seen), gradients, seen)
+        matrix, right = row_equations(residual_products(warped, gradients, seen), gradients, seen)
         known = matrix[0, :, 0, 0] > 0
         assert known.tolist() == seen[0, 0].bool().tolist()
         total, sums = matrix[0].sum(0), right[0].sum(1)
         return torch.linalg.solve(total, sums[..., None])[..., 0]
 
-    again = row_pulls([(slice(None), spectra.warped(rows, none))], gradients, seen)
-    torch.testing.assert_close(gradients.pulls, again, rtol=1e-9, atol=1e-9)
+    again = residual_products([(slice(None), spectra.warped(rows, none))], gradients, seen)
+    torch.testing.assert_close(gradients.residual_products, again, rtol=1e-9, atol=1e-9)
     shifts = told(none)
     torch.testing.assert_close(shifts[:, 0], expected.double(), rtol=0.1, atol=2e-4)
     assert shifts[:, 1].abs().max() < 0.02 * abs(remaining) + 1e-5

@@ -1,6 +1,5 @@
 import itertools
 
-import numpy as np
 import pytest
 import torch
 
@@ -10,7 +9,6 @@ from rsvib_torch.frames.orientation import (
     frames_to_row_order,
     offsets_from_row_order,
 )
-from rsvib_torch.frames.prepare import as_float_frames
 
 ORIENTATIONS = list(itertools.product((-2, -1), ("forward", "reverse")))
 VIBRATION = Vibration(
@@ -62,39 +60,3 @@ def test_vibration_and_offsets_agree(scan_axis, direction):
     for name in ("amplitude", "frequency", "phase", "image_motion"):
         torch.testing.assert_close(getattr(back, name), getattr(VIBRATION, name), rtol=0, atol=1e-12)
     assert bool((turned.amplitude >= 0).all())
-
-
-def test_float_frames_are_left_alone():
-    for dtype in (torch.float16, torch.float32, torch.float64):
-        frames = torch.rand(2, 4, 5, dtype=torch.float64).to(dtype) * 300 - 7
-        assert as_float_frames(frames) is frames
-
-
-def test_integer_frames_are_scaled():
-    counts = torch.tensor([[[0, 51, 255]]], dtype=torch.uint8)
-    assert as_float_frames(counts).flatten().tolist() == pytest.approx([0.0, 0.2, 1.0])
-    deep = np.array([[[0, 4095, 819]]], dtype=np.uint16)
-    scaled = as_float_frames(deep, 4095)
-    assert scaled.dtype == torch.float32
-    assert scaled.flatten().tolist() == pytest.approx([0.0, 1.0, 0.2])
-
-
-@pytest.mark.parametrize(
-    ("frames", "options", "error", "message"),
-    [
-        (torch.zeros(2, 4, 4, dtype=torch.uint16), {}, ValueError, "uint16 frames do not say their full scale"),
-        (torch.zeros(2, 4, 4, dtype=torch.int64), {}, ValueError, "int64 frames do not say their full scale"),
-        (torch.zeros(2, 4, 4, dtype=torch.uint8), {"full_scale": 0}, ValueError, "full_scale must be larger than 0"),
-        (torch.zeros(2, 4, 4, dtype=torch.uint8), {"full_scale": "12 bit"}, TypeError, "full_scale must be a number"),
-        (torch.zeros(4, 4), {}, ValueError, r"frames must have shape .* got \(4, 4\)"),
-        (torch.zeros(2, 0, 4), {}, ValueError, "frames must not be empty"),
-        (torch.zeros(2, 4, 4, dtype=torch.complex64), {}, TypeError, "frames must be real numbers"),
-        ("frames.tif", {}, TypeError, "frames must be a tensor or array of numbers, got str"),
-        (torch.zeros(1, 4, 4), {"minimum_frames": 2}, ValueError, "at least 2 frames are needed, got 1"),
-        (torch.zeros(3, 1, 1, 4, 4), {"minimum_frames": 2}, ValueError, "at least 2 frames are needed, got 1"),
-        (torch.tensor([[[0.0, torch.nan]]]), {}, ValueError, r"pixel \(0, 0, 1\) is nan"),
-    ],
-)
-def test_bad_frames(frames, options, error, message):
-    with pytest.raises(error, match=message):
-        as_float_frames(frames, **options)

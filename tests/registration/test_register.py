@@ -6,6 +6,7 @@ import torch
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, register_bands
+from rsvib_torch.registration.methods import BAND_METHODS
 
 METHODS = ("projection", "ncc", "phase")
 # rms error in px along the rows and along the scan, good bands only; the offsets are 1.4 and 5 px rms
@@ -253,3 +254,27 @@ def test_single_curve_is_not_a_batch(pair, paper_camera):
     curve = register_bands(pair[0][:, :256], paper_camera)
     with pytest.raises(IndexError, match="this offset curve is not a batch"):
         curve[0]
+
+
+def test_method_added_to_the_table(pair, paper_camera, monkeypatch):
+    """A method that meets the contract of ``BAND_METHODS`` is used by name, with the task that the contract states."""
+    tasks = []
+
+    def whole_frame(task):
+        """The whole-frame offset for every band; no offset where the band is constant."""
+        tasks.append(task)
+        rows = task.tops[:, None] + torch.arange(task.height)
+        constant = task.first[:, rows].flatten(2).std(-1) == 0
+        offsets = torch.where(constant[..., None], torch.nan, task.start.double())
+        return offsets, (~constant).double()
+
+    monkeypatch.setitem(BAND_METHODS, "whole-frame", whole_frame)
+    frames = pair[0][:, :256]
+    curve = register_bands(frames, paper_camera, method="whole-frame", band_rows=24, band_step=12, search=8)
+    assert [(len(task.tops), task.height, task.search) for task in tasks] == [(20, 24, 8)]
+    assert curve.offsets.shape == (1, 20, 2)
+    assert torch.equal(curve.offsets, tasks[0].coarse[:, None].double().expand(1, 20, 2))
+    assert torch.equal(curve.quality, torch.ones(1, 20, dtype=torch.float64))
+    monkeypatch.delitem(BAND_METHODS, "whole-frame")
+    with pytest.raises(ValueError, match="registration must be one of 'projection', 'ncc', 'phase'"):
+        register_bands(frames, paper_camera, method="whole-frame")

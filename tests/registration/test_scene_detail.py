@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from rsvib_torch.registration.scene_detail import Compared, _noise_of_mean, _transformed, scene_detail
+from rsvib_torch.registration.gradients import FrameComparison, _noise_of_mean, _transform_length, scene_detail
 
 
 def spectra_of(images):
@@ -26,7 +26,7 @@ def test_detail_and_its_gradient_are_those_of_the_scene(rows):
     warped = spectra_of(scene + noise)[None]
     seen = torch.ones(1, 2, rows, dtype=torch.float64)
     halves = (slice(0, rows // 2), slice(rows // 2, rows))
-    compared = Compared.of(((part, warped[:, :, part]) for part in halves), seen)
+    compared = FrameComparison.of(((part, warped[:, :, part]) for part in halves), seen)
     found = scene_detail(compared, torch.fft.rfftfreq(192, dtype=torch.float64))
     inner = slice(40, rows - 40)
     for images, truth in zip(found, (scene, slope), strict=True):
@@ -38,13 +38,13 @@ def test_noise_of_two_frames_is_what_they_differ_by():
     warped = torch.randn(1, 2, 24, 33, generator=torch.Generator().manual_seed(2), dtype=torch.complex128)
     seen = torch.ones(1, 2, 24, dtype=torch.float64)
     seen[0, 0, :8] = seen[0, 1, 4:12] = 0
-    noise = Compared.of([(slice(0, 24), warped)], seen).noise[:, :24]
+    noise = FrameComparison.of([(slice(0, 24), warped)], seen).noise[:, :24]
     torch.testing.assert_close(noise.abs(), _noise_of_mean(warped[..., ::4], seen).abs())
     assert float(noise[:, 12:].abs().mean()) > 0.3
 
 
 @pytest.mark.parametrize("rows", [97, 128, 1024, 2048, 2055])
 def test_transforms_across_rows_are_of_lengths_that_suit_a_cache(rows):
-    length = _transformed(rows)
+    length = _transform_length(rows)
     assert rows <= length < 1.1 * rows + 8
     assert length % 128 != 0

@@ -34,8 +34,7 @@ from rsvib_torch.detection.tones.selection import (
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration.gradients import RowGradients
-from rsvib_torch.registration.pattern import EVERY, column_pattern
-from rsvib_torch.registration.row_spectra import RowSpectra
+from rsvib_torch.registration.row_spectra import EVERY, RowSpectra, column_pattern
 
 __all__ = ["DirectFit", "refine_directly"]
 

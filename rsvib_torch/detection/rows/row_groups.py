@@ -12,7 +12,7 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.equal_blur import Shown, blurred_unlike, warp_to_same_blur
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.registration.gradients import RowGradients, row_gradients, row_pulls, row_shifts
+from rsvib_torch.registration.gradients import RowGradients, residual_products, row_equations, row_gradients
 from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra, chunks
 
 __all__ = [
@@ -140,10 +140,10 @@ def measure_group(
     warped = ((run, warp(run)) for run in group.spectra.runs(place.shape[-1], 2))
     if gradients is None:
         gradients = row_gradients(group.spectra, warped, shown.rows, shown.shift, seen)
-        pulls = gradients.pulls
+        products = gradients.residual_products
     else:
-        pulls = row_pulls(warped, gradients, seen)
-    matrix, right = row_shifts(pulls, gradients, seen)
+        products = residual_products(warped, gradients, seen)
+    matrix, right = row_equations(products, gradients, seen)
     matrix = _blocks(matrix[:, None]).sum(3)[:, 0]  # (B, N, 2, 2)
     right = _blocks(right).sum(3)  # (B, G, N, 2)
     determinant = matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1].square()

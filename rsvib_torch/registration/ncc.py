@@ -1,13 +1,49 @@
-"""Zero-mean normalised cross-correlation of bands by matrix products."""
+"""Band registration by zero-mean normalised cross-correlation (NCC), computed with matrix products."""
 
 import torch
 from torch import Tensor
 
-from rsvib_torch.registration.band_windows import take_windows
+from rsvib_torch.registration.bands import BINNING, LAGS, BandTask, fine_offsets, take_windows, whole_pixel_peak
 
-__all__ = ["correlate_bands", "correlate_profiles"]
+__all__ = ["correlate_bands", "normalise", "register_ncc"]
 
-_ROWS = 8  # of templates that are multiplied at a time: of more, most products are of rows that no lag brings together
+
+def register_ncc(task: BandTask) -> tuple[Tensor, Tensor]:
+    """Offsets and quality of bands: a search for whole pixels in binned columns, then the peak at full resolution.
+
+    The contract is that of ``BAND_METHODS``.
+    """
+    width = task.width // BINNING
+    factor = BINNING if width >= 64 else 1
+    reach = -(-task.search // factor)
+    width = task.width // factor
+    binned = [
+        take_windows(image, torch.zeros_like(left), left, image.shape[-2], columns * factor)[:, 0]
+        .unflatten(-1, (columns, factor))
+        .mean(-1)
+        for image, left, columns in (
+            (task.first, task.left[:, None], width),
+            (task.second, (task.left + task.coarse[:, 0])[:, None] - reach * factor, width + 2 * reach),
+        )
+    ]
+    places = task.places
+    rows = places[..., 1]
+    surface = correlate_bands(
+        binned[0],
+        binned[1],
+        torch.stack([torch.zeros_like(rows), rows], -1),
+        torch.stack([torch.full_like(rows, reach), rows + task.coarse[:, None, 1]], -1),
+        size=(task.height, width),
+        reach=(task.search, reach),
+    )
+    lag, inside = whole_pixel_peak(surface, factor)
+    shift = task.start + lag
+    moved = places + shift
+    surface = correlate_bands(
+        task.first, task.second, places, moved, size=(task.height, task.width), reach=(LAGS, LAGS)
+    )
+    inside &= (moved[..., 1] >= LAGS) & (moved[..., 1] + task.height + LAGS <= task.first.shape[-2])
+    return fine_offsets(task, shift, surface, inside)
 
 
 def correlate_bands(
@@ -19,18 +55,18 @@ def correlate_bands(
     size: tuple[int, int],
     reach: tuple[int, int],
 ) -> Tensor:
-    """Zero-mean normalised cross-correlation of windows of one image with windows of another, at all lags.
+    """Zero-mean normalised cross-correlation of windows of one image with windows of another.
 
-    For one lag along the columns, the lags along the rows are the diagonal sums of the product of template and search
-    rows: matrix products do the work. Means and energies of the search windows come from running sums.
+    For one lag along the columns, the correlation at all lags across the rows consists of the diagonal sums of the
+    matrix product of template and search rows. Means and energies of the search windows come from running sums.
 
     Args:
         first: (L, H, W) images the templates are cut from, roughly of zero mean.
-        second: (L, H, V) images they are looked for in.
+        second: (L, H, V) images that are searched.
         places: (L, N, 2) int64, column and row of the first pixel of each template.
-        later_places: (L, N, 2) int64, the same of its window at lag zero.
+        later_places: (L, N, 2) int64, the same for the window at lag zero.
         size: Rows and columns of a template.
-        reach: Lags along rows' axis and columns: -reach ... reach.
+        reach: Lags -reach ... reach across the rows and along the columns.
 
     Returns:
         (L, N, 2 reach[0] + 1, 2 reach[1] + 1) in -1 ... 1; 0 where a window is constant or leaves the image.
@@ -46,8 +82,9 @@ def correlate_bands(
     ).flatten(0, 1)
     lags_y, lags_x = 2 * reach[0] + 1, 2 * reach[1] + 1
     cross = template.new_zeros(len(template), lags_y, lags_x)
-    for top in range(0, height, _ROWS):
-        rows = template[:, top : top + _ROWS]
+    step = 8  # rows of templates per product: in products of more, most row pairs belong to no lag
+    for top in range(0, height, step):
+        rows = template[:, top : top + step]
         own = search[:, top : top + rows.shape[1] + lags_y - 1]
         for lag in range(lags_x):
             product = rows @ own[..., lag : lag + width].transpose(-2, -1)  # (M, h, h + 2 reach)
@@ -63,15 +100,15 @@ def correlate_bands(
     cross = cross - template_total * total / pixels
     energy = energy - total.square() / pixels
     template_energy = template_energy - template_total.square() / pixels
-    return _normalise(cross, energy, template_energy, pixels * second.square().mean((-2, -1))[:, None, None, None])
+    return normalise(cross, energy, template_energy, pixels * second.square().mean((-2, -1))[:, None, None, None])
 
 
-def _normalise(cross: Tensor, energy: Tensor, template_energy: Tensor, typical: Tensor) -> Tensor:
-    """Correlation coefficient, 0 where either energy is nothing against the typical one or not known."""
+def normalise(cross: Tensor, energy: Tensor, template_energy: Tensor, typical: Tensor) -> Tensor:
+    """Correlation coefficient; 0 where an energy is NaN or below 1e-7 of the typical one (rounding of float32)."""
     floor = 1e-7 * typical
-    known = (energy > floor) & (template_energy > floor)
-    scale = torch.where(known, energy * template_energy, 1.0).rsqrt()
-    return torch.where(known, cross * scale, 0.0).clamp(-1.0, 1.0)
+    textured = (energy > floor) & (template_energy > floor)
+    scale = torch.where(textured, energy * template_energy, 1.0).rsqrt()
+    return torch.where(textured, cross * scale, 0.0).clamp(-1.0, 1.0)
 
 
 def _window_sums(
@@ -106,22 +143,3 @@ def _window_sums(
         block = table.gather(1, flat + height * step) - table.gather(1, flat)
         sums.append(torch.where(inside, block.unflatten(1, index.shape[1:]), torch.nan))
     return sums[0], sums[1]
-
-
-def correlate_profiles(template: Tensor, search: Tensor) -> Tensor:
-    """Zero-mean normalised cross-correlation of profiles at all lags.
-
-    Args:
-        template: (..., w).
-        search: (..., w + b).
-
-    Returns:
-        (..., b + 1) in -1 ... 1; 0 where a window is constant.
-    """
-    template = template.to(torch.float64)
-    template = template - template.mean(-1, keepdim=True)
-    windows = search.to(torch.float64).unfold(-1, template.shape[-1], 1)
-    cross = (windows @ template[..., None])[..., 0]
-    energy = windows.square().sum(-1) - windows.sum(-1).square() / template.shape[-1]
-    typical = search.square().mean(-1, keepdim=True) * template.shape[-1]
-    return _normalise(cross, energy, template.square().sum(-1, keepdim=True), typical)

@@ -1,0 +1,204 @@
+"""What all band registration methods share: the task, windows of rows, and peaks of correlation surfaces.
+
+Images have rows on axis -2 in readout order.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "BINNING",
+    "LAGS",
+    "BandTask",
+    "cut_lags",
+    "fine_offsets",
+    "integer_peak",
+    "subpixel_peak",
+    "take_windows",
+    "whole_pixel_peak",
+]
+
+BINNING = 4  # columns that are averaged in the search for whole pixels; a parabola recovers the single pixel
+LAGS = 4  # px, reach of a fine correlation surface to either side: 9 samples fix the peak to 0.001 px (subpixel_peak)
+
+
+@dataclass(frozen=True, eq=False)
+class BandTask:
+    """Bands of frame pairs to be registered.
+
+    Attributes:
+        first: (L, H, W) earlier frames, float32 or float64, of about zero mean.
+        second: (L, H, W) later frames.
+        coarse: (L, 2) int64 px, whole-frame offsets, axes (x, y).
+        tops: (N,) int64, first row of each band in the earlier frame.
+        height: Rows of a band.
+        search: Search range in px around the coarse offset.
+    """
+
+    first: Tensor
+    second: Tensor
+    coarse: Tensor
+    tops: Tensor
+    height: int
+    search: int
+
+    @property
+    def margin(self) -> int:
+        """Columns kept free on either side of a template, so that no lag leaves the frame."""
+        return self.search + LAGS + BINNING
+
+    @property
+    def width(self) -> int:
+        """Columns of the templates: the overlap of every pair less the margins."""
+        return self.first.shape[-1] - int(self.coarse[:, 0].abs().amax()) - 2 * self.margin
+
+    @property
+    def left(self) -> Tensor:
+        """First column of the templates of each pair, (L,)."""
+        return (-self.coarse[:, 0]).clamp(min=0) + self.margin
+
+    @property
+    def places(self) -> Tensor:
+        """Column and row of the first pixel of each template, (L, N, 2)."""
+        shape = (len(self.coarse), len(self.tops))
+        return torch.stack([self.left[:, None].expand(shape), self.tops.expand(shape)], dim=-1)
+
+    @property
+    def start(self) -> Tensor:
+        """Whole-pixel shifts (L, N, 2) at which the search starts: the whole-frame offset for every band."""
+        return self.coarse[:, None].expand(-1, len(self.tops), -1)
+
+
+def take_windows(images: Tensor, tops: Tensor, lefts: Tensor, height: int, width: int) -> Tensor:
+    """Cut windows out of images; rows beyond the edge repeat the edge row, columns are clamped to the image.
+
+    Args:
+        images: (L, H, W).
+        tops: (L, N) int64, first row of each window.
+        lefts: (L, N) int64, first column of each window.
+        height: Rows of a window.
+        width: Columns of a window, at most W.
+
+    Returns:
+        (L, N, height, width).
+    """
+    batch, num_rows, num_columns = images.shape
+    rows = (tops[..., None] + torch.arange(height, device=images.device)).clamp(0, num_rows - 1)
+    lefts = lefts.clamp(0, num_columns - width)
+    start = torch.arange(batch, device=images.device)[:, None, None] * num_rows + rows
+    flat = images.reshape(-1).unfold(0, width, 1)  # a view: entry i holds pixels i to i + width - 1
+    return flat[start * num_columns + lefts[..., None]]
+
+
+def integer_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
+    """Indices (M, 2) as (row, column) of the largest entry of each surface (M, A, B), and its value (M,)."""
+    value, flat = surface.flatten(-2).max(-1)
+    return torch.stack([flat // surface.shape[-1], flat % surface.shape[-1]], dim=-1), value
+
+
+def cut_lags(surface: Tensor, place: Tensor, reach: tuple[int, int]) -> Tensor:
+    """The part of each surface (M, A, B) around ``place`` (M, 2), 2 reach + 1 lags per axis; edges repeat."""
+    rows = place[:, :1] + torch.arange(-reach[0], reach[0] + 1, device=surface.device)
+    columns = place[:, 1:] + torch.arange(-reach[1], reach[1] + 1, device=surface.device)
+    rows, columns = rows.clamp(0, surface.shape[-2] - 1), columns.clamp(0, surface.shape[-1] - 1)
+    part = surface.gather(1, rows[..., None].expand(-1, -1, surface.shape[-1]))
+    return part.gather(2, columns[:, None].expand(-1, rows.shape[1], -1))
+
+
+def _at_edge(place: Tensor, surface: Tensor) -> Tensor:
+    """(M,) bool: whether a peak lies at the edge of its surface (M, A, B)."""
+    last = torch.tensor(surface.shape[-2:], device=place.device) - 1
+    return ((place == 0) | (place == last)).any(-1)
+
+
+def whole_pixel_peak(surface: Tensor, factor: int) -> tuple[Tensor, Tensor]:
+    """Whole-pixel lags (L, N, 2) in (x, y) of the peaks of surfaces (L, N, A, B), and whether they are inside (L, N).
+
+    The columns of the surfaces count ``factor`` pixels each; a parabola through three columns gives the single pixel.
+    """
+    flat = surface.flatten(0, 1)
+    place, value = integer_peak(flat)
+    around = cut_lags(flat, place, (0, 1))[:, 0]
+    bend = around[:, 2] - 2 * around[:, 1] + around[:, 0]
+    fraction = torch.where(bend < 0, 0.5 * (around[:, 0] - around[:, 2]) / bend.clamp(max=-1e-12), 0.0)
+    x = ((place[:, 1] - flat.shape[-1] // 2 + fraction.clamp(-0.5, 0.5)) * factor).round().long()
+    y = place[:, 0] - flat.shape[-2] // 2
+    inside = ~_at_edge(place, flat) & (value > 0)
+    return torch.stack([x, y], -1).unflatten(0, surface.shape[:2]), inside.unflatten(0, surface.shape[:2])
+
+
+def fine_offsets(task: BandTask, shift: Tensor, surface: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Offsets (L, N, 2) and quality (L, N) from correlation surfaces at the lags around whole-pixel shifts.
+
+    Args:
+        task: The bands.
+        shift: (L, N, 2) px, whole-pixel shifts at which the surfaces are centred.
+        surface: (L, N, 2 LAGS + 1, 2 LAGS + 1).
+        valid: (L, N) bool, bands whose whole-pixel shift is known.
+    """
+    flat = surface.flatten(0, 1)
+    place, _ = integer_peak(flat)
+    # the peak comes to the centre, so that it has neighbours on every side to interpolate from
+    position, value = subpixel_peak(cut_lags(flat, place, (LAGS - 1, LAGS - 1)))
+    fine = (position + place - LAGS).flip(-1).unflatten(0, valid.shape)
+    offsets = shift + fine
+    good = valid & ~_at_edge(place, flat).unflatten(0, valid.shape) & torch.isfinite(fine).all(-1)
+    good = good & ((offsets - task.start).abs() < task.search).all(-1)
+    quality = torch.where(good, value.unflatten(0, valid.shape).clamp(0.0, 1.0), 0.0)
+    return torch.where(good[..., None], offsets, torch.nan), quality
+
+
+@cache
+def _polynomial_fit(size: int) -> Tensor:
+    """Matrix (size, size) from samples at -(size // 2) ... size // 2 to the coefficients of the polynomial."""
+    places = torch.arange(size, dtype=torch.float64) - size // 2
+    matrix: Tensor = torch.linalg.inv(torch.vander(places, increasing=True))
+    return matrix
+
+
+def _powers(position: Tensor, size: int) -> Tensor:
+    """Powers 0 ... size - 1 of positions (M,), with their first and second derivatives, (M, 3, size)."""
+    order = torch.arange(size, dtype=position.dtype, device=position.device)
+    value = position[:, None] ** order
+    result = value.new_zeros(len(value), 3, size)
+    result[:, 0] = value
+    result[:, 1, 1:] = value[:, :-1] * order[1:]
+    result[:, 2, 2:] = value[:, :-2] * (order[2:] * (order[2:] - 1))
+    return result
+
+
+def subpixel_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
+    """Maximum of the polynomial through all samples of a surface, by Newton's method from its centre.
+
+    The correlation of band-limited images is band limited, so that its samples at whole pixels determine it. For
+    images smoothed by a Gaussian of 1 px, the polynomial through 9 samples per axis errs by less than 0.001 px, a
+    three-point parabola by 0.05 px.
+
+    Args:
+        surface: (M, A, B) with A and B odd, the integer peak at the centre. An axis of length 1 is not searched.
+
+    Returns:
+        Position (M, 2) as (row, column) relative to the centre, NaN where no maximum lies within one pixel of it, and
+        the value there (M,); float64.
+    """
+    count, rows, columns = surface.shape
+    fit_rows, fit_columns = (_polynomial_fit(size).to(surface.device) for size in (rows, columns))
+    polynomial = fit_rows @ surface.to(torch.float64) @ fit_columns.T
+    position = polynomial.new_zeros(count, 2)
+    converging = torch.ones(count, dtype=torch.bool, device=surface.device)
+    for _ in range(6):  # Newton's method doubles the digits: 6 steps from within half a pixel reach float64
+        derivative = _powers(position[:, 0], rows) @ polynomial @ _powers(position[:, 1], columns).mT  # (M, 3, 3)
+        down, right, b = derivative[:, 1, 0], derivative[:, 0, 1], derivative[:, 1, 1]
+        a = derivative[:, 2, 0] if rows > 1 else -torch.ones_like(b)
+        c = derivative[:, 0, 2] if columns > 1 else -torch.ones_like(b)
+        determinant = a * c - b * b
+        converging = converging & (determinant > 0) & (a < 0)
+        move = torch.stack([b * right - c * down, b * down - a * right], dim=-1)
+        step = (move / torch.where(converging, determinant, 1.0)[:, None]).clamp(-0.5, 0.5)
+        position = position + torch.where(converging[:, None], step, 0.0)
+    value = (_powers(position[:, 0], rows) @ polynomial @ _powers(position[:, 1], columns).mT)[:, 0, 0]
+    converging = converging & (position.abs() <= 1.0).all(-1)
+    return torch.where(converging[:, None], position, torch.nan), value

@@ -1,0 +1,135 @@
+"""Input preparation and the way back, for every layout, orientation and dtype."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from rsvib_torch import SensorTiming
+from rsvib_torch.frames.prepare import as_float_frames, prepare_frames
+
+ORIENTATIONS = list(itertools.product((-2, -1), ("forward", "reverse")))
+LAYOUTS = [(2, 5, 7), (2, 3, 5, 7), (4, 2, 3, 5, 7)]
+
+
+def sensor(scan_axis=-2, direction="forward"):
+    return SensorTiming(20e-6, 20, 2048, scan_axis=scan_axis, readout_direction=direction)
+
+
+@pytest.mark.parametrize(("scan_axis", "direction"), ORIENTATIONS)
+@pytest.mark.parametrize("shape", LAYOUTS)
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
+def test_there_and_back(shape, scan_axis, direction, dtype):
+    frames = torch.rand(shape, dtype=torch.float64).to(dtype)
+    prepared = prepare_frames(frames, sensor(scan_axis, direction))
+    height, width = (5, 7) if scan_axis == -2 else (7, 5)
+    channels = 1 if len(shape) == 3 else 3
+    assert prepared.images.shape == (4 if len(shape) == 5 else 1, 2, channels, height, width)
+    assert prepared.images.dtype == (torch.float64 if dtype == torch.float64 else torch.float32)
+    row = frames.select(scan_axis, -1 if direction == "reverse" else 0)
+    assert torch.equal(prepared.images[..., 0, :].flatten(), row.flatten().to(prepared.images.dtype))
+    assert (prepared.timing.scan_axis, prepared.timing.readout_direction) == (-2, "forward")
+    assert prepared.missing is prepared.saturated is None
+    assert prepared.filled is prepared.images
+    back = prepared.from_row_order(prepared.images)
+    assert back.dtype == dtype
+    assert torch.equal(back, frames)
+
+
+def test_finer_and_joint_images_return_to_the_same_layout():
+    prepared = prepare_frames(torch.rand(3, 5, 7), sensor(-1))
+    finer = torch.nn.functional.interpolate(prepared.images[:, :1, 0], scale_factor=2)[:, :, None]
+    assert prepared.from_row_order(finer).shape == (1, 10, 14)
+
+
+def test_masks_follow_the_frames():
+    """NaN, ignored and saturated pixels, in counts and floats, turned with the frames."""
+    frames = torch.full((2, 3, 4, 6), 0.5)
+    frames[0, 1, 2, 3] = math.nan
+    frames[1, 2, 0, 5] = 0.9
+    ignore = torch.zeros(4, 6, dtype=torch.bool)
+    ignore[3, 0] = True
+    frames[:, :, 3, 0] = math.inf  # ignored pixels may hold any value
+    timing = sensor(-1, "reverse")
+    prepared = prepare_frames(frames, timing, ignore=ignore, saturation=0.8)
+    missing, saturated = (prepared.from_row_order(mask.float()) for mask in (prepared.missing, prepared.saturated))
+    expected = torch.isnan(frames) | ignore
+    assert torch.equal(missing, expected.float())
+    assert torch.equal(saturated, ((frames > 0.8) & ~expected).float())
+    assert bool((prepared.images[prepared.missing] == 0).all())
+    assert torch.allclose(prepared.filled[prepared.missing], torch.tensor(0.5), atol=0.05)
+    counts = torch.tensor([[[0, 255], [17, 3]]], dtype=torch.uint8)
+    assert prepare_frames(counts, sensor(), saturation="auto").saturated.flatten().tolist() == [False, True] + 2 * [
+        False
+    ]
+    assert prepare_frames(counts.float(), sensor(), saturation="auto").saturated is None
+    assert prepare_frames(counts, sensor()).saturated is None
+
+
+@pytest.mark.parametrize("shape", [(4, 6), (2, 4, 6), (2, 1, 6), (2, 3, 4, 6)])
+def test_masks_that_broadcast(shape):
+    ignore = torch.zeros(shape, dtype=torch.bool)
+    ignore[..., 0, 2] = True
+    prepared = prepare_frames(torch.rand(2, 3, 4, 6), sensor(), ignore=ignore.numpy())
+    expected = ignore if len(shape) == 4 else ignore.expand(2, 4, 6)[:, None].expand(2, 3, 4, 6)
+    assert torch.equal(prepared.missing[0], expected)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"ignore": torch.zeros(5, 5, dtype=torch.bool)}, ValueError, r"ignore \(5, 5\) does not fit .* \(2, 4, 6\)"),
+        ({"ignore": torch.zeros(4, 6)}, TypeError, "ignore must be a bool tensor, got torch.float32"),
+        ({"ignore": torch.ones(4, 6, dtype=torch.bool)}, ValueError, "ignore leaves no pixel"),
+        ({"frames": torch.full((2, 4, 6), math.nan)}, ValueError, "ignore leaves no pixel"),
+        ({"frames": torch.full((2, 4, 6), math.nan), "allow_missing": False}, ValueError, r"pixel \(0, 0, 0\) is nan"),
+        ({"frames": torch.full((2, 4, 6), -math.inf)}, ValueError, r"pixel \(0, 0, 0\) is -inf"),
+        ({"frames": torch.rand(2, 3000, 6)}, ValueError, "frame_rows=2048 is less than the 3000 rows"),
+        ({"saturation": -1.0}, ValueError, "saturation must be larger than 0"),
+        ({"saturation": 1e-9}, ValueError, "every pixel is saturated"),
+        ({"timing": "camera"}, TypeError, "timing must be a SensorTiming, got str"),
+        ({"frames": "stack.tif", "name": "restored"}, TypeError, "restored must be a tensor or array of numbers"),
+    ],
+)
+def test_bad_input(options, error, message):
+    arguments = {"frames": 0.1 + torch.rand(2, 4, 6), "timing": sensor(), **options}
+    with pytest.raises(error, match=message):
+        prepare_frames(arguments.pop("frames"), arguments.pop("timing"), **arguments)
+
+
+def test_float_frames_are_left_alone():
+    for dtype in (torch.float16, torch.float32, torch.float64):
+        frames = torch.rand(2, 4, 5, dtype=torch.float64).to(dtype) * 300 - 7
+        assert as_float_frames(frames) is frames
+
+
+def test_integer_frames_are_scaled():
+    counts = torch.tensor([[[0, 51, 255]]], dtype=torch.uint8)
+    assert as_float_frames(counts).flatten().tolist() == pytest.approx([0.0, 0.2, 1.0])
+    deep = np.array([[[0, 4095, 819]]], dtype=np.uint16)
+    scaled = as_float_frames(deep, 4095)
+    assert scaled.dtype == torch.float32
+    assert scaled.flatten().tolist() == pytest.approx([0.0, 1.0, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("frames", "options", "error", "message"),
+    [
+        (torch.zeros(2, 4, 4, dtype=torch.uint16), {}, ValueError, "uint16 frames do not say their full scale"),
+        (torch.zeros(2, 4, 4, dtype=torch.int64), {}, ValueError, "int64 frames do not say their full scale"),
+        (torch.zeros(2, 4, 4, dtype=torch.uint8), {"full_scale": 0}, ValueError, "full_scale must be larger than 0"),
+        (torch.zeros(2, 4, 4, dtype=torch.uint8), {"full_scale": "12 bit"}, TypeError, "full_scale must be a number"),
+        (torch.zeros(4, 4), {}, ValueError, r"frames must have shape .* got \(4, 4\)"),
+        (torch.zeros(2, 0, 4), {}, ValueError, "frames must not be empty"),
+        (torch.zeros(2, 4, 4, dtype=torch.complex64), {}, TypeError, "frames must be real numbers"),
+        ("frames.tif", {}, TypeError, "frames must be a tensor or array of numbers, got str"),
+        (torch.zeros(1, 4, 4), {"minimum_frames": 2}, ValueError, "at least 2 frames are needed, got 1"),
+        (torch.zeros(3, 1, 1, 4, 4), {"minimum_frames": 2}, ValueError, "at least 2 frames are needed, got 1"),
+        (torch.tensor([[[0.0, torch.nan]]]), {}, ValueError, r"pixel \(0, 0, 1\) is nan"),
+    ],
+)
+def test_bad_frames(frames, options, error, message):
+    with pytest.raises(error, match=message):
+        as_float_frames(frames, **options)
