@@ -17,8 +17,7 @@ from torch import Tensor
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields, resolution_chart
-from rsvib_torch.report.html.figures import psf_film
-from rsvib_torch.report.plots import offset_figure, save_figure
+from rsvib_torch.report.plots import offset_figure, psf_figure, save_figure
 
 SEED = 3
 ROW_TIME, FRAME_ROWS = 20.52e-6, 2048
@@ -53,7 +52,7 @@ def offsets() -> Figure:
 
 def kernels() -> Figure:
     """Point spread functions down a frame whose rows are exposed for 8.2 ms."""
-    return psf_film(VIBRATION, camera(400), FRAME_ROWS)
+    return psf_figure(VIBRATION, camera(400), FRAME_ROWS)
 
 
 def ways_to_restore() -> Figure:

@@ -1,8 +1,7 @@
-"""``rsvib motion`` and ``rsvib known``: motion of any shape from frames, and frames restored with a recorded one."""
+"""Commands for other motion and for the camera: ``motion``, ``known`` and ``calibrate``."""
 
 import csv
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,135 +11,147 @@ import typer
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.commands.options import ConfigOption, DeviceOption, ScaleOption
-from rsvib_torch.commands.terminal import error_line, say, working
-from rsvib_torch.commands.workflow import chosen_device, full_scale_of, load, save
+from rsvib_torch.calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
+from rsvib_torch.commands.options import (
+    ConfigOption,
+    DeviceOption,
+    FramesArgument,
+    RestoredArgument,
+    ScaleOption,
+    full_scale_of,
+    torch_device,
+)
+from rsvib_torch.commands.stack_commands import load, save
+from rsvib_torch.commands.terminal import error_line, print_line, working
 from rsvib_torch.config import read_config
 from rsvib_torch.detection import align_motion, check_motion, detect_motion, detect_swept_tone
-from rsvib_torch.io import check_stack_target, check_writable, read_stack_info, whole_file
+from rsvib_torch.io import check_stack_target, check_writable, read_stack, read_stack_info, whole_file
 from rsvib_torch.motion.recorded import MotionUnit, TimeUnit, read_motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.report.plots import measured_text
 from rsvib_torch.restoration import restore
 
-__all__ = ["known", "motion"]
+__all__ = ["calibrate", "known", "motion"]
 
 Array = NDArray[np.float64]
+MotionTable = tuple[tuple[str, ...], Array]  # names of the columns, and their values (N, columns); s and px
 
 
 def motion(
-    frames: Annotated[Path, typer.Argument(help="Stack of frames.")],
+    frames: FramesArgument,
     *,
     config: ConfigOption,
-    out: Annotated[Path, typer.Option(help="CSV file to write: time, x, y; and std_x, std_y of a free motion.")],
+    out: Annotated[
+        Path,
+        typer.Option(help="CSV file to write: time in s, x and y in px, and their standard deviations (model free)."),
+    ],
     model: Annotated[
         Literal["free", "swept"],
-        typer.Option(help="A smooth curve of any shape, or one tone an axis that decays or grows and sweeps."),
+        typer.Option(
+            help="free: a smooth curve of any shape; swept: one sinusoid per axis whose amplitude decays or grows and "
+            "whose frequency changes linearly."
+        ),
     ] = "free",
-    knot_rows: Annotated[int, typer.Option(help="Rows from one knot of a free motion to the next.")] = 24,
-    search: Annotated[int, typer.Option(help="Search range in px around the whole-frame offset.")] = 16,
+    knot_rows: Annotated[int, typer.Option(help="Distance of the knots of a free motion, in rows.")] = 24,
+    search: Annotated[
+        int, typer.Option(help="Search range for the offset of a row, in px around the offset of its whole frame.")
+    ] = 16,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
 ) -> None:
-    """Detect a motion that is no steady vibration in a stack of frames.
+    """Detect motion that is not a steady vibration.
 
-    The CSV file goes into rsvib known, with --unit px --offset 0.
+    To restore frames with the CSV file: rsvib known --motion FILE --unit px --offset 0.
     """
     settings = read_config(config)
     check_writable(out)
-    stack = load(frames, settings, full_scale, chosen_device(device))
+    stack = load(frames, settings, full_scale, torch_device(device))
     with working("detecting the motion"):
-        lines, table = _MODELS[model](stack.frames, stack.timing, knot_rows, search)
+        if model == "free":
+            names, table = _detect_free_motion(stack.frames, stack.timing, knot_rows, search)
+        else:
+            names, table = _detect_swept_tone(stack.frames, stack.timing, search)
     with whole_file(out) as file, file.open("w", newline="", encoding="utf-8") as text:
-        csv.writer(text).writerows(table)
-    for line in lines:
-        say(line)
-    say(f"{out}: {', '.join(table[0])}")
+        writer = csv.writer(text)
+        writer.writerow(names)
+        writer.writerows([f"{time:.9f}", *(f"{value:.5f}" for value in row)] for time, *row in table)
+    print_line(f"{out}: {', '.join(names)}")
 
 
-_Table = list[list[str]]
-
-
-def _free(stack: Tensor, timing: SensorTiming, knot_rows: int, search: int) -> tuple[list[str], _Table]:
-    """A free motion in words, and as a table at even times with standard deviations."""
-    found = detect_motion(stack, timing, knot_rows=knot_rows, search=search)
-    lines = []
+def _detect_free_motion(frames: Tensor, timing: SensorTiming, knot_rows: int, search: int) -> MotionTable:
+    """Detect a free motion, print its accuracy, and sample it twice per knot."""
+    result = detect_motion(frames, timing, knot_rows=knot_rows, search=search)
     for axis, name in enumerate("xy"):
-        size = float(found.displacement[..., axis].square().mean().sqrt())
-        lines.append(
-            f"{name}: moves by {size:.3f} px rms; known to {float(found.std_seen[axis]):.3f} px between frames, a "
-            f"warp that stays with the scene to {float(found.unseen[axis]):.3f} px; {_verdict(found.reasons[axis])}"
+        size = float(result.displacement[..., axis].square().mean().sqrt())
+        print_line(
+            f"{name}: displacement {size:.3f} px rms; standard deviation {float(result.std_seen[axis]):.3f} px of the "
+            f"part that differs between frames, {float(result.unseen[axis]):.3f} px of the part common to all frames; "
+            + _verdict(result.reasons[axis])
         )
-    times, values = _sampled(found.motion, float(found.times.max()) + timing.exposure_time, 0.5)
-    known_at, stds = found.times.flatten().cpu().numpy(), found.std.flatten(0, 1).cpu().numpy()
-    spread = np.stack([np.interp(times, known_at, stds[:, axis]) for axis in range(2)], -1)
-    return lines, _table(("time", "x", "y", "std_x", "std_y"), times, np.concatenate([values, spread], -1))
+    times, values = _sampled(result.motion, float(result.times.max()) + timing.exposure_time, 0.5)
+    measured, stds = result.times.flatten().cpu().numpy(), result.std.flatten(0, 1).cpu().numpy()
+    interpolated = [np.interp(times, measured, stds[:, axis]) for axis in range(2)]
+    return ("time", "x", "y", "std_x", "std_y"), np.column_stack([times, values, *interpolated])
 
 
-def _swept(stack: Tensor, timing: SensorTiming, knot_rows: int, search: int) -> tuple[list[str], _Table]:
-    """Swept tones in words, and their motion as a table at even times."""
-    found = detect_swept_tone(stack, timing, search=search)
+def _detect_swept_tone(frames: Tensor, timing: SensorTiming, search: int) -> MotionTable:
+    """Detect a swept tone per axis, print its parameters, and sample its motion once per knot."""
+    result = detect_swept_tone(frames, timing, search=search)
     units = {"amplitude": "px", "frequency": "Hz", "decay": "/s", "chirp": "Hz/s", "phase": "rad"}
-    lines = []
     for axis, name in enumerate("xy"):
-        told = [
-            f"{what} {float(getattr(found, what)[axis]):.4g} ± {float(found.std[what][axis]):.2g} {unit}"
-            for what, unit in units.items()
+        values = [
+            f"{quantity} {float(getattr(result, quantity)[axis]):.4g} ± {float(result.std[quantity][axis]):.2g} {unit}"
+            for quantity, unit in units.items()
         ]
-        lines.append(f"{name}: {', '.join(told)}; {_verdict(found.reasons[axis])}")
-    times, values = _sampled(found.motion, found.motion.end, 1.0)
-    return lines, _table(("time", "x", "y"), times, values)
+        print_line(f"{name}: {', '.join(values)}; {_verdict(result.reasons[axis])}")
+    times, samples = _sampled(result.motion, result.motion.end, 1.0)
+    return ("time", "x", "y"), np.column_stack([times, samples])
 
 
 def _verdict(reasons: tuple[str, ...]) -> str:
     return f"not reliable: {'; '.join(reasons)}" if reasons else "reliable"
 
 
-def _sampled(motion: FreeMotion, last: float, steps: float) -> tuple[Array, Array]:
-    """A motion (N, 2) at even times (N,) up to the last, ``steps`` knots apart."""
+def _sampled(motion: FreeMotion, last: float, knots: float) -> tuple[Array, Array]:
+    """Displacement (N, 2) of a motion at equidistant times (N,) up to ``last``, at most ``knots`` knots apart."""
     end = max(motion.end, last)
-    times = np.linspace(motion.start, end, math.ceil((end - motion.start) / (steps * motion.spacing)) + 1)
+    times = np.linspace(motion.start, end, math.ceil((end - motion.start) / (knots * motion.spacing)) + 1)
     return times, motion.displacement(torch.from_numpy(times).to(motion.device)).cpu().numpy()
 
 
-def _table(names: tuple[str, ...], times: Array, values: Array) -> _Table:
-    rows = ([f"{time:.9f}", *(f"{v:.5f}" for v in row)] for time, row in zip(times, values, strict=True))
-    return [list(names), *rows]
-
-
-_MODELS: dict[str, Callable[[Tensor, SensorTiming, int, int], tuple[list[str], _Table]]] = {
-    "free": _free,
-    "swept": _swept,
-}
-
-
 def known(
-    frames: Annotated[Path, typer.Argument(help="Stack of frames.")],
-    restored: Annotated[Path, typer.Argument(help="Stack to write, in the type and full scale of the frames.")],
+    frames: FramesArgument,
+    restored: RestoredArgument,
     *,
     config: ConfigOption,
     motion: Annotated[Path, typer.Option(help="CSV file with the columns time, x and y.")],
-    unit: Annotated[MotionUnit, typer.Option(help="Of x and y: px, angles, or rates of angles.")],
-    focal_length: Annotated[float | None, typer.Option(help="In px, for angles and rates.")] = None,
-    time_unit: Annotated[TimeUnit, typer.Option(help="Of the times.")] = "s",
-    flip_x: Annotated[bool, typer.Option("--flip-x", help="A positive x moves the image towards smaller x.")] = False,
-    flip_y: Annotated[bool, typer.Option("--flip-y", help="A positive y moves the image towards smaller y.")] = False,
+    unit: Annotated[MotionUnit, typer.Option(help="Unit of x and y: px, an angle, or an angular rate.")],
+    focal_length: Annotated[
+        float | None, typer.Option(help="Focal length in px; required for angles and angular rates.")
+    ] = None,
+    time_unit: Annotated[TimeUnit, typer.Option(help="Unit of the times.")] = "s",
+    flip_x: Annotated[bool, typer.Option("--flip-x", help="Positive x moves the image towards smaller x.")] = False,
+    flip_y: Annotated[bool, typer.Option("--flip-y", help="Positive y moves the image towards smaller y.")] = False,
     offset: Annotated[
         float | None,
         typer.Option(
-            help="Reading of the file's clock at the first row of frame 0, in s; found in the frames if not given."
+            help="Time of the recording, in s, at the exposure start of the first row of frame 0.",
+            show_default="estimated from the frames",
         ),
     ] = None,
-    fit_gain: Annotated[bool, typer.Option("--fit-gain", help="Find the focal length in the frames as well.")] = False,
+    fit_gain: Annotated[
+        bool, typer.Option("--fit-gain", help="Estimate the focal length from the frames as well.")
+    ] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Restore also where the recording does not explain the frames.")
+        bool, typer.Option("--force", help="Restore even if the recording does not explain the motion of the frames.")
     ] = False,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
 ) -> None:
-    """Restore frames with a motion recorded by a gyroscope or attitude sensor.
+    """Restore frames with a motion that was recorded by a gyroscope or attitude sensor.
 
-    The motion is held against the offsets of rows between the frames: one that does not explain them is refused.
+    The recording is compared with the offsets of rows between the frames, and refused if it does not explain them.
     """
     settings = read_config(config)
     recorded = read_motion(
@@ -153,63 +164,157 @@ def known(
     info = read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
     check_stack_target(restored, info.shape, dtype=info.dtype, full_scale=scale)
-    stack = load(frames, settings, full_scale, chosen_device(device))
+    stack = load(frames, settings, full_scale, torch_device(device))
     if offset is None:
-        with working("looking for the frames in the recording"):
+        with working("aligning the recording with the frames"):
             found = align_motion(stack.frames, stack.timing, recorded, fit_gain=fit_gain)
-        say(f"clock {found.offset:.6f} ± {found.offset_std:.6f} s at the first row, speed {found.scale:.7f}")
-        say(f"gain {found.gain[0]:.4f}, {found.gain[1]:.4f}; drift {found.drift[0]:.4g}, {found.drift[1]:.4g} px/s")
+        print_line(
+            f"clock {found.offset:.6f} ± {found.offset_std:.6f} s at the first row of frame 0, rate {found.scale:.7f}; "
+            f"gain {found.gain[0]:.4f} and {found.gain[1]:.4f}, drift {found.drift[0]:.4g} and {found.drift[1]:.4g} "
+            "px/s along x and y"
+        )
         _refuse(motion, found.reasons, force)
-        moving = found.motion
+        placed = found.motion
     else:
-        moving = _placed(motion, recorded, offset, stack.frames, stack.timing)
-    _judge(motion, stack.frames, stack.timing, moving, force, required=offset is None)
+        placed = recorded.retimed(offset)
+        starts = stack.timing.row_starts(len(stack.frames), stack.frames.shape[int(stack.timing.scan_axis)])
+        first, last = float(starts.min()), float(starts.max()) + stack.timing.exposure_time
+        if placed.start > first + 1e-9 or placed.end < last - 1e-9:  # s; rounding of the offset
+            raise ValueError(
+                f"{motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, the frames need "
+                f"{offset + first:.6g} to {offset + last:.6g} s"
+            )
+    _check_motion(motion, stack.frames, stack.timing, placed, force, required=offset is None)
     with working("restoring the frames"):
-        clear = restore(stack.frames, stack.timing, moving, **settings.restoration)
-    save(restored, clear, stack)
-    say(f"{restored}: {len(clear)} frames restored, {info.dtype}")
+        result = restore(stack.frames, stack.timing, placed, **settings.restoration)
+    save(restored, result, stack)
+    print_line(f"{restored}: {len(result)} frames restored, {info.dtype}")
 
 
 def _refuse(path: Path, reasons: tuple[str, ...], force: bool) -> None:
-    """An error for a recording that speaks against itself; warnings where it is to be used all the same."""
+    """Raise an error with the reasons against a recording, or print them as warnings with ``--force``."""
     if reasons and not force:
-        raise ValueError(f"{path}: {'; '.join(reasons)}; --force restores with it all the same")
+        raise ValueError(f"{path}: {'; '.join(reasons)}; --force restores with it nevertheless")
     for reason in reasons:
         error_line(reason, "warning")
 
 
-def _placed(path: Path, recorded: FreeMotion, offset: float, frames: Tensor, timing: SensorTiming) -> FreeMotion:
-    """The recording on the clock of the frames, at an offset that was given."""
-    moving = recorded.retimed(offset)
-    rows = frames.shape[-1 if timing.scan_axis == -1 else -2]
-    starts = timing.row_starts(len(frames), rows)
-    first, last = float(starts.min()), float(starts.max()) + timing.exposure_time
-    if moving.start > first + 1e-9 or moving.end < last - 1e-9:
-        raise ValueError(
-            f"{path}: covers {recorded.start:.6g} to {recorded.end:.6g} s, the frames need {offset + first:.6g} to "
-            f"{offset + last:.6g} s"
-        )
-    return moving
-
-
-def _judge(
-    path: Path, frames: Tensor, timing: SensorTiming, moving: FreeMotion, force: bool, *, required: bool
+def _check_motion(
+    path: Path, frames: Tensor, timing: SensorTiming, motion: FreeMotion, force: bool, *, required: bool
 ) -> None:
-    """Say how far rows are apart before and after, and refuse a motion that brings them no closer."""
+    """Print the offsets of rows before and after correction with a motion, and refuse a motion that enlarges them.
+
+    With ``required``, an error of the comparison is an error of the command, otherwise a warning.
+    """
     if len(frames) < 2:
-        error_line("one frame alone does not tell whether the motion fits", "warning")
+        error_line("cannot determine whether the motion fits: the comparison needs two frames", "warning")
         return
     try:
-        with working("holding the motion against the frames"):
-            check = check_motion(frames, timing, moving)
+        with working("comparing the motion with the frames"):
+            check = check_motion(frames, timing, motion)
     except ValueError as error:
         if required:
             raise
-        error_line(f"whether the motion fits cannot be told: {error}", "warning")
+        error_line(f"cannot determine whether the motion fits: {error}", "warning")
         return
     before, after = (" and ".join(f"{value:.3f}" for value in sizes) for sizes in (check.before, check.after))
-    say(f"rows are {before} px rms apart between frames along x and y, less the motion {after} px")
-    if not check.helps:
-        _refuse(path, check.reasons or ("the motion brings rows no closer to each other",), force)
-    for reason in check.reasons if check.helps else ():
-        error_line(reason, "warning")
+    print_line(f"offset of rows between frames: {before} px rms along x and y, {after} px rms without the motion")
+    if check.helps:
+        for reason in check.reasons:
+            error_line(reason, "warning")
+    else:
+        _refuse(path, check.reasons or ("the motion does not reduce the offsets of rows between frames",), force)
+
+
+def calibrate(
+    frames: Annotated[list[Path], typer.Argument(help="One or more stacks of frames: TIFF, PNG, video ...")],
+    *,
+    frequency: Annotated[
+        float | None,
+        typer.Option(help="Flicker frequency in Hz; a mains-powered light flickers at twice the mains frequency."),
+    ] = None,
+    exposure: Annotated[
+        list[float] | None,
+        typer.Option(help="Exposure time in s, given once per frame, for a strobe of unknown frequency."),
+    ] = None,
+    frame_rate: Annotated[float | None, typer.Option(help="Frames per second, if the frames are consecutive.")] = None,
+    on_fraction: Annotated[
+        float | None,
+        typer.Option(help="Duty cycle of a light that is switched on and off; determines the exposure time."),
+    ] = None,
+    light_contrast: Annotated[
+        float | None,
+        typer.Option(help="Amplitude over mean of a sinusoidal light; determines the exposure time."),
+    ] = None,
+    scan_axis: Annotated[
+        Literal["y", "x"], typer.Option(help="Image axis along which the rows follow each other.")
+    ] = "y",
+    gamma: Annotated[float, typer.Option(help="Exponent that makes pixel values proportional to light.")] = 1.0,
+    full_scale: Annotated[float | None, typer.Option(help="Count that corresponds to full scale.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Configuration file to write, with the table sensor.")] = None,
+) -> None:
+    """Measure row time, readout direction and exposure of a camera from frames of a flickering light."""
+    if (frequency is None) == (not exposure):
+        raise ValueError(
+            "give --frequency of the flicker, or --exposure once per frame for a strobe of unknown frequency"
+        )
+    if out is not None:
+        check_writable(out)
+    with working("reading the frames"):
+        stacks = [read_stack(path, full_scale=full_scale) for path in frames]
+    for path, stack in zip(frames, stacks, strict=True):
+        if stack.shape[1:] != stacks[0].shape[1:]:
+            raise ValueError(
+                f"{path}: frames of shape {tuple(stack.shape[1:])}, expected {tuple(stacks[0].shape[1:])} as in "
+                f"{frames[0]}"
+            )
+    stack = torch.cat(stacks)
+    axis: Literal[-2, -1] = -1 if scan_axis == "x" else -2
+    with working("measuring the flicker"):
+        if frequency is None:
+            result = calibrate_row_time_by_exposure(stack, exposure or [], scan_axis=axis, gamma=gamma)
+        else:
+            result = calibrate_row_time(
+                stack,
+                frequency,
+                frame_rate=frame_rate,
+                on_fraction=on_fraction,
+                light_contrast=light_contrast,
+                scan_axis=axis,
+                gamma=gamma,
+            )
+    _print_calibration(result, stack.shape[axis])
+    if out is not None:
+        with whole_file(out) as file:
+            file.write_text(_sensor_toml(result, scan_axis), encoding="utf-8")
+        print_line(f"{out}: [sensor]")
+
+
+def _print_calibration(result: RowTimeCalibration, num_rows: int) -> None:
+    row_time, std = result.row_time, result.row_time_std
+    readout = measured_text(1e3 * row_time * num_rows, 1e3 * std * num_rows)
+    print_line(f"row time {measured_text(1e6 * row_time, 1e6 * std)} us ({num_rows} rows in {readout} ms)")
+    print_line(f"flicker {result.flicker_frequency:.6g} Hz")
+    print_line(f"bands of {result.period_rows:.3f} rows, contrast {result.contrast:.3g}")
+    if result.frame_rows is not None:
+        print_line(f"frame rows {result.frame_rows:.2f}")
+    if result.readout_direction is not None:
+        print_line(f"readout direction {result.readout_direction}")
+    if result.exposure_time is not None and result.exposure_time_std:
+        exposure = measured_text(1e6 * result.exposure_time, 1e6 * result.exposure_time_std)
+        print_line(f"exposure {exposure} us, {result.exposure_time / row_time:.2f} rows")
+    for note in result.notes:
+        print_line(note)
+
+
+def _sensor_toml(result: RowTimeCalibration, scan_axis: str) -> str:
+    """The table ``[sensor]`` of a configuration file; unknown values are comments to be filled in."""
+    values = {
+        "row_time": f"{result.row_time:.9g}",
+        "exposure_rows": None if result.exposure_time is None else f"{result.exposure_time / result.row_time:.6g}",
+        "frame_rows": None if result.frame_rows is None else f"{result.frame_rows:.8g}",
+        "scan_axis": f'"{scan_axis}"',
+        "readout_direction": None if result.readout_direction is None else f'"{result.readout_direction}"',
+    }
+    lines = [f"# {name} = ?  (unknown)" if text is None else f"{name} = {text}" for name, text in values.items()]
+    return "\n".join(["[sensor]", *lines, *(f"# {note}" for note in result.notes)]) + "\n"

@@ -1,308 +1,507 @@
-"""``rsvib run``, and ``rsvib detect`` and ``rsvib restore`` of stacks in windows."""
+"""Commands that detect and remove vibration: ``simulate``, ``detect``, ``restore``, ``run`` and ``report``."""
 
-import csv
-from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch
 import typer
+from torch import Tensor
 
+import rsvib_torch
 from rsvib_torch.commands.options import (
     ConfigOption,
+    DeviceName,
     DeviceOption,
     ForceOption,
     FramesArgument,
     JointOption,
     MemoryOption,
     MethodOption,
+    Overrides,
     PriorOption,
+    RestoredArgument,
     SaturationOption,
     ScaleOption,
-    WindowOption,
     WorkersOption,
-)
-from rsvib_torch.commands.terminal import counting, error_line, say, show_result, working
-from rsvib_torch.commands.workflow import (
-    DeviceName,
-    Restored,
-    Wishes,
-    chosen_device,
     full_scale_of,
     restoration_options,
-    tell_restoration,
-    write_detection,
+    torch_device,
+)
+from rsvib_torch.commands.terminal import (
+    counting,
+    error_line,
+    print_detection,
+    print_line,
+    print_restoration,
+    working,
 )
 from rsvib_torch.config import Config, read_config
-from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.validation import validate
-from rsvib_torch.detection import DetectionResult
-from rsvib_torch.io import check_writable, open_stack, read_stack_info, timing_from_first_frame, whole_folder
+from rsvib_torch.detection import DetectionResult, detect_vibration
+from rsvib_torch.imaging import simulate_frames
+from rsvib_torch.io import (
+    StackInfo,
+    check_stack_target,
+    check_writable,
+    exposure_times,
+    open_stack,
+    read_stack,
+    read_stack_info,
+    timing_from_first_frame,
+    whole_folder,
+    write_stack,
+)
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.schema import TimingRecord, check_same_timing
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.report.plots import comparison_figure, save_figure
+from rsvib_torch.report.html import Box, Report, write_report_page
+from rsvib_torch.report.plots import comparison_figure, offset_figure, save_figure
+from rsvib_torch.report.results import (
+    read_vibration,
+    write_offsets,
+    write_restoration,
+    write_vibration,
+    write_windows,
+)
+from rsvib_torch.restoration.verdict.trust import Detected
 from rsvib_torch.stacks import (
     DEFAULT_WINDOW,
-    StackManifest,
-    StackReport,
+    BadFrames,
+    RestoredFrames,
     WindowResult,
     detect_stack,
     iterate_stack,
     process_stack,
     read_manifest,
+    restore_trusted,
 )
 
-__all__ = ["detect_windows", "restore_windows", "run", "window_of"]
-
-_BAD_FRAMES = ("pass", "skip")
+__all__ = ["Stack", "detect", "load", "report", "restore", "run", "save", "simulate"]
 
 
-def window_of(config: Config, option: int | None) -> int:
-    """Most frames of a window: the option first, then the config."""
-    return int(config.stack.get("window", DEFAULT_WINDOW)) if option is None else option
+@dataclass(frozen=True)
+class Stack:
+    """Frames in memory.
+
+    Attributes:
+        frames: (T, H, W) or (T, C, H, W), full scale 1.
+        info: Data type and metadata of the file, with exposure times for frame times.
+        full_scale: Count that corresponds to full scale; None for floating point.
+        timing: The sensor, with the frame times of the file.
+    """
+
+    frames: Tensor
+    info: StackInfo
+    full_scale: float | None
+    timing: SensorTiming
 
 
-def _bad_frames(config: Config, option: str | None) -> Any:
-    chosen = config.stack.get("bad_frames", "pass") if option is None else option
-    check_choice("--bad-frames", chosen, _BAD_FRAMES)
-    return chosen
+def load(path: Path, config: Config, full_scale: float | None, device: torch.device) -> Stack:
+    """Read a stack; ``full_scale`` is the option of the command line."""
+    info = read_stack_info(path)
+    scale = full_scale_of(path, info, config, full_scale)
+    with working(f"reading {path}"):
+        frames = read_stack(path, full_scale=scale)
+    timing = timing_from_first_frame(config.timing, info)
+    info = replace(info, frame_times=exposure_times(info, config.timing), times_of_playback=False)
+    return Stack(frames.to(device), info, scale, timing)
+
+
+def save(path: Path, frames: Tensor, stack: Stack) -> None:
+    """Write frames with the data type, full scale and metadata of a stack."""
+    with working(f"writing {path.name}"):
+        write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
+
+
+def _detect(stack: Stack, config: Config) -> DetectionResult:
+    with working("detecting the vibration"):
+        result: DetectionResult = detect_vibration(stack.frames, stack.timing, **config.detection)
+    return result
+
+
+def _restore(stack: Stack, detected: Detected, options: dict[str, Any], force: bool) -> RestoredFrames:
+    """Restore frames, judge the result on eight pairs of frames, and print the verdict."""
+    with working("restoring the frames and judging the result"):
+        result = restore_trusted(stack.frames, stack.timing, detected, options, force=force, most_pairs=8)
+    print_restoration(result)
+    return result
+
+
+def _write_detection(folder: Path, result: DetectionResult, timing: SensorTiming) -> list[str]:
+    """Write a detection as JSON, CSV and figure, and return the names of the files."""
+    with working("drawing the offset curve"):
+        write_vibration(folder / "vibration.json", result, timing)
+        write_offsets(folder / "offsets.csv", result)
+        save_figure(offset_figure(result), folder / "offsets.png")
+    return ["vibration.json", "offsets.csv", "offsets.png"]
+
+
+def simulate(
+    scene: Annotated[Path, typer.Argument(help="Image of the scene at rest, larger than the frames.")],
+    frames: Annotated[Path, typer.Argument(help="Stack to write.")],
+    *,
+    config: ConfigOption,
+    device: DeviceOption = "auto",
+    full_scale: Annotated[
+        float | None, typer.Option(help="Count of the scene's file that corresponds to full scale.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of the noise.", min=0, show_default="from the configuration")
+    ] = None,
+) -> None:
+    """Simulate frames of a vibrating camera.
+
+    The camera, its vibration and its noise are described in the configuration file.
+    """
+    settings = read_config(config)
+    if settings.simulation is None:
+        raise ValueError(f"{config}: simulation: missing key; expected a table with vibration, num_frames, ...")
+    simulation, target = settings.simulation, torch_device(device)
+    image = read_stack(scene, full_scale=full_scale)
+    if len(image) != 1:
+        raise ValueError(f"{scene}: the scene must be one image, this file has {len(image)} frames")
+    scale = settings.full_scale
+    dtype = "float32" if scale is None else "uint8" if scale <= 255 else "uint16"
+    check_stack_target(frames, (simulation.num_frames, *image.shape[1:]), dtype=dtype, full_scale=scale)
+    with working("simulating the frames"):
+        simulated = simulate_frames(
+            image[0].to(target),
+            settings.timing,
+            simulation.vibration,
+            simulation.num_frames,
+            frame_size=simulation.frame_size,
+            noise=simulation.noise,
+            generator=torch.Generator(target).manual_seed(simulation.seed if seed is None else seed),
+        )
+    with working(f"writing {frames}"):
+        write_stack(frames, simulated, dtype=dtype, full_scale=scale)
+    print_line(f"{frames}: {len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}")
+
+
+def detect(
+    frames: FramesArgument,
+    *,
+    config: ConfigOption,
+    out: Annotated[Path, typer.Option(help="Folder for vibration.json, offsets.csv and offsets.png.")],
+    window: Annotated[
+        int | None,
+        typer.Option(
+            help="Detect separately in windows of at most this number of frames; writes manifest.json and windows.csv.",
+            show_default="from the configuration, or all frames together",
+        ),
+    ] = None,
+    memory: MemoryOption = None,
+    workers: WorkersOption = None,
+    device: DeviceOption = "auto",
+    full_scale: ScaleOption = None,
+) -> None:
+    """Detect the vibration in a stack of frames.
+
+    The vibration is modelled as sinusoids of constant amplitude and frequency. For other motion see rsvib motion.
+    """
+    settings = read_config(config)
+    check_writable(out, folder=True)
+    window = settings.stack.get("window") if window is None else window
+    if window is None:
+        stack = load(frames, settings, full_scale, torch_device(device))
+        result = _detect(stack, settings)
+        with whole_folder(out) as folder:
+            names = _write_detection(folder, result, stack.timing)
+        print_detection(result)
+        print_line(f"{out}: {', '.join(names)}")
+        return
+    scale = full_scale_of(frames, read_stack_info(frames), settings, full_scale)
+    with whole_folder(out) as folder:
+        with counting(f"detecting in {frames.name}") as progress:
+            detect_stack(
+                frames,
+                folder / "manifest.json",
+                settings.timing,
+                window=window,
+                detection=settings.detection,
+                full_scale=scale,
+                memory=memory,
+                workers=workers,
+                device=str(torch_device(device)),
+                progress=progress,
+            )
+        manifest = read_manifest(folder / "manifest.json")
+        write_windows(folder / "windows.csv", manifest)
+    _warn_of_failures(sum(record.error is not None for record in manifest.windows))
+    print_line(f"{out}: manifest.json, windows.csv, {len(manifest.windows)} windows")
+
+
+def _warn_of_failures(windows: int) -> None:
+    if windows:
+        error_line(f"detection failed in {windows} windows: see manifest.json", "warning")
+
+
+def restore(
+    frames: FramesArgument,
+    restored: RestoredArgument,
+    *,
+    config: ConfigOption,
+    vibration: Annotated[
+        Path, typer.Option(help="The vibration.json, or manifest.json of windows, written by detect or run.")
+    ],
+    method: MethodOption = None,
+    joint: JointOption = None,
+    prior: PriorOption = None,
+    saturation: SaturationOption = None,
+    force: ForceOption = False,
+    report: Annotated[
+        Path | None, typer.Option(help="JSON file to write: whether restoration helped, with the measured values.")
+    ] = None,
+    device: DeviceOption = "auto",
+    full_scale: ScaleOption = None,
+) -> None:
+    """Restore a stack of frames with a detected vibration, and judge the result.
+
+    If the restored frames are judged no better than the input, the input is written unchanged, unless --force is given.
+    """
+    settings = read_config(config)
+    overrides = Overrides(method, joint, prior, saturation)
+    with vibration.open("rb") as file:
+        is_manifest = b'"rsvib stack"' in file.read(200)  # bytes; the format is the first key of either file
+    if is_manifest:
+        if report is not None:
+            raise ValueError("--report needs a vibration.json; the verdict on each window is in its manifest.json")
+        _restore_windows(frames, restored, settings, vibration, overrides, force, device, full_scale)
+        return
+    detected = read_vibration(vibration, timing_from_first_frame(settings.timing, read_stack_info(frames)))
+    stack = load(frames, settings, full_scale, torch_device(device))
+    shape = (1, *stack.info.shape[1:]) if joint == "all" else stack.info.shape
+    check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale)
+    if report is not None:
+        check_writable(report)
+    options = restoration_options(stack.info, stack.full_scale, settings, overrides)
+    result = _restore(stack, detected, options, force)
+    save(restored, result.frames, stack)
+    if report is not None:
+        write_restoration(report, result, options)
+    state = "restored" if result.restored else "unchanged"
+    print_line(f"{restored}: {len(result.frames)} frames {state}, {stack.info.dtype}")
+
+
+def _restore_windows(
+    frames: Path,
+    restored: Path,
+    config: Config,
+    vibration: Path,
+    overrides: Overrides,
+    force: bool,
+    device: DeviceName,
+    full_scale: float | None,
+) -> None:
+    """Restore a stack with the detections of its windows."""
+    manifest = read_manifest(vibration)
+    stored = validate(TimingRecord, manifest.settings.get("sensor", {}), f"{vibration}: settings.sensor")
+    timing = config.timing
+    if timing.frame_start_times is None:  # frame times of the file were stored with the detection
+        timing = replace(timing, frame_start_times=stored.frame_start_times)
+    check_same_timing(str(vibration), stored, timing)
+    window = manifest.settings.get("window")
+    if not isinstance(window, int):
+        raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")
+    info = read_stack_info(frames)
+    scale = full_scale_of(frames, info, config, full_scale)
+    with counting(f"restoring {frames.name}") as progress:
+        result = process_stack(
+            frames,
+            restored,
+            config.timing,
+            window=window,
+            given=manifest.detections(),
+            restoration=restoration_options(info, scale, config, overrides),
+            full_scale=scale,
+            force=force,
+            device=str(torch_device(device)),
+            progress=progress,
+        )
+    print_line(f"{restored}: {result.frames} frames in {result.windows} windows, {result.restored} windows restored")
 
 
 def run(
     frames: FramesArgument,
-    out: Annotated[Path, typer.Argument(help="Folder for the restored frames, the vibration and the pictures.")],
+    out: Annotated[Path, typer.Argument(help="Folder for the restored frames, the vibration and the figures.")],
     *,
     config: ConfigOption,
     output: Annotated[
-        str, typer.Option("--output", help="Name of the restored stack in that folder; its ending tells the format.")
+        str,
+        typer.Option("--output", help="Name of the restored stack in that folder; its extension selects the format."),
     ] = "restored.tif",
     compression: Annotated[
-        str | None, typer.Option("--compression", help="Compress a TIFF stack: zlib or lzma.")
+        str | None, typer.Option("--compression", help="Compression of a TIFF stack: zlib or lzma.")
     ] = None,
     method: MethodOption = None,
     joint: JointOption = None,
     prior: PriorOption = None,
     saturation: SaturationOption = None,
     force: ForceOption = False,
-    window: WindowOption = None,
-    bad_frames: Annotated[
-        str | None,
+    window: Annotated[
+        int | None,
         typer.Option(
-            "--bad-frames",
-            help="Frames that cannot be read or used: 'pass' them on as they are, or 'skip' them.",
-            show_default="the config's, or pass",
+            "--window",
+            help="Largest number of frames that are processed together; longer stacks are divided into windows.",
+            show_default=f"from the configuration, or {DEFAULT_WINDOW}",
         ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
+    bad_frames: Annotated[
+        BadFrames | None,
+        typer.Option(
+            "--bad-frames",
+            help="Frames that cannot be read or used: 'pass' writes them unchanged, 'skip' leaves them out.",
+            show_default="from the configuration, or pass",
+        ),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
     memory: MemoryOption = None,
     workers: WorkersOption = None,
     scheduler: Annotated[
         str | None,
         typer.Option(
-            "--scheduler", help="Compute with Dask: tcp://HOST:PORT, or 'local' for processes on this machine."
+            "--scheduler",
+            help="Compute with Dask: address of a scheduler (tcp://HOST:PORT), or 'local' for processes on this "
+            "machine.",
         ),
     ] = None,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
 ) -> None:
-    """Detect the vibration, restore the frames, judge whether that helps, and draw pictures.
+    """Detect the vibration, restore the frames, judge the result and draw figures.
 
-    Stacks may be of any length: they are gone through in windows. Where restored frames are no better than the raw
-    ones, the raw ones are written, unless forced. Ctrl-C stops when the windows at work are done; --resume goes on.
+    Stacks of any length are processed in windows. If the restored frames are judged no better than the input, the
+    input is written unchanged, unless --force is given. Ctrl-C stops after the current windows; --resume continues.
     """
     settings = read_config(config)
     if Path(output).name != output or output in ("", ".", ".."):
-        raise ValueError(f"--output must be a name without a folder, got {output!r}")
+        raise ValueError(f"--output must be a file name without a folder, got {output!r}")
     check_writable(out, folder=True)
     info = read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
-    options = restoration_options(info, scale, settings, Wishes(method, joint, prior, saturation, force))
+    options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation))
     common: dict[str, Any] = {
-        "window": window_of(settings, window),
+        "window": settings.stack.get("window", DEFAULT_WINDOW) if window is None else window,
         "detection": settings.detection,
         "restoration": options,
         "full_scale": scale,
         "force": force,
         "memory": memory,
         "workers": workers,
-        "device": str(chosen_device(device)),
+        "device": str(torch_device(device)),
     }
     with counting(f"restoring {frames.name}") as progress:
-        report = process_stack(
+        result = process_stack(
             frames,
             out / output,
             settings.timing,
             **common,
-            bad_frames=_bad_frames(settings, bad_frames),
+            bad_frames=bad_frames or settings.stack.get("bad_frames", "pass"),
             scheduler=scheduler,
             compression=compression,
             resume=resume,
             manifest=out / "manifest.json",
             progress=progress,
         )
-    first = report.first
-    if first is None:
+    first = result.first
+    if first is None:  # the run was complete before, or its first window was
         first = next(iter(iterate_stack(frames, settings.timing, **common)))
     names = [output, "manifest.json"]
     with whole_folder(out) as folder:
-        if report.windows == 1:
-            _write_single(folder, first, options, timing_from_first_frame(settings.timing, info))
-            names += ["restoration.json", "vibration.json", "offsets.csv", "offsets.png"]
+        if result.windows == 1:
+            assert isinstance(first.detection, DetectionResult)
+            assert first.restoration is not None
+            write_restoration(folder / "restoration.json", first.restoration, options)
+            timing = timing_from_first_frame(settings.timing, info)
+            names += ["restoration.json", *_write_detection(folder, first.detection, timing)]
         else:
-            _write_table(folder / "windows.csv", read_manifest(out / "manifest.json"))
+            write_windows(folder / "windows.csv", read_manifest(out / "manifest.json"))
             names.append("windows.csv")
-        with working("drawing before and after"):
-            if _draw(folder / "before_after.png", frames, scale, first):
-                names.append("before_after.png")
-    _tell(report, first)
-    say(f"{out}: {', '.join(names)}")
-
-
-def _write_single(folder: Path, result: WindowResult, options: dict[str, Any], timing: SensorTiming) -> None:
-    """What is written of a stack that is one window."""
-    restoration = result.restoration
-    assert isinstance(result.detection, DetectionResult)
-    assert restoration is not None
-    write_detection(folder, result.detection, timing)
-    told = Restored(result.frames, result.restored, options, restoration.left_alone, restoration.verdict)
-    told.write_report(folder / "restoration.json")
-
-
-def _tell(report: StackReport, first: WindowResult) -> None:
-    """The result in words."""
-    if report.windows == 1:
+        if len(first.frames):
+            with working("drawing input and restored frame"):
+                _draw_comparison(folder / "before_after.png", frames, scale, first)
+            names.append("before_after.png")
+    if result.windows == 1:
         if isinstance(first.detection, DetectionResult):
-            show_result(first.detection)
+            print_detection(first.detection)
         if first.restoration is not None:
-            tell_restoration(first.restoration)
+            print_restoration(first.restoration)
     else:
-        rate = f", {report.seconds / report.frames:.2f} s a frame" if report.frames and not report.resumed else ""
-        say(f"{report.frames} frames in {report.windows} windows, {report.restored} of them restored{rate}")
-        if report.resumed:
-            say(f"{report.resumed} windows were there already")
-        if report.failed:
-            error_line(f"in {report.failed} windows nothing could be detected: see manifest.json", "warning")
-    if report.bad_frames:
-        error_line(f"{report.bad_frames} frames could not be used: see manifest.json", "warning")
+        rate = f", {result.seconds / result.frames:.2f} s per frame" if result.frames and not result.resumed else ""
+        print_line(f"{result.frames} frames in {result.windows} windows, {result.restored} windows restored{rate}")
+        if result.resumed:
+            print_line(f"{result.resumed} windows were complete before this run")
+        _warn_of_failures(result.failed)
+    if result.bad_frames:
+        error_line(f"{result.bad_frames} frames could not be used: see manifest.json", "warning")
+    print_line(f"{out}: {', '.join(names)}")
 
 
-def _draw(path: Path, frames: Path, full_scale: float | None, first: WindowResult) -> bool:
-    """Draw a frame before and after; False where there is none."""
-    if not len(first.frames):
-        return False
-    shown = first.indices[0] if first.indices else (first.window.first + first.window.last + 1) // 2
+def _draw_comparison(path: Path, frames: Path, full_scale: float | None, first: WindowResult) -> None:
+    """Draw the first restored frame of a stack beside the frame of the input."""
+    index = first.indices[0] if first.indices else (first.window.first + first.window.last + 1) // 2
     reader = open_stack(frames)
-    raw = counts_to_frames(reader.frame(shown)[None], full_scale or reader.info.full_scale, str(frames))[0]
+    raw = counts_to_frames(reader.frame(index)[None], full_scale or reader.info.full_scale, str(frames))[0]
     reader.close()
-    names = ("as taken", "restored" if first.restored else "left as taken")
+    names = ("input", "restored" if first.restored else "unchanged")
     save_figure(comparison_figure(raw, first.frames[0].cpu(), names=names), path)
-    return True
 
 
-_COLUMNS = ("amplitude", "frequency", "phase")
-
-
-def _table(manifest: StackManifest) -> Iterable[list[Any]]:
-    """One line a window: the strongest tone of each axis, and what became of the window."""
-    head: list[Any] = ["window", "first_frame", "last_frame", "start_s"]
-    for letter in "xy":
-        head += [f"{name}_{letter}{end}" for name in _COLUMNS for end in ("", "_std")]
-        head += [f"image_motion_{letter}", f"reliable_{letter}"]
-    yield [*head, "frames", "outcome", "bad_frames", "note"]
-    for record in manifest.windows:
-        line: list[Any] = [record.window, record.first, record.last, record.start_time]
-        found = record.detection
-        for axis in (0, 1):
-            if found is None:
-                line += [None] * (2 * len(_COLUMNS) + 2)
-                continue
-            for name in _COLUMNS:
-                line.extend((getattr(found.vibration, name)[axis][0], getattr(found.std, name)[axis][0]))
-            line.extend((found.vibration.image_motion[axis], found.reliable[axis]))
-        note = record.error or "; ".join(record.left_alone)
-        yield [*line, record.frames, record.outcome, len(record.bad_frames), note]
-
-
-def _write_table(path: Path, manifest: StackManifest) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows(_table(manifest))
-
-
-def detect_windows(
-    frames: Path,
-    config: Config,
-    out: Path,
-    window: int,
+def report(
+    frames: FramesArgument,
+    out: Annotated[Path, typer.Argument(help="Folder for report.html and its figures.")],
     *,
-    device: DeviceName,
-    full_scale: float | None,
-    memory: str | None,
-    workers: int | None,
+    config: ConfigOption,
+    edge: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Slanted edge to measure: TOP,LEFT,HEIGHT,WIDTH in px; may be given several times.",
+            show_default="edges are searched for",
+        ),
+    ] = None,
+    method: MethodOption = None,
+    joint: JointOption = None,
+    prior: PriorOption = None,
+    saturation: SaturationOption = None,
+    force: ForceOption = False,
+    device: DeviceOption = "auto",
+    full_scale: ScaleOption = None,
 ) -> None:
-    """Detect the vibration in every window of a stack: ``manifest.json`` and ``windows.csv``."""
-    check_writable(out, folder=True)
-    info = read_stack_info(frames)
-    scale = full_scale_of(frames, info, config, full_scale)
-    with whole_folder(out) as folder:
-        with counting(f"detecting in {frames.name}") as progress:
-            detect_stack(
-                frames,
-                folder / "manifest.json",
-                config.timing,
-                window=window,
-                detection=config.detection,
-                full_scale=scale,
-                memory=memory,
-                workers=workers,
-                device=str(chosen_device(device)),
-                progress=progress,
-            )
-        manifest = read_manifest(folder / "manifest.json")
-        _write_table(folder / "windows.csv", manifest)
-    failed = sum(record.error is not None for record in manifest.windows)
-    if failed:
-        error_line(f"in {failed} windows nothing could be detected: see manifest.json", "warning")
-    say(f"{out}: manifest.json, windows.csv, {len(manifest.windows)} windows")
+    """Detect, restore and judge as rsvib run does, and write a report as an HTML page with figures.
 
-
-def restore_windows(
-    frames: Path,
-    restored: Path,
-    config: Config,
-    manifest: StackManifest,
-    wishes: Wishes,
-    *,
-    device: DeviceName,
-    full_scale: float | None,
-) -> StackReport:
-    """Restore a stack with what was detected in its windows.
-
-    Raises:
-        ValueError: If the windows are those of another camera.
+    The page is one file that needs no network. The figures are also written as PNG files.
     """
-    stored = validate(TimingRecord, manifest.settings.get("sensor", {}), "manifest.json: settings.sensor")
-    if config.timing.frame_start_times is None:  # the frames' file may hold their times
-        check_same_timing("manifest.json", stored, replace(config.timing, frame_start_times=stored.frame_start_times))
-    else:
-        check_same_timing("manifest.json", stored, config.timing)
-    window = manifest.settings.get("window")
-    if not isinstance(window, int):
-        raise ValueError("manifest.json: settings.window: missing key; expected a whole number")
-    info = read_stack_info(frames)
-    scale = full_scale_of(frames, info, config, full_scale)
-    with counting(f"restoring {frames.name}") as progress:
-        report = process_stack(
-            frames,
-            restored,
-            replace(config.timing),
-            window=window,
-            given=manifest.detections(),
-            restoration=restoration_options(info, scale, config, wishes),
-            full_scale=scale,
-            force=wishes.force,
-            device=str(chosen_device(device)),
-            progress=progress,
-        )
-    say(f"{restored}: {report.frames} frames in {report.windows} windows, {report.restored} of them restored")
-    return report
+    boxes = [_edge_box(text) for text in edge or []]
+    settings = read_config(config)
+    check_writable(out, folder=True)
+    stack = load(frames, settings, full_scale, torch_device(device))
+    options = restoration_options(stack.info, stack.full_scale, settings, Overrides(method, joint, prior, saturation))
+    detection = _detect(stack, settings)
+    print_detection(detection)
+    result = _restore(stack, detection, options, force)
+    content = Report(
+        title=f"Vibration in {frames.name}",
+        subtitle=f"{frames}, camera of {config}",
+        frames=stack.frames,
+        restored=result.frames,
+        was_restored=result.restored,
+        timing=stack.timing,
+        detection=detection,
+        verdict=result.verdict,
+        left_alone=result.left_alone,
+        options=options,
+        version=rsvib_torch.__version__,
+    )
+    with whole_folder(out) as folder, working("writing the page"):
+        files = write_report_page(folder, content, boxes or None)
+    print_line(f"{out}: {', '.join(files)}")
+
+
+def _edge_box(text: str) -> Box:
+    """Position of a slanted edge (top, left, height, width) in px."""
+    numbers = [part.strip() for part in text.split(",")]
+    if len(numbers) != 4 or not all(number.isdecimal() for number in numbers):
+        raise ValueError(f"--edge must be TOP,LEFT,HEIGHT,WIDTH in px, got {text!r}")
+    top, left, height, width = map(int, numbers)
+    return top, left, height, width

@@ -1,4 +1,4 @@
-"""What the command line shows: progress, the result in words, warnings and errors in one line each."""
+"""Terminal output: progress, results as tables, and warnings and errors in one line each."""
 
 import math
 import warnings
@@ -23,17 +23,27 @@ from rich.table import Table
 from rich.text import Text
 
 from rsvib_torch.detection import DetectionResult
+from rsvib_torch.report.plots import measured_text
+from rsvib_torch.stacks import RestoredFrames
 
-__all__ = ["counting", "error_line", "say", "show_result", "warnings_in_one_line", "working"]
+__all__ = [
+    "counting",
+    "error_line",
+    "print_detection",
+    "print_line",
+    "print_restoration",
+    "warnings_in_one_line",
+    "working",
+]
 
 
-def say(message: str) -> None:
-    """Print one line to standard output; brackets in file names are no markup, long lines are not broken."""
+def print_line(message: str) -> None:
+    """Print one line to standard output; long lines are not wrapped, and brackets are not markup."""
     Console(highlight=False).print(Text(message), soft_wrap=True)
 
 
 def error_line(message: str, kind: str = "error") -> None:
-    """Print one line (or one a mistake) to standard error."""
+    """Print a message to standard error, with the prefix ``rsvib: error:`` on each of its lines."""
     console = Console(stderr=True, highlight=False)
     for line in message.splitlines() or [""]:
         console.print(Text.assemble(("rsvib: ", "bold"), (f"{kind}: ", "bold red"), line), soft_wrap=True)
@@ -41,7 +51,7 @@ def error_line(message: str, kind: str = "error") -> None:
 
 @contextmanager
 def warnings_in_one_line() -> Iterator[None]:
-    """Show Python's warnings without file and source line."""
+    """Show Python's warnings without file name and source line."""
 
     def show(message: Any, *_: Any, **__: Any) -> None:
         error_line(" ".join(str(message).split()), "warning")
@@ -51,96 +61,90 @@ def warnings_in_one_line() -> Iterator[None]:
         yield
 
 
-@contextmanager
-def working(what: str) -> Iterator[None]:
-    """Show a moving bar and the time while ``what`` goes on; on a terminal only, and gone afterwards."""
+def _progress(*columns: ProgressColumn) -> Progress:
+    """A progress bar on standard error that is removed at the end; nothing is shown unless it is a terminal."""
     console = Console(stderr=True)
-    columns = (
+    description = TextColumn("{task.description}", markup=False)
+    return Progress(
         SpinnerColumn(),
-        TextColumn("{task.description}", markup=False),
+        description,
         BarColumn(bar_width=30),
-        TimeElapsedColumn(),
+        *columns,
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+        speed_estimate_period=300.0,  # s; windows of a stack may take minutes each
     )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        progress.add_task(what, total=None)
+
+
+@contextmanager
+def working(description: str) -> Iterator[None]:
+    """Show a moving bar and the elapsed time."""
+    with _progress(TimeElapsedColumn()) as progress:
+        progress.add_task(description, total=None)
         yield
 
 
 class _RateColumn(ProgressColumn):
-    """Frames a second."""
+    """Frames per second."""
 
     def render(self, task: Task) -> Text:
-        """The rate, once it is known."""
+        """The rate, empty until it has been measured."""
         rate = task.finished_speed or task.speed
         return Text("" if rate is None else f"{rate:.2f} frames/s")
 
 
 @contextmanager
-def counting(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Show how many frames are done, their rate and the time that is left; on a terminal only, and gone afterwards.
+def counting(description: str) -> Iterator[Callable[[int, int], None]]:
+    """Show the number of processed frames, their rate and the remaining time.
 
     Yields:
-        A function to call with the number of frames that are done, and of all.
+        A function to call with the number of processed frames and the number of all frames.
     """
-    console = Console(stderr=True)
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=30),
-        MofNCompleteColumn(),
-        _RateColumn(),
-        TimeRemainingColumn(),
-    )
-    shown = Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal, speed_estimate_period=300.0
-    )
-    with shown as progress:
+    with _progress(MofNCompleteColumn(), _RateColumn(), TimeRemainingColumn()) as progress:
         task: Any = None
 
         def show(done: int, total: int) -> None:
             nonlocal task
-            if task is None:  # frames of an earlier run do not count for the rate
-                task = progress.add_task(what, total=total, completed=done)
+            if task is None:  # frames of a resumed run do not count for the rate
+                task = progress.add_task(description, total=total, completed=done)
             else:
                 progress.update(task, completed=done)
 
         yield show
 
 
-def _number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else "∞"
-
-
-def _measured(value: float, std: float) -> str:
-    """A value with its standard deviation, to the digits that the latter leaves."""
-    digits = 2
-    if math.isfinite(std) and std > 0:
-        digits = min(6, max(0, 1 - math.floor(math.log10(std))))
-    return f"{_number(value, digits)} ± {_number(std, digits)}"
-
-
-def show_result(result: DetectionResult) -> None:
-    """Print a detection as a table with one line a tone, and the verdict on each axis in words."""
+def print_detection(result: DetectionResult) -> None:
+    """Print a detection as a table with one line per tone, and the verdict on each axis."""
     vibration, std = result.vibration, result.std
     heads = ("axis", "amplitude (px)", "frequency (Hz)", "period (ms)", "phase (π)", "gain")
     table = Table(*heads, title="Vibration", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    for axis, name in enumerate("xy"):
+    for axis, letter in enumerate("xy"):
         for tone in range(vibration.amplitude.shape[-1]):
-            at = (axis, tone)
-            if tone > 0 and not float(vibration.amplitude[at]) > 0:
+            if tone > 0 and not float(vibration.amplitude[axis, tone]) > 0:
                 continue
-            table.add_row(
-                name,
-                _measured(float(vibration.amplitude[at]), float(std.amplitude[at])),
-                _measured(float(vibration.frequency[at]), float(std.frequency[at])),
-                _measured(1e3 * float(vibration.period[at]), 1e3 * float(std.period[at])),
-                _measured(float(vibration.phase[at]) / math.pi, float(std.phase[at]) / math.pi),
-                _number(float(result.gain[at]), 2),
-            )
-    width = None if Console().is_terminal else 100
-    Console(highlight=False, width=width).print(table)
+            cells = []
+            for name, scale in (("amplitude", 1), ("frequency", 1), ("period", 1e3), ("phase", 1 / math.pi)):
+                value, deviation = (scale * getattr(values, name)[axis, tone] for values in (vibration, std))
+                cells.append(measured_text(value, deviation))
+            table.add_row(letter, *cells, f"{float(result.gain[axis, tone]):.2f}")
+    Console(highlight=False, width=None if Console().is_terminal else 100).print(table)
     for axis, name in enumerate("xy"):
-        motion = _measured(float(vibration.image_motion[axis]), float(std.image_motion[axis]))
-        line = f"{name}: residual {float(result.residual[axis]):.4f} px, image motion {motion} px/s; "
+        motion = measured_text(vibration.image_motion[axis], std.image_motion[axis])
         verdict = "reliable" if bool(result.reliable[axis]) else f"not reliable: {'; '.join(result.reasons[axis])}"
-        say(line + verdict)
+        print_line(f"{name}: residual {float(result.residual[axis]):.4f} px, image motion {motion} px/s; {verdict}")
+
+
+def print_restoration(result: RestoredFrames) -> None:
+    """Print which axes were not restored, and whether restoration helped."""
+    for note in result.left_alone:
+        print_line(note)
+    if not result.moves:
+        error_line("no vibration to remove: the frames are written unchanged", "warning")
+    elif result.verdict is None:
+        print_line("cannot determine whether restoration helps: no two frames show the same scene")
+    elif result.verdict.overall in ("partly", "worse"):
+        unchanged = "" if result.restored else "; the frames are written unchanged, --force writes the restored ones"
+        error_line(result.verdict.summary + unchanged, "warning")
+    else:
+        print_line(result.verdict.summary)

@@ -1,8 +1,9 @@
-"""Pictures of a detection and a restoration."""
+"""Figures of detections and restorations, and values with their standard deviations as text."""
 
 import math
 import os
 import textwrap
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,77 +17,98 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.detection import DetectionResult
+from rsvib_torch.evaluation import MtfCurve
+from rsvib_torch.imaging import row_psf
+from rsvib_torch.imaging.trajectory import exposure_nodes
 from rsvib_torch.io import whole_file
+from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import blind_frequencies
 
 __all__ = [
     "axis_offset_figure",
     "comparison_figure",
     "detailed_places",
+    "gain_figure",
     "measured_text",
+    "motion_blur",
+    "mtf_figure",
     "offset_figure",
     "plain_axes",
+    "psf_figure",
+    "rows_figure",
     "save_figure",
+    "tones_text",
 ]
 
-_INK, _FAINT, _LINE, _FAILED = "#222222", "#d9d9d9", "#c8102e", "#8a8a8a"
-_COLOURS = LinearSegmentedColormap.from_list("quality", ["#f0a030", "#9cc3e0", "#14487a"])  # poor ... good
+_INK, _GREY, _GRID = "#222222", "#8a8a8a", "#d9d9d9"
+_AXIS_COLOURS = {"x": "#14487a", "y": "#c8102e"}
+_FIT_COLOUR = _AXIS_COLOURS["y"]
+_QUALITY_COLOURS = LinearSegmentedColormap.from_list("quality", ["#f0a030", "#9cc3e0", "#14487a"])  # poor ... good
+
+
+def measured_text(value: Tensor | float, std: Tensor | float, digits: int = 2) -> str:
+    """Format ``value ± std`` with two significant digits of the standard deviation.
+
+    Args:
+        value: The value; an infinite one is written as ∞.
+        std: Its standard deviation.
+        digits: Decimals if the standard deviation is zero or unknown.
+
+    Example:
+        >>> measured_text(60.0, 0.012)
+        '60.000 ± 0.012'
+    """
+    value, std = float(value), float(std)
+    if math.isfinite(std) and std > 0:
+        digits = min(9, max(0, 1 - math.floor(math.log10(std))))
+    return " ± ".join(f"{number:.{digits}f}" if math.isfinite(number) else "∞" for number in (value, std))
+
+
+def tones_text(result: DetectionResult, axis: int) -> list[str]:
+    """Amplitude and frequency of every tone of an axis, one text each."""
+    vibration, std = result.vibration, result.std
+    return [
+        f"{measured_text(vibration.amplitude[axis, tone], std.amplitude[axis, tone])} px at "
+        f"{measured_text(vibration.frequency[axis, tone], std.frequency[axis, tone])} Hz"
+        for tone in range(vibration.amplitude.shape[-1])
+        if float(vibration.amplitude[axis, tone]) > 0
+    ]
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150) -> None:
-    """Write a figure as an image file; it appears whole or not at all."""
+    """Write a figure as an image file, atomically."""
     with whole_file(path) as part:
         FigureCanvasAgg(figure).print_figure(str(part), dpi=dpi, facecolor="white")
 
 
 def plain_axes(axes: Axes) -> None:
-    """Take away what an axes does not need."""
+    """Apply the style of the package: a light grid, no upper and right border."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(_INK)
     axes.tick_params(colors=_INK, labelsize=9)
-    axes.grid(color=_FAINT, linewidth=0.6)
+    axes.grid(color=_GRID, linewidth=0.6)
     axes.set_axisbelow(True)
 
 
-def measured_text(value: Tensor, std: Tensor, digits: int) -> str:
-    """A value with its standard deviation, to as many digits as the latter needs to show."""
-    deviation = float(std)
-    if math.isfinite(deviation) and deviation > 0:
-        digits = min(6, max(digits, -math.floor(math.log10(deviation))))
-    return f"{float(value):.{digits}f} ± {deviation:.{digits}f}"
-
-
-def _tone_text(result: DetectionResult, axis: int) -> str:
-    """The tones of an axis in words, or why there are none to trust."""
-    vibration, std = result.vibration, result.std
-    if not bool(result.reliable[axis]):
-        return "not reliable: " + "; ".join(str(reason) for reason in result.reasons[axis])
-    parts = [
-        f"{measured_text(vibration.amplitude[axis, k], std.amplitude[axis, k], 3)} px at "
-        f"{measured_text(vibration.frequency[axis, k], std.frequency[axis, k], 2)} Hz"
-        for k in range(vibration.amplitude.shape[-1])
-        if float(vibration.amplitude[axis, k]) > 0
-    ]
-    return ",  ".join(parts)
-
-
 def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) -> Any:
-    """Draw the offsets along an axis with their fit, and the residuals beneath; returns the coloured points."""
+    """Draw the offsets of an axis with their fit, and below the residuals; returns the coloured points."""
     curve = result.offsets
     times = curve.times.cpu().numpy() * 1e3
     offsets, fitted, quality = (t.detach().cpu().numpy() for t in (curve.offsets, result.fitted, curve.quality))
     measured, expected = offsets[..., axis], fitted[..., axis]
     good = np.isfinite(measured)
     residual = (measured - expected)[good]
-    style = {"c": quality[good], "cmap": _COLOURS, "vmin": 0.0, "vmax": 1.0, "linewidths": 0, "zorder": 2}
+    style = {"c": quality[good], "cmap": _QUALITY_COLOURS, "vmin": 0.0, "vmax": 1.0, "linewidths": 0, "zorder": 2}
     size = max(4.0, min(22.0, 4000.0 / max(1, measured.size)))
     points = upper.scatter(times[good], measured[good], s=size, **style)
     for pair in range(len(times)):
-        upper.plot(times[pair], expected[pair], color=_LINE, linewidth=1.3, zorder=3)
+        upper.plot(times[pair], expected[pair], color=_FIT_COLOUR, linewidth=1.3, zorder=3)
     failed = times[~good]
     edge = upper.get_xaxis_transform()
-    upper.scatter(failed, np.full_like(failed, 0.02), s=18, marker="x", color=_FAILED, transform=edge, zorder=4)
+    upper.scatter(failed, np.full_like(failed, 0.02), s=18, marker="x", color=_GREY, transform=edge, zorder=4)
     lower.scatter(times[good], residual, s=0.6 * size, **style)
-    lower.axhline(0.0, color=_LINE, linewidth=1.0, zorder=3)
+    lower.axhline(0.0, color=_FIT_COLOUR, linewidth=1.0, zorder=3)
     spread = 1.15 * float(np.quantile(np.abs(residual), 0.99)) if residual.size else 1.0
     lower.set_ylim(-max(spread, 1e-3), max(spread, 1e-3))
     lower.set_title(f"mean |residual| {float(result.residual[axis]):.4f} px", loc="left", fontsize=9.5, color=_INK)
@@ -98,24 +120,24 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
     return points
 
 
-def _finish_offsets(figure: Figure, panels: Any, points: Any, *, columns: int) -> None:
+def _finish_offsets(figure: Figure, panels: Any, points: Any) -> None:
     """Add the legend and the colour bar."""
-    keys = [
-        Line2D([], [], color=_COLOURS(1.0), marker="o", markersize=5, linewidth=0, label="measured band"),
-        Line2D([], [], color=_LINE, linewidth=1.3, label="detected vibration"),
-        Line2D([], [], color=_FAILED, marker="x", markersize=5, linewidth=0, label="band that failed"),
+    handles = [
+        Line2D([], [], color=_QUALITY_COLOURS(1.0), marker="o", markersize=5, linewidth=0, label="measured band"),
+        Line2D([], [], color=_FIT_COLOUR, linewidth=1.3, label="detected vibration"),
+        Line2D([], [], color=_GREY, marker="x", markersize=5, linewidth=0, label="failed band"),
     ]
-    figure.legend(handles=keys, loc="outside lower center", ncols=columns, fontsize=9.5, frameon=False)
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=9.5, frameon=False)
     bar = figure.colorbar(points, ax=panels, fraction=0.025, pad=0.01)
     bar.set_label("quality of the band (correlation)", color=_INK)
     bar.outline.set_visible(False)
 
 
 def offset_figure(result: DetectionResult) -> Figure:
-    """Draw the offset curve of each axis with its fit, and the residuals beneath (as Figure 6 of Liu et al. 2023).
+    """Draw the offset curve of each axis with its fit, and the residuals (as Figure 6 of Liu et al. 2023).
 
     Points are the measured bands, coloured by their quality; crosses on the lower edge are failed bands; the line is
-    the curve that the detected vibration gives.
+    the offset curve of the detected vibration.
 
     Args:
         result: A detection (not a batch).
@@ -127,15 +149,18 @@ def offset_figure(result: DetectionResult) -> Figure:
         upper, lower = panels[0, axis], panels[1, axis]
         points = _draw_offsets(upper, lower, result, axis)
         upper.set_title(f"Offset along {name}", loc="left", fontsize=12, fontweight="bold", color=_INK, pad=36)
-        words = "\n".join(textwrap.wrap(_tone_text(result, axis), 76, max_lines=2, placeholder=" …"))
-        note = upper.annotate(words, (0, 1), (0, 32), "axes fraction", "offset points", va="top", fontsize=9.5)
-        note.set_in_layout(False)  # a long text must not squeeze the panels
-    _finish_offsets(figure, panels, points, columns=3)
+        text = ",  ".join(tones_text(result, axis))
+        if not bool(result.reliable[axis]):
+            text = "not reliable: " + "; ".join(str(reason) for reason in result.reasons[axis])
+        text = "\n".join(textwrap.wrap(text, 76, max_lines=2, placeholder=" …"))
+        note = upper.annotate(text, (0, 1), (0, 32), "axes fraction", "offset points", va="top", fontsize=9.5)
+        note.set_in_layout(False)  # a long text would reduce the size of the panels
+    _finish_offsets(figure, panels, points)
     return figure
 
 
 def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
-    """Draw the offset curve of one axis, small enough for a narrow page.
+    """Draw the offset curve of one axis with its fit and residuals.
 
     Args:
         result: A detection (not a batch).
@@ -143,63 +168,206 @@ def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
     """
     figure = Figure(figsize=(5.6, 4.4), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    _finish_offsets(figure, panels, _draw_offsets(panels[0], panels[1], result, axis), columns=3)
+    _finish_offsets(figure, panels, _draw_offsets(panels[0], panels[1], result, axis))
     return figure
 
 
-def detailed_places(image: Tensor, size: int, count: int) -> list[tuple[int, int]]:
+def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
+    """Draw the gain of a pair of frames over frequency, and the detected tones with two standard deviations.
+
+    The gain is ``|2 sin(pi f m T_row) sinc(f T_e)|``, px of offset per px of displacement (Eqs. 2 and 7 of Liu et al.
+    2023). Blind frequencies are dashed lines.
+
+    Args:
+        result: A detection (not a batch).
+        timing: The sensor.
+    """
+    vibration, std = result.vibration, result.std
+    highest = max(1.35 * float((vibration.frequency * (vibration.amplitude > 0)).max()), 4.2 / timing.frame_period)
+    frequency = np.linspace(0.0, highest, 2000)
+    gain = np.abs(2 * np.sin(np.pi * frequency * timing.frame_period) * np.sinc(frequency * timing.exposure_time))
+    figure = Figure(figsize=(5.6, 4.6), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1))
+    upper.plot(frequency, gain, color="#555555", linewidth=1.2)
+    for panel in (upper, lower):
+        for blind in blind_frequencies(timing, highest).tolist():
+            panel.axvline(blind, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
+    labels: dict[str, Any] = {}
+    for axis, name in enumerate("xy"):
+        reliable = bool(result.reliable[axis])
+        style: dict[str, Any] = {"color": _AXIS_COLOURS[name], "marker": "o", "markersize": 6, "linestyle": "none"}
+        style |= {} if reliable else {"markerfacecolor": "white"}
+        for tone in range(vibration.amplitude.shape[-1]):
+            at, amplitude = float(vibration.frequency[axis, tone]), float(vibration.amplitude[axis, tone])
+            if amplitude <= 0:
+                continue
+            tone_gain = abs(float(result.gain[axis, tone])) * abs(float(np.sinc(at * timing.exposure_time)))
+            labels[name if reliable else f"{name} (not reliable)"] = upper.plot(at, tone_gain, **style)[0]
+            errors = [2 * float(values[axis, tone]) for values in (std.amplitude, std.frequency)]
+            bars = [error if math.isfinite(error) else 0.0 for error in errors]
+            lower.errorbar(at, amplitude, bars[0], bars[1], capsize=3, elinewidth=1.4, **style)
+    if labels:
+        upper.legend(list(labels.values()), list(labels), fontsize=9, frameon=False, loc="upper right", ncols=2)
+    upper.set_ylim(0, 2.4)
+    lower.set_ylim(0, 1.15 * lower.get_ylim()[1])
+    upper.set_xlim(0, highest)
+    upper.set_ylabel("gain (px per px)")
+    lower.set_ylabel("amplitude (px)")
+    lower.set_xlabel("frequency (Hz)")
+    plain_axes(upper)
+    plain_axes(lower)
+    return figure
+
+
+def motion_blur(vibration: Motion, starts: Tensor, timing: SensorTiming) -> Tensor:
+    """Range of the displacement during the exposure of each row, (..., 2) in px.
+
+    Args:
+        vibration: The motion.
+        starts: Exposure starts of the rows in seconds.
+        timing: The sensor.
+    """
+    nodes, _ = exposure_nodes(timing, "gauss", 16)
+    ends = torch.tensor([0.0, timing.exposure_time], dtype=torch.float64)
+    path = vibration.displacement(starts[..., None] + torch.cat([ends, nodes.cpu()]).to(starts.device))
+    return path.amax(-2) - path.amin(-2)
+
+
+def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure:
+    """Draw mean displacement and motion blur of every row of frame 0.
+
+    Args:
+        vibration: The motion.
+        timing: The sensor.
+        num_rows: Rows of a frame.
+    """
+    starts = timing.row_starts(1, num_rows)[0]
+    figure = Figure(figsize=(5.6, 4.6), layout="constrained")
+    panels = figure.subplots(2, 1, sharex=True)
+    curves = (vibration.mean_displacement(starts, timing.exposure_time), motion_blur(vibration, starts, timing))
+    for panel, values, label in zip(panels, curves, ("displacement (px)", "motion blur (px)"), strict=True):
+        for axis, name in enumerate("xy"):
+            panel.plot(np.arange(num_rows), values[:, axis].numpy(), color=_AXIS_COLOURS[name], lw=1.3, label=name)
+        panel.set_ylabel(label)
+        plain_axes(panel)
+    panels[0].legend(fontsize=9, frameon=False, ncols=2)
+    panels[1].set_ylim(bottom=0)
+    panels[1].set_xlabel("row (in readout order)")
+    return figure
+
+
+def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure:
+    """Draw point spread functions of 24 rows of frame 0 with the path of the image during their exposure.
+
+    Each kernel is centred on the mean displacement of its row, rounded to whole px; all have the same grey scale.
+
+    Args:
+        vibration: The motion.
+        timing: The sensor.
+        num_rows: Rows of a frame.
+    """
+    down, across = 3, 8
+    rows = torch.linspace(0, num_rows - 1, down * across).round()
+    starts = timing.row_starts(1, num_rows)[0][rows.long()]
+    psf = row_psf(vibration, starts, timing)
+    centre = psf.centroid().round()
+    nodes, _ = exposure_nodes(timing, "gauss", 32)
+    path = (vibration.displacement(starts[:, None] + nodes) - centre[:, None]).numpy()
+    first = psf.first_tap - centre
+    height, width = psf.weights.shape[-2:]
+    last = first + torch.tensor([width - 1, height - 1])
+    reach = max(2, int(torch.maximum(first.abs(), last.abs()).max()))  # px around the centre
+    cells = np.zeros((len(rows), 2 * reach + 1, 2 * reach + 1))
+    for index, (left, top) in enumerate((first.long() + reach).tolist()):
+        cells[index, top : top + height, left : left + width] = psf.weights[index].numpy()
+    figure = Figure(figsize=(11.4, 4.9), layout="constrained")
+    panels = figure.subplots(down, across).flatten()
+    extent = (-reach - 0.5, reach + 0.5, reach + 0.5, -reach - 0.5)
+    for index, panel in enumerate(panels):
+        panel.imshow(cells[index], cmap="Greys", vmin=0, vmax=cells.max(), interpolation="nearest", extent=extent)
+        panel.plot(path[index, :, 0], path[index, :, 1], color=_AXIS_COLOURS["y"], linewidth=1.6)
+        panel.set_title(f"row {int(rows[index])}", fontsize=9, loc="left", pad=3)
+        panel.set_xticks([])
+        panel.set_yticks([])
+        panel.spines[:].set_color(_GRID)
+    panels[-across].set_xlabel(f"{2 * reach + 1} px", fontsize=9)
+    return figure
+
+
+def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]]) -> Figure:
+    """Draw modulation transfer functions of slanted edges: thin lines for the edges, a bold line for their mean.
+
+    Args:
+        curves: Measured edges of the input and of the restored frame, by the name in the legend.
+    """
+    figure = Figure(figsize=(5.6, 3.9), layout="constrained")
+    panel = figure.subplots()
+    frequency = torch.linspace(0, 0.5, 51, dtype=torch.float64)
+    for colour, (name, edges) in zip((_GREY, _AXIS_COLOURS["x"]), curves.items(), strict=True):
+        values = [edge.at(frequency.to(edge.lsf.device)).cpu() for edge in edges]
+        for value in values:
+            panel.plot(frequency, value, color=colour, linewidth=0.7, alpha=0.5)
+        if values:
+            panel.plot(frequency, torch.stack(values).mean(0), color=colour, linewidth=2.0, label=name)
+    panel.axhline(0.5, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
+    panel.set_xlim(0, 0.5)
+    panel.set_ylim(0, max(1.05, panel.get_ylim()[1]))
+    panel.set_xlabel("spatial frequency (cycles/px)")
+    panel.set_ylabel("MTF")
+    panel.legend(fontsize=9, frameon=False)
+    plain_axes(panel)
+    return figure
+
+
+def detailed_places(image: Tensor, size: int, count: int, rim: int = 0) -> list[tuple[int, int]]:
     """Corners (row, column) of the square windows with the strongest detail that do not overlap.
 
     Args:
         image: (H, W), finite.
-        size: Side of the windows in px; at most the image's sides.
-        count: Windows wanted; there may be room for fewer.
+        size: Side of the windows in px; at most the sides of the image.
+        count: Largest number of windows.
+        rim: Width of the border in px that the windows avoid, where the image is large enough.
     """
+    rim = min(rim, (min(image.shape) - size) // 2)
+    image = image[rim : image.shape[0] - rim, rim : image.shape[1] - rim]
     down, right = (functional.pad(image.diff(dim=d), pad) for d, pad in ((0, (0, 0, 0, 1)), (1, (0, 1))))
-    # The root keeps a single hard edge from outweighing rich texture.
+    # The square root reduces the weight of a single hard edge relative to rich texture.
     sums = functional.pad((down.square() + right.square()).sqrt().double().cumsum(0).cumsum(1), (1, 0, 1, 0))
     detail = sums[size:, size:] - sums[:-size, size:] - sums[size:, :-size] + sums[:-size, :-size]
     places: list[tuple[int, int]] = []
     while len(places) < count:
-        best = int(detail.argmax())
-        row, column = divmod(best, detail.shape[-1])
+        row, column = divmod(int(detail.argmax()), detail.shape[-1])
         if not math.isfinite(float(detail[row, column])):
             break
-        places.append((row, column))
+        places.append((row + rim, column + rim))
         detail[max(0, row - size + 1) : row + size, max(0, column - size + 1) : column + size] = -math.inf
     return places
 
 
 def comparison_figure(
-    raw: Tensor, restored: Tensor, *, count: int = 3, size: int = 160, names: tuple[str, str] = ("as taken", "restored")
+    raw: Tensor, restored: Tensor, *, count: int = 3, size: int = 160, names: tuple[str, str] = ("input", "restored")
 ) -> Figure:
-    """Draw crops of a raw and a restored frame beneath each other, where detail is strongest.
+    """Draw crops of an input frame and a restored frame below each other, where detail is strongest.
 
     Args:
         raw: (H, W) or (C, H, W), full scale 1.
         restored: The same shape.
-        count: Crops.
+        count: Number of crops.
         size: Side of the crops in px.
-        names: What the two are called.
+        names: Titles of the two rows of panels.
     """
     raw, restored = (_picture(frame) for frame in (raw, restored))
     size = min(size, *raw.shape[:2])
-    margin = min(16, (min(raw.shape[:2]) - size) // 2)  # the rim of a restored frame is made up
-    grey = restored.mean(-1)
-    inner = grey[margin : grey.shape[0] - margin, margin : grey.shape[1] - margin]
-    places = [(row + margin, column + margin) for row, column in detailed_places(inner, size, count)]
+    places = detailed_places(restored.mean(-1), size, count, rim=16)  # boundary extension changes the border
     figure = Figure(figsize=(4.0 * len(places) + 0.4, 8.6), layout="constrained")
     panels = figure.subplots(2, len(places), squeeze=False)
     for index, (row, column) in enumerate(places):
         crops = [frame[row : row + size, column : column + size] for frame in (raw, restored)]
         low, high = (float(torch.stack(crops).quantile(q)) for q in (0.002, 0.998))
+        extent = (column - 0.5, column + size - 0.5, row + size - 0.5, row - 0.5)
         for crop, panel, name in zip(crops, panels[:, index], names, strict=True):
-            shown = ((crop - low) / max(high - low, 1e-6)).clamp(0, 1)
-            panel.imshow(
-                shown.expand(-1, -1, 3).numpy(),
-                interpolation="nearest",
-                extent=(column - 0.5, column + size - 0.5, row + size - 0.5, row - 0.5),
-            )
+            grey_levels = ((crop - low) / max(high - low, 1e-6)).clamp(0, 1).expand(-1, -1, 3).numpy()
+            panel.imshow(grey_levels, interpolation="nearest", extent=extent)
             panel.tick_params(colors=_INK, labelsize=8)
             panel.spines[:].set_visible(False)
             panel.locator_params(nbins=4)
@@ -211,7 +379,7 @@ def comparison_figure(
 
 
 def _picture(frame: Tensor) -> Tensor:
-    """Frame (H, W, 1) or (H, W, 3) on the CPU, for drawing."""
+    """Frame (H, W, 1) or (H, W, 3) on the CPU."""
     frame = frame.detach().float().cpu()
     frame = frame[None] if frame.ndim == 2 else frame
     frame = frame[:3] if frame.shape[0] >= 3 else frame.mean(0, keepdim=True)

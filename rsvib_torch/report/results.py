@@ -1,9 +1,9 @@
-"""What a run leaves on disk: ``vibration.json``, ``offsets.csv`` and ``restoration.json``."""
+"""Result files: ``vibration.json``, ``offsets.csv``, ``restoration.json`` and ``windows.csv``."""
 
 import csv
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,9 +14,9 @@ from rsvib_torch.detection import DetectionResult
 from rsvib_torch.io import whole_file
 from rsvib_torch.io.schema import DetectedVibration, DetectionRecord, TimingRecord, check_same_timing, to_json
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration import RestorationVerdict
+from rsvib_torch.stacks import RestoredFrames, StackManifest
 
-__all__ = ["VibrationFile", "read_vibration", "write_offsets", "write_restoration", "write_vibration"]
+__all__ = ["VibrationFile", "read_vibration", "write_offsets", "write_restoration", "write_vibration", "write_windows"]
 
 _UNITS = {
     "amplitude": "px",
@@ -91,7 +91,7 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming) -> Detect
 
 
 def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None:
-    """Write the measured and the fitted offset curve as CSV, one line a band; a failed band has empty offsets.
+    """Write the measured and the fitted offset curve as CSV, one line per band; a failed band has empty offsets.
 
     Args:
         path: The file to write.
@@ -114,44 +114,72 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
         "quality": curve.quality,
     }
     values = [to_json(column.flatten()) for column in columns.values()]
+    _write_csv(path, columns, zip(*values, strict=True))
+
+
+def _write_csv(path: str | os.PathLike[str], head: Iterable[str], lines: Iterable[Iterable[Any]]) -> None:
+    """Write a table; None becomes an empty cell."""
     with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(zip(*values, strict=True))  # None is written as an empty cell
+        writer.writerow(head)
+        writer.writerows(lines)
 
 
-def write_restoration(
-    path: str | os.PathLike[str],
-    verdict: RestorationVerdict | None,
-    *,
-    restored: bool,
-    options: dict[str, Any],
-    left_alone: Sequence[str],
-) -> None:
-    """Write what was restored, how, and whether it helped, as JSON.
+def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None:
+    """Write a table of the windows of a stack as CSV: the strongest tone of each axis, and the verdict.
 
     Args:
         path: The file to write.
-        verdict: What pairs of frames say; None where they could not be compared.
-        restored: Whether restored frames were written, or the raw ones as they are.
-        options: Options of ``restore``.
-        left_alone: A sentence for each axis whose vibration was not undone.
+        manifest: The manifest of the stack.
 
     Raises:
         OSError: If the file cannot be written.
     """
+    quantities = ("amplitude", "frequency", "phase")
+    head = ["window", "first_frame", "last_frame", "start_s"]
+    for letter in "xy":
+        head += [f"{name}_{letter}{end}" for name in quantities for end in ("", "_std")]
+        head += [f"image_motion_{letter}", f"reliable_{letter}"]
+    lines = []
+    for record in manifest.windows:
+        line: list[Any] = [record.window, record.first, record.last, record.start_time]
+        detection = record.detection
+        for axis in (0, 1):
+            if detection is None:
+                line += [None] * (2 * len(quantities) + 2)
+                continue
+            vibration, std = detection.vibration, detection.std
+            for name in quantities:
+                line += [getattr(vibration, name)[axis][0], getattr(std, name)[axis][0]]
+            line += [vibration.image_motion[axis], detection.reliable[axis]]
+        note = record.error or "; ".join(record.left_alone)
+        lines.append([*line, record.frames, record.outcome, len(record.bad_frames), note])
+    _write_csv(path, [*head, "frames", "outcome", "bad_frames", "note"], lines)
+
+
+def write_restoration(path: str | os.PathLike[str], result: RestoredFrames, options: dict[str, Any]) -> None:
+    """Write whether frames were restored, with which options, and whether that helped, as JSON.
+
+    Args:
+        path: The file to write.
+        result: Restored frames with their verdict.
+        options: Options of ``restore``.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    verdict = result.verdict
     content: dict[str, Any] = {
         "format": "rsvib restoration",
         "version": 1,
-        "frames": "restored" if restored else "as taken",
+        "frames": "restored" if result.restored else "as taken",
         "options": options,
-        "left_alone": list(left_alone),
+        "left_alone": list(result.left_alone),
         "outcome": None if verdict is None else verdict.overall,
         "summary": None if verdict is None else verdict.summary,
     }
     if verdict is not None:
-        content["pairs"] = {
-            name: to_json(value) for name, value in vars(verdict).items() if isinstance(value, Tensor)
-        } | {"outcome": list(verdict.outcome), "reasons": list(verdict.reasons)}
+        pairs = {name: to_json(value) for name, value in vars(verdict).items() if isinstance(value, Tensor)}
+        content["pairs"] = {**pairs, "outcome": list(verdict.outcome), "reasons": list(verdict.reasons)}
         content["units"] = {"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"}
     _write_json(path, content)

@@ -187,9 +187,9 @@ def test_a_wrong_vibration_leaves_the_frames_as_they_are_unless_forced(place, tm
     assert run(*arguments, "--report", tmp_path / "report.json") == 0
     shown = capsys.readouterr()
     assert shown.err.startswith("rsvib: warning: restored is no better than raw")
-    assert "--force restores them all the same" in shown.err
+    assert "--force writes the restored ones" in shown.err
     assert shown.err.count("\n") == 1
-    assert "2 frames as taken" in shown.out
+    assert "2 frames unchanged" in shown.out
     assert (tifffile.imread(tmp_path / "r.tif") == tifffile.imread(place / "frames.tif")).all()
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["frames"], report["outcome"], report["pairs"]["outcome"]) == ("as taken", "worse", ["worse"])
@@ -249,7 +249,7 @@ def test_frames_without_a_vibration_are_left_as_they_are(place, tmp_path, capsys
     write_stack(tmp_path / "still.tif", (still + noise).clamp(0, 1), dtype="uint16", full_scale=4095)
     assert run("run", tmp_path / "still.tif", tmp_path / "out", "--config", place / "camera.toml") == 0
     shown = capsys.readouterr()
-    assert "there is no vibration to undo: frames are left as they are" in shown.err
+    assert "no vibration to remove: the frames are written unchanged" in shown.err
     assert "x is left alone: its vibration is not reliable" in shown.out
     assert (tifffile.imread(tmp_path / "out" / "restored.tif") == tifffile.imread(tmp_path / "still.tif")).all()
     assert json.loads((tmp_path / "out" / "restoration.json").read_text())["frames"] == "as taken"
@@ -285,7 +285,10 @@ def test_full_scale_comes_from_option_file_or_config(place, tmp_path, capsys):
     other = tmp_path / "other.toml"
     other.write_text(CONFIG.replace("4095", "16383"))
     assert run("detect", place / "frames.tif", "--config", other, "--out", tmp_path / "out2") == 2
-    assert "states full_scale=4095, the config 16383; say which: --full-scale" in capsys.readouterr().err
+    assert (
+        "the full scale is 4095 in the file and 16383 in the configuration; choose one with --full-scale"
+        in capsys.readouterr().err
+    )
     assert run("detect", *arguments, "--full-scale", 100) == 2
     assert "beyond full_scale=100" in capsys.readouterr().err
     assert not (tmp_path / "out2").exists()
@@ -469,7 +472,7 @@ def test_scenes_that_cannot_be_simulated(place, tmp_path, capsys):
     large = tmp_path / "large.toml"
     large.write_text(CONFIG.replace("[448, 256]", "[480, 256]"))
     for scene, config, message in (
-        (place / "frames.tif", place / "camera.toml", "a scene is one image, this file has 2 frames"),
+        (place / "frames.tif", place / "camera.toml", "the scene must be one image, this file has 2 frames"),
         (place / "scene.png", silent, "silent.toml: simulation: missing key"),
         (place / "scene.png", large, "is too small"),
     ):
@@ -512,7 +515,7 @@ def test_usage_mistakes(capsys, tmp_path):
 def test_gpu_that_is_not_there(place, tmp_path, capsys):
     arguments = (place / "frames.tif", "--config", place / "camera.toml", "--out", tmp_path / "out")
     assert run("detect", *arguments, "--device", "cuda") == 2
-    assert capsys.readouterr().err == "rsvib: error: --device cuda: there is no CUDA device here; use auto or cpu\n"
+    assert capsys.readouterr().err == "rsvib: error: --device cuda: no CUDA device is available; use auto or cpu\n"
 
 
 def test_warnings_are_one_line(place, tmp_path, capsys, monkeypatch):

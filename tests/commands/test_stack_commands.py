@@ -53,7 +53,7 @@ def test_run_of_a_long_stack(place, tmp_path, capsys):
     assert run(*command(place, tmp_path / "out", "--output", "clear.zarr")) == 0
     shown = capsys.readouterr()
     assert shown.err == ""
-    assert "13 frames in 4 windows, 4 of them restored, " in shown.out
+    assert "13 frames in 4 windows, 4 windows restored, " in shown.out
     names = ["before_after.png", "clear.zarr", "manifest.json", "windows.csv"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
     assert read_stack_info(tmp_path / "out" / "clear.zarr").full_scale == 4095
@@ -78,7 +78,7 @@ def test_detect_in_windows_then_restore(place, tmp_path, capsys):
     other.write_text(CONFIG.replace("frame_rows = 104", "frame_rows = 105"))
     for config, more, message in (
         (other, (), "the vibration was detected with another timing: frame_rows=104.0 (here 105.0)"),
-        (place / "camera.toml", ("--report", tmp_path / "report.json"), "--report is for vibration.json"),
+        (place / "camera.toml", ("--report", tmp_path / "report.json"), "--report needs a vibration.json"),
     ):
         arguments = ("--config", config, "--vibration", manifest, *more)
         assert run("restore", place / "frames.tif", tmp_path / "o.tif", *arguments) == 2
@@ -103,7 +103,7 @@ def test_interrupted_run_says_how_to_go_on(place, tmp_path):
         process.send_signal(signal.SIGINT)
         error = process.communicate(timeout=60)[1]
     assert process.returncode == 130
-    assert error == "rsvib: error: stopped; what is done of a run is kept, --resume goes on with it\n"
+    assert error == "rsvib: error: stopped; the windows completed by rsvib run are kept, --resume continues\n"
     assert not (out / "restored.tif").exists()
     done = journal.read_bytes().count(b"\n")
     assert 2 <= done < 35
@@ -114,14 +114,14 @@ def test_broken_off_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypat
     with monkeypatch.context() as patch:
         patch.setattr("rsvib_torch.stacks.sink.Sink.finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         assert run(*command(place, out)) == 130
-    assert "--resume goes on with it" in capsys.readouterr().err
+    assert "--resume continues" in capsys.readouterr().err
     assert run(*command(place, out)) == 2
     assert "a run was broken off here after 4 windows; resume it (--resume)" in capsys.readouterr().err
     assert run(*command(place, out, "--resume", "--window", 5)) == 2
     assert "cannot resume: settings.window was 4, now it is 5" in capsys.readouterr().err
     for _ in range(2):  # the second finds it complete
         assert run(*command(place, out, "--resume")) == 0
-        assert "4 windows were there already" in capsys.readouterr().out
+        assert "4 windows were complete before this run" in capsys.readouterr().out
     assert (out / "restored.tif").read_bytes() == (place / "out" / "restored.tif").read_bytes()
     assert (out / "manifest.json").read_bytes() == (place / "out" / "manifest.json").read_bytes()
 
@@ -143,9 +143,9 @@ def test_bad_frames_are_told(place, tmp_path, capsys):
         (("--memory", "much"), "memory must be like '2GB' or '500MB', got 'much'"),
         (("--memory", "100MB"), "memory of 0.1 GB is too little: a window of 4 frames of 96 x 64 px takes about"),
         (("--window", 1), "window must be at least 2, got 1"),
-        (("--output", "../restored.tif"), "--output must be a name without a folder, got '../restored.tif'"),
+        (("--output", "../restored.tif"), "--output must be a file name without a folder, got '../restored.tif'"),
         (("--output", "restored.mp4"), "video files can only be read"),
-        (("--bad-frames", "drop"), "--bad-frames must be one of 'pass', 'skip'; got 'drop'"),
+        (("--bad-frames", "drop"), "Invalid value for '--bad-frames': 'drop' is not one of 'pass', 'skip'"),
         (("--compression", "jpeg"), "compression must be one of 'zlib', 'lzma'; got 'jpeg'"),
         (("--scheduler", "nonsense://x"), "no Dask scheduler answers at nonsense://x"),
     ],

@@ -1,4 +1,4 @@
-"""Pages: nothing from outside, nothing unescaped, pictures of the right places, and words that fit the verdict."""
+"""Report pages: self-contained, escaped, with the right images, and sentences that match the verdict."""
 
 import base64
 import math
@@ -21,9 +21,9 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.report.html import Report, before_after, write_page, write_report_page
-from rsvib_torch.report.html.figures import gain_figure, psf_film, rows_figure, smear
-from rsvib_torch.report.html.sharpness import measure_edges
-from rsvib_torch.report.html.words import mood_of, verdict_words
+from rsvib_torch.report.html.page import measure_edges
+from rsvib_torch.report.html.words import mark_of, verdict_sentences
+from rsvib_torch.report.plots import gain_figure, motion_blur, psf_figure, rows_figure
 from rsvib_torch.restoration import RestorationVerdict
 
 TIMING = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=512)
@@ -135,16 +135,16 @@ def test_what_users_write_is_escaped(page):
 
 def test_page_has_all_its_parts(page):
     text = "".join(page[2].text)
-    assert text.index("The camera shook") < text.index("Before and after")
+    assert text.index("restoration improves the frames") < text.index("Input and restored frame")
     for part in (
-        "Details, pixel by pixel",
+        "Details at full resolution",
         "Offsets along x",
         "Offsets along y",
-        "1.600 ± 0.001",
-        "What a pair of frames can see",
-        "Displacement and smear",
-        "Point spread functions down the frame",
-        "Sharpness across slanted edges",
+        "1.6000 ± 0.0010",
+        "Gain of a pair of frames",
+        "Displacement and motion blur",
+        "Point spread functions",
+        "Sharpness: MTF of slanted edges",
         "40 µs",
     ):
         assert part in text
@@ -185,14 +185,14 @@ def test_missing_pixels_are_drawn():
     assert decoded(before_after(frame, frame, names=("a", "b"), caption="", exact=True).after)[3].max() == 0
 
 
-def test_smear_is_the_largest_excursion():
+def test_motion_blur_is_the_range_of_the_displacement():
     starts = torch.arange(0, 0.05, 1e-5, dtype=torch.float64)
-    found = smear(SHAKE, starts, TIMING).amax(0)
+    found = motion_blur(SHAKE, starts, TIMING).amax(0)
     expected = 2 * SHAKE.amplitude[:, 0] * (math.pi * SHAKE.frequency[:, 0] * TIMING.exposure_time).sin()
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=0)
     moving = Vibration([0.0, 0.0], [0.0, 0.0], image_motion=[300.0, -200.0])
     expected = torch.tensor([300.0, 200.0]).double() * TIMING.exposure_time
-    torch.testing.assert_close(smear(moving, starts[:5], TIMING), expected.expand(5, 2))
+    torch.testing.assert_close(motion_blur(moving, starts[:5], TIMING), expected.expand(5, 2))
 
 
 def test_figures_show_what_is_there():
@@ -212,8 +212,8 @@ def test_figures_show_what_is_there():
 
 
 @pytest.mark.parametrize("motion", [SHAKE, Vibration([0.1, 0.2], [60.0, 90.0], 0.3, [3000.0, 0.0])])
-def test_film_centres_kernels_on_their_rows(motion):
-    for panel in psf_film(motion, TIMING, 300).axes:
+def test_kernels_are_centred_on_their_rows(motion):
+    for panel in psf_figure(motion, TIMING, 300).axes:
         kernel = panel.images[0].get_array()
         assert kernel.sum() == pytest.approx(1.0)
         reach = kernel.shape[0] // 2
@@ -229,51 +229,57 @@ def test_edges_are_measured_in_both():
     assert notes == []
     for curve, sigma in ((pair.before, 0.9), (pair.after, 0.6)):
         assert float(curve.mtf50) == pytest.approx(mtf50_of(through_pixels(gaussian(sigma), 5.0)), rel=1e-3)
-    assert pair.axis == "horizontal"
+    assert pair.direction == "horizontal"
     flat = torch.full((92, 72), 0.5)
     pairs, notes = measure_edges(flat, flat, [(0, 0, 40, 40)])
     assert pairs == []
-    assert notes[0].startswith("Edge 0,0,40,40 was not measured")
+    assert notes[0].startswith("The edge at rows 0 … 39, columns 0 … 39 was not measured")
     assert measure_edges(flat, flat) == ([], [])
-    with pytest.raises(ValueError, match=r"edge 60,0,40,40 .* does not lie in a frame of 92 x 72 px"):
+    with pytest.raises(ValueError, match=r"edge 60,0,40,40 .* must be inside the frame of 92 x 72 px"):
         measure_edges(flat, flat, [(60, 0, 40, 40)])
 
 
 @pytest.mark.parametrize(
     ("reliable", "verdict", "restored", "mood", "first"),
     [
-        ((True, True), verdict_of("helps"), True, "good", "undoing it helps"),
-        ((True, False), verdict_of("partly", "y: apart"), True, "doubt", "undone in part"),
-        ((True, True), verdict_of("unknown", "alike"), True, "doubt", "cannot be told"),
-        ((True, True), None, True, "doubt", "cannot be told"),
+        ((True, True), verdict_of("helps"), True, "good", "restoration improves the frames"),
+        ((True, False), verdict_of("partly", "y: apart"), True, "doubt", "removed in part"),
+        (
+            (True, True),
+            verdict_of("unknown", "alike"),
+            True,
+            "doubt",
+            "not sufficient to determine whether",
+        ),
+        ((True, True), None, True, "doubt", "not sufficient to determine whether"),
         (
             (True, True),
             verdict_of("worse", "x: apart"),
             False,
             "bad",
-            "does not help; the frames are left as they were",
+            "Restoration does not improve the frames; they are unchanged",
         ),
-        ((False, False), None, False, "doubt", "No vibration was found that could be undone"),
-        ((False, False), verdict_of("helps"), True, "bad", "cannot be relied on"),
+        ((False, False), None, False, "doubt", "No vibration was detected that can be removed"),
+        ((False, False), verdict_of("helps"), True, "bad", "not reliable"),
     ],
 )
-def test_words_fit_the_verdict(reliable, verdict, restored, mood, first):
+def test_sentences_match_the_verdict(reliable, verdict, restored, mood, first):
     reasons = tuple(() if good else ("only a third of a period is seen",) for good in reliable)
     result = result_of(reliable=reliable, reasons=reasons)
-    assert mood_of(result, verdict, restored) == mood
-    words = verdict_words(result, SHAKE, TIMING, 256, restored=restored, left_alone=(), verdict=verdict)
+    assert mark_of(result, verdict, restored) == mood
+    words = verdict_sentences(result, SHAKE, TIMING, 256, restored=restored, left_alone=(), verdict=verdict)
     assert first in words[0]
     for name, good in zip("xy", reliable, strict=True):
-        refused = f"Along {name} no vibration can be relied on: only a third of a period is seen."
+        refused = f"The vibration along {name} is not reliable: only a third of a period is seen."
         assert (refused in words) != good
-    assert any("smeared by up to" in line for line in words)
+    assert any("blurred by up to" in line for line in words)
 
 
-def test_words_name_a_blind_frequency():
+def test_sentences_name_a_blind_frequency():
     near = Vibration([1.0, 1.0], [1 / TIMING.frame_period + 1.5, 75.0])
-    words = verdict_words(result_of(near), near, TIMING, 256, restored=True, left_alone=(), verdict=None)
-    (line,) = [line for line in words if "cannot see" in line]
-    assert "along x is 1.5 Hz from 48.8 Hz" in line
+    words = verdict_sentences(result_of(near), near, TIMING, 256, restored=True, left_alone=(), verdict=None)
+    (line,) = [line for line in words if "blind frequency" in line]
+    assert "along x is 1.5 Hz from the blind frequency 48.8 Hz" in line
 
 
 def test_a_still_camera_gets_a_page_too(tmp_path):
@@ -282,11 +288,11 @@ def test_a_still_camera_gets_a_page_too(tmp_path):
     report = report_of(detection=result_of(still, (False, False), reasons), verdict=None, was_restored=False)
     files = write_report_page(tmp_path, replace(report, restored=report.frames), [(0, 0, 30, 30)])
     text = "".join(read(tmp_path / "report.html").text)
-    assert "No vibration was found that could be undone" in text
-    assert "No tone was found." in text
+    assert "No vibration was detected that can be removed" in text
+    assert "No vibration was detected." in text
     assert "No two frames" not in text
     assert "restored with" not in text
-    assert "psf_film.png" not in files
+    assert "psf.png" not in files
 
 
 @pytest.fixture(scope="module", name="place")
@@ -311,11 +317,11 @@ def test_command_writes_a_page(place, capsys):
     reader = read(place / "out" / "report.html")
     text = "".join(reader.text)
     assert "Vibration in chart & <co>.tif" in text
-    assert "The camera shook, the vibration was measured, and undoing it helps." in text
+    assert "The vibration of the camera was measured and removed; restoration improves the frames." in text
     found = re.search(r"Along x the image vibrates by ([\d.]+) ± [\d.]+ px at ([\d.]+)", text)
     assert float(found[1]) == pytest.approx(1.6, rel=0.01)
     assert float(found[2]) == pytest.approx(71.0, rel=0.002)
-    assert (place / "out" / "psf_film.png").exists()
+    assert (place / "out" / "psf.png").exists()
 
 
 @pytest.mark.parametrize("edge", ["1,2,3", "a,b,c,d", "-1,0,40,40", "0,0,4000,40"])

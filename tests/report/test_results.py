@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from rsvib_torch.commands.terminal import show_result
+from rsvib_torch.commands.terminal import print_detection
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
@@ -18,6 +18,7 @@ from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.report.plots import comparison_figure, detailed_places, offset_figure, save_figure
 from rsvib_torch.report.results import VibrationFile, read_vibration, write_offsets, write_restoration, write_vibration
 from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
+from rsvib_torch.stacks import RestoredFrames
 
 TIMING = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
 
@@ -158,7 +159,8 @@ def test_what_was_restored_is_plain_json(tmp_path):
     verdict = RestorationVerdict(one, one, pair, pair, pair, one, one, one, ("worse",), ("x: frames lie apart",))
     options = {"method": "exact", "joint": True}
     path = tmp_path / "restoration.json"
-    write_restoration(path, verdict, restored=False, options=options, left_alone=("y is left alone",))
+    frames = torch.rand(2, 8, 8)
+    write_restoration(path, RestoredFrames(frames, False, ("y is left alone",), verdict, True), options)
     data = json.loads(path.read_text())
     assert data["frames"] == "as taken"
     assert data["options"] == options
@@ -167,7 +169,7 @@ def test_what_was_restored_is_plain_json(tmp_path):
     assert data["summary"] == "restored is no better than raw: x: frames lie apart"
     assert data["pairs"]["misfit_before"] == [[0.1, None]]
     assert data["pairs"]["reasons"] == ["x: frames lie apart"]
-    write_restoration(path, None, restored=True, options={}, left_alone=())
+    write_restoration(path, RestoredFrames(frames, True, (), None, True), {})
     assert json.loads(path.read_text())["outcome"] is None
 
 
@@ -209,7 +211,7 @@ def test_offset_figure_shows_what_was_measured(tmp_path, result):
     )
     assert "(ms)" in below.get_xlabel()
     texts = " ".join(text.get_text() for axes in figure.axes for text in axes.texts)
-    assert "2.000 ± 0.010 px at 60.00 ± 0.01 Hz" in texts
+    assert "2.000 ± 0.010 px at 60.000 ± 0.010 Hz" in texts
     assert "not reliable: only one period is seen" in texts
     save_figure(figure, tmp_path / "offsets.png", dpi=50)
     assert cv2.imread(str(tmp_path / "offsets.png")).std() > 5
@@ -248,7 +250,7 @@ def test_comparison_shows_the_same_crop_of_both(tmp_path, shape):
 
 
 def test_result_in_words(capsys, result):
-    show_result(result)
+    print_detection(result)
     out = capsys.readouterr().out
     assert "2.000 ± 0.010" in out  # amplitude to the digits that its standard deviation leaves
     assert "60.000 ± 0.010" in out
