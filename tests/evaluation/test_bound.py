@@ -4,7 +4,7 @@ import torch
 from scipy.interpolate import BSpline
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import information
+from rsvib_torch.evaluation.bound import information
 from rsvib_torch.evaluation.bound.cramer_rao import _parameters, _sensitivity, cramer_rao_bound
 from rsvib_torch.evaluation.bound.information import Recording
 

@@ -7,8 +7,9 @@ from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.restoration import sampled_rows, strength
+from rsvib_torch.restoration.exact import strength
 from rsvib_torch.restoration.frame_motion import frame_motion
+from rsvib_torch.restoration.scene_model import sampled_rows
 from rsvib_torch.restoration.scene_model.row_prior import fit_prior
 from rsvib_torch.restoration.scene_model.row_system import row_kernels
 from rsvib_torch.restoration.scene_model.sampled_rows import Explained, sample_rows
