@@ -1,4 +1,4 @@
-"""Training data: still images as a vibrating rolling-shutter camera takes them."""
+"""Training data: still images as a vibrating rolling-shutter camera records them."""
 
 from rsvib_torch.augmentation.rolling_shutter import RollingShutterVibration
 

@@ -1,6 +1,7 @@
-"""The Kornia augmentation that takes still images with a vibrating rolling-shutter camera."""
+"""Kornia augmentation: still images as a vibrating rolling-shutter camera records them."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -9,34 +10,70 @@ from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 
-from rsvib_torch.augmentation.image_motion import ImageMotion
-from rsvib_torch.augmentation.moving import move_boxes, move_images, move_masks
-from rsvib_torch.augmentation.ranges import Range, axis_ranges, draw
+from rsvib_torch.augmentation.moving import ImageMotion, move_boxes, move_images, move_masks
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.psf import Interpolation
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["RollingShutterVibration"]
 
+Range = float | Sequence[float] | Sequence[Sequence[float]]
 Parameters = dict[str, Tensor]
 _DRAWN = ("amplitude", "frequency", "phase", "image_motion", "exposure_rows")
+_NO_INVERSE = "RollingShutterVibration has no inverse; restore(frames, timing, vibration) removes a known vibration"
+
+
+def _axis_ranges(
+    name: str, value: Range, *, at_least: float = -math.inf
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Lowest and highest value of the axes x and y, from a number or a range for both or for each.
+
+    Raises:
+        TypeError: If the value is none of these.
+        ValueError: If low exceeds high, or a value is less than ``at_least``.
+
+    Example:
+        >>> _axis_ranges("amplitude", (1.0, 2.0))
+        ((1.0, 2.0), (1.0, 2.0))
+    """
+    if not isinstance(value, Sequence):
+        number = check_number(name, value, at_least=at_least)
+        return (number, number), (number, number)
+    pairs = value if any(isinstance(part, Sequence) for part in value) else (value, value)
+    if len(pairs) != 2 or not all(isinstance(pair, Sequence) and len(pair) == 2 for pair in pairs):
+        raise TypeError(
+            f"{name} must be a number, (low, high) or ((low, high), (low, high)) for x and y, got {value!r}"
+        )
+    x, y = (tuple(check_number(name, number, at_least=at_least) for number in pair) for pair in pairs)  # type: ignore[union-attr]
+    for low, high in (x, y):
+        if low > high:
+            raise ValueError(f"{name} must not have low above high, got ({low:g}, {high:g})")
+    return (x[0], x[1]), (y[0], y[1])
+
+
+def _draw(
+    ranges: tuple[tuple[float, float], ...], shape: Sequence[int], device: torch.device, dtype: torch.dtype
+) -> Tensor:
+    """Uniformly distributed values between low and high, (*shape, number of ranges)."""
+    low, high = torch.tensor(ranges, device=device, dtype=dtype).unbind(-1)
+    return low + (high - low) * torch.rand(*shape, len(ranges), device=device, dtype=dtype)
 
 
 class RollingShutterVibration(GeometricAugmentationBase2D):
-    """Take images of a still scene with a vibrating rolling-shutter camera (Eq. 9 of Liu et al. 2023).
+    """Record images of a still scene with a vibrating rolling-shutter camera (Eq. 9 of Liu et al. 2023).
 
     ``g(x, y) = 1/T_e int f[x - X(t), y - Y(t)] dt`` for every row over its own exposure, with random vibration, image
-    motion and exposure. Images are bent and blurred; keypoints go where the mean displacement of the row that shows
-    them puts them, masks likewise to the nearest pixel, and boxes become the smallest straight ones around their bent
-    contents. Past its edges an image (and its mask) is mirrored.
+    motion and exposure. Images are distorted and blurred; keypoints move by the mean displacement of the row that shows
+    them, masks likewise to the nearest pixel, and boxes become the smallest upright boxes around their distorted
+    content. Images and masks are mirrored at their boundaries.
 
     An image is frame 0 of a recording. In ``VideoSequential`` the frames of a clip that share one draw
     (``same_on_frame=True``, Kornia's default) are consecutive frames of one recording, ``frame_rows`` apart.
 
-    A range is one number, ``(low, high)``, or ``((low, high), (low, high))`` for x and y; every axis draws its own
-    value, evenly.
+    A range is one number, ``(low, high)``, or ``((low, high), (low, high))`` for x and y; values are drawn uniformly
+    and independently for each axis.
 
     Args:
         timing: The sensor; its ``frame_rows`` must not be less than the rows of the images.
@@ -46,8 +83,8 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         image_motion: Range of v in px/s.
         exposure_rows: Exposure in row times, a number or ``(low, high)``; by default that of the sensor.
         tones: Number of tones of each axis.
-        interpolation: ``"cubic"``, or ``"linear"``, which blurs a little beyond the exposure.
-        p: Probability that an image is taken so.
+        interpolation: ``"cubic"``, or ``"linear"``, which adds a slight blur.
+        p: Probability that an image is augmented.
         same_on_batch: Whether all images share one draw.
         keepdim: Whether the output keeps the rank of the input.
 
@@ -79,48 +116,46 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         same_on_batch: bool = False,
         keepdim: bool = False,
     ) -> None:
-        if not isinstance(timing, SensorTiming):
-            raise TypeError(f"timing must be a SensorTiming, got {type(timing).__name__}")
+        check_timing(timing)
         check_choice("interpolation", interpolation, ("linear", "cubic"))
         check_number("p", p, at_least=0.0, at_most=1.0)
         super().__init__(p=p, p_batch=1.0, same_on_batch=same_on_batch, keepdim=keepdim)
         self.timing = timing
         self.tones = check_whole_number("tones", tones, at_least=1)
-        exposures = axis_ranges("exposure_rows", timing.exposure_rows if exposure_rows is None else exposure_rows)[0]
+        exposures = _axis_ranges("exposure_rows", timing.exposure_rows if exposure_rows is None else exposure_rows)[0]
         for value in exposures:
             check_number("exposure_rows", value, above=0.0, at_most=timing.frame_rows)
         self.flags = {
-            "amplitude": axis_ranges("amplitude", amplitude, at_least=0.0),
-            "frequency": axis_ranges("frequency", frequency, at_least=0.0),
-            "phase": axis_ranges("phase", phase),
-            "image_motion": axis_ranges("image_motion", image_motion),
+            "amplitude": _axis_ranges("amplitude", amplitude, at_least=0.0),
+            "frequency": _axis_ranges("frequency", frequency, at_least=0.0),
+            "phase": _axis_ranges("phase", phase),
+            "image_motion": _axis_ranges("image_motion", image_motion),
             "exposure_rows": exposures,
             "interpolation": interpolation,
         }
 
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> Parameters:
-        """Draw one motion an image: amplitude, frequency, phase (B, 2, K), image_motion (B, 2), exposure_rows (B,)."""
+        """Draw one motion per image: amplitude, frequency, phase (B, 2, K), image_motion (B, 2), exposure_rows (B,)."""
         draws = 1 if self.same_on_batch else batch_shape[0]
         drawn = {
-            name: draw(self.flags[name], (draws, self.tones), self.device, self.dtype).mT
+            name: _draw(self.flags[name], (draws, self.tones), self.device, self.dtype).mT
             for name in ("amplitude", "frequency", "phase")
         }
-        drawn["image_motion"] = draw(self.flags["image_motion"], (draws,), self.device, self.dtype)
-        drawn["exposure_rows"] = draw((self.flags["exposure_rows"],), (draws,), self.device, self.dtype)[:, 0]
+        drawn["image_motion"] = _draw(self.flags["image_motion"], (draws,), self.device, self.dtype)
+        drawn["exposure_rows"] = _draw((self.flags["exposure_rows"],), (draws,), self.device, self.dtype)[:, 0]
         return {
             name: value.repeat(batch_shape[0] // max(draws, 1), *[1] * (value.ndim - 1))
             for name, value in drawn.items()
         }
 
     def drawn_vibration(self, params: Parameters | None = None) -> Vibration:
-        """The vibration of every image of the last call, in image axes: the truth that a network may learn.
+        """The vibration of every image of the last call, in image axes: the ground truth for training.
 
-        Clips whose frames share one draw have one vibration each, as a stack has for ``restore``.
-
-        Images that were left alone (``p`` below 1) have amplitude and image motion 0.
+        Clips whose frames share one draw have one vibration each, as a stack in ``restore``. Images that were not
+        augmented (``p`` below 1) have amplitude and image motion 0.
 
         Args:
-            params: Parameters of another call (``augmentation._params`` of that time).
+            params: Parameters of another call (``augmentation._params`` after that call).
 
         Raises:
             ValueError: If nothing was drawn yet.
@@ -139,13 +174,13 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         return Vibration(*(value[::step] for value in drawn))
 
     def compute_transformation(self, input: Tensor, params: Parameters, flags: dict[str, Any]) -> Tensor:
-        """Return identities (B, 3, 3): no matrix describes rows that move apart."""
+        """Return identities (B, 3, 3): no matrix describes rows that move by different amounts."""
         return self.identity_matrix(input)
 
     def apply_transform(
         self, input: Tensor, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
-        """Bend and blur images (B, C, H, W)."""
+        """Distort and blur images (B, C, H, W)."""
         if input.numel() == 0:
             return input
         images = frames_to_row_order(input, self.timing)
@@ -164,7 +199,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
     def apply_transform_keypoint(
         self, input: Keypoints, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
     ) -> Keypoints:
-        """Move keypoints to where the frame shows them."""
+        """Move keypoints to their positions in the frame."""
         output = input.clone()
         points = input.data.to(torch.float64)
         if points.numel():
@@ -177,7 +212,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
     def apply_transform_box(
         self, input: Boxes, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
     ) -> Boxes:
-        """Put the smallest straight boxes around what the boxes held."""
+        """Return the smallest upright boxes around the moved content of the boxes."""
         output = input.clone()
         corners = input.data.to(torch.float64)
         if corners.numel():
@@ -202,14 +237,14 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         )
 
     def _frame_starts(self, params: Parameters, count: int) -> Tensor:
-        """When each image begins: at 0, or in its turn within a recording."""
+        """Exposure start of each image: 0, or that of the frame in its recording."""
         length = self._recording_length(params)
         if length == 1:
             return torch.zeros(count, dtype=torch.float64)
         return self.timing.frame_starts(length).repeat(count // length)
 
     def _recording_length(self, params: Parameters) -> int:
-        """Frames of the clips of a video that share one draw; 1 for images, and frames that were drawn each."""
+        """Number of frames of video clips that share one draw; 1 for images and for frames with individual draws."""
         clips = params.get("video_batch_size")
         count = len(params["exposure_rows"])
         if clips is None or count == 0:
@@ -238,16 +273,13 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
     def inverse_transform(
         self, input: Tensor, flags: dict[str, Any], transform: Tensor | None = None, size: tuple[int, int] | None = None
     ) -> Tensor:
-        """Refuse: blur takes a restoration to undo."""
+        """Raise an error: the blur is inverted by restoration only."""
         raise NotImplementedError(_NO_INVERSE)
 
     def inverse_boxes(self, input: Boxes, *args: Any, **kwargs: Any) -> Boxes:
-        """Refuse, as ``inverse_transform`` does."""
+        """Raise an error, as ``inverse_transform`` does."""
         raise NotImplementedError(_NO_INVERSE)
 
     def inverse_keypoints(self, input: Keypoints, *args: Any, **kwargs: Any) -> Keypoints:
-        """Refuse, as ``inverse_transform`` does."""
+        """Raise an error, as ``inverse_transform`` does."""
         raise NotImplementedError(_NO_INVERSE)
-
-
-_NO_INVERSE = "RollingShutterVibration has no inverse; restore(frames, timing, vibration) undoes a known vibration"

@@ -119,7 +119,9 @@ def rows_showing(
             iteration == 2
         )  # three steps are enough for most motions; the third keeps the slope of the second
         if not last_of_three:
-            slope = vibration.velocity(starts + 0.5 * exposure_time)[..., 1].detach() * timing.row_time
+            # derivative of the mean displacement, which differs from the velocity for periods as short as exposures
+            ends = vibration.displacement(starts + exposure_time) - vibration.displacement(starts)
+            slope = ends[..., 1].detach() * (timing.row_time / exposure_time)
         step = residual / (1.0 - slope).clamp(min=0.1)  # the limit keeps steps finite near slope 1
         rows = rows + step
         if last_of_three and bool((step.abs() < 1e-9).all()):  # px, far below any measurement

@@ -373,7 +373,7 @@ def test_in_a_chain_with_other_augmentations():
 @pytest.mark.parametrize(
     ("options", "error", "match"),
     [
-        ({"amplitude": (2.0, 1.0)}, ValueError, "amplitude must have low before high"),
+        ({"amplitude": (2.0, 1.0)}, ValueError, "amplitude must not have low above high"),
         ({"amplitude": -1.0}, ValueError, "amplitude must be at least 0"),
         ({"frequency": "fast"}, TypeError, "frequency must be a number, \\(low, high\\)"),
         ({"frequency": (1.0, 2.0, 3.0)}, TypeError, "frequency must be a number, \\(low, high\\)"),
