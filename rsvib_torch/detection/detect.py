@@ -14,7 +14,7 @@ from rsvib_torch.detection.grey_frames import grey_frames
 from rsvib_torch.detection.reliability import judge
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, stacked
 from rsvib_torch.detection.rows.direct import refine_directly
-from rsvib_torch.detection.rows.row_groups import LARGEST_GROUP, intervals_compared, stack_spectra
+from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals, stack_spectra
 from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, model_displacements, vibration_of_fit
@@ -274,8 +274,8 @@ def _detect(frames: Tensor, valid: Tensor | None, timing: SensorTiming, options:
     later = curve.rows + fitted[..., 1]
     shown = (later >= 0.5 * options.bands.band_rows) & (later <= frames.shape[-2] - 1 - 0.5 * options.bands.band_rows)
     duration = float(curve.later_times.max() - curve.times.min()) + options.bands.band_rows * timing.row_time
-    largest = 2 if options.method == "bands" else LARGEST_GROUP
-    intervals = intervals_compared(in_rows, frames.shape[1], largest, frames.device)
+    largest = 2 if options.method == "bands" else MAX_GROUP_FRAMES
+    intervals = compared_intervals(in_rows, frames.shape[1], largest, frames.device)
     verdicts = [
         judge(
             vibration[index],

@@ -1,5 +1,6 @@
-"""What registration tells the fit: displacements of scene rows between frames, with no image left."""
+"""Displacements of scene rows between frames: the input of all fits, independent of images."""
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -7,27 +8,24 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-__all__ = ["Measurements"]
-
-_SMALL = 0.1  # of the median residual: below it, sizes count as equal
-_TUNING = 6.0  # of Tukey's biweight: 98 % efficient for Gaussian errors
+__all__ = ["Measurements", "trimmed_mean"]
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
     """Displacements of scene rows in the frames of a batch of stacks, in row order.
 
-    Every scene row n is seen in a group of G frames (two of them make an offset). Where the scene itself lies is
-    unknown, so only differences within a group count: displacements have their mean over the group taken out, and so
-    has every model that is held against them.
+    Every scene row n is measured in a group of G frames (two of them give an offset). The position of the scene itself
+    is unknown, so only differences within a group are measured: the mean over the group is subtracted from the
+    displacements, and from every model that is compared with them.
 
     Attributes:
-        moments: (B, N, G) float64 s, exposure start of the row of each frame that shows scene row n.
-        displacements: (B, N, G, 2) float64 px, axes (x, y), with zero mean over the frames that see the row; 0 in the
-            others.
-        seen: (B, N, G) float64, 1 where a frame sees the row, else 0.
+        moments: (B, N, G) float64 s, exposure start of the row of each frame that contains scene row n.
+        displacements: (B, N, G, 2) float64 px, axes (x, y), with zero mean over the frames that contain the row; 0 in
+            the others.
+        seen: (B, N, G) float64, 1 where a frame contains the row, else 0.
         information: (B, N, 2, 2) float64 px^-2, inverse covariance of the displacement in one frame up to a common
-            factor; 0 where unknown.
+            factor; 0 where nothing was measured.
         exposure_time: T_e in seconds.
         average_times: Duration over which each displacement (x, y) is an average: rows of a band times the row time.
         independent: Fraction of the measurements that are independent (bands may overlap).
@@ -52,20 +50,20 @@ class Measurements:
         average_times: tuple[float, float] = (0.0, 0.0),
         independent: float = 1.0,
     ) -> "Measurements":
-        """Measurements of offsets (B, N, 2) between rows exposed from ``starts`` and ``later_starts`` (B, N) on."""
+        """Measurements of offsets (B, N, 2) between rows whose exposures start at the two given times (B, N)."""
         return cls(
             torch.stack([starts, later_starts], dim=-1),
             torch.stack([-0.5 * offsets, 0.5 * offsets], dim=-2),
             torch.ones(*starts.shape, 2, dtype=torch.float64, device=starts.device),
-            2.0 * information,  # an offset tells of two displacements that are equal and opposite
+            2.0 * information,  # of each of the two displacements, which are equal and opposite
             exposure_time,
             average_times,
             independent,
         )
 
     @cached_property
-    def _share(self) -> Tensor:
-        """(B, N, G) weights of the mean over the frames that see a row."""
+    def _mean_weights(self) -> Tensor:
+        """(B, N, G) weights of the mean over the frames that contain a row."""
         return self.seen / self.seen.sum(2, keepdim=True).clamp(min=1.0)
 
     @cached_property
@@ -97,7 +95,7 @@ class Measurements:
 
     @property
     def differences(self) -> Tensor:
-        """(B, N) independent differences within each group: one less than the frames that see the row."""
+        """(B, N) independent differences within each group: one less than the frames that contain the row."""
         return (self.seen.sum(-1) - 1).clamp(min=0.0)
 
     @property
@@ -107,78 +105,116 @@ class Measurements:
 
     def repeated(self, count: int) -> "Measurements":
         """Every stack ``count`` times in a row."""
-        tensors = (self.moments, self.displacements, self.seen, self.information)
-        moments, displacements, seen, information = (t.repeat_interleave(count, dim=0) for t in tensors)
-        return replace(self, moments=moments, displacements=displacements, seen=seen, information=information)
+        return self._mapped(lambda values: values.repeat_interleave(count, dim=0))
 
     def in_segments(self, count: int) -> "Measurements":
         """The record cut into ``count`` pieces of equal length, as a batch (B count, N / count, ...)."""
         rows = self.moments.shape[1] // count * count
-        tensors = (self.moments, self.displacements, self.seen, self.information)
-        cut = (t[:, :rows].unflatten(1, (count, -1)).flatten(0, 1) for t in tensors)
-        return replace(self, **dict(zip(("moments", "displacements", "seen", "information"), cut, strict=True)))
+        return self._mapped(lambda values: values[:, :rows].unflatten(1, (count, -1)).flatten(0, 1))
+
+    def _mapped(self, function: Callable[[Tensor], Tensor]) -> "Measurements":
+        """The measurements with a function applied to all tensors."""
+        return replace(
+            self,
+            moments=function(self.moments),
+            displacements=function(self.displacements),
+            seen=function(self.seen),
+            information=function(self.information),
+        )
 
     def only(self, counts: Tensor) -> "Measurements":
-        """The rows that count (B, N), the others known no more."""
-        return self._known_by(self.information * counts[..., None, None])
+        """The measurements with information 0 in the rows where ``counts`` (B, N) is False."""
+        return self._with_information(self.information * counts[..., None, None])
 
-    def _known_by(self, information: Tensor) -> "Measurements":
-        """The same displacements with another information; what follows from their times is not worked out again."""
+    def scaled(self, factor: Tensor) -> "Measurements":
+        """The measurements with their information multiplied by factors (B, N, 2) of each axis."""
+        root = factor.sqrt()
+        return self._with_information(self.information * root[..., :, None] * root[..., None, :])
+
+    def _with_information(self, information: Tensor) -> "Measurements":
+        """The same displacements with other information; cached values are kept, because they depend on times only."""
         result = copy(self)
         object.__setattr__(result, "information", information)
         return result
 
     def relative(self, values: Tensor) -> Tensor:
-        """Values (B, N, G, ...) of every frame less their mean over the frames that see the row, 0 where unseen."""
+        """Values (B, N, G, ...) less their mean over the frames that contain the row; 0 in the other frames."""
         ones = (1,) * (values.ndim - 3)
-        mean = (self._share.reshape(*self.seen.shape, *ones) * values).sum(2, keepdim=True)
+        mean = (self._mean_weights.reshape(*self.seen.shape, *ones) * values).sum(2, keepdim=True)
         return self.seen.reshape(*self.seen.shape, *ones) * (values - mean)
 
+    # Residuals of a fit, (B, N, G, 2) px
+
     def square(self, residual: Tensor) -> Tensor:
-        """(B, 2) weighted sum of squares of residuals (B, N, G, 2), each axis with its share of the cross terms."""
+        """(B, 2) weighted sum of squares of residuals, each axis with its share of the cross terms."""
         return torch.einsum("bnga,bnac,bngc->ba", residual, self.information, residual)
 
     def sizes(self, residual: Tensor) -> Tensor:
-        """(B, N, 2) size of residuals (B, N, G, 2) in units of their information; NaN where unknown."""
+        """(B, N, 2) rms residual of each row in standard deviations; NaN where nothing was measured."""
         return self.distances(residual) * self.weights.sqrt()
 
     def distances(self, residual: Tensor) -> Tensor:
-        """(B, N, 2) size of residuals (B, N, G, 2) in px; NaN where unknown."""
-        known = (self.weights > 0) & (self.differences[..., None] > 0)
+        """(B, N, 2) rms residual of each row in px; NaN where nothing was measured."""
+        measured = (self.weights > 0) & (self.differences[..., None] > 0)
         square = residual.square().sum(2) / self.differences[..., None].clamp(min=1.0)
-        return torch.where(known, square.sqrt(), torch.nan)
+        return torch.where(measured, square.sqrt(), torch.nan)
 
-    def scaled(self, factor: Tensor) -> "Measurements":
-        """The measurements with their information multiplied by factors (B, N, 2) of each axis."""
-        root = factor.sqrt()
-        return self._known_by(self.information * root[..., :, None] * root[..., None, :])
+    def unexplained(self, residual: Tensor) -> Tensor:
+        """(B, 2) px, rms residual without the part that is explained by noise."""
+        measured = (self.weights > 0) & (self.differences[..., None] > 0)
+        square = residual.square().sum(2) / self.differences[..., None].clamp(min=1.0)
+        excess = square - 1 / self.weights.clamp(min=1e-300)
+        return trimmed_mean(torch.where(measured, excess, torch.nan)).clamp(min=0.0).sqrt()
+
+    def independent_fraction(self, residual: Tensor, *, lags: int = 4) -> float:
+        """Fraction of the rows that are independent, from the correlation rho(k) of residuals k rows apart.
+
+        Errors of the model correlate the residuals of neighbouring rows, and the variance of a mean is larger by
+        ``1 + 2 sum rho(k)``, k = 1 ... ``lags``.
+        """
+        scaled = residual * self.weights.sqrt()[:, :, None]
+        energy = scaled.square().sum()
+        total = sum((scaled[:, lag:] * scaled[:, :-lag]).sum() / energy for lag in range(1, lags + 1))
+        return 1.0 / max(1.0, 1.0 + 2.0 * float(total))
+
+    # Robust weights
 
     def for_least_absolute(self, residual: Tensor) -> "Measurements":
-        """Weights that turn a sum of squares into a sum of sizes of the residual: outliers have little pull."""
+        """Weights that make a least-squares fit minimise the sum of absolute residuals, which limits outliers."""
         size = self.sizes(residual)
-        floor = _SMALL * size.nanmedian(dim=1, keepdim=True).values.nan_to_num(1.0) + 1e-12
+        floor = 0.1 * size.nanmedian(dim=1, keepdim=True).values.nan_to_num(1.0) + 1e-12  # no weight is unbounded
         return self.scaled(1 / torch.maximum(size.nan_to_num(0.0), floor))
 
     def reweighted(self, residual: Tensor) -> "Measurements":
-        """The measurements with outliers weighed down by Tukey's biweight of their residual, axis by axis."""
-        return self.scaled((1 - self._reach(residual).square()).square())
+        """The measurements with Tukey's biweight of their residual on each axis: outliers have weight 0."""
+        return self.scaled((1 - self._biweight_argument(residual).square()).square())
 
     def share_counted(self, residual: Tensor) -> float:
-        """What the rows of ``reweighted`` count for in the variance of a fit, against rows of fixed weight.
+        """Correction (0 to 1) of the number of measurements after ``reweighted``, for the covariance of the fit.
 
-        A row that is weighed by its own residual makes the residual look smaller than the error is: the variance of
-        an M-estimator is ``E psi^2 / (E psi')^2`` with ``psi = w z``, not ``E w z^2 / E w`` (Huber 1981, ch. 6).
+        Weights that depend on the residuals make these look smaller than the errors are: the variance of an M-estimator
+        is ``E psi^2 / (E psi')^2`` with ``psi = w z``, not ``E w z^2 / E w`` (Huber 1981, ch. 6).
         """
-        reach = self._reach(residual)
-        weight = (1 - reach.square()).square()
-        slope = (1 - reach.square()) * (1 - 5 * reach.square())
-        counted, weights, slopes = (reach < 1).sum(), weight.sum(), slope.sum()
-        apparent = (weight * reach.square()).sum() / (weights * counted).clamp(min=1e-300)
-        actual = (weight * reach).square().sum() / slopes.square().clamp(min=1e-300)
+        z = self._biweight_argument(residual)
+        weight = (1 - z.square()).square()
+        slope = (1 - z.square()) * (1 - 5 * z.square())
+        apparent = (weight * z.square()).sum() / (weight.sum() * (z < 1).sum()).clamp(min=1e-300)
+        actual = (weight * z).square().sum() / slope.sum().square().clamp(min=1e-300)
         return min(1.0, float(apparent / actual.clamp(min=1e-300)))
 
-    def _reach(self, residual: Tensor) -> Tensor:
-        """(B, N, 2) size of residuals over the largest that counts, 1 from there on and where nothing is known."""
+    def _biweight_argument(self, residual: Tensor) -> Tensor:
+        """(B, N, 2) rms residual over 6 robust standard deviations, at most 1; 1 where nothing was measured.
+
+        With this limit the biweight is 98 % efficient for Gaussian errors.
+        """
         size = self.sizes(residual)
         spread = 1.4826 * size.nanmedian(dim=1, keepdim=True).values
-        return (size / (_TUNING * spread.nan_to_num(1.0).clamp(min=1e-9))).nan_to_num(1.0).clamp(max=1.0)
+        return (size / (6.0 * spread.nan_to_num(1.0).clamp(min=1e-9))).nan_to_num(1.0).clamp(max=1.0)
+
+
+def trimmed_mean(values: Tensor, *, fraction: float = 0.7) -> Tensor:
+    """Mean (B, A) of the smallest ``fraction`` of values (B, N, A) without NaN; clouds may cover the other rows."""
+    ordered = values.sort(dim=1).values  # NaN come last
+    count = ((~torch.isnan(values)).sum(1, keepdim=True) * fraction).ceil()
+    counted = torch.arange(values.shape[1], device=values.device)[None, :, None] < count
+    return torch.where(counted, ordered, 0.0).sum(1) / count[:, 0].clamp(min=1)

@@ -242,15 +242,15 @@ def test_differences_from_the_mean_of_the_frames_that_see_a_row(num_frames):
         np.testing.assert_allclose(-found[:, 0], expected[:, 1], atol=1e-12)
 
 
-def test_a_further_round_would_change_next_to_nothing(paper_camera, monkeypatch):
-    """Detection ends when rounds tell that the next one is not worth it: held against one that goes on to the end."""
+def test_further_rounds_change_the_result_by_less_than_its_std(paper_camera, monkeypatch):
+    """Compared with a detection that uses all rounds."""
     frames = pair_of(paper_camera, Motion((3.1, 5.2), (50.0, 30.0), (0.4, -1.1)), 91, 0.005)
     rounds = []
-    measure = direct.measure_group
-    monkeypatch.setattr(direct, "measure_group", lambda *given: (rounds.append(1), measure(*given))[1])
+    measure = direct.measure_groups
+    monkeypatch.setattr(direct, "measure_groups", lambda *given: (rounds.append(1), measure(*given))[1])
     found = detect_vibration(frames, paper_camera)
     few = len(rounds)
-    monkeypatch.setattr(direct, "_settled", lambda *given: False)
+    monkeypatch.setattr(direct, "_converged", lambda *given: False)
     whole = detect_vibration(frames, paper_camera)
     assert few <= 3 < len(rounds) - few
     for name in ("amplitude", "frequency", "phase"):
@@ -273,26 +273,26 @@ def fit_of(coefficients, frequencies):
 
 
 @pytest.mark.parametrize(
-    ("change", "share", "settled"),
+    ("change", "ratio", "converged"),
     [
-        (0.4, None, True),  # of a standard deviation
+        (0.4, None, True),  # change in standard deviations
         (0.6, None, False),
-        (0.6, 0.5, False),  # slow: as if nothing were known
+        (0.6, 0.5, False),  # slow convergence: as without a ratio
         (0.4, 0.9, True),
-        (0.6, 0.05, True),  # fast: the next change is a twentieth of this one
+        (0.6, 0.05, True),  # fast convergence: the next change is a twentieth of this one
         (1.4, 0.05, False),
         (1.4, 0.02, True),
         (1.6, 0.001, False),
     ],
 )
-def test_rounds_end_where_the_next_one_would_change_little(change, share, settled):
+def test_convergence_follows_from_the_change_and_the_ratio_of_steps(change, ratio, converged):
     before = fit_of([1.0, 2.0], [50.0, 30.0])
-    share = None if share is None else torch.tensor([share], dtype=torch.float64)
+    ratio = None if ratio is None else torch.tensor([ratio], dtype=torch.float64)
     for after in (
         fit_of([1.0 + 0.01 * change, 2.0], [50.0, 30.0]),
         fit_of([1.0, 2.0], [50.0, 30.0 - 0.02 * change]),
     ):
-        assert direct._settled(before, after, share) is settled
+        assert direct._converged(before, after, ratio) is converged
 
 
 @pytest.mark.parametrize("remaining", [0.0, 0.05, -0.3])

@@ -5,8 +5,8 @@ import torch
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import Vibration
-from rsvib_torch.detection.rows.equal_blur import Shown, warp_to_same_blur
-from rsvib_torch.detection.rows.row_groups import frame_groups, measure_group, stack_spectra
+from rsvib_torch.detection.rows import displacements
+from rsvib_torch.detection.rows.displacements import FrameGroup, frame_groups, measure_groups, stack_spectra
 from rsvib_torch.registration.row_spectra import RowSpectra
 
 MOTION = Motion((3.1, 5.2), (50.0, 30.0), (-1.39, -1.42))
@@ -27,40 +27,39 @@ def of_each_stack(motion: Motion) -> Vibration:
 
 
 def prepared(frames, camera):
-    """Spectra of the frames, where they show the scene by the true motion, and what warps them to it."""
+    """Spectra of the frames, the positions of the scene rows by the true motion, and the function that warps them."""
     spectra, truth = RowSpectra(frames), of_each_stack(MOTION)
-    place = torch.arange(frames.shape[-2], dtype=torch.float64).expand(2, 1, -1)
-    left, starts = torch.zeros(2, 1, 1, dtype=torch.float64), camera.frame_starts(2).expand(2, -1)[..., None]
-    shown = Shown.of(place, left, starts, camera, truth)
-    return spectra, shown, warp_to_same_blur(spectra, shown, place, left, camera, truth)
+    group = FrameGroup(spectra, camera.frame_starts(2).expand(2, -1))
+    positions = displacements._Positions.of(group, camera, truth)
+    return spectra, positions, displacements._warp_to_scene(spectra, positions, camera, truth)
 
 
-def test_rows_are_where_the_motion_says(pairs):
-    """Measured around the true motion rows miss nothing; kernels that change from row to row would leave 3e-3 px."""
+def test_residual_displacements_about_the_true_motion_are_zero(pairs):
+    """Without the correction for kernels that change from row to row they would be 3e-3 px."""
     frames, camera = pairs
     truth = of_each_stack(MOTION)
-    (group,) = frame_groups(stack_spectra(frames, None), camera, truth, alike=True)
-    found, _ = measure_group(group, camera, truth, None)
+    groups = frame_groups(stack_spectra(frames, None), camera, truth, pairs_if_blurred_differently=True)
+    found, _ = measure_groups(groups, camera, truth)
     expected = found.relative(truth.mean_displacement(found.moments, found.exposure_time))
     wrong = (found.displacements - expected)[:, 8:-8, 0].unflatten(1, (-1, 8)).mean(2)  # of 64 rows each
     assert bool((wrong.square().mean(1).sqrt() < torch.tensor([8e-4, 1.5e-3])).all())
 
 
-def test_both_frames_show_the_same_image(pairs):
+def test_warped_frames_of_a_pair_are_equal(pairs):
     frames, camera = pairs
-    spectra, shown, warp = prepared(frames, camera)
+    spectra, positions, warp = prepared(frames, camera)
 
     def apart(warped):
         images = torch.fft.irfft(warped, n=spectra.length)[:, :, 40:-40, 40 : frames.shape[-1] - 40]
         return float((images[:, 0] - images[:, 1]).square().mean().sqrt())
 
     whole = warp(slice(None))
-    assert apart(whole) < 0.04 * apart(spectra.warped(shown.rows, shown.shift))
+    assert apart(whole) < 0.04 * apart(spectra.warped(positions.rows, positions.shift))
     parts = torch.cat([warp(slice(first, first + 300)) for first in range(0, frames.shape[-2], 300)], 2)
     torch.testing.assert_close(parts, whole, atol=1e-4, rtol=1e-4)
 
 
-def test_frames_blurred_alike_are_only_warped(paper_camera, pairs):
+def test_frames_with_equal_blur_are_only_warped(paper_camera, pairs):
     frames, _ = pairs
-    spectra, shown, warp = prepared(frames, paper_camera)
-    torch.testing.assert_close(warp(slice(None)), spectra.warped(shown.rows, shown.shift))
+    spectra, positions, warp = prepared(frames, paper_camera)
+    torch.testing.assert_close(warp(slice(None)), spectra.warped(positions.rows, positions.shift))

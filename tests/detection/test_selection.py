@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.rows import direct
 from rsvib_torch.detection.tones import periodogram, selection
-from rsvib_torch.detection.tones.fit import MotionModel, fit_tones
+from rsvib_torch.detection.tones.fit import fit_tones
 
 ROWS, ROW_TIME, FRAME_PERIOD = 120, 16 * 20.52e-6, 2048 * 20.52e-6
 
@@ -61,26 +60,6 @@ def test_a_weak_tone_beside_a_strong_one_is_found_and_noise_is_not():
         fit = selection.find_tones(measurements, ROW_TIME)
         assert fit.active.sum(-1).tolist() == [[tones, tones]]
     assert fit.frequencies[0, :, 1].tolist() == pytest.approx([88.0, 79.0], rel=0.02)
-
-
-def test_a_tone_that_the_exposure_averages_out_is_dropped_when_it_grows():
-    """Its amplitude is larger than that of the true one; an exposure of 400 rows averages out 121.8 Hz."""
-    exposure = 400 * 20.52e-6
-    starts = (torch.arange(ROWS, dtype=torch.float64) * ROW_TIME).expand(1, -1)
-    offsets = offsets_of([3.1, 5.2], [50.0, 30.0], torch.Generator().manual_seed(5))
-    information = torch.eye(2, dtype=torch.float64).expand(1, ROWS, 2, 2)
-    measurements = Measurements.of_pairs(starts, starts + FRAME_PERIOD, offsets, information, exposure)
-    frequencies = torch.tensor([[[50.0, 121.9], [30.0, 121.9]]], dtype=torch.float64)
-    active = torch.tensor([[[True, True], [True, False]]])
-    fit, _ = selection.robust_fit(measurements, frequencies, active, MotionModel())
-    before = replace(fit, coefficients=torch.tensor([[[3.1, 6.0], [5.2, 0.0]]], dtype=torch.complex128))
-    after = replace(before, coefficients=torch.tensor([[[3.0, 600.0], [5.2, 0.0]]], dtype=torch.complex128))
-    size = selection.visible_size(measurements, before)
-    assert size[0, 0, 1] < 0.1 * size[0, 0, 0]
-    kept = direct._without_runaways(measurements, before, after)
-    assert kept.active.tolist() == [[[True, False], [True, False]]]
-    doubled = replace(before, coefficients=torch.tensor([[[5.0, 6.0], [5.2, 0.0]]], dtype=torch.complex128))
-    assert direct._without_runaways(measurements, before, doubled) is doubled
 
 
 @pytest.mark.parametrize(

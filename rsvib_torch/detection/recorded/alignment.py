@@ -11,8 +11,7 @@ from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.detection.band_curve import measurements_of_curve
 from rsvib_torch.detection.grey_frames import grey_frames
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.rows.residuals import independent_fraction, unexplained
-from rsvib_torch.detection.rows.row_groups import frame_groups, measure_groups, stack_spectra
+from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import start_curve
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.motion.spline import FreeMotion
@@ -145,16 +144,16 @@ def align_motion(
     clock, covariance = _refine(measured.reweighted(_left(measured, turned, clock)), turned, clock, fit_scale, fit_gain)
     groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, clock.motion(turned).expanded(1))
     for _ in range(_LOOKS):
-        measured = measure_groups(groups, rowwise, clock.motion(turned).expanded(1))
+        measured, _ = measure_groups(groups, rowwise, clock.motion(turned).expanded(1))
         weighed = measured.reweighted(_left(measured, turned, clock))
         clock, covariance = _refine(weighed, turned, clock, fit_scale, fit_gain)
     left = _left(measured, turned, clock)
-    honest = independent_fraction(measured, left)
+    honest = measured.independent_fraction(left)
     std = (covariance.diagonal() / honest).clamp(min=0.0).sqrt()
     # from the middle of the record to time 0
     reach = torch.tensor([1.0, -clock.middle], dtype=torch.float64, device=std.device)
     offset_std = float((reach @ covariance[:2, :2] @ reach / honest).clamp(min=0.0).sqrt())
-    beside = unexplained(measured, left)[0]
+    beside = measured.unexplained(left)[0]
     moved = measured.relative(clock.motion(turned).mean_displacement(measured.moments, rowwise.exposure_time))
     size = moved[0].square().sum(1).div(measured.differences[0].clamp(min=1.0)[:, None]).mean(0).sqrt()
     reasons = _reasons(beside, size, other, float(std[0]))

@@ -11,8 +11,7 @@ from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.detection.band_curve import band_curve, measurements_of_curve
 from rsvib_torch.detection.grey_frames import GreyFrames, grey_frames
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.rows.residuals import independent_fraction, unexplained
-from rsvib_torch.detection.rows.row_groups import frame_groups, measure_groups, stack_spectra
+from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.spline_fit import SplineFit, fit_spline
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import offsets_from_row_order
@@ -147,14 +146,14 @@ def _detect(
     motion = _motion(fit, size, 0.0)
     groups = frame_groups(stack_spectra(grey, valid), rowwise, motion)
     for step in range(iterations):
-        measured = measure_groups(groups, rowwise, motion)
+        measured, _ = measure_groups(groups, rowwise, motion)
         if step:  # blocks that show something that moves by itself have less say
             measured = measured.reweighted(_left(measured, motion))
         fit = fit_spline(measured, spacing, record)
         motion = _motion(fit, size, 0.0)  # groups follow the image as it moves on
     left = _left(measured, motion)
     weighed = measured.reweighted(left)
-    share = independent_fraction(weighed, left) * measured.share_counted(left)
+    share = weighed.independent_fraction(left) * measured.share_counted(left)
     fit = fit_spline(replace(weighed, independent=share), spacing, record, learn=True)
     motion = _motion(fit, size, _FAR)
     return _report(motion, fit, measured, _left(measured, motion), timing, starts, size[0])
@@ -236,7 +235,7 @@ def _report(
         told, common = _told_and_common(fit, moments, measured.seen[0])
         seen.append(_variance(told, fit.covariance[axis]).mean().sqrt())
         unseen.append(_variance(common - columns.mean(0), fit.covariance[axis]).mean().sqrt())
-    beside = unexplained(measured, left)[0]
+    beside = measured.unexplained(left)[0]
     value = motion[0].displacement(times)
     value = value - value.mean((0, 1))
     relative = (value - value.mean(0)).square().mean((0, 1)).sqrt()

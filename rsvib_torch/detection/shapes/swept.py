@@ -14,8 +14,7 @@ from rsvib_torch.core.quadrature import gauss_legendre
 from rsvib_torch.detection.band_curve import measurements_of_curve
 from rsvib_torch.detection.grey_frames import GreyFrames, grey_frames
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.rows.residuals import independent_fraction, unexplained
-from rsvib_torch.detection.rows.row_groups import frame_groups, measure_groups, stack_spectra
+from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import start_curve
 from rsvib_torch.detection.shapes.spline_fit import precision_of_axis
 from rsvib_torch.frames.arrays import ArrayLike
@@ -156,7 +155,7 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions,
     groups = frame_groups(stack_spectra(stack.images, stack.valid), rowwise, _motion(fits, record, rowwise))
     for _ in range(iterations):
         motion = _motion(fits, record, rowwise)
-        measured = measure_groups(groups, rowwise, motion)
+        measured, _ = measure_groups(groups, rowwise, motion)
         weighed = measured.reweighted(_left(measured, motion))
         fits = [_settle(weighed, axis, record, fit[None])[0][0] for axis, fit in enumerate(fits)]
     solved = [_settle(weighed, axis, record, fit[None]) for axis, fit in enumerate(fits)]
@@ -164,8 +163,8 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions,
     fits = [torch.where(gain > _SIGNIFICANT, fit[0], _still(fit[0])) for fit, _, gain in solved]
     motion = _motion(fits, record, rowwise)
     left = _left(measured, motion)
-    honest = independent_fraction(weighed, left) * measured.share_counted(left)
-    tone = _report(fits, covariances, honest, motion, unexplained(measured, left)[0], measured, record, timing)
+    honest = weighed.independent_fraction(left) * measured.share_counted(left)
+    tone = _report(fits, covariances, honest, motion, measured.unexplained(left)[0], measured, record, timing)
     return _Found(tone, fits, record)
 
 

@@ -16,7 +16,6 @@ from rsvib_torch.detection.tones.fit import (
     offset_gain,
     residual_of,
     select_stacks,
-    tone_response,
 )
 from rsvib_torch.detection.tones.periodogram import best_candidate, visibility
 
@@ -29,7 +28,6 @@ __all__ = [
     "significant_only",
     "strongest_only",
     "typical_size",
-    "visible_size",
 ]
 
 MAX_TONES = 4  # of each axis
@@ -63,12 +61,6 @@ def robust_fit(
     rough, residual = fit_roughly(measurements.reweighted(residual), frequencies, active, model)
     weighed = measurements.reweighted(residual)
     return fit_tones(weighed, rough, active, model), weighed
-
-
-def visible_size(measurements: Measurements, fit: ToneFit) -> Tensor:
-    """Root-mean-square displacement (B, 2, K) in px that each tone causes in the measurements; small for blind ones."""
-    response = tone_response(measurements, fit.frequencies).abs().square().mean((1, 2)).sqrt()
-    return fit.amplitude * response
 
 
 def typical_size(measurements: Measurements, fit: ToneFit) -> Tensor:

@@ -1,0 +1,389 @@
+"""Displacements of scene rows, measured in images that are warped by a known motion.
+
+Frames are compared in groups that contain the same part of the scene. The frames of a group are warped to the scene by
+the motion, and blurred alike if their exposures blurred them differently. ``registration.gradients`` then gives the
+residual displacement of every scene row in every frame and its information matrix, which are summed over
+``BLOCK_ROWS`` rows. This is where images become measurements.
+"""
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from rsvib_torch.detection.measurements import Measurements, trimmed_mean
+from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing
+from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.timing import RowTiming
+from rsvib_torch.registration.gradients import RowGradients, residual_products, row_equations, row_gradients
+from rsvib_torch.registration.row_spectra import EVERY, MARGIN, RowSpectra, column_pattern
+
+__all__ = [
+    "BLOCK_ROWS",
+    "MAX_GROUP_FRAMES",
+    "FrameGroup",
+    "compared_intervals",
+    "differential_motion",
+    "differently_blurred",
+    "frame_groups",
+    "measure_group",
+    "measure_groups",
+    "remove_column_pattern",
+    "stack_spectra",
+]
+
+BLOCK_ROWS = 8  # rows of one measurement; tones up to 1 / (16 T_row) are resolved
+MAX_GROUP_FRAMES = 8  # frames with one mean scene; more lower the noise of that scene by less than 1 / 16
+
+
+@dataclass(frozen=True, eq=False)
+class FrameGroup:
+    """Consecutive frames that are compared with each other.
+
+    Attributes:
+        spectra: Spectra of the G frames.
+        starts: (B, G) s, exposure starts of their first rows.
+    """
+
+    spectra: RowSpectra
+    starts: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Positions:
+    """Where the frames of a group contain scene rows.
+
+    Attributes:
+        scene_rows: (B, 1, S) scene rows s.
+        columns: (B, 1, 1) px, displacement along the rows that is common to the group and is not taken out.
+        rows: (B, G, S) frame rows that contain the scene rows.
+        shift: (B, G, S) px, displacement along the rows to be taken out.
+        moments: (B, G, S) s, exposure starts of the frame rows.
+    """
+
+    scene_rows: Tensor
+    columns: Tensor
+    rows: Tensor
+    shift: Tensor
+    moments: Tensor
+
+    @classmethod
+    def of(cls, group: FrameGroup, timing: RowTiming, motion: Motion, step: int = 1) -> "_Positions":
+        """Positions of every ``step``-th row of the scene that the middle of a group contains."""
+        height = group.spectra.height
+        rows = torch.arange(0, height, step, dtype=torch.float64, device=group.starts.device)
+        # an image motion carries the group away from the first frame: rows and columns follow it by whole pixels
+        middle = group.starts.mean(-1, keepdim=True) + 0.5 * height * timing.row_time
+        travelled = motion.drift(middle).round()[:, :, None]  # (B, 1, 1, 2)
+        return cls.of_rows(rows - travelled[..., 1], travelled[..., 0], group.starts[..., None], timing, motion)
+
+    @classmethod
+    def of_rows(
+        cls, scene_rows: Tensor, columns: Tensor, starts: Tensor, timing: RowTiming, motion: Motion
+    ) -> "_Positions":
+        """Positions of given scene rows in frames that start at ``starts`` (B, G, 1)."""
+        rows = rows_showing(scene_rows, starts, timing, motion)
+        moments = starts + rows * timing.row_time
+        shift = motion.mean_displacement(moments, timing.exposure_time)[..., 0] - columns
+        return cls(scene_rows, columns, rows, shift, moments)
+
+    def visible(self, height: int, block: int) -> Tensor:
+        """(B, G, S) float64, 1 for blocks of scene rows that lie inside a frame of ``height`` rows, else 0."""
+        blocks = self.rows.shape[-1] // block
+        inside = ((self.rows >= MARGIN) & (self.rows <= height - 1 - MARGIN)).double()
+        whole = inside[..., : blocks * block].unflatten(-1, (blocks, block)).amin(-1)
+        return functional.pad(whole.repeat_interleave(block, dim=-1), (0, self.rows.shape[-1] - blocks * block))
+
+
+# Groups of frames
+
+
+def compared_intervals(
+    timing: RowTiming, num_frames: int, max_group_frames: int, device: torch.device | None = None
+) -> Tensor:
+    """Times (M,) in seconds between all frames that are compared with each other in groups of limited size."""
+    starts = timing.frame_starts(num_frames, device)
+    return torch.cat([starts[step:] - starts[:-step] for step in range(1, min(num_frames, max_group_frames))])
+
+
+def stack_spectra(frames: Tensor, valid: Tensor | None) -> RowSpectra:
+    """Spectra of grey frames (B, T, H, W) in row order, each frame with mean 0 and standard deviation 1.
+
+    Args:
+        frames: The frames.
+        valid: (B, T, H, W) bool, False for missing pixels; None if all are valid.
+    """
+    if valid is None:
+        variance, level = torch.var_mean(frames[..., ::4, :], (-2, -1), correction=0, keepdim=True)
+        return RowSpectra(frames, None, level, variance.sqrt())
+    weight = valid / valid.sum((-2, -1), keepdim=True)
+    level = (frames * weight).sum((-2, -1), keepdim=True)
+    variance = ((frames - level).square_() * weight).sum((-2, -1), keepdim=True)
+    return RowSpectra(frames, valid, level, variance.sqrt())
+
+
+def frame_groups(
+    spectra: RowSpectra,
+    timing: RowTiming,
+    motion: Motion,
+    *,
+    pairs_if_blurred_differently: bool = False,
+    min_overlap: float = 0.5,
+) -> list[FrameGroup]:
+    """Frames in groups of at most ``MAX_GROUP_FRAMES``, each sharing one frame with the next group.
+
+    Args:
+        spectra: Spectra of all frames, from ``stack_spectra``.
+        timing: The sensor, in row order.
+        motion: Motion of each stack (B); an image motion limits how many frames contain the same part of the scene.
+        pairs_if_blurred_differently: Form pairs if exposures blur the frames differently, because only the blur of two
+            frames can be equalised. Pairs are enough for a tone; a free motion needs all frames that contain a row.
+        min_overlap: Part of the frame that all frames of a group contain.
+    """
+    stacks, count = spectra.values.shape[:2]
+    starts = timing.frame_starts(count, spectra.values.device).expand(stacks, -1)
+    travelled = (motion.drift(starts[:, 1:]) - motion.drift(starts[:, :-1])).abs().amax((0, 1))
+    fraction = float((travelled / travelled.new_tensor([spectra.width, spectra.height])).amax())
+    most = int(max(2, min(MAX_GROUP_FRAMES, 1 + (1 - min_overlap) // max(fraction, 1e-9))))
+    if pairs_if_blurred_differently:
+        most = 2 if bool(differently_blurred(starts, spectra.height, timing, motion).any()) else most
+    number = max(1, math.ceil((count - 1) / (most - 1)))
+    ends = [round(i * (count - 1) / number) for i in range(number + 1)]
+    parts = [slice(first, last + 1) for first, last in itertools.pairwise(ends)]
+    return [FrameGroup(spectra.part(part), starts[:, part]) for part in parts]
+
+
+# Measurements
+
+
+def measure_group(
+    group: FrameGroup, timing: RowTiming, motion: Motion, gradients: RowGradients | None = None
+) -> tuple[Measurements, RowGradients]:
+    """Displacements of blocks of scene rows in the frames of a group, measured around a motion.
+
+    The displacement of the motion is added to the measured residual displacement, so that the measurements do not
+    depend on the motion to first order.
+
+    Args:
+        group: The frames.
+        timing: The sensor, in row order.
+        motion: Motion of each stack (B) that the frames are warped by.
+        gradients: Gradients of the scene from a motion that differs by much less than a pixel; None to compute them.
+
+    Returns:
+        The measurements, and the gradients for the next call.
+    """
+    positions = _Positions.of(group, timing, motion)
+    visible = positions.visible(group.spectra.height, BLOCK_ROWS)
+    warp = _warp_to_scene(group.spectra, positions, timing, motion)
+    warped = ((run, warp(run)) for run in group.spectra.runs(positions.rows.shape[-1], 2))
+    if gradients is None:
+        gradients = row_gradients(group.spectra, warped, positions.rows, positions.shift, visible)
+        products = gradients.residual_products
+    else:
+        products = residual_products(warped, gradients, visible)
+    information, gradient = row_equations(products, gradients, visible)
+    information = _in_blocks(information[:, None]).sum(3)[:, 0]  # (B, N, 2, 2)
+    gradient = _in_blocks(gradient).sum(3)  # (B, G, N, 2)
+    xx, yy = information[..., 0, 0], information[..., 1, 1]
+    determinant = xx * yy - information[..., 0, 1].square()
+    # blocks with structure along one direction only have a singular matrix
+    measured = (determinant > 1e-4 * xx * yy) & (determinant > 0)
+    eye = torch.eye(2, dtype=information.dtype, device=information.device)
+    regular = torch.where(measured[..., None, None], information, eye)
+    residual = torch.linalg.solve(regular[:, None], gradient[..., None])[..., 0]
+    residual = torch.where(measured[:, None, :, None], residual, 0.0)
+    moments = _in_blocks(positions.moments).mean(3)
+    around = motion.mean_displacement(moments, timing.exposure_time)
+    measurements = Measurements(
+        moments=moments.transpose(1, 2),
+        displacements=(around + residual).transpose(1, 2),
+        seen=_in_blocks(visible)[..., 0].transpose(1, 2),
+        information=torch.where(measured[..., None, None], information, 0.0),
+        exposure_time=timing.exposure_time,
+    )
+    return replace(measurements, displacements=measurements.relative(measurements.displacements)), gradients
+
+
+def _in_blocks(values: Tensor) -> Tensor:
+    """Rows on axis 2 as blocks of ``BLOCK_ROWS`` rows on axes 2 and 3; the remaining rows are left out."""
+    count = values.shape[2] // BLOCK_ROWS
+    blocks: Tensor = values[:, :, : count * BLOCK_ROWS].unflatten(2, (count, BLOCK_ROWS))
+    return blocks
+
+
+def measure_groups(
+    groups: list[FrameGroup],
+    timing: RowTiming,
+    motion: Motion,
+    gradients: list[RowGradients] | None = None,
+) -> tuple[Measurements, list[RowGradients]]:
+    """``measure_group`` of all groups, the measurements as one record."""
+    each = [None] * len(groups) if gradients is None else gradients
+    measured = [measure_group(group, timing, motion, own) for group, own in zip(groups, each, strict=True)]
+    return _joined([part for part, _ in measured]), [own for _, own in measured]
+
+
+def _joined(parts: list[Measurements]) -> Measurements:
+    """Measurements of all groups as one record; smaller groups get frames in which no row is visible."""
+    most = max(part.moments.shape[-1] for part in parts)
+
+    def padded(values: Tensor) -> Tensor:
+        return functional.pad(values, (0, 0) * (values.ndim - 3) + (0, most - values.shape[2]))
+
+    def repeated(moments: Tensor) -> Tensor:
+        return torch.cat([moments, moments[:, :, :1].expand(-1, -1, most - moments.shape[2])], 2)
+
+    return replace(
+        parts[0],
+        moments=torch.cat([repeated(part.moments) for part in parts], 1),
+        displacements=torch.cat([padded(part.displacements) for part in parts], 1),
+        seen=torch.cat([padded(part.seen) for part in parts], 1),
+        information=torch.cat([part.information for part in parts], 1),
+    )
+
+
+def remove_column_pattern(
+    groups: list[FrameGroup], timing: RowTiming, motion: Motion, gradients: list[RowGradients]
+) -> bool:
+    """Subtract a pattern of columns that is fixed to the sensor from the spectra of all frames; False if there is none.
+
+    The pattern would pull all displacements to zero.
+    """
+    parts = []
+    for group, own in zip(groups, gradients, strict=True):
+        positions = _Positions.of(group, timing, motion, EVERY)
+        visible = positions.visible(group.spectra.height, BLOCK_ROWS // EVERY)
+        parts.append((group.spectra, positions.rows, positions.shift, visible, own.variance[:, ::EVERY]))
+    pattern = column_pattern(parts)
+    if pattern is None:
+        return False
+    for group in groups:
+        group.spectra.subtract(pattern)
+    return True
+
+
+def differential_motion(gradients: list[RowGradients], *, rows: int = 64) -> Tensor:
+    """(B, 2) px, rms difference of the residual displacements of the two halves of the rows, without its noise.
+
+    Rotation of the camera and parallax move the halves differently.
+
+    Args:
+        gradients: Gradients of all groups, from ``measure_groups``.
+        rows: Rows over which the sums are taken.
+    """
+    excesses = []
+    for own in gradients:
+        count = own.halves.shape[1] // rows * rows
+        weight = torch.where(own.variance > 0, 1 / own.variance.clamp(min=1e-300), 0.0)[:, :count, None, None]
+        hxx, hxy, hyy, bx, by = (own.halves[:, :count] * weight).unflatten(1, (-1, rows)).sum(2).unbind(-1)
+        determinant = hxx * hyy - hxy.square()
+        regular = determinant > 1e-4 * hxx * hyy
+        safe = torch.where(regular, determinant, 1.0)
+        residual = -torch.stack([hyy * bx - hxy * by, hxx * by - hxy * bx], -1) / safe[..., None]  # (B, N, halves, 2)
+        noise = 2 * torch.stack([hyy, hxx], -1) / safe[..., None]  # of a difference of two frames
+        excess = (residual[:, :, 1] - residual[:, :, 0]).square() - noise.sum(2)
+        excesses.append(torch.where(regular.all(-1)[..., None], excess, torch.nan))
+    return trimmed_mean(torch.cat(excesses, 1)).clamp(min=0.0).sqrt()
+
+
+# Frames that are blurred differently
+
+
+def _paths(moments: Tensor, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor]:
+    """Paths (B, G, S, N, 2) in px about their means during exposures that start at ``moments``, and weights (N,)."""
+    # two thirds of the nodes of the restoration: an accuracy of 1e-3 is enough for images that are blurred twice
+    count = math.ceil(2 / 3 * gauss_node_count(motion, timing.exposure_time))
+    path, weights = exposure_trajectory(motion, moments, timing, "gauss", count)
+    weights = weights.to(path)
+    return path - (path * weights[:, None]).sum(-2, keepdim=True), weights
+
+
+def _second_moments(paths: Tensor, weights: Tensor) -> Tensor:
+    """Second moments (B, G, S, 2, 2) in px^2 of paths from ``_paths``."""
+    return torch.einsum("bgsni,bgsnj,n->bgsij", paths, paths, weights)
+
+
+def _different(moments: Tensor, timing: RowTiming, motion: Motion) -> Tensor:
+    """(B,) bool, whether exposures that start at ``moments`` (B, G, S) blur the same scene row differently."""
+    paths, weights = _paths(moments[..., ::8], timing, motion)
+    third = torch.einsum("bgsn,bgsni->bgsi", paths.square().sum(-1) * weights, paths)
+
+    def spread(values: Tensor) -> Tensor:
+        return (values.amax(1) - values.amin(1)).flatten(1).amax(1)
+
+    # px, px^2 and px^3; third moments of this size displace fine detail by 0.001 px
+    return (spread(paths) > 0.5) | (spread(_second_moments(paths, weights)) > 0.03) | (spread(third) > 0.0024)
+
+
+def differently_blurred(starts: Tensor, height: int, timing: RowTiming, motion: Motion) -> Tensor:
+    """(B,) bool, whether frames of ``height`` rows that start at ``starts`` (B, G) in s are blurred differently."""
+    rows = torch.arange(height, dtype=torch.float64, device=starts.device)
+    return _different(starts[..., None] + rows * timing.row_time, timing, motion)
+
+
+def _warp_to_scene(
+    spectra: RowSpectra, positions: _Positions, timing: RowTiming, motion: Motion
+) -> Callable[[slice], Tensor]:
+    """Function that warps the frames of a group to some of the scene rows, the frames of a pair with equal blur.
+
+    A long exposure displaces fine detail by more or less than the mean displacement of the row, differently in each
+    frame. Each frame of a pair is therefore blurred once more, by the kernel of the other frame, so that both equal
+    ``K_1 K_2 f`` of the scene f. This is the mean of copies of the frame that are warped along the path of the other.
+
+    Kernels change from row to row, and such operators do not commute: a copy from a distance y was blurred by second
+    moments M of the path that differ by ``y dM/ds`` to first order, which displaces detail by 0.01 px. Each node of the
+    path is therefore corrected by ``y / 2 dM/ds`` times second derivatives of the image.
+
+    Args:
+        spectra: Spectra of the frames of a group.
+        positions: Where the frames contain the scene rows.
+        timing: The sensor, in row order.
+        motion: Motion of each stack (B).
+
+    Returns:
+        Function from a slice of the scene rows to warped spectra (B, G, s, U).
+    """
+    different = torch.zeros(len(positions.rows), dtype=torch.bool, device=positions.rows.device)
+    if positions.rows.shape[1] == 2:
+        different = _different(positions.moments, timing, motion)
+    if not bool(different.any()):
+        return lambda part: spectra.warped(positions.rows[..., part], positions.shift[..., part])
+    paths, weights = _paths(positions.moments, timing, motion)
+    paths = paths * different[:, None, None, None, None]
+    real = spectra.values.real.dtype
+    moment_slope = 0.5 * torch.gradient(_second_moments(paths, weights), dim=2)[0].to(real)[..., None]
+    x, y = paths.flip(1).unbind(-1)  # of the other frame
+    starts = (positions.moments - positions.rows * timing.row_time)[..., None]
+    nodes = _Positions.of_rows(
+        positions.scene_rows[..., None] - y, positions.columns[..., None] + x, starts, timing, motion
+    )
+    factors = torch.stack([weights.expand_as(y), weights * y], -1).to(real)
+    by_x = (2j * math.pi * spectra.frequencies).to(spectra.values.dtype)  # derivative along the rows
+    count = positions.rows.shape[-1]
+
+    def warped(part: slice) -> Tensor:
+        first, last, _ = part.indices(count)
+        index = torch.arange(first - 2, last + 2, device=y.device).clamp(0, count - 1)  # two neighbours, see below
+        shape = (*y.shape[:2], len(index), len(by_x))
+        mean, moment = (spectra.values.new_zeros(shape) for _ in range(2))  # mean of the copies; and of y times them
+        for node in range(len(weights)):
+            copy = torch.view_as_real(spectra.warped(nodes.rows[..., index, node], nodes.shift[..., index, node]))
+            for total, factor in zip((mean, moment), factors[:, :, index, node].unbind(-1), strict=True):
+                torch.view_as_real(total).addcmul_(copy, factor[..., None, None])
+
+        def neighbour(step: int) -> Tensor:
+            return moment[:, :, 2 + step : len(index) - 2 + step]
+
+        # derivatives across rows, of fourth order
+        by_y = (8 * (neighbour(1) - neighbour(-1)) - (neighbour(2) - neighbour(-2))) / 12
+        by_yy = (16 * (neighbour(1) + neighbour(-1)) - (neighbour(2) + neighbour(-2)) - 30 * neighbour(0)) / 12
+        xx, xy, yy = (moment_slope[:, :, part, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        result: Tensor = mean[:, :, 2:-2] + (xx * by_x * neighbour(0) + 2 * xy * by_y) * by_x + yy * by_yy
+        return result
+
+    return warped
