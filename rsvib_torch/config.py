@@ -1,4 +1,4 @@
-"""TOML files that describe a camera and what to do with its frames."""
+"""TOML configuration files: the camera, and the options of simulation, detection and restoration."""
 
 import inspect
 import os
@@ -25,12 +25,12 @@ __all__ = ["Config", "Simulation", "read_config"]
 
 @dataclass(frozen=True)
 class Simulation:
-    """What ``[simulation]`` says.
+    """Content of ``[simulation]``.
 
     Attributes:
         vibration: The motion to simulate.
-        num_frames: Frames to take.
-        frame_size: (height, width) of the frames; None for the largest that the scene allows.
+        num_frames: Number of frames.
+        frame_size: (height, width) of the frames in px; None for the largest size that the scene allows.
         noise: Noise of the sensor; None for none.
         seed: Seed of the noise.
     """
@@ -44,15 +44,15 @@ class Simulation:
 
 @dataclass(frozen=True)
 class Config:
-    """What a config file says.
+    """Content of a configuration file.
 
     Attributes:
         timing: The sensor.
-        full_scale: Count that means 1.0 in the camera's integer frames; None where the file does not say.
-        detection: Options for ``detect_vibration``; those not in the file are not here either.
-        restoration: Options for ``restore``, likewise.
-        simulation: What to simulate; None where the file does not say.
-        stack: How long stacks are cut, ``window`` and ``bad_frames``, likewise.
+        full_scale: Count that corresponds to 1.0 in integer frames; None if it is not in the file.
+        detection: Options of ``detect_vibration`` that are in the file.
+        restoration: Options of ``restore`` that are in the file.
+        simulation: Vibration and noise to simulate; None if it is not in the file.
+        stack: Options ``window`` and ``bad_frames`` of ``process_stack`` that are in the file.
     """
 
     timing: SensorTiming
@@ -64,7 +64,7 @@ class Config:
 
 
 class SensorSection(TimingRecord):
-    """``[sensor]``: the timing, and the full scale of the camera's counts."""
+    """``[sensor]``: the timing, and the full scale of integer frames."""
 
     scan_axis: Literal["y", "x"] = "y"
     readout_direction: Literal["forward", "reverse"] = "forward"
@@ -98,7 +98,7 @@ class _SimulationSection(Section):
     seed: int = 0
 
     @model_validator(mode="after")
-    def _check(self) -> "_SimulationSection":
+    def _check(self) -> Self:
         check_whole_number("num_frames", self.num_frames, at_least=1)
         check_whole_number("seed", self.seed, at_least=0)
         if self.frame_size is not None and (len(self.frame_size) != 2 or min(self.frame_size) < 1):
@@ -107,7 +107,7 @@ class _SimulationSection(Section):
         return self
 
     def simulation(self) -> Simulation:
-        """What to simulate."""
+        """The values as a ``Simulation``."""
         size = None if self.frame_size is None else (self.frame_size[0], self.frame_size[1])
         noise = None if self.noise is None else SensorNoise(**dict(self.noise))
         return Simulation(self.vibration.to_vibration(), self.num_frames, size, noise, self.seed)
@@ -119,14 +119,14 @@ _DetectionSection = options_section(
 
 
 class _StackSection(Section):
-    """``[stack]``: how long stacks are gone through."""
+    """``[stack]``: processing of stacks in windows."""
 
     window: int = Field(default=DEFAULT_WINDOW, ge=2)
     bad_frames: BadFrames = "pass"
 
 
 def _restoration_section(method: object) -> Any:
-    """``[restoration]``: the keys are those of the method."""
+    """``[restoration]``: the keys depend on the method."""
     default = inspect.signature(restore).parameters["method"].default
     chosen = METHODS[method if isinstance(method, str) and method in METHODS else default]
     more = {"method": (Literal[*METHODS], default), "saturation": (float | None, None)}
@@ -134,21 +134,24 @@ def _restoration_section(method: object) -> Any:
 
 
 def read_config(path: str | os.PathLike[str]) -> Config:
-    """Read a config file.
+    """Read a configuration file.
 
-    ``[sensor]`` holds the fields of ``SensorTiming`` and ``full_scale``; ``[detection]`` and ``[restoration]`` the
-    options of ``detect_vibration`` and ``restore``, with ``saturation`` in the unit of the file; ``[simulation]``
-    frames, size and seed, with ``[simulation.vibration]`` (fields of ``Vibration``) and ``[simulation.noise]`` (fields
-    of ``SensorNoise``); ``[stack]`` ``window`` and ``bad_frames`` of
-    ``process_stack``. Only ``[sensor]`` is required.
+    Only ``[sensor]`` is required.
+
+    * ``[sensor]``: fields of ``SensorTiming``, and ``full_scale``.
+    * ``[detection]``: options of ``detect_vibration``.
+    * ``[restoration]``: options of ``restore``, with ``saturation`` in the unit of the frames' file.
+    * ``[simulation]``: ``num_frames``, ``frame_size``, ``seed``, ``[simulation.vibration]`` (fields of ``Vibration``)
+      and ``[simulation.noise]`` (fields of ``SensorNoise``).
+    * ``[stack]``: ``window`` and ``bad_frames`` of ``process_stack``.
 
     Args:
         path: The TOML file.
 
     Raises:
         OSError: If the file cannot be opened.
-        ValueError: If it is not TOML, or a key is missing, unknown or has a wrong type or value: one line a mistake
-            with the path of the key, its value and what was expected.
+        ValueError: If it is not TOML, or a key is missing, unknown or has a wrong type or value: one line per key,
+            with its path, its value and what was expected.
     """
     path = Path(path)
     try:
@@ -179,5 +182,5 @@ def read_config(path: str | os.PathLike[str]) -> Config:
 
 
 def _given(section: Any) -> dict[str, Any]:
-    """The keys that the file has: defaults stay with the function that takes them."""
+    """The keys that are in the file; the functions that take the options have the defaults."""
     return {} if section is None else section.model_dump(exclude_unset=True)

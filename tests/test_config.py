@@ -1,4 +1,4 @@
-"""Config files: those shipped are read, mistakes are told in one line each."""
+"""Configuration files: the examples can be read, and every error is one line."""
 
 from pathlib import Path
 
@@ -49,7 +49,7 @@ def test_every_shipped_config_has_a_test():
     torch.testing.assert_close(blind_frequencies(timing, 30.0), torch.tensor([1 / (2048 * 20.52e-6)]).double())
 
 
-def test_only_the_sensor_is_required_and_only_what_is_given_is_handed_on(tmp_path):
+def test_only_the_sensor_is_required_and_missing_options_are_not_filled_in(tmp_path):
     config = read(tmp_path, SENSOR)
     assert config.timing == SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
     assert (config.full_scale, config.detection, config.restoration, config.simulation) == (None, {}, {}, None)
@@ -62,7 +62,7 @@ def test_only_the_sensor_is_required_and_only_what_is_given_is_handed_on(tmp_pat
     assert config.restoration == {"method": "banded", "half_rows": 8, "noise_to_signal": 1e-3}
 
 
-def test_two_tones_an_axis(tmp_path):
+def test_two_tones_per_axis(tmp_path):
     text = "[simulation.vibration]\namplitude = [[1, 0.5], [2, 0]]\nfrequency = [[40, 90], [55, 0]]\n"
     simulation = read(tmp_path, SENSOR + text).simulation
     assert simulation is not None
@@ -124,18 +124,19 @@ VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
             SENSOR + "[simulation]\nframe_size = [9]\n" + VIBRATION,
             "simulation: frame_size must be [height, width] in px",
         ),
+        (SENSOR + "[stack]\nwindow = 1", "stack.window: expected at least 2, got 1"),
         ("[sensor", "not a TOML file: Expected ']'"),
         ("a = 1\na = 2", "not a TOML file: Cannot overwrite a value"),
     ],
 )
-def test_mistakes_are_told_in_one_line(tmp_path, text, message):
+def test_errors_are_one_line(tmp_path, text, message):
     with pytest.raises(ValueError) as caught:
         read(tmp_path, text)
     assert str(caught.value).startswith(f"{tmp_path / 'camera.toml'}: {message}")
     assert "\n" not in str(caught.value)
 
 
-def test_every_mistake_has_its_line(tmp_path):
+def test_every_error_has_its_own_line(tmp_path):
     text = SENSOR.replace("2e-5", "'fast'") + "gain = 3\n[detection]\nsearch = 'far'\n"
     with pytest.raises(ValueError) as caught:
         read(tmp_path, text)
@@ -143,7 +144,7 @@ def test_every_mistake_has_its_line(tmp_path):
     assert [line.split(":")[0] for line in lines] == ["sensor.row_time", "sensor.gain", "detection.search"]
 
 
-def test_files_that_are_no_config(tmp_path):
+def test_files_that_are_not_configurations(tmp_path):
     with pytest.raises(FileNotFoundError):
         read_config(tmp_path / "none.toml")
     (tmp_path / "image.toml").write_bytes(b"\x89PNG\xff\xfe")

@@ -1,4 +1,4 @@
-"""The rsvib command: the whole chain on small frames, and one line for every mistake."""
+"""The rsvib program: all commands on small frames, and one line for every error."""
 
 import csv
 import json
@@ -65,7 +65,7 @@ def run(*arguments):
 
 
 def still_frame(place):
-    """What a still camera would have seen."""
+    """The frame of a camera at rest."""
     scene = read_stack(place / "scene.png")[0]
     return scene[32 : 32 + 448, 32 : 32 + 256]
 
@@ -117,7 +117,7 @@ def test_detect_then_restore(place, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["detection", "restored.tif"]
 
 
-def test_run_does_all_of_it_and_again(place, tmp_path):
+def test_run_writes_all_results_and_can_be_repeated(place, tmp_path):
     out = tmp_path / "out"
     for _ in range(2):
         assert run("run", place / "frames.tif", out, "--config", place / "camera.toml") == 0
@@ -151,7 +151,7 @@ def test_other_formats_and_colour(place, tmp_path):
     assert min(psnr(read_stack(tmp_path / "restored.npy"), still_frame(place))) > 38
 
 
-def test_axis_that_is_not_reliable_is_left_alone(place, tmp_path, capsys):
+def test_an_unreliable_axis_is_not_restored(place, tmp_path, capsys):
     frames, config = place / "frames.tif", place / "camera.toml"
     assert run("detect", frames, "--config", config, "--out", tmp_path) == 0
     path = tmp_path / "vibration.json"
@@ -169,19 +169,19 @@ def test_axis_that_is_not_reliable_is_left_alone(place, tmp_path, capsys):
     assert difference.abs().mean() < 0.01
 
 
-def spoil_vibration(place, folder, change):
-    """A vibration.json that says something else than what was detected."""
+def change_vibration(place, folder, change):
+    """A vibration.json that differs from the detection."""
     assert run("detect", place / "frames.tif", "--config", place / "camera.toml", "--out", folder / "detected") == 0
     data = json.loads((folder / "detected" / "vibration.json").read_text())
     change(data)
     (folder / "v.json").write_text(json.dumps(data))
 
 
-def test_a_wrong_vibration_leaves_the_frames_as_they_are_unless_forced(place, tmp_path, capsys):
+def test_a_wrong_vibration_leaves_the_frames_unchanged_unless_forced(place, tmp_path, capsys):
     def turn(data):
         data["vibration"]["phase"] = [[p + 3.0 for p in axis] for axis in data["vibration"]["phase"]]
 
-    spoil_vibration(place, tmp_path, turn)
+    change_vibration(place, tmp_path, turn)
     arguments = restore_arguments(place, tmp_path)
     capsys.readouterr()
     assert run(*arguments, "--report", tmp_path / "report.json") == 0
@@ -203,7 +203,7 @@ def test_half_of_the_vibration_is_restored_with_a_warning(place, tmp_path, capsy
     def halve(data):
         data["vibration"]["amplitude"] = [[0.5 * a for a in axis] for axis in data["vibration"]["amplitude"]]
 
-    spoil_vibration(place, tmp_path, halve)
+    change_vibration(place, tmp_path, halve)
     capsys.readouterr()
     assert run(*restore_arguments(place, tmp_path)) == 0
     shown = capsys.readouterr()
@@ -221,7 +221,7 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     assert report["options"] == {"method": "banded", "half_rows": 8, "saturation": 4000 / 4095}
     assert (report["outcome"], report["frames"], report["left_alone"]) == ("helps", "restored", [])
     assert "restored frames agree; estimated gain +" in capsys.readouterr().out
-    # options of the config's method go with it
+    # options of the configured method are dropped with it
     assert run(*common, "--method", "exact", "--joint", "all", "--saturation", 4095) == 0
     report = json.loads((out / "restoration.json").read_text())
     assert report["options"] == {"method": "exact", "joint": True, "saturation": 1.0}
@@ -243,7 +243,7 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
         assert error.count("\n") == 1
 
 
-def test_frames_without_a_vibration_are_left_as_they_are(place, tmp_path, capsys):
+def test_frames_without_vibration_are_unchanged(place, tmp_path, capsys):
     still = still_frame(place).expand(2, -1, -1)
     noise = 0.003 * torch.randn(still.shape, generator=torch.Generator().manual_seed(1))
     write_stack(tmp_path / "still.tif", (still + noise).clamp(0, 1), dtype="uint16", full_scale=4095)
@@ -275,7 +275,7 @@ def test_full_scale_comes_from_option_file_or_config(place, tmp_path, capsys):
     counts = tifffile.imread(place / "frames.tif")
     tifffile.imwrite(tmp_path / "plain.tif", counts, photometric="minisblack")
     arguments = (tmp_path / "plain.tif", "--config", place / "camera.toml", "--out", tmp_path / "out")
-    assert run("detect", *arguments) == 0  # the config knows
+    assert run("detect", *arguments) == 0  # the full scale is in the configuration
     silent = tmp_path / "silent.toml"
     silent.write_text(CONFIG.replace("full_scale = 4095", ""))
     assert run("detect", arguments[0], "--config", silent, "--out", tmp_path / "out", "--full-scale", 4095) == 0
@@ -490,7 +490,7 @@ def test_simulated_noise_has_a_seed(place, tmp_path):
     assert np.std(first - second) == pytest.approx(0.003 * 4095 * 2**0.5, rel=0.05)
 
 
-def test_usage_mistakes(capsys, tmp_path):
+def test_usage_errors(capsys, tmp_path):
     for arguments, message in (
         (["detect", "f.tif"], "Missing option '--config'"),
         (["paint"], "No such command 'paint'"),
@@ -512,7 +512,7 @@ def test_usage_mistakes(capsys, tmp_path):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_gpu_that_is_not_there(place, tmp_path, capsys):
+def test_missing_gpu(place, tmp_path, capsys):
     arguments = (place / "frames.tif", "--config", place / "camera.toml", "--out", tmp_path / "out")
     assert run("detect", *arguments, "--device", "cuda") == 2
     assert capsys.readouterr().err == "rsvib: error: --device cuda: no CUDA device is available; use auto or cpu\n"

@@ -1,4 +1,4 @@
-"""rsvib run, detect and restore of long stacks: in windows, resumed, in memory that is stated."""
+"""rsvib run, detect and restore of long stacks: in windows, resumed, within a memory limit."""
 
 import csv
 import json
@@ -86,14 +86,14 @@ def test_detect_in_windows_then_restore(place, tmp_path, capsys):
     assert not (tmp_path / "o.tif").exists()
 
 
-def test_interrupted_run_says_how_to_go_on(place, tmp_path):
+def test_interrupted_run_can_be_continued(place, tmp_path):
     counts = np.concatenate([tifffile.imread(place / "frames.tif")] * 8)
     np.save(tmp_path / "long.npy", counts)
     out = tmp_path / "out"
     arguments = ["run", tmp_path / "long.npy", out, "--config", place / "camera.toml", "--workers", "1"]
     program = Path(sys.executable).with_name("rsvib")
     journal = out / ".restored.tif.rsvib" / "journal.jsonl"
-    # a shell's background jobs ignore SIGINT, and what they start would inherit that
+    # background jobs of a shell ignore SIGINT, and their children inherit that
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     with subprocess.Popen([program, *map(str, arguments)], stderr=subprocess.PIPE, text=True) as process:
         signal.signal(signal.SIGINT, before)
@@ -109,7 +109,7 @@ def test_interrupted_run_says_how_to_go_on(place, tmp_path):
     assert 2 <= done < 35
 
 
-def test_broken_off_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypatch):
+def test_interrupted_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     with monkeypatch.context() as patch:
         patch.setattr("rsvib_torch.stacks.sink.Sink.finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -119,14 +119,14 @@ def test_broken_off_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypat
     assert "a run was broken off here after 4 windows; resume it (--resume)" in capsys.readouterr().err
     assert run(*command(place, out, "--resume", "--window", 5)) == 2
     assert "cannot resume: settings.window was 4, now it is 5" in capsys.readouterr().err
-    for _ in range(2):  # the second finds it complete
+    for _ in range(2):  # the second time it is complete
         assert run(*command(place, out, "--resume")) == 0
         assert "4 windows were complete before this run" in capsys.readouterr().out
     assert (out / "restored.tif").read_bytes() == (place / "out" / "restored.tif").read_bytes()
     assert (out / "manifest.json").read_bytes() == (place / "out" / "manifest.json").read_bytes()
 
 
-def test_bad_frames_are_told(place, tmp_path, capsys):
+def test_bad_frames_are_reported(place, tmp_path, capsys):
     counts = tifffile.imread(place / "frames.tif")
     counts[4] = 0
     np.save(tmp_path / "frames.npy", counts)
@@ -150,7 +150,7 @@ def test_bad_frames_are_told(place, tmp_path, capsys):
         (("--scheduler", "nonsense://x"), "no Dask scheduler answers at nonsense://x"),
     ],
 )
-def test_mistakes_are_one_line_and_leave_nothing(place, tmp_path, capsys, options, message):
+def test_errors_are_one_line_and_leave_no_files(place, tmp_path, capsys, options, message):
     capsys.readouterr()
     assert run(*command(place, tmp_path / "out", *options)) == 2
     error = capsys.readouterr().err

@@ -31,7 +31,7 @@ SHAKE = Vibration([1.6, 1.1], [71.0, 113.0], [0.6, -1.2])
 
 
 def result_of(vibration=SHAKE, reliable=(True, True), reasons=((), ())):
-    """A detection that found a vibration exactly."""
+    """A detection without errors."""
     rows = torch.arange(16, 240, 16).double()
     times = (rows * TIMING.row_time)[None]
     later = times + TIMING.frame_period
@@ -104,7 +104,7 @@ def make_page(tmp_path_factory):
     return folder, files, read(folder / "report.html")
 
 
-def test_page_needs_nothing_from_outside(page):
+def test_page_is_self_contained(page):
     folder, files, reader = page
     assert sorted(files) == sorted(path.name for path in folder.iterdir())
     images = [attributes["src"] for tag, attributes in reader.tags if tag == "img"]
@@ -123,7 +123,7 @@ def test_page_needs_nothing_from_outside(page):
             assert min(cv2.imread(str(folder / name)).shape[:2]) > 300
 
 
-def test_what_users_write_is_escaped(page):
+def test_text_of_the_user_is_escaped(page):
     _, _, reader = page
     assert [tag for tag, _ in reader.tags].count("script") == 1
     assert "b" not in [tag for tag, attributes in reader.tags if tag == "b" and attributes]
@@ -133,7 +133,7 @@ def test_what_users_write_is_escaped(page):
     assert "method = <exact>" in text
 
 
-def test_page_has_all_its_parts(page):
+def test_page_has_all_sections(page):
     text = "".join(page[2].text)
     assert text.index("restoration improves the frames") < text.index("Input and restored frame")
     for part in (
@@ -153,14 +153,14 @@ def test_page_has_all_its_parts(page):
     assert "aria-label" in ranges[0]
 
 
-def test_unwritable_place_leaves_nothing(tmp_path):
+def test_failed_write_leaves_no_files(tmp_path):
     with pytest.raises(OSError, match="does not exist"):
         write_page(tmp_path / "no" / "page.html", "base.html", {"title": "x"})
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("shape", [(3000, 700), (3, 700, 3000), (2, 90, 60)])
-def test_pictures_are_bounded_and_share_their_range(shape):
+def test_images_are_bounded_and_have_a_common_grey_scale(shape):
     ramp = torch.linspace(0, 1, shape[-1]).expand(shape)
     pair = before_after(0.5 * ramp, ramp, names=("a", "b"), caption="", longest=600, exact=True)
     first, second = decoded(pair.before).astype(float), decoded(pair.after).astype(float)
@@ -171,7 +171,7 @@ def test_pictures_are_bounded_and_share_their_range(shape):
     assert second.max() == 255
 
 
-def test_colours_keep_their_order():
+def test_order_of_colours():
     frame = torch.zeros(3, 40, 40)
     frame[0, :20], frame[2, 20:] = 1.0, 1.0
     shown = decoded(before_after(frame, frame, names=("a", "b"), caption="", exact=True).after)
@@ -195,7 +195,7 @@ def test_motion_blur_is_the_range_of_the_displacement():
     torch.testing.assert_close(motion_blur(moving, starts[:5], TIMING), expected.expand(5, 2))
 
 
-def test_figures_show_what_is_there():
+def test_gain_and_rows_figures_draw_the_model():
     figure = gain_figure(result_of(reliable=(True, False), reasons=((), ("x",))), TIMING)
     upper, lower = figure.axes
     curve = upper.lines[0].get_xydata()
@@ -223,7 +223,7 @@ def test_kernels_are_centred_on_their_rows(motion):
         np.testing.assert_allclose(panel.lines[0].get_xydata().mean(0), centre, atol=0.02)
 
 
-def test_edges_are_measured_in_both():
+def test_edges_are_measured_in_both_frames():
     frames = [torch.from_numpy(np.pad(draw_edge(5.0, sigma, (80, 60)), 6, mode="edge")) for sigma in (0.9, 0.6)]
     (pair,), notes = measure_edges(*frames, [(6, 6, 80, 60)])
     assert notes == []
@@ -282,7 +282,7 @@ def test_sentences_name_a_blind_frequency():
     assert "along x is 1.5 Hz from the blind frequency 48.8 Hz" in line
 
 
-def test_a_still_camera_gets_a_page_too(tmp_path):
+def test_page_without_vibration(tmp_path):
     still = Vibration([0.0, 0.0], [0.0, 0.0])
     reasons = (("no significant tone",),) * 2
     report = report_of(detection=result_of(still, (False, False), reasons), verdict=None, was_restored=False)

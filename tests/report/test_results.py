@@ -1,4 +1,4 @@
-"""vibration.json, offsets.csv and the pictures."""
+"""Result files and figures."""
 
 import csv
 import json
@@ -50,7 +50,7 @@ def draw_result() -> DetectionResult:
     return DetectionResult(vibration, std, curve, fitted, gain, residual, torch.tensor([True, False]), reasons)
 
 
-def test_vibration_comes_back_exactly(tmp_path, result):
+def test_vibration_is_read_back_exactly(tmp_path, result):
     write_vibration(tmp_path / "vibration.json", result, TIMING)
     back = read_vibration(tmp_path / "vibration.json", TIMING)
     for name in ("amplitude", "frequency", "phase", "image_motion"):
@@ -86,7 +86,7 @@ def test_vibration_file_is_plain_json(tmp_path, result):
         replace(TIMING, frame_start_times=[0.0, 0.01, 0.03]),
     ],
 )
-def test_vibration_of_another_camera_is_refused(tmp_path, result, timing):
+def test_vibration_of_another_timing_is_refused(tmp_path, result, timing):
     write_vibration(tmp_path / "vibration.json", result, timing)
     read_vibration(tmp_path / "vibration.json", timing)
     with pytest.raises(ValueError, match=r"the vibration was detected with another timing: .*here") as caught:
@@ -136,13 +136,13 @@ def test_malformed_vibration_files_are_refused(tmp_path, result, change, message
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", '"x"', "\x00", '{"vibration": 1e999}', "[" * 100_000])
-def test_files_that_are_no_vibration(tmp_path, text):
+def test_files_that_are_not_vibration_json(tmp_path, text):
     (tmp_path / "vibration.json").write_text(text)
     with pytest.raises(ValueError, match=r"vibration\.json: "):
         read_vibration(tmp_path / "vibration.json", TIMING)
 
 
-def test_standard_deviations_come_back(tmp_path, result):
+def test_standard_deviations_are_read_back(tmp_path, result):
     write_vibration(tmp_path / "vibration.json", result, TIMING)
     back = read_vibration(tmp_path / "vibration.json", TIMING)
     for name in ("amplitude", "frequency", "period", "phase", "image_motion", "image_acceleration"):
@@ -153,7 +153,7 @@ def test_standard_deviations_come_back(tmp_path, result):
     assert notes == ("y is left alone: its vibration is not reliable (only one period is seen)",)
 
 
-def test_what_was_restored_is_plain_json(tmp_path):
+def test_restoration_json(tmp_path):
     pair = torch.tensor([[0.1, math.nan]], dtype=torch.float64)
     one = torch.tensor([math.nan], dtype=torch.float64)
     verdict = RestorationVerdict(one, one, pair, pair, pair, one, one, one, ("worse",), ("x: frames lie apart",))
@@ -173,7 +173,7 @@ def test_what_was_restored_is_plain_json(tmp_path):
     assert json.loads(path.read_text())["outcome"] is None
 
 
-def test_offsets_are_written_one_line_a_band(tmp_path, result):
+def test_offsets_are_written_one_line_per_band(tmp_path, result):
     write_offsets(tmp_path / "offsets.csv", result)
     with (tmp_path / "offsets.csv").open() as file:
         lines = list(csv.DictReader(file))
@@ -192,7 +192,7 @@ def test_offsets_are_written_one_line_a_band(tmp_path, result):
     np.testing.assert_array_equal(good, result.offsets.offsets[..., 0][result.offsets.good])
 
 
-def test_offset_figure_shows_what_was_measured(tmp_path, result):
+def test_offset_figure_draws_the_measurements(tmp_path, result):
     figure = offset_figure(result)
     panels = {axes.get_title(loc="left"): axes for axes in figure.axes}
     for axis, name in enumerate("xy"):
@@ -217,7 +217,7 @@ def test_offset_figure_shows_what_was_measured(tmp_path, result):
     assert cv2.imread(str(tmp_path / "offsets.png")).std() > 5
 
 
-def test_crops_lie_where_detail_is_and_do_not_overlap():
+def test_crops_are_at_the_strongest_detail_and_do_not_overlap():
     image = torch.full((90, 120), 0.4)
     image[10:30, 70:90] = torch.rand(20, 20, generator=torch.Generator().manual_seed(1))
     image[60:80, 20:40] = 0.5 * torch.rand(20, 20, generator=torch.Generator().manual_seed(2))
@@ -231,7 +231,7 @@ def test_crops_lie_where_detail_is_and_do_not_overlap():
 
 
 @pytest.mark.parametrize("shape", [(96, 130), (3, 96, 130), (2, 40, 30)])
-def test_comparison_shows_the_same_crop_of_both(tmp_path, shape):
+def test_comparison_draws_the_same_crop_of_both_frames(tmp_path, shape):
     raw = torch.rand(shape, generator=torch.Generator().manual_seed(1))
     figure = comparison_figure(raw, raw * 0.5, count=2, size=32)
     pictures = [axes.images[0] for axes in figure.axes]
@@ -244,15 +244,15 @@ def test_comparison_shows_the_same_crop_of_both(tmp_path, shape):
         crop = grey[row : row + 30, column : column + 30].flatten()
         shown = before.get_array()[:30, :30, 0].flatten()
         assert np.corrcoef(shown, crop)[0, 1] > 0.99
-        assert after.get_array().mean() < before.get_array().mean()  # one scale of grey for both
+        assert after.get_array().mean() < before.get_array().mean()  # the grey scale is common to both
     save_figure(figure, tmp_path / "before_after.png", dpi=40)
     assert (tmp_path / "before_after.png").stat().st_size > 1000
 
 
-def test_result_in_words(capsys, result):
+def test_printed_detection(capsys, result):
     print_detection(result)
     out = capsys.readouterr().out
-    assert "2.000 ± 0.010" in out  # amplitude to the digits that its standard deviation leaves
+    assert "2.000 ± 0.010" in out  # two significant digits of the standard deviation
     assert "60.000 ± 0.010" in out
     assert out.count("∞") == 0
     words = " ".join(out.split())
