@@ -70,7 +70,8 @@ JointOption = Annotated[
     ),
 ]
 PriorOption = Annotated[
-    str | None, typer.Option("--prior", help="Prior for the scene, for methods that have this option.")
+    str | None,
+    typer.Option("--prior", help="Prior of the scene: gaussian or edges, for methods that have this option."),
 ]
 SaturationOption = Annotated[
     float | None,
