@@ -1,313 +1,148 @@
-"""Batched solver for Hermitian positive definite banded systems."""
+"""Batched solver for Hermitian positive definite banded systems ``A x = g``.
 
-from dataclasses import dataclass, field
-from functools import cached_property
+Elimination of one row after the other factors ``A = U^H D U`` with a unit upper triangular U: for j = 0, 1, ...
+
+    d_j = A[j, j],   U[j, k] = A[j, k] / d_j,   A[i, k] -= A[i, j] U[j, k]   for i, k = j + 1 ... j + b.
+
+Forward substitution solves ``U^H D y = g``, back substitution ``U x = y``. Every step is one operation for the whole
+batch of matrices.
+"""
+
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rsvib_torch.core.in_order import making_views, subtract_products
-
-__all__ = [
-    "BandedFactor",
-    "BandedMemory",
-    "factor_banded",
-    "factor_skewed",
-    "runs_of_rows",
-    "skew_band",
-    "solve_banded",
-    "solve_factored",
-    "solve_skewed",
-]
+__all__ = ["BandedFactor", "factor_banded", "skew_band", "solve_banded", "solve_skewed"]
 
 
 @dataclass(frozen=True, eq=False)
 class BandedFactor:
-    """``A = L D L^H`` of a batch of banded matrices.
+    """``A = U^H D U`` of a batch of banded matrices.
 
     Attributes:
-        skewed: (K + b, 2 b + 1, S). Entry ``[j, b]`` of the first K rows is the diagonal of D, entries right of it
-            are row j of ``L^H``, entries ``[j + i, b - i]`` column j of ``L D``; the rest has no meaning.
-        inverse: (K, S), the diagonal of the inverse of D.
+        skewed: (K + b, 2 b + 1, S). Entry ``[j, b]`` of the first K rows is ``d_j``, ``[j, b + i]`` is ``U[j, j + i]``,
+            ``[j + i, b - i]`` is ``U[j, j + i]^* d_j``.
+        inverse: (K, S), ``1 / d_j``.
     """
 
     skewed: Tensor
     inverse: Tensor
-    _memories: dict[int, tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]] = field(default_factory=dict)
-
-    @property
-    def width(self) -> int:
-        """The half-width b of the band."""
-        return self.skewed.shape[1] // 2
 
     @property
     def pivots(self) -> Tensor:
-        """(K, S), the real diagonal of D."""
-        diagonal = self.skewed[: len(self.inverse), self.width]
+        """(K, S), the diagonal of D, real."""
+        diagonal = self.skewed[: len(self.inverse), self.skewed.shape[1] // 2]
         return diagonal.real if diagonal.is_complex() else diagonal
 
-    @cached_property
-    @making_views()
-    def _right(self) -> tuple[Tensor, ...]:
-        """Rows of ``L^H`` right of the diagonal, (b, 1, S) each."""
-        return self.skewed[: len(self.inverse), self.width + 1 :, None].unbind() if self.width else ()
-
-    @cached_property
-    @making_views()
-    def _above(self) -> tuple[Tensor, ...]:
-        return _columns(self.skewed, below=False)
-
     def solve(self, right_side: Tensor) -> Tensor:
-        """Solve ``A x = right_side`` for right sides (K, M, S), M of them per matrix."""
-        count, x, values, windows = len(self.inverse), *self._memory(right_side)
-        x[:count] = right_side.conj()
-        x[count:] = 0
-        if self.width:
-            subtract_products(windows[1:], self._right, values[:count])  # columns of the conjugate of L
-        if x.is_complex():
-            x.conj_physical_()
-        x[:count] *= self.inverse[:, None]
-        return self.substitute(x, values, windows, count).clone()
-
-    @making_views()
-    def _memory(self, right_side: Tensor) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """Memory for right sides like these, its rows, and every run of b of them: made once, for many solutions."""
-        number = right_side.shape[1]
-        if number not in self._memories:
-            x = right_side.new_empty(len(self.skewed), *right_side.shape[1:])
-            self._memories[number] = (x, x.unbind(), runs_of_rows(x, self.width))
-        return self._memories[number]
-
-    def substitute(self, x: Tensor, values: tuple[Tensor, ...], windows: tuple[Tensor, ...], count: int) -> Tensor:
-        """Solve ``L^H x' = x`` in place for right sides (K + b, M, S); returns the first rows.
-
-        Args:
-            x: Right sides, those beyond ``count`` rows 0.
-            values: Its rows.
-            windows: Every run of b of its rows.
-            count: Rows K, or fewer of a smaller system.
-        """
-        width = self.width
-        if width and count > width:
-            back = slice(count - 1 - width, None, -1)
-            subtract_products(windows[back], self._above[back], values[count - 1 : width - 1 : -1])
-        for j in range(min(width, count) - 1, 0, -1):
-            column = torch.stack([self.skewed[k, width + j - k] for k in range(j)])
-            x[:j].addcmul_(column[:, None], values[j], value=-1)
+        """Solve ``A x = right_side`` for right sides (K, M, S)."""
+        count, width = len(self.inverse), self.skewed.shape[1] // 2
+        if width == 0:
+            return right_side * self.inverse[:, None]
+        x = torch.cat([right_side, right_side.new_zeros(width, *right_side.shape[1:])])
+        rows = x[:count].unbind()
+        following = x[1:].unfold(0, width, 1).movedim(-1, 1).unbind()  # the b rows after each row
+        for value, inverse, column, after in zip(
+            rows, self.inverse.unbind(), _columns(self.skewed).unbind(), following, strict=True
+        ):
+            after.addcmul_(column, value.mul_(inverse), value=-1)
+        upper = self.skewed[:count, width + 1 :, None].unbind()
+        for value, row, after in zip(rows[::-1], upper[::-1], following[::-1], strict=True):
+            value.sub_((row * after).sum(0))
         return x[:count]
 
 
-def _with_rows(values: Tensor, count: int) -> Tensor:
-    return torch.cat([values, values.new_zeros(count, *values.shape[1:])])
+def _columns(skewed: Tensor) -> Tensor:
+    """Entries below the diagonal of every column, (K, b, 1, S): ``[j, i - 1]`` is ``A[j + i, j]``."""
+    width, (line, entry, _) = skewed.shape[1] // 2, skewed.stride()
+    shape = (len(skewed) - width, width, 1, skewed.shape[2])
+    return skewed.as_strided(
+        shape, (line, line - entry, entry, 1), skewed.storage_offset() + line + (width - 1) * entry
+    )
 
 
-def runs_of_rows(x: Tensor, width: int) -> tuple[Tensor, ...]:
-    """Every run of ``width`` rows of x (K + b, M, S)."""
-    step = x.stride()
-    shape = (len(x) - width + 1, width, *x.shape[1:])
-    return x.as_strided(shape, (step[0], *step), x.storage_offset()).unbind() if width else ()
-
-
-def _columns(full: Tensor, *, below: bool) -> tuple[Tensor, ...]:
-    """For every row j < K, what column j holds below, or column j + b above, the diagonal, (b, 1, S)."""
-    width = full.shape[1] // 2
-    if width == 0:
-        return ()
-    line, entry = full.stride(0), full.stride(1)
-    first = full.storage_offset() + (line + (width - 1) * entry if below else 2 * width * entry)
-    shape = (len(full) - width, width, 1, full.shape[2])
-    return full.as_strided(shape, (line, line - entry, entry, 1), first).unbind()
-
-
-class _Elimination:
-    """Views of every step of factoring matrices in their own memory, of ``factor_skewed``."""
-
-    @making_views()
-    def __init__(self, full: Tensor, right_side: Tensor | None) -> None:
-        width, size = full.shape[1] // 2, full.shape[2]
-        count = len(full) - width
-        pivots = full[:count, width]
-        self.factor = BandedFactor(full, torch.empty_like(pivots, memory_format=torch.contiguous_format))
-        self.right_side = right_side
-        self.values = () if right_side is None else right_side.unbind()
-        self.windows = () if right_side is None else runs_of_rows(right_side, width)
-        line, entry = full.stride(0), full.stride(1)
-        # the trailing window of every step: skewed, so that it is one strided view
-        first = full.storage_offset() + line + width * entry
-        shape, strides = (count, width, width, size), (line, line - entry, entry, 1)
-        self._steps = list(
-            zip(
-                pivots.unbind(),
-                self.factor.inverse.unbind(),
-                full[:count, width + 1 :].unbind(),
-                _columns(full, below=True),
-                full.as_strided(shape, strides, first).unbind() if width else (),
-                strict=False,  # none without a band
-            )
-        )
-
-    def run(self, count: int) -> BandedFactor:
-        """Factor what the first ``count`` rows of the memory hold now."""
-        if self.factor.width == 0:
-            torch.reciprocal(self.factor.skewed[:, 0], out=self.factor.inverse)
-            if self.right_side is not None:
-                self.right_side.mul_(self.factor.inverse[:, None])
-            return self.factor
-        values, windows = self.values, self.windows
-        for j, (pivot, inverse, row, column, trailing) in enumerate(self._steps[:count]):
+def factor_banded(skewed: Tensor) -> BandedFactor:
+    """Factor Hermitian positive definite matrices (K + b, 2 b + 1, S) as from ``skew_band`` in their own memory."""
+    width, (line, entry, _) = skewed.shape[1] // 2, skewed.stride()
+    count = len(skewed) - width
+    pivots = skewed[:count, width]
+    factor = BandedFactor(skewed, pivots.reciprocal())
+    if width:
+        # the b x b entries that step j changes are one strided view, because row j + 1 begins one column further right
+        shape, strides = (count, width, width, skewed.shape[2]), (line, line - entry, entry, 1)
+        trailing = skewed.as_strided(shape, strides, skewed.storage_offset() + line + width * entry)
+        steps = (pivots, factor.inverse, skewed[:count, width + 1 :], _columns(skewed), trailing)
+        for pivot, inverse, row, column, rest in zip(*(values.unbind() for values in steps), strict=True):
             torch.reciprocal(pivot, out=inverse)
-            trailing.addcmul_(column, row.mul_(inverse), value=-1)
-            if values:
-                windows[j + 1].addcmul_(column, values[j].mul_(inverse), value=-1)
-        return self.factor
-
-
-def factor_skewed(full: Tensor, right_side: Tensor | None = None) -> BandedFactor:
-    """Factor Hermitian positive definite matrices in their own memory.
-
-    Args:
-        full: (K + b, 2 b + 1, S) as from ``skew_band``, contiguous; overwritten.
-        right_side: (K + b, M, S) whose last b rows are 0; overwritten with ``(L D)^-1`` times it.
-
-    Returns:
-        The factors.
-    """
-    return _Elimination(full, right_side).run(len(full) - full.shape[1] // 2)
-
-
-class BandedMemory:
-    """Memory for systems of one size, with views of every step of solving them: made once, for many systems.
-
-    The views cost as much as the arithmetic.
-
-    Args:
-        rows: Rows K of the largest systems.
-        width: Half-width b of the band.
-        right_sides: Right sides M of each matrix; 0 where only factors are wanted.
-        batch: Matrices S that are solved at a time.
-        like: A tensor of the dtype and on the device of the systems.
-
-    Attributes:
-        full: (K + b, 2 b + 1, S), the first rows of which are to hold systems as from ``skew_band``.
-        right_side: (K + b, M, S), likewise.
-    """
-
-    def __init__(self, rows: int, width: int, right_sides: int, batch: int, like: Tensor) -> None:
-        self.full = like.new_empty(rows + width, 2 * width + 1, batch)
-        self.right_side = like.new_empty(rows + width, right_sides, batch)
-        self._elimination = _Elimination(self.full, self.right_side if right_sides else None)
-
-    def holds(self, rows: int, width: int, right_sides: int, batch: int) -> bool:
-        """Whether systems of so many rows can be solved in it."""
-        same = self.full.shape[1:] == (2 * width + 1, batch) and self.right_side.shape[1] == right_sides
-        return same and len(self.full) - width >= rows
-
-    def factor(self, rows: int) -> BandedFactor:
-        """Factor the systems of so many rows that the memory holds, in it."""
-        factor, width = self._elimination.run(rows), self.full.shape[1] // 2
-        return BandedFactor(factor.skewed[: rows + width], factor.inverse[:rows])
-
-    def solve(self, rows: int) -> Tensor:
-        """Solve the systems of so many rows that the memory holds; returns a part of ``right_side``."""
-        elimination = self._elimination
-        self.right_side[rows : rows + self.full.shape[1] // 2] = 0
-        factor = elimination.run(rows)
-        return factor.substitute(self.right_side, elimination.values, elimination.windows, rows)
+            rest.addcmul_(column, row.mul_(inverse), value=-1)
+    return factor
 
 
 def skew_band(band: Tensor) -> Tensor:
     """Both sides of Hermitian bands, row by row.
 
     Args:
-        band: Lower band (K, b + 1, S), ``band[k, d] = A[k + d, k]``; entries that would lie below the last row are
-            not read. Real or complex; the batch S comes last, so that each step works on contiguous memory.
+        band: Lower band (K, b + 1, S), ``band[k, d] = A[k + d, k]``; entries below the last row are not read. Real or
+            complex; the batch S comes last, so that each step works on contiguous memory.
 
     Returns:
         (K + b, 2 b + 1, S), ``[k, b + d] = A[k, k + d]``.
     """
     count, diagonals, size = band.shape
     width = diagonals - 1
-    full = band.new_zeros(count + width, 2 * width + 1, size)
-    full[:count, width] = band[:, 0].real if band.is_complex() else band[:, 0]
+    skewed = band.new_zeros(count + width, 2 * width + 1, size)
+    skewed[:count, width] = band[:, 0].real if band.is_complex() else band[:, 0]
     for d in range(1, min(diagonals, count)):
-        full[d:count, width - d] = band[: count - d, d]
-        full[: count - d, width + d] = band[: count - d, d].conj()
-    return full
-
-
-def factor_banded(band: Tensor) -> BandedFactor:
-    """Factor Hermitian positive definite bands, laid out as in ``skew_band``.
-
-    In the skewed storage the trailing window of an elimination step is one strided view, its update one call for the
-    whole batch.
-    """
-    return factor_skewed(skew_band(band))
+        skewed[d:count, width - d] = band[: count - d, d]
+        skewed[: count - d, width + d] = band[: count - d, d].conj()
+    return skewed
 
 
 class _Solve(torch.autograd.Function):
-    """Solve; the backward pass of a Hermitian solve is the same solve."""
+    """Solve; the gradients of ``x = A^-1 g`` are ``A^-1 dx`` for g and ``-(A^-1 dx) x^H`` for A."""
 
     @staticmethod
-    def forward(ctx: Any, full: Tensor, right_side: Tensor) -> Tensor:
-        x = _with_rows(right_side, full.shape[1] // 2)
-        elimination = _Elimination(full.clone() if ctx.needs_input_grad[0] else full, x)
-        count = len(right_side)
-        factor = elimination.run(count)
-        solution = factor.substitute(x, elimination.values, elimination.windows, count)
-        ctx.save_for_backward(factor.skewed, factor.inverse, solution)
+    def forward(ctx: Any, skewed: Tensor, right_side: Tensor, factor: BandedFactor | None) -> Tensor:
+        if factor is None:
+            factor = factor_banded(skewed.clone() if ctx.needs_input_grad[0] else skewed)
+        solution = factor.solve(right_side)
+        if any(ctx.needs_input_grad):
+            ctx.save_for_backward(factor.skewed, factor.inverse, solution)
         return solution
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor, None]:
         skewed, inverse, x = ctx.saved_tensors
-        factor = BandedFactor(skewed, inverse)
-        adjoint = factor.solve(gradient)
+        adjoint = BandedFactor(skewed, inverse).solve(gradient)
         if not ctx.needs_input_grad[0]:
-            return None, adjoint
-        width, count = factor.width, len(inverse)
-        full = torch.zeros_like(skewed)
+            return None, adjoint, None
+        width, count = skewed.shape[1] // 2, len(inverse)
+        of_matrix = torch.zeros_like(skewed)
         for d in range(-min(width, count - 1), min(width, count - 1) + 1):
             rows = slice(max(0, -d), min(count, count - d))
             columns = slice(max(0, d), min(count, count + d))
-            full[rows, width + d] = -(adjoint[rows] * x[columns].conj()).sum(1)
-        return full, adjoint
+            of_matrix[rows, width + d] = -(adjoint[rows] * x[columns].conj()).sum(1)
+        return of_matrix, adjoint, None
 
 
-class _SolveAgain(torch.autograd.Function):
-    """Solve with factors at hand, that have no gradient."""
-
-    @staticmethod
-    def forward(ctx: Any, factor: BandedFactor, right_side: Tensor) -> Tensor:
-        ctx.factor = factor
-        return factor.solve(right_side)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor]:
-        return None, ctx.factor.solve(gradient)
-
-
-def solve_factored(factor: BandedFactor, right_side: Tensor) -> Tensor:
-    """Solve ``A x = right_side`` (K, M, S) with the factors of A, differentiably in the right sides."""
-    solution: Tensor = _SolveAgain.apply(factor, right_side)  # type: ignore[no-untyped-call]
-    return solution
-
-
-def solve_skewed(full: Tensor, right_side: Tensor) -> Tensor:
-    """Solve Hermitian positive definite systems laid out by rows, differentiably.
+def solve_skewed(system: Tensor | BandedFactor, right_side: Tensor) -> Tensor:
+    """Solve Hermitian positive definite systems, differentiably.
 
     Args:
-        full: (K + b, 2 b + 1, S) as from ``skew_band``, contiguous; its memory is used up unless its gradient is asked
-            for.
+        system: (K + b, 2 b + 1, S) as from ``skew_band``, overwritten unless its gradient is required; or its factors,
+            for solving several times, through which no gradient flows.
         right_side: (K, M, S), M right sides per matrix.
 
     Returns:
         Solutions (K, M, S).
     """
-    solution: Tensor = _Solve.apply(full, right_side)  # type: ignore[no-untyped-call]
+    factor = system if isinstance(system, BandedFactor) else None
+    skewed = system.skewed if isinstance(system, BandedFactor) else system
+    solution: Tensor = _Solve.apply(skewed, right_side, factor)  # type: ignore[no-untyped-call]
     return solution
 
 
@@ -326,7 +161,5 @@ def solve_banded(band: Tensor, right_side: Tensor) -> Tensor:
         >>> solve_banded(band, torch.tensor([[3.0], [4.0], [3.0]])).flatten().round(decimals=4)
         tensor([1., 1., 1.])
     """
-    shape = (*band.shape[:2], -1)
-    return solve_skewed(skew_band(band.reshape(shape)), right_side.reshape(*right_side.shape[:2], -1)).reshape(
-        right_side.shape
-    )
+    skewed = skew_band(band.reshape(*band.shape[:2], -1))
+    return solve_skewed(skewed, right_side.reshape(*right_side.shape[:2], -1)).reshape(right_side.shape)

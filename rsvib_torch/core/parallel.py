@@ -1,28 +1,27 @@
-"""Independent pieces of work on all cores, where one operation after the other would keep but one of them busy."""
+"""Independent pieces of work in parallel threads, for sequences of operations too short to use all cores."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from threading import Lock
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import torch
 
-__all__ = ["MadeOnce", "in_parallel"]
+__all__ = ["in_parallel"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 def in_parallel(work: Callable[[Item], Result], items: Iterable[Item], device: torch.device) -> list[Result]:
-    """Do some work for every item, on a CPU in as many threads as PyTorch may use; nothing is differentiated.
+    """Call a function for every item, on a CPU in as many threads as PyTorch may use, without gradients.
 
-    The threads share what PyTorch may use for each operation. On other devices, or where one thread is allowed, it is
-    a plain loop.
+    The threads share the number of threads that PyTorch may use within each operation. On other devices, or with one
+    thread, it is a plain loop.
 
     Args:
-        work: Called with every item; must not write what another call reads.
+        work: Called with every item; must not write to memory that another call reads.
         items: The items.
-        device: Where the tensors are.
+        device: Device of the tensors.
 
     Returns:
         The results, in the order of the items.
@@ -50,59 +49,18 @@ def in_parallel(work: Callable[[Item], Result], items: Iterable[Item], device: t
                     results[place] = work(item)
                 except BaseException as error:
                     errors[place] = error
-                    for _ in waiting:  # nobody begins another
+                    for _ in waiting:  # no thread begins another item
                         pass
 
     try:
-        # a pool of its own: one that is kept would not survive a fork. This thread does its share: what it frees is
-        # kept for the next call, while the C library may give back what others held
+        # a new pool each time, because a kept one would not survive a fork; this thread takes part, because the C
+        # library keeps the memory that it frees for the next call, but may return that of other threads
         with ThreadPoolExecutor(threads - 1) as pool:
             for _ in range(threads - 1):
                 pool.submit(take_part)
             take_part()
     finally:
-        torch.set_num_threads(allowed)  # what threads begin with that are started later
+        torch.set_num_threads(allowed)  # the initial value of threads that are started later
     if errors:
         raise errors[min(errors)]
     return [results[place] for place in range(len(items))]
-
-
-class MadeOnce(Generic[Result]):
-    """What several threads need, made by the first of them, while the others do what they can without it.
-
-    Made by many short calls from Python, for each of which threads would wait for one another, so that with a lock in
-    common only one of several such things is made at a time.
-
-    Args:
-        make: Makes it.
-        lock: Held meanwhile.
-
-    Example:
-        >>> squares = MadeOnce(lambda: [n * n for n in range(4)], Lock())
-        >>> squares.begin()  # now, unless something else is being made
-        >>> squares.get()
-        [0, 1, 4, 9]
-    """
-
-    def __init__(self, make: Callable[[], Result], lock: Lock) -> None:
-        self._make, self._lock = make, lock
-        self._made: list[Result] = []
-
-    def begin(self) -> None:
-        """Make it, unless the lock is held; then it is made when it is asked for."""
-        if not self._made and self._lock.acquire(blocking=False):
-            try:
-                self._complete()
-            finally:
-                self._lock.release()
-
-    def get(self) -> Result:
-        """The thing, made now if it was not yet."""
-        if not self._made:
-            with self._lock:
-                self._complete()
-        return self._made[0]
-
-    def _complete(self) -> None:
-        if not self._made:
-            self._made.append(self._make())

@@ -18,12 +18,12 @@ from benchmarks.restoration import MARGIN, SEED, TIMED_NOISE, camera, vibration
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.restoration import exact, prior
-from rsvib_torch.restoration.exact.interpolated_solver import NodeFactors
-from rsvib_torch.restoration.exact.partition import Partition
+from rsvib_torch.restoration.exact import exact
+from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import frame_motion
+from rsvib_torch.restoration.scene_model.observation import Observation, row_kernels, smooth_kernels
 from rsvib_torch.restoration.scene_model.row_kernel import scene_weights
-from rsvib_torch.restoration.scene_model.row_system import row_kernels, smooth_band, smooth_kernels
+from rsvib_torch.restoration.scene_model.row_prior import ORDER
 
 REAL, COMPLEX = 4, 8  # bytes
 COPIED = 1 << 28  # bytes copied to measure the bandwidth
@@ -45,8 +45,6 @@ class Shapes:
         kernel_terms: Terms that kernels are put together from at each frequency.
         band_terms: Terms that entries of the band are put together from.
         chunks: Parts that the frequencies are solved in.
-        nodes: Frequencies that are factored; the factors of all others lie between theirs.
-        mixed: Products of which each entry of those factors is made, for all frequencies together.
     """
 
     rows: int
@@ -59,8 +57,6 @@ class Shapes:
     kernel_terms: int
     band_terms: int
     chunks: int
-    nodes: int
-    mixed: int
 
 
 def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibration, device: str = "cpu") -> Shapes:
@@ -70,31 +66,24 @@ def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibrat
     starts = motion.row_starts(torch.arange(height, dtype=torch.float64)).expand(1, 1, height)
     moved, weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
     length = exact.scene_period(width, motion.reach(height), moved)
-    kernels = row_kernels(moved[0], weights, torch.ones(1), height, exact._MARGIN)
-    seen, order = kernels.scene_rows(height), prior.ORDER
-    band = smooth_band(kernels, seen, max(kernels.taps.shape[-2] - 1, order), order, torch.float32)
+    kernels = row_kernels(moved[0], weights, torch.ones(1), height, 16)
+    observation = Observation(kernels, height, torch.float32)
+    band = observation.band(ORDER)
     frequencies = length // 2 + 1
-    shares = Partition().of(
-        seen.count, band.width, length, torch.device(device), kernels.reach, blurred=kernels.blurred
+    parts, _ = Partition().divide(
+        observation.count, band.width, frequencies, torch.device(device), blurred=kernels.blurred, keep=False
     )
-    nodes = torch.arange(frequencies) if shares.nodes is None else shares.nodes.cpu()
-    factors, mixed = NodeFactors(nodes, torch.empty(0), torch.empty(0)), 0
-    if shares.nodes is not None:
-        for part in shares.parts(frequencies):
-            mixed += sum(matrix.numel() for _, _, matrix in factors.between(part.start, part.stop)[0])
     return Shapes(
         rows=height,
         columns=width,
         length=length,
         frequencies=frequencies,
-        unknowns=seen.count,
+        unknowns=observation.count,
         taps=kernels.taps.shape[-2],
         width=band.width,
         kernel_terms=smooth_kernels(kernels, torch.float32).left.shape[-1],
         band_terms=band.left.shape[-1],
-        chunks=math.ceil(frequencies / shares.chunk),
-        nodes=len(nodes),
-        mixed=mixed,
+        chunks=len(parts),
     )
 
 
@@ -106,10 +95,7 @@ def steps(s: Shapes) -> list[dict[str, Any]]:
     transform = 2.5 * s.rows * s.length * math.log2(s.length)
     kernels = REAL * s.rows * s.taps * s.kernel_terms
     entries = (s.unknowns + b) * (2 * b + 1)
-    band, terms = COMPLEX * entries * s.nodes, REAL * entries * s.band_terms
-    at_nodes = s.unknowns * s.nodes
-    factored, updates = ("factors", b * (b + 2)) if s.nodes == s.frequencies else ("factors of some", b * (b + 1))
-    sides = solution if s.nodes == s.frequencies else 0  # eliminated along with the factors
+    band, terms = COMPLEX * entries * s.frequencies, REAL * entries * s.band_terms
     shared = len(scene_weights())
     counted = [
         ("Fourier transform of rows", transform, frame + spectrum, frame + 2 * period + spectrum),
@@ -119,14 +105,10 @@ def steps(s: Shapes) -> list[dict[str, Any]]:
             kernels + spectrum + solution,
             6 * spectrum + s.taps * 7 * spectrum + s.chunks * kernels + 2 * solution,
         ),
-        ("bands", 4 * entries * s.band_terms * s.nodes, terms + band, s.chunks * terms + band),
-        (
-            factored,
-            8 * updates * at_nodes,
-            2 * band + 2 * sides,
-            2 * b * (b + 2) * COMPLEX * at_nodes + 3 * b * sides,
-        ),
-        *_substitution(s, solution, unknowns),
+        ("bands", 4 * entries * s.band_terms * s.frequencies, terms + band, s.chunks * terms + band),
+        ("factors", 8 * b * (b + 1) * unknowns, 2 * band, 2 * b * (b + 2) * solution),
+        ("forward substitution", (8 * b + 2) * unknowns, (b + 2) * solution, (3 * b + 3) * solution),
+        ("back substitution", 8 * b * unknowns, (b + 2) * solution, (4 * b + 2) * solution),
         (
             "scene between its rows",
             4 * shared * values,
@@ -138,20 +120,6 @@ def steps(s: Shapes) -> list[dict[str, Any]]:
     return [
         {"part": "step", "step": name, "operations": operations, "bytes_least": least, "bytes_moved": moved}
         for name, operations, least, moved in counted
-    ]
-
-
-def _substitution(s: Shapes, solution: float, unknowns: int) -> list[tuple[str, float, float, float]]:
-    """What follows the factors: back substitution, and before it, where only some are factored, all factors twice."""
-    b = s.width
-    back = ("back substitution", 8 * b * unknowns, (b + 2) * solution, (3 * b + 1) * solution)
-    if s.nodes == s.frequencies:
-        return [back]
-    nodes, all_ = COMPLEX * s.unknowns * b * s.nodes, b * solution
-    return [
-        ("factors of all, twice", 4 * s.unknowns * b * s.mixed, nodes, 2 * (nodes + all_)),
-        ("forward substitution", (8 * b + 2) * unknowns, 2 * solution, (3 * b + 3) * solution),
-        ("back substitution", 8 * b * unknowns, 2 * solution, (3 * b + 1) * solution),
     ]
 
 
@@ -210,7 +178,7 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
     }
     text = [
         f'Roofline of restore(method="exact"), one frame of {options.size} x {options.size} px: '
-        f"{shapes['frequencies']} systems ({shapes['nodes']} of them factored) of {shapes['unknowns']} unknowns, "
+        f"{shapes['frequencies']} systems of {shapes['unknowns']} unknowns, "
         f"half-width of the band {shapes['width']}. "
         "At best: least bytes at the rate of copying, or operations at that of multiplying matrices, whichever takes "
         "longer; the rates are measured in the same run.",

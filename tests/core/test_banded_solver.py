@@ -1,13 +1,9 @@
-import gc
-from itertools import pairwise
-
 import numpy as np
 import pytest
 import torch
 from scipy.linalg import solveh_banded
 
-from rsvib_torch.core.banded_solver import BandedMemory, factor_banded, skew_band, solve_banded, solve_skewed
-from rsvib_torch.restoration.scene_model.segments import Segments
+from rsvib_torch.core.banded_solver import factor_banded, skew_band, solve_banded, solve_skewed
 
 
 def random_system(count, width, *, dtype=torch.complex128, batch=(3,), columns=2, seed=0):
@@ -35,7 +31,8 @@ def test_pivots_give_the_determinant():
     for d in range(3):
         for k in range(6 - d):
             dense[k + d, k], dense[k, k + d] = band[k, d, 0], band[k, d, 0].conj()
-    assert factor_banded(band).pivots.log().sum().item() == pytest.approx(torch.logdet(dense).real.item(), rel=1e-12)
+    pivots = factor_banded(skew_band(band)).pivots
+    assert pivots.log().sum().item() == pytest.approx(torch.logdet(dense).real.item(), rel=1e-12)
 
 
 def test_single_precision_residual():
@@ -63,73 +60,29 @@ def test_gradients(dtype):
     assert torch.autograd.gradcheck(solve, (band.requires_grad_(), right_side.requires_grad_()))
 
 
-def solved_in(segments, band, right_side):
-    width = band.shape[1] - 1
-    windows = segments.split(skew_band(band)[: len(band)]).flatten(-2)
-    full = torch.cat([windows, windows.new_zeros(width, *windows.shape[1:])])
-    solved = solve_skewed(full, segments.split(right_side).flatten(-2))
-    return segments.join(solved.unflatten(-1, (-1, band.shape[-1])))
+@pytest.mark.parametrize("width", [0, 2])
+def test_solving_again_with_kept_factors(width):
+    band, right_side = random_system(7, width)
+    factor = factor_banded(skew_band(band))
+    expected = solve_banded(band, right_side)
+    for _ in range(2):
+        torch.testing.assert_close(solve_skewed(factor, right_side), expected)
+    assert torch.autograd.gradcheck(lambda columns: solve_skewed(factor, columns), (right_side.requires_grad_(),))
 
 
-@pytest.mark.parametrize("count", [2, 3, 7])
-def test_overlapping_segments_agree_with_scipy(count):
-    rows, width = 211, 3
-    band, right_side = random_system(rows, width)
-    segments = Segments(rows, count, overlap=24)
-    assert not segments.whole
-    found = solved_in(segments, band, right_side)
-    for index in range(3):
-        expected = solveh_banded(band[..., index].numpy().T.copy(), right_side[..., index].numpy(), lower=True)
-        np.testing.assert_allclose(found[..., index].numpy(), expected, rtol=0, atol=1e-8)
-    wrong = solved_in(Segments(rows, count, overlap=1), band, right_side)
-    assert (wrong - found).abs().max() > 1e-6
-
-
-def test_segments_that_overlap_everywhere_are_one():
-    assert Segments(100, 1).whole
-    assert Segments(100, 4, 96).whole
-    values = torch.rand(100, 2, 3)
-    assert torch.equal(Segments(100, 4, 96).join(Segments(100, 4, 96).split(values)), values)
-
-
-@pytest.mark.parametrize(("rows", "count", "overlap"), [(211, 3, 24), (97, 2, 8), (1000, 7, 60), (101, 4, 0)])
-def test_windows_of_one_size_cover_all_rows(rows, count, overlap):
-    segments = Segments(rows, count, overlap)
-    windows = segments.windows
-    assert (windows[0].start, windows[-1].stop, len(windows)) == (0, rows, count)
-    assert {window.stop - window.start for window in windows} == {segments.size}
-    shared = [before.stop - after.start for before, after in pairwise(windows)]
-    assert min(shared) >= 2 * overlap
-    assert segments.size <= (rows + 2 * overlap * (count - 1)) / count + 1
-    values = torch.arange(rows * 6.0).reshape(rows, 2, 3)
-    assert torch.equal(segments.join(segments.split(values)), values)
-
-
-@pytest.mark.parametrize("width", [0, 1, 5])
-def test_memory_serves_smaller_systems_too(width):
-    band, right_side = random_system(40, width)
-    memory = BandedMemory(40, width, 2, 3, right_side)
-    for rows in (40, 13, 40, 29):  # what a larger system left does not matter
-        memory.full[: rows + width] = skew_band(band[:rows])
-        memory.right_side[:rows] = right_side[:rows]
-        torch.testing.assert_close(memory.solve(rows), solve_banded(band[:rows], right_side[:rows]))
-    assert memory.holds(29, width, 2, 3)
-    assert not memory.holds(41, width, 2, 3)
-    assert not memory.holds(29, width, 1, 3)
-    assert not memory.holds(29, width + 1, 2, 3)
-
-
-def test_views_are_made_without_a_search_for_garbage():
-    runs = []
-    gc.callbacks.append(lambda phase, info: runs.append(phase) if phase == "start" else None)
-    try:
-        memory = BandedMemory(3000, 4, 1, 2, torch.zeros(1))
-        assert len(runs) <= 2  # one that was due, before it
-        assert gc.isenabled()
-        gc.disable()
-        assert memory.holds(3000, 4, 1, 2)
-        BandedMemory(30, 4, 1, 2, torch.zeros(1))
-        assert not gc.isenabled()  # stays as it was
-    finally:
-        gc.enable()
-        gc.callbacks.pop()
+@pytest.mark.parametrize("width", [1, 4])
+def test_values_and_gradients_agree_with_a_dense_solution(width):
+    band, right_side = random_system(9, width, batch=(1,))
+    results = []
+    for dense in (False, True):
+        entries, columns = band.clone().requires_grad_(), right_side.clone().requires_grad_()
+        if dense:
+            lower = sum(torch.diag(entries[: 9 - d, d, 0], -d) for d in range(1, width + 1))
+            matrix = torch.diag(entries[:, 0, 0].real + 0j) + lower + lower.mH
+            solution = torch.linalg.solve(matrix, columns[..., 0])[..., None]
+        else:
+            solution = solve_banded(entries, columns)
+        gradients = torch.autograd.grad(solution.abs().square().sum(), (entries, columns))
+        results.append((solution, *gradients))
+    for found, expected in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected)

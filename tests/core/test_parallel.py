@@ -3,7 +3,7 @@ import threading
 import pytest
 import torch
 
-from rsvib_torch.core.parallel import MadeOnce, in_parallel
+from rsvib_torch.core.parallel import in_parallel
 
 CPU = torch.device("cpu")
 
@@ -16,7 +16,7 @@ def two_threads():
     torch.set_num_threads(before)
 
 
-def test_items_are_worked_on_side_by_side(two_threads):
+def test_items_are_processed_in_parallel(two_threads):
     both = threading.Barrier(2, timeout=20)  # two calls at once, or it breaks
 
     def work(item):
@@ -57,7 +57,7 @@ def test_the_caller_takes_part(two_threads):
     assert threading.main_thread() in in_parallel(work, range(2), CPU)
 
 
-def test_errors_come_out_and_nothing_else_begins(two_threads):
+def test_errors_are_raised_and_no_further_item_begins(two_threads):
     both, begun = threading.Barrier(2, timeout=20), []
 
     def fail(item):
@@ -69,50 +69,3 @@ def test_errors_come_out_and_nothing_else_begins(two_threads):
         in_parallel(fail, range(9), CPU)
     assert sorted(begun) == [0, 1]
     assert torch.get_num_threads() == 2
-
-
-def test_threads_share_what_one_of_them_makes(two_threads):
-    lock, making, made = threading.Lock(), threading.Event(), []
-    others_turn = threading.Event()
-
-    def make():
-        making.set()
-        assert others_turn.wait(timeout=20)
-        made.append(threading.current_thread())
-        return len(made)
-
-    thing, another = MadeOnce(make, lock), MadeOnce(lambda: "another", lock)
-
-    def work(item):
-        if item == 0:
-            thing.begin()
-        else:
-            assert making.wait(timeout=20)
-            thing.begin()  # comes back at once: the other is at it
-            another.begin()
-            assert not another._made
-            assert not made
-            others_turn.set()
-        return thing.get()
-
-    assert in_parallel(work, range(2), CPU) == [1, 1]
-    assert len(made) == 1
-    assert another.get() == "another"
-    assert not lock.locked()
-
-
-def test_what_could_not_be_made_is_tried_again():
-    def make():
-        tries.append(1)
-        if len(tries) < 3:
-            raise ValueError("not yet")
-        return "made"
-
-    tries, lock = [], threading.Lock()
-    thing = MadeOnce(make, lock)
-    for attempt in (thing.begin, thing.get):
-        with pytest.raises(ValueError, match="not yet"):
-            attempt()
-        assert not lock.locked()
-    assert thing.get() == thing.get() == "made"
-    assert len(tries) == 3

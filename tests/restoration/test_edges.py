@@ -8,7 +8,7 @@ from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
 from rsvib_torch.restoration import restore as restore_by_any_method
-from rsvib_torch.restoration.exact.edge_prior import shrink_patches
+from rsvib_torch.restoration.exact.priors import shrink_patches
 
 restore = partial(restore_by_any_method, method="exact", check=False)
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)

@@ -8,12 +8,13 @@ from scipy import ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch.restoration.exact.exact as exact_module
-import rsvib_torch.restoration.exact.partition as partition_module
 from rsvib_torch import SensorTiming, Vibration, psnr, simulate_frames
 from rsvib_torch.evaluation.scenes import city_and_fields
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
-from rsvib_torch.restoration.exact.partition import Partition
+from rsvib_torch.restoration.exact import scene_solver
+from rsvib_torch.restoration.exact.priors import PRIORS
+from rsvib_torch.restoration.exact.scene_solver import Partition
 
 restore = partial(restore_by_any_method, method="exact")
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -293,7 +294,8 @@ def test_segments_of_rows_change_nothing(short, joint, monkeypatch):
                 frames, TIMING, motion.vibration(), segments=3, chunk_frequencies=chunk, check=False, joint=joint
             )
             torch.testing.assert_close(again, whole.detach(), rtol=0, atol=2e-5)
-    monkeypatch.setattr(partition_module, "_OVERLAP", 2)
+    windows = scene_solver.row_windows
+    monkeypatch.setattr(scene_solver, "row_windows", lambda rows, count: windows(rows, count, overlap=2))
     careless = restore(frames, TIMING, motion.vibration(), segments=3, check=False, joint=joint)
     assert (careless - whole).abs().max() > 1e-3
 
@@ -306,14 +308,14 @@ def test_tall_frames_are_split_only_where_rows_depend_on_near_ones(exposure, mon
     scene = city_and_fields(1200 + 96, 64 + 96, seed=4)
     frames = simulate_frames(scene, timing, vibration, 1, frame_size=(1200, 64))
     counts = []
-    segments_of = Partition.of
+    divide = Partition.divide
 
     def counted(*arguments, **options):
-        shares = segments_of(*arguments, **options)
-        counts.append(len(shares.segments.windows))
-        return shares
+        parts, windows = divide(*arguments, **options)
+        counts.append(len(windows))
+        return parts, windows
 
-    monkeypatch.setattr(Partition, "of", counted)
+    monkeypatch.setattr(Partition, "divide", counted)
     whole = restore(frames, timing, vibration, segments=1, check=False)
     assert set(counts) == {1}
     for options in ({}, {"segments": 4}):
@@ -339,3 +341,22 @@ def test_gradients_through_filled_pixels_and_ends(joint):
 
     values = tuple(value.clone().requires_grad_() for value in inputs)
     assert torch.autograd.gradcheck(run, values, fast_mode=True)
+
+
+def test_a_prior_is_added_by_one_entry_of_the_table(short, monkeypatch):
+    _, frames, motion = short
+    frames = noisy(frames[:1, :96, :80], 0.005, dtype=torch.float64)
+    options = []
+
+    def toy(problem, chosen):
+        """Only the mean brightness."""
+        options.append(chosen)
+        return torch.zeros_like(problem.data[0])
+
+    monkeypatch.setitem(PRIORS, "toy", toy)
+    restored = restore(frames, TIMING, motion.vibration(), prior="toy", regularisation=2.0)
+    assert options[0].regularisation == 2.0
+    assert (restored - restored.mean()).abs().max() < 1e-12
+    monkeypatch.delitem(PRIORS, "toy")
+    with pytest.raises(ValueError, match="prior must be one of 'gaussian', 'edges'; got 'toy'"):
+        restore(frames, TIMING, motion.vibration(), prior="toy")

@@ -9,8 +9,8 @@ from scipy import ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
-from rsvib_torch.restoration import exact
 from rsvib_torch.restoration import restore as restore_by_any_method
+from rsvib_torch.restoration.exact import exact
 from rsvib_torch.restoration.frame_motion import frame_motion
 from rsvib_torch.restoration.scene_model.row_prior import fit_prior
 

@@ -1,245 +1,228 @@
-"""One scene and the frames that see it: the fast solution, and what a solution predicts."""
+"""One scene and its frames: regularised least squares, one banded system per horizontal frequency.
 
-from collections.abc import Callable
+The coefficients c of the scene minimise ``sum_m w_m |g_m - K_m c|^2 + c^H P c`` with the data g_m, the observation
+operators K_m, the weights w_m and the precision matrix P of a prior. The normal equations
+
+    (sum_m K_m^H w_m K_m + P) c = sum_m K_m^H w_m g_m
+
+are banded, Hermitian and positive definite for every horizontal frequency.
+"""
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from math import prod
 
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.banded_solver import BandedFactor, factor_skewed, solve_factored, solve_skewed
+from rsvib_torch.core.banded_solver import BandedFactor, factor_banded, solve_skewed
 from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.parallel import MadeOnce, in_parallel
+from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.core.short_filters import correlated
-from rsvib_torch.restoration.exact.interpolated_solver import NodeFactors
-from rsvib_torch.restoration.exact.partition import Partition
-from rsvib_torch.restoration.scene_model.observation import SeenScene
+from rsvib_torch.restoration.scene_model.observation import Observation
 from rsvib_torch.restoration.scene_model.row_kernel import SCENE_REACH, scene_weights
-from rsvib_torch.restoration.scene_model.row_sums import sum_looked_up
 
-__all__ = ["Coefficients", "SceneSolver"]
+__all__ = ["Partition", "SceneProblem", "SceneSolver", "join_windows", "row_windows"]
 
-_ROWS = {"cpu": 128}  # of the scene at a time: they stay in the cache
 
-Coefficients = list[Tensor]  # (K, C, U') for each chunk of frequencies
-SolvePart = Callable[[int, slice, Tensor | None], Tensor]  # thread, chunk of frequencies, pull: its coefficients
+def row_windows(rows: int, count: int, overlap: int = 96) -> list[slice]:
+    """Windows of one size that cover all rows, neighbours overlapping by at least twice ``overlap`` rows.
+
+    The dependence of a solution on distant rows decreases exponentially: windows are solved side by side, and the rows
+    of the overlap are discarded. With 96 rows the solution changes by about 1e-5 unless the exposure blurs.
+
+    Example:
+        >>> row_windows(10, 2, overlap=1)
+        [slice(0, 6, None), slice(4, 10, None)]
+    """
+    size = -(-(rows + 2 * overlap * (count - 1)) // count)
+    if count <= 1 or size >= rows:
+        return [slice(0, rows)]
+    starts = [min(k * (size - 2 * overlap), rows - size) for k in range(count)]
+    return [slice(start, start + size) for start in starts]
+
+
+def join_windows(values: Tensor, windows: list[slice]) -> Tensor:
+    """Windows (R, ..., n, S) of rows joined in the middle of their overlaps, (K, ..., S)."""
+    if len(windows) == 1:
+        return values[..., 0, :]
+    borders = [0, *((before.stop + after.start) // 2 for before, after in pairwise(windows)), windows[-1].stop]
+    parts = zip(windows, pairwise(borders), strict=True)
+    return torch.cat([values[a - w.start : b - w.start, ..., k, :] for k, (w, (a, b)) in enumerate(parts)])
+
+
+@dataclass(eq=False)
+class Partition:
+    """Which parts of the systems of a scene are solved at a time, in memory that is used again.
+
+    Attributes:
+        chunk: Frequencies solved at a time; None: chosen by memory.
+        segments: Number of windows of rows; None: as many as make a step of the elimination worth its call.
+    """
+
+    chunk: int | None = None
+    segments: int | None = None
+    _buffers: dict[int, Tensor] = field(default_factory=dict)
+
+    @staticmethod
+    def threads(device: torch.device) -> int:
+        """Chunks that are solved side by side; more than two threads wait for each other's calls from Python."""
+        return min(torch.get_num_threads(), 2) if device.type == "cpu" else 1
+
+    def divide(
+        self, rows: int, width: int, frequencies: int, device: torch.device, *, blurred: bool, keep: bool
+    ) -> tuple[list[slice], list[slice]]:
+        """Chunks of the frequencies, and windows of the rows of a scene.
+
+        Args:
+            rows: Rows of the scene.
+            width: Half-width of the band.
+            frequencies: Number of frequencies.
+            device: Device of the data.
+            blurred: Whether exposures blur: frequencies that many neighbouring rows do not observe then depend on
+                distant rows, and the rows are not divided.
+            keep: Whether the factors of all frequencies are kept.
+        """
+        cpu = device.type == "cpu"
+        # values of the bands in memory: 64 MB on a CPU, 2 GB on a GPU, or 16 times the spectrum of a large scene,
+        # for two chunks at a time on a CPU, so that results do not depend on the number of threads
+        values = max(1 << (23 if cpu else 28), 16 * rows * frequencies) // (2 if cpu else 1)
+        most = frequencies if keep else max(1, values // (rows * (2 * width + 1)))
+        rounds = -(-frequencies // most)
+        chunk = self.chunk or -(-frequencies // (8 * rounds)) * 8  # rows begin at full cache lines
+        chunk = min(chunk, frequencies)
+        if blurred:
+            return runs(frequencies, chunk), [slice(0, rows)]
+        # values that a step of the elimination changes, so that they take longer than its call, and rows of a window,
+        # of which the overlap is a small part
+        step, least = (20_000, 512) if cpu else (1 << 22, 256)
+        work = chunk * max(width, 1) ** (1 if keep else 2)
+        count = self.segments or min(-(-step // work), max(1, rows // least))
+        return runs(frequencies, chunk), row_windows(rows, count)
+
+    def buffer(self, thread: int, shape: tuple[int, ...], like: Tensor) -> Tensor:
+        """Memory of a thread: page faults in fresh memory take as long as the elimination."""
+        if thread not in self._buffers or self._buffers[thread].numel() < prod(shape):
+            self._buffers.pop(thread, None)
+            self._buffers[thread] = like.new_empty(prod(shape))
+        memory: Tensor = self._buffers[thread][: prod(shape)].view(shape)
+        return memory
 
 
 class SceneSolver:
-    """Least squares for the coefficients of one scene, frequency by frequency.
-
-    It minimises ``sum_m w_m |g_m - K_m c|^2 + c^H P c`` over the coefficients c of the scene.
+    """Solver of the normal equations of one scene.
 
     Args:
-        seen: How M frames of R rows see the scene.
+        observation: Observation operator of M frames of R rows.
         precision: P, products (p + 1, p + 1, U) as from ``RowPrior.precision``, in units of the noise of weight 1.
-        length: L, of the period of the data.
-        partition: What is solved at a time.
-        keep: Keep the factors, for solving again and again.
+        length: Period L of the data.
+        partition: Parts solved at a time.
+        keep: Keep the factors, for solving several times.
     """
 
     def __init__(
-        self, seen: SeenScene, precision: Tensor, length: int, partition: Partition, *, keep: bool = False
+        self, observation: Observation, precision: Tensor, length: int, partition: Partition, *, keep: bool = False
     ) -> None:
-        self.kernels, self.rows, self.num_rows, self.dtype = seen.kernels, seen.rows, seen.num_rows, seen.dtype
-        self.length, self.precision = length, precision
+        self.observation, self.precision, self.length = observation, precision, length
         self.u = torch.fft.rfftfreq(length, dtype=torch.float64, device=precision.device)
-        normal = seen.band(len(precision) - 1)
-        size_of_all, device, blurred = (self.rows.count, normal.width), precision.device, self.kernels.blurred
-        if keep:
-            shares = partition.factoring_all(*size_of_all, len(self.u), device, blurred=blurred, keep=True)
-        else:
-            shares = partition.of(*size_of_all, length, device, self.kernels.reach, blurred=blurred)
-        self._shares, self._segments = shares, shares.segments
-        self._whole, self._normal = normal, normal.in_segments(shares.segments)
+        normal = observation.band(len(precision) - 1)
         self._partition = partition
-        self.parts = shares.parts(len(self.u))
-        self._seen, self._sums = seen.smooth, seen.sums
-        self._sampling = torch.tensor([scene_weights()], dtype=seen.dtype, device=precision.device)
+        self._parts, self._windows = partition.divide(
+            observation.count,
+            normal.width,
+            len(self.u),
+            precision.device,
+            blurred=observation.kernels.blurred,
+            keep=keep,
+        )
+        self._normal = normal.in_windows(self._windows)
         self._factors: list[BandedFactor] | None = None
-        moving = self._normal.left.requires_grad or precision.requires_grad
-        if keep and not (torch.is_grad_enabled() and moving):
-            self._factors = [factor_skewed(self._normal.at(self.u[p], precision[..., p])) for p in self.parts]
-
-    def _right(self, spectra: Tensor, part: slice, out: Tensor | None = None) -> Tensor:
-        """``K^H W g`` (K, C, U') of a chunk of the spectra (M, C, R, U) of data."""
-        turned = spectra[..., part] * self.kernels.phases(self.length, part, self.dtype)[:, None]
-        return self._sums.of(turned.transpose(1, 2).flatten(0, 1), self.u[part], out)
-
-    def fit(self, data: Tensor, pull: Coefficients | None = None) -> Coefficients:
-        """The coefficients for data (M, C, R, L).
-
-        Args:
-            data: Rows continued to a period.
-            pull: To be added to the right sides: P times what the prior expects.
-        """
-        spectra = torch.fft.rfft(data)
-        differentiated = self._differentiates(spectra, *(pull or ()))
-        if self._factors is None and not differentiated:
-            return self._fit_in_place(spectra, pull)
-        solutions = []
-        for k, part in enumerate(self.parts):
-            shape = (self.rows.count, spectra.shape[1], part.stop - part.start)
-            right = self._right(spectra, part, None if differentiated else spectra.new_empty(shape))
-            split = self._segments.split(right if pull is None else right + pull[k]).flatten(-2)
-            if self._factors is None:
-                solved = solve_skewed(self._normal.at(self.u[part], self.precision[..., part]), split)
-            else:
-                solved = solve_factored(self._factors[k], split)
-            solutions.append(self._segments.join(solved.unflatten(-1, (-1, right.shape[-1]))))
-        return solutions
-
-    def _fit_in_place(self, spectra: Tensor, pull: Coefficients | None) -> Coefficients:
-        """``fit`` without gradients."""
-        found: Coefficients = [spectra.new_empty(0)] * len(self.parts)
-
-        def keep(k: int, solved: Tensor) -> None:
-            found[k] = solved.conj_physical() if self._shares.nodes is not None else solved.clone()
-
-        self._solve_in_place(spectra, pull, keep)
-        return found
-
-    def _solve_in_place(self, spectra: Tensor, pull: Coefficients | None, take: Callable[[int, Tensor], None]) -> None:
-        """Solve without gradients, in memory that is used again and again, and on all cores.
-
-        Args:
-            spectra: (M, C, R, U) of the data.
-            pull: As in ``fit``.
-            take: Is given each chunk's number and its coefficients (K, C, U'), conjugated where there are nodes, in
-                memory that will be used again.
-        """
-        threads = min(self._partition.threads(spectra.device), len(self.parts))
-        nodes = self._shares.nodes
-        if nodes is None:
-            solve_part = self._factoring_all(threads, spectra)
-        else:
-            solve_part = self._factoring_few(nodes, threads, spectra)
-
-        def solve(thread: int) -> None:
-            for k in range(thread, len(self.parts), threads):
-                take(k, solve_part(thread, self.parts[k], None if pull is None else pull[k]))
-
-        in_parallel(solve, range(threads), spectra.device)
-
-    def _factoring_all(self, threads: int, spectra: Tensor) -> SolvePart:
-        """How to find coefficients at a chunk of frequencies, each by itself."""
-        width, rows, right_sides = self._normal.width, self._segments.size, spectra.shape[1]
-        batch = len(self._segments.windows) * self._shares.chunk
-        memories = [self._partition.memory(k, rows, width, right_sides, batch, spectra) for k in range(threads)]
-
-        def solve_part(thread: int, part: slice, pull: Tensor | None) -> Tensor:
-            memory, chunk = memories[thread], self._wide(part)
-            self._normal.at(self.u[chunk], self.precision[..., chunk], memory.full[: rows + width])
-            self._prepare(memory.right_side[:rows], spectra, part, pull)
-            return self._joined(memory.solve(rows), part)
-
-        return solve_part
-
-    def _factoring_few(self, nodes: Tensor, threads: int, spectra: Tensor) -> SolvePart:
-        """How to find coefficients at a chunk of frequencies, with factors between those of a few."""
-        segments = self._shares.node_segments or self._segments
-        normal, rows = self._whole.in_segments(segments), segments.size
-        batch = len(segments.windows) * len(nodes)
-        memory = self._partition.memory("nodes", rows, normal.width, 0, batch, spectra)
-
-        def factored() -> NodeFactors:
-            normal.at(self.u[nodes], self.precision[..., nodes], memory.full[: rows + normal.width])
-            found = NodeFactors.of(nodes, memory.factor(rows), segments)
-            return found if self._segments.whole else found.in_segments(self._segments)
-
-        height = self._segments.size
-        sizes = (normal.width, spectra.shape[1], len(self._segments.windows), self._shares.chunk)
-        memories = [self._partition.substitution_memory(k, height, *sizes, spectra) for k in range(threads)]
-        factors = MadeOnce(factored, self._partition.lock)
-
-        def solve_part(thread: int, part: slice, pull: Tensor | None) -> Tensor:
-            own, chunk = memories[thread], self._wide(part)
-            factors.begin()
-            self._prepare(own.right_side[:height], spectra, part, pull)
-            made = factors.get()
-            return self._joined(own.solve(made, made.between(chunk.start, chunk.stop)), part)
-
-        return solve_part
-
-    def _wide(self, part: slice) -> slice:
-        """As many frequencies as in all other parts: the last one is solved as wide as the others."""
-        return slice(part.stop - self._shares.chunk, part.stop)
-
-    def _prepare(self, sides: Tensor, spectra: Tensor, part: slice, pull: Tensor | None) -> None:
-        """Write the right sides (K, C, n S) of a part."""
-        whole = self._segments.whole
-        right = self._right(spectra, self._wide(part), sides if whole else None)
-        if pull is not None:
-            right[..., part.start - part.stop :] += pull
-        if not whole:
-            sides.copy_(self._segments.split(right).flatten(-2))
-
-    def _joined(self, solved: Tensor, part: slice) -> Tensor:
-        """Coefficients (K, C, U') of a part from solutions (K, C, n S)."""
-        windows = solved.unflatten(-1, (-1, self._shares.chunk))[..., part.start - part.stop :]
-        return windows[..., 0, :] if self._segments.whole else self._segments.join(windows)
-
-    def predict(self, coefficients: Coefficients) -> Tensor:
-        """What the frames show of a scene, (M, C, R, L)."""
-        spectra = []
-        for part, values in zip(self.parts, coefficients, strict=True):
-            phases = self.kernels.phases(self.length, part, self.dtype).conj()
-            rows = self._seen_rows(values, self.u[part])
-            spectra.append(rows.unflatten(0, phases.shape[:2]) * phases[:, :, None])
-        images: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1).transpose(1, 2), n=self.length)
-        return images
-
-    def _seen_rows(self, values: Tensor, u: Tensor) -> Tensor:
-        """What the rows (M R, C, U') see of coefficients (K, C, U'), without the phase of their middles."""
-        base, left = self._sums.base, self._seen.left
-        if not self._differentiates(values):
-            source = base[:, None] + torch.arange(len(left), device=base.device)
-            out = values.new_empty(len(base), *values.shape[1:])
-            return sum_looked_up(values, source, left.transpose(0, 1), self._seen.matrix(u), out)
-        seen = (kernel[:, None] * values[base + i] for i, kernel in enumerate(self._seen.taps(u)))
-        return sum(seen, start=values.new_zeros(()))
-
-    def scene(self, coefficients: Coefficients) -> Tensor:
-        """Rows of the scene where the frame at rest would show them, (C, R, L)."""
-        spectra = torch.cat([self._between_rows(values) for values in coefficients], dim=-1)
-        scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=self.length)
-        return scene
-
-    def fit_scene(self, data: Tensor, width: int, level: Tensor, out: Tensor | None = None) -> Tensor:
-        """The first ``width`` columns of ``scene(fit(data))`` and a brightness on top.
-
-        Coefficients are kept only to be differentiated.
-
-        Args:
-            data: As in ``fit``.
-            width: Columns.
-            level: (C, 1, 1) the brightness.
-            out: (C, R, width) where to write them; nothing is then differentiated.
-        """
-        spectra = torch.fft.rfft(data)
-        if self._factors is not None or self._differentiates(spectra):
-            return torch.add(self.scene(self.fit(data))[..., :width], level, out=out)
-        found = spectra.new_empty(self.num_rows, spectra.shape[1], len(self.u))
-        blocks = runs(self.num_rows, _ROWS.get(found.device.type, self.num_rows))
-
-        def take(k: int, solved: Tensor) -> None:
-            for rows in blocks:
-                sampled = self._between_rows(solved, rows)
-                found[rows, :, self.parts[k]] = sampled if self._shares.nodes is None else sampled.conj()
-
-        self._solve_in_place(spectra, None, take)
-        image = data.new_empty(spectra.shape[1], self.num_rows, width) if out is None else out
-        for rows in blocks:
-            scene = torch.fft.irfft(found[rows].movedim(1, 0), n=self.length)[..., :width]
-            torch.add(scene, level, out=image[:, rows])
-        return image
+        if keep and not self._differentiates():
+            self._factors = [factor_banded(self._normal.at(self.u[p], precision[..., p])) for p in self._parts]
 
     def _differentiates(self, *values: Tensor) -> bool:
         given = (*values, self._normal.left, self.precision)
         return torch.is_grad_enabled() and any(value.requires_grad for value in given)
 
-    def _between_rows(self, coefficients: Tensor, rows: slice | None = None) -> Tensor:
-        """What coefficients (K, C, U') make of some rows of the scene, by default all."""
-        chosen = slice(0, self.num_rows) if rows is None else rows
-        first = chosen.start - SCENE_REACH - self.rows.top
-        near = coefficients[first : first + chosen.stop - chosen.start + 2 * SCENE_REACH]
-        sampled = correlated(torch.view_as_real(near).flatten(1), self._sampling, 0)[0]
-        return torch.view_as_complex(sampled.unflatten(1, (*near.shape[1:], 2)))
+    def fit(self, data: Tensor, expected: Tensor | None = None) -> Tensor:
+        """Coefficients (K, C, U) of the scene for data (M, C, R, L), whose rows are extended to a period.
+
+        Args:
+            data: The data.
+            expected: (K, C, U) added to the right sides: P times the expectation of the prior.
+        """
+        spectra: Tensor = torch.fft.rfft(data)
+
+        def solve(number: int, thread: int | None = None) -> Tensor:
+            part = self._parts[number]
+            u = self.u[part]
+            right = self.observation.adjoint(spectra[..., part], u, part, self.length)
+            right = right if expected is None else right + expected[..., part]
+            right = torch.stack([right[window] for window in self._windows], dim=-2).flatten(-2)
+            if self._factors is not None:
+                solution = solve_skewed(self._factors[number], right)
+            else:
+                left = self._normal.left
+                shape = (*left.shape[:2], len(self._windows) * len(u))
+                out = None if thread is None else self._partition.buffer(thread, shape, spectra)
+                solution = solve_skewed(self._normal.at(u, self.precision[..., part], out), right)
+            return join_windows(solution.unflatten(-1, (-1, len(u))), self._windows)
+
+        if self._differentiates(spectra, *(() if expected is None else (expected,))):
+            return torch.cat([solve(number) for number in range(len(self._parts))], dim=-1)
+        coefficients: Tensor = spectra.new_empty(self.observation.count, spectra.shape[1], len(self.u))
+        threads = min(Partition.threads(data.device), len(self._parts))
+
+        def share(thread: int) -> None:
+            for number in range(thread, len(self._parts), threads):
+                coefficients[..., self._parts[number]] = solve(number, thread)
+
+        in_parallel(share, range(threads), data.device)
+        return coefficients
+
+    def predict(self, coefficients: Tensor) -> Tensor:
+        """Noiseless frames (M, C, R, L) of a scene, ``K c``."""
+        spectra = [
+            self.observation.forward(coefficients[..., part], self.u[part], part, self.length) for part in self._parts
+        ]
+        images: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1), n=self.length)
+        return images
+
+    def scene(self, coefficients: Tensor) -> Tensor:
+        """Rows of the scene where the frame at rest would observe them, (C, R, L)."""
+        first = -SCENE_REACH - self.observation.top
+        near = coefficients[first : first + self.observation.num_rows + 2 * SCENE_REACH]
+        weights = torch.tensor([scene_weights()], dtype=near.real.dtype, device=near.device)
+        sampled = correlated(torch.view_as_real(near).flatten(1), weights, 0)[0]
+        spectra = torch.view_as_complex(sampled.unflatten(1, (*near.shape[1:], 2)))
+        scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=self.length)
+        return scene
+
+
+@dataclass(frozen=True, eq=False)
+class SceneProblem:
+    """One scene, observed by M frames.
+
+    Attributes:
+        data: (M, C, R, L) rows extended to a period.
+        observation: Observation operator of the frames.
+        precision: Precision of the row prior, products as from ``RowPrior.precision``.
+        level: Standard deviation of the noise of data of weight 1.
+        partition: Parts solved at a time.
+    """
+
+    data: Tensor
+    observation: Observation
+    precision: Tensor
+    level: Tensor
+    partition: Partition
+
+    def solver(self, weight: Tensor | None = None, *, keep: bool = False) -> SceneSolver:
+        """The solver for complete data.
+
+        Args:
+            weight: (M, R) of the rows, by default that of the kernels.
+            keep: Keep the factors, for solving several times.
+        """
+        observation = self.observation if weight is None else self.observation.weighted(weight)
+        return SceneSolver(observation, self.precision, self.data.shape[-1], self.partition, keep=keep)

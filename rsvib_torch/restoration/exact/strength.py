@@ -5,8 +5,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from rsvib_torch.restoration.scene_model.observation import RowKernels
 from rsvib_torch.restoration.scene_model.row_prior import RowPrior
-from rsvib_torch.restoration.scene_model.row_system import RowKernels
 from rsvib_torch.restoration.scene_model.sampled_rows import Explained, sample_rows
 
 __all__ = ["Strengths", "prior_strength"]

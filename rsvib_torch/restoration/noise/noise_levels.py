@@ -10,8 +10,8 @@ from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.noise.blurred_noise import noise_beside_blur
 from rsvib_torch.restoration.noise.noise_floor import noise_floor
 from rsvib_torch.restoration.noise.single_frame import estimate_noise
+from rsvib_torch.restoration.scene_model.observation import row_kernels
 from rsvib_torch.restoration.scene_model.row_prior import RowPrior
-from rsvib_torch.restoration.scene_model.row_system import row_kernels
 from rsvib_torch.restoration.scene_model.sampled_rows import sample_rows
 
 __all__ = ["noise_levels"]

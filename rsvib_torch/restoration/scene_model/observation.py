@@ -1,55 +1,292 @@
-"""How frames see one scene, in the forms that solving asks for."""
+"""The observation operator: kernels of the rows of frames, and the normal equations of a scene, frequency by frequency.
 
-from dataclasses import replace
+A row that is displaced by (x_n, y_n) at N times of its exposure has, at horizontal frequency u, the kernel
+``K(u) = sum_n w_n h(. - y_n) exp(-2 pi i u x_n)``. Relative to the middle of the range of the row the x_n are small, so
+that kernels and their products are smooth in u: they are computed at a few Chebyshev nodes in double precision and
+interpolated to all frequencies by one matrix product. The phase of the middle is applied to the data.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from rsvib_torch.restoration.scene_model.row_sums import RowSums
-from rsvib_torch.restoration.scene_model.row_system import (
-    RowKernels,
-    SmoothBand,
-    SmoothKernels,
-    smooth_band,
-    smooth_kernels,
-)
+from rsvib_torch.core.fourier import shift_phases
+from rsvib_torch.core.splines import spread_taps
+from rsvib_torch.restoration.scene_model.row_kernel import REACH, SCENE_REACH, TAPS, kernel_weights
 
-__all__ = ["SeenScene"]
+__all__ = ["Observation", "RowKernels", "SmoothBand", "row_kernels", "smooth_band", "smooth_kernels"]
 
 
-class SeenScene:
-    """Kernels of M frames of R rows, and what follows from them alone: made once for all that is solved with them.
+@dataclass(frozen=True, eq=False)
+class RowKernels:
+    """Kernels of the rows of M frames, which act on the coefficients of the scene.
+
+    Attributes:
+        first: (M, R) first scene row of the kernel of each row.
+        taps: (M, R, J, N) weights of J scene rows at N nodes of the exposure, float64.
+        middle: (M, R) displacement along the row in px that the phase of the data is corrected by, float64.
+        along: (M, R, N) displacement along the row relative to the middle, float64.
+        weight: (M, R) weight of each row, float64.
+    """
+
+    first: Tensor
+    taps: Tensor
+    middle: Tensor
+    along: Tensor
+    weight: Tensor
+
+    @cached_property
+    def reach(self) -> float:
+        """Largest distance along the row from the middle in px."""
+        return float(self.along.detach().abs().amax())
+
+    @property
+    def blurred(self) -> bool:
+        """Whether the displacement changes by more than 1 px during an exposure."""
+        return max(2.0 * self.reach, float(self.taps.shape[-2] - TAPS)) > 1.0
+
+    def rows(self, top: int, count: int) -> "RowKernels":
+        """Kernels of ``count`` rows from row ``top`` on, counted from there."""
+        first, *others = (
+            value[:, top : top + count] for value in (self.first, self.taps, self.middle, self.along, self.weight)
+        )
+        return RowKernels(first - top, *others)
+
+    def at(self, frequencies: Tensor) -> Tensor:
+        """Kernels (M, R, J, Q) without the phase of the middle."""
+        angle = (-2 * math.pi) * self.along[..., None] * frequencies
+        return torch.complex(self.taps @ angle.cos(), self.taps @ angle.sin())
+
+
+def row_kernels(displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int, margin: int) -> RowKernels:
+    """Kernels of rows with displacement (M, R, N, 2) during the exposure.
+
+    Rows whose content lies more than ``margin`` px outside the ``num_rows`` rows of the frame have weight 0.
+    """
+    rows = torch.arange(displacement.shape[-3], dtype=displacement.dtype, device=displacement.device)
+    place = rows[:, None] - displacement[..., 1]
+    cell = place.detach().floor()
+    first, taps = spread_taps(cell, kernel_weights(place - cell) * node_weights[:, None])
+    taps, count, first = taps.transpose(-2, -1), taps.shape[-1], first - (REACH - 1)
+    near = (first > -margin - count) & (first < num_rows + margin)
+    first = first.clamp(-margin - count, num_rows + margin)
+    x = displacement[..., 0]
+    middle = 0.5 * (x.detach().amin(-1) + x.detach().amax(-1))
+    return RowKernels(first, taps, middle, x - middle[..., None], weight[:, None].to(torch.float64) * near)
+
+
+def _interpolation(reach: float, u: Tensor, precision: float) -> tuple[Tensor, Tensor]:
+    """Nodes (Q,) in 0 ... 1/2 cycles per px, and the matrix (2 Q, 2 U) to frequencies ``u``.
+
+    Functions ``f(-u) = conj f(u)`` that are sums of waves of up to ``reach`` px are interpolated from real and
+    imaginary parts at the nodes to interleaved real and imaginary parts at ``u``: even and odd Chebyshev series.
+    """
+    half = math.pi * reach
+    degree, bound = 1, half
+    while bound > precision or degree < half:
+        degree += 1
+        bound *= 0.5 * half / degree if half else 0.0
+    count = degree // 2 + 1
+    k = torch.arange(count, dtype=torch.float64, device=u.device)
+    angles = math.pi * (2 * k + 1) / (4 * count)
+    at = torch.acos((2 * u).clamp(-1, 1))
+    matrix = u.new_zeros(2 * count, len(u), 2)
+    for odd in (0, 1):
+        order = 2 * k + odd
+        series = torch.cos(angles[:, None] * order) * (2 / count)
+        if not odd:
+            series[:, 0] *= 0.5
+        matrix[odd * count : (odd + 1) * count, :, odd] = series @ torch.cos(order[:, None] * at)
+    return 0.5 * torch.cos(angles), matrix.flatten(1)
+
+
+def _precision(dtype: torch.dtype) -> float:
+    return 1e-5 if dtype == torch.float32 else 1e-15
+
+
+def _stacked(values: Tensor) -> Tensor:
+    return torch.cat([values.real, values.imag], dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothKernels:
+    """Kernels at any frequencies by one matrix product.
+
+    Attributes:
+        left: (J, M R, 2 Q) real and imaginary parts at Q nodes of every tap of every row.
+        reach: Largest distance along the rows in px from their middles.
+    """
+
+    left: Tensor
+    reach: float
+
+    def taps(self, u: Tensor) -> Iterator[Tensor]:
+        """Kernels (M R, U), complex, without the phase of their middles, one tap after the other."""
+        right = _interpolation(self.reach, u, _precision(self.left.dtype))[1].to(self.left.dtype)
+        for tap in self.left:
+            yield torch.view_as_complex((tap @ right).unflatten(-1, (-1, 2)))
+
+
+def smooth_kernels(kernels: RowKernels, dtype: torch.dtype) -> SmoothKernels:
+    """Kernels of all rows at the Chebyshev nodes."""
+    nodes, _ = _interpolation(kernels.reach, kernels.middle.new_zeros(1), _precision(dtype))
+    return SmoothKernels(
+        _stacked(kernels.at(nodes)).to(dtype).flatten(0, 1).transpose(0, 1).contiguous(), kernels.reach
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothBand:
+    """Normal matrices at any frequencies, prior included, by one matrix product.
+
+    Attributes:
+        left: (R + b, 2 b + 1, n, 2 Q + p + 1) real and imaginary parts at Q nodes, and the entries of each lag of the
+            prior, for n windows of R rows; the last b rows are 0.
+        reach: Largest distance along the rows in px of the products of kernels.
+        order: Order p of the prior.
+        systems: Whether the windows are separate systems instead of parts of one.
+    """
+
+    left: Tensor
+    reach: float
+    order: int
+    systems: bool = False
+
+    @property
+    def width(self) -> int:
+        """The half-width b of the band."""
+        return self.left.shape[1] // 2
+
+    def in_windows(self, windows: list[slice]) -> "SmoothBand":
+        """The matrix of all rows as those of windows of rows."""
+        if len(windows) == 1:
+            return self
+        parts = torch.stack([self.left[window, :, 0] for window in windows], dim=2)
+        return replace(self, left=torch.cat([parts, parts.new_zeros(self.width, *parts.shape[1:])]))
+
+    def apart(self, count: int) -> "SmoothBand":
+        """The matrix of ``count`` systems of one size, one after the other and not coupled by data, as windows."""
+        rows = self.left[: len(self.left) - self.width, :, 0].unflatten(0, (count, -1)).movedim(0, 2)
+        return replace(self, left=torch.cat([rows, rows.new_zeros(self.width, *rows.shape[1:])]), systems=True)
+
+    def at(self, u: Tensor, precision: Tensor, out: Tensor | None = None) -> Tensor:
+        """Skewed bands (R + b, 2 b + 1, n U), complex.
+
+        Args:
+            u: Frequencies in cycles per px.
+            precision: Products (p + 1, p + 1, U) of the prior there.
+            out: Memory for them; page faults in fresh memory take as long as the product that fills it.
+        """
+        lags = torch.stack([precision.sum(1), torch.zeros_like(precision[:, 0])], dim=-1).flatten(1)
+        right = torch.cat([_interpolation(self.reach, u, _precision(self.left.dtype))[1], lags]).to(self.left.dtype)
+        rows = self.left.flatten(0, 2)
+        if out is None:
+            product = rows @ right
+        else:
+            product = torch.mm(rows, right, out=torch.view_as_real(out).view(len(rows), -1))
+        bands = product.view(*self.left.shape[:3], -1, 2)
+        width, real = self.width, bands[..., 0]
+        count = len(self.left) - width
+        first, last = (slice(None), slice(None)) if self.systems else (slice(1), slice(-1, None))
+        for d in range(self.order + 1):
+            for side in {d, -d}:
+                for k in range(1, self.order + 1 - d):
+                    top = max(0, -side)
+                    real[top : top + k, width + side, first] -= precision[d, k]
+                    bottom = count - max(0, side)
+                    real[bottom - k : bottom, width + side, last] -= precision[d, k]
+        return torch.view_as_complex(bands).flatten(2)
+
+
+def smooth_band(kernels: RowKernels, top: int, count: int, order: int, dtype: torch.dtype) -> SmoothBand:
+    """Normal matrices ``sum_m w_m K_m^H K_m`` of all frames of one scene, to which a prior can be added.
 
     Args:
-        kernels: How the rows see the scene.
+        kernels: Kernels of the frames.
+        top: First row of the scene.
+        count: Rows of the scene.
+        order: Order of the prior. The half-width of the band is that or the number of taps less 1.
+        dtype: dtype of the frames.
+    """
+    width = max(kernels.taps.shape[-2] - 1, order)
+    nodes, _ = _interpolation(2 * kernels.reach, kernels.middle.new_zeros(1), _precision(dtype))
+    values = kernels.at(nodes)
+    weighted = values * kernels.weight[..., None, None]
+    base = (kernels.first - top).flatten()
+    sides: list[Tensor] = []
+    taps = values.shape[-2]
+    for d in range(taps):
+        entry = base[:, None] + torch.arange(taps - d, device=base.device)
+        products = weighted[..., : taps - d, :].conj() * values[..., d:, :]
+        entries = values.new_zeros(count + width, len(nodes))
+        sides.append(entries.index_add(0, entry.flatten(), products.flatten(0, 2)))  # A[k, k + d]
+    absent = torch.zeros_like(sides[0])
+    right = [sides[d] if d < len(sides) else absent for d in range(width + 1)]
+    left = [torch.cat([absent[:d], right[d][: len(absent) - d].conj()]) for d in range(width, 0, -1)]
+    lags = kernels.middle.new_zeros(len(absent), 2 * width + 1, order + 1)
+    for d in range(order + 1):
+        lags[: count - d, width + d, d] = 1
+        lags[d:count, width - d, d] = 1
+    matrix = torch.cat([_stacked(torch.stack(left + right, dim=1)), lags], dim=-1)
+    return SmoothBand(matrix.to(dtype)[:, :, None], 2 * kernels.reach, order)
+
+
+class Observation:
+    """The observation operator K of M frames of R rows, and all that follows from their kernels alone.
+
+    Attributes:
+        kernels: Kernels of the rows.
         num_rows: R.
-        dtype: Of the data.
+        dtype: dtype of the data.
+        top: First scene row that is observed or needed to evaluate the scene, in frame coordinates.
+        count: Number of such scene rows, K.
     """
 
     def __init__(self, kernels: RowKernels, num_rows: int, dtype: torch.dtype) -> None:
-        self.kernels, self.dtype = kernels, dtype
-        self.num_rows, self.rows = num_rows, kernels.scene_rows(num_rows)
-        self._bands: dict[tuple[int, bool], SmoothBand] = {}
-
-    @cached_property
-    def smooth(self) -> SmoothKernels:
-        """The kernels at all frequencies."""
-        return smooth_kernels(self.kernels, self.dtype)
-
-    @cached_property
-    def sums(self) -> RowSums:
-        """What rows say of the scene."""
-        return RowSums(self.kernels, self.smooth, self.rows.top, self.rows.count)
+        self.kernels, self.num_rows, self.dtype = kernels, num_rows, dtype
+        self.top = min(int(kernels.first.amin()), -SCENE_REACH)
+        last = max(int(kernels.first.amax()) + kernels.taps.shape[-2], num_rows + SCENE_REACH)
+        self.count = last - self.top
+        self._smooth = smooth_kernels(kernels, dtype)
+        self._first = (kernels.first - self.top).flatten()
+        self._bands: dict[int, SmoothBand] = {}
 
     def band(self, order: int) -> SmoothBand:
-        """Normal matrices to which a prior of an order can be added."""
-        key = (order, torch.is_grad_enabled())
-        if key not in self._bands:
-            width = max(self.kernels.taps.shape[-2] - 1, order)
-            self._bands[key] = smooth_band(self.kernels, self.rows, width, order, self.dtype)
-        return self._bands[key]
+        """Normal matrices ``K^H W K`` to which a prior of an order can be added."""
+        if order not in self._bands:
+            self._bands[order] = smooth_band(self.kernels, self.top, self.count, order, self.dtype)
+        return self._bands[order]
 
-    def weighted(self, weight: Tensor) -> "SeenScene":
+    def weighted(self, weight: Tensor) -> "Observation":
         """The same with other weights (M, R) of the rows."""
-        return SeenScene(replace(self.kernels, weight=weight), self.num_rows, self.dtype)
+        return Observation(replace(self.kernels, weight=weight), self.num_rows, self.dtype)
+
+    def adjoint(self, spectra: Tensor, u: Tensor, part: slice, length: int) -> Tensor:
+        """``K^H W g``, (K, C, U).
+
+        Args:
+            spectra: (M, C, R, U) of the rows of the data.
+            u: (U,) frequencies in cycles per px.
+            part: The same in cycles per period.
+            length: Period in px.
+        """
+        phases = shift_phases(self.kernels.middle, length, part, spectra.dtype)
+        rows = (spectra * (phases * self.kernels.weight.to(self.dtype)[..., None])[:, None]).transpose(1, 2)
+        rows = rows.flatten(0, 1).conj().resolve_conj()
+        total = rows.new_zeros(self.count, *rows.shape[1:])
+        for tap, kernel in enumerate(self._smooth.taps(u)):
+            total = total.index_add_(0, self._first + tap, kernel[:, None] * rows)
+        return total.conj().resolve_conj()
+
+    def forward(self, coefficients: Tensor, u: Tensor, part: slice, length: int) -> Tensor:
+        """``K c``, (M, C, R, U), of coefficients (K, C, U); the other arguments as in ``adjoint``."""
+        rows = coefficients.new_zeros(len(self._first), *coefficients.shape[1:])
+        for tap, kernel in enumerate(self._smooth.taps(u)):
+            rows = rows + kernel[:, None] * coefficients[self._first + tap]
+        phases = shift_phases(self.kernels.middle, length, part, coefficients.dtype).conj()
+        observed: Tensor = (rows.unflatten(0, phases.shape[:2]) * phases[:, :, None]).transpose(1, 2)
+        return observed

@@ -7,16 +7,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.banded_solver import BandedFactor, factor_skewed
+from rsvib_torch.core.banded_solver import BandedFactor, factor_banded
 from rsvib_torch.core.fourier import squared_modulus, waves
-from rsvib_torch.restoration.scene_model.row_prior import ORDER
-from rsvib_torch.restoration.scene_model.row_system import (
+from rsvib_torch.restoration.scene_model.observation import (
     RowKernels,
-    SceneRows,
     SmoothBand,
     smooth_band,
     smooth_kernels,
 )
+from rsvib_torch.restoration.scene_model.row_prior import ORDER
 
 __all__ = ["Explained", "SampledRows", "sample_rows"]
 
@@ -74,7 +73,7 @@ class SampledRows:
         slabs, rows = self.normal.left.shape[2], len(self.normal.left) - self.normal.width
         # each prior once as it is and once a little stronger, all in one batch
         products = torch.cat([*precisions, *(_STEP * products for products in precisions)], dim=-1)
-        factor = factor_skewed(self.normal.at(self.u.repeat(2 * number), products))
+        factor = factor_banded(self.normal.at(self.u.repeat(2 * number), products))
         logs = factor.pivots.log().to(torch.float64).sum(0).unflatten(-1, (slabs, -1)).sum(0)
         growth = (logs[many:] - logs[:many]) / math.log(_STEP)
         right = self.spectra.new_zeros(slabs * rows, *self.spectra.shape[1:])
@@ -120,7 +119,7 @@ def sample_rows(images: Tensor, kernels: RowKernels, chosen: Tensor) -> SampledR
     place = kernels.first - slab * height
     rows = int(place.amax() - place.amin()) + len(taps)
     apart = replace(kernels, first=place - place.amin() + slab * rows)
-    normal = smooth_band(apart, SceneRows(0, slabs * rows), max(len(taps) - 1, ORDER), ORDER, images.dtype)
+    normal = smooth_band(apart, 0, slabs * rows, ORDER, images.dtype)
     return SampledRows(
         u,
         spectra.flatten(0, 1),

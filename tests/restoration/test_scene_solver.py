@@ -1,0 +1,79 @@
+"""Parts of the systems of a scene: windows of rows, chunks of frequencies, and the observation operator."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import solveh_banded
+
+from rsvib_torch.core.banded_solver import skew_band, solve_skewed
+from rsvib_torch.restoration.exact.scene_solver import join_windows, row_windows
+from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
+
+
+def solved_in(windows, band, right_side):
+    width = band.shape[1] - 1
+    parts = torch.stack([skew_band(band)[window] for window in windows], dim=-2).flatten(-2)
+    full = torch.cat([parts, parts.new_zeros(width, *parts.shape[1:])])
+    right = torch.stack([right_side[window] for window in windows], dim=-2).flatten(-2)
+    return join_windows(solve_skewed(full, right).unflatten(-1, (-1, band.shape[-1])), windows)
+
+
+@pytest.mark.parametrize("count", [2, 3, 7])
+def test_overlapping_windows_agree_with_scipy(count):
+    rows, width = 211, 3
+    generator = torch.Generator().manual_seed(0)
+    band = torch.randn(rows, width + 1, 3, dtype=torch.complex128, generator=generator)
+    band[:, 0] = band[:, 0].abs() + 2.5 * (width + 1)
+    right_side = torch.randn(rows, 2, 3, dtype=torch.complex128, generator=generator)
+    windows = row_windows(rows, count, overlap=24)
+    assert len(windows) == count
+    found = solved_in(windows, band, right_side)
+    for index in range(3):
+        expected = solveh_banded(band[..., index].numpy().T.copy(), right_side[..., index].numpy(), lower=True)
+        np.testing.assert_allclose(found[..., index].numpy(), expected, rtol=0, atol=1e-8)
+    wrong = solved_in(row_windows(rows, count, overlap=1), band, right_side)
+    assert (wrong - found).abs().max() > 1e-6
+
+
+def test_windows_that_overlap_everywhere_are_one():
+    assert row_windows(100, 1) == row_windows(100, 4, 96) == [slice(0, 100)]
+
+
+@pytest.mark.parametrize(("rows", "count", "overlap"), [(211, 3, 24), (97, 2, 8), (1000, 7, 60), (101, 4, 0)])
+def test_windows_of_one_size_cover_all_rows(rows, count, overlap):
+    windows = row_windows(rows, count, overlap)
+    assert (windows[0].start, windows[-1].stop, len(windows)) == (0, rows, count)
+    sizes = {window.stop - window.start for window in windows}
+    assert len(sizes) == 1
+    shared = [before.stop - after.start for before, after in pairwise(windows)]
+    assert min(shared) >= 2 * overlap
+    assert sizes.pop() <= (rows + 2 * overlap * (count - 1)) / count + 1
+    values = torch.arange(rows * 6.0).reshape(rows, 2, 3)
+    parts = torch.stack([values[window] for window in windows], dim=-2)
+    assert torch.equal(join_windows(parts, windows), values)
+
+
+@pytest.mark.parametrize("first", [torch.arange(90) // 2 * 2, torch.arange(90).clamp(min=85) * 4 - 340])
+def test_observation_operator_is_a_sum_over_taps_and_has_that_adjoint(first):
+    generator = torch.Generator().manual_seed(3)
+    taps = torch.randn(1, 90, 6, 2, dtype=torch.float64, generator=generator)
+    along, middle = 0.3 * torch.randn(2, 1, 90, 2, dtype=torch.float64, generator=generator)
+    weight = torch.rand(1, 90, dtype=torch.float64, generator=generator)
+    weight[0, ::7] = 0
+    kernels = RowKernels(first[None], taps, middle[..., 0], along, weight)
+    observation = Observation(kernels, 90, torch.float64)
+    part, length = slice(2, 13), 40
+    u = torch.arange(part.start, part.stop, dtype=torch.float64) / length
+    data = torch.randn(1, 2, 90, 11, dtype=torch.complex128, generator=generator)
+    coefficients = torch.randn(observation.count, 2, 11, dtype=torch.complex128, generator=generator)
+    observed = observation.forward(coefficients, u, part, length)
+    turned = kernels.at(u)[0] * torch.exp(-2j * torch.pi * u * middle[0, :, :1])[:, None]
+    for row in (0, 8, 44, 89):
+        place = int(first[row]) - observation.top
+        expected = (turned[row, :, None] * coefficients[place : place + 6]).sum(0)
+        torch.testing.assert_close(observed[0, :, row], expected, rtol=1e-9, atol=1e-9)
+    back = observation.adjoint(data, u, part, length)
+    left = (weight[:, None, :, None] * observed.conj() * data).sum()
+    torch.testing.assert_close(left, (coefficients.conj() * back).sum(), rtol=1e-9, atol=1e-9)
