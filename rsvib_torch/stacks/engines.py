@@ -1,9 +1,9 @@
-"""Who works on the windows: threads of this process, or Dask workers."""
+"""Parallel processing of windows: threads of this process, or Dask workers."""
 
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -18,97 +18,98 @@ from rsvib_torch.stacks.windows import Window
 
 __all__ = ["compute_here", "compute_with_dask"]
 
-_Done = TypeVar("_Done")
-_RETRIES = 3
-_AHEAD = 2  # windows a Dask worker is given beyond the one that it works on
+_Result = TypeVar("_Result")
 
 
-def _several(windows: Sequence[Window]) -> bool:
-    """Whether every window is to be computed on one thread: where there are several.
+def _one_thread_each(windows: Sequence[Window]) -> bool:
+    """Whether to compute every window on one thread, which is the case if there are several windows.
 
-    Sums of floats depend on how many threads share them: with one, a window comes out the same however many others
-    are worked on at once.
+    Sums of floats depend on the number of threads: results must not depend on how many windows are computed at once.
     """
     return not all(window.alone for window in windows)
+
+
+def _results_in_order(
+    windows: Sequence[Window], submit: Callable[[Window], Any], capacity: Callable[[], int], waiting: deque[Any]
+) -> Generator[Any, None, None]:
+    """Results in the order of the windows; up to ``capacity()`` windows are submitted ahead, into ``waiting``."""
+    remaining = iter(windows)
+    while True:
+        while len(waiting) < capacity() and (window := next(remaining, None)) is not None:
+            waiting.append(submit(window))
+        if not waiting:
+            return
+        yield waiting.popleft().result()
 
 
 def compute_here(
     job: StackJob,
     windows: Sequence[Window],
-    finish: Callable[[WindowResult, WindowFrames], _Done],
+    finish: Callable[[WindowResult, WindowFrames], _Result],
     *,
     at_once: int,
-) -> Iterator[_Done]:
-    """Work on windows in threads of this process; one more thread reads ahead.
+) -> Generator[_Result, None, None]:
+    """Compute windows in threads of this process; one more thread reads ahead.
 
     Args:
-        job: What to do.
+        job: What to compute.
         windows: The windows, in order.
-        finish: What to make of a result and the pixels it came from, still in the thread that computed it.
-        at_once: Windows to work on at once.
+        finish: Function of a result and the frames from which it was computed, called in the thread that computed it.
+        at_once: Number of windows to compute at once.
 
     Yields:
-        What ``finish`` made, in the order of the windows.
+        Results of ``finish``, in the order of the windows.
     """
     share_one_heap()
     reader = WindowReader(job.source, job.info)
-    before = torch.get_num_threads()
-
-    def set_threads() -> None:
-        torch.set_num_threads(1 if _several(windows) else before)
-
+    default_threads = torch.get_num_threads()
+    threads = 1 if _one_thread_each(windows) else default_threads
     reading = ThreadPoolExecutor(1, "rsvib-read")
-    computing = ThreadPoolExecutor(at_once, "rsvib-compute", initializer=set_threads)
+    computing = ThreadPoolExecutor(at_once, "rsvib-compute", initializer=torch.set_num_threads, initargs=(threads,))
     stopped = threading.Event()
 
-    def compute(window: Window, frames: "Future[WindowFrames]") -> _Done:
+    def compute(window: Window, frames: "Future[WindowFrames]") -> _Result:
         pixels = frames.result()
         if stopped.is_set():
             raise RuntimeError("stopped")
         return finish(job.compute(window, pixels), pixels)
 
-    waiting: deque[Future[_Done]] = deque()
-    left = iter(windows)
+    def submit(window: Window) -> "Future[_Result]":
+        return computing.submit(compute, window, reading.submit(reader.read, window))
+
     try:
-        while True:
-            while len(waiting) < at_once + 1 and (window := next(left, None)) is not None:
-                waiting.append(computing.submit(compute, window, reading.submit(reader.read, window)))
-            if not waiting:
-                break
-            yield waiting.popleft().result()
+        yield from _results_in_order(windows, submit, lambda: at_once + 1, deque())
     finally:
         stopped.set()
         reading.shutdown(wait=True, cancel_futures=True)
         computing.shutdown(wait=True, cancel_futures=True)
-        torch.set_num_threads(before)  # what threads that start later begin with
+        torch.set_num_threads(default_threads)  # the default of threads that start later
         reader.close()
 
 
-def _compute_there(job: StackJob, window: Window, several: bool) -> StoredWindow:
-    """Read, compute and store one window, on a Dask worker."""
+def _compute_on_worker(job: StackJob, window: Window, one_thread: bool) -> StoredWindow:
+    """Read and compute one window on a Dask worker."""
     share_one_heap()
     keep_freed_memory()
-    threads = torch.get_num_threads()
-    if several:
+    default_threads = torch.get_num_threads()
+    if one_thread:
         torch.set_num_threads(1)
+    reader = WindowReader(job.source, job.info)
     try:
         if job.device.startswith("cuda"):
-            job = replace(job, device=_own_device())
-        reader = WindowReader(job.source, job.info)
-        try:
-            pixels = reader.read(window)
-        finally:
-            reader.close()
+            job = replace(job, device=_device_of_worker())
+        pixels = reader.read(window)
         return job.stored(job.compute(window, pixels), pixels)
     finally:
-        torch.set_num_threads(threads)
+        reader.close()
+        torch.set_num_threads(default_threads)
 
 
-def _own_device() -> str:
-    """The GPU of this worker: workers are numbered, and take turns."""
+def _device_of_worker() -> str:
+    """The GPU of this worker: workers with a number as their name use the GPUs in turn."""
     count = torch.cuda.device_count()
     if count == 0:
-        raise RuntimeError("this worker has no CUDA device")
+        raise RuntimeError("this worker has no CUDA device; use device='cpu'")
     name = needed_package("distributed", "the Dask engine", "distributed").get_worker().name
     return f"cuda:{int(name) % count}" if str(name).isdecimal() else "cuda:0"
 
@@ -134,35 +135,34 @@ def _dask_client(scheduler: str, workers: int) -> Iterator[Any]:
 
 def compute_with_dask(
     job: StackJob, windows: Sequence[Window], *, scheduler: str, workers: int
-) -> Iterator[StoredWindow]:
-    """Work on windows with Dask: one task a window, which reads its frames itself and sends back what is to be stored.
+) -> Generator[StoredWindow, None, None]:
+    """Compute windows with Dask: each is one task that reads its frames and returns the frames to store.
 
-    Workers must see the stack under the same path. A task whose worker is lost goes to another one.
+    Workers must be able to read the stack under the same path. If a worker fails, its tasks are repeated elsewhere.
 
     Args:
-        job: What to do.
+        job: What to compute.
         windows: The windows, in order.
         scheduler: Address like ``tcp://host:8786``, or ``"local"`` for workers on this machine.
-        workers: Workers of a local cluster.
+        workers: Number of workers on this machine.
 
     Yields:
         Frames to store, in the order of the windows.
     """
     job = replace(job, source=job.source.absolute())
-    several = _several(windows)
+    one_thread = _one_thread_each(windows)
     with _dask_client(scheduler, workers) as client:
+
+        def submit(window: Window) -> Any:
+            # the job is sent with every task: scattered data are lost with the worker that holds them
+            return client.submit(_compute_on_worker, job.of_window(window), window, one_thread, retries=3, pure=False)
+
+        def two_per_worker() -> int:
+            return 2 * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
+
         waiting: deque[Any] = deque()
-        left = iter(windows)
         try:
-            while True:
-                room = max(1, _AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"])))
-                while len(waiting) < room and (window := next(left, None)) is not None:
-                    # the job goes along: what is scattered is lost with the worker that holds it
-                    task = (job.of_window(window), window, several)
-                    waiting.append(client.submit(_compute_there, *task, retries=_RETRIES, pure=False))
-                if not waiting:
-                    break
-                yield waiting.popleft().result()
+            yield from _results_in_order(windows, submit, two_per_worker, waiting)
         finally:
             with suppress(Exception):
                 client.cancel(list(waiting))

@@ -1,4 +1,4 @@
-"""How the C library keeps memory: in one heap for all threads, and from one window to the next."""
+"""Settings of the GNU C library's memory allocator that limit the memory and the time of long runs."""
 
 import ctypes
 import functools
@@ -7,33 +7,33 @@ from typing import Any
 
 __all__ = ["keep_freed_memory", "share_one_heap"]
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of glibc's mallopt
-_MMAP_FROM = 1 << 25  # bytes; as far as glibc goes by itself
-
 
 def share_one_heap() -> bool:
-    """Have the threads that start from now on take their memory from one heap, where the C library is glibc.
+    """Let all threads that start from now on allocate from one heap; the setting holds for the process.
 
-    It gives every thread a heap of its own, and keeps in it what the thread let go of. Pixels are read in one thread,
-    computed on in others and written in yet another: each heap then grows to the worst moment of its own, and their
-    sum goes on growing for hundreds of windows. The setting holds for the process, and cannot be taken back.
+    By default every thread has its own heap and keeps freed memory in it. Frames are read, computed and written by
+    different threads, and the sum of their heaps grows for hundreds of windows (after 1000 frames 1.55 GB instead of
+    1.36 GB, ``docs/stacks.md``).
 
     Returns:
-        Whether the C library took it.
+        Whether the C library has accepted the setting.
     """
-    return _set(_ARENA_MAX, 1)
+    arena_max = -8  # parameter M_ARENA_MAX of mallopt
+    return _set(arena_max, 1)
 
 
 def keep_freed_memory() -> bool:
-    """Have this process keep freed memory for the next frames, as glibc does unless it is told otherwise.
+    """Let this process keep freed memory for the next frames, as is the default outside Dask.
 
-    Dask tells the workers it starts to hand it back to the system at once: the pages of every large tensor are then
-    asked for, and cleared, anew.
+    Dask workers return it to the system at once, so that the pages of every large tensor are requested and cleared
+    again: 40 % of the CPU time of a run (``docs/stacks.md``).
 
     Returns:
-        Whether the C library took it.
+        Whether the C library has accepted the setting.
     """
-    return _set(_MMAP_THRESHOLD, _MMAP_FROM) and _set(_TRIM_THRESHOLD, 2 * _MMAP_FROM)
+    trim_threshold, mmap_threshold = -1, -3  # parameters M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of mallopt
+    largest_dynamic = 1 << 25  # bytes; the upper limit of the default, dynamic threshold
+    return _set(mmap_threshold, largest_dynamic) and _set(trim_threshold, 2 * largest_dynamic)
 
 
 @functools.cache

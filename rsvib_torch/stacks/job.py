@@ -1,32 +1,32 @@
-"""What is done with every window, wherever it is done."""
+"""The computation of one window: reading its frames, detection, restoration, and the record of the result."""
 
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.detection import DetectionResult, detect_vibration
-from rsvib_torch.io.files import open_stack
+from rsvib_torch.io.files import PathLike, open_stack, read_stack_info
 from rsvib_torch.io.formats import FrameReader
-from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
+from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts, required_full_scale
 from rsvib_torch.io.schema import DetectedVibration, detection_to_json
-from rsvib_torch.io.stack_info import FrameError, StackInfo
+from rsvib_torch.io.stack_info import FrameError, StackInfo, timing_of_stack
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.stacks.frame_faults import frame_fault, placeholder
-from rsvib_torch.stacks.records import WindowRecord
-from rsvib_torch.stacks.window_restoration import RestoredFrames, restore_trusted
-from rsvib_torch.stacks.windows import Window, window_timing
+from rsvib_torch.stacks.memory import parse_memory, windows_at_once
+from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted
+from rsvib_torch.stacks.windows import Window, cut_windows, window_timing
 
-__all__ = ["BadFrames", "StackJob", "StoredWindow", "WindowFrames", "WindowReader", "WindowResult"]
+__all__ = ["BadFrames", "StackJob", "StoredWindow", "WindowFrames", "WindowReader", "WindowResult", "plan_job"]
 
 BadFrames = Literal["pass", "skip"]
-WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why there are none
-_JUDGED_PAIRS, _JUDGED_PAIRS_ALONE = 2, 8  # of a window, evenly spread
+WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why a frame cannot be read
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +34,13 @@ class WindowResult:
     """One window of a stack, restored.
 
     Attributes:
-        window: Which frames it has and which of them it writes.
-        indices: Numbers of ``frames`` in the stack; empty where all frames became one image.
-        frames: Restored frames, full scale 1: (T, H, W) or (T, C, H, W). Where nothing was restored, as taken.
+        window: Its position in the stack.
+        indices: Indices of ``frames`` in the stack; empty if all frames were restored jointly as one image.
+        frames: Frames whose full scale is 1, (T, H, W) or (T, C, H, W): restored, or as taken.
         restored: Whether they are restored.
-        detection: What was detected; its time begins with the window's first frame. None where nothing could be.
-        restoration: What is known of the restoration; None without a detection.
-        error: Why nothing was detected or restored.
+        detection: The detection, with the time origin at the window's first frame; None if it failed.
+        restoration: Details of the restoration; None without a detection.
+        error: Why detection or restoration failed.
         bad_frames: Frames of ``window.written`` that could not be used, with the reason; they are not in ``frames``.
     """
 
@@ -56,7 +56,7 @@ class WindowResult:
 
 @dataclass(frozen=True, eq=False)
 class StoredWindow:
-    """Frames of a window as they go into the file, with the record of it."""
+    """Frames of a window as they are stored, and the content of its ``WindowRecord``."""
 
     frames: list[NDArray[Any]]
     record: dict[str, Any]
@@ -64,19 +64,19 @@ class StoredWindow:
 
 @dataclass(frozen=True, eq=False)
 class StackJob:
-    """Everything that the result of a window depends on, besides its frames.
+    """Everything on which the result of a window depends, except its frames.
 
     Attributes:
         source: The stack.
-        info: What it says of itself.
-        timing: The sensor, for the whole stack.
-        full_scale: Count that means 1.0; None for floats.
+        info: What its file states.
+        timing: Timing of the whole stack.
+        full_scale: Count that corresponds to 1.0; None for floats.
         detection: Options of ``detect_vibration``.
-        restoration: Options of ``restore``, for frames whose full scale is 1; None to detect only.
+        restoration: Options of ``restore``, for frames whose full scale is 1; None for detection only.
         given: Detections to use instead, by number of the window; None where a window has none.
-        bad_frames: Whether frames that cannot be used are written as they are, or left out.
-        force: Keep restored frames even where they are judged no better than raw.
-        device: Where to compute.
+        bad_frames: Whether frames that cannot be used are written unchanged or omitted.
+        force: Whether to write restored frames even if they are judged worse than the raw ones.
+        device: Device for the computation.
     """
 
     source: Path
@@ -96,98 +96,106 @@ class StackJob:
         return self.restoration is not None and self.restoration.get("joint", False) is True
 
     def of_window(self, window: Window) -> "StackJob":
-        """The same for one window: of the detections to use only its own."""
+        """The job with only those given detections that ``window`` needs."""
         return self if self.given is None else replace(self, given={window.index: self.given[window.index]})
 
     def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
-        """Detect, restore and judge one window.
+        """Detect the vibration in a window, restore its frames and judge the result.
 
         Args:
-            window: Which frames it has.
-            pixels: The frames, or why there are none.
+            window: The window.
+            pixels: Its frames, or why they cannot be read.
         """
-        faults = {
-            index: frame if isinstance(frame, str) else frame_fault(frame, index, self.full_scale)
-            for index, frame in zip(window.frames, pixels, strict=True)
-        }
-        good = [index for index, fault in faults.items() if fault is None]
-        bad = {index: fault for index in window.written if (fault := faults[index]) is not None}
-        usable = [frame for frame, fault in zip(pixels, faults.values(), strict=True) if fault is None]
-        kept = tuple(index for index in good if index in window.written)
-        shape = (0, *self.info.shape[1:])
-        taken = torch.empty(shape)
+        faults: dict[int, str] = {}
+        usable: dict[int, NDArray[Any]] = {}
+        for index, frame in zip(window.frames, pixels, strict=True):
+            fault = frame if isinstance(frame, str) else frame_fault(frame, index, self.full_scale)
+            if fault is not None:
+                faults[index] = fault
+            elif not isinstance(frame, str):
+                usable[index] = frame
+        frames = torch.empty((0, *self.info.shape[1:]))
         if usable:
-            taken = counts_to_frames(np.stack(usable), self.full_scale, str(self.source)).to(self.device)
-        if len(usable) < 2 and any(fault is not None for fault in faults.values()):
-            reason = next(fault for fault in faults.values() if fault is not None)
-            return WindowResult(window, kept, taken[: len(kept)], False, None, None, reason, bad)
-        timing = window_timing(self.timing, window, good)
+            stored = np.stack(list(usable.values()))
+            frames = counts_to_frames(stored, self.full_scale, str(self.source)).to(self.device)
+        kept = tuple(index for index in usable if index in window.written)
+        bad = {index: fault for index, fault in faults.items() if index in window.written}
+        as_taken = WindowResult(window, kept, frames[: len(kept)], False, None, None, None, bad)
+        if faults and len(usable) < 2:
+            return replace(as_taken, error=next(iter(faults.values())))
+        timing = window_timing(self.timing, window, list(usable))
         detection: DetectionResult | DetectedVibration | None = None
         try:
-            detection = self._detect(window, taken, timing)
-            if detection is None or self.restoration is None:
-                unknown = "no vibration is known for this window" if detection is None else None
-                return WindowResult(window, kept, taken[: len(kept)], False, detection, None, unknown, bad)
-            fewer = len(kept) if len(kept) > 1 and not self.restoration.get("joint", False) else None
-            restored = restore_trusted(
-                taken,
+            if self.given is not None:
+                detection = self.given[window.index]
+            else:
+                detection = detect_vibration(frames, timing, **self.detection)
+            if detection is None:
+                return replace(as_taken, error="no detection was given for this window")
+            if self.restoration is None:
+                return replace(as_taken, detection=detection)
+            joint = bool(self.restoration.get("joint", False))
+            restoration = restore_trusted(
+                frames,
                 timing,
                 detection,
                 self.restoration,
                 force=self.force,
-                first_frames=fewer,
-                most_pairs=_JUDGED_PAIRS_ALONE if window.alone else _JUDGED_PAIRS,
+                first_frames=len(kept) if len(kept) > 1 and not joint else None,
+                most_pairs=8 if window.alone else 2,  # limits the time of the verdict
             )
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
-            message = " ".join(str(error).split())
-            return WindowResult(window, kept, taken[: len(kept)], False, detection, None, message, bad)
-        if self.joined and restored.restored:
-            return WindowResult(window, (), restored.frames, True, detection, restored, None, bad)
-        return WindowResult(
-            window, kept, restored.frames[: len(kept)], restored.restored, detection, restored, None, bad
+            return replace(as_taken, detection=detection, error=" ".join(str(error).split()))
+        one_image = self.joined and restoration.restored
+        return replace(
+            as_taken,
+            indices=() if one_image else kept,
+            frames=restoration.frames if one_image else restoration.frames[: len(kept)],
+            restored=restoration.restored,
+            detection=detection,
+            restoration=restoration,
         )
 
-    def _detect(
-        self, window: Window, frames: Tensor, timing: SensorTiming
-    ) -> DetectionResult | DetectedVibration | None:
-        if self.given is not None:
-            return self.given[window.index]
-        found: DetectionResult = detect_vibration(frames, timing, **self.detection)
-        return found
-
     def stored(self, result: WindowResult, pixels: WindowFrames) -> StoredWindow:
-        """The frames of a result as they go into the file: what was not restored goes there unchanged."""
+        """The frames of a result as they are stored: frames that were not restored are unchanged.
+
+        A frame that cannot be read is stored as NaN, or 0 for integers, unless bad frames are omitted.
+        """
         dtype = np.dtype(self.info.dtype)
-        window, rows = result.window, list(result.window.written)
         if result.restored and not result.indices:
             frames = list(frames_to_counts(result.frames, dtype, self.full_scale))
-        else:
-            new = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
-            frames = []
-            for index in [rows[len(rows) // 2]] if self.joined else rows:
-                if index in new:
-                    frames.append(frames_to_counts(new[index], dtype, self.full_scale))
-                elif self.bad_frames == "pass" or index not in result.bad_frames:
-                    old = pixels[index - window.first]
-                    frames.append(placeholder(self.info.shape[1:], self.info.dtype) if isinstance(old, str) else old)
+            return StoredWindow(frames, self.record(result, len(frames)))
+        written = list(result.window.written)
+        restored = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
+        frames = []
+        for index in [written[len(written) // 2]] if self.joined else written:
+            if index in restored:
+                frames.append(frames_to_counts(restored[index], dtype, self.full_scale))
+            elif self.bad_frames == "pass" or index not in result.bad_frames:
+                frame = pixels[index - result.window.first]
+                if isinstance(frame, str):
+                    frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
+                frames.append(frame)
         return StoredWindow(frames, self.record(result, len(frames)))
 
     def record(self, result: WindowResult, written: int) -> dict[str, Any]:
-        """What is kept of a result."""
-        restoration = result.restoration
+        """Content of the ``WindowRecord`` of a result of which ``written`` frames were written."""
+        window, restoration = result.window, result.restoration
         verdict = None if restoration is None else restoration.verdict
-        return WindowRecord.content(
-            result.window,
-            float(self.timing.frame_starts(result.window.first + 1)[-1]),
-            written=written,
-            frames="restored" if result.restored else "as taken",
-            detection=detection_to_json(result.detection),
-            left_alone=[] if restoration is None else list(restoration.left_alone),
-            outcome=None if verdict is None else verdict.overall,
-            summary=None if verdict is None else verdict.summary,
-            error=result.error,
-            bad_frames={str(index): reason for index, reason in result.bad_frames.items()},
-        )
+        return {
+            "window": window.index,
+            "first": window.first,
+            "last": window.last,
+            "start_time": float(self.timing.frame_starts(window.first + 1)[-1]),
+            "written": written,
+            "frames": "restored" if result.restored else "as taken",
+            "detection": detection_to_json(result.detection),
+            "left_alone": [] if restoration is None else list(restoration.left_alone),
+            "outcome": None if verdict is None else verdict.overall,
+            "summary": None if verdict is None else verdict.summary,
+            "error": result.error,
+            "bad_frames": {str(index): reason for index, reason in result.bad_frames.items()},
+        }
 
 
 class WindowReader:
@@ -195,7 +203,7 @@ class WindowReader:
 
     Args:
         source: The stack.
-        info: What it said of itself when the run began.
+        info: What its file stated when the job was planned.
     """
 
     def __init__(self, source: Path, info: StackInfo) -> None:
@@ -204,11 +212,11 @@ class WindowReader:
         self._last: tuple[int, NDArray[Any] | str] | None = None
 
     def read(self, window: Window) -> WindowFrames:
-        """Pixels of the frames of a window as stored, or why there are none."""
+        """Pixels of the frames of a window as stored, or why they cannot be read."""
         if self._reader is None:
             self._reader = open_stack(self._source)
             if self._reader.info != self._info:
-                raise ValueError(f"{self._source} has changed while it was read")
+                raise ValueError(f"{self._source} has changed since it was first opened; start again")
         frames = [self._frame(self._reader, index) for index in window.frames]
         self._last = (window.last, frames[-1])
         return frames
@@ -222,6 +230,70 @@ class WindowReader:
             return " ".join(str(error).split())
 
     def close(self) -> None:
-        """Let go of the stack."""
+        """Close the stack."""
         if self._reader is not None:
             self._reader.close()
+
+
+def plan_job(
+    source: PathLike,
+    timing: SensorTiming,
+    *,
+    window: int,
+    detection: Mapping[str, Any] | None,
+    restoration: Mapping[str, Any] | None,
+    full_scale: float | None,
+    memory: str | float | None,
+    workers: int | None,
+    device: str,
+    given: Sequence[DetectedVibration | None] | None = None,
+    bad_frames: BadFrames = "pass",
+    force: bool = False,
+) -> tuple[StackJob, list[Window], int]:
+    """The job of a run, its windows, and how many of them to compute at once; arguments as in ``process_stack``.
+
+    Raises:
+        OSError: If the stack cannot be read.
+        TypeError: If an option is unknown.
+        ValueError: If a value is out of range or contradicts the stack.
+    """
+    check_choice("bad_frames", bad_frames, get_args(BadFrames))
+    info = read_stack_info(source)
+    if info.is_integer:
+        full_scale = info.full_scale if full_scale is None else full_scale
+        full_scale = required_full_scale(full_scale, np.dtype(info.dtype), source)
+    else:
+        full_scale = None
+    timing = timing_of_stack(timing, info)
+    timing.frame_starts(info.shape[0])  # raises an error if there are too few frame start times
+    timing.check_rows(info.shape[-1 if timing.scan_axis == -1 else -2])
+    options = dict(detection or {})
+    for name in ("window", "window_step"):
+        if name in options:
+            raise TypeError(f"{name!r} is not an option of detection here: a stack is cut into windows by window=")
+    if options.get("model", "tones") != "tones":
+        raise ValueError(f"model={options['model']!r}: in windows only tones are detected; see detect_vibration")
+    check_choice("device", device.partition(":")[0], ("auto", "cpu", "cuda"))
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    job = StackJob(
+        Path(source),
+        info,
+        timing,
+        full_scale,
+        options,
+        None if restoration is None else dict(restoration),
+        None if given is None else dict(enumerate(given)),
+        bad_frames,
+        force,
+        device,
+    )
+    windows = cut_windows(info.shape[0], window)
+    if workers is not None:
+        most = check_whole_number("workers", workers, at_least=1)
+    elif device != "cpu":
+        most = 1
+    else:
+        most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limit = None if memory is None else parse_memory(memory)
+    return job, windows, windows_at_once(info, window, memory=limit, most=most, restoration=job.restoration)

@@ -1,4 +1,4 @@
-"""``manifest.json``: what a run read, how, and what became of every window."""
+"""``manifest.json``: the input, settings and versions of a run, and the result of every window."""
 
 import hashlib
 import json
@@ -8,39 +8,60 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import Field
+
 from rsvib_torch.core.validation import Section, read_json, validate
-from rsvib_torch.io.schema import DetectedVibration, TimingRecord, detection_to_json
+from rsvib_torch.io.schema import DetectedVibration, DetectionRecord, TimingRecord, detection_to_json
 from rsvib_torch.stacks.job import StackJob
-from rsvib_torch.stacks.records import WindowRecord
 
-__all__ = ["StackManifest", "manifest_header", "read_manifest", "write_manifest"]
+__all__ = ["StackManifest", "WindowRecord", "fingerprint", "manifest_header", "read_manifest", "write_manifest"]
 
-_FORMAT = "rsvib stack"
-_UNITS = {
-    "start_time": "s, of the first row of the first frame of a window, where its time begins",
-    "amplitude": "px",
-    "frequency": "Hz",
-    "period": "s",
-    "phase": "rad at start_time",
-    "image_motion": "px/s",
-    "image_acceleration": "px/s^2",
-    "residual": "px",
-}
+
+class WindowRecord(Section):
+    """Result of one window.
+
+    Attributes:
+        window: Number of the window.
+        first: Its first frame.
+        last: Its last frame.
+        start_time: Exposure start of its first row in seconds, the time origin of its detection.
+        written: Number of frames written.
+        frames: Whether the frames written are restored, or as taken.
+        detection: The detection; None if it failed.
+        left_alone: A sentence for each axis that was not restored.
+        outcome: ``RestorationVerdict.overall``; None if the frames could not be compared.
+        summary: ``RestorationVerdict.summary``.
+        error: Why detection or restoration failed.
+        bad_frames: Index of each frame that could not be used, with the reason.
+    """
+
+    window: int
+    first: int
+    last: int
+    start_time: float
+    written: int = Field(ge=0)
+    frames: Literal["restored", "as taken"]
+    detection: DetectionRecord | None
+    left_alone: list[str]
+    outcome: str | None
+    summary: str | None
+    error: str | None
+    bad_frames: dict[str, str]
 
 
 class StackManifest(Section):
-    """What ``manifest.json`` says.
+    """Content of ``manifest.json``.
 
     Attributes:
         format: ``"rsvib stack"``.
-        version: Of the format.
+        version: Version of the format.
         input: Name, size and hash of the stack.
         settings: Sensor and options.
-        versions: Of the packages that computed it.
-        output: Name of what was written; None where nothing was.
-        units: Of the numbers.
-        bad_frames: Frames that could not be used, with the reason.
-        windows: What became of every window.
+        versions: Versions of the packages that computed it.
+        output: Name of the output; None for detection only.
+        units: Units of the numbers.
+        bad_frames: Index of each frame that could not be used, with the reason.
+        windows: Result of every window.
     """
 
     format: Literal["rsvib stack"]
@@ -54,38 +75,70 @@ class StackManifest(Section):
     windows: list[WindowRecord]
 
     def header(self) -> dict[str, Any]:
-        """All that was known before the first window."""
-        return {"input": self.input, "settings": self.settings, "versions": self.versions, "output": self.output}
+        """Everything that was determined before the first window, as made by ``manifest_header``."""
+        return self.model_dump(include={"input", "settings", "versions", "output"})
 
     def detections(self) -> list[DetectedVibration | None]:
-        """What was detected in every window; None where nothing could be."""
+        """The detection of every window; None where it failed."""
         return [None if record.detection is None else record.detection.to_detection() for record in self.windows]
 
 
-def _given_keys(given: Iterable[DetectedVibration | None]) -> str:
-    records = [detection_to_json(detected) for detected in given]
-    return hashlib.sha256(json.dumps(records).encode()).hexdigest()
+def fingerprint(path: Path, *, block: int = 1 << 16, blocks: int = 32, files: int = 32) -> dict[str, Any]:
+    """Name, size and hash of a file or folder.
+
+    The hash covers the names and sizes of all files, and evenly spaced blocks of them that include the first and the
+    last; with the defaults, files of up to 2 MiB completely.
+
+    Args:
+        path: The file or folder; a file ``NAME.json`` beside a file is included.
+        block: Bytes per block.
+        blocks: Maximum number of blocks of a file.
+        files: Maximum number of files of a folder whose blocks are read.
+
+    Raises:
+        OSError: If it cannot be read.
+    """
+
+    def spread(count: int, most: int) -> list[int]:
+        steps = min(count, most)
+        return sorted({round(i * (count - 1) / max(1, steps - 1)) for i in range(steps)})
+
+    if path.is_dir():
+        members = sorted(file for file in path.rglob("*") if file.is_file())
+    else:
+        sidecar = path.with_name(path.name + ".json")
+        members = [path, sidecar] if sidecar.is_file() else [path]
+    sizes = [file.stat().st_size for file in members]
+    digest = hashlib.sha256()
+    for file, size in zip(members, sizes, strict=True):
+        digest.update(f"{file.relative_to(path.parent)}\0{size}\0".encode())
+    for number in spread(len(members), files):
+        with members[number].open("rb") as opened:
+            for index in spread(-(-sizes[number] // block), blocks):
+                opened.seek(index * block)
+                digest.update(opened.read(block))
+    return {"name": path.name, "bytes": sum(sizes), "sha256_of_samples": digest.hexdigest()}
 
 
-def manifest_header(
-    job: StackJob, window: int, output: str | None, compression: str | None, source: dict[str, Any]
-) -> dict[str, Any]:
-    """Everything that the result depends on: a run goes on only where it is the same."""
-    shape = {"shape": list(job.info.shape), "dtype": job.info.dtype}
-    settings = {
-        "sensor": TimingRecord.from_timing(job.timing).model_dump(),
-        "full_scale": job.full_scale,
-        "window": window,
-        "detection": dict(job.detection),
-        "restoration": None if job.restoration is None else dict(job.restoration),
-        "given": None if job.given is None else _given_keys(job.given.values()),
-        "bad_frames": job.bad_frames,
-        "force": job.force,
-        "device": job.device.partition(":")[0],
-    }
+def manifest_header(job: StackJob, window: int, output: str | None, compression: str | None) -> dict[str, Any]:
+    """Everything on which the result depends, as JSON: a run is resumed only if it is unchanged."""
+    given = None
+    if job.given is not None:
+        records = [detection_to_json(detected) for detected in job.given.values()]
+        given = hashlib.sha256(json.dumps(records).encode()).hexdigest()
     header = {
-        "input": {**source, **shape},
-        "settings": settings,
+        "input": {**fingerprint(job.source), "shape": list(job.info.shape), "dtype": job.info.dtype},
+        "settings": {
+            "sensor": TimingRecord.from_timing(job.timing).model_dump(),
+            "full_scale": job.full_scale,
+            "window": window,
+            "detection": dict(job.detection),
+            "restoration": None if job.restoration is None else dict(job.restoration),
+            "given": given,
+            "bad_frames": job.bad_frames,
+            "force": job.force,
+            "device": job.device.partition(":")[0],
+        },
         "versions": {name: version(name) for name in ("rsvib_torch", "torch", "numpy")},
         "output": None if output is None else {"name": output, "compression": compression},
     }
@@ -94,17 +147,27 @@ def manifest_header(
 
 
 def write_manifest(path: Path, header: dict[str, Any], records: Iterable[dict[str, Any]]) -> None:
-    """Write a manifest, one line a key and one a window; the records are gone through once.
+    """Write a manifest with one line per key and window; records are not kept in memory.
 
     Args:
-        path: The file to write; a temporary name, for it is not written at once.
-        header: What ``manifest_header`` made.
+        path: Temporary name of the file.
+        header: As made by ``manifest_header``.
         records: Contents of ``WindowRecord``.
     """
+    units = {
+        "start_time": "s, of the first row of the first frame of a window, the time origin of its detection",
+        "amplitude": "px",
+        "frequency": "Hz",
+        "period": "s",
+        "phase": "rad at start_time",
+        "image_motion": "px/s",
+        "image_acceleration": "px/s^2",
+        "residual": "px",
+    }
     bad: dict[str, str] = {}
     with path.open("w", encoding="utf-8") as file:
         file.write("{\n")
-        for key, value in {"format": _FORMAT, "version": 1, **header, "units": _UNITS}.items():
+        for key, value in {"format": "rsvib stack", "version": 1, **header, "units": units}.items():
             file.write(f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)},\n")
         file.write('  "windows": [')
         for number, record in enumerate(records):
@@ -117,7 +180,7 @@ def write_manifest(path: Path, header: dict[str, Any], records: Iterable[dict[st
 
 
 def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
-    """Read what a run wrote down.
+    """Read the manifest of a complete run.
 
     Args:
         path: The ``manifest.json``.
@@ -125,6 +188,9 @@ def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
     Raises:
         OSError: If the file cannot be opened.
         ValueError: If it is not a complete manifest.
+
+    Example:
+        >>> [record.outcome for record in read_manifest("manifest.json").windows]  # doctest: +SKIP
     """
     path = Path(path)
     manifest = validate(StackManifest, read_json(path, "manifest.json"), str(path))

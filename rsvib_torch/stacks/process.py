@@ -1,26 +1,175 @@
-"""Stacks of any length from file to file: read ahead, detected in windows, restored, written as it goes."""
+"""Processing of stacks of any length: ``iterate_stack``, ``detect_stack`` and ``process_stack``."""
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from rsvib_torch.io.atomic import whole_file
 from rsvib_torch.io.files import PathLike, check_info_target
 from rsvib_torch.io.schema import DetectedVibration
 from rsvib_torch.io.stack_info import exposure_times
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.stacks.fingerprint import fingerprint
-from rsvib_torch.stacks.job import BadFrames
-from rsvib_torch.stacks.job_setup import DEFAULT_WINDOW, job_windows_at_once, make_job
-from rsvib_torch.stacks.journal import Journal, describe_difference
+from rsvib_torch.stacks.engines import compute_here, compute_with_dask
+from rsvib_torch.stacks.job import BadFrames, StoredWindow, WindowFrames, WindowResult, plan_job
 from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_manifest
-from rsvib_torch.stacks.run import StackReport, StackRun, disk_trouble_named
-from rsvib_torch.stacks.sink import Sink
-from rsvib_torch.stacks.windows import cut_windows
+from rsvib_torch.stacks.output import Journal, Sink, describe_difference, disk_errors_named
+from rsvib_torch.stacks.windows import Window
 
-__all__ = ["process_stack"]
+__all__ = ["DEFAULT_WINDOW", "StackReport", "detect_stack", "iterate_stack", "process_stack"]
+
+DEFAULT_WINDOW = 8  # frames
+_MAX_INITIAL_FAILURES = 8  # windows; a run stops if all windows up to this number fail
+
+
+@dataclass(frozen=True, eq=False)
+class StackReport:
+    """Summary of a run.
+
+    Attributes:
+        frames: Number of frames written, including those of an interrupted run that was resumed.
+        windows: Number of windows of the stack.
+        restored: Number of windows whose frames were restored.
+        failed: Number of windows in which detection or restoration failed.
+        bad_frames: Number of frames that could not be used.
+        resumed: Number of windows that were complete before.
+        seconds: Duration of the run.
+        first: Result of the first window, if it was computed in this process.
+        manifest: Path of the manifest.
+    """
+
+    frames: int
+    windows: int
+    restored: int
+    failed: int
+    bad_frames: int
+    resumed: int
+    seconds: float
+    first: WindowResult | None
+    manifest: Path
+
+
+def iterate_stack(
+    source: PathLike,
+    timing: SensorTiming,
+    *,
+    window: int = DEFAULT_WINDOW,
+    detection: Mapping[str, Any] | None = None,
+    restoration: Mapping[str, Any] | None = None,
+    full_scale: float | None = None,
+    force: bool = False,
+    memory: str | float | None = None,
+    workers: int | None = None,
+    device: str = "auto",
+) -> Iterator[WindowResult]:
+    """Restore a stack of any length window by window; each is available as soon as it is complete.
+
+    A stack is cut into windows of at most ``window`` frames that share one frame with their neighbours. Each window is
+    processed as a separate stack, with the time origin at its first frame. Later windows are read and computed
+    meanwhile.
+
+    Args:
+        source: The stack, as in ``read_stack``.
+        timing: The sensor. If it has no frame start times and the file states them, those of the file are used.
+        window: Maximum number of frames of a window.
+        detection: Options of ``detect_vibration``.
+        restoration: Options of ``restore``, for frames whose full scale is 1.
+        full_scale: As in ``read_stack``.
+        force: Whether to return restored frames even if they are judged worse than the raw ones.
+        memory: Limit for the memory of the process, in bytes or like ``"2GB"``; by default 80 % of the free memory.
+        workers: Maximum number of windows to compute at once; by default the number of processors.
+        device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
+
+    Yields:
+        One ``WindowResult`` per window, in order.
+
+    Raises:
+        OSError: If the stack cannot be read.
+        TypeError: If an option is unknown.
+        ValueError: If a value is out of range, or the stack is not readable.
+
+    Example:
+        >>> for result in iterate_stack("frames.tif", timing):  # doctest: +SKIP
+        ...     print(result.indices, result.restored)
+    """
+    job, windows, at_once = plan_job(
+        source,
+        timing,
+        window=window,
+        detection=detection,
+        restoration=restoration or {},
+        full_scale=full_scale,
+        memory=memory,
+        workers=workers,
+        device=device,
+        force=force,
+    )
+    yield from compute_here(job, windows, lambda result, _: result, at_once=at_once)
+
+
+def detect_stack(
+    source: PathLike,
+    manifest: PathLike,
+    timing: SensorTiming,
+    *,
+    window: int = DEFAULT_WINDOW,
+    detection: Mapping[str, Any] | None = None,
+    full_scale: float | None = None,
+    memory: str | float | None = None,
+    workers: int | None = None,
+    device: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Detect the vibration in every window of a stack of any length.
+
+    Args:
+        source: As in ``iterate_stack``.
+        manifest: The ``manifest.json`` to write; ``read_manifest`` reads it, ``process_stack(given=...)`` uses it.
+        timing: As in ``iterate_stack``.
+        window: As in ``iterate_stack``.
+        detection: As in ``iterate_stack``.
+        full_scale: As in ``iterate_stack``.
+        memory: As in ``iterate_stack``.
+        workers: As in ``iterate_stack``.
+        device: As in ``iterate_stack``.
+        progress: As in ``process_stack``.
+
+    Raises:
+        OSError: If the stack cannot be read, or the manifest cannot be written.
+        TypeError: If an option is unknown.
+        ValueError: If a value is out of range, the stack is not readable, or detection fails in all first windows.
+
+    Example:
+        >>> detect_stack("frames.tif", "manifest.json", timing)  # doctest: +SKIP
+    """
+    job, windows, at_once = plan_job(
+        source,
+        timing,
+        window=window,
+        detection=detection,
+        restoration=None,
+        full_scale=full_scale,
+        memory=memory,
+        workers=workers,
+        device=device,
+    )
+
+    def records() -> Iterator[dict[str, Any]]:
+        errors: list[str | None] = []
+        for record in compute_here(job, windows, lambda result, _: job.record(result, 0), at_once=at_once):
+            errors.append(record["error"])
+            _check_not_all_failed(errors, windows)
+            if progress is not None:
+                progress(record["last"] + 1, job.info.shape[0])
+            yield record
+
+    header = manifest_header(job, window, None, None)
+    with whole_file(manifest) as part:
+        write_manifest(part, header, records())
 
 
 def process_stack(
@@ -46,108 +195,177 @@ def process_stack(
 ) -> StackReport:
     """Restore a stack of any length from file to file.
 
-    The stack is cut into windows as in ``iterate_stack``; where they begin depends on the number of frames and
-    ``window`` alone, and each is computed on one thread: results are the same whatever memory, workers and engine. The
-    output appears when it is complete; until then the work is kept in a folder ``.NAME.rsvib`` beside it, from which a
-    run that was broken off goes on. Memory does not grow with the number of frames.
+    The stack is cut into windows as in ``iterate_stack``. They depend only on the number of frames and ``window``, and
+    each is computed on one thread: results do not depend on memory, workers and scheduler. The output gets its name
+    when it is complete; until then it is stored in the folder ``.NAME.rsvib`` beside it, from which an interrupted run
+    can be resumed. Memory does not grow with the number of frames.
 
-    Frames that cannot be read or used (constant, infinite, beyond full scale) are named in the manifest; the others of
-    their window are restored without them. A window in which nothing can be detected is written as taken.
+    Frames that cannot be read or used (constant, infinite, beyond full scale) are listed in the manifest; the other
+    frames of their window are restored without them. A window in which the detection fails is written unchanged.
 
     Args:
         source: The stack, as in ``read_stack``.
-        sink: The stack to write, as in ``write_stack``; type, full scale, resolution and frame times are kept.
+        sink: The stack to write, as in ``write_stack``; data type, full scale, resolution and frame times are kept.
         timing: As in ``iterate_stack``.
         window: As in ``iterate_stack``.
         detection: As in ``iterate_stack``.
         restoration: As in ``iterate_stack``; with ``joint=True`` every window becomes one image.
-        given: Detections to use instead, one a window (see ``read_manifest``).
+        given: Detections to use instead, one for each window (see ``read_manifest``).
         full_scale: As in ``read_stack``.
-        bad_frames: Whether frames that cannot be used are written as they are (``"pass"``; one that cannot be read is
-            0, or NaN in floats), or left out (``"skip"``).
+        bad_frames: Whether frames that cannot be used are written unchanged (``"pass"``; a frame that cannot be read is
+            written as NaN, or 0 for integers), or omitted (``"skip"``).
         force: As in ``iterate_stack``.
-        memory: As in ``iterate_stack``. Dask workers keep to their own limits.
-        workers: As in ``iterate_stack``; with ``scheduler="local"``, processes.
+        memory: As in ``iterate_stack``. Dask workers have their own limits.
+        workers: As in ``iterate_stack``; with ``scheduler="local"``, the number of processes.
         device: As in ``iterate_stack``.
-        scheduler: Address of a Dask scheduler whose workers see ``source`` under the same path; ``"local"`` starts
-            workers on this machine; None computes here.
+        scheduler: Address of a Dask scheduler whose workers can read ``source`` under the same path; ``"local"`` starts
+            workers on this machine; None computes in this process.
         compression: As in ``write_stack``.
-        resume: Go on with a run that was broken off; a complete one is left as it is.
-        manifest: Where to write down what was done; beside ``sink`` with ``.manifest.json`` added, if not given.
-        progress: Called with the number of frames that are done, and of all.
+        resume: Whether to continue an interrupted run; a complete output is not changed.
+        manifest: Path of the manifest; by default ``sink`` with ``.manifest.json`` appended.
+        progress: Called with the number of complete frames and of all frames.
 
     Returns:
-        What was done.
+        Summary of the run.
 
     Raises:
-        FileExistsError: If a run was broken off there, and is not to be resumed.
+        FileExistsError: If there is an interrupted run and ``resume`` is False.
         ModuleNotFoundError: If an optional package is missing, with the extra to install.
-        OSError: If a file cannot be read or written; what is done is kept to go on with.
-        TypeError: If an option is not known.
-        ValueError: If a value is out of range, the stack is not readable, nothing in it can be detected, or input,
-            settings or versions are not those of the run to go on with.
+        OSError: If a file cannot be read or written; the run can then be resumed.
+        TypeError: If an option is unknown.
+        ValueError: If a value is out of range, the stack is not readable, detection fails in all first windows, or
+            input, settings or versions differ from those of the run to resume.
+
+    Example:
+        >>> report = process_stack("frames.tif", "restored.tif", timing, memory="2GB")  # doctest: +SKIP
     """
     start, sink = time.perf_counter(), Path(sink)
-    job = make_job(
+    job, windows, at_once = plan_job(
         source,
         timing,
+        window=window,
         detection=detection,
         restoration=restoration or {},
-        given=given,
         full_scale=full_scale,
+        memory=memory,
+        workers=workers,
+        device=device,
+        given=given,
         bad_frames=bad_frames,
         force=force,
-        device=device,
     )
-    windows = cut_windows(job.info.shape[0], window)
     if given is not None and len(given) != len(windows):
-        raise ValueError(f"{len(given)} detections for {len(windows)} windows of at most {window} frames")
-    count = len(windows) if job.joined else job.info.shape[0]
-    out = replace(
-        job.info,
-        shape=(count, *job.info.shape[1:]),
-        full_scale=job.full_scale,
-        frame_times=exposure_times(job.info, timing) if count == job.info.shape[0] else None,
-    )
+        raise ValueError(
+            f"given has {len(given)} detections for {len(windows)} windows of at most {window} frames; "
+            "pass one for each window"
+        )
+    out = job.info.with_frames(len(windows) if job.joined else job.info.shape[0])
+    times = None if out.frame_times is None else exposure_times(job.info, timing)
+    out = replace(out, full_scale=job.full_scale, frame_times=times)
     form = check_info_target(sink, out, compression, check_folder=False)
     target = sink.with_name(sink.name + ".manifest.json") if manifest is None else Path(manifest)
-    if Path(source).exists() and sink.exists() and os.path.samefile(source, sink):
-        raise ValueError(f"{sink}: a stack cannot be written over itself")
-    at_once = job_windows_at_once(job, window, memory, workers)
-    header = manifest_header(job, window, sink.name, compression, fingerprint(job.source))
-    run = StackRun(job, windows, at_once, scheduler, progress)
+    if sink.exists() and os.path.samefile(source, sink):
+        raise ValueError(f"{sink}: a stack cannot be written over itself; choose another name")
+    header = manifest_header(job, window, sink.name, compression)
+    first: WindowResult | None = None
+
+    def finish(result: WindowResult, pixels: WindowFrames) -> StoredWindow:
+        nonlocal first
+        if result.window.index == 0:
+            first = result
+        return job.stored(result, pixels)
+
+    def report(records: Iterable[Mapping[str, Any]], resumed: int) -> StackReport:
+        return StackReport(
+            **_totals(records),
+            windows=len(windows),
+            resumed=resumed,
+            seconds=time.perf_counter() - start,
+            first=first,
+            manifest=target,
+        )
+
     journal = Journal(sink)
     try:
         if resume and not journal.has_lines and sink.exists() and target.exists():
-            _check_same(sink, read_manifest(target).header(), header)
-            return run.report(_records(target), len(windows), start, target)
+            complete = read_manifest(target)
+            difference = describe_difference(complete.header(), header)
+            if difference:
+                raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
+            return report((record.model_dump() for record in complete.windows), len(windows))
         fresh = not journal.open(header, resume=resume)
         resumed = journal.count
-        sure = bad_frames == "pass"
-        with disk_trouble_named(sink, journal):
-            writer = Sink(sink, journal.folder, form, out, sure=sure, compression=compression, fresh=fresh)
+        with disk_errors_named(journal):
+            writer = Sink(
+                sink, journal.folder, form, out, staged=bad_frames == "skip", compression=compression, fresh=fresh
+            )
         try:
-            run.write(writer, journal)
-            with disk_trouble_named(sink, journal):
+            if scheduler is None:
+                results = compute_here(job, windows[resumed:], finish, at_once=at_once)
+            else:
+                results = compute_with_dask(job, windows[resumed:], scheduler=scheduler, workers=at_once)
+            _store_windows(windows, results, writer, journal, progress)
+            with disk_errors_named(journal):
                 write_manifest(journal.folder / "manifest.json", header, journal.records())
                 writer.finish(journal.written)
         finally:
             writer.close()
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(journal.folder / "manifest.json", target)
-        report = run.report(journal.records(), resumed, start, target)
+        summary = report(journal.records(), resumed)
         journal.remove()
-        return report
+        return summary
     finally:
         journal.close()
 
 
-def _check_same(sink: Path, old: Mapping[str, Any], new: Mapping[str, Any]) -> None:
-    """Raise a ``ValueError`` unless a complete output came from what is to be done now."""
-    difference = describe_difference(old, new)
-    if difference:
-        raise ValueError(f"{sink}: cannot resume: {difference}; without resume it is done again and replaced")
+def _totals(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    totals = dict.fromkeys(("frames", "restored", "failed", "bad_frames"), 0)
+    for record in records:
+        totals["frames"] += record["written"]
+        totals["restored"] += record["frames"] == "restored"
+        totals["failed"] += record["error"] is not None
+        totals["bad_frames"] += len(record["bad_frames"])
+    return totals
 
 
-def _records(manifest: Path) -> Iterator[dict[str, Any]]:
-    return (record.model_dump() for record in read_manifest(manifest).windows)
+def _check_not_all_failed(errors: Sequence[str | None], windows: Sequence[Window]) -> None:
+    """Raise a ``ValueError`` with the first error if the detection has failed in every window so far."""
+    if len(errors) >= min(_MAX_INITIAL_FAILURES, len(windows)) and all(errors) and errors[0] is not None:
+        raise ValueError(errors[0])
+
+
+def _store_windows(
+    windows: Sequence[Window],
+    results: Generator[StoredWindow, None, None],
+    sink: Sink,
+    journal: Journal,
+    progress: Callable[[int, int], None] | None,
+) -> None:
+    """Store the results of all windows that are not in the journal, while later windows are computed."""
+    errors = [record["error"] for record in journal.records()]
+    remaining, total = windows[journal.count :], windows[-1].last + 1
+
+    def store(stored: StoredWindow) -> None:
+        with disk_errors_named(journal):
+            sink.put(stored.record["window"], journal.written, stored.frames)
+            journal.add(stored.record)
+
+    if progress is not None:
+        progress(remaining[0].first if remaining else total, total)
+    with ThreadPoolExecutor(1, "rsvib-write") as writing, closing(results):
+        previous: Future[None] | None = None
+        for window, stored in zip(remaining, results, strict=True):
+            errors.append(stored.record["error"])
+            if previous is not None:
+                previous.result()
+            try:
+                _check_not_all_failed(errors, windows)
+            except ValueError:
+                journal.clear()
+                raise
+            previous = writing.submit(store, stored)
+            if progress is not None:
+                progress(window.first + window.kept, total)
+        if previous is not None:
+            previous.result()

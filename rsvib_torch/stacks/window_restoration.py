@@ -1,32 +1,37 @@
-"""Frames of one window restored with what was detected in them, and judged."""
+"""Restoration of the frames of one window, with a check of each frame and a verdict on the result."""
 
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from rsvib_torch.detection import detect_vibration
 from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.io.full_scale import check_dtype, counts_to_frames, frames_to_counts, known_full_scale
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError, trusted_vibration
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.restoration.verdict.trust import Detected
 
-__all__ = ["RestoredFrames", "restore_trusted"]
+__all__ = ["RestoredFrames", "frame_fault", "restore_block", "restore_trusted"]
 
 
 @dataclass(frozen=True, eq=False)
 class RestoredFrames:
-    """Frames to write, and what is known of them.
+    """Result of ``restore_trusted``.
 
     Attributes:
-        frames: Restored, or as taken.
-        restored: Which of the two.
-        left_alone: A sentence for each axis whose vibration was not undone.
-        verdict: Whether restoration helps; None where frames could not be compared.
-        moves: Whether there was a vibration to undo.
+        frames: Frames to write: restored, or as taken.
+        restored: Whether they are restored.
+        left_alone: A sentence for each axis that was not restored.
+        verdict: Whether restoration helps; None if frames could not be compared.
+        moves: Whether there was a vibration to remove.
     """
 
     frames: Tensor
@@ -46,19 +51,19 @@ def restore_trusted(
     first_frames: int | None = None,
     most_pairs: int | None = None,
 ) -> RestoredFrames:
-    """Restore frames with the part of a detection that is known well enough, and judge whether that helps.
+    """Restore frames with the reliable part of a detection, and judge whether that helps.
 
     Args:
         frames: Stack (T, H, W) or (T, C, H, W) whose full scale is 1.
         timing: The sensor.
-        detected: What was detected in them.
+        detected: Detection in these frames.
         options: Options of ``restore``.
-        force: Keep restored frames even where they are judged no better than raw.
-        first_frames: Restore no more than these.
-        most_pairs: Compare no more pairs of frames.
+        force: Whether to return restored frames even if they are judged worse than the raw ones.
+        first_frames: Number of frames to restore; None for all.
+        most_pairs: Maximum number of pairs of frames to compare; None for all.
 
     Returns:
-        Restored frames, or those that came in where there is nothing to undo, or undoing it does not help.
+        Restored frames; the frames as taken if nothing moves, or if restoration makes them worse.
     """
     rows = frames.shape[-1 if timing.scan_axis == -1 else -2]
     vibration, left_alone = trusted_vibration(detected, timing, len(frames), rows)
@@ -75,3 +80,93 @@ def restore_trusted(
             verdict = judge_prepared(prepared, restored, vibration, joint=joint, most_pairs=most_pairs)
     keep = verdict is None or verdict.overall != "worse" or force
     return RestoredFrames(prepared.from_row_order(restored) if keep else frames, keep, left_alone, verdict, True)
+
+
+def frame_fault(
+    frame: NDArray[Any], index: int, full_scale: float | None, *, valid_fraction: float = 0.1
+) -> str | None:
+    """Why a frame cannot be used, or None.
+
+    Args:
+        frame: Pixels as stored.
+        index: Index of the frame in the stack, for the message.
+        full_scale: Count that corresponds to 1.0; not used for floats.
+        valid_fraction: Smallest fraction of pixels that must not be NaN.
+    """
+    low, high = frame.min(), frame.max()
+    if frame.dtype.kind != "f":
+        if full_scale is not None and high > full_scale:
+            return (
+                f"counts reach {high}, beyond full_scale={full_scale:g}; pass a full_scale of at least the largest "
+                f"count (frame {index})"
+            )
+    elif not np.isfinite(low) or not np.isfinite(high):
+        infinite = np.argwhere(np.isinf(frame))
+        if len(infinite):
+            place = tuple(int(i) for i in infinite[0])
+            return f"frames must be finite, but pixel {(index, *place)} is {float(frame[place])}"
+        valid = 1.0 - float(np.isnan(frame).mean())
+        if valid < valid_fraction:
+            return f"frame {index} has only {valid:.1%} of pixels that count"
+        low, high = np.nanmin(frame), np.nanmax(frame)
+    rounding = 1e-7  # of float32, relative
+    if float(high) - float(low) <= rounding * max(abs(float(high)), abs(float(low))):
+        return f"frame {index} is constant: without detail there is nothing to register"
+    return None
+
+
+def restore_block(
+    frames: NDArray[Any],
+    timing: SensorTiming,
+    *,
+    detection: Mapping[str, Any] | None = None,
+    restoration: Mapping[str, Any] | None = None,
+    full_scale: float | None = None,
+    force: bool = False,
+    device: str = "cpu",
+) -> NDArray[Any]:
+    """Detect the vibration in a block of frames and restore them; the result has the shape and data type of the block.
+
+    For ``dask.array.map_overlap`` with an overlap of one frame, and similar tools. The time origin is the first frame
+    of the block. A block in which the detection fails is returned unchanged.
+
+    Args:
+        frames: (T, H, W) or (T, C, H, W), as stored.
+        timing: The sensor; frames must be evenly spaced, because the position of the block in the stack is unknown.
+        detection: Options of ``detect_vibration``.
+        restoration: Options of ``restore``, for frames whose full scale is 1; not ``joint=True``.
+        full_scale: Count that corresponds to 1.0; 255 for ``uint8`` if not given, required for other integers.
+        force: Whether to return restored frames even if they are judged worse than the raw ones.
+        device: Device for the computation.
+
+    Returns:
+        Restored frames.
+
+    Raises:
+        ValueError: If the timing has frame start times, ``joint=True``, or the full scale is unknown.
+
+    Example:
+        >>> restored = array.map_overlap(  # doctest: +SKIP
+        ...     rsv.restore_block, depth={0: 1}, boundary="none", dtype=array.dtype, meta=array._meta,
+        ...     timing=timing, full_scale=4095,
+        ... )
+    """
+    if timing.frame_start_times is not None:
+        raise ValueError(
+            "timing must not have frame_start_times: the position of a block in the stack is unknown; use process_stack"
+        )
+    options = dict(restoration or {})
+    if options.get("joint", False) is True:
+        raise ValueError("joint=True makes one image of a block; restore_block keeps its shape")
+    check_dtype(frames.dtype)
+    scale = known_full_scale(frames.dtype, full_scale)
+    stored = frames.astype(frames.dtype.newbyteorder("="), copy=False)
+    if len(stored) < 2 or any(frame_fault(frame, index, scale) for index, frame in enumerate(stored)):
+        return frames
+    floats = counts_to_frames(stored, scale, "frames").to(device)
+    try:
+        detected = detect_vibration(floats, timing, **(detection or {}))
+        restored = restore_trusted(floats, timing, detected, options, force=force, most_pairs=2)
+    except (ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
+        return frames
+    return frames_to_counts(restored.frames, np.dtype(frames.dtype), scale) if restored.restored else frames

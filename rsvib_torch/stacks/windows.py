@@ -1,7 +1,7 @@
-"""A long stack cut into windows: where they begin and end depends on the stack alone."""
+"""Windows: consecutive frames that are processed together. They depend only on the length of the stack."""
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -15,14 +15,14 @@ __all__ = ["Window", "cut_windows", "window_timing"]
 class Window:
     """Consecutive frames whose vibration is detected together.
 
-    Neighbouring windows share one frame, so that every pair of consecutive frames is in exactly one window; the
-    shared frame is written by the later one.
+    Neighbouring windows share one frame, so that every pair of consecutive frames belongs to exactly one window; the
+    later window writes the shared frame.
 
     Attributes:
         index: Number of the window.
-        first: Its first frame.
-        last: Its last frame, which belongs to it.
-        kept: Number of its frames that it writes.
+        first: Index of its first frame.
+        last: Index of its last frame (inclusive).
+        kept: Number of frames that it writes.
     """
 
     index: int
@@ -32,29 +32,29 @@ class Window:
 
     @property
     def frames(self) -> range:
-        """Its frames."""
+        """Indices of its frames."""
         return range(self.first, self.last + 1)
+
+    @property
+    def written(self) -> range:
+        """Indices of the frames that it writes."""
+        return range(self.first, self.first + self.kept)
 
     @property
     def alone(self) -> bool:
         """Whether it is the whole stack."""
         return self.index == 0 and self.kept == len(self.frames)
 
-    @property
-    def written(self) -> range:
-        """The frames that it writes."""
-        return range(self.first, self.first + self.kept)
-
 
 def cut_windows(num_frames: int, window: int) -> list[Window]:
-    """Cut a stack into windows of at most ``window`` frames, as equal as they can be.
+    """Cut a stack into windows of at most ``window`` frames, of equal length to within one frame.
 
     Args:
-        num_frames: Frames of the stack.
-        window: Most frames of a window, at least 2.
+        num_frames: Number of frames of the stack.
+        window: Maximum number of frames of a window, at least 2.
 
     Returns:
-        Windows in order; a stack that is no longer than one is one window.
+        Windows in order; a stack of up to ``window`` frames is one window.
 
     Example:
         >>> [(w.first, w.last, w.kept) for w in cut_windows(8, 4)]
@@ -72,22 +72,14 @@ def cut_windows(num_frames: int, window: int) -> list[Window]:
 
 
 def window_timing(timing: SensorTiming, window: Window, frames: list[int]) -> SensorTiming:
-    """Timing of some frames of a window as a stack of its own: time begins with the window's first frame.
+    """Timing of some frames of a window as a separate stack, with the time origin at the window's first frame.
 
     Args:
-        timing: The sensor, for the whole stack.
+        timing: Timing of the whole stack.
         window: The window.
-        frames: Those of its frames that are there.
+        frames: Indices of its usable frames.
     """
     if timing.frame_start_times is None and frames == list(window.frames):
         return timing
     starts = timing.frame_starts(window.last + 1)
-    chosen = starts[torch.tensor(frames)] - starts[window.first]
-    return SensorTiming(
-        timing.row_time,
-        timing.exposure_rows,
-        timing.frame_rows,
-        timing.scan_axis,
-        timing.readout_direction,
-        chosen,
-    )
+    return replace(timing, frame_start_times=starts[torch.tensor(frames)] - starts[window.first])

@@ -112,11 +112,11 @@ def test_interrupted_run_can_be_continued(place, tmp_path):
 def test_interrupted_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     with monkeypatch.context() as patch:
-        patch.setattr("rsvib_torch.stacks.sink.Sink.finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr("rsvib_torch.stacks.output.Sink.finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         assert run(*command(place, out)) == 130
     assert "--resume continues" in capsys.readouterr().err
     assert run(*command(place, out)) == 2
-    assert "a run was broken off here after 4 windows; resume it (--resume)" in capsys.readouterr().err
+    assert "a run was interrupted here after 4 windows; resume it (--resume)" in capsys.readouterr().err
     assert run(*command(place, out, "--resume", "--window", 5)) == 2
     assert "cannot resume: settings.window was 4, now it is 5" in capsys.readouterr().err
     for _ in range(2):  # the second time it is complete

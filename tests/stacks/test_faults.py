@@ -17,7 +17,7 @@ from small_stack import CONFIG, FRAMES, OPTIONS, WINDOWS, fork_server, process_s
 
 from rsvib_torch.commands.main import run_command
 from rsvib_torch.stacks import read_manifest
-from rsvib_torch.stacks.journal import work_folder
+from rsvib_torch.stacks.output import work_folder
 
 _FILE_CALLS = ("write", "pwrite", "replace", "fsync", "fdatasync", "ftruncate", "unlink", "mkdir", "rmdir", "rename")
 
@@ -198,7 +198,7 @@ def break_a_run(forks, whole, tmp_path):
 
 
 def test_a_broken_run_is_neither_overwritten_nor_mixed(broken):
-    with pytest.raises(FileExistsError, match=r"a run was broken off here after \d+ windows; resume it"):
+    with pytest.raises(FileExistsError, match=r"a run was interrupted here after \d+ windows; resume it"):
         process_small(broken / "frames.tif", broken / "out.tif")
     for options, message in (
         ({"window": 4}, "settings.window was 3, now it is 4"),
@@ -279,7 +279,7 @@ def test_full_disk_is_noticed_before_the_work(forks, whole, tmp_path):
 def test_disk_that_fills_up_on_the_way_keeps_what_is_done(forks, whole, tmp_path):
     # frames in files of their own fit, the stack that is made of them in the end does not
     said = run_on_small_disk(forks, whole / "frames.tif", tmp_path / "out.npy", 100_000, bad_frames="skip")
-    assert f"File too large; {WINDOWS} windows are kept, resume goes on with them" in said
+    assert f"File too large; {WINDOWS} windows are complete, resume the run to continue" in said
     assert not (tmp_path / "out.npy").exists()
     report = process_small(whole / "frames.tif", tmp_path / "out.npy", bad_frames="skip", resume=True)
     assert report.resumed == WINDOWS

@@ -67,7 +67,7 @@ def run_on_full_disks(mount, whole, folder, trials):
         text=True,
         check=False,
         timeout=300,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])},
     )
     assert done.returncode == 0, done.stderr[-2000:]
     found = json.loads(done.stdout.splitlines()[-1])
@@ -77,7 +77,7 @@ def run_on_full_disks(mount, whole, folder, trials):
             assert "\n" not in run["said"]
             assert not run["made"], trial
             assert set(run["left"]) <= {f".{trial[0]}.rsvib"}, trial
-            kept = f"{run['resumed']} windows are kept, resume goes on with them"
+            kept = f"{run['resumed']} windows are complete, resume the run to continue"
             assert (kept in run["said"]) == (run["resumed"] > 0), trial
         assert run["same"], trial
         companion = {"out.raw.json"} if trial[0] == "out.raw" else set()

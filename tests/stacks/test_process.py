@@ -123,7 +123,7 @@ def test_detections_of_windows_restore_another_time(place, tmp_path):
     assert all(record.written == 0 and record.detection for record in manifest.windows)
     process_small(place / "frames.tif", tmp_path / "restored.tif", given=manifest.detections(), detection=None)
     assert (tmp_path / "restored.tif").read_bytes() == (place / "restored.tif").read_bytes()
-    with pytest.raises(ValueError, match="8 detections for 6 windows of at most 4 frames"):
+    with pytest.raises(ValueError, match="given has 8 detections for 6 windows of at most 4 frames"):
         process_small(place / "frames.tif", tmp_path / "other.tif", given=manifest.detections(), window=4)
 
 
