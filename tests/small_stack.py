@@ -1,4 +1,4 @@
-"""A small vibrating stack, taken by the independent camera of tests/truth.py, and how tests process it."""
+"""A small vibrating stack, simulated by the independent camera of tests/truth.py, and its processing."""
 
 import multiprocessing
 
@@ -30,7 +30,7 @@ STILL = crop(SCENE)
 
 
 def fork_server():
-    """Where processes start at once: the libraries are loaded once, for all of them."""
+    """A context in which processes start quickly, because the libraries are loaded once for all of them."""
     context = multiprocessing.get_context("forkserver")
     libraries = ["rsvib_torch.stacks", "scipy.ndimage", "scipy.interpolate", "h5py", "zarr", "pytest", "_pytest.config"]
     context.set_forkserver_preload(libraries)
@@ -43,7 +43,7 @@ def draw_counts(frames=FRAMES):
 
 
 def write_small(path, frames=FRAMES):
-    """The stack as a TIFF file of another program."""
+    """Write the stack as a TIFF file without metadata, like another program."""
     tifffile.imwrite(path, draw_counts(frames), photometric="minisblack", metadata=None)
 
 

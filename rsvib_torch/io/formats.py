@@ -27,15 +27,14 @@ Frame = NDArray[Any]
 class FrameReader(Protocol):
     """An open stack; frames are read one at a time, in any order."""
 
-    @property
-    def info(self) -> StackInfo:
-        """What the file states."""
+    info: StackInfo
 
     def frame(self, index: int) -> Frame:
         """Pixels of a frame as stored: (H, W) or (C, H, W), in ``info.dtype``; ``FrameError`` if it is damaged."""
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file, if it is open between frames."""
+        return
 
 
 class FrameWriter(Protocol):
@@ -45,10 +44,12 @@ class FrameWriter(Protocol):
         """Write a frame, (H, W) or (C, H, W)."""
 
     def sync(self) -> None:
-        """Return when all written frames are on the disk."""
+        """Return when all written frames are on the disk; needed if the format buffers them."""
+        return
 
     def close(self) -> None:
-        """Finish the file."""
+        """Finish the file, if it is open between frames."""
+        return
 
 
 # Contract of a format. All functions are called with the path of the stack; ``create`` and ``write_all`` with that of a

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.formats import StackFormat
+from rsvib_torch.io.formats import FrameReader, FrameWriter, StackFormat
 from rsvib_torch.io.png import decode_png, encode_png, png_info
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.io.tiff import open_tiff, write_tiff
@@ -63,7 +63,7 @@ def _describe(info: StackInfo) -> str:
     return f"{info.shape[1:]} {info.dtype}{scale}"
 
 
-class _ImagesReader:
+class _ImagesReader(FrameReader):
     """Frames of files that are decoded on access."""
 
     def __init__(self, path: Path) -> None:
@@ -97,9 +97,6 @@ class _ImagesReader:
             message = str(error) if str(error).startswith(str(file)) else f"{file}: {error}"
             raise FrameError(message) from error
 
-    def close(self) -> None:
-        """Nothing is open."""
-
 
 def _ending(info: StackInfo) -> str:
     return ".png" if info.dtype in _PNG_TYPES else ".tif"
@@ -110,7 +107,7 @@ def _frame_names(info: StackInfo) -> list[str]:
     return [f"frame_{index:0{digits}d}{_ending(info)}" for index in range(info.shape[0])]
 
 
-class _ImagesWriter:
+class _ImagesWriter(FrameWriter):
     """One file per frame, each written atomically."""
 
     def __init__(self, files: list[Path], info: StackInfo) -> None:
@@ -125,12 +122,6 @@ class _ImagesWriter:
         else:
             write_tiff(part, one, iter([frame]), None)
         os.replace(part, file)
-
-    def sync(self) -> None:
-        """Files are not buffered."""
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 def _create_folder(path: Path, info: StackInfo, fresh: bool) -> _ImagesWriter:

@@ -120,7 +120,7 @@ def _read_info(tif: Any) -> tuple[StackInfo, tuple[int, ...]]:
     return info, (*ones, *kept)
 
 
-class _ArrayReader:
+class _ArrayReader(FrameReader):
     """Frames of an array in memory."""
 
     def __init__(self, info: StackInfo, pixels: NDArray[Any]) -> None:
@@ -129,9 +129,6 @@ class _ArrayReader:
     def frame(self, index: int) -> NDArray[Any]:
         """Pixels of a frame as stored."""
         return np.array(self._pixels[index])
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 class _PageReader:

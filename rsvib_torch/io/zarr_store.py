@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.validation import read_json
-from rsvib_torch.io.formats import StackFormat, needed_package
+from rsvib_torch.io.formats import FrameReader, FrameWriter, StackFormat, needed_package
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_from_attributes, readable_frame, readable_stack
 
@@ -68,7 +68,7 @@ def _check_sizes(
         )
 
 
-class _ZarrReader:
+class _ZarrReader(FrameReader):
     """Frames of a Zarr array."""
 
     def __init__(self, path: Path, array: Any, info: StackInfo) -> None:
@@ -79,9 +79,6 @@ class _ZarrReader:
         """Pixels of a frame as stored."""
         with readable_frame(self._path, index):
             return self.info.from_stored(np.asarray(self._array[index] if self._array.ndim > 2 else self._array[...]))
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 def _open(path: Path) -> _ZarrReader:
@@ -101,7 +98,7 @@ def _open(path: Path) -> _ZarrReader:
         return _ZarrReader(path, array, info)
 
 
-class _ZarrWriter:
+class _ZarrWriter(FrameWriter):
     """Frames of a Zarr array, one chunk each."""
 
     def __init__(self, array: Any, info: StackInfo) -> None:
@@ -110,12 +107,6 @@ class _ZarrWriter:
     def write(self, index: int, frame: NDArray[Any]) -> None:
         """Write the chunk of a frame."""
         self._array[index] = self._info.to_stored(frame)
-
-    def sync(self) -> None:
-        """Chunks are not buffered."""
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 def _create(path: Path, info: StackInfo, fresh: bool) -> _ZarrWriter:

@@ -1,6 +1,6 @@
-"""Runs on a file system that is full, with nothing but JSON on standard output: to be run where it may be mounted.
+"""Runs on a full file system, in a process that is allowed to mount one; prints their results as JSON.
 
-Every run is told by what it said, what it left, and whether it went on to the same bytes when there was room again.
+The result of a run contains its error message, the files that it left, and whether it was resumed to the same bytes.
 """
 
 import json
@@ -22,7 +22,7 @@ def free_pages(folder):
 
 
 def leave_free(folder, pages):
-    """Fill the disk up to so many pages."""
+    """Fill the disk except for a number of pages."""
     with (folder / "ballast").open("wb") as file:
         file.write(b"b" * (PAGE * (free_pages(folder) - pages)))
     assert abs(free_pages(folder) - pages) <= 1
@@ -35,13 +35,13 @@ def content(path):
 
 def try_small_disk(source, whole, disk, name, pages, options):
     leave_free(disk, pages)
-    said = "done"
+    message = "done"
     try:
         process_small(source, disk / "new" / name, **options)
     except OSError as error:
-        said = str(error)
-    made = (disk / "new" / name).exists()
-    left = [path.name for path in (disk / "new").iterdir()] if (disk / "new").exists() else []
+        message = str(error)
+    exists = (disk / "new" / name).exists()
+    files = [path.name for path in (disk / "new").iterdir()] if (disk / "new").exists() else []
     (disk / "ballast").unlink()
     report = process_small(source, disk / "new" / name, resume=True, **options)
     same = content(disk / "new" / name) == content(whole / name)
@@ -49,7 +49,14 @@ def try_small_disk(source, whole, disk, name, pages, options):
     for path in sorted((disk / "new").rglob("*"), reverse=True):
         path.rmdir() if path.is_dir() else path.unlink()
     (disk / "new").rmdir()
-    return {"said": said, "made": made, "left": left, "resumed": report.resumed, "same": same, "names": names}
+    return {
+        "message": message,
+        "output_exists": exists,
+        "files": files,
+        "resumed": report.resumed,
+        "same": same,
+        "names": names,
+    }
 
 
 def main():

@@ -1,4 +1,4 @@
-"""Dask as the engine: the same bytes as here, lost workers replaced; and blocks of Dask arrays."""
+"""Computation with Dask: the same bytes as with threads, killed workers are replaced; blocks of Dask arrays."""
 
 import os
 import signal
@@ -38,7 +38,7 @@ def test_dask_workers_give_the_same_bytes(place, tmp_path):
     check_same(place, tmp_path)
 
 
-def test_run_of_threads_resumes_with_dask(place, tmp_path):
+def test_run_with_threads_is_resumed_with_dask(place, tmp_path):
     def stop(done, total):
         if done > FRAMES // 2:
             raise KeyboardInterrupt
@@ -58,7 +58,7 @@ def test_run_of_threads_resumes_with_dask(place, tmp_path):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_workers_that_are_killed_are_replaced(place, tmp_path):
-    """Each of both once: nothing may be kept in one alone."""
+    """Each of two workers is killed once: no data may exist in one worker only."""
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         pids = [worker.process.process.pid for worker in cluster.workers.values()]
         done_at_death = []
@@ -77,12 +77,12 @@ def test_workers_that_are_killed_are_replaced(place, tmp_path):
 
 
 @pytest.mark.slow
-def test_local_scheduler_starts_workers_of_its_own(place, tmp_path):
+def test_local_scheduler_starts_workers(place, tmp_path):
     process_small(place / "frames.tif", tmp_path / "out.tif", scheduler="local", workers=2)
     check_same(place, tmp_path)
 
 
-def test_scheduler_that_is_not_there_and_package_that_is_missing(place, tmp_path, monkeypatch):
+def test_missing_scheduler_and_missing_package(place, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="no Dask scheduler answers at nonsense://x"):
         process_small(place / "frames.tif", tmp_path / "out.tif", scheduler="nonsense://x")
     monkeypatch.setitem(sys.modules, "distributed", None)
@@ -108,11 +108,11 @@ def test_blocks_of_a_dask_array(place):
     frames = restored.compute(scheduler="synchronous")
     assert (frames.shape, frames.dtype) == (counts.shape, counts.dtype)
     assert min(decibel(frame / 4095, STILL, 12) for frame in frames) > 34
-    block = counts[5:13]  # what map_overlap hands on
+    block = counts[5:13]  # as map_overlap passes it
     np.testing.assert_array_equal(rsv.restore_block(block, TIMING, full_scale=4095, **options)[1:-1], frames[6:12])
 
 
-def test_blocks_that_cannot_be_restored(place):
+def test_blocks_that_cannot_be_restored_are_returned_or_refused(place):
     counts = tifffile.imread(place / "frames.tif")[:3]
     for block in (counts[:1], np.zeros_like(counts)):
         assert rsv.restore_block(block, TIMING, full_scale=4095) is block

@@ -1,4 +1,4 @@
-"""Runs that are broken off: nothing lost, nothing doubled, nothing half-written."""
+"""Interrupted runs: no frame is missing, repeated or incomplete after they are resumed."""
 
 import itertools
 import json
@@ -29,7 +29,7 @@ def start_fork_server():
 
 @pytest.fixture(scope="module", name="whole")
 def process_whole(tmp_path_factory):
-    """A stack and what an unbroken run makes of it."""
+    """A stack and the output of an uninterrupted run."""
     folder = tmp_path_factory.mktemp("whole")
     write_small(folder / "frames.tif")
     for name in ("out.tif", "out.npy"):
@@ -39,13 +39,13 @@ def process_whole(tmp_path_factory):
 
 @pytest.fixture(scope="module", name="whole_zarr")
 def process_whole_zarr(whole):
-    """The same, with what an unbroken run writes as Zarr."""
+    """The same, with Zarr output."""
     process_small(whole / "frames.tif", whole / "out.zarr")
     return whole
 
 
 def _count_file_calls(die_at):
-    """Kill this process with SIGKILL at its n-th call that changes a file; count them."""
+    """Kill this process with SIGKILL at its n-th call that changes a file; returns the number of calls so far."""
     count = itertools.count()
     lock = threading.Lock()
     done = [0]
@@ -73,8 +73,8 @@ def _run(source, sink, options, die_at, counted):
         counted.value = done[0]
 
 
-def run_apart(forks, source, sink, *, die_at=0, seconds=None, counted=None, **options):
-    """Process the stack in a process of its own, which dies at some file call or after some time."""
+def run_in_process(forks, source, sink, *, die_at=0, seconds=None, counted=None, **options):
+    """Process the stack in a separate process, which is killed at a file call or after some time."""
     process = forks.Process(target=_run, args=(source, sink, options, die_at, counted))
     process.start()
     process.join(timeout=seconds)
@@ -85,21 +85,21 @@ def run_apart(forks, source, sink, *, die_at=0, seconds=None, counted=None, **op
 
 
 def content(path):
-    """All bytes below a path."""
+    """All files below a path."""
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     return {str(file.relative_to(path.parent)): file.read_bytes() for file in files}
 
 
 def check_whole(whole, folder, name):
-    """The result is that of the unbroken run to the byte, and nothing else is left."""
+    """The result is identical to that of the uninterrupted run, and there are no other files."""
     assert content(folder / name) == content(whole / name)
     manifest = f"{name}.manifest.json"
     assert json.loads((folder / manifest).read_text()) == json.loads((whole / manifest).read_text())
     assert {path.name for path in folder.iterdir()} == {name, manifest}
 
 
-def check_broken(whole, folder, name):
-    """What a killed run left: no output, or the whole one."""
+def check_interrupted(whole, folder, name):
+    """A killed run has left no output, or the complete one."""
     if (folder / name).exists():
         assert content(folder / name) == content(whole / name)
     if (folder / f"{name}.manifest.json").exists():
@@ -108,9 +108,9 @@ def check_broken(whole, folder, name):
 
 def kill_and_resume(forks, whole, folder, name, **how):
     folder.mkdir()
-    code = run_apart(forks, whole / "frames.tif", folder / name, **how)
+    code = run_in_process(forks, whole / "frames.tif", folder / name, **how)
     assert code in (-signal.SIGKILL, 0)
-    check_broken(whole, folder, name)
+    check_interrupted(whole, folder, name)
     options = {key: value for key, value in how.items() if key not in ("die_at", "seconds")}
     report = process_small(whole / "frames.tif", folder / name, resume=True, **options)
     assert (report.frames, report.windows) == (FRAMES, WINDOWS)
@@ -121,7 +121,7 @@ def kill_and_resume(forks, whole, folder, name, **how):
 def test_killed_runs_resume_to_the_same_bytes(forks, whole, tmp_path):
     counted = forks.Value("i", 0)
     (tmp_path / "count").mkdir()
-    assert run_apart(forks, whole / "frames.tif", tmp_path / "count" / "out.tif", counted=counted) == 0
+    assert run_in_process(forks, whole / "frames.tif", tmp_path / "count" / "out.tif", counted=counted) == 0
     total = counted.value
     assert total > 5 * WINDOWS
     resumed = [
@@ -135,10 +135,10 @@ def test_killed_runs_resume_to_the_same_bytes(forks, whole, tmp_path):
 @pytest.mark.slow
 def test_kill_at_twenty_random_moments(forks, whole_zarr, tmp_path):
     whole = whole_zarr
-    for name in ("first", "timed"):  # whatever is done for the first time takes longer
+    for name in ("first", "timed"):  # the first run takes longer
         (tmp_path / name).mkdir()
         start = time.perf_counter()
-        assert run_apart(forks, whole / "frames.tif", tmp_path / name / "out.tif", workers=2) == 0
+        assert run_in_process(forks, whole / "frames.tif", tmp_path / name / "out.tif", workers=2) == 0
         duration = time.perf_counter() - start
     choice = random.Random(6)
     resumed = []
@@ -151,10 +151,10 @@ def test_kill_at_twenty_random_moments(forks, whole_zarr, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["out.tif", "out.zarr", "skip.npy"])
-def test_kill_at_every_kind_of_file_call(forks, whole_zarr, tmp_path, name):
+def test_kill_at_many_file_calls(forks, whole_zarr, tmp_path, name):
     whole = whole_zarr
     options = {}
-    if name == "skip.npy":  # kept window by window, then put together
+    if name == "skip.npy":  # stored window by window, then assembled
         name, options = "out.npy", {"bad_frames": "skip"}
         process_small(whole / "frames.tif", whole / "skip" / "out.npy", **options)
         whole = whole / "skip"
@@ -163,7 +163,7 @@ def test_kill_at_every_kind_of_file_call(forks, whole_zarr, tmp_path, name):
         process_small(whole / "frames.tif", whole / "out.npy", **options)
     counted = forks.Value("i", 0)
     (tmp_path / "count").mkdir()
-    assert run_apart(forks, whole / "frames.tif", tmp_path / "count" / name, counted=counted, **options) == 0
+    assert run_in_process(forks, whole / "frames.tif", tmp_path / "count" / name, counted=counted, **options) == 0
     for die_at in {*range(1, 12, 2), *range(12, counted.value, 11), *range(counted.value - 12, counted.value + 1)}:
         kill_and_resume(forks, whole, tmp_path / f"{die_at}", name, die_at=die_at, **options)
 
@@ -174,7 +174,7 @@ def _command(arguments, die_at):
     assert run_command(arguments) == 0
 
 
-def test_command_killed_at_its_first_look_leaves_nothing_for_good(forks, whole, tmp_path):
+def test_folder_of_a_command_killed_at_its_first_check_is_removed_by_the_next(forks, whole, tmp_path):
     (tmp_path / "camera.toml").write_text(CONFIG)
     arguments = ["run", str(whole / "frames.tif"), str(tmp_path / "out"), "--config", str(tmp_path / "camera.toml")]
     process = forks.Process(target=_command, args=(arguments, 2))
@@ -188,18 +188,18 @@ def test_command_killed_at_its_first_look_leaves_nothing_for_good(forks, whole, 
     assert (tmp_path / "out" / "restored.tif").read_bytes() == (whole / "out.tif").read_bytes()
 
 
-@pytest.fixture(name="broken")
-def break_a_run(forks, whole, tmp_path):
-    """A run killed half way."""
+@pytest.fixture(name="interrupted")
+def interrupt_a_run(forks, whole, tmp_path):
+    """A folder with a run that was killed."""
     write_small(tmp_path / "frames.tif")
-    assert run_apart(forks, tmp_path / "frames.tif", tmp_path / "out.tif", die_at=30) == -signal.SIGKILL
+    assert run_in_process(forks, tmp_path / "frames.tif", tmp_path / "out.tif", die_at=30) == -signal.SIGKILL
     assert work_folder(tmp_path / "out.tif").is_dir()
     return tmp_path
 
 
-def test_a_broken_run_is_neither_overwritten_nor_mixed(broken):
+def test_an_interrupted_run_is_not_overwritten_or_resumed_with_other_settings(interrupted):
     with pytest.raises(FileExistsError, match=r"a run was interrupted here after \d+ windows; resume it"):
-        process_small(broken / "frames.tif", broken / "out.tif")
+        process_small(interrupted / "frames.tif", interrupted / "out.tif")
     for options, message in (
         ({"window": 4}, "settings.window was 3, now it is 4"),
         ({"detection": {**OPTIONS["detection"], "search": 7}}, "settings.detection.search was 6, now it is 7"),
@@ -207,28 +207,28 @@ def test_a_broken_run_is_neither_overwritten_nor_mixed(broken):
         ({"force": True}, "settings.force was false, now it is true"),
     ):
         with pytest.raises(ValueError, match=f"cannot resume: {message}"):
-            process_small(broken / "frames.tif", broken / "out.tif", resume=True, **options)
-    counts = tifffile.imread(broken / "frames.tif")
+            process_small(interrupted / "frames.tif", interrupted / "out.tif", resume=True, **options)
+    counts = tifffile.imread(interrupted / "frames.tif")
     counts[10, 5, 5] ^= 1
-    tifffile.imwrite(broken / "frames.tif", counts, photometric="minisblack", metadata=None)
+    tifffile.imwrite(interrupted / "frames.tif", counts, photometric="minisblack", metadata=None)
     with pytest.raises(ValueError, match=r"cannot resume: input\.sha256_of_samples was"):
-        process_small(broken / "frames.tif", broken / "out.tif", resume=True)
-    assert not (broken / "out.tif").exists()
+        process_small(interrupted / "frames.tif", interrupted / "out.tif", resume=True)
+    assert not (interrupted / "out.tif").exists()
 
 
-def test_damaged_journal_is_refused_and_a_torn_line_done_again(whole, broken):
-    lines = work_folder(broken / "out.tif") / "journal.jsonl"
+def test_damaged_journal_is_refused_and_an_incomplete_last_line_is_ignored(whole, interrupted):
+    lines = work_folder(interrupted / "out.tif") / "journal.jsonl"
     good = lines.read_bytes()
     lines.write_bytes(b'{"window": 7}\n' + good)
     with pytest.raises(ValueError, match="line 1 is damaged; delete"):
-        process_small(broken / "frames.tif", broken / "out.tif", resume=True)
+        process_small(interrupted / "frames.tif", interrupted / "out.tif", resume=True)
     lines.write_bytes(good[:-30])
-    report = process_small(broken / "frames.tif", broken / "out.tif", resume=True)
+    report = process_small(interrupted / "frames.tif", interrupted / "out.tif", resume=True)
     assert report.resumed == good.count(b"\n") - 1
-    assert (broken / "out.tif").read_bytes() == (whole / "out.tif").read_bytes()
+    assert (interrupted / "out.tif").read_bytes() == (whole / "out.tif").read_bytes()
 
 
-def test_two_runs_do_not_write_the_same(forks, whole, tmp_path):
+def test_two_runs_cannot_write_the_same_output(forks, whole, tmp_path):
     started = forks.Process(target=_run, args=(whole / "frames.tif", tmp_path / "out.tif", {}, 0, None))
     started.start()
     while not (work_folder(tmp_path / "out.tif") / "journal.jsonl").exists():
@@ -240,7 +240,7 @@ def test_two_runs_do_not_write_the_same(forks, whole, tmp_path):
     check_whole(whole, tmp_path, "out.tif")
 
 
-def test_complete_run_is_left_as_it_is(whole, tmp_path):
+def test_resuming_a_complete_run_changes_nothing(whole, tmp_path):
     process_small(whole / "frames.tif", tmp_path / "out.npy")
     before = (tmp_path / "out.npy").stat().st_mtime_ns
     report = process_small(whole / "frames.tif", tmp_path / "out.npy", resume=True)
@@ -250,43 +250,43 @@ def test_complete_run_is_left_as_it_is(whole, tmp_path):
     assert (tmp_path / "out.npy").stat().st_mtime_ns == before
 
 
-def _run_with_small_disk(source, sink, limit, said, options):
+def _run_with_small_disk(source, sink, limit, message, options):
     torch.set_num_threads(1)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
     try:
         process_small(source, sink, **options)
     except OSError as error:
-        said.put(str(error))
+        message.put(str(error))
     else:
-        said.put("done")
+        message.put("done")
 
 
 def run_on_small_disk(forks, source, sink, limit, **options):
-    said = forks.SimpleQueue()
-    process = forks.Process(target=_run_with_small_disk, args=(source, sink, limit, said, options))
+    message = forks.SimpleQueue()
+    process = forks.Process(target=_run_with_small_disk, args=(source, sink, limit, message, options))
     process.start()
     process.join(timeout=60)
     assert process.exitcode == 0
-    return said.get()
+    return message.get()
 
 
-def test_full_disk_is_noticed_before_the_work(forks, whole, tmp_path):
-    said = run_on_small_disk(forks, whole / "frames.tif", tmp_path / "new" / "out.npy", 100_000)
-    assert "File too large" in said
+def test_full_disk_is_an_error_before_the_computation(forks, whole, tmp_path):
+    message = run_on_small_disk(forks, whole / "frames.tif", tmp_path / "new" / "out.npy", 100_000)
+    assert "File too large" in message
     assert list(tmp_path.iterdir()) == []
 
 
-def test_disk_that_fills_up_on_the_way_keeps_what_is_done(forks, whole, tmp_path):
-    # frames in files of their own fit, the stack that is made of them in the end does not
-    said = run_on_small_disk(forks, whole / "frames.tif", tmp_path / "out.npy", 100_000, bad_frames="skip")
-    assert f"File too large; {WINDOWS} windows are complete, resume the run to continue" in said
+def test_disk_that_fills_up_keeps_complete_windows(forks, whole, tmp_path):
+    # the files of single windows fit, the stack does not
+    message = run_on_small_disk(forks, whole / "frames.tif", tmp_path / "out.npy", 100_000, bad_frames="skip")
+    assert f"File too large; {WINDOWS} windows are complete, resume the run to continue" in message
     assert not (tmp_path / "out.npy").exists()
     report = process_small(whole / "frames.tif", tmp_path / "out.npy", bad_frames="skip", resume=True)
     assert report.resumed == WINDOWS
     assert (tmp_path / "out.npy").read_bytes() == (whole / "out.npy").read_bytes()
 
 
-def test_interrupt_keeps_what_is_done(whole, tmp_path):
+def test_keyboard_interrupt_keeps_complete_windows(whole, tmp_path):
     def stop(done, total):
         if done > FRAMES // 2:
             raise KeyboardInterrupt
@@ -300,7 +300,7 @@ def test_interrupt_keeps_what_is_done(whole, tmp_path):
     check_whole(whole, tmp_path, "out.tif")
 
 
-def test_torn_chunks_of_zarr_are_cleared(whole_zarr, tmp_path):
+def test_incomplete_chunks_of_zarr_are_removed(whole_zarr, tmp_path):
     def stop(done, total):
         if done > 4:
             raise KeyboardInterrupt
@@ -308,12 +308,12 @@ def test_torn_chunks_of_zarr_are_cleared(whole_zarr, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         process_small(whole_zarr / "frames.tif", tmp_path / "out.zarr", progress=stop)
     chunk = next((work_folder(tmp_path / "out.zarr") / "out.zarr" / "c").iterdir())
-    (chunk / "0" / "0.1003c751a7d14a53b4832d1c3c0beb81.partial").write_bytes(b"torn")  # as the store leaves it
+    (chunk / "0" / "0.1003c751a7d14a53b4832d1c3c0beb81.partial").write_bytes(b"incomplete")  # as the store leaves it
     process_small(whole_zarr / "frames.tif", tmp_path / "out.zarr", resume=True)
     check_whole(whole_zarr, tmp_path, "out.zarr")
 
 
-def test_input_that_vanishes_stops_the_run_and_can_come_back(whole, tmp_path):
+def test_run_stops_if_the_input_is_removed_and_can_be_resumed(whole, tmp_path):
     frames = tifffile.imread(whole / "frames.tif")
     for index, frame in enumerate(frames):
         (tmp_path / "in").mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""A disk that is really full: one line, nothing half-written, and the run goes on when there is room again."""
+"""Full file systems: a one-line error, no incomplete output, and the run can be resumed when there is space."""
 
 import json
 import os
@@ -11,11 +11,11 @@ import pytest
 from small_stack import CONFIG, WINDOWS, process_small, write_small
 
 TRIALS = [
-    ["out.tif", 20, {}],  # the room that it needs is taken first
+    ["out.tif", 20, {}],  # its space is allocated first
     ["out.tif", 55, {}],  # enough for the frames, not for the journal
     ["out.zarr", 20, {}],
-    ["out.npy", 30, {"bad_frames": "skip"}],  # windows wait in files of their own
-    ["out.npy", 70, {"bad_frames": "skip"}],  # all of them do, but what is made of them does not fit beside
+    ["out.npy", 30, {"bad_frames": "skip"}],  # windows are stored in separate files
+    ["out.npy", 70, {"bad_frames": "skip"}],  # all of these fit, the stack does not
 ]
 MORE_TRIALS = [
     [name, pages, options]
@@ -34,7 +34,7 @@ MORE_TRIALS = [
 
 @pytest.fixture(scope="module", name="mount")
 def find_how_to_mount():
-    """A command that runs a shell where it may mount, seen by nobody else."""
+    """A command that runs a shell in a mount namespace of its own."""
     for options in ("-m", "-rm"):
         command = ["unshare", options, "sh", "-c"]
         if shutil.which("unshare") is None:
@@ -72,24 +72,24 @@ def run_on_full_disks(mount, whole, folder, trials):
     assert done.returncode == 0, done.stderr[-2000:]
     found = json.loads(done.stdout.splitlines()[-1])
     for trial, run in zip(trials, found["runs"], strict=True):
-        if run["said"] != "done":
-            assert "No space left on device" in run["said"], trial
-            assert "\n" not in run["said"]
-            assert not run["made"], trial
-            assert set(run["left"]) <= {f".{trial[0]}.rsvib"}, trial
+        if run["message"] != "done":
+            assert "No space left on device" in run["message"], trial
+            assert "\n" not in run["message"]
+            assert not run["output_exists"], trial
+            assert set(run["files"]) <= {f".{trial[0]}.rsvib"}, trial
             kept = f"{run['resumed']} windows are complete, resume the run to continue"
-            assert (kept in run["said"]) == (run["resumed"] > 0), trial
+            assert (kept in run["message"]) == (run["resumed"] > 0), trial
         assert run["same"], trial
         companion = {"out.raw.json"} if trial[0] == "out.raw" else set()
         assert set(run["names"]) == {trial[0], f"{trial[0]}.manifest.json"} | companion, trial
     return found, done.stderr
 
 
-def test_full_disk_stops_in_one_line_and_the_run_goes_on_later(mount, whole, tmp_path):
+def test_full_disk_is_a_one_line_error_and_the_run_can_be_resumed(mount, whole, tmp_path):
     found, shown = run_on_full_disks(mount, whole, tmp_path, TRIALS)
     runs = found["runs"]
-    assert all(run["said"] != "done" for run in runs)
-    assert runs[0]["left"] == []
+    assert all(run["message"] != "done" for run in runs)
+    assert runs[0]["files"] == []
     assert runs[0]["resumed"] == 0 < runs[1]["resumed"] < WINDOWS
     assert 0 < runs[2]["resumed"] < WINDOWS
     assert 0 < runs[3]["resumed"] < WINDOWS
@@ -100,8 +100,8 @@ def test_full_disk_stops_in_one_line_and_the_run_goes_on_later(mount, whole, tmp
 
 
 @pytest.mark.slow
-def test_disks_full_at_any_moment(mount, whole, tmp_path):
+def test_disks_that_are_full_at_different_moments(mount, whole, tmp_path):
     found, _ = run_on_full_disks(mount, whole, tmp_path, MORE_TRIALS)
-    stopped = [run["resumed"] for run in found["runs"] if run["said"] != "done"]
+    stopped = [run["resumed"] for run in found["runs"] if run["message"] != "done"]
     assert len(stopped) > len(MORE_TRIALS) // 2
     assert len(set(stopped)) > 3

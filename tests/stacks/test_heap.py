@@ -1,4 +1,4 @@
-"""One heap for all threads: none of them keeps memory of its own."""
+"""Settings of the memory allocator: one heap for all threads, and freed memory is kept."""
 
 import os
 import platform
@@ -38,7 +38,7 @@ def test_threads_share_one_heap():
     assert heaps["own"] > 3
 
 
-def test_other_c_libraries_are_left_alone(monkeypatch):
+def test_other_c_libraries_are_not_changed(monkeypatch):
     monkeypatch.setattr(platform, "libc_ver", lambda: ("", ""))
     heap._glibc.cache_clear()
     assert not heap.share_one_heap()
@@ -59,12 +59,12 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
-def test_freed_memory_is_kept_where_dask_would_have_it_handed_back():
+def test_freed_memory_is_kept_in_dask_workers():
     faults = {}
-    for choice in ("kept", "handed back"):
+    for choice in ("kept", "returned"):
         command = [sys.executable, "-c", _FAULTS, heap.__file__, choice]
         environment = {**os.environ, "MALLOC_TRIM_THRESHOLD_": "65536"}  # as Dask starts its workers
         done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
         faults[choice] = int(done.stdout)
-    assert faults["handed back"] > 20_000
+    assert faults["returned"] > 20_000
     assert faults["kept"] < 5_000

@@ -1,4 +1,4 @@
-"""Stacks of any length: right, and the same however they are gone through."""
+"""Stacks of any length: correct, and identical for all ways of processing."""
 
 import itertools
 import json
@@ -19,7 +19,7 @@ from rsvib_torch.stacks.memory import memory_needed, parse_memory, windows_at_on
 
 @pytest.fixture(scope="module", name="place")
 def make_place(tmp_path_factory):
-    """A folder with a stack and what an unbroken run makes of it."""
+    """A folder with a stack and the output of an uninterrupted run."""
     folder = tmp_path_factory.mktemp("stack")
     write_small(folder / "frames.tif")
     report = process_small(folder / "frames.tif", folder / "restored.tif")
@@ -28,7 +28,7 @@ def make_place(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("frames", "window"), [(1, 2), (2, 2), (9, 8), (25, 3), (100, 8), (101, 8), (7, 100)])
-def test_windows_see_every_pair_once_and_write_every_frame_once(frames, window):
+def test_windows_contain_every_pair_once_and_write_every_frame_once(frames, window):
     windows = cut_windows(frames, window)
     pairs = [pair for w in windows for pair in itertools.pairwise(w.frames)]
     assert pairs == list(itertools.pairwise(range(frames)))
@@ -39,7 +39,7 @@ def test_windows_see_every_pair_once_and_write_every_frame_once(frames, window):
     assert [w.alone for w in windows] == [len(windows) == 1] * len(windows)
 
 
-def test_long_stack_is_restored_everywhere(place):
+def test_every_frame_of_a_long_stack_is_restored(place):
     raw, restored = (tifffile.imread(place / name) / 4095 for name in ("frames.tif", "restored.tif"))
     assert restored.shape == (FRAMES, HEIGHT, WIDTH)
     before, after = ([decibel(frame, STILL, 12) for frame in stack] for stack in (raw, restored))
@@ -51,13 +51,13 @@ def test_long_stack_is_restored_everywhere(place):
         found = record.detection.vibration
         assert found.amplitude[0][0] == pytest.approx(MOTION.amplitude[0], rel=0.06)
         assert found.frequency[1][0] == pytest.approx(MOTION.frequency[1], rel=0.03)
-        # the phase belongs to the window's own time
+        # the phase refers to the time origin of the window
         turn = 2 * np.pi * MOTION.frequency[0] * record.start_time + MOTION.phase[0] - found.phase[0][0]
         assert abs(np.angle(np.exp(1j * turn))) < 0.2
     assert sorted(path.name for path in place.iterdir()) == ["frames.tif", "restored.tif", "restored.tif.manifest.json"]
 
 
-def test_window_is_what_the_functions_make_of_its_frames(place):
+def test_window_equals_detection_and_restoration_of_its_frames(place):
     frames = rsv.read_stack(place / "frames.tif", full_scale=4095)[8:11]
     found = rsv.detect_vibration(frames, TIMING, **OPTIONS["detection"])
     expected = rsv.restore(frames[:2], TIMING, found.vibration, method="dewarp", check=False)
@@ -66,7 +66,7 @@ def test_window_is_what_the_functions_make_of_its_frames(place):
 
 
 @pytest.mark.parametrize("options", [{"workers": 3}, {"memory": "900MB", "workers": 8}, {"bad_frames": "skip"}])
-def test_result_depends_on_neither_workers_nor_memory_nor_staging(place, tmp_path, options):
+def test_result_does_not_depend_on_workers_memory_or_staging(place, tmp_path, options):
     threads = torch.get_num_threads()
     process_small(place / "frames.tif", tmp_path / "restored.tif", **options)
     assert (tmp_path / "restored.tif").read_bytes() == (place / "restored.tif").read_bytes()
@@ -76,7 +76,7 @@ def test_result_depends_on_neither_workers_nor_memory_nor_staging(place, tmp_pat
 
 
 @pytest.mark.parametrize("ending", [".npy", ".raw", ".h5", ".zarr", ""])
-def test_every_format_holds_the_same(place, tmp_path, ending):
+def test_output_is_the_same_in_every_format(place, tmp_path, ending):
     sink = tmp_path / f"restored{ending}"
     process_small(place / "frames.tif", sink)
     reader = open_stack(sink)
@@ -97,7 +97,7 @@ def test_compressed_tiff(place, tmp_path):
         process_small(place / "frames.tif", tmp_path / "restored.npy", compression="zlib")
 
 
-def test_iterator_gives_windows_as_they_come(place):
+def test_iterator_yields_windows_in_order(place):
     options = {name: OPTIONS[name] for name in ("window", "detection", "restoration", "workers")}
     windows = rsv.iterate_stack(place / "frames.tif", TIMING, full_scale=4095, **options)
     first = next(windows)
@@ -116,7 +116,7 @@ def test_one_image_from_every_window(place, tmp_path):
     assert min(decibel(image, STILL, 12) for image in joint) > 28
 
 
-def test_detections_of_windows_restore_another_time(place, tmp_path):
+def test_stack_is_restored_with_detections_of_an_earlier_run(place, tmp_path):
     shared = {name: OPTIONS[name] for name in ("window", "detection", "workers")}
     detect_stack(place / "frames.tif", tmp_path / "manifest.json", TIMING, full_scale=4095, **shared)
     manifest = read_manifest(tmp_path / "manifest.json")
@@ -128,7 +128,7 @@ def test_detections_of_windows_restore_another_time(place, tmp_path):
 
 
 @pytest.mark.parametrize("choice", ["pass", "skip"])
-def test_bad_frames_are_flagged_and_the_others_restored(place, tmp_path, choice):
+def test_bad_frames_are_listed_and_the_others_restored(place, tmp_path, choice):
     counts = tifffile.imread(place / "frames.tif").astype(np.float32) / 4095
     counts[5] = 0.5  # constant
     counts[12, 3, 4] = np.inf
@@ -157,7 +157,7 @@ def test_bad_frames_are_flagged_and_the_others_restored(place, tmp_path, choice)
     assert min(decibel(frame, STILL, 12) for frame in restored) > 28
 
 
-def test_window_without_two_good_frames_passes_as_taken(place, tmp_path):
+def test_window_without_two_usable_frames_is_written_unchanged(place, tmp_path):
     counts = tifffile.imread(place / "frames.tif")
     counts[5:8] = 7
     np.save(tmp_path / "frames.npy", counts)
@@ -205,7 +205,7 @@ def test_frame_times_of_the_file_are_used_and_kept(place, tmp_path):
     records = read_manifest(report.manifest).windows
     assert [r.start_time for r in records] == pytest.approx([times[r.first] for r in records])
     restored = rsv.read_stack(tmp_path / "out.tif").numpy()
-    assert sorted(decibel(frame, STILL, 12) for frame in restored)[1] > 38  # frames next to the gaps, too
+    assert sorted(decibel(frame, STILL, 12) for frame in restored)[1] > 38  # also next to the gaps
     for record in records:
         found = record.detection.vibration
         turn = 2 * np.pi * MOTION.frequency[0] * record.start_time + MOTION.phase[0] - found.phase[0][0]
@@ -224,7 +224,7 @@ def test_frame_times_of_the_file_are_used_and_kept(place, tmp_path):
         ({"method": "richardson-lucy"}, [0, 1, 7]),
     ],
 )
-def test_windows_at_once_keep_to_the_memory(restoration, at_once):
+def test_windows_at_once_fit_into_the_memory(restoration, at_once):
     info = rsv.StackInfo((1000, 1024, 1024), "uint16", 4095.0)
     for text, count in zip(("1.3GB", "2GB", "8 GB"), at_once, strict=True):
         memory = parse_memory(text)
@@ -236,7 +236,7 @@ def test_windows_at_once_keep_to_the_memory(restoration, at_once):
         assert memory_needed(info, 8, restoration, count) <= memory < memory_needed(info, 8, restoration, count + 1)
 
 
-def test_memory_is_read():
+def test_memory_sizes_are_parsed():
     assert [parse_memory(text) for text in ("2GB", "1.5 GiB", "500 MB", 4096)] == [2 * 10**9, 3 << 29, 5 * 10**8, 4096]
     for text in ("much", "-1GB", "0", "2 GBB", ""):
         with pytest.raises(ValueError, match="memory must be like '2GB'"):
@@ -257,7 +257,7 @@ def test_memory_is_read():
         ({"memory": "1KB"}, ValueError, "is too little"),
     ],
 )
-def test_wrong_options_leave_nothing(place, tmp_path, options, error, message):
+def test_invalid_options_are_errors_without_files(place, tmp_path, options, error, message):
     with pytest.raises(error, match=message):
         process_small(place / "frames.tif", tmp_path / "out.tif", **options)
     assert list(tmp_path.iterdir()) == []
