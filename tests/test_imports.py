@@ -34,7 +34,7 @@ INNER_LAYERS = {
     "evaluation": ({"quality", "mtf", "bound", "scenes"},),
     "report": ({"results", "plots"}, {"html"}),
     "restoration": (
-        {"frame_motion", "row_extension", "joint_groups"},
+        {"frame_motion", "joint_groups"},
         {"scene_model"},
         {"noise"},
         {"exact", "banded", "dewarp", "verdict"},

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.precision import full_precision
-from rsvib_torch.core.quadrature import gauss_legendre
-from rsvib_torch.core.splines import mirrored
+from rsvib_torch.core.splines import gauss_legendre, mirrored
 from rsvib_torch.imaging import blur_rows, gauss_node_count, rows_showing, trajectory_psf
 from rsvib_torch.imaging.psf import Interpolation
 from rsvib_torch.motion.motion import Motion

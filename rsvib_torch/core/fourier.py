@@ -1,21 +1,29 @@
-"""Fourier transforms along rows of images that are not periodic."""
+"""Fourier transforms along rows that are not periodic: lengths, boundary extension, phase factors."""
 
 import math
-from functools import cache
 
 import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
 
-__all__ = ["extend_rows", "fast_length", "shift_phases", "squared_modulus", "waves"]
+from rsvib_torch.core.chunking import gathered
+from rsvib_torch.core.splines import bspline_coefficient_rows
 
-_TABLE = 64  # frequencies that a phase is stepped through
+__all__ = [
+    "extend_rows",
+    "extended_length",
+    "fast_length",
+    "shift_phases",
+    "spline_spectra",
+    "squared_modulus",
+    "waves",
+]
 
 
 def fast_length(minimum: int) -> int:
-    """Length from ``minimum`` on that is fast to transform: a multiple of 8 without prime factors over 11.
+    """Smallest length from ``minimum`` on that is fast to transform: a multiple of 8 with prime factors up to 11.
 
-    A prime length takes 4-5 times as long, and an odd one without large factors still more than twice.
+    A prime length takes 4-5 times as long, and an odd one with small factors more than twice.
 
     Example:
         >>> [fast_length(minimum) for minimum in (1, 97, 1104, 2072)]
@@ -24,15 +32,19 @@ def fast_length(minimum: int) -> int:
     return 8 * int(next_fast_len(-(-minimum // 8)))
 
 
-def extend_rows(images: Tensor, length: int) -> Tensor:
-    """Extend rows at their right end to ``length`` so that they close smoothly into a period.
+def extend_rows(images: Tensor, length: int, hold: float = 0.25) -> Tensor:
+    """Extend rows at their right end to ``length``, so that they close smoothly into a period.
 
-    Both ends go on by odd reflection, which keeps value and slope, and fade to their mean: interpolation in the
-    Fourier domain then stays local, where a jump or kink would ring into the image.
+    Both ends are extended by odd reflection, which keeps value and slope; a cosine blends the reflection of the last
+    pixels into that of the first ones. Without it, the jump would ring into the image, and displaced rows would wrap
+    around.
 
     Args:
         images: (..., W).
         length: Length of the period, at least W.
+        hold: Share of the gap next to either end that consists of the reflection of that end only, 0 <= hold < 0.5.
+            With a quarter, rows displaced by up to a quarter of the gap contain no content of the opposite end, which
+            improves restoration near the ends by up to 0.7 dB (displacements of 40 px, exposures of 100 rows).
 
     Returns:
         Tensor (..., length) whose first W columns are the image.
@@ -41,28 +53,33 @@ def extend_rows(images: Tensor, length: int) -> Tensor:
     extra = length - width
     if extra <= 0:
         return images
-    reach = min(extra, width - 1)
-    ends = torch.cat([images[..., : reach + 1], images[..., width - 1 - reach :]], dim=-1)
-    gap = ends @ _extension(reach, extra, images.dtype, images.device)
-    return torch.cat([images, gap], dim=-1)
+    steps = torch.arange(1, extra + 1, device=images.device)
+    after = 2 * images[..., -1:] - images[..., (width - 1 - steps).clamp(min=0)]
+    before = 2 * images[..., :1] - images[..., steps.flip(0).clamp(max=width - 1)]
+    progress = ((steps / (extra + 1) - hold) / (1 - 2 * hold)).clamp(0, 1)
+    share = (0.5 + 0.5 * torch.cos(torch.pi * progress)).to(images.dtype)
+    return torch.cat([images, share * after + (1 - share) * before], dim=-1)
 
 
-@cache
-@torch.inference_mode(False)
-def _extension(reach: int, extra: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Matrix (2 reach + 2, extra) from the values at both ends of a row to those that ``extend_rows`` adds."""
-    left, right = torch.eye(2 * reach + 2, dtype=torch.float64).chunk(2, dim=1)
-    taper = 0.5 + 0.5 * torch.cos(torch.arange(1, reach + 1, dtype=torch.float64) * (torch.pi / (reach + 1)))
-    first, last = left[:, :1], right[:, -1:]
-    middle = 0.5 * (first + last)
-    gap = middle.repeat(1, extra)
-    gap[:, :reach] += (2 * last - middle - right[:, :-1].flip(-1)) * taper
-    gap[:, extra - reach :] += (2 * first - middle - left[:, 1:].flip(-1)) * taper.flip(-1)
-    return gap.to(device, dtype)
+def extended_length(width: int, reach: int) -> int:
+    """Length for ``extend_rows`` of rows of ``width`` px that are displaced by up to ``reach`` px.
+
+    A quarter of the gap is 8 px longer than the displacement.
+    """
+    return fast_length(width + 4 * (8 + reach))
+
+
+def spline_spectra(images: Tensor, degree: int, length: int) -> Tensor:
+    """Transforms (..., H, U) along rows, extended to ``length``, of spline coefficients across images (..., H, W)."""
+    pieces = (
+        (rows, torch.fft.rfft(extend_rows(coefficients, length)))
+        for rows, coefficients in bspline_coefficient_rows(images, degree)
+    )
+    return gathered(pieces, images.shape[-2], images.ndim - 2)
 
 
 def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dtype) -> Tensor:
-    """``exp(2 pi i k shift / length)``: what moves rows back by a shift, as products of two tables.
+    """Phase factors ``exp(2 pi i k shift / length)``, which move rows back by a shift, as products of two tables.
 
     Args:
         shift: (...) px, float64.
@@ -81,8 +98,9 @@ def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dt
         True
     """
     start, stop = frequencies.start, frequencies.stop
-    coarse = torch.arange(start, stop, _TABLE, device=shift.device)
-    steps = torch.cat([coarse, torch.arange(_TABLE, device=shift.device)]).to(torch.float64)
+    step = 64  # frequencies per entry of the coarse table
+    coarse = torch.arange(start, stop, step, device=shift.device)
+    steps = torch.cat([coarse, torch.arange(step, device=shift.device)]).to(torch.float64)
     turns = shift[..., None] * (steps / length)
     angle = ((turns - turns.detach().round()) * (2 * math.pi)).to(dtype.to_real())
     tables = torch.complex(angle.cos(), angle.sin())  # several times faster than torch.polar

@@ -1,28 +1,25 @@
-"""B-spline interpolation on a unit grid: basis weights and the prefilter that turns samples into coefficients."""
+"""B-spline interpolation on a unit grid, correlation with short filters, and Gauss-Legendre quadrature."""
 
 from collections.abc import Iterator
 from fractions import Fraction
 from functools import cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.short_filters import correlated, toeplitz
 
 __all__ = [
     "bspline_coefficient_rows",
     "bspline_coefficients",
     "bspline_coefficients_adjoint",
     "bspline_weights",
+    "correlated",
+    "gauss_legendre",
     "mirrored",
     "spread_taps",
 ]
-
-_PRECISION = 1e-9  # of the largest tap, below which the prefilter is cut off
-_SINGLE_PRECISION = 3e-8  # the same for float32, which does not hold more
-_ROWS, _MANY_ROWS = {"cpu": 64}, 256  # at a time: they stay in the cache
-_FEW, _NOT_MANY = {"cpu": 1 << 20}, 1 << 24  # values of images that do so without being cut
 
 
 def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
@@ -73,15 +70,15 @@ def spread_taps(cells: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 
 @cache
 def _polynomials(degree: int) -> tuple[tuple[float, ...], ...]:
-    """Coefficients of the weights as polynomials of the fraction: a row for each power, highest first, of all taps.
+    """Coefficients of the weights as polynomials of the fraction: one row of all taps per power, highest power first.
 
-    By the Cox-de Boor recursion, in whole fractions.
+    They follow from the Cox-de Boor recursion in rational numbers.
     """
-    taps = [[Fraction(1)]]  # of each tap, lowest power first
+    taps = [[Fraction(1)]]  # for each tap, lowest power first
     for order in range(1, degree + 1):
         before, taps = taps, [[Fraction(0)] * (order + 1) for _ in range(order + 1)]
         for tap, weight in enumerate(before):
-            # knots of the spline of this order that starts so many cells before that of the position
+            # cells from the first knot of this tap's spline to the cell of the position
             distance = order - 1 - tap
             for power, value in enumerate(weight):
                 for which, at_zero, slope in ((tap, order - distance, -1), (tap + 1, distance, 1)):
@@ -92,7 +89,7 @@ def _polynomials(degree: int) -> tuple[tuple[float, ...], ...]:
 
 @cache
 def _prefilter_taps(degree: int, double: bool) -> tuple[float, ...]:
-    """One half (taps 0, 1, 2 ...) of the symmetric inverse of the sampled B-spline."""
+    """Taps 0, 1, 2 ... of the symmetric inverse filter of the sampled B-spline."""
     length = 1024
     samples = bspline_weights(torch.zeros((), dtype=torch.float64), degree)[:-1]
     kernel = torch.zeros(length, dtype=torch.float64)
@@ -100,17 +97,18 @@ def _prefilter_taps(degree: int, double: bool) -> tuple[float, ...]:
     for tap, value in enumerate(samples.tolist()):
         kernel[(tap - half) % length] = value
     inverse = torch.fft.irfft(1.0 / torch.fft.rfft(kernel).real, n=length)
-    reach = int((inverse[: length // 2].abs() > (_PRECISION if double else _SINGLE_PRECISION)).nonzero().max()) + 1
+    smallest = 1e-9 if double else 3e-8  # of the largest tap; float32 has no more digits
+    reach = int((inverse[: length // 2].abs() > smallest).nonzero().max()) + 1
     return tuple(inverse[:reach].tolist())
 
 
 def _symmetric(taps: tuple[float, ...], like: Tensor) -> Tensor:
-    """The whole of a symmetric kernel from one half."""
+    """A symmetric kernel from its taps 0, 1, 2 ..."""
     return torch.tensor(taps[:0:-1] + taps, dtype=like.dtype, device=like.device)
 
 
 def mirrored(index: Tensor, length: int) -> Tensor:
-    """Indices, however far out, folded into ``0 .. length - 1`` by mirroring about the end samples.
+    """Indices folded into ``0 .. length - 1`` by mirroring about the end samples, any number of times.
 
     Example:
         >>> mirrored(torch.arange(-3, 7), 4).tolist()
@@ -122,29 +120,32 @@ def mirrored(index: Tensor, length: int) -> Tensor:
 
 
 def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[tuple[slice, Tensor]]:
-    """``bspline_coefficients`` across the rows of images, some rows at a time, or all of small ones.
+    """``bspline_coefficients`` across the rows of images, in chunks of rows that stay in the cache.
 
     Args:
         samples: (..., H, W).
         degree: Odd degree of the spline, at least 3.
 
     Yields:
-        Which rows, and their coefficients (..., r, W).
+        A slice of rows, and their coefficients (..., r, W).
     """
-    if samples.numel() <= _FEW.get(samples.device.type, _NOT_MANY):
+    on_cpu = samples.device.type == "cpu"
+    if samples.numel() <= (1 << 20 if on_cpu else 1 << 24):  # fits the cache, or the memory
         yield slice(0, samples.shape[-2]), bspline_coefficients(samples, degree, -2)
         return
     taps = _prefilter_taps(degree, samples.dtype in (torch.float64, torch.complex128))
     reach, height = len(taps) - 1, samples.shape[-2]
     index = mirrored(torch.arange(-reach, height + reach, device=samples.device), height)
-    step = min(_ROWS.get(samples.device.type, _MANY_ROWS), height)
-    matrix = toeplitz(_symmetric(taps, samples), step)
+    step = min(64 if on_cpu else 256, height)
+    matrix = _toeplitz(_symmetric(taps, samples), step)
     for rows in runs(height, step):
         count = rows.stop - rows.start
         near = slice(rows.start - reach, rows.stop + reach)
         inside = near.start >= 0 and near.stop <= height
-        seen = samples[..., near, :] if inside else samples.index_select(-2, index[rows.start : rows.stop + 2 * reach])
-        yield rows, torch.matmul(matrix[:count, : count + 2 * reach], seen)
+        source = (
+            samples[..., near, :] if inside else samples.index_select(-2, index[rows.start : rows.stop + 2 * reach])
+        )
+        yield rows, torch.matmul(matrix[:count, : count + 2 * reach], source)
 
 
 def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
@@ -181,3 +182,87 @@ def bspline_coefficients_adjoint(values: Tensor, degree: int, dim: int) -> Tenso
     spread = correlated(torch.cat([edge, values, edge], dim), _symmetric(taps, values)[None], dim)[0]
     index = mirrored(torch.arange(-reach, length + reach, device=values.device), length)
     return torch.zeros_like(values).index_add(dim, index, spread)
+
+
+def _toeplitz(kernels: Tensor, rows: int, step: int = 1) -> Tensor:
+    """Matrix whose product with samples is their correlation with kernels.
+
+    Args:
+        kernels: (..., N) taps.
+        rows: Number of values of the product.
+        step: Samples between neighbouring values.
+
+    Returns:
+        (..., rows, (rows - 1) step + N).
+
+    """
+    taps = kernels.shape[-1]
+    matrix = kernels.new_zeros(*kernels.shape[:-1], rows, (rows - 1) * step + taps)
+    row = torch.arange(rows, device=kernels.device)[:, None]
+    matrix[..., row, step * row + torch.arange(taps, device=kernels.device)] = kernels[..., None, :]
+    return matrix
+
+
+def correlated(samples: Tensor, kernels: Tensor, dim: int, step: int = 1) -> Tensor:
+    """Correlate along an axis with several kernels, at places where these lie inside ("valid").
+
+    Products with small dense matrices are faster than convolutions.
+
+    Args:
+        samples: Real or complex, at least as long as the kernels along ``dim``.
+        kernels: (Q, N) taps, of the same dtype.
+        dim: Axis to filter.
+        step: Samples between neighbouring values.
+
+    Returns:
+        Values like the samples, but ``(n - N) // step + 1`` of n along ``dim``; a leading dimension counts kernels.
+
+    Example:
+        >>> correlated(torch.arange(5.0), torch.tensor([[-1.0, 1.0], [0.5, 0.5]]), 0).tolist()
+        [[1.0, 1.0, 1.0, 1.0], [0.5, 1.5, 2.5, 3.5]]
+    """
+    if samples.ndim == 1:
+        return correlated(samples[None], kernels, 1, step)[:, 0]
+    number, taps = kernels.shape
+    length = (samples.shape[dim] - taps) // step + 1
+    if dim not in (-1, samples.ndim - 1):
+        values = _across(samples.movedim(dim, -2), kernels, step, length)
+        return values.movedim(-2, dim + 1 if dim >= 0 else dim)
+    block = min(64 if samples.device.type == "cpu" else 256, length)  # values per matrix product
+    matrix = _toeplitz(kernels, block, step)  # (Q, block, m)
+    parts = []
+    for part in runs(length, block):
+        count = part.stop - part.start
+        own = matrix[:, :count, : (count - 1) * step + taps].flatten(0, 1)
+        values = samples[..., part.start * step : (part.stop - 1) * step + taps] @ own.T
+        parts.append(values.unflatten(-1, (number, count)))
+    return torch.cat(parts, -1).movedim(-2, 0)
+
+
+def _across(samples: Tensor, kernels: Tensor, step: int, length: int) -> Tensor:
+    """``correlated`` across rows (..., n, W): (Q, ..., length, W), by batches of small matrices."""
+    number, taps = kernels.shape
+    block = min(8 if samples.device.type == "cpu" else 256, length)
+    span = (block - 1) * step + taps
+    count = length // block
+    own = _toeplitz(kernels, block, step).flatten(0, 1)
+    windows = samples.unfold(-2, span, block * step).mT  # (..., count, span, W)
+    blocks: Tensor = (own @ windows).unflatten(-2, (number, block)).movedim(-3, 0).flatten(-3, -2)
+    rest = length - count * block
+    if not rest:
+        return blocks
+    return torch.cat([blocks, _across(samples[..., count * block * step :, :], kernels, step, rest)], -2)
+
+
+@cache
+def gauss_legendre(count: int) -> tuple[Tensor, Tensor]:
+    """Gauss-Legendre nodes (N,) within 0 ... 1, and weights that sum to 1, float64; cached, do not modify them.
+
+    Example:
+        >>> nodes, weights = gauss_legendre(2)
+        >>> round(float((weights * nodes**3).sum()), 12)
+        0.25
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    with torch.inference_mode(False):  # later callers may differentiate
+        return torch.from_numpy((nodes + 1) / 2), torch.from_numpy(weights / 2)

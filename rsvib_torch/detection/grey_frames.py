@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.frames.arrays import ArrayLike
-from rsvib_torch.frames.columns import detailed_columns
-from rsvib_torch.frames.missing import fill_roughly
+from rsvib_torch.frames.pixels import detailed_columns, fill_with_means
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.motion.timing import SensorTiming
 
@@ -72,7 +71,7 @@ def grey_frames(frames: ArrayLike, timing: SensorTiming, full_scale: float | Non
         if bool((share < _LEAST_FRAME).any()):
             where = (share < _LEAST_FRAME).nonzero()[0].tolist()
             raise ValueError(f"frame {where[-1]} has only {share[*where]:.1%} of pixels that count")
-        images = fill_roughly(images, missing[:, :, None].expand(images.shape))
+        images = fill_with_means(images, missing[:, :, None].expand(images.shape))
         valid = ~missing if bool(missing.any()) else None
     _check_detail(images)
     return GreyFrames(images.mean(2) if images.shape[2] > 1 else images[:, :, 0], valid, prepared.batched)

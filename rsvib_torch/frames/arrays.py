@@ -1,4 +1,4 @@
-"""NumPy arrays at the door: whatever their memory looks like, they become tensors."""
+"""Conversion of NumPy arrays of any memory layout and byte order to tensors."""
 
 from typing import Any
 
@@ -15,15 +15,15 @@ ArrayLike = Tensor | NDArray[Any]
 def as_tensor(name: str, value: object) -> Tensor:
     """Return a tensor, array or nested list of numbers as a tensor of the same values and dtype.
 
-    An array lends its memory where PyTorch can read it; one that is read-only, runs backwards or has foreign byte
-    order (FITS and TIFF files) is copied.
+    The tensor shares the memory of an array if PyTorch supports its layout. Read-only arrays and arrays with negative
+    strides or foreign byte order (FITS and TIFF files) are copied.
 
     Args:
-        name: What the value is called in the message.
+        name: Name of the argument in error messages.
         value: The value.
 
     Raises:
-        TypeError: If it holds no numbers.
+        TypeError: If the value is a masked array or does not consist of numbers.
 
     Example:
         >>> as_tensor("frames", np.arange(3, dtype=">u2")[::-1]).tolist()
@@ -32,14 +32,12 @@ def as_tensor(name: str, value: object) -> Tensor:
     if isinstance(value, Tensor):
         return value
     if isinstance(value, np.ma.MaskedArray):
-        raise TypeError(f"{name} must not be a masked array; give its data, and the mask by itself (ignore=)")
+        raise TypeError(f"{name} must not be a masked array; pass its data, and the mask as ignore=")
     try:
         if isinstance(value, np.ndarray):
             native = value if value.dtype.isnative else value.astype(value.dtype.newbyteorder("="))
-            strange = not native.flags.writeable or any(
-                stride < 0 or stride % native.itemsize for stride in native.strides
-            )
-            return torch.from_numpy(native.copy() if strange else native)
+            unsupported = any(stride < 0 or stride % native.itemsize for stride in native.strides)
+            return torch.from_numpy(native.copy() if unsupported or not native.flags.writeable else native)
         return torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError) as error:
         kind = f" of {value.dtype}" if isinstance(value, np.ndarray) else ""

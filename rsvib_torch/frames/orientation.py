@@ -1,7 +1,6 @@
-"""The door to the core: any scan axis and readout direction become rows on axis -2, first row read first.
+"""Row order: any scan axis and readout direction become rows on axis -2 with the row read first at index 0.
 
-Behind this door all code sees one orientation only. Frames are transposed and flipped, and displacements change
-with them: a transpose swaps x and y, a flip along the rows turns the sign of y.
+A transpose swaps the x and y components of displacements; a flip along the rows changes the sign of y.
 """
 
 import torch
@@ -9,11 +8,7 @@ from torch import Tensor
 
 from rsvib_torch.motion.timing import SensorTiming
 
-__all__ = [
-    "frames_from_row_order",
-    "frames_to_row_order",
-    "offsets_from_row_order",
-]
+__all__ = ["frames_from_row_order", "frames_to_row_order", "offsets_from_row_order"]
 
 
 def frames_to_row_order(frames: Tensor, timing: SensorTiming) -> Tensor:
@@ -23,13 +18,13 @@ def frames_to_row_order(frames: Tensor, timing: SensorTiming) -> Tensor:
 
 
 def frames_from_row_order(frames: Tensor, timing: SensorTiming) -> Tensor:
-    """Undo ``frames_to_row_order``."""
+    """Inverse of ``frames_to_row_order``."""
     frames = frames.flip(-2) if timing.readout_direction == "reverse" else frames
     return frames.transpose(-2, -1) if timing.scan_axis == -1 else frames
 
 
 def offsets_from_row_order(offsets: Tensor, timing: SensorTiming) -> Tensor:
-    """Turn displacements or offsets (..., 2) measured in row order back to image axes (x, y)."""
+    """Turn displacements or offsets (..., 2) in row order back to image axes (x, y)."""
     if timing.readout_direction == "reverse":
         offsets = offsets * torch.tensor([1.0, -1.0], dtype=offsets.dtype, device=offsets.device)
     return offsets.flip(-1) if timing.scan_axis == -1 else offsets

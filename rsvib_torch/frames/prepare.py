@@ -14,8 +14,8 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.frames.arrays import ArrayLike, as_tensor
-from rsvib_torch.frames.missing import fill_roughly
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
+from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 
 __all__ = ["PreparedFrames", "Saturation", "as_float_frames", "prepare_frames"]
@@ -53,7 +53,7 @@ class PreparedFrames:
     @cached_property
     def filled(self) -> Tensor:
         """The images with local means at missing pixels."""
-        return self.images if self.missing is None else fill_roughly(self.images, self.missing)
+        return self.images if self.missing is None else fill_with_means(self.images, self.missing)
 
     def with_images(self, images: Tensor) -> "PreparedFrames":
         """The same frames with other pixel values (B, T, C, H, W') in row order; masks must be None or fit them."""

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.quadrature import gauss_legendre
+from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.quadrature import gauss_legendre
-from rsvib_torch.core.splines import bspline_coefficients, bspline_weights
+from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, gauss_legendre
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.vibration import TensorLike, Vibration
 

@@ -60,7 +60,7 @@ class RowSpectra:
         self.height, self.width = frames.shape[-2:]
         self.length = fast_length(self.width + 64)  # 32 px of boundary extension per end close the period smoothly
         pieces = (
-            (rows, torch.fft.rfft(extend_rows(coefficients.sub_(level).div_(contrast), self.length)))
+            (rows, torch.fft.rfft(extend_rows(coefficients.sub_(level).div_(contrast), self.length, hold=0.0)))
             for rows, coefficients in bspline_coefficient_rows(frames, DEGREE)
         )
         self.values = gathered(pieces, self.height, frames.ndim - 2)

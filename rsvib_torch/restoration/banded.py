@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.core.fourier import extend_rows, extended_length
 from rsvib_torch.core.splines import bspline_weights, mirrored
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.noise.single_frame import estimate_noise, gradient_energy
-from rsvib_torch.restoration.row_extension import continue_rows, period_of_rows
 
 __all__ = ["restore_banded"]
 
@@ -91,7 +91,7 @@ def _aligned_spectra(frames: Tensor, motion: FrameMotion, u: Tensor, length: int
     starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device))
     starts = starts.expand(B, T, H)
     mean = motion.vibration.mean_displacement(starts, motion.timing.exposure_time)[..., 0] - motion.shift[..., 0, None]
-    spectra = torch.fft.rfft(continue_rows(frames, length)).transpose(-3, -2).flatten(0, 2)
+    spectra = torch.fft.rfft(extend_rows(frames, length)).transpose(-3, -2).flatten(0, 2)
     moved = [
         rows * torch.complex(*(part.to(frames.dtype) for part in _turn(u, -places)))[:, None]
         for rows, places in zip(spectra.split(_ALIGN_ROWS), mean.flatten().split(_ALIGN_ROWS), strict=True)
@@ -141,7 +141,7 @@ def restore_banded(
     check_choice("interpolation", interpolation, tuple(_TRANSFERS))
     weights = _noise_to_signal(frames, noise_to_signal)
     B, T, C, H, W = frames.shape
-    length = period_of_rows(W, motion.reach(H) + _RINGING)
+    length = extended_length(W, motion.reach(H) + _RINGING)
     size = 2 * half_rows + 1
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=frames.device)
     v = torch.fft.fftfreq(size, dtype=torch.float64, device=frames.device)

@@ -6,10 +6,9 @@ from torch.nn.functional import embedding_bag
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.chunking import gathered, runs
-from rsvib_torch.core.fourier import shift_phases
+from rsvib_torch.core.fourier import extended_length, shift_phases, spline_spectra
 from rsvib_torch.core.splines import bspline_weights, mirrored
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.row_extension import period_of_rows, spline_spectra
 
 __all__ = ["restore_dewarp"]
 
@@ -37,7 +36,7 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 256
     along = (mean - motion.shift[..., 0, None]).flatten(0, 1)
     rows = rows.flatten(0, 1)
 
-    length = period_of_rows(W, motion.reach(H))
+    length = extended_length(W, motion.reach(H))
     spectra = spline_spectra(frames, _DEGREE, length)
     count = spectra.shape[-1]
     cell = rows.detach().floor()

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.frames.missing import fill_roughly
+from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.imaging.blur import RowVaryingBlur
 from rsvib_torch.imaging.psf import RowPSF, row_psf
 from rsvib_torch.restoration.dewarp import restore_dewarp
@@ -55,7 +55,7 @@ def restore_richardson_lucy(
     weights = psf.weights.to(frames.dtype)[:, :, None]
     measured = torch.ones_like(frames)
     if ignore is not None:
-        frames, measured = fill_roughly(frames, ignore), (~ignore).to(frames.dtype)
+        frames, measured = fill_with_means(frames, ignore), (~ignore).to(frames.dtype)
     counts = frames.clamp(min=0.0)
     upright, shift = restore_dewarp(frames, motion), motion.shift.to(torch.int64)
     # degree 1: the kernels act on the coefficients themselves

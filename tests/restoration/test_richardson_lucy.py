@@ -64,9 +64,9 @@ def test_agrees_with_a_dense_loop(small, hidden):
     found = lucy(tensor, SHORT, motion.vibration(), iterations=4, **options)[0].numpy()
     known = torch.from_numpy(frame)[None]
     if hidden:
-        from rsvib_torch.frames.missing import fill_roughly
+        from rsvib_torch.frames.pixels import fill_with_means
 
-        known = fill_roughly(known, mask)
+        known = fill_with_means(known, mask)
     start = restore(known, SHORT, motion.vibration(), method="dewarp", check=False)[0].numpy()
     weight = (~ignore).ravel().astype(float)
     scene = np.maximum(start, 1e-4 * frame[~ignore].mean()).ravel()

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.quadrature import gauss_legendre
-from rsvib_torch.core.splines import bspline_weights
+from rsvib_torch.core.splines import bspline_weights, gauss_legendre
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.shapes.motion_spectrum import MOST_KNOTS, fit_with_spectrum
 

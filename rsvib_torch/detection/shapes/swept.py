@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.core.quadrature import gauss_legendre
+from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.detection.band_curve import measurements_of_curve
 from rsvib_torch.detection.grey_frames import GreyFrames, grey_frames
 from rsvib_torch.detection.measurements import Measurements

@@ -110,7 +110,7 @@ def projected_information(recording: Recording) -> Tensor:
     place = _Places.of(recording)
     length = fast_length(recording.scene.shape[1] + 2 * _MARGIN)
     coefficients = bspline_coefficients(_within_band(recording.scene), _DEGREE, -2)
-    spectra = torch.fft.rfft(extend_rows(coefficients, length))
+    spectra = torch.fft.rfft(extend_rows(coefficients, length, hold=0.0))
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=spectra.device)
     step = max(1, _CHUNK // place.first.numel())
     left = []
@@ -127,7 +127,7 @@ def projected_information(recording: Recording) -> Tensor:
 def _within_band(scene: Tensor) -> Tensor:
     """The scene without its finest detail across rows."""
     length = fast_length(len(scene) + 2 * _MARGIN)
-    spectra = torch.fft.rfft(extend_rows(scene.T, length))
+    spectra = torch.fft.rfft(extend_rows(scene.T, length, hold=0.0))
     v = torch.fft.rfftfreq(length, dtype=scene.dtype, device=scene.device)
     low, high = _BAND
     share = 0.5 + 0.5 * torch.cos(math.pi * ((v - low) / (high - low)).clamp(0.0, 1.0))
@@ -274,7 +274,7 @@ def _row_information(recording: Recording, noise: float | None) -> Tensor:
 def _gradient_products(scene: Tensor, window: Tensor, noise: float | None, num_frames: int) -> Tensor:
     """Sums (S, 2, 2) of the gradient products of each scene row over the columns in the window."""
     lengths = [fast_length(size + 2 * _MARGIN) for size in scene.shape]
-    closed = extend_rows(extend_rows(scene, lengths[1]).T, lengths[0]).T
+    closed = extend_rows(extend_rows(scene, lengths[1], hold=0.0).T, lengths[0], hold=0.0).T
     spectrum = torch.fft.fft2(closed - closed.mean())
     v, u = (torch.fft.fftfreq(n, dtype=torch.float64, device=scene.device) for n in lengths)
     slopes = torch.stack([2j * math.pi * u * spectrum, 2j * math.pi * v[:, None] * spectrum])

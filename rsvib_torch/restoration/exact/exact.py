@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.core.fourier import extend_rows, extended_length
 from rsvib_torch.core.parallel import in_parallel
-from rsvib_torch.frames.missing import fill_roughly
+from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.exact.filling import fill_beyond_ends, fill_missing, measured_values
 from rsvib_torch.restoration.exact.priors import PRIORS, PriorOptions
@@ -17,7 +18,6 @@ from rsvib_torch.restoration.exact.strength import Strengths, prior_strength
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.joint_groups import joint_groups
 from rsvib_torch.restoration.noise.noise_levels import noise_levels
-from rsvib_torch.restoration.row_extension import continue_rows, period_of_rows
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels, row_kernels
 from rsvib_torch.restoration.scene_model.row_prior import RowPrior, brightness, fit_prior
 
@@ -84,7 +84,7 @@ def restore_exact(
         for name, value in (("chunk_frequencies", chunk_frequencies), ("segments", segments))
     )
     if ignore is not None:
-        frames = fill_roughly(frames, ignore)
+        frames = fill_with_means(frames, ignore)
     missing = ignore if clipped is None else clipped if ignore is None else ignore | clipped
     levels = _noise_levels(frames, motion, noise, ignore)
     mean = brightness(frames).mean(1)[..., None, None]
@@ -196,7 +196,7 @@ class _Stack:
         along = self.shift[members, 0] - self.shift[reference, 0]
         neighbours = members == list(range(members[0], members[-1] + 1))  # a view instead of a copy
         frames = self.frames[members[0] : members[-1] + 1] if neighbours else self.frames[members]
-        data = continue_rows(frames, self.length).sub_(self.mean)
+        data = extend_rows(frames, self.length).sub_(self.mean)
         problem = SceneProblem(data, Observation(kernels, height, data.dtype), precision, self.level, partition)
         missing = None if self.missing is None else self.missing[members]
         ends = kernels.reach > _FILLED_REACH
@@ -222,7 +222,7 @@ def scene_period(width: int, reach: int, displacement: Tensor) -> int:
     """
     along = displacement[..., 0].detach()
     filled = bool((along.amax(-1) - along.amin(-1)).amax() > 2 * _FILLED_REACH)
-    return period_of_rows(width, reach if filled else reach + 8)  # px beyond the displacement that influence the ends
+    return extended_length(width, reach if filled else reach + 8)  # px beyond the displacement that influence the ends
 
 
 def _without_empty_frames(groups: list[tuple[list[int], int]], missing: Tensor) -> list[tuple[list[int], int]]:

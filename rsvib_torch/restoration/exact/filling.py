@@ -6,9 +6,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.fourier import fast_length
+from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem
-from rsvib_torch.restoration.row_extension import continue_rows
 
 __all__ = ["fill_beyond_ends", "fill_missing", "measured_values"]
 
@@ -110,6 +109,6 @@ def fill_beyond_ends(problem: SceneProblem, width: int, reach: float) -> Tensor:
     flat = problem.precision.flatten(0, 1)[None]
     precision = torch.nn.functional.interpolate(flat, length // 2 + 1, mode="linear", align_corners=True)
     precision = precision[0].unflatten(0, problem.precision.shape[:2])
-    joined = replace(problem, data=continue_rows(strip, length), precision=precision)
+    joined = replace(problem, data=extend_rows(strip, length), precision=precision)
     filled = fill_missing(joined, measured.expand(*data.shape[:-1], length), iterations=40)
     return torch.cat([data[..., :width], filled[..., gap]], dim=-1)

@@ -18,7 +18,7 @@ from torch import Tensor
 from rsvib_torch.core.banded_solver import BandedFactor, factor_banded, solve_skewed
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.parallel import in_parallel
-from rsvib_torch.core.short_filters import correlated
+from rsvib_torch.core.splines import correlated
 from rsvib_torch.restoration.scene_model.observation import Observation
 from rsvib_torch.restoration.scene_model.row_kernel import SCENE_REACH, scene_weights
 

@@ -6,7 +6,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.quadrature import gauss_legendre
+from rsvib_torch.core.splines import gauss_legendre
 
 __all__ = [
     "REACH",

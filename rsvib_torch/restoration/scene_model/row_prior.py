@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.fourier import squared_modulus, waves
+from rsvib_torch.core.fourier import extend_rows, squared_modulus, waves
 from rsvib_torch.core.splines import mirrored
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.row_extension import continue_rows
 from rsvib_torch.restoration.scene_model.row_kernel import interpolation_error, kernel_spectrum
 
 __all__ = ["ORDER", "RowPrior", "autoregressive_prior", "brightness", "fit_prior"]
@@ -272,7 +271,7 @@ def _power_of_rows(strips: Tensor, length: int, count: int) -> Tensor:
         length: Period of the rows.
         count: U.
     """
-    power = squared_modulus(torch.fft.fft(torch.fft.rfft(continue_rows(strips, length)), dim=-2))
+    power = squared_modulus(torch.fft.fft(torch.fft.rfft(extend_rows(strips, length)), dim=-2))
     return torch.nn.functional.adaptive_avg_pool1d(power.mean((0, 1, 2)), count).T.to(torch.float64)
 
 

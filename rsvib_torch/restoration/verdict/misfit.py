@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.short_filters import correlated
+from rsvib_torch.core.splines import correlated
 
 __all__ = ["RIM", "misfit"]
 

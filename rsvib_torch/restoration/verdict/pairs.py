@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rsvib_torch.frames.columns import detailed_columns
+from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.verdict.misfit import RIM
 from rsvib_torch.restoration.verdict.outcome import TooLittleInCommonError

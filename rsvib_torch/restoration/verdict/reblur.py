@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.fourier import extended_length, spline_spectra
 from rsvib_torch.core.splines import bspline_weights, mirrored, spread_taps
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.row_extension import period_of_rows, spline_spectra
 
 __all__ = ["reblur"]
 
@@ -38,7 +38,7 @@ def reblur(scene: Tensor, motion: FrameMotion, frame: int, *, first_row: int = 0
     displacement, node_weights = exposure_trajectory(motion.vibration[0], starts, motion.timing, "gauss")
     displacement = displacement - motion.shift[0, frame]
     reach = math.ceil(float(displacement[..., 0].abs().amax()))
-    length = period_of_rows(width, reach)
+    length = extended_length(width, reach)
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=scene.device)
     spectra = spline_spectra(scene, _DEGREE, length)
 
