@@ -14,7 +14,7 @@ restore = partial(restore_by_any_method, method="exact", check=False)
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 
 
-def test_patches_agree_with_a_loop():
+def test_patches_agree_with_a_loop_over_dct():
     image = np.random.default_rng(0).standard_normal((11, 13))
     padded = np.pad(image, 7, mode="edge")
     total, weights = np.zeros_like(padded), np.zeros_like(padded)
@@ -47,7 +47,7 @@ def step(request):
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_better_than_the_quadratic_prior(town, joint):
+def test_psnr_exceeds_that_of_the_gaussian_prior(town, joint):
     truth, frames = town
     plain = restore(frames, TIMING, Motion().vibration(), joint=joint)
     kept = restore(frames, TIMING, Motion().vibration(), joint=joint, prior="edges")
@@ -57,7 +57,7 @@ def test_better_than_the_quadratic_prior(town, joint):
 
 @pytest.mark.parametrize("exposure_rows", [100, 400])
 @pytest.mark.parametrize("joint", [False, True])
-def test_better_than_the_quadratic_prior_where_exposures_blur(joint, exposure_rows):
+def test_psnr_exceeds_that_of_the_gaussian_prior_under_blur(joint, exposure_rows):
     scene = draw_scene(272, 240, seed=5)
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=exposure_rows, frame_rows=2048)
     frames = torch.from_numpy(take_frames(scene, timing, Motion(), 2, 0.02, samples=32)).float()
@@ -67,7 +67,7 @@ def test_better_than_the_quadratic_prior_where_exposures_blur(joint, exposure_ro
     assert decibel(kept, crop(scene)) > decibel(plain, crop(scene)) + 0.2
 
 
-def test_steps_ring_less_and_are_far_less_noisy(step):
+def test_steps_have_less_overshoot_and_noise(step):
     truth, frames, timing, along = step
     plain, kept = (
         restore(frames[:1], timing, Motion().vibration(), prior=prior)[0].numpy() for prior in ("gaussian", "edges")

@@ -33,7 +33,7 @@ def short():
 
 @pytest.fixture
 def prior_fitted_once(monkeypatch):
-    """The prior of the first call stays, so that results depend on the frames through the solution only."""
+    """Keep the prior of the first call, so that results depend on the frames through the solution only."""
     fitted = []
 
     def fit_once(*arguments):
@@ -50,7 +50,7 @@ def noisy(frames, noise, seed=5, dtype=torch.float32):
 
 
 @pytest.mark.parametrize(("noise", "one", "two"), [(0.0, 64.0, 67.5), (0.005, 47.0, 49.2), (0.02, 38.0, 40.0)])
-def test_as_good_as_a_still_camera(short, noise, one, two):
+def test_psnr_of_restored_frames(short, noise, one, two):
     truth, frames, motion = short
     frames = noisy(frames, noise)
     single = restore(frames, TIMING, motion.vibration())
@@ -76,7 +76,7 @@ def test_long_exposures(rows, one, two):
 
 
 @pytest.mark.parametrize("noise", [0.001, 0.005, 0.02, 0.05])
-def test_regularisation_from_the_data_is_near_the_best_by_hand(short, noise):
+def test_estimated_regularisation_is_close_to_the_best(short, noise):
     truth, frames, motion = short
     frames = noisy(frames, noise)[:1]
     found = decibel(restore(frames, TIMING, motion.vibration()), truth)
@@ -85,14 +85,14 @@ def test_regularisation_from_the_data_is_near_the_best_by_hand(short, noise):
         assert decibel(by_hand, truth) < found + 0.3
 
 
-def test_beats_the_slabs(short):
+def test_psnr_exceeds_that_of_the_banded_method(short):
     truth, frames, motion = short
     frames = noisy(frames, 0.005)
     slabs = restore_by_any_method(frames, TIMING, motion.vibration(), method="banded")
     assert decibel(restore(frames, TIMING, motion.vibration()), truth) > decibel(slabs, truth) + 1
 
 
-def test_noisier_frames_count_less(short):
+def test_noisier_frames_have_less_weight(short):
     truth, frames, motion = short
     frames = torch.cat([noisy(frames[:1], 0.003), noisy(frames[1:], 0.01, seed=6)])
     alone = restore(frames[:1], TIMING, motion.vibration())
@@ -125,7 +125,7 @@ def test_nothing_wraps_around(short, prior_fitted_once):
     assert change[:, -32:, 64:].abs().max() < 0.01
 
 
-def test_batch_and_chunks_and_channels_change_nothing(short):
+def test_results_do_not_depend_on_batch_chunks_and_channels(short):
     _, frames, motion = short
     stacks = noisy(frames[:, :96, :80], 0.005, dtype=torch.float64)[None, :, None]
     stacks = torch.cat([stacks, 0.5 * stacks], dim=0)
@@ -142,11 +142,11 @@ def test_batch_and_chunks_and_channels_change_nothing(short):
 
 
 @pytest.mark.parametrize("joint", [False, 2])
-def test_frames_side_by_side_are_frames_one_after_the_other(short, joint, monkeypatch):
+def test_results_do_not_depend_on_threads_and_gradients(short, joint, monkeypatch):
     _, frames, motion = short
     stack = noisy(np.concatenate([frames, frames[::-1]])[:3, :120, :100], 0.005, dtype=torch.float64)
     allowed = torch.get_num_threads()
-    asked = {"joint": joint, "check": False}
+    options = {"joint": joint, "check": False}
     found = []
     parts = []
     solver = exact_module._Stack.problem
@@ -160,12 +160,12 @@ def test_frames_side_by_side_are_frames_one_after_the_other(short, joint, monkey
         for threads, workers in ((2, 2), (1, 1)):
             parts.clear()
             torch.set_num_threads(threads)
-            found.append(restore(stack, TIMING, motion.vibration(), **asked))
+            found.append(restore(stack, TIMING, motion.vibration(), **options))
             assert len(parts) == 3
             assert len({thread for thread, _ in parts}) == workers
         parts.clear()
         torch.set_num_threads(2)
-        found.append(restore(stack.requires_grad_(), TIMING, motion.vibration(), **asked))
+        found.append(restore(stack.requires_grad_(), TIMING, motion.vibration(), **options))
         assert parts == [(threading.current_thread(), True)] * 3
     finally:
         torch.set_num_threads(allowed)
@@ -175,7 +175,7 @@ def test_frames_side_by_side_are_frames_one_after_the_other(short, joint, monkey
 
 
 @pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "forward"), (-1, "reverse")])
-def test_turned_problem_gives_turned_answer(short, scan_axis, direction):
+def test_scan_axis_and_readout_direction(short, scan_axis, direction):
     _, frames, motion = short
     frames = noisy(frames, 0.005)[..., :96]
     expected = restore(frames, TIMING, motion.vibration())
@@ -205,21 +205,21 @@ def test_push_scan_frames_are_joined_where_they_overlap():
     assert decibel(joint[0], truth, 8) > decibel(single[1], truth, 8) - 0.1
 
 
-def test_ignored_pixels_are_filled_from_the_others(short):
+def test_ignored_pixels_are_estimated_from_all_others(short):
     truth, frames, motion = short
     frames = noisy(frames, 0.005)
     ignore = torch.rand(frames.shape, generator=torch.Generator().manual_seed(2)) < 0.01
     ignore[0, 100:104, 120:124] = True
-    spoiled = frames.masked_fill(ignore, float("nan"))
-    joint = restore(spoiled, TIMING, motion.vibration(), joint=True, ignore=ignore)
-    single = restore(spoiled, TIMING, motion.vibration(), ignore=ignore)
+    incomplete = frames.masked_fill(ignore, float("nan"))
+    joint = restore(incomplete, TIMING, motion.vibration(), joint=True, ignore=ignore)
+    single = restore(incomplete, TIMING, motion.vibration(), ignore=ignore)
     assert decibel(single, truth) > decibel(restore(frames, TIMING, motion.vibration()), truth) - 1.5
     assert decibel(joint, truth) > decibel(restore(frames, TIMING, motion.vibration(), joint=True), truth) - 0.5
     blind = restore(frames.masked_fill(ignore, 1.0), TIMING, motion.vibration())
     assert decibel(blind, truth) < decibel(single, truth) - 10
 
 
-def test_dead_rows_and_pixels_harm_no_others(short):
+def test_missing_rows_and_pixels_do_not_affect_others(short):
     truth, frames, motion = short
     frames = noisy(frames, 0.005)[:1]
     ignore = torch.rand(frames.shape, generator=torch.Generator().manual_seed(3)) < 0.01
@@ -227,12 +227,12 @@ def test_dead_rows_and_pixels_harm_no_others(short):
     starts = torch.arange(frames.shape[1]) * TIMING.row_time
     x, y = motion.vibration().mean_displacement(starts, TIMING.exposure_time).round().long().T
     rows, columns = ignore[0].nonzero().T
-    harmed = np.zeros(truth.shape, dtype=bool)
+    affected = np.zeros(truth.shape, dtype=bool)
     place = (rows - y[rows]).clamp(0, truth.shape[0] - 1), (columns - x[rows]).clamp(0, truth.shape[1] - 1)
-    harmed[place] = True
-    harmed = ndimage.binary_dilation(harmed, np.ones((5, 5)))
+    affected[place] = True
+    affected = ndimage.binary_dilation(affected, np.ones((5, 5)))
     clean, filled = (
-        np.where(harmed, truth, image[0].numpy())
+        np.where(affected, truth, image[0].numpy())
         for image in (
             restore(frames, TIMING, motion.vibration()),
             restore(frames.masked_fill(ignore, 0.9), TIMING, motion.vibration(), ignore=ignore),
@@ -240,7 +240,7 @@ def test_dead_rows_and_pixels_harm_no_others(short):
     )
     assert decibel(filled, truth) > decibel(clean, truth) - 0.2
     blind = restore(frames.masked_fill(ignore, 0.9), TIMING, motion.vibration())[0].numpy()
-    assert decibel(np.where(harmed, truth, blind), truth) < decibel(clean, truth) - 3
+    assert decibel(np.where(affected, truth, blind), truth) < decibel(clean, truth) - 3
 
 
 def test_gradients_to_frames_and_vibration():
@@ -277,7 +277,7 @@ def test_bad_input(options, error, message):
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_segments_of_rows_change_nothing(short, joint, monkeypatch):
+def test_results_do_not_depend_on_segments(short, joint, monkeypatch):
     _, frames, motion = short
     frames = noisy(frames, 0.02)[..., :64]
     frames = torch.cat([frames, frames.flip(-2)], dim=-2).requires_grad_()
@@ -288,7 +288,7 @@ def test_segments_of_rows_change_nothing(short, joint, monkeypatch):
     torch.testing.assert_close(split, whole, rtol=0, atol=2e-5)
     gradients = [torch.autograd.grad(image[..., 150:, :].square().sum(), frames)[0] for image in (whole, split)]
     torch.testing.assert_close(gradients[1], gradients[0], rtol=0, atol=2e-4)
-    with torch.no_grad():  # solved in memory that is used again
+    with torch.no_grad():  # in memory that is used again
         for chunk in (None, 7, 1000):
             again = restore(
                 frames, TIMING, motion.vibration(), segments=3, chunk_frequencies=chunk, check=False, joint=joint
@@ -296,13 +296,13 @@ def test_segments_of_rows_change_nothing(short, joint, monkeypatch):
             torch.testing.assert_close(again, whole.detach(), rtol=0, atol=2e-5)
     windows = scene_solver.row_windows
     monkeypatch.setattr(scene_solver, "row_windows", lambda rows, count: windows(rows, count, overlap=2))
-    careless = restore(frames, TIMING, motion.vibration(), segments=3, check=False, joint=joint)
-    assert (careless - whole).abs().max() > 1e-3
+    too_small_overlap = restore(frames, TIMING, motion.vibration(), segments=3, check=False, joint=joint)
+    assert (too_small_overlap - whole).abs().max() > 1e-3
 
 
 @pytest.mark.parametrize("exposure", [20, 300])
-def test_tall_frames_are_split_only_where_rows_depend_on_near_ones(exposure, monkeypatch):
-    """At 300 rows and no noise, segments would go astray by far more than the scene is bright."""
+def test_rows_are_divided_only_without_blur(exposure, monkeypatch):
+    """At 300 rows of exposure and no noise, errors of segments would exceed the brightness of the scene."""
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=exposure, frame_rows=2048)
     vibration = Vibration([3.1, 5.2], [50.0, 30.0], [0.7, 2.1])
     scene = city_and_fields(1200 + 96, 64 + 96, seed=4)

@@ -1,4 +1,4 @@
-"""How a sample of rows tells what a prior predicts: slabs side by side, each as if there were no other."""
+"""Residuals and degrees of freedom of sampled rows against dense matrices; choice of the strength of the prior."""
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def dense(frames, kernels, u, products, rows):
 
 
 @pytest.mark.parametrize("slab", [1000, 128, 80])
-def test_slabs_are_explained_each_by_itself(taken, monkeypatch, slab):
+def test_slabs_are_fitted_independently(taken, monkeypatch, slab):
     frames, kernels, chosen, precision = taken
     monkeypatch.setattr(sampled_rows, "_SLAB", slab)
     found = sample_rows(frames, kernels, chosen).explain([precision, 0.25 * precision])
@@ -84,7 +84,7 @@ def test_slabs_are_explained_each_by_itself(taken, monkeypatch, slab):
             assert found.freedom[index, place].item() == pytest.approx(freedom, rel=0.01)
 
 
-def test_weak_priors_are_tried_only_where_they_may_be_wanted(monkeypatch):
+def test_weak_priors_are_tried_only_if_the_third_is_selected(monkeypatch):
     tried = []
 
     class Sample:

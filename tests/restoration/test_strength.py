@@ -1,4 +1,4 @@
-"""Regularisation from the data, against the best of several weights by hand."""
+"""Strength of the prior estimated from the data, compared with the best of several strengths."""
 
 from functools import partial
 
@@ -34,7 +34,7 @@ SCENES = {
 
 @pytest.fixture
 def without_choice(monkeypatch):
-    """Restores with the prior as strong as the noise asks for, times a factor."""
+    """Restore with the strength that follows from the noise level, times a factor."""
 
     def run(frames, timing, **options):
         with monkeypatch.context() as patch:
@@ -56,7 +56,7 @@ def without_choice(monkeypatch):
         ("dense texture", 20, 0.001, 2, True, -0.1, 0.3),
     ],
 )
-def test_weight_from_the_data_is_near_the_best_by_hand(without_choice, name, rows, noise, given, joint, least, within):
+def test_estimated_strength_is_close_to_the_best(without_choice, name, rows, noise, given, joint, least, within):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     scene = SCENES[name]()
     clean = take_frames(scene, timing, MOTION, 2, samples=64)
@@ -71,7 +71,7 @@ def test_weight_from_the_data_is_near_the_best_by_hand(without_choice, name, row
     assert max(by_hand.values()) - min(by_hand.values()) > 0.5
 
 
-def test_each_frame_is_blind_to_what_its_own_blur_leaves():
+def test_interpolation_error_depends_on_the_blur_of_each_frame():
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=200, frame_rows=2048)
     frames = torch.from_numpy(take_frames(texture(0.7), timing, MOTION, 2, 0.001, samples=100)).float()[:, None]
     height = frames.shape[-2]
@@ -80,7 +80,7 @@ def test_each_frame_is_blind_to_what_its_own_blur_leaves():
     assert prior.blind.shape == (2, 129)
     times = (2048 * np.arange(2)[:, None, None] + np.arange(height)[:, None] + np.arange(0, 200, 5)) * timing.row_time
     across = MOTION.displacement(times)[..., 1]
-    path = (across.max(-1) - across.min(-1)).mean(-1)  # px that rows are blurred over, in each frame
+    path = (across.max(-1) - across.min(-1)).mean(-1)  # px, length of the blur of the rows in each frame
     assert path[0] < 0.8 * path[1]
     assert prior.blind[0].mean() > 3 * prior.blind[1].mean()
     torch.testing.assert_close(prior.of([0, 1]).blind, prior.blind.mean(0))
@@ -90,7 +90,7 @@ def test_each_frame_is_blind_to_what_its_own_blur_leaves():
 @pytest.mark.parametrize(
     ("name", "rows", "noise", "choices"), [("buildings", 20, 0.005, 1), ("dense texture", 100, 0.001, 2)]
 )
-def test_frames_that_are_alike_share_a_choice(monkeypatch, name, rows, noise, choices):
+def test_frames_of_the_same_noise_share_a_strength(monkeypatch, name, rows, noise, choices):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     clean = take_frames(SCENES[name](), timing, MOTION, 2, samples=48)
     frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()
@@ -106,7 +106,7 @@ def test_frames_that_are_alike_share_a_choice(monkeypatch, name, rows, noise, ch
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_frequencies_of_noise_alone_get_hardly_any_power(count):
+def test_power_of_pure_noise_is_close_to_zero(count):
     noise = torch.randn(count, 1, 512, 512, generator=torch.Generator().manual_seed(0))
     motion = frame_motion(MOTION.vibration().expanded(1), TIMING, count, 512)
     prior = fit_prior(0.5 + 0.02 * noise, motion, 0, torch.full((count,), 0.02), 576)
@@ -119,7 +119,7 @@ def test_frequencies_of_noise_alone_get_hardly_any_power(count):
 def test_regular_patterns_are_restored_up_to_their_ends(across, along, joint):
     rows, columns = np.mgrid[:336, :400]
     scene = 0.5 + 0.4 * np.sin(2 * np.pi * (across * rows + along * columns))
-    motion = Motion(amplitude=(0.0, 2.0))  # nothing is hidden at the ends of the rows
+    motion = Motion(amplitude=(0.0, 2.0))  # all columns are visible at the ends of the rows
     frames = torch.from_numpy(take_frames(scene, TIMING, motion, 2, 0.005)).float()
     ends = np.r_[:16, 304:320]
     truth = crop(scene)[32:-32][:, ends]

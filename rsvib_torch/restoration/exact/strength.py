@@ -1,4 +1,4 @@
-"""How strong the prior has to be: what predicts pixels best that the scene was not fitted to."""
+"""Strength of the prior by generalised cross-validation."""
 
 from collections.abc import Callable
 
@@ -11,31 +11,24 @@ from rsvib_torch.restoration.scene_model.sampled_rows import Explained, sample_r
 
 __all__ = ["Strengths", "prior_strength"]
 
-_STRENGTHS = (2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
-_DOUBT = (0.014, 0.002)  # by how much a prior half, or twice, as strong has to predict better, in logarithms
-_CLEAR = 200.0  # times what the kernel between rows cannot follow: less noise hides behind that
-_FIRST = 3  # of them are nearly always enough
-_ROWS = 512  # at most, from the middle of the frames
-_FREQUENCIES = 24
-_LOWEST = 0.02  # cycles per px; the taper spreads what lies below
-_SMALLEST = 64  # rows and columns that a choice can be made from
-_ALIKE = 0.2  # in the logarithm of what counts as noise
+_STRENGTHS = (2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # factors on the prior, from strong to weak
 
 
 def _cross_validation(explained: Explained, strengths: Tensor) -> int:
-    """Index of the strength, of those from strong to weak, that generalised cross-validation asks for.
+    """Index of the strength, of those from strong to weak, selected by generalised cross-validation.
 
     ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from all
-    others. For all frequencies together, those with the largest errors decide; its geometric mean over the frequencies
-    counts all alike. Too weak a prior costs less than one that is too strong, so that the weaker one is taken; and what
-    the noise asks for, strength 1, as long as hardly anything speaks against it.
+    others. The sum over the frequencies is dominated by those with the largest errors; the geometric mean gives all the
+    same weight. The weaker of the two selected priors is used, because one that is too weak has the smaller error.
     """
-    left = explained.count - explained.freedom
-    together = explained.power.sum(-1).log() - 2 * left.sum(-1).log()
-    one_by_one = (explained.power.log() - 2 * left.log()).mean(-1)
+    residual_freedom = explained.count - explained.freedom
+    of_sum = explained.power.sum(-1).log() - 2 * residual_freedom.sum(-1).log()
+    geometric = (explained.power.log() - 2 * residual_freedom.log()).mean(-1)
     octaves = strengths.log2()
-    doubt = torch.maximum(-_DOUBT[0] * octaves, _DOUBT[1] * octaves)
-    return int(torch.maximum((together + doubt).argmin(), (one_by_one + doubt).argmin()))
+    # strength 1 follows from the noise level: another must reduce the logarithm by this much per octave, weaker or
+    # stronger
+    handicap = torch.maximum(-0.014 * octaves, 0.002 * octaves)
+    return int(torch.maximum((of_sum + handicap).argmin(), (geometric + handicap).argmin()))
 
 
 @torch.no_grad()
@@ -44,58 +37,60 @@ def prior_strength(
 ) -> float:
     """Factor on the prior for restoring one scene.
 
-    The prior is fitted to the power of the frames less that of the noise. Where dense texture passes for noise, or the
-    scene is unlike its mean spectrum, a weaker one is better: it leaves smaller errors where a pixel is predicted from
-    all others.
+    The prior is fitted to the power spectrum of the frames minus that of the noise. A weaker one predicts pixels better
+    where dense texture is taken for noise, or where the scene differs from its mean spectrum.
 
     Args:
         images: (M, C, R, W) of one scene, in row order.
-        kernels: How they see it.
+        kernels: Kernels of the images.
         prior: Fitted to them.
         noise_power: In the units of the prior.
-        certain: The noise is known, and not taken from one frame, where texture adds to it: only then can the prior
-            be too weak.
+        certain: Whether the noise level is given or estimated from several frames. That of a single frame includes
+            texture, so that the prior cannot be too weak.
 
     Returns:
         One of a few factors.
     """
     height, width = images.shape[-2:]
-    if min(height, width) < _SMALLEST:
+    if min(height, width) < 64:  # too few values for a choice
         return 1.0
-    count = min(height, _ROWS)
+    count = min(height, 512)  # rows from the middle
     top = (height - count) // 2
     part = kernels.rows(top, count)
-    chosen = torch.linspace(_LOWEST * width, width // 2, min(_FREQUENCIES, width // 4), device=images.device).long()
+    # 24 frequencies from 0.02 cycles per px, below which the taper mixes them
+    chosen = torch.linspace(0.02 * width, width // 2, min(24, width // 4), device=images.device).long()
     place = (chosen / width * 2 * (prior.power.shape[-1] - 1)).round().long()
     sample = sample_rows(images[..., top : top + count, :], part, chosen)
-    certain = certain and bool(noise_power > _CLEAR * prior.blind.mean())
+    # less noise than 200 times the interpolation error of the kernel cannot be distinguished from it
+    certain = certain and bool(noise_power > 200.0 * prior.blind.mean())
     strengths = [strength for strength in _STRENGTHS if certain or strength <= 1]
     reach = kernels.reach
     precisions = [prior.precision(noise_power, strength, reach)[..., place] for strength in strengths]
-    tried = sample.explain(precisions[:_FIRST])
-    choice = _cross_validation(tried, tried.power.new_tensor(strengths[:_FIRST]))
-    if choice == _FIRST - 1:
-        tried = tried.joined(sample.explain(precisions[_FIRST:]))
+    first = 3  # weaker priors are rarely selected
+    tried = sample.explain(precisions[:first])
+    choice = _cross_validation(tried, tried.power.new_tensor(strengths[:first]))
+    if choice == first - 1:
+        tried = tried.joined(sample.explain(precisions[first:]))
         choice = _cross_validation(tried, tried.power.new_tensor(strengths))
     return strengths[choice]
 
 
 class Strengths:
-    """Strengths of one scene after the other; those with as much noise, and as blind, share one."""
+    """Strengths of the prior for the scenes of a stack: those with about the same noise share one."""
 
     def __init__(self) -> None:
-        self._known: list[tuple[float, float]] = []
+        self._chosen: list[tuple[float, float]] = []
 
     def of(self, noise: Tensor, choose: Callable[[], float]) -> float:
         """The strength for one scene.
 
         Args:
-            noise: Power of what counts as noise.
-            choose: Gives a strength where none is known of a scene with as much.
+            noise: Power of the noise and of the interpolation error.
+            choose: Returns the strength; called unless that of a scene with the same power, to 20 %, was chosen before.
         """
         logarithm = float(noise.detach().log())
-        for known, strength in self._known:
-            if abs(logarithm - known) < _ALIKE:
+        for other, strength in self._chosen:
+            if abs(logarithm - other) < 0.2:
                 return strength
-        self._known.append((logarithm, choose()))
-        return self._known[-1][1]
+        self._chosen.append((logarithm, choose()))
+        return self._chosen[-1][1]

@@ -19,14 +19,13 @@ __all__ = [
     "scene_weights",
 ]
 
-REACH = 3  # rows on either side that a position is interpolated from
+REACH = 3  # rows on either side; support of the kernel
 TAPS = 2 * REACH
-SCENE_REACH = 5  # rows on either side that a row of the scene is made from
-_FINEST, _OPTICS = 0.46, 0.6  # cycles per row up to which it is faithful; px, sigma, of the optics that it is made for
-# (1 - z^2)^2 times this polynomial in z^2, z the distance over the reach: of all such kernels that pass at least 5 % at
-# half a cycle per row (less makes the coefficients ill-conditioned; the quintic B-spline passes 7 %) the one that
-# interpolates samples best, gain and images outside the band, for power spectra like frequency^-2 under Gaussian
-# optics of sigma 0.6 px: to -52 dB of the power.
+SCENE_REACH = 5  # rows on either side; support of the weights of a scene row
+# The kernel is (1 - z^2)^2 times this polynomial in z^2, z the distance divided by the reach. It has the least error of
+# interpolation (gain and aliases, -52 dB of the power) for power spectra like frequency^-2 behind Gaussian optics of
+# sigma 0.6 px, of all such kernels with a transfer function of at least 5 % at half a cycle per row: less makes the
+# coefficients ill-conditioned (the quintic B-spline has 7 %).
 _POLYNOMIAL = (
     0.5769045436701062,
     -3.0182129505404856,
@@ -74,18 +73,18 @@ def kernel_spectrum(frequencies: Tensor) -> Tensor:
 
 @cache
 def scene_weights() -> tuple[float, ...]:
-    """Weights of the rows -5 ... 5 of coefficients that make a row of the scene.
+    """Weights of the coefficients of rows -5 ... 5 in a row of the scene.
 
-    Between its rows a wave of coefficients has the height that ``kernel_spectrum`` says, and on them that of its
-    aliases, too. Exposures blur these away, and so do frames that see the rows at many places. So the scene is what the
-    kernel makes of the coefficients without aliases, as well as so few weights can tell, for spectra like frequency^-1
-    (of the amplitude) under Gaussian optics.
+    On the rows, a wave of coefficients interpolated by the kernel has the amplitude of ``kernel_spectrum`` plus that of
+    its aliases. Exposures, and frames that sample at many places, do not contain the aliases. So the scene is the
+    interpolation without aliases: the least-squares fit of these weights to ``kernel_spectrum`` up to 0.46 cycles per
+    row, for amplitude spectra like frequency^-1 behind Gaussian optics of sigma 0.6 px.
     """
-    v = torch.linspace(0, _FINEST, 369, dtype=torch.float64)
+    v = torch.linspace(0, 0.46, 369, dtype=torch.float64)
     spectrum = kernel_spectrum(v)
     order = torch.arange(SCENE_REACH + 1, dtype=torch.float64)
     cosines = torch.cos(2 * torch.pi * v[:, None] * order) * torch.where(order > 0, 2.0, 1.0)
-    count = torch.exp(-0.5 * (2 * torch.pi * _OPTICS * v).square()) / ((v + 0.02) * spectrum)
+    count = torch.exp(-0.5 * (2 * torch.pi * 0.6 * v).square()) / ((v + 0.02) * spectrum)
     half = torch.linalg.lstsq(cosines * count[:, None], (spectrum * count)[:, None]).solution[:, 0]
     return tuple(torch.cat([half.flip(0), half[1:]]).tolist())
 
@@ -95,9 +94,9 @@ def interpolation_error(frequencies: Tensor, cycles: Sequence[int] = (-3, -2, -1
 
     Args:
         frequencies: Cycles per row within -0.5 ... 0.5, any shape.
-        cycles: How many cycles per row beyond to look.
+        cycles: Offsets of the aliases in cycles per row.
 
     Returns:
-        Power of the same shape: what the kernel lets through there.
+        Power of the same shape.
     """
     return kernel_spectrum(frequencies[..., None] + torch.tensor(cycles).to(frequencies)).square().sum(-1)

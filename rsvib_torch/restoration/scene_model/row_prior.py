@@ -1,4 +1,4 @@
-"""Scene prior estimated from the frames themselves."""
+"""Gaussian prior of a scene, an autoregressive model across rows, estimated from the frames."""
 
 import math
 from collections.abc import Sequence
@@ -17,33 +17,20 @@ from rsvib_torch.restoration.scene_model.row_kernel import interpolation_error, 
 __all__ = ["ORDER", "RowPrior", "autoregressive_prior", "brightness", "fit_prior"]
 
 ORDER = 2  # rows that a row is predicted from
-_PIECE = (64, 256)  # rows and columns of the pieces whose spectra are averaged
-_MOST_PIECES = 128  # of a frame
-_AT_A_TIME = {"cpu": 4}  # rows of pieces: they stay in the cache
-_EVERY = 8  # rows of which one tells how bright a frame is
-_STRIPS = 4  # of whole rows that say what their ends add to the spectrum
-_BEYOND = 25.0  # times what pieces show: as much power of whole rows is that of their ends, and not chance
-_SMOOTHING = 3  # neighbouring frequencies whose statistics are pooled
-_ITERATIONS = 20
-_FAINT, _LEAST = 0.5, 0.002  # of the noise: below, neighbours are pooled to start from; what is always started from
-_ROUNDING = 1e-14  # of the squared modulus of a filter, a sum of terms around 1
-# noise power over variance of e: above, the systems lose digits and nothing is gained; below, rows half a pixel apart
-# from the scene's lose them in single precision. Long exposures see every place of the scene from many of its rows,
-# and may go as much lower as the blur is longer than a px.
-_STRONGEST, _WEAKEST = 1e3, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class RowPrior:
-    """For each horizontal frequency, how the coefficients of a scene row follow from those of the rows before it.
+    """Autoregressive model of the coefficients of the scene rows s, one for each horizontal frequency.
 
-    ``c(s) = - a_1 c(s - 1) - ... - a_p c(s - p) + e(s)`` with white ``e``: a stationary autoregressive model, whose
-    precision matrix is banded.
+    ``c(s) = - a_1 c(s - 1) - ... - a_p c(s - p) + e(s)`` with white ``e``: a stationary process, whose precision
+    matrix is banded.
 
     Attributes:
         power: (U,) variance of a coefficient.
         reflections: (p, U) partial correlations, within -1 ... 1.
-        blind: (U,) power of what the kernel between rows cannot follow, which counts as noise; (T, U) of each frame.
+        blind: (U,) power of the interpolation error of the kernel between rows, which counts as noise; (T, U) of each
+            frame.
     """
 
     power: Tensor
@@ -52,16 +39,16 @@ class RowPrior:
 
     @classmethod
     def smooth(cls, u: Tensor) -> "RowPrior":
-        """Neighbouring rows are alike at all frequencies (U,), and the innovation has variance 1."""
+        """Correlation 0.9 of neighbouring rows at all frequencies (U,), and innovations of variance 1."""
         reflections = torch.stack([torch.full_like(u, 0.9), torch.zeros_like(u)])
         return cls(1 / (1 - reflections[0].square()), reflections, torch.zeros_like(u))
 
     def of(self, members: list[int]) -> "RowPrior":
-        """The prior for restoring a scene from some of the frames: each is blind to what its own blur leaves."""
+        """The prior for restoring a scene from some of the frames; the interpolation error depends on their blur."""
         return replace(self, blind=self.blind[members].mean(0))
 
     def filter(self) -> Tensor:
-        """Coefficients 1, a_1 ... a_p of the filter that whitens, (p + 1, U)."""
+        """Coefficients 1, a_1 ... a_p of the whitening filter, (p + 1, U)."""
         filter_ = torch.ones_like(self.power)[None]
         for reflection in self.reflections:
             padded = torch.cat([filter_, torch.zeros_like(filter_[:1])])
@@ -82,17 +69,20 @@ class RowPrior:
     def precision(self, noise_power: Tensor, strength: float, reach: float = 0.0) -> Tensor:
         """Products ``a_k a_(k + d)`` of the filter in units of the data's noise, (p + 1, p + 1, U), 0 for k + d > p.
 
-        The precision of interior rows d apart is the sum over k; the first and the last rows are predicted from
-        fewer, and of row j only the first j + 1 products count.
+        The precision of interior rows at distance d is the sum over k. The first and the last rows are predicted from
+        fewer rows: for row j it is the sum of the first j + 1 products.
 
         Args:
             noise_power: Power of the noise of data of weight 1.
             strength: Factor on the precision.
-            reach: Distance in px along the rows that the scene moves in half an exposure.
+            reach: Largest displacement along the row in px during an exposure, from its middle.
         """
         a = self.filter()
         ratio = (noise_power + self.blind) * strength / self.innovation()
-        ratio = ratio.clamp(_WEAKEST / (1 + reach), _STRONGEST)
+        # noise power over variance of e. Above 1e3, the systems lose digits in single precision without a gain; below
+        # 1e-4, rows displaced by half a pixel lose them. Long exposures observe every place from many rows, and allow
+        # a bound lower by the length of the blur in px.
+        ratio = ratio.clamp(1e-4 / (1 + reach), 1e3)
         count = len(a)
         products = a.new_zeros(count, count, a.shape[1])
         for d in range(count):
@@ -101,14 +91,14 @@ class RowPrior:
 
 
 def _levinson(moments: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor], Tensor]:
-    """Autoregressive model of p + 1 autocovariances (U,): partial correlations, filter and innovation's variance."""
+    """Levinson recursion for p + 1 autocovariances (U,): partial correlations, filter, variance of the innovation."""
     variance = moments[0].clamp(min=torch.finfo(moments[0].dtype).tiny)
     filter_, reflections = [torch.ones_like(variance)], []
     for lag in range(1, len(moments)):
-        left = moments[lag]
+        error = moments[lag]
         for k in range(1, lag):
-            left = torch.addcmul(left, filter_[k], moments[lag - k])
-        reflection = (left / variance).clamp(-0.9995, 0.9995)
+            error = torch.addcmul(error, filter_[k], moments[lag - k])
+        reflection = (error / variance).clamp(-0.9995, 0.9995)
         inner = [torch.addcmul(filter_[k], reflection, filter_[lag - k], value=-1) for k in range(1, lag)]
         filter_ = [filter_[0], *inner, -reflection]
         variance = torch.addcmul(variance, variance * reflection, reflection, value=-1)
@@ -124,29 +114,33 @@ def _pooled(power: Tensor) -> Tensor:
 
 
 def _pooling(u: Tensor) -> Tensor:
-    """Matrix (U, U) that pools what is known at frequencies (U,) over neighbouring ones, mirrored at both ends."""
-    half = _SMOOTHING // 2
-    kernel = torch.hann_window(_SMOOTHING + 2, periodic=False, dtype=u.dtype, device=u.device)[1:-1]
-    near = torch.arange(len(u), device=u.device)[:, None] + torch.arange(-half, half + 1, device=u.device)
-    taps = (kernel / kernel.sum()).expand(len(u), -1)
+    """Matrix (U, U) of a weighted mean over three neighbouring frequencies (U,), mirrored at both ends."""
+    near = torch.arange(len(u), device=u.device)[:, None] + torch.arange(-1, 2, device=u.device)
+    taps = u.new_tensor([0.25, 0.5, 0.25]).expand(len(u), -1)
     return torch.zeros_like(u).expand(len(u), -1).scatter_add(1, mirrored(near, len(u)), taps)
 
 
 def autoregressive_prior(
-    observed: Tensor, transfer: Tensor, aliases: Tensor, noise_power: Tensor, order: int = ORDER
+    observed: Tensor,
+    transfer: Tensor,
+    aliases: Tensor,
+    noise_power: Tensor,
+    order: int = ORDER,
+    iterations: int = 20,
 ) -> RowPrior:
     """Fit the prior to the power spectrum of blurred, noisy frames by expectation maximisation.
 
-    Each step adds what the blurred spectrum says about the scene's and what the noise leaves open, and fits the
-    autoregressive model to the sum (Yule-Walker).
+    Each step computes the expected power spectrum of the scene for the current model, the sum of the squared Wiener
+    estimate and of its variance, and fits the autoregressive model to it (Yule-Walker equations).
 
     Args:
         observed: (U, V) power of the frames, horizontal frequencies by vertical ones.
-        transfer: (U, V) power that the blur lets through.
-        aliases: (T, U, V) power of what the kernel between rows cannot follow, through the blur of each frame, of a
-            wave of power 1.
+        transfer: (U, V) squared transfer function of the blur.
+        aliases: (T, U, V) power of the interpolation error of the kernel between rows, through the blur of each frame,
+            for a wave of power 1.
         noise_power: Power of the noise in each value, shape (U, V) or ().
         order: Rows that a row is predicted from.
+        iterations: Steps of expectation maximisation.
 
     Returns:
         The prior.
@@ -165,31 +159,33 @@ def autoregressive_prior(
 
     through, pooling = transfer * observed, _pooling(observed[:, 0]) / len(v)
     excess = observed - noise_power
-    # where noise outweighs the scene, steps are small, and should not have to begin from what chance has left over
-    level = _FAINT * noise_power
+    # steps are small where the noise is stronger than the scene: below half of the noise power, the initial value is
+    # pooled over neighbouring frequencies, as that of a single one depends on chance
+    level = 0.5 * noise_power
     excess = torch.where(excess < level, _pooled(excess).minimum(level), excess)
-    scene = torch.maximum(excess, _LEAST * noise_power) * transfer / (transfer.square() + 1e-2)
-    for _ in range(_ITERATIONS):
+    scene = torch.maximum(excess, 0.002 * noise_power) * transfer / (transfer.square() + 1e-2)
+    for _ in range(iterations):
         moments = (pooling @ (scene @ cosine)).unbind(-1)
         reflections, filter_, innovation = _levinson(moments)
         products = torch.stack([dot(filter_[: order + 1 - d], filter_[d:]) for d in range(order + 1)], -1)
-        against = (products @ both).clamp(min=_ROUNDING) * (noise_power / innovation[:, None])  # of the noise
-        gain = (against + transfer).reciprocal()
+        # squared modulus of the filter, whose terms are of order 1: at least their rounding error
+        penalty = (products @ both).clamp(min=1e-14) * (noise_power / innovation[:, None])
+        gain = (penalty + transfer).reciprocal()
         scene = torch.addcmul(gain * noise_power, gain.square(), through)
     tiny = torch.finfo(scene.dtype).tiny
     return RowPrior(moments[0].clamp(min=tiny), torch.stack(reflections), (scene * aliases).mean(-1).clamp(min=tiny))
 
 
 def brightness(frames: Tensor) -> Tensor:
-    """About the mean of each image (..., H, W): some rows tell it well enough to be taken off."""
-    return frames[..., ::_EVERY, :].mean((-2, -1))
+    """Approximate mean of each image (..., H, W), from every eighth row."""
+    return frames[..., ::8, :].mean((-2, -1))
 
 
 def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, length: int) -> RowPrior:
     """Fit the prior to the frames of a stack.
 
-    Rows are moved back by their displacement, so that neighbours correlate as in the scene; spectra of pieces are
-    averaged, each weighted by what its blur lets through and by the noise of its frame.
+    Rows are moved back by their displacement, so that neighbours correlate as in the scene. The power spectra of pieces
+    of 64 x 256 px are averaged, weighted by the transfer function of their blur and the noise of their frame.
 
     Args:
         frames: (T, C, H, W) in row order.
@@ -201,7 +197,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     Returns:
         The prior for transforms of that length.
     """
-    size = [min(piece, whole) for piece, whole in zip(_PIECE, frames.shape[-2:], strict=True)]
+    size = [min(piece, whole) for piece, whole in zip((64, 256), frames.shape[-2:], strict=True)]
     starts = _spread_pieces(frames.shape[-2:], size)  # rows, columns
     tops, lefts = (begin.tolist() for begin in starts)
     rows = (starts[0][:, None] + torch.arange(size[0])).to(frames.device)
@@ -218,16 +214,16 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     back = waves(mean, -u).to(frames.dtype.to_complex()).unflatten(1, rows.shape)  # (T, pieces, rows, U)
     back = back * tapers[0][:, None]
     bright = brightness(frames)[..., None, None, None]
-    step = _AT_A_TIME.get(frames.device.type, len(tops))
-    found = []
+    step = 4 if frames.device.type == "cpu" else len(tops)  # rows of pieces at a time, which stay in the cache
+    powers = []
     for chosen in runs(len(tops), step):
         strips = [frames[..., top : top + size[0], :] for top in tops[chosen]]
         pieces = torch.stack([strip[..., left : left + size[1]] for strip in strips for left in lefts], dim=2)
         pieces = pieces.unflatten(2, (-1, len(lefts)))  # (T, C, n, n, rows, columns)
         spectra = torch.fft.rfft(pieces.sub_(bright[..., None]).mul_(tapers[1])).mul_(back[:, None, chosen, None])
-        found.append(squared_modulus(torch.fft.fft(spectra, dim=-2)).mean((1, 3)).transpose(-2, -1))
-    power = torch.cat(found, dim=1).to(torch.float64) * length  # (T, pieces, U, V)
-    few = torch.linspace(0, len(tops) - 1, min(_STRIPS, len(tops)), device=rows.device).round().to(torch.int64)
+        powers.append(squared_modulus(torch.fft.fft(spectra, dim=-2)).mean((1, 3)).transpose(-2, -1))
+    power = torch.cat(powers, dim=1).to(torch.float64) * length  # (T, pieces, U, V)
+    few = torch.linspace(0, len(tops) - 1, min(4, len(tops)), device=rows.device).round().to(torch.int64)
     strips_of_rows = (frames[..., rows[few], :] - bright) * tapers[0][:, None]  # (T, C, n, rows, W)
     whole = _power_of_rows(strips_of_rows, length, len(u))
 
@@ -239,13 +235,15 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     transfer = squared_modulus(along.transpose(-2, -1) @ across) * kernel_spectrum(v).square()
     transfer = _smeared(transfer)
     aliases = torch.zeros_like(transfer[:, 0])
-    for cycle in (-1, 1):  # all others together are less than 4 % of these
+    for cycle in (-1, 1):  # all others together have less than 4 % of their power
         beyond = across * waves(displacement[..., 1], v.new_tensor([cycle]))
         blurred = squared_modulus(along.transpose(-2, -1) @ beyond).mean(1)
         aliases = aliases + blurred * interpolation_error(v, [cycle])
     weight = transfer / levels.to(torch.float64).square()[:, None, None, None]
     total = weight.sum((0, 1)).clamp(min=torch.finfo(torch.float32).tiny)
-    observed = torch.maximum((weight * power).sum((0, 1)) / total, whole / _BEYOND)
+    # power of whole rows above 25 times that of the pieces is due to the boundary extension and not to chance: without
+    # it, regular patterns are lost near the ends of the rows
+    observed = torch.maximum((weight * power).sum((0, 1)) / total, whole / 25.0)
     noise_power = transfer.sum((0, 1)) / total * length
     passed = (weight * transfer).sum((0, 1)) / total
     prior = autoregressive_prior(observed, passed, aliases, noise_power)
@@ -253,7 +251,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
 
 
 def _smeared(transfer: Tensor) -> Tensor:
-    """Transfer (..., U, V) as pieces show it, whose taper mixes neighbouring frequencies: nowhere quite zero."""
+    """Transfer function (..., U, V) of tapered pieces: the taper mixes neighbouring frequencies."""
     count = transfer.shape[-2]
     near = torch.arange(-1, count + 1, device=transfer.device)
     wide = transfer[..., mirrored(near, count), :]
@@ -262,9 +260,9 @@ def _smeared(transfer: Tensor) -> Tensor:
 
 
 def _power_of_rows(strips: Tensor, length: int, count: int) -> Tensor:
-    """Power (U, V) of whole rows with what they go on by beyond their ends, pooled to U frequencies along them.
+    """Power (U, V) of whole rows with their boundary extension, pooled to U frequencies along them.
 
-    What ends add lies at low frequencies, where a displacement hardly turns phases: rows are left where they are.
+    Rows are not moved back by their displacement: it does not matter at the low frequencies of the extension.
 
     Args:
         strips: (T, C, n, R, W), tapered across their rows.
@@ -276,9 +274,9 @@ def _power_of_rows(strips: Tensor, length: int, count: int) -> Tensor:
 
 
 def _spread_pieces(shape: torch.Size, size: list[int]) -> list[Tensor]:
-    """First rows and first columns of pieces spread evenly over the frame, overlapping by half if they are few."""
+    """First rows and columns of at most 128 pieces spread evenly over the frame, overlapping by half if possible."""
     counts = [-(-2 * (whole - extent) // extent) + 1 for whole, extent in zip(shape, size, strict=True)]
-    excess = max(1.0, math.sqrt(counts[0] * counts[1] / _MOST_PIECES))
+    excess = max(1.0, math.sqrt(counts[0] * counts[1] / 128))
     counts = [max(1, round(count / excess)) for count in counts]
     return [
         torch.linspace(0, whole - extent, count).round().to(torch.int64)

@@ -1,4 +1,4 @@
-"""How a scene that is fitted to frames explains them, at a sample of their rows and frequencies."""
+"""Residuals and degrees of freedom of a scene fitted to frames, at a sample of their rows and frequencies."""
 
 import math
 from collections.abc import Sequence
@@ -19,18 +19,17 @@ from rsvib_torch.restoration.scene_model.row_prior import ORDER
 
 __all__ = ["Explained", "SampledRows", "sample_rows"]
 
-_STEP = 1.2  # in the strength of a prior, for a derivative
-_SLAB = 128  # rows
+_SLAB = 128  # rows solved side by side, each slab by itself: enough for the dependence on distant rows to vanish
 
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """What fits with n priors leave of the rows, frequency by frequency.
+    """Residuals of fits with n priors, frequency by frequency.
 
     Attributes:
         power: (n, F) squared residuals of all rows, mean over channels, in units of the noise of one pixel.
-        freedom: (n, F) how many values the fit follows.
-        count: Rows that count.
+        freedom: (n, F) degrees of freedom of the fit.
+        count: Rows with a weight above 0.
     """
 
     power: Tensor
@@ -38,25 +37,25 @@ class Explained:
     count: int
 
     def joined(self, other: "Explained") -> "Explained":
-        """With what fits of the same rows with other priors leave."""
+        """These and the residuals of fits of the same rows with other priors."""
         power, freedom = (torch.cat(pair) for pair in ((self.power, other.power), (self.freedom, other.freedom)))
         return Explained(power, freedom, self.count)
 
 
 @dataclass(frozen=True, eq=False)
 class SampledRows:
-    """Rows of M images at F frequencies, in n slabs, and the K coefficients of the scene that each slab sees.
+    """Rows of M images at F frequencies, in n slabs with K coefficients of the scene each.
 
-    Slabs are explained side by side, each as if there were no other: a step costs little more for all than for one.
+    Slabs are fitted independently and in one batch, which takes little longer than one slab.
 
     Attributes:
         u: (F,) frequencies in cycles per px.
         spectra: (M R, C, F), the phase of each row's middle taken off.
         taps: Kernels (M R, 1, F), one tap after the other.
         base: (M R,) first coefficient of each row's kernel, of n K: one slab after the other.
-        weight: (M R, 1, 1) how much each row counts.
+        weight: (M R, 1, 1) weight of each row.
         normal: The normal matrices, one window for each slab.
-        energy: Of the taper and of all channels, that powers are divided by.
+        energy: Squared norm of the taper, times the number of channels; powers are divided by it.
     """
 
     u: Tensor
@@ -71,19 +70,20 @@ class SampledRows:
         """Fit the scene with each of n priors, products (p + 1, p + 1, F) as from ``RowPrior.precision``."""
         number, many = len(precisions), len(precisions) * len(self.u)
         slabs, rows = self.normal.left.shape[2], len(self.normal.left) - self.normal.width
-        # each prior once as it is and once a little stronger, all in one batch
-        products = torch.cat([*precisions, *(_STEP * products for products in precisions)], dim=-1)
+        # n - d log det A / d log s are the degrees of freedom, with the strength s of the prior: a difference quotient
+        step = 1.2
+        products = torch.cat([*precisions, *(step * products for products in precisions)], dim=-1)
         factor = factor_banded(self.normal.at(self.u.repeat(2 * number), products))
         logs = factor.pivots.log().to(torch.float64).sum(0).unflatten(-1, (slabs, -1)).sum(0)
-        growth = (logs[many:] - logs[:many]) / math.log(_STEP)
+        growth = (logs[many:] - logs[:many]) / math.log(step)
         right = self.spectra.new_zeros(slabs * rows, *self.spectra.shape[1:])
         for i, tap in enumerate(self.taps):
             right.index_add_(0, self.base + i, tap.conj() * self.spectra * self.weight)
         sides = right.unflatten(0, (slabs, rows)).movedim(0, 2).repeat(1, 1, 1, number).flatten(-2)
-        as_they_are = (
+        unchanged = (
             values.unflatten(-1, (slabs, -1))[..., :many].flatten(-2) for values in (factor.skewed, factor.inverse)
         )
-        solved = BandedFactor(*as_they_are).solve(sides).unflatten(-1, (slabs, -1))
+        solved = BandedFactor(*unchanged).solve(sides).unflatten(-1, (slabs, -1))
         fitted = solved.movedim(2, 0).flatten(0, 1).unflatten(-1, (number, -1))
         residual = self.spectra[..., None, :] - sum(
             tap[..., None, :] * fitted[self.base + i] for i, tap in enumerate(self.taps)
@@ -94,11 +94,11 @@ class SampledRows:
 
 
 def sample_rows(images: Tensor, kernels: RowKernels, chosen: Tensor) -> SampledRows:
-    """Take the spectra of tapered rows at a few frequencies, in slabs of rows that are few but enough each.
+    """Spectra of tapered rows at a few frequencies, in slabs of rows.
 
     Args:
-        images: (M, C, R, W); up to n - 1 rows, which n slabs of one height leave over, do not count.
-        kernels: How their rows see the scene.
+        images: (M, C, R, W); of up to n - 1 rows more than n slabs of equal height have, none is used.
+        kernels: Kernels of their rows.
         chosen: (F,) whole numbers of cycles in W px.
     """
     slabs = max(1, images.shape[-2] // _SLAB)
