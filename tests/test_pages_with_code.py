@@ -1,0 +1,63 @@
+"""The Python code on the pages of the documentation runs from top to bottom and gives correct results."""
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+import rsvib_torch as rsv
+from rsvib_torch.evaluation.scenes import resolution_chart
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def run_page(name, least_blocks):
+    """Execute all Python blocks of a page; returns the names that they define."""
+    page = DOCS / name
+    blocks = re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    assert len(blocks) >= least_blocks
+    torch.manual_seed(0)
+    names = {"__name__": "page"}
+    exec(compile("\n".join(blocks), str(page), "exec"), names)
+    return names
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    return run_page("ml_pipeline.md", 8)
+
+
+def test_shapes_on_the_machine_learning_page(pipeline):
+    assert pipeline["features"].shape == (2, 8, *pipeline["frames"].shape[-2:])
+    assert pipeline["vibration"].amplitude.shape == (4, 2, 1)
+    assert pipeline["moved_points"].shape == (4, 2, 2)
+    assert not torch.equal(pipeline["moved_boxes"], pipeline["boxes"])
+    assert pipeline["taken"].shape == (4, 2, 3, 96, 64)
+
+
+def test_model_on_the_machine_learning_page_restores(pipeline):
+    """Its detector measures the vibration, and its restorer recovers the scene."""
+    frames, truth = pipeline["frames"], pipeline["truth"]
+    found = pipeline["model"].detector(frames).vibration[0]
+    torch.testing.assert_close(found.amplitude, truth.amplitude, rtol=0, atol=0.2)
+    height, width = frames.shape[-2:]
+    top, left = (320 - height) // 2, (200 - width) // 2
+    still = pipeline["scene"][top : top + height, left : left + width]
+    restored = pipeline["model"].restorer(frames, found)[0, :, 0]
+    assert (rsv.psnr(restored, still, 1.0, rim=16) > rsv.psnr(frames[0, :, 0], still, 1.0, rim=16) + 5).all()
+
+
+def test_quick_start_page(tmp_path, monkeypatch, capsys):
+    """The frames of the demonstration are replaced by smaller ones with the same camera and vibration."""
+    monkeypatch.chdir(tmp_path)
+    timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+    motion = rsv.Vibration(amplitude=[3.1, 5.2], frequency=[50.0, 30.0], phase=[0.7, -1.9])
+    frames = rsv.simulate_frames(resolution_chart(1100, 300), timing, motion, num_frames=2)
+    (tmp_path / "out" / "demo" / "chart").mkdir(parents=True)
+    rsv.write_stack("out/demo/chart/frames.tif", frames, full_scale=4095, dtype="uint16")
+    names = run_page("quickstart.md", 3)
+    assert re.search(r"^x: 3\.1.* px at (49\.99|50\.00)", capsys.readouterr().out, flags=re.MULTILINE)
+    assert rsv.read_stack("out/restored.tif").shape == frames.shape
+    assert names["measured"].reliable.all()
+    torch.testing.assert_close(names["measured"].vibration.amplitude, names["vibration"].amplitude, rtol=0, atol=0.02)
