@@ -8,6 +8,9 @@ import torch
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation.scenes import resolution_chart
+from rsvib_torch.io import formats
+from rsvib_torch.registration.methods import BAND_METHODS
+from rsvib_torch.restoration.exact.priors import PRIORS
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -61,3 +64,30 @@ def test_quick_start_page(tmp_path, monkeypatch, capsys):
     assert rsv.read_stack("out/restored.tif").shape == frames.shape
     assert names["measured"].reliable.all()
     torch.testing.assert_close(names["measured"].vibration.amplitude, names["vibration"].amplitude, rtol=0, atol=0.02)
+
+
+def test_recipes_of_the_architecture_page(tmp_path, monkeypatch):
+    """A toy registration method, prior and file format are added by the recipes, used, and removed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(formats, "FORMATS", dict(formats.FORMATS))
+    tables = [(BAND_METHODS, dict(BAND_METHODS)), (PRIORS, dict(PRIORS))]
+    try:
+        names = run_page("architecture.md", 4)
+    finally:
+        for table, entries in tables:
+            table.clear()
+            table.update(entries)
+    offsets = names["rounded"].offsets
+    assert torch.equal(offsets, offsets.round())
+    assert names["detection"].reliable.all()
+    frames, vibration, timing = (names[name] for name in ("frames", "vibration", "timing"))
+    rough, smooth = ((image.diff(dim=-2) ** 2).mean() for image in (frames, names["smoothed"]))
+    assert smooth < rough
+    assert not torch.equal(names["smoothed"], rsv.restore(frames, timing, vibration))
+    torch.testing.assert_close(names["read_again"], frames, rtol=0, atol=0.0021)
+    for call, name in (
+        (lambda: rsv.register_bands(frames, timing, method="whole-pixels"), "whole-pixels"),
+        (lambda: rsv.restore(frames, timing, vibration, prior="smooth"), "smooth"),
+    ):
+        with pytest.raises(ValueError, match=name):
+            call()
