@@ -78,8 +78,10 @@ def test_recipes_of_the_architecture_page(tmp_path, monkeypatch):
             table.clear()
             table.update(entries)
     offsets = names["rounded"].offsets
-    assert torch.equal(offsets, offsets.round())
-    assert names["detection"].reliable.all()
+    assert torch.equal(offsets.nan_to_num(), offsets.round().nan_to_num())
+    assert offsets.nan_to_num().abs().max() >= 2
+    found = names["detection"].vibration.amplitude[:, :1]
+    torch.testing.assert_close(found, names["vibration"].amplitude, rtol=0, atol=0.02)  # refined on the rows
     frames, vibration, timing = (names[name] for name in ("frames", "vibration", "timing"))
     rough, smooth = ((image.diff(dim=-2) ** 2).mean() for image in (frames, names["smoothed"]))
     assert smooth < rough
