@@ -1,4 +1,4 @@
-"""Checks of user values: every failure names the value and what was expected."""
+"""Checks of arguments; error messages contain the name, the value and what is expected."""
 
 import math
 from numbers import Real
@@ -17,8 +17,8 @@ def check_number(
     """Return ``value`` as a finite float within its bounds.
 
     Args:
-        name: What the value is called in the message.
-        value: The value to check; booleans are not numbers here.
+        name: Name of the argument in error messages.
+        value: The value; booleans are refused.
         above: The value must be larger than this.
         at_least: The value must not be smaller than this.
         at_most: The value must not be larger than this.

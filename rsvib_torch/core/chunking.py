@@ -1,4 +1,4 @@
-"""Tensors in pieces: which runs of rows are worked on at a time, and what they make, joined again."""
+"""Processing of tensors in chunks along one axis."""
 
 from collections.abc import Iterable
 
@@ -9,7 +9,7 @@ __all__ = ["gathered", "runs"]
 
 
 def runs(count: int, size: int) -> list[slice]:
-    """Runs of ``size`` places of ``count``, one after the other, the last one shorter.
+    """Consecutive slices of ``size`` indices that cover ``count``; the last one may be shorter.
 
     Example:
         >>> runs(5, 2)
@@ -19,9 +19,10 @@ def runs(count: int, size: int) -> list[slice]:
 
 
 def gathered(pieces: Iterable[tuple[slice, Tensor]], count: int, dim: int) -> Tensor:
-    """Pieces of a tensor, each with its place along ``dim``, as one of ``count`` places.
+    """Join pieces of a tensor, each with its slice along ``dim``, to one tensor of ``count`` indices.
 
-    Each is written where it belongs as soon as it is made, unless it is differentiated.
+    Each piece is copied as soon as it is computed, so that one piece at a time needs memory. Pieces that require
+    gradients are concatenated.
 
     Example:
         >>> gathered(((slice(i, i + 1), torch.full((1, 2), float(i))) for i in range(3)), 3, 0).tolist()

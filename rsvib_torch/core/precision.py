@@ -1,4 +1,4 @@
-"""Full precision and plain execution, where mixed precision or a compiler would spoil the result."""
+"""Decorators that exclude functions from mixed precision and from graph compilation."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -14,31 +14,30 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class _WholeProducts:
-    """Products and convolutions of float32 with all their digits, whatever was allowed for the rest of a program.
+class _Float32Products:
+    """Context in which products and convolutions of float32 use float32, not TF32 or bfloat16.
 
-    Shorter formats (TF32, bfloat16) are allowed for a whole process: where several threads ask for all digits, the
-    first one takes the permission away and the last one gives it back.
+    The setting belongs to the process: the first of several threads that enter changes it, the last one restores it.
     """
 
     _BACKENDS: Any = torch.backends  # their attributes are not typed
     _KINDS = (
         _BACKENDS.cuda.matmul,
         _BACKENDS.cudnn.conv,
-        _BACKENDS.cudnn.rnn,  # asked for together with convolutions, by one name
+        _BACKENDS.cudnn.rnn,  # set together with convolutions under one name
         _BACKENDS.mkldnn.matmul,
         _BACKENDS.mkldnn.conv,
     )
 
     def __init__(self) -> None:
         self._lock, self._users = Lock(), 0
-        self._allowed: list[str] = []
+        self._previous: list[str] = []
 
     def __enter__(self) -> None:
         with self._lock:
             self._users += 1
             if self._users == 1:
-                self._allowed = [kind.fp32_precision for kind in self._KINDS]
+                self._previous = [kind.fp32_precision for kind in self._KINDS]
                 for kind in self._KINDS:
                     kind.fp32_precision = "ieee"
 
@@ -46,15 +45,15 @@ class _WholeProducts:
         with self._lock:
             self._users -= 1
             if self._users == 0:
-                for kind, allowed in zip(self._KINDS, self._allowed, strict=True):
-                    kind.fp32_precision = allowed
+                for kind, previous in zip(self._KINDS, self._previous, strict=True):
+                    kind.fp32_precision = previous
 
 
-_WHOLE_PRODUCTS = _WholeProducts()
+_FLOAT32_PRODUCTS = _Float32Products()
 
 
 def full_precision(function: Callable[P, R]) -> Callable[P, R]:
-    """Make a function ignore autocast and TF32: splines, transforms and fits need every digit of float32.
+    """Run a function without autocast and TF32: splines, transforms and fits need all digits of float32.
 
     The device is that of the first tensor among the arguments.
 
@@ -66,28 +65,28 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
     """
 
     @wraps(function)
-    def with_all_digits(*args: P.args, **kwargs: P.kwargs) -> R:
+    def in_full_precision(*args: P.args, **kwargs: P.kwargs) -> R:
         tensors = (value for value in (*args, *kwargs.values()) if isinstance(value, Tensor))
         device = next((tensor.device.type for tensor in tensors), "cpu")
-        with torch.autocast(device_type=device, enabled=False), _WHOLE_PRODUCTS:
+        with torch.autocast(device_type=device, enabled=False), _FLOAT32_PRODUCTS:
             return function(*args, **kwargs)
 
-    return with_all_digits
+    return in_full_precision
 
 
 def outside_graphs(function: Callable[P, R]) -> Callable[P, R]:
-    """Make ``torch.compile`` call a function as it is: one break of the graph instead of many.
+    """Exclude a function from ``torch.compile``: one break of the graph instead of many.
 
-    Sizes of kernels and bands follow from the motion, so that a graph could not outlive the next vibration.
+    Sizes of kernels and bands follow from the motion, so that a graph would be compiled again for every vibration.
     """
-    disabled: list[Callable[P, R]] = []  # filled on demand: importing the compiler takes seconds
+    disabled: list[Callable[P, R]] = []  # filled at the first use: importing the compiler takes seconds
 
     @wraps(function)
-    def as_it_is(*args: P.args, **kwargs: P.kwargs) -> R:
+    def uncompiled(*args: P.args, **kwargs: P.kwargs) -> R:
         if not torch.compiler.is_compiling():
             return function(*args, **kwargs)
         if not disabled:
             disabled.append(torch.compiler.disable(function, reason="sizes follow from the motion"))
         return disabled[0](*args, **kwargs)
 
-    return as_it_is
+    return uncompiled

@@ -176,7 +176,8 @@ def as_float_frames(
     if full_scale is None:
         if frames.dtype != torch.uint8:
             raise ValueError(
-                f"{frames.dtype} {name} do not say their full scale; state full_scale, e.g. 4095 for 12-bit counts"
+                f"full scale of {str(frames.dtype).removeprefix('torch.')} {name} unknown: pass full_scale, e.g. "
+                "full_scale=4095 for 12-bit counts"
             )
         full_scale = 255.0
     return frames.to(torch.float32) / check_number("full_scale", full_scale, above=0.0)

@@ -326,7 +326,7 @@ class FrameComparison:
         """
         whole: list[Tensor] = []
         count = visible.shape[2]
-        counts = (_transform_length(count), _transform_length(count), count)
+        counts = (fast_length(count), fast_length(count), count)
         for rows, run in warped:
             shown = visible[:, :, rows]
             different = differences(run, shown)
@@ -367,12 +367,6 @@ def scene_detail(compared: FrameComparison, u: Tensor) -> tuple[Tensor, Tensor]:
     detail = torch.fft.ifft(whole)
     whole *= (2j * math.pi * v).to(whole.dtype)
     return detail.transpose(-2, -1), torch.fft.ifft(whole).transpose(-2, -1)
-
-
-def _transform_length(rows: int) -> int:
-    """Length of a fast transform across rows; no multiple of 128, at which columns would share few cache lines."""
-    length = fast_length(rows)
-    return length if length % 128 else fast_length(length + 1)
 
 
 def _wiener_filter(mean: Tensor, noise: Tensor, u: Tensor, v: Tensor) -> Tensor:

@@ -393,7 +393,12 @@ def with_pixel(value):
         (with_pixel(-math.inf), {}, ValueError, r"pixel \(1, 17, 5\) is -inf"),
         (torch.full((2, 256, 128), 0.4), {}, ValueError, "frame 0 is constant"),
         (torch.cat([detail(1, 256, 128), torch.zeros(1, 256, 128)]), {}, ValueError, "frame 1 is constant"),
-        (torch.zeros(2, 256, 128, dtype=torch.uint16), {}, ValueError, "uint16 frames do not say their full scale"),
+        (
+            torch.zeros(2, 256, 128, dtype=torch.uint16),
+            {},
+            ValueError,
+            "full scale of uint16 frames unknown: pass full_scale",
+        ),
         (torch.zeros(2, 256, 128, dtype=torch.bool), {}, TypeError, "frames must be real numbers"),
         (detail(2, 24, 128), {}, ValueError, "too small for bands of 32 rows searched over 16 px"),
         (detail(2, 256, 40), {}, ValueError, "too small for bands"),

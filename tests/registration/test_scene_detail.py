@@ -1,9 +1,9 @@
-"""What the mean of warped frames tells of the scene."""
+"""Detail of the scene and noise from the mean of warped frames."""
 
 import pytest
 import torch
 
-from rsvib_torch.registration.gradients import FrameComparison, _noise_of_mean, _transform_length, scene_detail
+from rsvib_torch.registration.gradients import FrameComparison, _noise_of_mean, scene_detail
 
 
 def spectra_of(images):
@@ -11,7 +11,7 @@ def spectra_of(images):
 
 
 def smooth_scene(rows, columns):
-    """Waves of at most a fifth of a cycle per px either way, whole along the rows, and their derivative across them."""
+    """Waves of up to 0.2 cycles/px along both axes, periodic along the rows, and their derivative across the rows."""
     across, along, phase = torch.rand(3, 40, 1, 1, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     y, x = torch.arange(rows)[:, None], torch.arange(columns)
     slope = 2 * torch.pi * (0.1 + 0.1 * across)
@@ -20,7 +20,7 @@ def smooth_scene(rows, columns):
 
 
 @pytest.mark.parametrize("rows", [128, 256, 300])
-def test_detail_and_its_gradient_are_those_of_the_scene(rows):
+def test_detail_and_its_gradient_equal_those_of_the_scene(rows):
     scene, slope = smooth_scene(rows, 192)
     noise = 0.02 * torch.randn(2, rows, 192, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     warped = spectra_of(scene + noise)[None]
@@ -34,17 +34,10 @@ def test_detail_and_its_gradient_are_those_of_the_scene(rows):
         assert float((image - truth[inner]).std()) < 0.02 * float(truth[inner].std())
 
 
-def test_noise_of_two_frames_is_what_they_differ_by():
+def test_noise_of_two_frames_is_their_difference():
     warped = torch.randn(1, 2, 24, 33, generator=torch.Generator().manual_seed(2), dtype=torch.complex128)
     seen = torch.ones(1, 2, 24, dtype=torch.float64)
     seen[0, 0, :8] = seen[0, 1, 4:12] = 0
     noise = FrameComparison.of([(slice(0, 24), warped)], seen).noise[:, :24]
     torch.testing.assert_close(noise.abs(), _noise_of_mean(warped[..., ::4], seen).abs())
     assert float(noise[:, 12:].abs().mean()) > 0.3
-
-
-@pytest.mark.parametrize("rows", [97, 128, 1024, 2048, 2055])
-def test_transforms_across_rows_are_of_lengths_that_suit_a_cache(rows):
-    length = _transform_length(rows)
-    assert rows <= length < 1.1 * rows + 8
-    assert length % 128 != 0

@@ -175,7 +175,11 @@ def test_noise_is_estimated_under_texture():
         ({"noise_to_signal": "much"}, TypeError, "noise_to_signal must be a number, got 'much'"),
         ({"interpolation": "lanczos"}, ValueError, "interpolation must be one of 'linear', 'cubic'"),
         ({"frames": torch.zeros(8, 8)}, ValueError, r"frames must have shape .* got \(8, 8\)"),
-        ({"frames": torch.zeros(1, 8, 8, dtype=torch.int16)}, ValueError, "do not say their full scale"),
+        (
+            {"frames": torch.zeros(1, 8, 8, dtype=torch.int16)},
+            ValueError,
+            "full scale of int16 frames unknown: pass full_scale",
+        ),
         ({"frames": torch.zeros(1, 4096, 8)}, ValueError, "frame_rows=2048 is less than the 4096 rows"),
         ({"vibration": Vibration.still((3,))}, ValueError, r"vibration of batch shape \(3,\) does not fit"),
     ],
