@@ -172,13 +172,10 @@ def _move_files(part: Path, target: Path) -> None:
 def move_into_place(
     part: Path, target: Path, kind: Literal["file", "folder", "tree"] = "file", companions: tuple[str, ...] = ()
 ) -> None:
-    """Rename a complete stack from its temporary name; may be repeated after an interruption.
+    """Rename a complete stack from its temporary name ``part``; may be repeated after an interruption.
 
-    Args:
-        part: Temporary name on the file system of ``target``.
-        target: Final name. An existing file or tree is replaced, an existing folder keeps its other files.
-        kind: As in ``StackFormat``.
-        companions: As in ``StackFormat``.
+    An existing file or tree is replaced, an existing folder keeps its other files; ``kind`` and ``companions`` are
+    those of ``StackFormat``.
     """
     for ending in companions:
         companion = part.with_name(part.name + ending)

@@ -48,22 +48,16 @@ def _find_dataset(file: Any) -> Any:
     return stacks[0]
 
 
-def _check_sizes(dataset: Any, file_size: int, *, largest_ratio: int = 5000, largest_chunk: int = 1 << 26) -> None:
-    """Raise a ``ValueError`` if the pixels cannot be in the file.
-
-    Args:
-        dataset: The dataset.
-        file_size: Size of the file in bytes.
-        largest_ratio: Largest accepted ratio of pixels to compressed data; gzip reaches 1032.
-        largest_chunk: Size of a chunk in bytes that is accepted even if the stack is smaller.
-    """
+def _check_sizes(dataset: Any, file_size: int) -> None:
+    """Raise a ``ValueError`` if the pixels cannot be in the file, before memory is allocated for them."""
     stored = dataset.id.get_storage_size()
     needed = int(np.prod(dataset.shape, dtype=object)) * dataset.dtype.itemsize
     compressed = dataset.compression or dataset.id.get_create_plist().get_nfilters()
-    if stored > file_size or needed > (largest_ratio if compressed else 1) * stored:
+    largest_ratio = 5000 if compressed else 1  # of pixels to stored bytes; gzip reaches 1032
+    if stored > file_size or needed > largest_ratio * stored:
         raise ValueError(f"its header states {needed} bytes of pixels, the file holds {stored}")
     chunk = int(np.prod(dataset.chunks or (1,), dtype=object)) * dataset.dtype.itemsize
-    if chunk > max(needed, largest_chunk):
+    if chunk > max(needed, 1 << 26):  # 64 MiB are accepted even if the stack is smaller
         raise ValueError(f"its chunks of {chunk} bytes are larger than the stack of {needed}")
 
 

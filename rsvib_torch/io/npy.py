@@ -20,11 +20,7 @@ __all__ = ["FORMAT"]
 class _FortranOrderReader:
     """Frames of an array whose first axis varies fastest, in a file that is mapped into memory.
 
-    Args:
-        path: The file.
-        info: The stack, which the file must hold completely.
-        offset: Position of the first pixel in bytes.
-        dtype: Data type in the file, with its byte order.
+    Arguments are those of ``ContiguousReader``; the file must hold all frames.
     """
 
     def __init__(self, path: Path, info: StackInfo, offset: int, dtype: np.dtype[Any]) -> None:

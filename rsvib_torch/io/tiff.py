@@ -47,26 +47,21 @@ def _check_page_chain(path: Path) -> None:
         raise ValueError("it contains no page")
 
 
-def _complete_pages(tif: Any, size: int, *, largest_ratio: int = 5000, fraction: float = 0.5) -> list[bool]:
-    """Whether the pixels of each page lie within the file.
-
-    Args:
-        tif: The open file.
-        size: Its size in bytes.
-        largest_ratio: Largest accepted ratio of pixels to the size of the file; deflate reaches 1032.
-        fraction: Smallest accepted fraction of complete pages.
+def _complete_pages(tif: Any, size: int) -> list[bool]:
+    """Whether the pixels of each page lie within the file of ``size`` bytes.
 
     Raises:
-        ValueError: If the file cannot hold that many pixels, or too many pages are incomplete.
+        ValueError: If the file cannot hold that many pixels, or more than half of the pages are incomplete.
     """
     declared, complete = 0, []
     for page in tif.pages:
         declared += int(page.nbytes)
         ends = (offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True))
         complete.append(max(ends, default=size + 1) <= size)
+    largest_ratio = 5000  # of pixels to the size of the file; deflate reaches 1032
     if declared > largest_ratio * size:
         raise ValueError(f"its header states {declared} bytes of pixels, which {size} bytes cannot hold")
-    if sum(complete) < fraction * len(complete):
+    if sum(complete) < 0.5 * len(complete):
         raise ValueError(f"truncated: pixels of page {complete.index(False)} lie beyond the end of the file")
     return complete
 
@@ -132,14 +127,7 @@ class _ArrayReader(FrameReader):
 
 
 class _PageReader:
-    """Frames decoded page by page.
-
-    Args:
-        path: The file.
-        tif: The open file.
-        info: The stack.
-        order: Permutation of the stored axes, as from ``_read_info``.
-        complete: Whether the pixels of each page lie within the file.
+    """Frames decoded page by page; arguments as from ``_read_info`` and ``_complete_pages``.
 
     Raises:
         ValueError: If a frame is not a sequence of pages.

@@ -46,14 +46,14 @@ def _playback_times(path: Path) -> list[float]:
     video = _open_decoder(path)
     times = []
     with _silent():
-        promised = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        stated = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         while video.grab():
             times.append(1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC)))
         video.release()
     if not times:
         raise ValueError(f"{path}: no frame of the video can be decoded")
-    if len(times) < promised - max(1, promised // 10):
-        raise ValueError(f"{path}: truncated: {len(times)} of {promised} frames can be decoded")
+    if len(times) < stated - max(1, stated // 10):
+        raise ValueError(f"{path}: truncated: {len(times)} of {stated} frames can be decoded")
     return times
 
 

@@ -47,20 +47,12 @@ def _check_codecs(codecs: Any) -> None:
             _check_codecs(codec["configuration"]["codecs"])
 
 
-def _check_sizes(
-    array: Any, info: StackInfo, folder: Path, *, largest_chunk: int = 1 << 30, largest_ratio: int = 100_000
-) -> None:
-    """Raise a ``ValueError`` if the pixels cannot be in the folder.
-
-    Args:
-        array: The array.
-        info: The stack.
-        folder: Where its chunks are.
-        largest_chunk: Largest accepted size of a chunk or frame in bytes.
-        largest_ratio: Largest accepted ratio of pixels to stored bytes; chunks of constant frames are very small.
-    """
+def _check_sizes(array: Any, info: StackInfo, folder: Path) -> None:
+    """Raise a ``ValueError`` if the pixels cannot be in the folder, before memory is allocated for them."""
     chunk = int(np.prod(array.shards or array.chunks, dtype=object)) * array.dtype.itemsize
     held = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    largest_chunk = 1 << 30  # bytes, also of a frame
+    largest_ratio = 100_000  # of pixels to stored bytes; chunks of constant frames are very small
     if max(chunk, info.frame_bytes) > largest_chunk or info.shape[0] * info.frame_bytes > largest_ratio * held:
         raise ValueError(
             f"its header states {info.shape[0]} frames of {info.frame_bytes} bytes in chunks of {chunk}, "
