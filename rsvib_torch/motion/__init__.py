@@ -1,1 +1,1 @@
-"""Motion of the image on the sensor: timing of the rows, vibrations, splines in time, recorded motions."""
+"""Motion of the image on the sensor: timing of rows, the base class of motions, vibrations, splines, recordings."""

@@ -77,9 +77,10 @@ class Motion(ABC):
 
     @abstractmethod
     def displacement_within(self, duration: float) -> Tensor:
-        """Bound on the length of the path that the image covers within ``duration`` seconds, (..., axes), in px.
+        """Bound on the displacement between two times ``duration`` seconds apart, (..., axes), in px (Eq. 24).
 
-        For less than half a period of a tone it is the largest displacement between two times (Eq. 24).
+        A tone counts with 4 A per period beyond half a period, its path length, on which quadrature depends; image
+        motion counts with its velocity at the time origin.
         """
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Recorded motion from files: angles, rates or pixels over time, as gyroscopes and attitude sensors log them."""
+"""Recorded motion from CSV files of gyroscopes and attitude sensors: angles, angular rates or pixels over time."""
 
 import csv
 import math
@@ -28,10 +28,6 @@ _RADIANS = {
     "deg/s": math.pi / 180,
 }
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_GAP = 4.0  # median steps
-_LARGEST_ANGLE = math.pi  # rad, within one record
-_FINEST_STEP, _COARSEST_STEP = 1e-6, 0.5  # s between samples
-_LEAST_SAMPLES = 4
 _COLUMNS = ("time", "x", "y")
 
 Array = NDArray[np.float64]
@@ -45,31 +41,31 @@ def read_motion(
     time_unit: TimeUnit = "s",
     signs: tuple[float, float] = (1.0, 1.0),
 ) -> FreeMotion:
-    """Read a recorded motion from a CSV file with the columns ``time``, ``x`` and ``y`` (others are passed over).
+    """Read a recorded motion from a CSV file with the columns ``time``, ``x`` and ``y``; other columns are ignored.
 
-    Angles move the image by ``focal_length tan(angle)``, rates are summed up to angles first (trapezoids). ``x`` is
-    what moves the image along x: for a camera, the angle about its y axis.
+    Angles displace the image by ``focal_length tan(angle)``; rates are integrated to angles first (trapezoidal rule).
+    ``x`` is the quantity that displaces the image along x: for a camera, the angle about its y axis.
 
     Args:
-        path: The CSV file, its first line names the columns.
-        unit: Of x and y.
-        focal_length: In px, for angles and rates; not for px.
-        time_unit: Of the times, on whatever clock.
-        signs: 1 or -1 for each axis (x, y), where a positive angle moves the image back.
+        path: The CSV file; its first line names the columns.
+        unit: Unit of x and y.
+        focal_length: Focal length in px, required for angles and rates and not accepted for px.
+        time_unit: Unit of the times, which may be on any clock.
+        signs: 1 or -1 for each axis (x, y); -1 where a positive angle displaces the image in the negative direction.
 
     Returns:
-        The motion on the clock of the file, less its mean; its times as they are in the file, in seconds.
+        The motion without its mean, with the times of the file in seconds.
 
     Raises:
         OSError: If the file cannot be opened.
-        ValueError: If a column is missing, a value is no number, times are not increasing or have gaps, or values or
-            steps are of a size that tells of another unit: one line with the line of the file.
+        ValueError: If a column is missing, a value is not a number, times do not increase or have gaps, or values or
+            time steps indicate another unit; the message names the line of the file.
     """
     path = Path(path)
     check_choice("unit", unit, get_args(MotionUnit))
     check_choice("time_unit", time_unit, get_args(TimeUnit))
     if unit == "px" and focal_length is not None:
-        raise ValueError("focal_length goes with angles and rates; a motion in px needs none")
+        raise ValueError("focal_length is for angles and rates only; omit it for unit='px'")
     if unit != "px":
         if focal_length is None:
             raise ValueError(f"unit={unit!r} needs a focal_length in px")
@@ -85,8 +81,8 @@ def read_motion(
     return FreeMotion.from_samples(torch.from_numpy(times), torch.from_numpy(displacement), spacing=spacing)
 
 
-def _table(path: Path) -> tuple[Array, Array]:
-    """Times (N,) and values (N, 2) of a file."""
+def _table(path: Path, least_samples: int = 4) -> tuple[Array, Array]:
+    """Times (N,) and values (N, 2) of a file; a cubic spline requires at least 4 samples."""
     rows: list[list[float]] = []
     with path.open(newline="", encoding="utf-8-sig") as file:
         try:
@@ -94,14 +90,14 @@ def _table(path: Path) -> tuple[Array, Array]:
             names = [name.strip().lower() for name in reader.fieldnames or []]
             missing = [name for name in _COLUMNS if name not in names]
             if missing:
-                has = ", ".join(names) or "nothing"
-                raise ValueError(f"{path}: column {missing[0]!r} is missing; the first line has {has}")
+                present = ", ".join(names) or "nothing"
+                raise ValueError(f"{path}: column {missing[0]!r} is missing; the first line has {present}")
             reader.fieldnames = names
             rows.extend([_number(path, reader.line_num, name, row[name]) for name in _COLUMNS] for row in reader)
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{path}: not a CSV file: {error}") from error
-    if len(rows) < _LEAST_SAMPLES:
-        raise ValueError(f"{path}: {len(rows)} samples; at least {_LEAST_SAMPLES} are needed")
+    if len(rows) < least_samples:
+        raise ValueError(f"{path}: {len(rows)} samples; at least {least_samples} are required")
     table = np.asarray(rows)
     return table[:, 0], table[:, 1:]
 
@@ -116,8 +112,8 @@ def _number(path: Path, line: int, name: str, text: str | None) -> float:
     return value
 
 
-def _check_times(path: Path, times: Array, unit: str) -> None:
-    """Refuse times that run back, have gaps, or are of another unit."""
+def _check_times(path: Path, times: Array, unit: str, longest_gap: float = 4.0) -> None:
+    """Raise a ValueError for times that do not increase, have gaps (in median steps), or are in another unit."""
     steps = np.diff(times)
     if (steps <= 0).any():
         place = int(np.argmax(steps <= 0))
@@ -126,9 +122,9 @@ def _check_times(path: Path, times: Array, unit: str) -> None:
             f"{times[place]:.9g} s"
         )
     typical = float(np.median(steps))
-    if not _FINEST_STEP <= typical <= _COARSEST_STEP:
-        raise ValueError(f"{path}: samples are {typical:.3g} s apart; are the times really in {unit}?")
-    if steps.max() > _GAP * typical:
+    if not 1e-6 <= typical <= 0.5:  # s; motion sensors sample at 2 Hz to 1 MHz
+        raise ValueError(f"{path}: samples are {typical:.3g} s apart; check time_unit={unit!r}")
+    if steps.max() > longest_gap * typical:
         place = int(np.argmax(steps))
         raise ValueError(
             f"{path}: gap of {steps[place]:.4g} s after {times[place]:.9g} s, samples are {typical:.4g} s apart"
@@ -142,9 +138,7 @@ def _displacement(path: Path, times: Array, values: Array, unit: str, focal_leng
         mean = 0.5 * (angles[1:] + angles[:-1]) * np.diff(times)[:, None]
         angles = np.concatenate([np.zeros((1, 2)), np.cumsum(mean, axis=0)])
     angles = angles - angles.mean(0)
-    if np.abs(angles).max() > 0.5 * _LARGEST_ANGLE:
-        largest = np.degrees(np.abs(angles).max())
-        raise ValueError(
-            f"{path}: angles reach {largest:.4g} degrees from their mean; are the values really in {unit}?"
-        )
+    largest = np.abs(angles).max()
+    if largest > 0.5 * math.pi:  # the tangent is not defined
+        raise ValueError(f"{path}: angles reach {np.degrees(largest):.4g} degrees from their mean; check unit={unit!r}")
     return np.asarray(focal_length * np.tan(angles))

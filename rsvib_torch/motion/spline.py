@@ -262,7 +262,7 @@ class FreeMotion(Motion):
         return self.tones.largest_oscillation() + self.coefficients.detach().abs().amax(-1)
 
     def displacement_within(self, duration: float) -> Tensor:
-        """Bound on the path of the image within ``duration`` seconds, (..., 2), in px."""
+        """Bound on the displacement between two times ``duration`` seconds apart, (..., 2), in px."""
         speed = self.coefficients.detach().diff(dim=-1).abs().amax(-1) / self.spacing
         return self.tones.displacement_within(duration) + speed * duration
 

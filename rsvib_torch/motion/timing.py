@@ -1,4 +1,4 @@
-"""When each row of each frame of a rolling-shutter sensor is exposed."""
+"""Timing of a rolling-shutter sensor: the exposure start of each row of each frame."""
 
 import itertools
 from collections.abc import Sequence
@@ -21,22 +21,22 @@ class SensorTiming:
 
     Row ``i`` of frame ``p`` starts its exposure at ``frame_start(p) + i row_time``, with
     ``frame_start(p) = p frame_rows row_time`` unless ``frame_start_times`` says otherwise, and is exposed for
-    ``exposure_rows row_time``. Row 0 is the row that is read first. Nothing has a default that would be a guess:
-    ``frame_rows`` counts blanking rows and is not the image height.
+    ``exposure_rows row_time``. Row 0 is the row that is read first. The three times have no defaults, since they
+    cannot be guessed: ``frame_rows`` counts blanking rows and is not the image height.
 
     Args:
         row_time: Time between the exposure starts of two neighbouring rows, in seconds.
         exposure_rows: Exposure time in row times (may be fractional).
         frame_rows: Row times between the exposure starts of one row in consecutive frames.
-        scan_axis: Axis along which rows follow each other in the image: ``-2`` (or ``"y"``, the default: rows are
-            image rows) or ``-1`` (or ``"x"``: image columns are exposed one after another).
-        readout_direction: ``"forward"`` when the row at index 0 of the scan axis is read first, ``"reverse"`` when
-            the last one is.
-        frame_start_times: Exposure start of the first row of each frame in seconds, where frames are not evenly
-            spaced (dropped frames, uneven clocks); strictly increasing.
+        scan_axis: Axis along which rows are exposed one after another: ``-2`` (or ``"y"``, the default: rows are
+            image rows) or ``-1`` (or ``"x"``: rows are image columns).
+        readout_direction: ``"forward"`` if the row at index 0 of the scan axis is read first, ``"reverse"`` if the
+            last one is.
+        frame_start_times: Exposure start of the first row of each frame in seconds, for frames that are not evenly
+            spaced (dropped frames, irregular clocks); strictly increasing.
 
     Raises:
-        ValueError: If a value is out of range, or looks like another unit (a row time over 10 ms, a frame period
+        ValueError: If a value is out of range, or indicates another unit (a row time over 10 ms, a frame period
             over 10 s).
         TypeError: If a value is not a number.
 
@@ -93,19 +93,19 @@ class SensorTiming:
     def line_sensors(
         cls, line_time: float, delays: Sequence[float], num_lines: int, exposure_lines: float = 1.0
     ) -> "SensorTiming":
-        """Timing of images that several lines of a push-broom sensor (or its bands) take of the same ground.
+        """Timing of images of the same ground from several lines (or bands) of a push-broom sensor.
 
-        Every image is taken line by line while the ground moves on; the lines see the same ground one after another.
-        Registered to the ground, their images are frames whose rows are read at the same pace, each begun its delay
-        later: parallax pairs tell the jitter of the platform as frames of a rolling shutter do, and are blind to
-        frequencies that are multiples of one over all delays.
+        Every image is recorded line by line while the ground moves; each line records the same ground after its own
+        delay. Registered to the ground, the images are frames of a rolling shutter whose exposures start after these
+        delays: the jitter of the platform is estimated from parallax pairs, except at frequencies that are multiples of
+        one over all delays.
 
         Args:
             line_time: Time between lines, in seconds.
-            delays: Time from when the first line sees the ground until each of the lines does, in seconds, increasing;
-                0 for the first.
-            num_lines: Lines of the images.
-            exposure_lines: Exposure in line times; stages of time-delayed integration count.
+            delays: Delay in seconds between the recording of the ground by the first line and by each line,
+                increasing; 0 for the first.
+            num_lines: Number of lines of the images.
+            exposure_lines: Exposure in line times, including the stages of time-delayed integration.
 
         Example:
             >>> pair = SensorTiming.line_sensors(line_time=1e-4, delays=[0.0, 0.04], num_lines=5000)
@@ -114,7 +114,7 @@ class SensorTiming:
         """
         lines = check_whole_number("num_lines", num_lines, at_least=1)
         if len(delays) < 2:
-            raise ValueError(f"delays must name two lines or more, got {list(delays)}")
+            raise ValueError(f"delays must have at least two entries, got {list(delays)}")
         return cls(
             row_time=line_time,
             exposure_rows=exposure_lines,
@@ -144,7 +144,7 @@ class SensorTiming:
             float64 tensor of shape (num_frames,).
 
         Raises:
-            ValueError: If ``frame_start_times`` has fewer entries than frames are asked for.
+            ValueError: If ``frame_start_times`` has fewer than ``num_frames`` entries.
         """
         if self.frame_start_times is None:
             return torch.arange(num_frames, dtype=torch.float64, device=device) * self.frame_period
@@ -162,11 +162,11 @@ class SensorTiming:
         return self.frame_starts(num_frames, device)[:, None] + rows * self.row_time
 
     def check_rows(self, num_rows: int) -> None:
-        """Raise a ``ValueError`` if a frame of ``num_rows`` rows cannot come from this sensor."""
+        """Raise a ``ValueError`` if a frame of this sensor has fewer row times than ``num_rows``."""
         if self.frame_rows < num_rows:
             raise ValueError(
-                f"frame_rows={self.frame_rows:g} is less than the {num_rows} rows of the frames; it counts the row "
-                "times from one frame to the next, blanking rows included"
+                f"frame_rows={self.frame_rows:g} is less than the {num_rows} rows of the frames; it is the number of "
+                "row times from one frame to the next, including blanking rows"
             )
 
     def in_row_order(self) -> "RowTiming":

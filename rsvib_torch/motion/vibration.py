@@ -217,7 +217,9 @@ class Vibration(Motion):
         return self.amplitude.detach().sum(-1)
 
     def displacement_within(self, duration: float) -> Tensor:
-        """Bound on the path of the image within ``duration`` seconds, (..., 2), in px (Eq. 24, summed over tones).
+        """Bound on the displacement between two times ``duration`` apart, (..., 2), in px (Eq. 24, sum of tones).
+
+        Beyond half a period a tone counts with its path length 4 A per period. Image motion counts with its velocity.
 
         Condition (24): the discrete point spread function of Eqs. (25)-(39) requires less than 0.1 px in a row time.
         """

@@ -1,4 +1,4 @@
-"""The augmentation against frames taken by the independent simulator, and inside Kornia's containers."""
+"""The augmentation compared with the independent simulator, and in the containers of Kornia."""
 
 import copy
 import math
@@ -30,13 +30,13 @@ def fixed(motion=MOTION, timing=TIMING, **options):
 
 
 def mean_displacement(times, motion=MOTION, timing=TIMING):
-    """Mean over exposures that begin at ``times``, as a plain sum."""
+    """Mean over exposures that begin at ``times``, as a sum of 400 midpoints."""
     nodes = (np.arange(400) + 0.5) / 400 * timing.exposure_time
     return motion.displacement(np.asarray(times, dtype=float)[..., None] + nodes).mean(-2)
 
 
 def place(point, motion=MOTION, timing=TIMING, start=0.0):
-    """Where the frame shows a scene point: the root of ``r = y + Y(t(r))``."""
+    """Position of a scene point in the frame: the root of ``r = y + Y(t(r))``."""
 
     def shown(row):
         return mean_displacement(start + row * timing.row_time, motion, timing)
@@ -55,7 +55,7 @@ def still(scene):
     return torch.from_numpy(crop(scene))
 
 
-def test_image_is_that_of_the_camera(scene, still):
+def test_image_equals_that_of_the_independent_simulator(scene, still):
     truth = take_frames(scene, TIMING, MOTION, 1)[0]
     assert decibel(still, truth) < 25
     assert decibel(fixed()(still[None, None])[0, 0], truth) > 58
@@ -67,7 +67,7 @@ def test_image_is_that_of_the_camera(scene, still):
 @pytest.mark.parametrize("scan_axis", [-2, -1])
 @pytest.mark.parametrize("readout_direction", ["forward", "reverse"])
 def test_any_orientation(still, scan_axis, readout_direction):
-    """The image turned by hand, moved by the motion turned by hand."""
+    """The image and the motion are transposed and flipped in the test."""
     timing = SensorTiming(40e-6, 30, 320, scan_axis=scan_axis, readout_direction=readout_direction)
 
     def turned(image):
@@ -101,7 +101,7 @@ def test_any_orientation(still, scan_axis, readout_direction):
 
 
 def test_keypoints_masks_and_boxes_follow_the_image(still):
-    """Discs: their centres are keypoints, their pixels the mask, their extent the boxes."""
+    """Discs: their centres are keypoints, their pixels the mask, their extents the boxes."""
     centres = torch.tensor([[40.0, 50.0], [150.0, 60.0], [60.0, 180.0], [140.0, 200.0]], dtype=torch.float64)
     radius = 12.0
     y, x = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
@@ -131,7 +131,7 @@ def test_keypoints_masks_and_boxes_follow_the_image(still):
 
 @pytest.mark.parametrize("exposure_rows", [1, 30, 60])
 def test_points_of_fast_vibrations_and_long_exposures(exposure_rows):
-    """Up to two and a half periods in an exposure: the mean of one and a half has the sign of its last half."""
+    """Up to two and a half periods in an exposure, where the mean displacement may have the opposite sign."""
     motion = Motion((6.0, 5.0), (640.0, 1060.0), (0.3, -0.9))
     timing = SensorTiming(row_time=40e-6, exposure_rows=exposure_rows, frame_rows=320)
     slow = Motion((3.0, 2.0), (640.0, 1060.0), (0.3, -0.9)) if exposure_rows == 1 else motion
@@ -144,8 +144,8 @@ def test_points_of_fast_vibrations_and_long_exposures(exposure_rows):
     np.testing.assert_allclose(moved.numpy(), expected, atol=2e-4)
 
 
-def test_boxes_are_the_smallest_around_the_bent_contents():
-    """A tall box over several periods: its sides lie at the largest displacements of the rows in it."""
+def test_boxes_are_the_smallest_around_the_distorted_content():
+    """The sides of a tall box over several periods are at the largest displacements of its rows."""
     motion = Motion((3.0, 0.0), (400.0, 0.0), (0.3, 0.0))
     boxes = Boxes.from_tensor(torch.tensor([[[50.0, 20.0, 91.0, 221.0]]], dtype=torch.float64), mode="xyxy")
     augmentation = fixed(motion)
@@ -158,8 +158,8 @@ def test_boxes_are_the_smallest_around_the_bent_contents():
     np.testing.assert_allclose(corners, [place(p, motion) for p in slanted.data[0, 0].numpy()], atol=1e-4)
 
 
-def test_clip_is_a_recording(scene, still):
-    """Frames of a clip are consecutive frames of one camera; labels of the clip move with it."""
+def test_clip_is_one_recording(scene, still):
+    """Frames of a clip are consecutive frames of one camera; labels of the clip have the same motion."""
     truth = take_frames(scene, TIMING, MOTION, 3)
     clip = still.expand(1, 3, 1, -1, -1)
     video = kornia_augmentation.VideoSequential(fixed(), same_on_frame=True)
@@ -224,7 +224,7 @@ def test_draws_lie_in_their_ranges_and_fill_them():
 
 
 def test_every_image_has_its_own_motion_and_exposure(still):
-    """A batch equals its images taken one by one; the exposure drawn is the one that blurs."""
+    """A batch equals its single images; the blur is that of the drawn exposure."""
     images = still[None, None].expand(3, 2, -1, -1)[..., 20:120, 20:100]
     augmentation = RollingShutterVibration(TIMING, exposure_rows=(2.0, 200.0), tones=2, image_motion=(-50.0, 50.0))
     together = augmentation(images)
@@ -279,7 +279,7 @@ def test_replay_same_on_batch_keepdim_probability():
 
 
 def test_masks_of_many_kinds(still):
-    """Integer labels, a list with one mask an image, and masks without channels move alike."""
+    """Integer labels, a list with one mask per image, and masks without channels have the same motion."""
     images = still[None, None].expand(2, -1, -1, -1).float()
     labels = (torch.arange(HEIGHT)[:, None] // 7 + torch.arange(WIDTH) // 5).remainder(9).expand(2, 1, -1, -1)
     augmentation = RollingShutterVibration(TIMING)
@@ -351,7 +351,7 @@ def test_copies_draw_alike():
 
 
 def test_in_a_chain_with_other_augmentations():
-    """After a crop the rows count anew; the points of the whole chain agree with the marks in the image."""
+    """After a crop, rows are counted from the crop; keypoints of the chain agree with marks in the image."""
     images = torch.zeros(1, 1, 96, 96, dtype=torch.float64)
     y, x = torch.meshgrid(torch.arange(96.0), torch.arange(96.0), indexing="ij")
     images[0, 0] = torch.exp(-((x - 50) ** 2 + (y - 40) ** 2) / 8)
@@ -385,12 +385,12 @@ def test_in_a_chain_with_other_augmentations():
         ({"p": 1.5}, ValueError, "p must be at most 1"),
     ],
 )
-def test_wrong_options_are_named(options, error, match):
+def test_bad_options(options, error, match):
     with pytest.raises(error, match=match):
         RollingShutterVibration(TIMING, **options)
 
 
-def test_refusals():
+def test_wrong_use_is_an_error():
     with pytest.raises(TypeError, match="timing must be a SensorTiming"):
         RollingShutterVibration(2e-5)
     augmentation = RollingShutterVibration(TIMING)

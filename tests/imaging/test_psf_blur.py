@@ -13,7 +13,7 @@ MOTION = Vibration([3.1, 5.2], [50.0, 30.0], [0.4, 1.3], [120.0, -40.0])
 
 
 def literal_kernel(start, timing, size, centre):
-    """Eqs. (25) to (39), one sample and one tap after the other."""
+    """Eqs. (25) to (39) as loops over samples and taps."""
     amplitude, frequency, phase, speed = (3.1, 5.2), (50.0, 30.0), (0.4, 1.3), (120.0, -40.0)
     count = int(timing.exposure_rows)
     kernel = np.zeros(size)
@@ -48,7 +48,7 @@ def test_kernel_is_equations_26_to_39(timing, row):
     assert np.abs(kernel - expected).max() < 1e-12
 
 
-def test_dense_kernels_are_the_same_kernels():
+def test_dense_kernels_equal_the_sparse_kernels():
     starts = PAPER.row_starts(1, 2048)[0, ::64]
     psf = row_psf(MOTION, starts, PAPER)
     dense, (x, y) = psf.dense()
@@ -63,18 +63,18 @@ def test_dense_kernels_are_the_same_kernels():
 @pytest.mark.parametrize("quadrature", ["midpoint", "gauss"])
 @pytest.mark.parametrize("timing", [PAPER, LONG])
 def test_centroid_is_the_mean_displacement(interpolation, quadrature, timing):
-    """The kernel moves the image by the displacement of Eq. (2), and conserves its flux."""
+    """The kernel displaces the image by Eq. (2) and conserves its flux."""
     starts = timing.row_starts(2, 2048)
     psf = row_psf(MOTION, starts, timing, interpolation=interpolation, quadrature=quadrature)
     expected = MOTION.mean_displacement(starts, timing.exposure_time)
-    # midpoints of N_e samples err by (2 pi f T_row)^2 A / 24; gauss is exact
+    # the midpoint rule has an error of (2 pi f T_row)^2 A / 24; Gauss nodes are exact
     limit = 1e-5 if quadrature == "midpoint" else 1e-8
     assert (psf.centroid() - expected).abs().max() < limit
     assert (psf.weights.sum((-2, -1)) - 1).abs().max() < 1e-12
     assert bool((psf.weights >= -1e-15).all())
 
 
-def test_gauss_needs_far_fewer_nodes():
+def test_gauss_requires_fewer_nodes():
     long, weights = exposure_trajectory(MOTION, LONG.row_starts(1, 8), LONG, "gauss")
     assert len(weights) < 30
     assert long.shape == (1, 8, len(weights), 2)
@@ -109,7 +109,7 @@ def test_bad_options(options, message):
 
 
 def fast_motion(batch=None):
-    """A motion that differs much from row to row of a small frame."""
+    """A motion with large differences between the rows of a small frame."""
     amplitude = torch.tensor([[3.3], [2.4]], dtype=torch.float64)
     if batch is not None:
         amplitude = amplitude * torch.linspace(0.4, 1.3, batch, dtype=torch.float64)[:, None, None]
@@ -131,7 +131,7 @@ def noise(*shape, seed=0, dtype=torch.float64):
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 def test_output_row_selects_its_kernel(interpolation):
-    """Away from the borders the frame is the double sum over taps, row by row."""
+    """Inside its boundaries the frame is the double sum over taps in each row."""
     psf = small_psf(interpolation)
     scene = noise(46, 50)
     frame = blur_rows(scene, psf, frame_width=18, origin=(16, 16))

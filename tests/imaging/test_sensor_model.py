@@ -1,4 +1,4 @@
-"""Fixed pattern of a sensor, and optics in front of it."""
+"""Fixed pattern of a sensor and transfer function of the optics."""
 
 import math
 
@@ -12,7 +12,7 @@ from rsvib_torch import Optics, SensorNoise, slanted_edge_mtf
 FLAT = torch.full((3, 300, 400), 0.5, dtype=torch.float64)
 
 
-def test_the_pattern_stays_with_the_sensor():
+def test_fixed_pattern_is_the_same_in_all_frames():
     sensor = SensorNoise(gain_spread=0.01, column_offset=0.004, row_offset=0.002)
     frames = sensor.apply(FLAT) - 0.5
     assert torch.equal(frames[0], frames[2])
@@ -22,7 +22,7 @@ def test_the_pattern_stays_with_the_sensor():
     assert abs(correlation) < 0.2
 
 
-def test_every_part_of_the_pattern_has_its_size():
+def test_parts_of_the_pattern_have_their_standard_deviations():
     gain = SensorNoise(gain_spread=0.01).apply(FLAT)[0] / 0.5 - 1
     assert gain.std().item() == pytest.approx(0.01, rel=0.02)
     assert gain.mean(0).std() < 0.002  # neither rows nor columns
@@ -37,7 +37,7 @@ def test_every_part_of_the_pattern_has_its_size():
     torch.testing.assert_close(dark, columns, rtol=0, atol=1e-12)
 
 
-def test_noise_comes_on_top_of_the_pattern():
+def test_noise_is_added_to_the_pattern():
     generator = torch.Generator().manual_seed(0)
     sensor = SensorNoise(full_well=10000, read_noise=0.003, gain_spread=0.01, column_offset=0.004)
     frames = sensor.apply(FLAT, generator)
@@ -63,7 +63,7 @@ def test_bad_sensor(values, error, message):
         SensorNoise(**values)
 
 
-def test_a_wave_is_weakened_by_the_transfer():
+def test_a_wave_is_attenuated_by_the_transfer_function():
     optics = Optics(sigma=0.4, cutoff=0.9, pixel=1.0)
     height, width, k, m = 60, 80, 19, 7  # half cycles: cosines that are mirrored at the borders
     y, x = torch.arange(height, dtype=torch.float64) + 0.5, torch.arange(width, dtype=torch.float64) + 0.5
@@ -78,7 +78,7 @@ def test_a_wave_is_weakened_by_the_transfer():
 
 
 def test_diffraction_is_the_autocorrelation_of_the_pupil():
-    """The Hankel transform of the Airy pattern, summed numerically."""
+    """Compared with the Hankel transform of the Airy pattern, integrated numerically."""
     radius = (np.arange(400000) + 0.5) * 0.005
     airy = (2 * j1(np.pi * radius) / (np.pi * radius)) ** 2
     from scipy.special import j0
@@ -90,7 +90,7 @@ def test_diffraction_is_the_autocorrelation_of_the_pupil():
         assert float(found) == pytest.approx(expected, abs=0.003)
 
 
-def test_the_slanted_edge_sees_the_optics():
+def test_slanted_edge_measures_the_optics():
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in (160, 120)), indexing="ij")
     edge = torch.special.ndtr(((x - 60) + 0.1 * (y - 80)) / math.hypot(1, 0.1) / 0.6)
     optics = Optics(sigma=0.5, cutoff=1.4)

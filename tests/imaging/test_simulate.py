@@ -15,12 +15,12 @@ WAVES = ((0.25, 0.0, 0.3), (0.0, 0.25, 1.0), (0.17, -0.18, 2.0), (-0.03, 0.22, 0
 
 
 def analytic(rows, columns):
-    """A scene of five sines, full scale 1, at any place."""
+    """A scene of five sines, full scale 1, at any position."""
     return 0.5 + sum(0.09 * np.sin(2 * np.pi * (u * columns + v * rows) + p) for u, v, p in WAVES)
 
 
 def analytic_frames(timing, motion, num_frames, size, corner):
-    """Frames of the analytic scene: no interpolation, only the exposure is a sum (64 midpoints)."""
+    """Frames of the analytic scene without interpolation; exposures are sums of 64 midpoints."""
     rows, columns = np.arange(size[0])[:, None], np.arange(size[1])
     frames = np.zeros((num_frames, *size))
     for p in range(num_frames):
@@ -45,7 +45,7 @@ def test_against_analytic_scene(waves):
     assert np.abs(frames - truth).max() < 3e-4
 
 
-def test_cubic_kernels_beat_linear_ones(waves):
+def test_cubic_kernels_are_more_accurate_than_linear_kernels(waves):
     truth = analytic_frames(TIMING, MOTION, 1, (220, 180), (40, 40))[0]
     error = {}
     for interpolation in ("linear", "cubic"):
@@ -88,7 +88,7 @@ def test_channels_equal_singles_and_dtype_is_kept():
 
 @pytest.mark.parametrize(("scan_axis", "direction"), [(-1, "forward"), (-2, "reverse"), (-1, "reverse")])
 def test_orientation(scan_axis, direction):
-    """A transposed or flipped scene under the transposed or flipped motion gives transposed or flipped frames."""
+    """A transposed or flipped scene and motion give transposed or flipped frames."""
     scene = torch.from_numpy(draw_scene(140, 120, 4))
     upright = simulate_frames(scene, TIMING, MOTION.vibration(), 2, frame_size=(80, 64))
     amplitude, frequency, phase, speed = (
@@ -113,8 +113,8 @@ def test_orientation(scan_axis, direction):
     assert (frames - turn(upright).flip(0)).abs().max() > 0.05
 
 
-def test_default_frame_keeps_its_distance_from_the_edge():
-    """16 px and the amplitude on every side."""
+def test_default_frame_has_a_margin():
+    """The margin is 16 px and the amplitude on every side."""
     scene = torch.from_numpy(draw_scene(140, 140, 4))
     frames = simulate_frames(scene, TIMING, Vibration([3.0, 5.0], [50.0, 30.0]))
     assert frames.shape == (2, 140 - 2 * 21, 140 - 2 * 19)
@@ -144,7 +144,7 @@ def test_bad_input(scene, options, error, message):
         simulate_frames(scene, TIMING, Vibration(1.0, 50.0), **options)
 
 
-def test_batch_of_vibrations_is_refused():
+def test_batch_of_vibrations_is_an_error():
     with pytest.raises(ValueError, match="takes one vibration, not a batch"):
         simulate_frames(torch.zeros(99, 99), TIMING, Vibration.still((2,)))
 

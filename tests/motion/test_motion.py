@@ -1,4 +1,4 @@
-"""What every motion type guarantees: the contract of ``Motion``, checked for each of them."""
+"""The contract of ``Motion``, checked for every motion type."""
 
 import math
 
@@ -36,7 +36,7 @@ def test_bounds_hold(motion):
     displacement = motion.displacement(TIMES)
     assert bool((displacement.abs() <= motion.largest_displacement(0.0, 0.2)).all())
     assert bool(((displacement - motion.drift(TIMES)).abs() <= motion.largest_oscillation()).all())
-    # without its acceleration, which displacement_within leaves out
+    # displacement_within is a bound without the acceleration of the image motion
     for steps in (1, 20, 400):
         slope = motion.drift(TIMES) - motion.image_motion * TIMES[:, None]
         moved = (displacement - slope)[steps:] - (displacement - slope)[:-steps]

@@ -1,4 +1,4 @@
-"""Recorded motion from CSV files, and a clear line for every mistake."""
+"""Recorded motion from CSV files, and the errors of wrong files and options."""
 
 import math
 
@@ -18,7 +18,7 @@ def write(path, columns, names="time,x,y"):
 
 
 @pytest.mark.parametrize(("unit", "size"), [("rad", 1.0), ("mrad", 1e-3), ("urad", 1e-6), ("deg", math.pi / 180)])
-def test_angles_become_pixels(tmp_path, unit, size):
+def test_angles_are_converted_to_pixels(tmp_path, unit, size):
     x, y = 0.01 * np.sin(9 * CLOCK), 0.02 * np.cos(5 * CLOCK)
     path = write(tmp_path / "a.csv", (CLOCK, x / size, y / size))
     motion = read_motion(path, unit=unit, focal_length=1000.0, signs=(1, -1))
@@ -27,7 +27,7 @@ def test_angles_become_pixels(tmp_path, unit, size):
     assert np.allclose(motion.displacement(torch.from_numpy(CLOCK)).numpy(), expected, atol=1e-3)
 
 
-def test_rates_are_summed_up_and_times_scaled(tmp_path):
+def test_rates_are_integrated_and_times_scaled(tmp_path):
     x, y = 0.01 * np.sin(9 * CLOCK), 0.02 * np.cos(5 * CLOCK)
     rates = np.degrees(0.09 * np.cos(9 * CLOCK)), np.degrees(-0.1 * np.sin(5 * CLOCK))
     path = write(tmp_path / "a.csv", (1e3 * CLOCK, CLOCK, *rates), " Time , other, X, y")
@@ -37,7 +37,7 @@ def test_rates_are_summed_up_and_times_scaled(tmp_path):
     assert np.allclose(found[:, 1] - found[:, 1].mean(), 1000 * (y - y.mean()), atol=0.02)
 
 
-def test_pixels_are_taken_as_they_are(tmp_path):
+def test_pixels_are_not_scaled(tmp_path):
     path = write(tmp_path / "a.csv", (CLOCK, np.sin(9 * CLOCK), CLOCK))
     found = read_motion(path, unit="px").displacement(torch.from_numpy(CLOCK)).numpy()
     assert np.allclose(found[:, 1], CLOCK - CLOCK.mean(), atol=1e-6)
@@ -56,25 +56,25 @@ def changed(place, time):
         (changed(7, CLOCK[6]), CLOCK, {}, "times must increase"),
         (np.concatenate([CLOCK[:50], CLOCK[60:]]), CLOCK[10:], {}, r"gap of 0\.055 s after 0\.245 s"),
         (CLOCK, changed(4, np.nan), {}, "line 6: x must be a number"),
-        (1e3 * CLOCK, CLOCK, {}, "really in s"),
-        (CLOCK, CLOCK, {"time_unit": "ns"}, "really in ns"),
-        (CLOCK, 20 * CLOCK, {"unit": "rad", "focal_length": 1000}, "really in rad"),
-        (CLOCK, 300 * CLOCK, {"unit": "rad/s", "focal_length": 1000}, "really in rad/s"),
+        (1e3 * CLOCK, CLOCK, {}, "check time_unit='s'"),
+        (CLOCK, CLOCK, {"time_unit": "ns"}, "check time_unit='ns'"),
+        (CLOCK, 20 * CLOCK, {"unit": "rad", "focal_length": 1000}, "check unit='rad'"),
+        (CLOCK, 300 * CLOCK, {"unit": "rad/s", "focal_length": 1000}, "check unit='rad/s'"),
         (CLOCK, CLOCK, {"unit": "rad"}, "needs a focal_length"),
-        (CLOCK, CLOCK, {"focal_length": 1000}, "needs none"),
+        (CLOCK, CLOCK, {"focal_length": 1000}, "omit it for unit="),
         (CLOCK, CLOCK, {"unit": "rad", "focal_length": -1}, "focal_length must be larger"),
         (CLOCK, CLOCK, {"unit": "feet"}, "unit must be one of"),
         (CLOCK, CLOCK, {"signs": (2, 1)}, "signs"),
         (CLOCK[:3], CLOCK[:3], {}, "3 samples"),
     ],
 )
-def test_mistakes_are_named(tmp_path, clock, values, options, message):
+def test_errors_name_the_problem(tmp_path, clock, values, options, message):
     path = write(tmp_path / "a.csv", (clock, values, values))
     with pytest.raises(ValueError, match=message):
         read_motion(path, **{"unit": "px", **options})
 
 
-def test_files_that_are_none(tmp_path):
+def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(FileNotFoundError):
         read_motion(tmp_path / "none.csv", unit="px")
     with pytest.raises(ValueError, match="column 'y' is missing; the first line has time, x"):

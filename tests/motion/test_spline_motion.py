@@ -1,4 +1,4 @@
-"""Motion of any shape: splines against SciPy's, and the whole way through simulation and restoration."""
+"""Free motion: splines compared with SciPy, and simulation and restoration with a free motion."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def test_displacement_velocity_and_mean_are_those_of_a_natural_spline():
     assert np.allclose(motion().mean_displacement(torch.from_numpy(starts), exposure).numpy(), mean, atol=2e-6)
 
 
-def test_ends_are_kept():
+def test_motion_is_constant_beyond_its_ends():
     ends = motion().displacement(torch.tensor([-1.0, 5.0], dtype=torch.float64)).numpy()
     assert np.allclose(ends, PATH[[0, -1]], atol=1e-6)
     assert not motion().velocity(torch.tensor([-1.0, 5.0])).any()
@@ -63,7 +63,7 @@ def test_batch_equals_singles():
     assert torch.allclose(motion().expanded(3).displacement(times[:1])[2], motion().displacement(times[0]))
 
 
-def test_tones_add_to_the_rest():
+def test_tones_are_added_to_the_spline():
     tones = rsv.Vibration([1.0, 0.5], [70.0, 90.0], [0.3, 0.4], [10.0, -5.0])
     whole = FreeMotion.through(TIMES, PATH, tones)
     times = torch.linspace(0, 0.19, 30, dtype=torch.float64)
@@ -84,7 +84,7 @@ def test_samples_at_uneven_times():
 
 @pytest.mark.parametrize("scan_axis", [-2, -1])
 @pytest.mark.parametrize("direction", ["forward", "reverse"])
-def test_orientation_is_undone(scan_axis, direction):
+def test_row_order_and_back(scan_axis, direction):
     timing = rsv.SensorTiming(4e-5, 40, 400, scan_axis=scan_axis, readout_direction=direction)
     tones = rsv.Vibration([1.0, 0.5], [70.0, 90.0])
     whole = FreeMotion.through(TIMES, PATH, tones)
@@ -110,7 +110,7 @@ def make_taken():
     return scene, take_frames(scene, TIMING, Free(), 3, 0.003)
 
 
-def test_simulated_frames_are_those_of_the_definition(taken):
+def test_simulated_frames_equal_those_of_the_independent_simulator(taken):
     scene, _ = taken
     frames = rsv.simulate_frames(torch.from_numpy(scene), TIMING, motion(), 2, frame_size=(320, 192))
     assert decibel(frames.numpy(), take_frames(scene, TIMING, Free(), 2), rim=16) > 60
@@ -134,12 +134,12 @@ def test_frames_are_restored(taken, method, least):
         ((torch.zeros(2, 8), 0.0, 1e-3, rsv.Vibration.still((3,))), "batch shape"),
     ],
 )
-def test_bad_values_are_named(arguments, message):
+def test_bad_values(arguments, message):
     with pytest.raises(ValueError, match=message):
         FreeMotion(*arguments)
 
 
-def test_bad_samples_are_named():
+def test_bad_samples():
     with pytest.raises(ValueError, match="evenly spaced"):
         FreeMotion.through([0.0, 1.0, 2.0, 4.0], torch.zeros(4, 2))
     with pytest.raises(ValueError, match="strictly increasing"):

@@ -55,7 +55,7 @@ def test_rows_of_a_frame():
 
 
 @pytest.mark.parametrize("name", GOOD)
-def test_nothing_has_a_default_that_is_a_guess(name):
+def test_times_have_no_defaults(name):
     with pytest.raises(TypeError, match=name):
         SensorTiming(**{key: value for key, value in GOOD.items() if key != name})
 
@@ -117,7 +117,7 @@ def test_type_checker_requires_row_order(tmp_path):
     files = [str(package / name) for name in ("motion/timing.py", "imaging/trajectory.py")]
     for argument, accepted in (("timing.in_row_order()", True), ("timing", False)):
         snippet.write_text(head + call.format(argument))
-        # modules that are not listed count as Any, so that torch need not be analysed
+        # modules that are not listed are analysed as Any, which avoids the analysis of torch
         output, _, status = mypy.api.run(
             ["--follow-imports=skip", "--config-file=", f"--cache-dir={tmp_path / 'cache'}", *files, str(snippet)]
         )

@@ -79,7 +79,7 @@ def test_blind_frequencies():
     assert averaged.mean_displacement(starts, TIMING.exposure_time).abs().max() < 1e-9
 
 
-def test_uneven_frames_are_blind_to_what_returns_in_all_of_them():
+def test_uneven_frames_are_blind_to_frequencies_that_displace_all_frames_alike():
     period = TIMING.frame_period
     pair = blind_frequencies(replace(TIMING, frame_start_times=(0.0, 2 * period)), 50.0)
     torch.testing.assert_close(pair, torch.arange(1, 5).double() / (2 * period))
