@@ -17,7 +17,7 @@ from rsvib_torch.io.schema import TimingRecord, VibrationRecord
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.restoration import restore
-from rsvib_torch.restoration.restore import MASKS, METHODS
+from rsvib_torch.restoration.restore import METHODS
 from rsvib_torch.stacks import DEFAULT_WINDOW, BadFrames
 
 __all__ = ["Config", "Simulation", "read_config"]
@@ -130,7 +130,7 @@ def _restoration_section(method: object) -> Any:
     default = inspect.signature(restore).parameters["method"].default
     chosen = METHODS[method if isinstance(method, str) and method in METHODS else default]
     more = {"method": (Literal[*METHODS], default), "saturation": (float | None, None)}
-    return options_section("_RestorationSection", chosen, skip=MASKS, **more)
+    return options_section("_RestorationSection", chosen.function, skip=chosen.masks, **more)
 
 
 def read_config(path: str | os.PathLike[str]) -> Config:

@@ -34,7 +34,7 @@ INNER_LAYERS = {
     "evaluation": ({"quality", "mtf", "bound", "scenes"},),
     "report": ({"results", "plots"}, {"html"}),
     "restoration": (
-        {"frame_motion", "joint_groups"},
+        {"frame_motion"},
         {"scene_model"},
         {"noise"},
         {"exact", "banded", "dewarp", "verdict"},

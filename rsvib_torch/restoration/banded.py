@@ -1,4 +1,4 @@
-"""Row-banded restoration: every row deconvolved within a slab of rows that is given one PSF (Sec. 3.2)."""
+"""Row-banded restoration: every row is deconvolved within a slab of rows with the PSF of that row (Sec. 3.2)."""
 
 import math
 from collections.abc import Callable
@@ -12,17 +12,14 @@ from rsvib_torch.core.fourier import extend_rows, extended_length
 from rsvib_torch.core.splines import bspline_weights, mirrored
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.noise.single_frame import estimate_noise, gradient_energy
+from rsvib_torch.restoration.noise.high_pass import estimate_noise
 
 __all__ = ["restore_banded"]
 
-_AUTOMATIC_RANGE = (5e-3, 10.0)  # below, the slab's own approximation is amplified more than noise would be
-_ALIGN_ROWS = 256  # rows moved at a time
-_RINGING = 8  # px that a Wiener filter reaches beyond the displacement, at least
-_CHUNK_ELEMENTS = {"cpu": 1 << 19, "cuda": 1 << 26}  # of a filter bank: stays in cache, or fills a GPU
+_CHUNK_ELEMENTS = {"cpu": 1 << 19, "cuda": 1 << 26}  # values of a filter bank; fit into the cache, or fill a GPU
 
 
-def _turn(frequencies: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+def _waves(frequencies: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
     """Real and imaginary part of exp(-2 pi i frequency place), shape of places + shape of frequencies."""
     angle = -2 * math.pi * places[..., None] * frequencies
     return angle.cos(), angle.sin()
@@ -34,33 +31,38 @@ def _spline_transfer(places: Tensor, frequencies: Tensor, degree: int) -> tuple[
     weights = bspline_weights(places - cell, degree)
     samples = bspline_weights(torch.zeros((), dtype=places.dtype, device=places.device), degree)
     taps = torch.arange(degree + 1, dtype=places.dtype, device=places.device) - degree // 2
-    at_rest = samples @ _turn(frequencies, taps)[0] if degree > 1 else torch.ones_like(frequencies)
-    real, imaginary = _turn(frequencies, cell[..., None] + taps)
+    at_rest = samples @ _waves(frequencies, taps)[0] if degree > 1 else torch.ones_like(frequencies)
+    real, imaginary = _waves(frequencies, cell[..., None] + taps)
     weights = weights[..., None]
     return (weights * real).sum(-2) / at_rest, (weights * imaginary).sum(-2) / at_rest
 
 
 _TRANSFERS: dict[str, tuple[Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], int, Quadrature]] = {
     "linear": (lambda places, u: _spline_transfer(places, u, 1), 1, "midpoint"),
-    "cubic": (lambda places, u: _turn(u, places), 3, "gauss"),
+    "cubic": (lambda places, u: _waves(u, places), 3, "gauss"),
 }
 
 
 def _noise_to_signal(frames: Tensor, value: float | Literal["auto"]) -> Tensor:
-    """Weight of the gradient prior of each stack, (B,)."""
+    """Weight of the gradient prior of each stack, (B,); estimated from the frames for ``"auto"``."""
     if value != "auto":
         number = check_number("noise_to_signal", value, at_least=0.0)
         return torch.full((frames.shape[0],), number, dtype=frames.dtype, device=frames.device)
     variance = estimate_noise(frames).square().flatten(1).mean(1)
-    gradients = gradient_energy(frames).flatten(1).mean(1) - 2.0 * variance
+    energy = frames.new_zeros(frames.shape[:-2])
+    for dim in (-2, -1):
+        squares = frames.diff(dim=dim).square()
+        energy += 0.5 * squares.sum((-2, -1)) / max(math.prod(squares.shape[-2:]), 1)
+    gradients = energy.flatten(1).mean(1) - 2.0 * variance
     tiny = torch.finfo(frames.dtype).tiny
-    return (variance / gradients.clamp(min=tiny)).clamp(*_AUTOMATIC_RANGE)
+    lowest, highest = 5e-3, 10.0  # below, errors of the slab approximation are amplified more than noise
+    return (variance / gradients.clamp(min=tiny)).clamp(lowest, highest)
 
 
 def _filters(
     displacement: Tensor, node_weights: Tensor, grid: tuple[Tensor, Tensor], weight: Tensor, interpolation: str
 ) -> Tensor:
-    """Wiener filters of slabs whose scene moved by ``displacement`` (n, N, 2): lag by frequency.
+    """Wiener filters of slabs with displacement (n, N, 2) during the exposure, by lag and frequency.
 
     Returns:
         Real and imaginary parts, (n, 2, V, U).
@@ -77,9 +79,9 @@ def _filters(
     damped = torch.addcmul(transfer[:, 0].square(), transfer[:, 1], transfer[:, 1])
     damped = torch.addcmul(damped, weight[:, None, None], prior).clamp(min=torch.finfo(u.dtype).tiny)
     response = transfer / damped[:, None]
-    # inverse Fourier transform over v of the conjugate, taken at all lags of the slab
+    # inverse Fourier transform over v of the conjugate, at all lags of the slab
     lags = torch.fft.fftfreq(len(v), d=1.0 / len(v), dtype=v.dtype, device=v.device)
-    cosine, sine = (part / len(v) for part in _turn(v, lags))
+    cosine, sine = (part / len(v) for part in _waves(v, lags))
     inverse = torch.cat([torch.cat([cosine, -sine], -1), torch.cat([-sine, -cosine], -1)], dim=-2)
     filters: Tensor = (inverse @ response.flatten(1, 2)).unflatten(-2, (2, len(v)))
     return filters
@@ -92,9 +94,10 @@ def _aligned_spectra(frames: Tensor, motion: FrameMotion, u: Tensor, length: int
     starts = starts.expand(B, T, H)
     mean = motion.vibration.mean_displacement(starts, motion.timing.exposure_time)[..., 0] - motion.shift[..., 0, None]
     spectra = torch.fft.rfft(extend_rows(frames, length)).transpose(-3, -2).flatten(0, 2)
+    aligned_rows = 256  # at a time; bounds the memory
     moved = [
-        rows * torch.complex(*(part.to(frames.dtype) for part in _turn(u, -places)))[:, None]
-        for rows, places in zip(spectra.split(_ALIGN_ROWS), mean.flatten().split(_ALIGN_ROWS), strict=True)
+        rows * torch.complex(*(part.to(frames.dtype) for part in _waves(u, -places)))[:, None]
+        for rows, places in zip(spectra.split(aligned_rows), mean.flatten().split(aligned_rows), strict=True)
     ]
     aligned: Tensor = torch.cat(moved).unflatten(0, (B * T, H))
     return aligned
@@ -112,21 +115,21 @@ def restore_banded(
 ) -> Tensor:
     """Restore frames slab by slab (Sec. 3.2 of Liu et al. 2023).
 
-    Scene row k is shown by frame row r(k). The slab of rows r(k) - l ... r(k) + l is taken to have the PSF of that
-    row all over, deconvolved by the Wiener filter ``H* / (|H|^2 + w (4 sin^2 pi u + 4 sin^2 pi v))`` and only its
-    central rows are kept. The whole pixels of the displacement move the slab, so that it need not be tall; the prior
-    is shaped like image gradients, so that the mean is conserved. Rows are transformed once per frame, and the filter
-    is evaluated at the central row only. Rows are extended smoothly at their ends and mirrored above and below. All
-    pixels count: ``restore`` puts local means in place of those without data, and saturated ones count at their level.
+    Scene row k appears at frame row r(k). The slab of rows r(k) - l ... r(k) + l is assumed to have the PSF of that
+    row. It is deconvolved by the Wiener filter ``H* / (|H|^2 + w (4 sin^2 pi u + 4 sin^2 pi v))``, and its central
+    rows are kept. Whole pixels of the displacement shift the slab, so that a low slab suffices. The prior penalises
+    image gradients, which preserves the mean. Rows are transformed once per frame, and the filter is evaluated at the
+    central rows only. Rows are extended smoothly at their ends and mirrored above and below. All pixels count:
+    ``restore`` replaces those without data by local means, and saturated ones count at their level.
 
     Args:
         frames: (B, T, C, H, W) in row order.
         motion: Motion of the frames.
         half_rows: l.
-        stride: Central rows kept per slab: 2 halve the time of 1 and cost 0.02 dB (paper camera, noise 0.003).
-        interpolation: How the PSF displaces the scene: ``"linear"`` is the paper's (Eqs. 26-39, N_e samples), which
-            takes its own blur for the camera's; ``"cubic"`` is a cubic B-spline across rows, exact along them.
-        noise_to_signal: w, the variance of the noise over that of the scene's gradients; ``"auto"`` estimates it.
+        stride: Central rows kept per slab: 2 takes half the time of 1 and costs 0.02 dB (paper camera, noise 0.003).
+        interpolation: Interpolation in the PSF: ``"linear"`` is that of the paper (Eqs. 26-39, N_e samples), whose own
+            blur is deconvolved as well; ``"cubic"`` is a cubic B-spline across rows, exact along them.
+        noise_to_signal: w, the variance of the noise over that of the scene gradients; ``"auto"`` estimates it.
         chunk_rows: Slabs filtered at a time; bounds the memory, does not change the result.
 
     Returns:
@@ -141,7 +144,7 @@ def restore_banded(
     check_choice("interpolation", interpolation, tuple(_TRANSFERS))
     weights = _noise_to_signal(frames, noise_to_signal)
     B, T, C, H, W = frames.shape
-    length = extended_length(W, motion.reach(H) + _RINGING)
+    length = extended_length(W, motion.reach(H) + 8)  # a Wiener filter extends at least 8 px beyond the displacement
     size = 2 * half_rows + 1
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=frames.device)
     v = torch.fft.fftfreq(size, dtype=torch.float64, device=frames.device)
@@ -149,14 +152,14 @@ def restore_banded(
         chunk_rows = max(1, _CHUNK_ELEMENTS.get(frames.device.type, 1 << 22) // (size * len(u)))
     chunk_rows = check_whole_number("chunk_rows", chunk_rows, at_least=1)
 
-    # one slab for every `stride` scene rows: its middle, the frame row that shows it, its motion relative to that row
+    # one slab for every `stride` scene rows: its middle, the frame row at which it appears, the motion relative to it
     centres = torch.arange((stride - 1) // 2, H + stride - 1, stride, device=frames.device)[: -(-H // stride)]
-    shown_by = motion.frame_rows(centres.to(torch.float64))
+    frame_rows = motion.frame_rows(centres.to(torch.float64))
     displacement, node_weights = exposure_trajectory(
-        motion.vibration, motion.row_starts(shown_by), motion.timing, _TRANSFERS[interpolation][2]
+        motion.vibration, motion.row_starts(frame_rows), motion.timing, _TRANSFERS[interpolation][2]
     )
-    rows = shown_by.detach().round()
-    mean = motion.vibration.mean_displacement(motion.row_starts(shown_by), motion.timing.exposure_time)
+    rows = frame_rows.detach().round()
+    mean = motion.vibration.mean_displacement(motion.row_starts(frame_rows), motion.timing.exposure_time)
     moved = torch.stack([mean[..., 0], rows - centres + motion.shift[..., 1, None]], dim=-1)
     displacement = (displacement - moved[..., None, :]).flatten(0, 2).to(frames.dtype)
     grid = (u.to(frames.dtype), v.to(frames.dtype))

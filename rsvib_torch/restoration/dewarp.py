@@ -1,4 +1,4 @@
-"""Restoration of the geometry only: every pixel fetched from where its row's mean displacement put it."""
+"""Restoration of the geometry only: every row is moved back by its mean displacement during the exposure."""
 
 import torch
 from torch import Tensor
@@ -12,24 +12,23 @@ from rsvib_torch.restoration.frame_motion import FrameMotion
 
 __all__ = ["restore_dewarp"]
 
-_DEGREE = 5  # of the spline across rows
-
 
 def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 256) -> Tensor:
-    """Undo the displacement of every row, not its blur: fast, and enough for short exposures.
+    """Undo the displacement of every row, not its blur: fast, and sufficient for short exposures.
 
-    Scene row s is fetched at frame row r(s) by a quintic B-spline across rows and moved back by the mean displacement
-    (Eq. 2) of that row by a phase ramp along it. Noise is not amplified.
+    Scene row s is interpolated at frame row r(s) by a quintic B-spline across rows and moved back along the row by the
+    mean displacement (Eq. 2) of that row with a phase ramp. Noise is not amplified.
 
     Args:
         frames: (B, T, C, H, W) in row order.
         motion: Motion of the frames.
-        chunk_rows: Rows fetched at a time; bounds the memory, does not change the result.
+        chunk_rows: Rows interpolated at a time; bounds the memory, does not change the result.
 
     Returns:
         Restored frames of the same shape.
     """
     chunk_rows = check_whole_number("chunk_rows", chunk_rows, at_least=1)
+    degree = 5
     B, T, C, H, W = frames.shape
     rows = motion.frame_rows(torch.arange(H, dtype=torch.float64, device=frames.device))
     mean = motion.vibration.mean_displacement(motion.row_starts(rows), motion.timing.exposure_time)[..., 0]
@@ -37,14 +36,14 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 256
     rows = rows.flatten(0, 1)
 
     length = extended_length(W, motion.reach(H))
-    spectra = spline_spectra(frames, _DEGREE, length)
+    spectra = spline_spectra(frames, degree, length)
     count = spectra.shape[-1]
     cell = rows.detach().floor()
-    weights = bspline_weights(rows - cell, _DEGREE).to(frames.dtype)
-    taps = cell.to(torch.int64)[..., None] + torch.arange(_DEGREE + 1, device=frames.device) - _DEGREE // 2
+    weights = bspline_weights(rows - cell, degree).to(frames.dtype)
+    taps = cell.to(torch.int64)[..., None] + torch.arange(degree + 1, device=frames.device) - degree // 2
     image = torch.arange(B * T, device=frames.device)[:, None, None]
     taps = mirrored(taps, H) + image * H
-    # one row after the other, all channels in it
+    # one entry per row, with all channels
     flat = torch.view_as_real(spectra.movedim(2, 3)).reshape(B * T * H, -1)
 
     def restored(part: slice) -> Tensor:

@@ -1,4 +1,4 @@
-"""Where the pixels of a restored frame are found: scene coordinates, reference shift, visibility."""
+"""Geometry of restored frames: scene coordinates, reference shift, visible pixels, frames restored together."""
 
 import math
 from dataclasses import dataclass
@@ -12,15 +12,16 @@ from rsvib_torch.imaging.trajectory import rows_showing
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 
-__all__ = ["FrameMotion", "frame_motion", "visible_pixels"]
+__all__ = ["FrameMotion", "frame_motion", "joint_groups", "visible_pixels"]
 
 
 @dataclass(frozen=True, eq=False)
 class FrameMotion:
     """Motion of every frame of a batch of stacks, in row order, relative to the frame's own reference shift.
 
-    A restored frame shows the scene at rest, moved by ``shift``: the uniform image motion at the middle of the frame
-    in whole pixels, so that a push-scan frame is restored where it looks. Without image motion the shift is zero.
+    A restored frame contains the scene at rest, moved by ``shift``: the displacement by the uniform image motion at
+    the middle of the frame, rounded to whole pixels. A push-scan frame is thus restored in place. Without image motion
+    the shift is zero.
 
     Attributes:
         vibration: The motion, batch shape (B,).
@@ -35,7 +36,7 @@ class FrameMotion:
     shift: Tensor
 
     def frame_rows(self, scene_rows: Tensor) -> Tensor:
-        """Frame rows (B, T, S) that show rows (S,) of the restored frames."""
+        """Frame rows (B, T, S) that contain rows (S,) of the restored frames."""
         return rows_showing(
             scene_rows - self.shift[..., 1, None], self.frame_starts[:, None], self.timing, self.vibration
         )
@@ -71,9 +72,9 @@ def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows
 def visible_pixels(
     timing: SensorTiming, vibration: Motion, size: tuple[int, int], num_frames: int
 ) -> tuple[Tensor, Tensor]:
-    """Pixels of the restored frames that the frames really show, and where the restored frames look.
+    """Pixels of the restored frames that were exposed, and the shift of every restored frame.
 
-    What lies outside was never exposed: restoration continues the frame there by mirroring.
+    Pixels outside the mask were never exposed; restoration extends the frame there by mirroring.
 
     Args:
         timing: The sensor.
@@ -102,7 +103,30 @@ def visible_pixels(
     starts = motion.row_starts(rows)
     displacement = rowwise.mean_displacement(starts, timing.exposure_time)[..., 0] - motion.shift[..., 0, None]
     columns = torch.arange(width, device=vibration.device) + displacement[..., None]
-    seen_rows = ((rows >= 0) & (rows <= height - 1))[..., None]
-    mask = frames_from_row_order(seen_rows & (columns >= 0) & (columns <= width - 1), timing)
+    visible_rows = ((rows >= 0) & (rows <= height - 1))[..., None]
+    mask = frames_from_row_order(visible_rows & (columns >= 0) & (columns <= width - 1), timing)
     shift = offsets_from_row_order(motion.shift, timing)
     return (mask, shift) if batch else (mask[0], shift[0])
+
+
+def joint_groups(count: int, joint: bool | int) -> list[tuple[list[int], int]]:
+    """Indices of the frames that are restored together, and the index of the reference frame, for every result.
+
+    The result is in the coordinates of the reference frame.
+
+    Args:
+        count: Frames of the stack.
+        joint: ``True``: all frames, with the middle one as reference; a number K: every frame with its neighbours,
+            K in all; ``False``: every frame by itself.
+
+    Example:
+        >>> joint_groups(3, True)
+        [([0, 1, 2], 1)]
+        >>> joint_groups(3, 2)
+        [([0, 1], 0), ([1, 2], 1), ([1, 2], 2)]
+    """
+    if joint is True:
+        return [(list(range(count)), count // 2)]
+    size = 1 if joint is False else min(check_whole_number("joint", joint, at_least=1), count)
+    starts = [min(max(frame - (size - 1) // 2, 0), count - size) for frame in range(count)]
+    return [(list(range(first, first + size)), frame) for frame, first in enumerate(starts)]

@@ -1,4 +1,4 @@
-"""What restoration makes of noise, found by sending some through it."""
+"""Noise gain of a restoration, measured with a noise probe."""
 
 from typing import Any
 
@@ -9,14 +9,11 @@ from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration.noise.single_frame import estimate_noise
+from rsvib_torch.restoration.noise.high_pass import estimate_noise
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
 __all__ = ["predict_noise_gain"]
-
-_RIM = 16  # px that are not counted
-_QUIETEST = 1e-4  # of full scale; below, rounding would be measured
 
 
 def predict_noise_gain(
@@ -29,11 +26,11 @@ def predict_noise_gain(
     full_scale: float | None = None,
     **options: Any,
 ) -> Tensor:
-    """Standard deviation of noise after restoration over that before it.
+    """Ratio of the standard deviation of noise after restoration to that before it.
 
-    Restoration is all but linear in the frames: known white noise, half as strong as that of the frames, is added to
-    a strip of them, and the difference that it makes is measured. 1 leaves noise as it is, less smooths it, more is
-    the price of undoing blur.
+    Restoration is nearly linear in the frames. White noise of half the standard deviation of the noise in the frames is
+    added to a strip of them, and the change of the result is measured. A gain below 1 means smoothing; a gain above 1
+    is the cost of deblurring.
 
     Args:
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W).
@@ -54,16 +51,17 @@ def predict_noise_gain(
         >>> round(predict_noise_gain(frames, timing, Vibration.still(), method="dewarp").item(), 1)
         1.0
     """
-    count = check_whole_number("columns", columns, at_least=4 * _RIM)
+    rim = 16  # px at the borders that are excluded
+    count = check_whole_number("columns", columns, at_least=4 * rim)
     prepared = prepare_frames(frames, timing, full_scale=full_scale, allow_missing=False)
     first = max(0, (prepared.images.shape[-1] - count) // 2)
     strip = prepared.images[..., first : first + count].to(torch.float64)
     vibration, _ = vibration_to_undo(vibration, timing, strip.shape[1], strip.shape[-2])
-    level = 0.5 * estimate_noise(strip).square().mean().sqrt().clamp(min=_QUIETEST)
+    level = 0.5 * estimate_noise(strip).square().mean().sqrt().clamp(min=1e-4)  # well above rounding
     generator = torch.Generator(strip.device).manual_seed(0)
     probe = level * torch.randn(strip.shape, generator=generator, dtype=strip.dtype, device=strip.device)
     plain, probed = (
-        restore_prepared(prepared.with_images(images), vibration, method, options)[..., _RIM:-_RIM, _RIM:-_RIM]
+        restore_prepared(prepared.with_images(images), vibration, method, options)[..., rim:-rim, rim:-rim]
         for images in (strip, strip + probe)
     )
     return (probed - plain).square().mean().sqrt() / probe.square().mean().sqrt()

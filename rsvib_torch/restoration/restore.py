@@ -1,9 +1,9 @@
 """Restoration of frames: input preparation, one of the methods, and a check of the result."""
 
-import inspect
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal, TypedDict, Unpack, overload
 
 from torch import Tensor, nn
 
@@ -18,27 +18,94 @@ from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact.exact import restore_exact
 from rsvib_torch.restoration.frame_motion import frame_motion
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
-from rsvib_torch.restoration.verdict.judge import judge_frames
-from rsvib_torch.restoration.verdict.outcome import RestorationWarning, TooLittleInCommonError
-from rsvib_torch.restoration.verdict.pairs import pairs_to_judge
+from rsvib_torch.restoration.verdict.judge import RestorationWarning, judge_frames
+from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError, pairs_to_judge
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
-__all__ = ["MASKS", "METHODS", "VibrationRestorer", "method_options", "restore", "restore_prepared"]
+__all__ = ["METHODS", "RestorationMethod", "VibrationRestorer", "method_options", "restore", "restore_prepared"]
 
-MASKS = ("ignore", "clipped")  # what a method is told of pixels; no options of the user's
-_CALLER = 5  # levels up from where a warning is given: helper, restore and its two decorators
-_JUDGED_PAIRS, _JUDGED_COLUMNS = 2, 160  # of every stack
 
-METHODS: dict[str, Callable[..., Tensor]] = {
-    "exact": restore_exact,
-    "banded": restore_banded,
-    "dewarp": restore_dewarp,
-    "richardson-lucy": restore_richardson_lucy,
+class CommonOptions(TypedDict, total=False):
+    """Options of ``restore`` and ``VibrationRestorer`` for all methods."""
+
+    full_scale: float | None
+    saturation: Saturation
+    check: bool
+
+
+class ExactOptions(CommonOptions, total=False):
+    """Options of method ``"exact"``, see ``restore_exact``."""
+
+    joint: bool | int
+    prior: str
+    noise: float | Literal["auto"]
+    regularisation: float
+    chunk_frequencies: int | None
+    segments: int | None
+
+
+class BandedOptions(CommonOptions, total=False):
+    """Options of method ``"banded"``, see ``restore_banded``."""
+
+    half_rows: int
+    stride: int
+    interpolation: Literal["linear", "cubic"]
+    noise_to_signal: float | Literal["auto"]
+    chunk_rows: int | None
+
+
+class DewarpOptions(CommonOptions, total=False):
+    """Options of method ``"dewarp"``, see ``restore_dewarp``."""
+
+    chunk_rows: int
+
+
+class RichardsonLucyOptions(CommonOptions, total=False):
+    """Options of method ``"richardson-lucy"``, see ``restore_richardson_lucy``."""
+
+    joint: bool | int
+    iterations: int
+
+
+@dataclass(frozen=True)
+class RestorationMethod:
+    """An entry of ``METHODS``.
+
+    Attributes:
+        function: The method, see the contract above ``METHODS``.
+        options: Names and types of its options.
+        masks: Masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels).
+    """
+
+    function: Callable[..., Tensor]
+    options: type
+    masks: tuple[Literal["ignore", "clipped"], ...] = ()
+
+
+# Restoration methods. A method is called as
+#
+#     function(frames, motion, *, ignore=None, clipped=None, **options) -> Tensor
+#
+#     frames: (B, T, C, H, W) float32 or float64 in row order, full scale 1, finite.
+#     motion: FrameMotion of the B stacks.
+#     ignore, clipped: bool tensors shaped like the frames, passed only if listed in ``masks`` and such pixels exist.
+#         Without ``"ignore"``, missing pixels hold local means; without ``"clipped"``, saturated ones count.
+#     returns: frames at rest, of the same shape and dtype, in the coordinates of ``motion.shift``; (B, 1, C, H, W) for
+#         option ``joint=True``.
+#
+# Frames of one stack must not affect other stacks, ``frames`` must not be changed, and gradients must flow to frames
+# and motion. A new method is one module, one TypedDict of its options, one line here, and one overload of ``restore``
+# and of ``VibrationRestorer``.
+METHODS: dict[str, RestorationMethod] = {
+    "exact": RestorationMethod(restore_exact, ExactOptions, ("ignore", "clipped")),
+    "banded": RestorationMethod(restore_banded, BandedOptions),
+    "dewarp": RestorationMethod(restore_dewarp, DewarpOptions),
+    "richardson-lucy": RestorationMethod(restore_richardson_lucy, RichardsonLucyOptions, ("ignore",)),
 }
 
 
 def method_options(method: str) -> tuple[str, ...]:
-    """Options of a restoration method.
+    """Names of the options of a restoration method.
 
     Raises:
         ValueError: If there is no such method.
@@ -48,27 +115,67 @@ def method_options(method: str) -> tuple[str, ...]:
         ('chunk_rows',)
     """
     check_choice("method", method, tuple(METHODS))
-    parameters = inspect.signature(METHODS[method]).parameters.values()
-    return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in MASKS)
+    return tuple(name for name in METHODS[method].options.__annotations__ if name not in CommonOptions.__annotations__)
 
 
-def _check_options(method: str, options: dict[str, Any]) -> None:
-    known = method_options(method)
+def _check_options(method: str, options: Mapping[str, Any]) -> None:
+    """Refuse options that the method does not have."""
+    valid = method_options(method)
     for name in options:
-        if name not in known:
-            raise TypeError(f"method={method!r} has no option {name!r}; its options are {', '.join(known)}")
+        if name not in valid:
+            raise TypeError(f"method={method!r} has no option {name!r}; its options are {', '.join(valid)}")
 
 
-def _method_input(frames: PreparedFrames, method: str, options: dict[str, Any]) -> tuple[Tensor, dict[str, Any]]:
-    """Images and options for a method: masks if it takes them, otherwise images with missing pixels filled."""
-    parameters = inspect.signature(METHODS[method]).parameters
-    if frames.saturated is not None and "clipped" in parameters:
-        options = {**options, "clipped": frames.saturated}
-    if frames.missing is not None and "ignore" in parameters:
-        return frames.images, {**options, "ignore": frames.missing}
-    return frames.filled, options
-
-
+@overload
+def restore(
+    frames: ArrayLike,
+    timing: SensorTiming,
+    vibration: Motion | Detected,
+    *,
+    method: Literal["exact"] = "exact",
+    ignore: Tensor | None = None,
+    **options: Unpack[ExactOptions],
+) -> Tensor: ...
+@overload
+def restore(
+    frames: ArrayLike,
+    timing: SensorTiming,
+    vibration: Motion | Detected,
+    *,
+    method: Literal["banded"],
+    ignore: Tensor | None = None,
+    **options: Unpack[BandedOptions],
+) -> Tensor: ...
+@overload
+def restore(
+    frames: ArrayLike,
+    timing: SensorTiming,
+    vibration: Motion | Detected,
+    *,
+    method: Literal["dewarp"],
+    ignore: Tensor | None = None,
+    **options: Unpack[DewarpOptions],
+) -> Tensor: ...
+@overload
+def restore(
+    frames: ArrayLike,
+    timing: SensorTiming,
+    vibration: Motion | Detected,
+    *,
+    method: Literal["richardson-lucy"],
+    ignore: Tensor | None = None,
+    **options: Unpack[RichardsonLucyOptions],
+) -> Tensor: ...
+@overload
+def restore(
+    frames: ArrayLike,
+    timing: SensorTiming,
+    vibration: Motion | Detected,
+    *,
+    method: str,
+    ignore: Tensor | None = None,
+    **options: Any,
+) -> Tensor: ...
 @outside_graphs
 @full_precision
 def restore(
@@ -85,35 +192,35 @@ def restore(
 ) -> Tensor:
     """Restore frames taken by a vibrating rolling-shutter camera: geometry and sharpness.
 
-    A restored frame shows the scene at rest. With a uniform image motion it shows the scene moved by the whole pixels
-    of that motion at the middle of the frame (``visible_pixels`` tells them); what a frame never exposed, a rim as
-    wide as the displacement, is continued by mirroring (``visible_pixels`` tells which pixels those are).
+    A restored frame contains the scene at rest. With a uniform image motion, the scene is moved by that motion at the
+    middle of the frame, in whole pixels. Pixels that were never exposed, a rim as wide as the displacement, are filled
+    by mirroring. ``visible_pixels`` returns both the shift and the mask of these pixels.
 
-    Pixels without data (NaN, or ``ignore``) do not count, and saturated ones say only that they are no darker than
-    their level. Method ``"exact"`` finds what they would have shown from all others, jointly from all frames where it
-    is told to; ``"banded"`` and ``"dewarp"`` put local means in place of pixels without data, and take saturated
-    pixels at their level.
+    Pixels without data (NaN, or ``ignore``) do not count, and saturated ones only give a lower bound: method
+    ``"exact"`` estimates both from all other pixels. ``"richardson-lucy"`` excludes pixels without data; ``"banded"``
+    and ``"dewarp"`` replace them by local means. These three methods treat saturated pixels as measured.
 
     Args:
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation; tensor or NumPy array.
         timing: The sensor.
         vibration: The motion in image axes: one for all, or a batch (B,) for a batch of stacks. Or what
-            ``detect_vibration`` returned: axes that it does not trust are then left alone, see ``trusted_vibration``.
-        method: ``"exact"``: all rows coupled, several frames jointly on demand; ``"banded"``: row by row within
-            slabs (Sec. 3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest; ``"richardson-lucy"``: iterated,
-            nowhere negative, several frames jointly on demand.
+            ``detect_vibration`` returned: axes without a reliable vibration are then left alone, see
+            ``trusted_vibration``.
+        method: ``"exact"``: all rows coupled, several frames jointly if requested; ``"banded"``: row by row within
+            slabs (Sec. 3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest; ``"richardson-lucy"``: iterative,
+            non-negative, several frames jointly if requested.
         full_scale: Count that means 1.0, for integer frames other than uint8.
-        ignore: Boolean mask shaped like the frames of pixels that do not count; they may hold anything. Stuck columns,
-            and a rim that never sees light, are to be named here: they show no noise, and do not move with the scene.
+        ignore: Boolean mask shaped like the frames of pixels that do not count; they may hold any value. Mask stuck
+            columns and a dark rim here: they do not move with the scene, and bias the noise level.
         saturation: Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for
-            integer frames, none for floats, which do not say where they were cut; None for none.
-        check: Judge the result on a part of the frames, and warn where it is no better than what came in; needs two
-            frames. ``judge_restoration`` does it on all of them.
+            integer frames, none for floating-point frames, whose level is unknown; None for none.
+        check: Judge the result on a part of the frames, and warn if it is no better than the raw frames; needs two
+            frames. ``judge_restoration`` judges all of them.
         **options: Options of the method, see ``restore_exact``, ``restore_banded``, ``restore_dewarp`` and
             ``restore_richardson_lucy``.
 
     Returns:
-        Restored frames of the same shape and floating dtype (float32 where integers went in, full scale 1); with
+        Restored frames of the same shape and floating-point dtype (float32 with full scale 1 for integer frames); with
         ``joint=True`` the time axis has length 1.
 
     Raises:
@@ -136,7 +243,7 @@ def restore(
     _, count, _, height, _ = prepared.images.shape
     vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
     for note in left_alone:
-        warnings.warn(note, RestorationWarning, stacklevel=_CALLER - 1)
+        warnings.warn(note, RestorationWarning, stacklevel=4)  # the caller, above two decorators
     restored = restore_prepared(prepared, vibration, method, options)
     if check:
         _warn_if_worse(prepared, restored.detach(), vibration, options.get("joint", False))
@@ -162,9 +269,12 @@ def restore_prepared(
     options = dict(options or {})
     check_choice("method", method, tuple(METHODS))
     _check_options(method, options)
-    images, chosen = _method_input(frames, method, options)
+    chosen = METHODS[method]
+    masks = {"ignore": frames.missing, "clipped": frames.saturated}
+    options |= {name: masks[name] for name in chosen.masks if masks[name] is not None}
+    images = frames.images if "ignore" in chosen.masks else frames.filled
     motion = _motion_in_row_order(frames, vibration)
-    return METHODS[method](images, frame_motion(motion, frames.timing, images.shape[1], images.shape[-2]), **chosen)
+    return chosen.function(images, frame_motion(motion, frames.timing, images.shape[1], images.shape[-2]), **options)
 
 
 def _motion_in_row_order(frames: PreparedFrames, vibration: Motion) -> Motion:
@@ -184,13 +294,13 @@ def _motion_in_row_order(frames: PreparedFrames, vibration: Motion) -> Motion:
 
 
 def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Motion, joint: bool | int) -> None:
-    """Judge each stack of a batch on a strip of columns of a few pairs of frames."""
+    """Judge each stack of a batch on a strip of 160 columns of two pairs of frames."""
     raw = frames.filled.detach()
     count = raw.shape[1]
     if count < 2:
         return
     motion = _motion_in_row_order(frames, vibration)
-    pairs = pairs_to_judge(count, joint, _JUDGED_PAIRS)
+    pairs = pairs_to_judge(count, joint, 2)
     shared = count if joint is True else max(int(joint), 1)
     for stack in range(len(raw)):
         still = motion[stack].detached()
@@ -203,7 +313,7 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Motion, 
                 frame_motion(still.expanded(1), frames.timing, count, raw.shape[-2]),
                 pairs,
                 shared=min(shared, count),
-                columns=_JUDGED_COLUMNS,
+                columns=160,
                 hidden=None if frames.missing is None else frames.missing[stack],
             )
         except TooLittleInCommonError:
@@ -211,13 +321,13 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Motion, 
         if verdict.overall in ("partly", "worse"):
             where = f"stack {stack}: " if len(raw) > 1 else ""
             summary = verdict.in_image_axes(frames.image_timing).summary
-            warnings.warn(f"{where}{summary}", RestorationWarning, stacklevel=_CALLER)
+            warnings.warn(f"{where}{summary}", RestorationWarning, stacklevel=5)  # the caller of ``restore``
 
 
 class VibrationRestorer(nn.Module):
     """``restore`` as a module, for stacks (T, H, W) to batches of stacks (B, T, C, H, W).
 
-    It has no weights. Autocast does not reach it, and ``torch.compile`` calls it as it is, at one break of the graph.
+    It has no weights, ignores autocast, and is called by ``torch.compile`` unchanged, at one break of the graph.
     Gradients flow to frames and vibration.
 
     Args:
@@ -229,6 +339,24 @@ class VibrationRestorer(nn.Module):
         **options: As in ``restore``.
     """
 
+    @overload
+    def __init__(
+        self, timing: SensorTiming, *, method: Literal["exact"] = "exact", **options: Unpack[ExactOptions]
+    ) -> None: ...
+    @overload
+    def __init__(
+        self, timing: SensorTiming, *, method: Literal["banded"], **options: Unpack[BandedOptions]
+    ) -> None: ...
+    @overload
+    def __init__(
+        self, timing: SensorTiming, *, method: Literal["dewarp"], **options: Unpack[DewarpOptions]
+    ) -> None: ...
+    @overload
+    def __init__(
+        self, timing: SensorTiming, *, method: Literal["richardson-lucy"], **options: Unpack[RichardsonLucyOptions]
+    ) -> None: ...
+    @overload
+    def __init__(self, timing: SensorTiming, *, method: str, **options: Any) -> None: ...
     def __init__(
         self,
         timing: SensorTiming,

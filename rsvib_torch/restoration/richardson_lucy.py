@@ -1,4 +1,4 @@
-"""Restoration by Richardson-Lucy iterations: what was never negative stays so."""
+"""Restoration by Richardson-Lucy iterations on the row-varying blur; the result is non-negative."""
 
 from collections.abc import Sequence
 
@@ -10,13 +10,9 @@ from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.imaging.blur import RowVaryingBlur
 from rsvib_torch.imaging.psf import RowPSF, row_psf
 from rsvib_torch.restoration.dewarp import restore_dewarp
-from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.joint_groups import joint_groups
+from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 
 __all__ = ["restore_richardson_lucy"]
-
-_LEAST = 1e-4  # of the mean: values that start lower would stay there for long
-_SEEN = 0.1  # of a pixel: what all pixels together see less of stays as it started
 
 
 def restore_richardson_lucy(
@@ -29,23 +25,23 @@ def restore_richardson_lucy(
 ) -> Tensor:
     """Restore frames by Richardson-Lucy iterations on the row-varying blur.
 
-    ``c <- c K^T(m g / K c) / K^T m`` climbs to the most probable scene for Poisson counts g of the pixels m that were
-    measured (Richardson 1972; Lucy 1974). The unknowns c are cubic B-spline coefficients of the scene: splines are
-    positive, so that the scene is, and they do not blur as linear interpolation does. Every step conserves the flux.
-    It starts from the frames with their geometry undone; fewer iterations amplify less noise. Several frames of one
-    scene add what they see, ``sum K^T(m g / K c) / sum K^T m``, and start from their mean.
+    ``c <- c K^T(m g / K c) / K^T m`` increases the likelihood of the scene for Poisson counts g of the measured pixels
+    m (Richardson 1972; Lucy 1974). The unknowns c are cubic B-spline coefficients of the scene: B-splines are positive,
+    hence the scene is non-negative, and they do not add the blur of linear interpolation. Every step preserves the
+    total intensity. The initial scene is the result of ``restore_dewarp``; fewer iterations amplify less noise. For
+    several frames of one scene, ``sum K^T(m g / K c) / sum K^T m`` is used, and their mean is the initial scene.
 
     Args:
         frames: (B, T, C, H, W) in row order; negative values count as 0.
         motion: Motion of the frames.
         joint: ``True``: one image from all frames, in the coordinates of the middle one (the time axis keeps length
-            1); a number K: every frame from K neighbouring ones; ``False``: every frame from itself. Where image
-            motion moves frames, only what they have in common with the restored one is joined.
-        iterations: How many.
+            1); a number K: every frame from K neighbouring ones; ``False``: every frame from itself. With
+            image motion, only the part that a frame shares with the restored one is used.
+        iterations: Number of iterations.
         ignore: Boolean mask shaped like the frames of pixels that do not count.
 
     Returns:
-        Restored frames of the same shape, or (B, 1, C, H, W); nowhere negative.
+        Non-negative restored frames of the same shape, or (B, 1, C, H, W).
     """
     iterations = check_whole_number("iterations", iterations, at_least=1)
     B, T, _, H, W = frames.shape
@@ -57,11 +53,11 @@ def restore_richardson_lucy(
     if ignore is not None:
         frames, measured = fill_with_means(frames, ignore), (~ignore).to(frames.dtype)
     counts = frames.clamp(min=0.0)
-    upright, shift = restore_dewarp(frames, motion), motion.shift.to(torch.int64)
+    dewarped, shift = restore_dewarp(frames, motion), motion.shift.to(torch.int64)
     # degree 1: the kernels act on the coefficients themselves
     if all(members == [reference] for members, reference in groups):
         kernels = RowPSF((psf.first_tap - shift[:, :, None])[:, :, None, None], weights[:, :, None], 1)
-        alone = _climb(counts.unsqueeze(2), measured.unsqueeze(2), upright.unsqueeze(2), kernels, iterations)
+        alone = _iterate(counts.unsqueeze(2), measured.unsqueeze(2), dewarped.unsqueeze(2), kernels, iterations)
         return _at_pixels(alone.squeeze(2))
     restored = []
     for stack in range(B):
@@ -69,32 +65,34 @@ def restore_richardson_lucy(
             first = psf.first_tap[stack, members] - shift[stack, reference]
             kernels = RowPSF(first[:, None], weights[stack, members], 1)
             elsewhere = torch.tensor([member != reference for member in members], device=frames.device)
-            beyond = elsewhere[:, None, None, None] & _looking_beyond(kernels, W)
-            start = _mean_of_shared(upright[stack, members], (shift[stack, members] - shift[stack, reference]).tolist())
+            beyond = elsewhere[:, None, None, None] & _depends_on_boundary(kernels, W)
+            start = _mean_of_overlap(
+                dewarped[stack, members], (shift[stack, members] - shift[stack, reference]).tolist()
+            )
             restored.append(
-                _climb(counts[stack, members], measured[stack, members] * ~beyond, start, kernels, iterations)
+                _iterate(counts[stack, members], measured[stack, members] * ~beyond, start, kernels, iterations)
             )
     return _at_pixels(torch.cat(restored).unflatten(0, (B, len(groups))))
 
 
-def _climb(counts: Tensor, measured: Tensor, start: Tensor, kernels: RowPSF, iterations: int) -> Tensor:
-    """Coefficients (..., 1, C, H, W), like ``start``, of the scene that frames (..., M, C, H, W) show."""
+def _iterate(counts: Tensor, measured: Tensor, start: Tensor, kernels: RowPSF, iterations: int) -> Tensor:
+    """Iterate the coefficients ``start`` (..., 1, C, H, W) of the scene of frames (..., M, C, H, W)."""
     blur, size = RowVaryingBlur(kernels, origin=(0, 0)), tuple(start.shape)
     tiny = torch.finfo(counts.dtype).tiny
     counts = counts * measured
     total, pixels = (values.sum((-4, -2, -1), keepdim=True) for values in (counts, measured))
     mean = (total / pixels.clamp(min=1.0)).clamp(min=tiny)
     sensitivity = blur.adjoint(measured, size)
-    seen = sensitivity > _SEEN
-    scene = torch.maximum(start, _LEAST * mean)
+    visible = sensitivity > 0.1  # of one pixel; a coefficient that affects the pixels less keeps its initial value
+    scene = torch.maximum(start, 1e-4 * mean)  # from a lower value, multiplicative updates need many iterations
     for _ in range(iterations):
         ratio = counts / blur(scene).clamp(min=tiny)
-        scene = torch.where(seen, scene * blur.adjoint(ratio, size) / sensitivity.clamp(min=tiny), scene)
+        scene = torch.where(visible, scene * blur.adjoint(ratio, size) / sensitivity.clamp(min=tiny), scene)
     return scene
 
 
-def _looking_beyond(kernels: RowPSF, width: int) -> Tensor:
-    """Pixels (..., R, W) that also show what lies beyond a scene of R rows and W columns, where it is mirrored."""
+def _depends_on_boundary(kernels: RowPSF, width: int) -> Tensor:
+    """Pixels (..., R, W) that depend on the mirrored extension of a scene of R rows and W columns."""
     inside = torch.ones((), dtype=torch.bool, device=kernels.first_tap.device)
     num_rows = kernels.weights.shape[-3]
     places = torch.arange(num_rows, device=inside.device)[:, None], torch.arange(width, device=inside.device)
@@ -106,29 +104,29 @@ def _looking_beyond(kernels: RowPSF, width: int) -> Tensor:
     return ~inside
 
 
-def _mean_of_shared(upright: Tensor, apart: Sequence[Sequence[int]]) -> Tensor:
-    """Mean (1, C, H, W), pixel by pixel, of those frames that show it.
+def _mean_of_overlap(dewarped: Tensor, apart: Sequence[Sequence[int]]) -> Tensor:
+    """Mean (1, C, H, W) of frames, pixel by pixel, over the frames that contain the pixel.
 
     Args:
-        upright: Frames (M, C, H, W) without distortion.
-        apart: By how many px (x, y) their content lies beyond that of the mean.
+        dewarped: Frames (M, C, H, W) without distortion.
+        apart: Displacement (x, y) in px of their content relative to that of the mean.
     """
-    height, width = upright.shape[-2:]
-    total, number = torch.zeros_like(upright[:1]), torch.zeros_like(upright[:1])
-    for image, (x, y) in zip(upright, apart, strict=True):
-        here = (..., _shared(height, y), _shared(width, x))
-        total[here] += image[..., _shared(height, -y), _shared(width, -x)]
+    height, width = dewarped.shape[-2:]
+    total, number = torch.zeros_like(dewarped[:1]), torch.zeros_like(dewarped[:1])
+    for image, (x, y) in zip(dewarped, apart, strict=True):
+        here = (..., _overlap(height, y), _overlap(width, x))
+        total[here] += image[..., _overlap(height, -y), _overlap(width, -x)]
         number[here] += 1.0
     return total / number
 
 
-def _shared(length: int, step: int) -> slice:
+def _overlap(length: int, step: int) -> slice:
     """Part of an axis whose content is found ``step`` px further on in another image of that length."""
     return slice(max(-step, 0), max(length - step, 0))
 
 
 def _at_pixels(coefficients: Tensor) -> Tensor:
-    """Cubic B-splines with mirrored ends at the pixels, (..., H, W)."""
+    """Values at the pixels of cubic B-splines with mirrored ends, (..., H, W)."""
     for dim in (-2, -1):
         length = coefficients.shape[dim]
         before = coefficients.narrow(dim, min(1, length - 1), 1)

@@ -1,12 +1,17 @@
+"""Noise levels of frames: each estimator against drawn scenes with known noise, and the policy that combines them."""
+
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.restoration.frame_motion import frame_motion
-from rsvib_torch.restoration.noise.noise_levels import noise_levels
-from rsvib_torch.restoration.noise.single_frame import estimate_noise
+from rsvib_torch.restoration.noise.high_pass import estimate_noise
+from rsvib_torch.restoration.noise.motion_blur import noise_of_blurred_frames
+from rsvib_torch.restoration.noise.policy import ESTIMATORS, noise_levels
+from rsvib_torch.restoration.noise.spectral_floor import noise_floor
 from rsvib_torch.restoration.scene_model.row_kernel import (
     interpolation_error,
     kernel_spectrum,
@@ -15,6 +20,7 @@ from rsvib_torch.restoration.scene_model.row_kernel import (
 )
 
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+DEFAULT_MOTION = Motion()
 
 
 def levels(frames, motion):
@@ -29,7 +35,7 @@ def test_white_noise_is_measured(shape):
 
 
 @pytest.mark.parametrize("quiet", [slice(None, 1000), slice(500, 1500), slice(-1000, None)])
-def test_quiet_parts_of_large_images_are_found_wherever_they_are(quiet):
+def test_quiet_part_of_a_large_image_determines_the_level(quiet):
     generator = torch.Generator().manual_seed(3)
     image = 0.2 * torch.rand(2000, 1400, generator=generator)
     image[quiet] = 0.01 * torch.randn(1000, 1400, generator=generator)
@@ -37,7 +43,7 @@ def test_quiet_parts_of_large_images_are_found_wherever_they_are(quiet):
 
 
 @pytest.mark.parametrize("image_motion", [(0.0, 0.0), (600.0, -400.0)])
-def test_two_frames_tell_texture_from_noise(image_motion):
+def test_two_frames_separate_texture_from_noise(image_motion):
     motion = Motion(image_motion=image_motion)
     margin = 90
     scene = draw_scene(300 + 2 * margin, 260 + 2 * margin, seed=4, blur=0.5)
@@ -65,7 +71,7 @@ def test_blocks_with_ignored_pixels_do_not_count(shape):
 
 @pytest.mark.parametrize("rows", [20, 100])
 @pytest.mark.parametrize("dead", ["black", "constant", "not measured"])
-def test_frames_that_show_nothing_have_as_much_noise_as_the_others(rows, dead):
+def test_empty_frames_are_assigned_the_noise_of_the_others(rows, dead):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     frames = torch.from_numpy(take_frames(draw_scene(336, 288, seed=12), timing, Motion(), 3, 0.01)).float()[:, None]
     motion = frame_motion(Motion().vibration().expanded(1), timing, 3, frames.shape[-2])
@@ -83,7 +89,7 @@ def test_frames_that_show_nothing_have_as_much_noise_as_the_others(rows, dead):
 
 @pytest.mark.parametrize("rows", [20, 100])
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.6])
-def test_what_was_not_measured_says_nothing(rows, share):
+def test_missing_pixels_do_not_affect_the_level(rows, share):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     frames = torch.from_numpy(take_frames(draw_scene(336, 288, seed=12), timing, Motion(), 2, 0.01)).float()[:, None]
     motion = frame_motion(Motion().vibration().expanded(1), timing, 2, frames.shape[-2])
@@ -93,12 +99,146 @@ def test_what_was_not_measured_says_nothing(rows, share):
     torch.testing.assert_close(found, torch.full((2,), 0.01), rtol=0.12, atol=0)
 
 
-def test_a_changed_scene_is_not_taken_for_more_noise_than_a_frame_has():
+def test_a_changed_scene_does_not_raise_the_level():
     scene = draw_scene(336, 288, seed=12)
     frames = take_frames(scene, TIMING, Motion(), 2, 0.005)
     frames[1] = frames[1][::-1]
     found = levels(frames, Motion())
     assert found.max().item() == pytest.approx(0.005, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("case", ["constant", "tiny", "all missing"])
+def test_estimators_return_nan_where_they_cannot_estimate(name, case):
+    frames = {"constant": torch.full((2, 1, 160, 160), 0.3), "tiny": torch.rand(2, 1, 5, 3)}.get(
+        case, torch.rand(2, 1, 160, 160)
+    )
+    ignore = torch.ones(frames.shape, dtype=torch.bool) if case == "all missing" else None
+    motion = frame_motion(Motion().vibration().expanded(1), TIMING.in_row_order(), 2, frames.shape[-2])
+    high_pass = torch.full((2,), float("nan"))
+    before = frames.clone()
+    power = ESTIMATORS[name](frames, motion, 0, ignore, high_pass)
+    assert power.shape == (2,)
+    assert power.isnan().all() or (power >= 0).all()
+    assert torch.equal(frames, before)
+
+
+def fractal(steepness, optics, size=320, seed=5):
+    """Texture whose amplitude falls like a power of the frequency, through Gaussian optics."""
+    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size))
+    frequency[0, 0] = np.inf
+    noise = np.random.default_rng(seed).standard_normal((size, size))
+    texture = np.fft.irfft2(np.fft.rfft2(noise) / frequency**steepness, (size, size))
+    return 0.5 + 0.15 * ndimage.gaussian_filter(texture / texture.std(), optics, mode="wrap")
+
+
+def with_noise(scene, level, seed=0):
+    return torch.from_numpy(scene + level * np.random.default_rng(seed).standard_normal(scene.shape)).float()
+
+
+def floor_of(image):
+    return noise_floor(image).sqrt().item()
+
+
+@pytest.mark.parametrize("level", [1e-4, 0.02])
+@pytest.mark.parametrize("shape", [(64, 64), (200, 90), (700, 500)])
+def test_floor_of_white_noise(shape, level):
+    noise = level * torch.randn(shape, generator=torch.Generator().manual_seed(2))
+    assert floor_of(0.3 + noise) == pytest.approx(level, rel=0.1 if min(shape) > 64 else 0.3)
+
+
+@pytest.mark.parametrize(
+    ("steepness", "level", "texture_adds"), [(1.0, 0.02, 1.2), (1.5, 0.005, 1.09), (1.5, 0.002, 1.4)]
+)
+def test_floor_is_below_texture(steepness, level, texture_adds):
+    image = with_noise(fractal(steepness, 0.5), level)
+    assert estimate_noise(image).item() > texture_adds * level
+    assert 0.6 * level < floor_of(image) < 0.5 * (level + estimate_noise(image).item())
+
+
+@pytest.mark.parametrize("optics", [0.5, 0.7])
+def test_floor_of_texture_without_noise_is_low(optics):
+    image = with_noise(fractal(1.0, optics), 0.0)
+    assert floor_of(image) < 0.5 * estimate_noise(image).item()
+
+
+def test_floor_of_edges_and_flat_ground():
+    assert floor_of(with_noise(draw_scene(320, 320, 3), 0.005)) == pytest.approx(0.005, rel=0.15)
+
+
+def test_floor_of_each_image_is_independent_and_proportional():
+    one, two = with_noise(fractal(1.5, 0.5), 0.005), with_noise(fractal(2.0, 0.5, seed=6), 0.02)
+    found = noise_floor(torch.stack([one, two])[None])
+    assert found.shape == (1, 2)
+    torch.testing.assert_close(found[0], torch.stack([noise_floor(one), noise_floor(two)]), rtol=1e-4, atol=0)
+    torch.testing.assert_close(noise_floor(3 * one), 9 * noise_floor(one), rtol=1e-4, atol=0)
+
+
+def test_floor_excludes_squares_with_ignored_pixels():
+    image = with_noise(fractal(1.5, 0.5), 0.01)
+    hidden = torch.zeros(image.shape, dtype=torch.bool)
+    hidden[:, 200:] = True
+    filled = image.masked_fill(hidden, 0.5)
+    assert noise_floor(filled, hidden).sqrt().item() == pytest.approx(0.01, rel=0.1)
+    assert noise_floor(filled).sqrt().item() < 0.85 * 0.01
+    assert noise_floor(filled, torch.ones_like(hidden)).isnan()
+
+
+def test_floor_of_small_and_empty_images():
+    assert noise_floor(torch.rand(2, 63, 200)).isnan().all()
+    assert noise_floor(torch.zeros(64, 64)) == 0
+
+
+def texture(size, blur, seed=1):
+    noise = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal((size, size)), blur, mode="wrap")
+    return np.clip(0.5 + 0.05 * noise / noise.std(), 0, 1)
+
+
+def blurred_frames(scene, rows, noise, count=1, motion=DEFAULT_MOTION):
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
+    clean = take_frames(scene, timing, motion, count, samples=24)
+    frames = clean + noise * np.random.default_rng(3).standard_normal(clean.shape)
+    moved = frame_motion(motion.vibration().expanded(1), timing, count, frames.shape[-2])
+    return torch.from_numpy(frames).float()[:, None], moved
+
+
+@pytest.mark.parametrize(
+    ("rows", "noise", "texture_adds"),
+    [(400, 0.001, 2.0), (400, 0.002, 1.4), (100, 0.005, 1.25), (100, 0.02, 1.03), (400, 0.02, 1.02)],
+)
+def test_motion_blur_separates_dense_texture_from_noise(rows, noise, texture_adds):
+    frames, motion = blurred_frames(texture(420, 0.7), rows, noise)
+    assert estimate_noise(frames[0])[0] > texture_adds * noise
+    assert noise_of_blurred_frames(frames, motion, 0)[0].sqrt().item() == pytest.approx(noise, rel=0.12)
+
+
+def test_motion_blur_with_edges_and_flat_ground():
+    frames, motion = blurred_frames(draw_scene(420, 420, 14), 100, 0.005)
+    assert noise_of_blurred_frames(frames, motion, 0)[0].sqrt().item() == pytest.approx(0.005, rel=0.1)
+
+
+def test_motion_blur_measures_every_frame_by_itself():
+    frames, motion = blurred_frames(texture(420, 0.7), 400, 0.0, 2)
+    levels = torch.tensor([0.002, 0.006])
+    noise = torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
+    frames = frames + levels[:, None, None, None] * noise
+    found = noise_of_blurred_frames(frames, motion, 0).sqrt().float()
+    torch.testing.assert_close(found, levels, rtol=0.12, atol=0)
+    wrong = noise_of_blurred_frames(frames.flip(0), motion, 0).sqrt().float().flip(0)
+    assert (wrong / levels - 1).abs().max() > 0.5
+
+
+def test_motion_blur_averages_channels():
+    (one, motion), (two, _) = (blurred_frames(texture(420, 0.7, seed), 400, 0.003) for seed in (1, 2))
+    colour = torch.cat([one, two], dim=1)
+    assert noise_of_blurred_frames(colour, motion, 0).sqrt().item() == pytest.approx(0.003, rel=0.1)
+    torch.testing.assert_close(noise_of_blurred_frames(3 * one, motion, 0), 9 * noise_of_blurred_frames(one, motion, 0))
+
+
+@pytest.mark.parametrize(("rows", "size"), [(20, 420), (100, 180)])
+def test_motion_blur_does_not_apply_without_blur_or_to_small_frames(rows, size):
+    frames, motion = blurred_frames(texture(size, 0.7), rows, 0.004)
+    assert noise_of_blurred_frames(frames, motion, 0).isnan().all()
 
 
 def test_kernel_between_rows():

@@ -1,5 +1,6 @@
-"""The door to restoration: what it takes, what it leaves alone, and what it warns of."""
+"""``restore``: accepted input, options, axes that are left alone, missing and saturated pixels, warnings."""
 
+import inspect
 import math
 import warnings
 from dataclasses import replace
@@ -18,7 +19,7 @@ from rsvib_torch.restoration import (
     restore,
     trusted_vibration,
 )
-from rsvib_torch.restoration.restore import METHODS
+from rsvib_torch.restoration.restore import METHODS, method_options
 
 TIMING = SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=448)
 MOTION = Motion((2.1, 3.2), (71.0, 113.0), (0.4, 1.3))
@@ -119,7 +120,7 @@ def test_an_axis_that_is_known_too_badly_is_left_alone(taken):
     doubtful = detected(MOTION.vibration())
     doubtful.std.phase = torch.tensor([[1.2], [0.1]], dtype=torch.float64)
     with pytest.warns(
-        RestorationWarning, match=r"x is left alone: its displacement of 1\.5 px is only known to \+- 1\.8"
+        RestorationWarning, match=r"x is left alone: its displacement of 1\.5 px has a standard deviation of 1\.8"
     ):
         found = restore(frames, TIMING, doubtful, check=False)
     only_y = Vibration([0.0, 3.2], MOTION.frequency, MOTION.phase)
@@ -220,14 +221,14 @@ def test_saturated_counts_are_no_darker_than_their_level(rows, better, largest):
 
 
 @pytest.mark.parametrize("scan_axis", [-2, -1])
-def test_saturated_pixels_are_told_to_the_method(lamps, monkeypatch, scan_axis):
+def test_saturated_pixels_are_passed_to_the_method(lamps, monkeypatch, scan_axis):
     counts, told = lamps[1], []
 
     def method(frames, motion, *, ignore=None, clipped=None):
         told.append((ignore, clipped))
         return frames
 
-    monkeypatch.setitem(METHODS, "exact", method)
+    monkeypatch.setitem(METHODS, "exact", replace(METHODS["exact"], function=method))
     timing, vibration = replace(TIMING, scan_axis=scan_axis), MOTION.vibration()
     expected = counts == 4095 if scan_axis == -2 else (counts == 4095).transpose(-2, -1)
 
@@ -298,3 +299,28 @@ def test_arrays_and_turned_sensors(taken):
     only_y = Vibration([0.0, 3.2], MOTION.frequency, MOTION.phase)
     expected = restore(frames, TIMING, only_y, method="dewarp", check=False)
     torch.testing.assert_close(found.transpose(-2, -1), expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_typed_options_are_those_of_the_function(name):
+    method = METHODS[name]
+    parameters = inspect.signature(method.function).parameters.values()
+    keywords = {p.name: p.annotation for p in parameters if p.kind is p.KEYWORD_ONLY}
+    assert set(method.masks) == {"ignore", "clipped"} & set(keywords)
+    assert {*method_options(name), *method.masks} == set(keywords)
+    for option in method_options(name):
+        assert method.options.__annotations__[option] == keywords[option]
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda **options: restore(torch.rand(1, 32, 32), TIMING, MOTION.vibration(), **options),
+        lambda **options: VibrationRestorer(TIMING, **options),
+    ],
+)
+@pytest.mark.parametrize("name", METHODS)
+def test_unknown_options_are_refused_with_the_valid_names(build, name):
+    valid = ", ".join(method_options(name))
+    with pytest.raises(TypeError, match=f"method='{name}' has no option 'strength'; its options are {valid}"):
+        build(method=name, strength=1.0)

@@ -15,9 +15,8 @@ from rsvib_torch.restoration.exact.filling import fill_beyond_ends, fill_missing
 from rsvib_torch.restoration.exact.priors import PRIORS, PriorOptions
 from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem
 from rsvib_torch.restoration.exact.strength import Strengths, prior_strength
-from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.joint_groups import joint_groups
-from rsvib_torch.restoration.noise.noise_levels import noise_levels
+from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
+from rsvib_torch.restoration.noise.policy import noise_levels
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels, row_kernels
 from rsvib_torch.restoration.scene_model.row_prior import RowPrior, brightness, fit_prior
 
@@ -60,7 +59,7 @@ def restore_exact(
             several times slower.
         noise: Standard deviation of the noise (full scale 1); ``"auto"`` estimates it for every frame. Noise and
             texture are distinguished with two frames or with blur, and only within bounds with one sharp frame, see
-            ``noise_floor``.
+            ``noise_levels``.
         regularisation: Factor on the prior; 1 is the strength estimated from the frames.
         ignore: Boolean mask shaped like the frames of missing pixels; their values are not used, and are estimated from
             all others.

@@ -1,1 +1,1 @@
-"""Estimators of the noise level of frames."""
+"""Noise level of frames: a policy, and one module per estimator."""

@@ -1,8 +1,13 @@
-"""Did restoration help? Judged without truth, by how well frames of one scene agree."""
+"""Verdict on a restoration without the true scene: agreement between frames of one scene.
+
+A restored frame, blurred by the motion of the next frame, should equal that next frame. The residual displacement
+between the two and the estimated gain in PSNR determine the outcome of every pair of frames, see ``_outcome``.
+"""
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -12,96 +17,171 @@ from rsvib_torch.frames.arrays import as_tensor
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
-from rsvib_torch.restoration.joint_groups import joint_groups
-from rsvib_torch.restoration.noise.single_frame import estimate_noise
-from rsvib_torch.restoration.verdict.misfit import misfit
-from rsvib_torch.restoration.verdict.outcome import OUTCOMES, Outcome, RestorationVerdict
-from rsvib_torch.restoration.verdict.pairs import FramePair, equally_bright, pairs_to_judge, shared_part
+from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, joint_groups
+from rsvib_torch.restoration.noise.high_pass import estimate_noise
+from rsvib_torch.restoration.verdict.pairs import FramePair, equally_bright, misfit, pairs_to_judge, shared_part
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
-__all__ = ["judge_frames", "judge_prepared", "judge_restoration"]
+__all__ = [
+    "Outcome",
+    "RestorationVerdict",
+    "RestorationWarning",
+    "judge_frames",
+    "judge_prepared",
+    "judge_restoration",
+]
 
-_EXPLAINED = 0.35  # of the displacement between the raw frames may remain
-_UNCHANGED = 0.9  # of it remaining means that nothing was gained
-_FINEST = 0.03  # px, a misfit that never matters
-_DOUBTFUL_GAIN, _BAD_GAIN = -2.0, -4.0  # dB; the estimate is low by as much where the exposure blurs most
-_WELCOME_GAIN = 1.0  # dB
-_QUIETEST = 1e-5  # noise level below which none is assumed, of full scale
-_MISSING = 0.5  # of the pixels of a pair: with more it is not judged
-_SMALL = 0.05  # of the displacement along the other axis: as much is no motion that was made up
+Outcome = Literal["helps", "unknown", "partly", "worse"]
+_OUTCOMES: tuple[Outcome, ...] = ("helps", "unknown", "partly", "worse")  # in order of concern
+
+# Thresholds of the two scores of the verdict, fitted on 720 restorations with known truth, see docs/ablation.md.
+_PARTLY_RESIDUAL = 0.35  # of the displacement between the raw frames; above, a part of the vibration was not undone
+_WORSE_RESIDUAL = 0.8  # of that displacement; above, the vibration was not undone
+_GAIN_ERROR = 2.0  # dB; error of the estimated gain, up to which its sign is not used
+
+_MIN_NOISE = 1e-5  # of full scale; noise level assumed at least, rounding of float32 images
 
 
-def _mean_square(difference: Tensor) -> Tensor:
-    return difference.square().mean(dtype=torch.float64)
+class RestorationWarning(UserWarning):
+    """A restored frame may be worse than the raw one, or a part of the vibration was not undone."""
 
 
-def _moves(motion: FrameMotion) -> tuple[bool, bool]:
-    """Whether the vibration claims to move the image along x, y."""
-    x, y = motion.vibration.moving_axes()[0].tolist()
-    return x, y
+@dataclass(frozen=True, eq=False)
+class RestorationVerdict:
+    """Verdict on a restoration from P pairs of frames of one scene.
+
+    Displacements and levels are root-mean-square values over the pixels that both frames contain.
+
+    Attributes:
+        before: (P,) difference of the raw frames, moved onto each other by whole pixels, full scale 1.
+        after: (P,) difference of the restored frames; NaN for one image restored jointly from all.
+        misfit_before: (P, 2) px, displacement between the raw frames, axes (x, y).
+        misfit_after: (P, 2) px, displacement between a raw frame and its prediction, which is the other frame
+            restored and blurred by the motion of the first.
+        resolution: (P, 2) px, misfits below this cannot be distinguished from zero.
+        noise: (P,) standard deviation of the noise of the raw frames.
+        chi_square: (P,) mean square of that frame's difference from its prediction, over the variance of the noise:
+            1 ... 2 where motion, blur and noise explain the frame.
+        predicted_gain: (P,) dB, estimated PSNR of the restored frames minus that of the raw ones.
+        outcome: For each pair: ``"helps"``; ``"partly"``: the vibration explains only a part of the displacement;
+            ``"worse"``; ``"unknown"``: cannot be determined from this pair (vibration too small, or at a blind
+            frequency; frames without contrast; too many missing pixels).
+        reasons: The reason for each pair; empty where restoration helps.
+    """
+
+    before: Tensor
+    after: Tensor
+    misfit_before: Tensor
+    misfit_after: Tensor
+    resolution: Tensor
+    noise: Tensor
+    chi_square: Tensor
+    predicted_gain: Tensor
+    outcome: tuple[Outcome, ...]
+    reasons: tuple[str, ...]
+
+    @property
+    def helped(self) -> Tensor:
+        """(P,) whether the outcome of the pair is ``"helps"``."""
+        return torch.tensor([outcome == "helps" for outcome in self.outcome], device=self.before.device)
+
+    @property
+    def overall(self) -> Outcome:
+        """The outcome of greatest concern over all pairs."""
+        return max(self.outcome, key=_OUTCOMES.index)
+
+    @property
+    def summary(self) -> str:
+        """The verdict in one line."""
+        worst = self.outcome.index(self.overall)
+        gain = float(self.predicted_gain.nanmean())
+        counted = f" ({self.outcome.count(self.overall)} of {len(self.outcome)} pairs)" if len(self.outcome) > 1 else ""
+        sentences = {
+            "helps": f"restored frames agree; estimated gain {gain:+.1f} dB",
+            "unknown": f"cannot determine whether restoration helps{counted}: {self.reasons[worst]}",
+            "partly": f"restoration helps in part only{counted}: {self.reasons[worst]}",
+            "worse": f"restored is no better than raw{counted}: {self.reasons[worst]}",
+        }
+        return sentences[self.overall]
+
+    def in_image_axes(self, timing: SensorTiming) -> "RestorationVerdict":
+        """The verdict on frames in row order, with axes named as in the image."""
+        if timing.scan_axis == -2:
+            return self
+        swapped = {name: getattr(self, name).flip(-1) for name in ("misfit_before", "misfit_after", "resolution")}
+        other = {"x: ": "y: ", "y: ": "x: "}
+        reasons = tuple(
+            "; ".join(other.get(part[:3], part[:3]) + part[3:] for part in why.split("; ")) for why in self.reasons
+        )
+        return replace(self, reasons=reasons, **swapped)
 
 
 def _outcome(
     before: list[float],
     after: list[float],
     resolution: list[float],
-    moves: tuple[bool, bool],
+    moves: list[bool],
     offset: list[float],
     gain: float,
-    difference: tuple[float, float],
+    *,
+    one_image: bool = False,
+    finest: float = 0.03,
+    crosstalk: float = 0.05,
 ) -> tuple[Outcome, str]:
-    """The verdict on one pair, and why.
+    """Outcome of one pair, and the reason.
+
+    Scores are the residual displacement relative to that of the raw frames, and the estimated gain. The gain decides
+    where the residual is small, because it is valid only where the motion is right.
 
     Args:
         before: Misfit of the raw frames (x, y) in px.
-        after: Misfit that remains.
-        resolution: Misfits that are not told from 0.
-        moves: Which axes the vibration moves.
+        after: Residual misfit after restoration.
+        resolution: Misfits below which they cannot be distinguished from 0.
+        moves: Axes with motion in the vibration.
         offset: Displacement between the frames that the vibration predicts, px.
         gain: Estimated gain in dB.
-        difference: Root-mean-square difference of the raw and of the restored frames; the latter NaN for one image.
+        one_image: Whether both frames were restored to one image, whose gain is not valid for a wrong motion.
+        finest: Misfit in px that is negligible in any image.
+        crosstalk: Error of ``after`` along one axis, relative to the displacement along the other.
     """
     found: list[tuple[Outcome, str]] = []
-    trust_gain = True
+    motion_is_complete = True
     for axis, name in enumerate("xy"):
-        least = max(resolution[axis], _FINEST)
+        least = max(resolution[axis], finest)
         if not moves[axis]:
-            trust_gain &= before[axis] <= least
+            motion_is_complete &= before[axis] <= least
             continue
-        apart = f"{name}: frames lie {before[axis]:.2g} px apart, {after[axis]:.2g} px are left unexplained"
+        residual = f"{name}: frames lie {before[axis]:.2g} px apart, {after[axis]:.2g} px remain unexplained"
         if math.isinf(least):
-            found.append(("unknown", f"{name}: the frames show nothing to tell it by"))
-        elif before[axis] <= least < after[axis] <= _SMALL * before[1 - axis] and gain > _WELCOME_GAIN:
-            found.append(("unknown", f"{apart}, next to {before[1 - axis]:.2g} px along the other axis"))
-        elif after[axis] > max(_UNCHANGED * before[axis], least):
-            # less noise may outweigh a motion that was not undone, but not one that was made up
-            outweighed = gain > _WELCOME_GAIN and before[axis] > least and not math.isnan(difference[1])
-            found.append(("partly" if outweighed else "worse", apart))
-        elif after[axis] > max(_EXPLAINED * before[axis], least):
-            found.append(("partly", apart))
-        elif max(before[axis], offset[axis]) <= least:
-            found.append(("unknown", f"{name}: frames lie less than {least:.2g} px apart, all are displaced alike"))
+            found.append(("unknown", f"{name}: the frames have no contrast"))
+        elif after[axis] <= max(least, crosstalk * before[1 - axis]):
+            visible = max(before[axis], offset[axis]) > least
+            alike = f"{name}: frames lie less than {least:.2g} px apart, all are displaced alike"
+            found.append(("helps", "") if visible else ("unknown", alike))
+        elif after[axis] > _WORSE_RESIDUAL * before[axis]:
+            # less noise may outweigh a motion that was not undone, but not a motion that does not exist
+            outweighed = before[axis] > least and gain > _GAIN_ERROR and not one_image
+            found.append(("partly" if outweighed else "worse", residual))
         else:
-            found.append(("helps", ""))
+            found.append(("partly", residual) if after[axis] > _PARTLY_RESIDUAL * before[axis] else ("helps", ""))
     if not found:
         return "unknown", "no vibration was undone"
-    outcome = max((outcome for outcome, _ in found), key=OUTCOMES.index)
-    if outcome in ("helps", "unknown") and trust_gain and gain < _DOUBTFUL_GAIN:
-        # a wrong motion makes the estimate of the gain wrong as well: it counts where the motion is right
-        return (
-            "worse" if gain < _BAD_GAIN else "partly",
-            f"noise and artefacts outweigh what was undone ({gain:.1f} dB)",
-        )
+    outcome = max((outcome for outcome, _ in found), key=_OUTCOMES.index)
+    if outcome in ("helps", "unknown") and motion_is_complete and gain < -_GAIN_ERROR:
+        return "worse", f"noise and artefacts outweigh the restored sharpness (estimated gain {gain:.1f} dB)"
     return outcome, "; ".join(why for kind, why in found if kind == outcome and why)
 
 
-def _judge_pair(pair: FramePair, moves: tuple[bool, bool], shared: int) -> RestorationVerdict:
-    """The verdict on one pair, its values without a leading axis."""
+def _mean_square(difference: Tensor) -> Tensor:
+    return difference.square().mean(dtype=torch.float64)
+
+
+def _judge_pair(pair: FramePair, moves: list[bool], shared: int, *, max_missing: float = 0.5) -> RestorationVerdict:
+    """Verdict on one pair, its values without a leading axis; not judged if more than ``max_missing`` is missing."""
     noise = estimate_noise(torch.stack([pair.earlier, pair.later]), pair.missing).square().nanmean().double()
-    noise = noise.nan_to_num(nan=0.0).clamp(min=_QUIETEST**2)
+    noise = noise.nan_to_num(nan=0.0).clamp(min=_MIN_NOISE**2)
     pair = equally_bright(pair, noise)
-    # what was made of both frames lies between them: their distance from it is the smaller
+    # an image restored from both frames lies between them, so that its distance from either is the smaller
     widening = math.sqrt(2.0 * shared / (shared - 1.0)) if shared > 1 else 1.0
     misfit_before, coarse = misfit(pair.earlier, pair.later)
     misfit_after, fine = (widening * value for value in misfit(pair.predicted, pair.later))
@@ -112,33 +192,26 @@ def _judge_pair(pair: FramePair, moves: tuple[bool, bool], shared: int) -> Resto
     if pair.restored_later is not None:
         after = _mean_square(pair.restored_later - pair.restored)
     error = torch.maximum(error, 0.5 * after) if shared == 1 else error + noise / shared
-    # what the motion does to the scene; noise of two restored frames drops out of the product
+    # change of the scene by the motion; the noise of two restored frames is independent and vanishes in the product
     raw_error = ((pair.predicted - pair.restored) * pair.changed_later).mean(dtype=torch.float64).clamp(min=0.0) + noise
-    gain = 10.0 * torch.log10(raw_error / error.clamp(min=_QUIETEST**2))
-    before, after = _mean_square(pair.later - pair.earlier).sqrt(), after.sqrt()
+    gain = 10.0 * torch.log10(raw_error / error.clamp(min=_MIN_NOISE**2))
+    misfits = (misfit_before.tolist(), misfit_after.tolist(), resolution.tolist())
+    one_image = pair.restored_later is None
+    outcome, why = _outcome(*misfits, moves, pair.offset.tolist(), float(gain), one_image=one_image)
     missing = 0.0 if pair.missing is None else float(pair.missing.any(0).double().mean())
-    outcome, why = _outcome(
-        misfit_before.tolist(),
-        misfit_after.tolist(),
-        resolution.tolist(),
-        moves,
-        pair.offset.tolist(),
-        float(gain),
-        (float(before), float(after)),
-    )
-    if missing > _MISSING:
+    if missing > max_missing:
         outcome, why = "unknown", f"{100 * missing:.0f} % of the pixels are missing"
     return RestorationVerdict(
-        before,
-        after,
-        misfit_before,
-        misfit_after,
-        resolution,
-        noise.sqrt(),
-        unexplained / noise,
-        gain,
-        (outcome,),
-        (why,),
+        before=_mean_square(pair.later - pair.earlier).sqrt(),
+        after=after.sqrt(),
+        misfit_before=misfit_before,
+        misfit_after=misfit_after,
+        resolution=resolution,
+        noise=noise.sqrt(),
+        chi_square=unexplained / noise,
+        predicted_gain=gain,
+        outcome=(outcome,),
+        reasons=(why,),
     )
 
 
@@ -153,37 +226,31 @@ def judge_frames(
     columns: int | None = None,
     hidden: Tensor | None = None,
 ) -> RestorationVerdict:
-    """Judge a stack in row order; ``judge_restoration`` with everything made ready.
+    """Judge a stack in row order: ``judge_restoration`` after input preparation.
 
     Args:
         raw: (T, C, H, W).
         restored: (T, C, H, W), or (1, C, H, W) in the coordinates of the first frame of every pair.
         motion: Motion of the frames, batch of one.
         pairs: Frames to compare.
-        shared: Frames that each restored one was made of.
+        shared: Number of frames that each restored one was made from.
         columns: Judge on so many columns only, those with the most detail.
         hidden: Mask shaped like ``raw`` of pixels that were not measured.
 
     Raises:
         TooLittleInCommonError: If two frames have too little in common.
     """
+    moves = motion.vibration.moving_axes()[0].tolist()
     verdicts = [
-        _judge_pair(shared_part(raw, restored, motion, frames, columns, hidden), _moves(motion), shared)
-        for frames in pairs
+        _judge_pair(shared_part(raw, restored, motion, frames, columns, hidden), moves, shared) for frames in pairs
     ]
-    tensors = (
-        "before",
-        "after",
-        "misfit_before",
-        "misfit_after",
-        "resolution",
-        "noise",
-        "chi_square",
-        "predicted_gain",
-    )
-    joined = {name: torch.stack([getattr(verdict, name) for verdict in verdicts]) for name in tensors}
+    joined = {
+        field.name: torch.stack([getattr(verdict, field.name) for verdict in verdicts])
+        for field in fields(RestorationVerdict)
+        if field.name not in ("outcome", "reasons")
+    }
     outcome = tuple(verdict.outcome[0] for verdict in verdicts)
-    return replace(verdicts[0], **joined, outcome=outcome, reasons=tuple(verdict.reasons[0] for verdict in verdicts))
+    return RestorationVerdict(**joined, outcome=outcome, reasons=tuple(verdict.reasons[0] for verdict in verdicts))
 
 
 def judge_restoration(
@@ -197,22 +264,24 @@ def judge_restoration(
     ignore: Tensor | None = None,
     most_pairs: int | None = None,
 ) -> RestorationVerdict:
-    """Judge without truth whether restored frames are better than raw ones.
+    """Judge whether restored frames are better than raw ones, without the true scene.
 
-    Three things are looked at. Every restored frame, blurred again by the motion of the next one, should be that
-    next frame: a wrong vibration leaves the two apart. Restored frames should agree with each other better than raw
-    frames do, noise and ringing included. And what is left unexplained should be noise (``chi_square``).
+    Three quantities are measured. Every restored frame, blurred by the motion of the next one, should equal that next
+    frame: a wrong vibration leaves a displacement between the two (``misfit_after``). Restored frames should agree
+    with each other better than raw frames do, noise and ringing included (``predicted_gain``). The residual should be
+    noise (``chi_square``).
 
-    What displaces all frames alike (a blind frequency) cannot be seen this way; the outcome is then ``"unknown"``.
+    A vibration that displaces all frames alike (at a blind frequency) is not visible in these quantities; the outcome
+    is then ``"unknown"``.
 
     Args:
         frames: Raw stack (T, H, W) or (T, C, H, W), at least two frames.
-        restored: What ``restore`` made of it: one frame from each, or one image (1, ...) from all.
+        restored: Result of ``restore``: one frame from each, or one image (1, ...) from all.
         timing: The sensor.
         vibration: The vibration that was undone, in image axes, or the detection that ``restore`` was given.
-        joint: What ``restore`` was told.
+        joint: As in ``restore``.
         full_scale: As in ``restore``.
-        ignore: As in ``restore``: what is ignored, and NaN, is not judged.
+        ignore: As in ``restore``; ignored pixels and NaN are not judged.
         most_pairs: Compare no more pairs than these, evenly spread over the stack; None for all.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Two frames of a stack cut to the scene that both show, with what restoration made of them."""
+"""Comparison of two frames of one scene: common part, the later one predicted from the earlier one, misfit."""
 
 import math
 from collections.abc import Sequence
@@ -8,32 +8,38 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.fourier import extended_length, spline_spectra
+from rsvib_torch.core.splines import bspline_weights, correlated, mirrored, spread_taps
 from rsvib_torch.frames.pixels import detailed_columns
+from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.verdict.misfit import RIM
-from rsvib_torch.restoration.verdict.outcome import TooLittleInCommonError
-from rsvib_torch.restoration.verdict.reblur import reblur
 
-__all__ = ["FramePair", "equally_bright", "pairs_to_judge", "shared_part"]
+__all__ = ["FramePair", "TooLittleInCommonError", "equally_bright", "misfit", "pairs_to_judge", "reblur", "shared_part"]
 
-_BLOCK = 16  # px, large beside displacements: means of such squares tell how bright two frames are
-_MARGIN = 4  # px between the pixels judged and what was made up
+_SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear
+_RIM = math.ceil(3 * _SMOOTHING) + 1  # px; half width of the kernels of ``misfit``
+_ELEMENTS = {"cpu": 1 << 18}  # values of the kernels in ``reblur`` at a time; they fit into the cache (speed only)
+
+
+class TooLittleInCommonError(ValueError):
+    """Two frames share too little of the scene to be compared."""
 
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """Two raw frames and their restored ones where all show the same scene, (C, h, w) each.
+    """The common part of two raw frames and of their restored frames, (C, h, w) each.
 
     Attributes:
         earlier: Raw.
         later: Raw.
-        restored: Of the earlier one, or the one image of all frames.
-        restored_later: Of the later one; None where there is one image.
-        predicted: The later raw frame, from ``restored``.
-        changed_later: What the motion of the later frame does to its restored one.
-        offset: (2,) px, root-mean-square displacement between the two that the motion predicts, axes (x, y).
-        missing: (2, C, h, w) bool, pixels of the raw frames that were not measured: they hold what the restored ones
-            predict; None for none.
+        restored: Restored from the earlier frame, or the one image of all frames.
+        restored_later: Restored from the later frame; None where there is one image.
+        predicted: The later raw frame, formed from ``restored``.
+        changed_later: Change of the restored later frame by the motion of that frame.
+        offset: (2,) px, root-mean-square displacement between the two frames by the motion, axes (x, y).
+        missing: (2, C, h, w) bool, pixels of the raw frames that were not measured; they hold the values that the
+            restored frames predict. None for none.
     """
 
     earlier: Tensor
@@ -65,30 +71,33 @@ def shared_part(
     frames: tuple[int, int],
     columns: int | None,
     hidden: Tensor | None = None,
+    *,
+    margin: int = 4,
 ) -> FramePair:
-    """Cut what two frames have in common; rows are those of the later one.
+    """Cut two frames to their common part; rows are those of the later one.
 
     Args:
         raw: (T, C, H, W) in row order.
         restored: (T, C, H, W), or (1, C, H, W) in the coordinates of the first of ``frames``.
         motion: Motion of the frames, batch of one.
-        frames: Which two.
+        frames: Indices of the two frames.
         columns: Cut to so many columns, those with the most detail; None for all.
         hidden: Mask shaped like ``raw`` of pixels that were not measured.
+        margin: px between the compared pixels and those outside the frame.
 
     Raises:
-        TooLittleInCommonError: If hardly any scene is left.
+        TooLittleInCommonError: If the common part is smaller than the filters.
     """
     earlier, later = frames
     x, y = (int(step) for step in (motion.shift[0, later] - motion.shift[0, earlier]).tolist())
     height, width = (size - abs(step) for size, step in zip(raw.shape[-2:], (y, x), strict=True))
-    moved = _moved(motion, frames, raw.shape[-2])
-    rim_x, rim_y = (math.ceil(reach) + _MARGIN for reach in moved.abs().amax((0, 1)).tolist())
-    if min(height - 2 * rim_y, width - 2 * rim_x) < 2 * RIM + 3:
+    moved = _displacement_of_rows(motion, frames, raw.shape[-2])
+    rim_x, rim_y = (math.ceil(reach) + margin for reach in moved.abs().amax((0, 1)).tolist())
+    if min(height - 2 * rim_y, width - 2 * rim_x) < 2 * _RIM + 3:
         raise TooLittleInCommonError(
             f"frames {earlier} and {later} have nothing in common, or too little: they lie ({x}, {y}) px apart"
         )
-    before, after = (_same_scene(step, raw.shape[-2:]) for step in ((y, x), (-y, -x)))
+    before, after = (_overlap(step, raw.shape[-2:]) for step in ((y, x), (-y, -x)))
     first, second = raw[earlier][before], raw[later][after]
     single = len(restored) == 1
     scene = restored[0 if single else earlier][before]
@@ -99,60 +108,147 @@ def shared_part(
         strip = slice(detailed.start, detailed.stop + 2 * rim_x)
     cut = (..., slice(rim_y, height - rim_y), slice(rim_x, -rim_x))
     first, second, scene, other = (image[..., strip] for image in (first, second, scene, other))
-    formed = reblur(torch.cat([scene, other]), motion, later, first_row=max(y, 0))
-    predicted, formed_later = (part[cut] for part in formed.chunk(2))
+    predicted, formed_later = reblur(torch.cat([scene, other]), motion, later, first_row=max(y, 0)).chunk(2)
     missing = None
     if hidden is not None:
-        lost = torch.stack([hidden[earlier][before], hidden[later][after]])[..., strip]
-        formed_earlier = reblur(scene, motion, earlier, first_row=max(-y, 0))
-        first = torch.where(lost[0], formed_earlier, first)
-        second = torch.where(lost[1], formed.chunk(2)[0], second)
-        missing = lost[(slice(None), *cut)]
+        masks = torch.stack([hidden[earlier][before], hidden[later][after]])[..., strip]
+        first = torch.where(masks[0], reblur(scene, motion, earlier, first_row=max(-y, 0)), first)
+        second = torch.where(masks[1], predicted, second)
+        missing = masks[(slice(None), *cut)]
     return FramePair(
         first[cut],
         second[cut],
         scene[cut],
         None if single else other[cut],
-        predicted,
-        formed_later - other[cut],
+        predicted[cut],
+        formed_later[cut] - other[cut],
         (moved[1] - moved[0]).square().mean(0).sqrt(),
         missing,
     )
 
 
-def equally_bright(pair: FramePair, noise: Tensor) -> FramePair:
-    """The pair with the earlier frame, and what was made of it, as bright and as contrasty as the later one."""
-    side = min(_BLOCK, *pair.later.shape[-2:])
-    shown, seen = (
+def equally_bright(pair: FramePair, noise: Tensor, *, block: int = 16) -> FramePair:
+    """The pair with the earlier frame, and the images made of it, at the brightness and contrast of the later one.
+
+    Gain and offset are the regression of the later frame on the predicted one, from means over squares of ``block`` px,
+    which are large beside residual displacements. The noise power ``noise`` draws the gain towards 1.
+    """
+    side = min(block, *pair.later.shape[-2:])
+    predicted, later = (
         torch.nn.functional.avg_pool2d(image[None], side)[0].to(torch.float64) for image in (pair.predicted, pair.later)
     )
-    mean, target = (values.mean((-2, -1), keepdim=True) for values in (shown, seen))
-    power = (shown - mean).square().mean() + noise
-    gain = (((shown - mean) * (seen - target)).mean() + noise) / power
+    mean, target = (values.mean((-2, -1), keepdim=True) for values in (predicted, later))
+    power = (predicted - mean).square().mean() + noise
+    gain = (((predicted - mean) * (later - target)).mean() + noise) / power
     if float(gain) <= 0.0:
         return pair
     mean, target, gain = (value.to(pair.later.dtype) for value in (mean, target, gain))
 
-    def bright(image: Tensor) -> Tensor:
+    def adjusted(image: Tensor) -> Tensor:
         return torch.addcmul(target - gain * mean, image, gain)
 
-    single = pair.restored_later is None
     return replace(
         pair,
-        earlier=bright(pair.earlier),
-        restored=bright(pair.restored),
-        predicted=bright(pair.predicted),
-        changed_later=gain * pair.changed_later if single else pair.changed_later,
+        earlier=adjusted(pair.earlier),
+        restored=adjusted(pair.restored),
+        predicted=adjusted(pair.predicted),
+        changed_later=gain * pair.changed_later if pair.restored_later is None else pair.changed_later,
     )
 
 
-def _same_scene(step: tuple[int, int], size: Sequence[int]) -> tuple[Any, ...]:
+def misfit(first: Tensor, second: Tensor, *, step: int = 4) -> tuple[Tensor, Tensor]:
+    """Root-mean-square displacement between two images of one scene, along each axis.
+
+    A displacement d changes brightness by ``d . grad f``, so that the mean squared difference is
+    ``a + dx^2 fx^2 + dy^2 fy^2 + 2 dx dy fx fy``; white noise raises ``a`` only. Both images are smoothed, so that this
+    holds for displacements up to about 10 px, and weighted least squares gives the means of dx^2 and dy^2.
+
+    Args:
+        first: (C, H, W), at least 35 px on a side.
+        second: The same shape.
+        step: px between the places that are used; after smoothing, neighbours are nearly equal.
+
+    Returns:
+        Misfit (2,) and its resolution (2,) in px, axes (x, y), float64; a misfit below the resolution cannot be
+        distinguished from zero. For images without contrast 0 and infinity.
+    """
+    place = torch.arange(-_RIM, _RIM + 1, device=first.device)
+    gaussian = torch.where(place.abs() < _RIM, torch.exp(-0.5 * (place / _SMOOTHING).double().square()), 0.0)
+    gaussian = gaussian / gaussian.sum()
+    kernels = torch.stack([gaussian, 0.5 * (gaussian.roll(1) - gaussian.roll(-1))]).to(first.dtype)
+    mean, changed = (0.5 * (first + second), second - first)
+    smooth, slope = correlated(torch.stack([mean, changed]), kernels, -1, step)
+    along = correlated(slope[0], kernels[:1], -2, step)[0].flatten().to(torch.float64)
+    (_, change), (across, _) = correlated(smooth, kernels, -2, step)
+    across, change = (values.flatten().to(torch.float64) for values in (across, change))
+    change = change.square()
+    energy = along.square() + across.square()
+    tiny = torch.finfo(torch.float64).tiny
+    weight = (energy + energy.mean()).square().clamp(min=tiny).reciprocal()
+    terms = torch.stack([torch.ones_like(along), along.square(), across.square(), 2 * along * across])
+    normal = (terms * weight) @ terms.T
+    scale = normal.diagonal().clamp(min=tiny).rsqrt()
+    inverse = torch.linalg.pinv(normal * scale * scale[:, None], hermitian=True) * scale * scale[:, None]
+    solution = inverse @ ((terms * weight) @ change)
+    # the variance of a squared Gaussian is twice the square of its mean; values within the smoothing are correlated
+    correlated_values = 4 * math.pi * (_SMOOTHING / step) ** 2
+    scatter = (terms * weight.square()) @ terms.T * (correlated_values * 2.0 * solution[0].square())
+    deviation = (inverse @ scatter @ inverse).diagonal()[1:3].clamp(min=0.0).sqrt()
+    rounding = 1e-5 * torch.maximum(first.abs().amax(), second.abs().amax())
+    has_contrast = energy.amax().sqrt() > rounding
+    size, resolution = solution[1:3].clamp(min=0.0).sqrt(), (2.0 * deviation).sqrt()
+    return size.where(has_contrast, 0.0), resolution.where(has_contrast, math.inf)
+
+
+def reblur(scene: Tensor, motion: FrameMotion, frame: int, *, first_row: int = 0, degree: int = 5) -> Tensor:
+    """Form one frame from a restored scene (Eq. 9), independently of the restoration method.
+
+    Displacement along rows is a phase ramp, across rows a B-spline, the exposure a Gauss-Legendre sum.
+
+    Args:
+        scene: (C, H, W) in row order, in the coordinates in which frame ``frame`` is restored; it may be a part of
+            the rows and columns, and is mirrored beyond.
+        motion: Motion of the frames, batch of one.
+        frame: Index of the frame to form.
+        first_row: Row of the frame at row 0 of the scene.
+        degree: Degree of the B-spline.
+
+    Returns:
+        The same part (C, H, W) of the frame.
+    """
+    height, width = scene.shape[-2:]
+    rows = torch.arange(height, dtype=torch.float64, device=scene.device)
+    starts = motion.frame_starts[frame] + (first_row + rows) * motion.timing.row_time
+    displacement, node_weights = exposure_trajectory(motion.vibration[0], starts, motion.timing, "gauss")
+    displacement = displacement - motion.shift[0, frame]
+    reach = math.ceil(float(displacement[..., 0].abs().amax()))
+    length = extended_length(width, reach)
+    u = torch.fft.rfftfreq(length, dtype=torch.float64, device=scene.device)
+    spectra = spline_spectra(scene, degree, length)
+
+    place = rows[:, None] - displacement[..., 1]
+    cell = place.floor()
+    first, taps = spread_taps(cell, bspline_weights(place - cell, degree) * node_weights[:, None])
+    angle = displacement[..., 0, None].to(scene.dtype) * (-2 * math.pi * u).to(scene.dtype)
+    taps = taps.transpose(-2, -1).to(scene.dtype)
+    count = taps.shape[-2]
+    source_rows = mirrored((first - degree // 2)[:, None] + torch.arange(count, device=scene.device), height)
+    step = max(1, _ELEMENTS.get(scene.device.type, height * count * len(u)) // (count * len(u)))
+    formed = []
+    for part in runs(height, step):
+        transfer = torch.complex(taps[part] @ angle[part].cos(), taps[part] @ angle[part].sin())  # (R, count, U)
+        formed.append((transfer * spectra[:, source_rows[part]]).sum(-2))
+    image: Tensor = torch.fft.irfft(torch.cat(formed, dim=-2), n=length)[..., :width]
+    return image
+
+
+def _overlap(step: tuple[int, int], size: Sequence[int]) -> tuple[Any, ...]:
     """Part of an image whose content is found ``step`` px further on in another image."""
     return (..., *(slice(max(-s, 0), n - max(s, 0)) for s, n in zip(step, size, strict=True)))
 
 
-def _moved(motion: FrameMotion, frames: Sequence[int], num_rows: int) -> Tensor:
-    """Mean displacement (2, R, 2) of the rows of two frames beyond their shifts, in px."""
+def _displacement_of_rows(motion: FrameMotion, frames: Sequence[int], num_rows: int) -> Tensor:
+    """Mean displacement (2, R, 2) of the rows of two frames minus their shifts, in px."""
     rows = torch.arange(num_rows, dtype=torch.float64, device=motion.frame_starts.device)
     starts = motion.frame_starts[list(frames), None] + rows * motion.timing.row_time
     moved = motion.vibration.mean_displacement(starts[None], motion.timing.exposure_time)

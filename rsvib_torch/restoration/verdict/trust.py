@@ -1,4 +1,4 @@
-"""Which part of a detected vibration may be undone: an axis that is not known well enough is left alone."""
+"""The part of a detected vibration that is accurate enough to be undone, from its standard deviations."""
 
 import math
 from typing import Any, Protocol
@@ -11,9 +11,6 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["Detected", "displacement_uncertainty", "trusted_vibration", "vibration_to_undo"]
-
-_WORTH_UNDOING = 0.5  # of the mean square displacement; an uncertainty beyond would leave more than it takes
-_MEASURED = 4.0  # standard deviations above which an image motion counts as measured
 
 
 class Detected(Protocol):
@@ -39,14 +36,15 @@ class Detected(Protocol):
 def displacement_uncertainty(
     vibration: Vibration, std: Any, timing: SensorTiming, num_frames: int, num_rows: int
 ) -> tuple[Tensor, Tensor]:
-    """Root-mean-square error of the rows' displacement that standard deviations imply, and the displacement itself.
+    """Root-mean-square error of the displacement of the rows by standard deviations, and the displacement itself.
 
-    From ``A sinc(f T_e) sin(2 pi f t + phi)``: ``(std_A^2 + A^2 std_angle^2) / 2`` a tone, averaged over its period.
-    The phase is given at the time origin, but is known best in the middle of the record: there, the part of its
-    variance that comes from the frequency is taken off, and grows again with the distance from the middle.
+    For ``A sinc(f T_e) sin(2 pi f t + phi)``, the variance of a tone averaged over its period is
+    ``sinc^2 (std_A^2 + A^2 std_angle^2) / 2``. The phase at the time origin and the frequency are correlated: the angle
+    is most accurate in the middle of the record. Its variance there, plus the variance by the frequency with the mean
+    squared distance from the middle, is ``std_angle^2``.
 
     Args:
-        vibration: What was detected, batch shape () or (B,).
+        vibration: The detected vibration, batch shape () or (B,).
         std: Its standard deviations.
         timing: The sensor.
         num_frames: Frames of the stack.
@@ -59,21 +57,21 @@ def displacement_uncertainty(
     first, last = float(starts[0]), float(starts[-1]) + num_rows * timing.row_time
     middle, spread = 0.5 * (first + last), (last - first) ** 2 / 12.0
     amplitude, moving = vibration.amplitude, vibration.amplitude > 0
-    turn = (2 * math.pi * std.frequency.to(amplitude)).square()
-    angle = (std.phase.to(amplitude).square() - turn * middle**2).clamp(min=0.0) + turn * spread
-    seen = 0.5 * torch.sinc(vibration.frequency * timing.exposure_time).square()
-    variance = seen * (std.amplitude.to(amplitude).square() + amplitude.square() * angle)
+    rate = (2 * math.pi * std.frequency.to(amplitude)).square()
+    angle = (std.phase.to(amplitude).square() - rate * middle**2).clamp(min=0.0) + rate * spread
+    attenuation = 0.5 * torch.sinc(vibration.frequency * timing.exposure_time).square()
+    variance = attenuation * (std.amplitude.to(amplitude).square() + amplitude.square() * angle)
     variance = torch.where(moving, variance.nan_to_num(nan=math.inf), 0.0)
-    return variance.sum(-1).sqrt(), (seen * amplitude.square()).sum(-1).sqrt()
+    return variance.sum(-1).sqrt(), (attenuation * amplitude.square()).sum(-1).sqrt()
 
 
 def trusted_vibration(
     detected: Detected, timing: SensorTiming, num_frames: int, num_rows: int
 ) -> tuple[Vibration, tuple[str, ...]]:
-    """The part of a detected vibration that is known well enough to be undone.
+    """The part of a detected vibration that is accurate enough to be undone.
 
-    An axis that is not reliable, or whose displacement is so uncertain that undoing it would not take away half of
-    its mean square, is taken as not vibrating. Its image motion stays where it was measured (4 standard deviations).
+    The amplitude of an axis is set to zero if the axis is not reliable, or if the variance of its displacement exceeds
+    half of the mean square displacement. Its image motion is kept if it exceeds 4 standard deviations.
 
     Args:
         detected: A detection.
@@ -99,9 +97,9 @@ def trusted_vibration(
     error, size = (
         value.to(vibration.device) for value in displacement_uncertainty(vibration, std, timing, num_frames, num_rows)
     )
-    certain = error.square() <= _WORTH_UNDOING * size.square()
+    accurate = error.square() <= 0.5 * size.square()
     motion = vibration.image_motion
-    measured = motion.abs() > _MEASURED * std.image_motion.to(motion)
+    measured = motion.abs() > 4.0 * std.image_motion.to(motion)
     batched = len(vibration.batch_shape) > 0
     notes = []
     for index in range(vibration.batch_shape[0] if batched else 1):
@@ -112,12 +110,12 @@ def trusted_vibration(
             here = (*at, axis)
             if not bool(reliable[here]):
                 notes.append(f"{where}{name} is left alone: its vibration is not reliable ({'; '.join(reasons[axis])})")
-            elif not bool(certain[here]):
+            elif not bool(accurate[here]):
                 notes.append(
-                    f"{where}{name} is left alone: its displacement of {float(size[here]):.2g} px is only known to "
-                    f"+- {float(error[here]):.2g} px"
+                    f"{where}{name} is left alone: its displacement of {float(size[here]):.2g} px has a standard "
+                    f"deviation of {float(error[here]):.2g} px; detect it from more frames"
                 )
-    keep = reliable & certain
+    keep = reliable & accurate
     drift = keep | measured
     trusted = Vibration(
         vibration.amplitude * keep[..., None],
@@ -132,7 +130,7 @@ def trusted_vibration(
 def vibration_to_undo(
     vibration: Motion | Detected, timing: SensorTiming, num_frames: int, num_rows: int
 ) -> tuple[Motion, tuple[str, ...]]:
-    """All of a vibration that was given; of one that was detected the trusted part, and what is left alone.
+    """A given motion unchanged; of a detection the accurate part, and one sentence for each axis left alone.
 
     Raises:
         TypeError: If it is neither.

@@ -1,0 +1,206 @@
+"""Receiver operating characteristic of the verdict on a restoration.
+
+``python -m benchmarks.verdict_roc`` in ``scripts``. Random scenes, vibrations, exposures and noise levels are restored
+with the correct, a partly correct and a wrong vibration. The truth is the PSNR against the still scene, of the restored
+frames minus that of the raw frames, in dB. Printed are the outcomes by the truth, the area under the ROC curve of each
+score, and the thresholds with the largest sum of sensitivity and specificity. Frames come from a camera that is
+independent of the package.
+"""
+
+import argparse
+import json
+import math
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from benchmarks.independent_camera import Shake, closed, take_frames
+from torch import Tensor
+
+import rsvib_torch as rsv
+from rsvib_torch.evaluation import city_and_fields, resolution_chart
+from rsvib_torch.restoration import judge_restoration, restore
+
+HEIGHT, WIDTH, MARGIN, RIM = 384, 192, 48, 32
+ROW_TIME = 4e-5
+NOISES = (0.0, 0.002, 0.005, 0.01, 0.02, 0.04)
+EXPOSURES = (5, 20, 50, 100, 200)
+OUTCOMES = ("helps", "unknown", "partly", "worse")
+
+Arrays = dict[str, np.ndarray[Any, np.dtype[np.float64]]]
+Hypothesis = Callable[[Arrays, np.random.Generator], Arrays]
+
+
+def _changed(name: str, change: Callable[[Any], Any]) -> Hypothesis:
+    return lambda truth, generator: {**truth, name: change(truth[name])}
+
+
+def draw_vibration(generator: np.random.Generator) -> Arrays:
+    """Amplitude 0.1-6 px, frequency 20-150 Hz and phase of one tone per axis (x, y)."""
+    return {
+        "amplitude": np.exp(generator.uniform(math.log(0.1), math.log(6.0), 2)),
+        "frequency": generator.uniform(20.0, 150.0, 2),
+        "phase": generator.uniform(-math.pi, math.pi, 2),
+    }
+
+
+HYPOTHESES: dict[str, tuple[str, Hypothesis, dict[str, Any]]] = {  # name: (group, vibration, options of restore)
+    "correct": ("correct", lambda truth, generator: truth, {}),
+    "correct, dewarp": ("correct", lambda truth, generator: truth, {"method": "dewarp"}),
+    "correct, one axis": ("correct", _changed("amplitude", lambda a: a * [0, 1]), {}),
+    "amplitude +10 %": ("correct", _changed("amplitude", lambda a: 1.1 * a), {}),
+    "amplitude x 0.5": ("half", _changed("amplitude", lambda a: 0.5 * a), {}),
+    "y inverted": ("half", _changed("amplitude", lambda a: a * [1, -1]), {}),
+    "phase + pi / 2": ("half", _changed("phase", lambda p: p + math.pi / 2), {}),
+    "inverted": ("wrong", _changed("phase", lambda p: p + math.pi), {}),
+    "other vibration": ("wrong", lambda truth, generator: draw_vibration(generator), {}),
+    "other frequency": (
+        "wrong",
+        lambda truth, generator: {**truth, "frequency": generator.uniform(20.0, 150.0, 2)},
+        {"method": "dewarp"},
+    ),
+    "too little smoothing": ("smoothing", lambda truth, generator: truth, {"regularisation": 1e-4}),
+    "too much smoothing": ("smoothing", lambda truth, generator: truth, {"regularisation": 1e4}),
+}
+
+
+def as_vibration(arrays: Arrays) -> rsv.Vibration:
+    """A ``Vibration``; a negative amplitude becomes a phase of pi."""
+    phase = arrays["phase"] + np.where(arrays["amplitude"] < 0, math.pi, 0.0)
+    return rsv.Vibration(np.abs(arrays["amplitude"]).tolist(), arrays["frequency"].tolist(), phase.tolist())
+
+
+def psnr(images: Tensor, still: Tensor) -> float:
+    """PSNR in dB of all frames, without the rim."""
+    inner = (..., slice(RIM, -RIM), slice(RIM, -RIM))
+    return float(-10 * torch.log10((images[inner].double() - still[inner]).square().mean()))
+
+
+def cases(draw: int) -> list[dict[str, Any]]:
+    """All hypotheses on one random recording of two frames: verdict, its scores, and the true gain in dB."""
+    generator = np.random.default_rng(draw)
+    size = (HEIGHT + 2 * MARGIN, WIDTH + 2 * MARGIN)
+    scene = city_and_fields(*size, draw) if generator.random() < 0.7 else resolution_chart(*size, seed=draw)
+    exposure, noise = int(generator.choice(EXPOSURES)), float(generator.choice(NOISES))
+    truth = draw_vibration(generator)
+    timing = rsv.SensorTiming(row_time=ROW_TIME, exposure_rows=exposure, frame_rows=int(generator.integers(384, 700)))
+    vibration = as_vibration(truth)
+    shake = Shake(
+        *(value.numpy() for value in (vibration.amplitude, vibration.frequency, vibration.phase)), np.zeros(2)
+    )
+    taken = take_frames(
+        closed(scene.double().numpy(), 24),
+        shake,
+        row_time=ROW_TIME,
+        exposure_rows=exposure,
+        frame_rows=timing.frame_rows,
+        num_frames=2,
+        size=(HEIGHT, WIDTH),
+    )
+    frames = torch.from_numpy(taken + noise * generator.standard_normal(taken.shape)).float()
+    still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN].double()
+    raw = psnr(frames, still)
+    found = []
+    for name, (group, hypothesis, options) in HYPOTHESES.items():
+        claimed = as_vibration(hypothesis(truth, generator))
+        restored = restore(frames, timing, claimed, check=False, **options)
+        verdict = judge_restoration(frames, restored, timing, claimed)
+        found.append(
+            {
+                "draw": draw,
+                "hypothesis": name,
+                "group": group,
+                "exposure_rows": exposure,
+                "noise": noise,
+                "raw_db": raw,
+                "gain_db": psnr(restored, still) - raw,
+                "moves": (claimed.amplitude[:, 0] > 0).tolist(),
+                "outcome": verdict.overall,
+                "reason": verdict.reasons[0],
+                "predicted_gain": float(verdict.predicted_gain),
+                "chi_square": float(verdict.chi_square),
+                **{
+                    name: getattr(verdict, name)[0].tolist() for name in ("misfit_before", "misfit_after", "resolution")
+                },
+            }
+        )
+    return found
+
+
+def area_under_curve(score: Tensor, positive: Tensor) -> float:
+    """Probability that a positive case has a higher score than a negative one, ties counted by half."""
+    high, low = score[positive][:, None], score[~positive]
+    return float((high > low).double().mean() + 0.5 * (high == low).double().mean())
+
+
+def best_threshold(score: Tensor, positive: Tensor) -> tuple[float, float, float]:
+    """Threshold with the largest sum of sensitivity and specificity, and these two."""
+    values = score.sort().values
+    rates = [
+        (float((score[positive] > value).double().mean()), float((score[~positive] <= value).double().mean()))
+        for value in values
+    ]
+    best = max(range(len(rates)), key=lambda index: sum(rates[index]))
+    return float(values[best]), *rates[best]
+
+
+def residual(row: dict[str, Any]) -> float:
+    """Largest residual displacement of an axis with motion, relative to that between the raw frames."""
+    ratios = [
+        after / max(before, least, 0.03) if after > max(least, 0.03) else 0.0
+        for before, after, least, moves in zip(
+            row["misfit_before"], row["misfit_after"], row["resolution"], row["moves"], strict=True
+        )
+        if moves
+    ]
+    return max(ratios, default=0.0)
+
+
+def print_tables(rows: list[dict[str, Any]], tie: float = 0.3) -> None:
+    """Outcomes by the true gain, then the ROC of both scores."""
+    counts = Counter(((row["gain_db"] > tie) - (row["gain_db"] < -tie), row["outcome"]) for row in rows)
+    print("| true gain | " + " | ".join(OUTCOMES) + " |")
+    print("|---" * (len(OUTCOMES) + 1) + "|")
+    for name, sign in ((f"> {tie} dB", 1), (f"within {tie} dB", 0), (f"< -{tie} dB", -1)):
+        print(f"| {name} | " + " | ".join(str(counts[sign, outcome]) for outcome in OUTCOMES) + " |")
+    visible = [row for row in rows if row["outcome"] != "unknown"]
+    motion = [row for row in visible if row["hypothesis"] != "amplitude +10 %" and row["group"] != "smoothing"]
+    right = [row for row in visible if residual(row) < 0.35 and abs(row["gain_db"]) > tie]
+    scores = {
+        "residual displacement: wrong motion": (
+            [residual(row) for row in motion],
+            [row["group"] != "correct" for row in motion],
+        ),
+        "negated gain in dB, where the motion is right: worse than raw": (
+            [-row["predicted_gain"] for row in right],
+            [row["gain_db"] < 0 for row in right],
+        ),
+    }
+    for name, (score, positive) in scores.items():
+        values, truth = torch.tensor(score, dtype=torch.float64), torch.tensor(positive)
+        threshold, sensitivity, specificity = best_threshold(values, truth)
+        print(
+            f"{name}: area {area_under_curve(values, truth):.3f}, best threshold {threshold:.2f} "
+            f"(sensitivity {sensitivity:.2f}, specificity {specificity:.2f}; {len(truth)} cases)"
+        )
+
+
+def main() -> None:
+    """Collect the cases and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draws", type=int, default=60, help="random recordings (default: 60, about half an hour)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first recording")
+    parser.add_argument("--json", type=Path, help="where to write all figures")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = [row for draw in range(options.draws) for row in cases(options.seed + draw)]
+    print_tables(rows)
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
