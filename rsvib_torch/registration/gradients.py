@@ -86,14 +86,14 @@ def row_gradients(
     memory = inner.new_empty(len(rows), parts[0].stop, 3 + (1 if rows.shape[1] == 2 else rows.shape[1]), length)
 
     def pixels(part: slice) -> _Rows:
-        own, shown = detail[:, part].contiguous(), visible[:, :, part]
+        own, part_visible = detail[:, part].contiguous(), visible[:, :, part]
         planes = memory[:, : own.shape[1]]
         for place, one in enumerate((own * along, across[:, part], own, *compared.differences[:, :, part].unbind(1))):
             planes[:, :, place] = torch.fft.irfft(one, n=length)
-        weight = inner * (shown.sum(1) > 1)[..., None].to(inner.dtype)
+        weight = inner * (part_visible.sum(1) > 1)[..., None].to(inner.dtype)
         if valid is not None:
             weight = weight * functional.pad(valid[:, part], (0, length - width))
-        return _Rows(planes, weight, shown)
+        return _Rows(planes, weight, part_visible)
 
     images = inner.new_empty(len(rows), rows.shape[-1], 3, length)
     fits, blocks = [], []
@@ -328,15 +328,15 @@ class FrameComparison:
         count = visible.shape[2]
         counts = (fast_length(count), fast_length(count), count)
         for rows, run in warped:
-            shown = visible[:, :, rows]
-            different = differences(run, shown)
+            part_visible = visible[:, :, rows]
+            different = differences(run, part_visible)
             # half the difference of two frames has the noise of their mean
             noise = (
                 different[:, 0, :, ::_NOISE_STEP]
                 if run.shape[1] == 2
-                else _noise_of_mean(run[..., ::_NOISE_STEP], shown)
+                else _noise_of_mean(run[..., ::_NOISE_STEP], part_visible)
             )
-            of_run = (mean_over_frames(run, shown), noise, different)
+            of_run = (mean_over_frames(run, part_visible), noise, different)
             if not whole:
                 sizes = zip(of_run, counts, strict=True)
                 whole = [one.new_empty(*one.shape[:-2], size, one.shape[-1]) for one, size in sizes]

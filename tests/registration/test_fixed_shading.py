@@ -1,4 +1,4 @@
-"""A scanned eye: tissue that moves under a vignette and speckle, registration must follow the tissue."""
+"""A scanned eye: tissue that moves under a fixed vignette and speckle; offsets must be those of the tissue."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def offsets_between(frames, first, second):
 
 
 @pytest.mark.parametrize("pair", [(0, 1), (1, 2), (0, 2)])
-def test_offsets_follow_what_moves_and_not_the_vignette(recording, pair):
+def test_offsets_are_those_of_the_tissue_not_of_the_vignette(recording, pair):
     frames, motion = recording
     rows, offsets = offsets_between(frames, *pair)
     then = pair[0] * TIMING.frame_period + rows * TIMING.row_time

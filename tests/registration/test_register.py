@@ -71,7 +71,7 @@ def test_layout(pair, paper_camera, method):
 def test_uniform_shift_to_subpixel(method, shift):
     """A still scene moved as a whole between the frames: every band has the same offset."""
     timing = SensorTiming(row_time=10e-6, exposure_rows=1e-3, frame_rows=1000)
-    # a motion as slow as that is a shift of every frame, and none worth mention within a frame
+    # this image motion displaces frames as a whole; within a frame it is negligible
     motion = Motion(amplitude=(0.0, 0.0), image_motion=(shift[0] / 10e-3, shift[1] / 10e-3))
     scene = draw_scene(512 + 80, 512 + 80, 5)
     frames = float_frames(take_frames(scene, timing, motion, samples=1))
@@ -126,7 +126,7 @@ def test_failed_bands(method):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("axis", [-1, -2])
-def test_peak_at_the_edge_of_the_search_has_failed(method, axis):
+def test_peak_at_the_edge_of_the_search_range_fails(method, axis):
     """Half the frame moves by more than the search range about the other half: never an offset at the edge."""
     timing = SensorTiming(row_time=10e-6, exposure_rows=10, frame_rows=1024)
     scene = torch.from_numpy(draw_scene(1100, 360, 3)).float()
@@ -137,19 +137,19 @@ def test_peak_at_the_edge_of_the_search_has_failed(method, axis):
     curve = register_bands(torch.stack([first, second]), timing, method=method, search=8)
     component = 0 if axis == -1 else 1
     reach = curve.heights[1] // 2 + 24
-    still = (curve.rows > reach) & (curve.rows < 700 - reach)
+    resting = (curve.rows > reach) & (curve.rows < 700 - reach)
     far = curve.rows > 700 + reach
-    assert curve.good[0, still].double().mean() > 0.95
-    assert curve.offsets[0, still & curve.good[0], component].abs().max() < (0.25 if method == "projection" else 0.1)
-    found = curve.offsets[0, far & curve.good[0], component]
-    # whatever is found there is inside the range, and of low quality
-    assert bool((found.abs() < 8).all())
+    assert curve.good[0, resting].double().mean() > 0.95
+    assert curve.offsets[0, resting & curve.good[0], component].abs().max() < (0.25 if method == "projection" else 0.1)
+    measured = curve.offsets[0, far & curve.good[0], component]
+    # offsets measured there are inside the range and have low quality
+    assert bool((measured.abs() < 8).all())
     assert int(far.sum()) > 5
     assert curve.good[0, far].double().mean() < 0.6
     assert bool((curve.quality[0, far & curve.good[0]] < 0.8).all())
-    # with the range to reach it, the very same bands have the offset
+    # with a larger range, the same bands have the true offset
     wide = register_bands(torch.stack([first, second]), timing, method=method, search=16)
-    # gray projection searches with windows 8 search ranges tall: bands nearer to the border may stay unknown
+    # gray projection uses windows that are 8 search ranges tall: bands close to the border may fail
     reach = (4 * 16 if method == "projection" else wide.heights[1] // 2) + 24
     far = (wide.rows > 700 + reach) & (wide.rows < 1024 - reach)
     assert int(far.sum()) > 2
@@ -166,7 +166,7 @@ def test_noise_lowers_quality(pair, paper_camera, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_brightness_and_contrast_do_not_matter(pair, paper_camera, method):
+def test_offsets_do_not_depend_on_brightness_and_contrast(pair, paper_camera, method):
     frames, _ = pair
     frames = frames[:, :768].double()
     changed = frames.clone()
@@ -177,12 +177,12 @@ def test_brightness_and_contrast_do_not_matter(pair, paper_camera, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_order_of_the_frames_turns_the_sign(pair, paper_camera, method):
+def test_sign_follows_the_order_of_the_frames(pair, paper_camera, method):
     frames, _ = pair
     there = register_bands(frames, paper_camera, method=method)
     back = register_bands(frames.flip(0), paper_camera, method=method)
     total = (there.offsets + back.offsets)[there.good & back.good]
-    # the bands of the way back lie a few rows aside, hence the residual
+    # the bands of the second direction cover rows a few px away, hence the residual
     assert total.abs().median(0).values.tolist() == pytest.approx([0.0, 0.0], abs=0.25)
     assert there.offsets[there.good].abs().median(0).values.min() > 1.0
 

@@ -24,9 +24,9 @@ def test_detail_and_its_gradient_equal_those_of_the_scene(rows):
     scene, slope = smooth_scene(rows, 192)
     noise = 0.02 * torch.randn(2, rows, 192, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     warped = spectra_of(scene + noise)[None]
-    seen = torch.ones(1, 2, rows, dtype=torch.float64)
+    visible = torch.ones(1, 2, rows, dtype=torch.float64)
     halves = (slice(0, rows // 2), slice(rows // 2, rows))
-    compared = FrameComparison.of(((part, warped[:, :, part]) for part in halves), seen)
+    compared = FrameComparison.of(((part, warped[:, :, part]) for part in halves), visible)
     found = scene_detail(compared, torch.fft.rfftfreq(192, dtype=torch.float64))
     inner = slice(40, rows - 40)
     for images, truth in zip(found, (scene, slope), strict=True):
@@ -36,8 +36,8 @@ def test_detail_and_its_gradient_equal_those_of_the_scene(rows):
 
 def test_noise_of_two_frames_is_their_difference():
     warped = torch.randn(1, 2, 24, 33, generator=torch.Generator().manual_seed(2), dtype=torch.complex128)
-    seen = torch.ones(1, 2, 24, dtype=torch.float64)
-    seen[0, 0, :8] = seen[0, 1, 4:12] = 0
-    noise = FrameComparison.of([(slice(0, 24), warped)], seen).noise[:, :24]
-    torch.testing.assert_close(noise.abs(), _noise_of_mean(warped[..., ::4], seen).abs())
+    visible = torch.ones(1, 2, 24, dtype=torch.float64)
+    visible[0, 0, :8] = visible[0, 1, 4:12] = 0
+    noise = FrameComparison.of([(slice(0, 24), warped)], visible).noise[:, :24]
+    torch.testing.assert_close(noise.abs(), _noise_of_mean(warped[..., ::4], visible).abs())
     assert float(noise[:, 12:].abs().mean()) > 0.3
