@@ -18,7 +18,7 @@ SCRIPTS = Path(__file__).parents[1] / "scripts"
 def scripts(monkeypatch):
     monkeypatch.syspath_prepend(str(SCRIPTS))
     yield
-    for name in [name for name in sys.modules if name.split(".")[0] in ("benchmarks", "benchmark")]:
+    for name in [name for name in sys.modules if name.split(".")[0] in ("benchmarks", "benchmark", "benchmark_page")]:
         monkeypatch.delitem(sys.modules, name)
 
 
@@ -46,7 +46,7 @@ def test_timed_runs_add_turn_by_turn_and_scale():
     assert [len(timed.runs) for timed in done.values()] == [2, 2]
 
 
-def test_registration():
+def test_registration(tmp_path):
     from benchmarks import registration
 
     chosen = options()
@@ -58,10 +58,12 @@ def test_registration():
     for name in ("ncc", "phase", "cv2.matchTemplate, parabola", "cv2.findTransformECC, from matchTemplate"):
         assert found[name]["share_off"] < 0.15
         assert max(found[name]["rms_px"]) < 0.12
-    assert sum(line.startswith("| ") for line in registration.lines(list(found.values()), chosen)) == len(found) + 1
+    text = registration.lines(list(found.values()), chosen)
+    assert sum(line.startswith("| ") for line in text) == len(found) + 1
+    assert registration.lines(*stored("registration", list(found.values()), chosen, tmp_path)) == text
 
 
-def test_pipeline():
+def test_pipeline(tmp_path):
     from benchmarks import pipeline
 
     chosen = options(runs=1)
@@ -88,17 +90,17 @@ def test_pipeline():
     ratio = timed[pipeline.PAPER]["seconds"] / timed[pipeline.OURS]["seconds"]
     assert found["time of the paper's chain over ours"]["value"] == pytest.approx(ratio)
     text = "\n".join(pipeline.lines(results, chosen))
+    assert "\n".join(pipeline.lines(*stored("pipeline", results, chosen, tmp_path))) == text
     for row in found.values():
         assert f"| {row['target']} | {row['goal']} | {row['value']:.2f} | " in text
 
 
-def test_difficulty(tmp_path):
+def test_difficulty():
     """Scenes are made easier until plain unwarping is as good as where goals were set; then goals are comparable."""
     from benchmarks import difficulty
 
-    told = []
-    difficulty.main(["--grid-size", "160", "--scenes", "city", "--json", str(tmp_path / "found.json")], told.append)
-    results = json.loads((tmp_path / "found.json").read_text())
+    chosen = options(images=[], difficulty_size=160, by=list(difficulty.WAYS))
+    results = difficulty.rows(chosen)
     cases = [(row["by"], row["exposure_rows"], row["noise"]) for row in results]
     assert cases == [(way, *case) for way in difficulty.WAYS for case in difficulty.CASES]
     for row in results:
@@ -106,8 +108,7 @@ def test_difficulty(tmp_path):
         if row["noise"] == 0:
             assert row["unwarped_db"] == pytest.approx(difficulty.UNWARPED[0], abs=0.2)
             assert row["one_db"] > 68
-    (text,) = told
-    assert sum(line.startswith("| city, ") for line in text.splitlines()) == len(results)
+    assert sum(line.startswith("| city, ") for line in difficulty.lines(results, chosen)) == len(results)
 
 
 def test_targets_are_met_or_missed():
@@ -142,7 +143,7 @@ def test_targets_are_met_or_missed():
     assert met == [*times, (30.0, True), (90.0, False), *ahead]
 
 
-def test_scaling(monkeypatch):
+def test_scaling(monkeypatch, tmp_path):
     from benchmarks import scaling
 
     every = scaling.cases(1024)
@@ -177,6 +178,7 @@ def test_scaling(monkeypatch):
     memory = [row for row in results if row["part"] == "memory"]
     assert {row["frames_of_memory"] for row in memory} == {1.25}
     text = "\n".join(scaling.lines(results, chosen))
+    assert "\n".join(scaling.lines(*stored("scaling", results, chosen, tmp_path))) == text
     assert f"| width | 128 | 6 | {narrow['detection']['seconds']:.3f}" in text
 
 
@@ -192,7 +194,7 @@ def test_peak_memory():
     assert peak_memory("detection", 2, 512, 512) > 2 * 4 * 512 * 512
 
 
-def test_roofline(monkeypatch):
+def test_roofline(monkeypatch, tmp_path):
     from benchmarks import roofline
 
     monkeypatch.setattr(roofline, "COPIED", 1 << 22)
@@ -217,7 +219,9 @@ def test_roofline(monkeypatch):
     assert device["least_seconds"] <= device["moved_seconds"]
     moved = sum(row["bytes_moved"] for row in counted.values())
     assert device["share_of_bandwidth"] == pytest.approx(moved / device["bytes_a_second"] / device["seconds"])
-    assert "| cpu | " in "\n".join(roofline.lines(results, chosen))
+    text = "\n".join(roofline.lines(results, chosen))
+    assert "| cpu | " in text
+    assert "\n".join(roofline.lines(*stored("roofline", results, chosen, tmp_path))) == text
 
 
 def test_roofline_of_interpolated_factors():
@@ -245,11 +249,68 @@ def test_restoration_next_to_row_loops():
         assert found["raw"] + 10 < found[name] < found["exact"]
 
 
-def test_json_knows_no_nan():
-    import benchmark
+def test_results_are_stored_and_read_back(tmp_path):
+    from benchmarks.store import read_result, write_result
 
-    figures = {"a": [1.5, math.nan], "b": {"c": (math.inf, 2)}, "d": "nan"}
-    assert benchmark.finite(figures) == {"a": [1.5, None], "b": {"c": [None, 2]}, "d": "nan"}
+    rows = [{"name": "a", "values": [1.5, -math.inf, None], "error": math.nan, "pair": (2, "x")}]
+    chosen = options(out=tmp_path, images=[Path("scene.png")])
+    path = write_result("registration", rows, chosen, 12.34, tmp_path)
+    text = path.read_text()
+    assert "NaN" not in text
+    assert "Infinity" not in text
+    back = read_result(path)
+    assert back.rows[0].pop("error") != back.rows[0].get("error")
+    assert back.rows == [{"name": "a", "values": [1.5, -math.inf, None], "pair": [2, "x"]}]
+    assert (back.section, back.version, back.seconds) == ("registration", rsv.__version__, 12.3)
+    assert (back.options.size, back.options.images) == (256, ["scene.png"])
+    assert not hasattr(back.options, "out")
+    assert back.machine["torch"] == torch.__version__
+    assert {"processor", "cores", "threads"} < set(back.machine)
+
+
+def test_page_is_generated_from_stored_results(tmp_path):
+    import benchmark_page
+
+    rows = [
+        {"name": "round trip", "seconds": 0.1, "seconds_least": 0.09, "seconds_most": 0.2, "round_trips": 1.0},
+        {"name": "direct, 2 frames", "seconds": 2.5, "seconds_least": 2.0, "seconds_most": 3.0, "round_trips": 25.0},
+    ]
+    machine = {"processor": "Model X", "cores": 4, "threads": 2, "python": "3.11.7", "torch": "2.0", "load": None}
+    machine |= {"libraries": {"NumPy": "2.0"}, "huge_pages": True, "kept_memory": False, "cuda": None}
+    content = {"section": "cost", "version": "0.1.0", "commit": "0123456789", "date": "2026-01-31", "seconds": 61.4}
+    content |= {"machine": machine, "options": {"size": 512, "runs": 5}, "rows": rows}
+    (tmp_path / "cost.json").write_text(json.dumps(content))
+    benchmark_page.main(["--results", str(tmp_path), "--out", str(tmp_path / "page.md")])
+    page = (tmp_path / "page.md").read_text()
+    assert (
+        page
+        == f"""{benchmark_page.HEAD}
+## Time of detection
+
+Measured by `python scripts/benchmark.py --only cost --store` with rsvib_torch 0.1.0, commit 0123456789, on 2026-01-31 \
+in 61 s. Model X, 4 cores, 2 threads; Python 3.11.7, torch 2.0, NumPy 2.0; huge pages. No CUDA device.
+
+| detection, 512^2 | seconds | FFT round trips |
+|---|---|---|
+| round trip | 0.100 (0.090 to 0.200) | 1.0 |
+| direct, 2 frames | 2.500 (2.000 to 3.000) | 25.0 |
+"""
+    )
+
+
+def test_the_page_of_the_documentation_is_up_to_date():
+    import benchmark_page
+
+    if any(benchmark_page.RESULTS.glob("*.json")):
+        assert benchmark_page.PAGE.read_text() == benchmark_page.page_text(benchmark_page.RESULTS)
+
+
+def stored(section, rows, chosen, folder):
+    """Rows and options of a result after storing and reading."""
+    from benchmarks.store import read_result, write_result
+
+    result = read_result(write_result(section, rows, chosen, 1.0, folder))
+    return result.rows, result.options
 
 
 def test_one_command_writes_markdown_and_json(monkeypatch, tmp_path, capsys):
@@ -262,10 +323,10 @@ def test_one_command_writes_markdown_and_json(monkeypatch, tmp_path, capsys):
         benchmark.main()
     finally:
         torch.set_num_threads(threads)
-    summary = json.loads((tmp_path / "benchmark.json").read_text())
+    summary = json.loads((tmp_path / "registration.json").read_text())
     assert summary["machine"]["torch"] == torch.__version__
     assert {"OpenCV", "SciPy", "scikit-image", "Kornia"} < set(summary["machine"]["libraries"])
-    assert len(summary["registration"]) == 7
+    assert len(summary["rows"]) == 7
     text = (tmp_path / "benchmark.md").read_text()
     assert text in capsys.readouterr().out + "\n"
     assert "skimage" in text

@@ -3,13 +3,10 @@
 Frames come from benchmarks/independent_camera.py, which shares no code with the package. Monte Carlo: pairs of many
 noise seeds, phases and scenes; errors over the bound for an unknown scene, and how often the 95 % intervals hold the
 truth. Cases: largest and root-mean-square error in per cent and π.
-
-On its own: cd scripts && python -m benchmarks.detection --out ../out/detection [--quick] [--cases]
 """
 
 import argparse
 import itertools
-import json
 import math
 import time
 from pathlib import Path
@@ -20,7 +17,6 @@ import torch
 from benchmarks import detection_report
 from benchmarks.detection_cases import CASES, NAMES, PAPER, SMALL, Take, take
 from benchmarks.independent_camera import Array, Shake
-from benchmarks.measure import machine
 
 import rsvib_torch as rsv
 
@@ -216,22 +212,3 @@ def quick_options() -> dict[str, Any]:
 
 
 lines = detection_report.lines
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("out/detection"), help="folder for .md, .json and .png")
-    add_options(parser)
-    options = parser.parse_args()
-    results = rows(options)
-    options.out.mkdir(parents=True, exist_ok=True)
-    text = "\n".join(lines(results, options)) + "\n"
-    summary = {"machine": machine(), "detection": results}
-    (options.out / "detection.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
-    (options.out / "detection.md").write_text(text, encoding="utf-8")
-    detection_report.draw(results, options.out)
-    print(text, end="")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,23 +1,21 @@
-"""PSNR of restored frames of scenes made as hard as another one: ``python -m benchmarks.difficulty``.
+"""PSNR of restored frames of scenes that are changed until they are as difficult as a reference scene.
 
-How well a frame can be restored depends on the scene: its contrast, and how much of it lies near the Nyquist frequency,
-which is lost first. Plain unwarping of a noiseless frame (``cv2.remap``, Lanczos-4) measures that. So scenes are made
-fainter, or blurred by Gaussian optics, until it reaches a given PSNR, and everything else is compared there; how
-unwarping does in the other cases says how alike the scenes have become. The true vibration is given, the strength of
-the prior comes from the frames, and these from a camera made without the package.
+The PSNR of a restored frame depends on the contrast of the scene and on its power near the Nyquist frequency. The PSNR
+that plain unwarping of a noiseless frame reaches (``cv2.remap``, Lanczos-4) measures this difficulty. Scenes are
+therefore reduced in contrast, or blurred by Gaussian optics, until unwarping reaches the PSNR of the reference scene.
+The PSNR of unwarping in the other cases indicates how similar the scenes have become. The true vibration is given, the
+regularisation is estimated from the frames, and these come from a camera made without the package.
 """
 
 import argparse
-import json
 from collections.abc import Callable
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from benchmarks.regularisation import two_frames
-from benchmarks.restoration import MARGIN, SCENES, SEED, camera, quality, scenes, vibration
+from benchmarks.restoration import MARGIN, SEED, camera, quality, scenes, vibration
 from benchmarks.restoration_peers import Peer, remap_lanczos
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
@@ -27,16 +25,16 @@ import rsvib_torch as rsv
 
 CASES = ((20, 0.0), (20, 0.005), (20, 0.02), (100, 0.005), (400, 0.005))  # exposure in rows, noise
 GOALS = ((68.0, 72.0), (47.0, 49.2), (38.0, 40.0), (45.0, 47.0), (39.8, 42.8))  # dB of one frame, of two jointly
-UNWARPED = (61.5, 46.5, 34.6, 44.3, 33.2)  # dB by plain unwarping on the scene that the goals were set on
+UNWARPED = (61.5, 46.5, 34.6, 44.3, 33.2)  # dB by plain unwarping on the reference scene, for which the goals were set
 _STEPS = 9
 
 
 def fainter(scene: NDArray[np.float64], share: float) -> NDArray[np.float64]:
-    """A scene of 1 - ``share`` of the contrast."""
+    """The scene with its contrast reduced to 1 - ``share``."""
     return np.asarray(scene.mean() + (1.0 - share) * (scene - scene.mean()))
 
 
-# what can be done to a scene, the largest amount of it, and its name
+# changes of a scene: function, largest amount, description
 WAYS: dict[str, tuple[Callable[[NDArray[np.float64], float], NDArray[np.float64]], float, Callable[[float], str]]] = {
     "contrast": (fainter, 0.99, lambda share: f"contrast {1.0 - share:.2f}"),
     "optics": (gaussian_filter, 1.5, lambda sigma: f"optics {sigma:.2f} px"),
@@ -51,17 +49,17 @@ def frames_of(scene: NDArray[np.float64], exposure: int, noise: float) -> Tensor
 
 
 def still_of(scene: NDArray[np.float64]) -> Tensor:
-    """What a still camera without noise shows."""
+    """The frame of a camera at rest, without noise."""
     return torch.from_numpy(scene[MARGIN:-MARGIN, MARGIN:-MARGIN]).float()
 
 
 def unwarped(frames: Tensor, scene: NDArray[np.float64], exposure: int) -> float:
-    """PSNR in dB that plain unwarping of the first frame reaches."""
+    """PSNR in dB of the first frame after plain unwarping."""
     return quality(remap_lanczos(frames[0].numpy(), camera(exposure), vibration()), still_of(scene))
 
 
 def made_easier(scene: NDArray[np.float64], wanted: float, way: str) -> tuple[NDArray[np.float64], str]:
-    """A scene changed no more than it takes for plain unwarping to reach ``wanted`` dB, and what was done to it."""
+    """The scene with the smallest change for which plain unwarping reaches ``wanted`` dB, and the change in words."""
     change, high, described = WAYS[way]
     low = 0.0
     for _ in range(_STEPS):
@@ -73,9 +71,10 @@ def made_easier(scene: NDArray[np.float64], wanted: float, way: str) -> tuple[ND
 
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """PSNR of every scene and case by unwarping, of one frame restored, and of two jointly."""
+    """PSNR of every scene and case: unwarped, restored from one frame, and restored jointly from two."""
     results = []
-    for (name, drawn), way in product(scenes(options).items(), options.by):
+    enlarged = argparse.Namespace(**{**vars(options), "grid_size": options.difficulty_size})
+    for (name, drawn), way in product(scenes(enlarged).items(), options.by):
         scene, described = made_easier(drawn.double().numpy(), UNWARPED[0], way)
         for (exposure, noise), goals, before in zip(CASES, GOALS, UNWARPED, strict=True):
             frames, found = frames_of(scene, exposure, noise), []
@@ -88,10 +87,10 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     return results
 
 
-def lines(results: list[dict[str, Any]]) -> list[str]:
+def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
     """A table in Markdown."""
     text = [
-        "| scene | rows, noise | unwarped (where goals were set) | one frame (goal) | two jointly (goal) | |",
+        "| scene | rows, noise | unwarped (reference scene) | one frame (goal) | two jointly (goal) | |",
         "|---|---|---|---|---|---|",
     ]
     for row in results:
@@ -105,20 +104,7 @@ def lines(results: list[dict[str, Any]]) -> list[str]:
     return text
 
 
-def main(arguments: list[str] | None = None, tell: Callable[[str], None] = print) -> None:
-    """Run it."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.difficulty", description=__doc__)
-    parser.add_argument("--grid-size", type=int, default=1024, help="frame side in px (default: 1024)")
-    parser.add_argument("--scenes", choices=SCENES, nargs="*", default=list(SCENES), help="drawn scenes")
-    parser.add_argument("--images", type=Path, nargs="*", default=[], help="images to restore as well")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this section; scenes and images are those of restoration."""
+    parser.add_argument("--difficulty-size", type=int, default=1024, help="side of the frames in px (default: 1024)")
     parser.add_argument("--by", choices=WAYS, nargs="*", default=list(WAYS), help="how scenes are made easier")
-    parser.add_argument("--json", type=Path, help="write the figures there")
-    options = parser.parse_args(arguments)
-    results = rows(options)
-    tell("\n".join(lines(results)))
-    if options.json is not None:
-        options.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -122,7 +123,7 @@ def machine() -> dict[str, Any]:
     return {
         "cores": os.cpu_count() or 1,
         "threads": torch.get_num_threads(),
-        "processor": platform.processor() or platform.machine(),
+        "processor": _processor(),
         "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "huge_pages": os.environ.get(HUGE_PAGES) == "1",
         "kept_memory": all(name in os.environ for name in KEPT),
@@ -131,6 +132,16 @@ def machine() -> dict[str, Any]:
         "torch": torch.__version__,
         "libraries": {name: version for name in _LIBRARIES if (version := _version(name)) is not None},
     }
+
+
+def _processor() -> str:
+    """Name of the processor, or of its architecture if the system does not provide the name."""
+    information = Path("/proc/cpuinfo")
+    if information.exists():
+        for line in information.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def _version(library: str) -> str | None:

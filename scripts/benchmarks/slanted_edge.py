@@ -1,15 +1,16 @@
-"""Accuracy of the slanted-edge MTF, the tables of docs/measuring.md: python scripts/benchmarks/slanted_edge.py."""
+"""Accuracy of the slanted-edge MTF on drawn edges whose MTF is known."""
 
 import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.special import j1
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "evaluation"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 from edge_truth import draw_edge, draw_edge_of, gaussian, mtf50_of, through_pixels
 
@@ -59,7 +60,7 @@ def errors(image: np.ndarray, truth: Transfer, lowest: float) -> tuple[float, fl
 
 
 def bound(sigma: float) -> float:
-    """Cramer-Rao bound of MTF50 in % where optics are known to be Gaussian: angle, place, blur, levels are fitted."""
+    """Cramér-Rao bound of MTF50 in % for Gaussian optics with unknown angle, position, blur and levels."""
     start, step = np.array([5.0, 0.0, sigma, 0.1, 0.9]), 1e-5
 
     def draw(p: np.ndarray) -> np.ndarray:
@@ -71,7 +72,8 @@ def bound(sigma: float) -> float:
     return float(100 * std * abs(ends[2] - ends[0]) / (2 * step) / ends[1])
 
 
-def gaussian_row(sigma: float, seeds: int) -> str:
+def gaussian_row(sigma: float, seeds: int) -> dict[str, Any]:
+    """Errors with Gaussian optics, without noise over angles and levels, and with noise."""
     worst = np.zeros(2)
     for angle in (-7.0, -6.0, -5.71, -5.0, -4.0, 4.0, 4.5, 5.0, 6.0, 7.0):
         truth = through_pixels(gaussian(sigma), angle)
@@ -79,55 +81,92 @@ def gaussian_row(sigma: float, seeds: int) -> str:
             image = draw_edge(angle, sigma, levels=levels).astype(np.float32)
             for roi in (image, image.T):
                 worst = np.maximum(worst, np.abs(errors(roi, truth, 0.1)))
-    found = []
+    noisy = []
     for seed in range(seeds):
         generator = np.random.default_rng(500_000 + seed)
         angle = generator.uniform(4, 7) * generator.choice([-1, 1])
         levels = (0.1, 0.9) if seed % 4 < 2 else (0.9, 0.1)
         image = draw_edge(angle, sigma, levels=levels, offset=generator.uniform(-0.5, 0.5, 2))
         image = image + NOISE * generator.standard_normal(image.shape)
-        found.append(errors(image.T if seed % 2 else image, through_pixels(gaussian(sigma), angle), 0.1)[1])
-    rms = np.sqrt(np.mean(np.square(found)))
-    return f"| Gaussian, sigma = {sigma} px | {worst[0]:.0e} | {worst[1]:.0e} % | {rms:.2f} % | {bound(sigma):.2f} % |"
+        noisy.append(errors(image.T if seed % 2 else image, through_pixels(gaussian(sigma), angle), 0.1)[1])
+    return {
+        "part": "gaussian",
+        "optics": f"Gaussian, sigma = {sigma} px",
+        "mtf_error": float(worst[0]),
+        "mtf50_percent": float(worst[1]),
+        "noisy_percent": float(np.sqrt(np.mean(np.square(noisy)))),
+        "bound_percent": bound(sigma),
+    }
 
 
-def other_row(name: str, seeds: int) -> str:
+def other_row(name: str, seeds: int) -> dict[str, Any]:
+    """Errors with other optics, without and with noise."""
     truth, image = through_pixels(OTHERS[name], 5.2), draw_edge_of(OTHERS[name], 5.2)
     error, clean = errors(image, truth, 0.02)
     noisy = [
         errors(image + NOISE * np.random.default_rng(seed).standard_normal(image.shape), truth, 0.02)[1]
         for seed in range(seeds)
     ]
-    return f"| {name} | {error:.0e} | {clean:+.4f} % | {np.sqrt(np.mean(np.square(noisy))):.2f} % |"
+    rms = float(np.sqrt(np.mean(np.square(noisy))))
+    return {"part": "other", "optics": name, "mtf_error": error, "mtf50_percent": clean, "noisy_percent": rms}
 
 
-def eight_bits(noise: float, seeds: int) -> str:
+def eight_bits(noise: float, seeds: int) -> dict[str, Any]:
+    """Mean error of MTF50 for 8-bit counts."""
     truth, counts = through_pixels(gaussian(0.5), 5.0), 255 * draw_edge(5.0, 0.5)
-    found = []
+    measured = []
     for seed in range(seeds):
         image = counts + noise * np.random.default_rng(seed).standard_normal(counts.shape)
-        found.append(errors(image.round().astype(np.uint8), truth, 0.1)[1])
-    return f"8 bits, sigma = 0.5 px, contrast 204 counts, noise {noise:g}: MTF50 mean {np.mean(found):+.2f} %"
+        measured.append(errors(image.round().astype(np.uint8), truth, 0.1)[1])
+    return {"part": "8 bits", "noise": noise, "mtf50_percent": float(np.mean(measured))}
 
 
-def main() -> None:
-    """Print both tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this section."""
     parser.add_argument(
-        "--seeds", type=int, default=100, help="noise seeds for Gaussian optics; a fifth for the others"
+        "--seeds", type=int, default=100, help="noise seeds for Gaussian optics; a fifth for others (default: 100)"
     )
-    seeds = parser.parse_args().seeds
-    torch.set_num_threads(1)
-    print("| optics | largest error at 0.1 ... 0.5, no noise | MTF50, no noise | MTF50 rms, noise 1 % | bound |")
-    print("|---|---|---|---|---|")
-    for sigma in SIGMAS:
-        print(gaussian_row(sigma, seeds), flush=True)
-    print("\n| optics | largest error at 0.02 ... 0.5, no noise | MTF50, no noise | MTF50 rms, noise 1 % |")
-    print("|---|---|---|---|")
-    for name in OTHERS:
-        print(other_row(name, max(seeds // 5, 1)), flush=True)
-    print(f"\n{eight_bits(0.0, 1)}\n{eight_bits(1.0, max(seeds // 5, 1))}")
 
 
-if __name__ == "__main__":
-    main()
+def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Errors of the MTF and of MTF50 for all optics."""
+    fewer = max(options.seeds // 5, 1)
+    return [
+        *(gaussian_row(sigma, options.seeds) for sigma in SIGMAS),
+        *(other_row(name, fewer) for name in OTHERS),
+        eight_bits(0.0, 1),
+        eight_bits(1.0, fewer),
+    ]
+
+
+def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+    """The figures as Markdown tables."""
+    text = [
+        "| optics | largest MTF error at 0.1 ... 0.5 cycles/px | MTF50, no noise | MTF50 rms, noise 1 % | bound |",
+        "|---|---|---|---|---|",
+    ]
+    text += [
+        f"| {row['optics']} | {row['mtf_error']:.0e} | {row['mtf50_percent']:.0e} % | {row['noisy_percent']:.2f} % "
+        f"| {row['bound_percent']:.2f} % |"
+        for row in results
+        if row["part"] == "gaussian"
+    ]
+    text += [
+        "",
+        "| optics | largest MTF error at 0.02 ... 0.5 cycles/px | MTF50, no noise | MTF50 rms, noise 1 % |",
+        "|---|---|---|---|",
+    ]
+    text += [
+        f"| {row['optics']} | {row['mtf_error']:.0e} | {row['mtf50_percent']:+.4f} % | {row['noisy_percent']:.2f} % |"
+        for row in results
+        if row["part"] == "other"
+    ]
+    text += [
+        "",
+        "8 bits, sigma = 0.5 px, contrast 204 counts, mean error of MTF50: "
+        + ", ".join(
+            f"{row['mtf50_percent']:+.2f} % at noise {row['noise']:g}" for row in results if row["part"] == "8 bits"
+        )
+        + ".",
+    ]
+    return text
