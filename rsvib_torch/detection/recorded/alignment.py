@@ -1,4 +1,4 @@
-"""A motion that another instrument recorded, brought to the clock of the frames."""
+"""Alignment of a motion that another instrument recorded with the clock of the frames."""
 
 import math
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from rsvib_torch.detection.band_curve import measurements_of_curve
 from rsvib_torch.detection.grey_frames import grey_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
-from rsvib_torch.detection.shapes.free import start_curve
+from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -20,31 +20,21 @@ from rsvib_torch.registration import Registration, RegistrationOptions
 
 __all__ = ["ClockAlignment", "align_motion"]
 
-_MOST_OFFSETS = 20000
-_FEW_ROWS = 400  # scene rows that tell where to start
-_CHUNK = 128  # offsets tried together
-_ROUNDS = 12
-_LOOKS = 3  # rounds of measuring on the images
-_EXPLAINED = 0.25  # of the motion that may be left
-_FINEST = 0.05  # px
-_ALIKE = 2.0  # of the least square that another offset must exceed
-_LEAST_MOTION = 0.05  # px between frames, that an offset shows in
-
 
 @dataclass(frozen=True, eq=False)
 class ClockAlignment:
-    """Where in a recorded motion the frames were taken: at ``scale t + offset`` of its clock.
+    """Time of the frames within a recorded motion: ``scale t + offset`` on its clock.
 
     Attributes:
         motion: The motion in image axes on the clock of the frames, with gain and drift.
         offset: Reading of the recording's clock at time 0 of the frames, in seconds.
         offset_std: Its standard deviation.
-        scale: Seconds that pass on it in one second of the frames.
-        scale_std: Its standard deviation; 0 where it was not fitted.
-        gain: Factor of the recorded motion of each axis (x, y); 1 where it was not fitted.
-        drift: (2,) px/s that the recording does not have, as gyroscopes drift.
+        scale: Seconds on the recording's clock per second of the frames.
+        scale_std: Its standard deviation; 0 if it was not fitted.
+        gain: Factor of the recorded motion of each axis (x, y); 1 if it was not fitted.
+        drift: (2,) px/s that the recording does not contain, as gyroscopes drift.
         unexplained: (2,) px, rms displacement of rows that the aligned motion does not explain, beyond their noise.
-        reliable: Whether the recording explains what the rows show, at this offset only.
+        reliable: Whether the recording explains the measurements, at this offset only.
         reasons: Why not.
     """
 
@@ -62,7 +52,7 @@ class ClockAlignment:
 
 @dataclass(frozen=True)
 class _Clock:
-    """Parameters of the fit; ``at`` is the reading of the recording's clock at ``middle`` of the frames' record."""
+    """Parameters of the fit; ``at`` is the reading of the recording's clock at time ``middle`` of the frames."""
 
     at: float
     scale: float
@@ -102,19 +92,18 @@ def align_motion(
 ) -> ClockAlignment:
     """Find offset and scale between the clock of a recorded motion and that of the frames.
 
-    The recording (of a gyroscope, of attitude sensors) is held against the displacements of the rows between frames:
-    first at many offsets against those of row bands, then by least squares against those measured on the images
-    around it, row by row. A uniform drift of each axis is fitted as well.
+    The recording (of a gyroscope, of attitude sensors) is compared with the displacements of the rows between frames:
+    first at many offsets with those of row bands, then by least squares with those measured on the images around it. A
+    uniform drift of each axis is fitted as well.
 
     Args:
-        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames, tensor or NumPy array; NaN marks pixels that
-            were not measured.
+        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames, tensor or NumPy array; NaN marks missing
+            pixels.
         timing: The sensor.
         recorded: The motion on its own clock, in image axes.
-        offsets: Least and largest offset to look at, in seconds; by default all for which the recording covers the
-            frames.
-        fit_scale: Whether the clocks may run at different speeds.
-        fit_gain: Whether the recorded motion may be too large or too small, each axis by a factor (focal length).
+        offsets: Smallest and largest offset in seconds; by default all for which the recording covers the frames.
+        fit_scale: Whether to fit the ratio of the speeds of the clocks.
+        fit_gain: Whether to fit a factor of the recorded motion of each axis (focal length).
         registration: Method of the start.
         band_rows: Rows of a band of the start.
         band_step: Rows from one band to the next.
@@ -122,10 +111,21 @@ def align_motion(
         ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out.
         full_scale: Count that means 1.0, for integer frames.
 
+    Returns:
+        The motion on the clock of the frames, offset and scale with standard deviations, and a verdict.
+
     Raises:
         TypeError: If frames are not numbers.
-        ValueError: If the recording is shorter than the frames or does not cover them at any offset asked for, frames
-            cannot be registered, or an option is out of range.
+        ValueError: If the recording is shorter than the frames or does not cover them at any offset in ``offsets``,
+            frames cannot be registered, or an option is out of range.
+
+    Example:
+        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=256)
+        >>> recorded = FreeMotion.from_samples(torch.arange(0, 1, 0.01), torch.zeros(100, 2))
+        >>> align_motion(torch.rand(1, 256, 256), timing, recorded)
+        Traceback (most recent call last):
+        ...
+        ValueError: at least 2 frames are needed, got 1
     """
     if recorded.batch_shape:
         raise ValueError("align_motion takes one motion, not a batch")
@@ -141,55 +141,56 @@ def align_motion(
     offset, other = _best_offset(measured, turned, low, high, rowwise)
     clock = _Clock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
     clock, covariance = _refine(measured, turned, clock, False, fit_gain)
-    clock, covariance = _refine(measured.reweighted(_left(measured, turned, clock)), turned, clock, fit_scale, fit_gain)
+    weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
+    clock, covariance = _refine(weighed, turned, clock, fit_scale, fit_gain)
     groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, clock.motion(turned).expanded(1))
-    for _ in range(_LOOKS):
+    for _ in range(3):
         measured, _ = measure_groups(groups, rowwise, clock.motion(turned).expanded(1))
-        weighed = measured.reweighted(_left(measured, turned, clock))
+        weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
         clock, covariance = _refine(weighed, turned, clock, fit_scale, fit_gain)
-    left = _left(measured, turned, clock)
-    honest = measured.independent_fraction(left)
-    std = (covariance.diagonal() / honest).clamp(min=0.0).sqrt()
-    # from the middle of the record to time 0
-    reach = torch.tensor([1.0, -clock.middle], dtype=torch.float64, device=std.device)
-    offset_std = float((reach @ covariance[:2, :2] @ reach / honest).clamp(min=0.0).sqrt())
-    beside = measured.unexplained(left)[0]
-    moved = measured.relative(clock.motion(turned).mean_displacement(measured.moments, rowwise.exposure_time))
-    size = moved[0].square().sum(1).div(measured.differences[0].clamp(min=1.0)[:, None]).mean(0).sqrt()
-    reasons = _reasons(beside, size, other, float(std[0]))
+    aligned = clock.motion(turned)
+    residual = residual_of_motion(measured, aligned)
+    independent = measured.independent_fraction(residual)
+    std = (covariance.diagonal() / independent).clamp(min=0.0).sqrt()
+    # offset = at - scale * middle
+    gradient = torch.tensor([1.0, -clock.middle], dtype=torch.float64, device=std.device)
+    offset_std = float((gradient @ covariance[:2, :2] @ gradient / independent).clamp(min=0.0).sqrt())
+    rest = measured.unexplained(residual)[0]
+    reasons = _reasons(rest, rms_motion(measured, aligned), other)
     swap = timing.scan_axis == -1
-    result = FreeMotion(recorded.coefficients, recorded.start, recorded.spacing, recorded.tones)
     sign = -1.0 if timing.readout_direction == "reverse" else 1.0
     drift = (clock.drift[0], sign * clock.drift[1])
-    there = replace(
+    in_image = replace(
         clock,
         gain=(clock.gain[1], clock.gain[0]) if swap else clock.gain,
         drift=(drift[1], drift[0]) if swap else drift,
     )
     return ClockAlignment(
-        motion=there.motion(result),
+        motion=in_image.motion(recorded),
         offset=clock.offset,
         offset_std=offset_std,
         scale=clock.scale,
         scale_std=float(std[1]),
-        gain=there.gain,
-        drift=torch.tensor(there.drift, dtype=torch.float64),
-        unexplained=beside.flip(-1) if swap else beside,
+        gain=in_image.gain,
+        drift=torch.tensor(in_image.drift, dtype=torch.float64),
+        unexplained=rest.flip(-1) if swap else rest,
         reliable=not reasons,
         reasons=tuple(reasons),
     )
 
 
-def _offsets(recorded: FreeMotion, first: float, last: float, asked: tuple[float, float] | None) -> tuple[float, float]:
-    """Range of offsets for which the recording covers the frames, within what was asked for."""
+def _offsets(
+    recorded: FreeMotion, first: float, last: float, limits: tuple[float, float] | None
+) -> tuple[float, float]:
+    """Range of offsets for which the recording covers the frames, within ``limits``."""
     low, high = recorded.start - first, recorded.end - last
     if high < low:
         raise ValueError(
             f"the recording of {recorded.end - recorded.start:.4g} s is shorter than the frames, {last - first:.4g} s; "
             "are its times in another unit?"
         )
-    if asked is not None:
-        bounds = (check_number("offsets", asked[0]), check_number("offsets", asked[1]))
+    if limits is not None:
+        bounds = (check_number("offsets", limits[0]), check_number("offsets", limits[1]))
         if bounds[1] < low or bounds[0] > high or bounds[1] < bounds[0]:
             raise ValueError(
                 f"offsets {bounds[0]:g} to {bounds[1]:g} s: the recording covers the frames from {low:.6g} to "
@@ -199,22 +200,16 @@ def _offsets(recorded: FreeMotion, first: float, last: float, asked: tuple[float
     return low, high
 
 
-def _left(measured: Measurements, recorded: FreeMotion, clock: _Clock) -> Tensor:
-    """What the recording leaves of the displacements (1, N, G, 2)."""
-    predicted = clock.motion(recorded).mean_displacement(measured.moments, measured.exposure_time)
-    return measured.relative(measured.displacements - predicted)
-
-
 def _best_offset(
     measured: Measurements, recorded: FreeMotion, low: float, high: float, timing: SensorTiming
 ) -> tuple[float, float | None]:
-    """The offset at which the recording explains most, a drift being free, and another that explains as much."""
-    every = max(1, measured.moments.shape[1] // _FEW_ROWS)
-    known = (measured.weights[0] > 0).all(-1).nonzero()[::every, 0]
-    moments = measured.moments[0, known] + 0.5 * measured.exposure_time
-    seen = measured.seen[0, known]
-    values = (measured.displacements[0, known] * seen[..., None]).flatten(0, 1)
-    weight = (measured.weights[0, known, None] * seen[..., None]).flatten(0, 1)
+    """The offset of the least residual, with a free drift, and another local minimum below twice the least square."""
+    every = max(1, measured.moments.shape[1] // 400)  # 400 scene rows are enough for a start
+    used = (measured.weights[0] > 0).all(-1).nonzero()[::every, 0]
+    moments = measured.moments[0, used] + 0.5 * measured.exposure_time
+    seen = measured.seen[0, used]
+    values = (measured.displacements[0, used] * seen[..., None]).flatten(0, 1)
+    weight = (measured.weights[0, used, None] * seen[..., None]).flatten(0, 1)
 
     def relative(of: Tensor) -> Tensor:  # (..., N, G, A)
         mean = (of * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)
@@ -222,22 +217,22 @@ def _best_offset(
 
     drift = relative(moments[..., None].expand(-1, -1, 2))
     norm = (weight * drift.square()).sum(0).clamp(min=1e-300)
-    step = max(0.5 * recorded.spacing, 4 * timing.row_time, (high - low) / _MOST_OFFSETS)
+    step = max(0.5 * recorded.spacing, 4 * timing.row_time, (high - low) / 20000)  # at most 20,000 offsets
     grid = torch.linspace(
         low, high, max(2, math.ceil((high - low) / step) + 1), dtype=torch.float64, device=drift.device
     )
     costs = []
-    for part in grid.split(_CHUNK):
-        left = values - relative(recorded.displacement(part[:, None, None] + moments))
-        along = (weight * drift * left).sum(-2) / norm
-        # axes that do not move say nothing: squares of the smallest residuals only, clouds have no say
-        size = (weight * (left - along[:, None] * drift).square()).sum(-1)
+    for part in grid.split(128):  # (128, N G, 2) values at a time
+        residual = values - relative(recorded.displacement(part[:, None, None] + moments))
+        along = (weight * drift * residual).sum(-2) / norm
+        # both axes together, as one of them may be at rest; without the largest fifth: clouds
+        size = (weight * (residual - along[:, None] * drift).square()).sum(-1)
         kept = size.sort(dim=-1).values[:, : math.ceil(0.8 * size.shape[-1])]
         costs.append(kept.sum(-1))
     cost = torch.cat(costs)
     best = int(cost.argmin())
     padded = torch.nn.functional.pad(cost, (1, 1), value=math.inf)
-    valleys = (padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]) & (cost < _ALIKE * cost[best] + 1e-300)
+    valleys = (padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]) & (cost < 2.0 * cost[best] + 1e-300)
     valleys[best] = False
     others = valleys.nonzero()[:, 0]
     other = float(grid[others[cost[others].argmin()]]) if len(others) else None
@@ -252,7 +247,7 @@ def _refine(
     middle = moments + 0.5 * measured.exposure_time - clock.middle
     free = torch.tensor([True, fit_scale, fit_gain, fit_gain, True, True], device=moments.device)
     covariance = torch.zeros(6, 6, dtype=torch.float64, device=moments.device)
-    for _ in range(_ROUNDS):
+    for _ in range(12):
         own = recorded.retimed(clock.offset, clock.scale)
         gain = moments.new_tensor(clock.gain)
         speed = own.velocity(moments + 0.5 * measured.exposure_time) * gain / clock.scale
@@ -270,14 +265,14 @@ def _refine(
             -1,
         )
         columns = measured.relative(columns) * free
-        left = _left(measured, recorded, clock)
+        residual = residual_of_motion(measured, clock.motion(recorded))
         gram = torch.einsum("bngap,bnac,bngcq->pq", columns, measured.information, columns)
-        right = torch.einsum("bngap,bnac,bngc->p", columns, measured.information, left)
+        right = torch.einsum("bngap,bnac,bngc->p", columns, measured.information, residual)
         scale = torch.where(gram.diagonal() > 0, gram.diagonal(), 1.0).sqrt()
         inverse = torch.linalg.pinv(gram / scale / scale[:, None], rtol=1e-10, hermitian=True) / scale / scale[:, None]
         change = inverse @ right
         known = measured.known.sum().clamp(min=7.0) - free.sum()
-        covariance = inverse * (measured.square(left).sum() / known)
+        covariance = inverse * (measured.square(residual).sum() / known)
         at, speedup, gain_x, gain_y, drift_x, drift_y = change.tolist()
         clock = _Clock(
             clock.at + at,
@@ -291,12 +286,15 @@ def _refine(
     return clock, covariance
 
 
-def _reasons(unexplained: Tensor, size: Tensor, other: float | None, offset_std: float) -> list[str]:
+def _reasons(unexplained: Tensor, size: Tensor, other: float | None) -> list[str]:
+    """Reasons against an alignment: rms motion ``size`` (2,) too small, residual too large, or another offset."""
     reasons = []
-    if float(size.amax()) < _LEAST_MOTION:
-        reasons.append(f"the recorded motion moves rows by {float(size.amax()):.2g} px between frames: too little")
+    if float(size.amax()) < 0.05:
+        reasons.append(
+            f"the recorded motion moves rows by {float(size.amax()):.2g} px between frames: below 0.05 px, too little"
+        )
     for axis, name in enumerate(("along the rows", "across the rows")):
-        if float(unexplained[axis]) > max(_EXPLAINED * float(size[axis]), _FINEST):
+        if float(unexplained[axis]) > max(0.25 * float(size[axis]), 0.05):
             reasons.append(f"rows move by {float(unexplained[axis]):.3g} px {name} that the recording does not explain")
     if other is not None:
         reasons.append(f"an offset of {other:.6g} s explains the frames as well: the motion repeats")

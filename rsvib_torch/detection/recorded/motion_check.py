@@ -1,4 +1,4 @@
-"""Whether a motion that is known from elsewhere explains what frames show."""
+"""Comparison of a given motion with the offsets between frames."""
 
 import math
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.detection.band_curve import measurements_of_curve
 from rsvib_torch.detection.grey_frames import grey_frames
 from rsvib_torch.detection.measurements import Measurements
@@ -19,21 +20,19 @@ from rsvib_torch.registration import Registration, RegistrationOptions
 
 __all__ = ["MotionCheck", "check_motion"]
 
-_COUNTED = 0.9  # of the bands, those that fit best: the others may be clouds or mistakes of registration
-_NOTHING = 0.05  # px, which bands are apart by mistakes of registration
-_MOST_LEFT = 0.5  # of the motion, that a recording which explains it may leave
+_MIN_CHANGE = 0.05  # px, registration errors of bands
 
 
 @dataclass(frozen=True, eq=False)
 class MotionCheck:
-    """How far rows move between frames, before and after a known motion is taken out.
+    """Offsets of rows between frames, before and after a given motion is subtracted.
 
     Attributes:
         before: (2,) px, rms offset of row bands between consecutive frames, axes (x, y), of the nine tenths that fit
-            best.
-        after: (2,) px, the same less the offsets that the motion makes.
-        helps: Whether the motion brings the frames closer to each other, both axes together.
-        reasons: What speaks against the motion.
+            best: the others may be clouds or registration errors.
+        after: (2,) px, the same of the offsets less those of the motion.
+        helps: Whether the motion reduces the offsets, both axes together.
+        reasons: Reasons against the motion.
     """
 
     before: Tensor
@@ -57,14 +56,13 @@ def check_motion(
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
 ) -> MotionCheck:
-    """Hold a known motion against the offsets of row bands between frames.
+    """Compare a given motion with the offsets of row bands between frames.
 
-    A motion of the wrong sign, clock or focal length makes frames worse: rows are then further apart less the motion
-    than with it.
+    A motion with the wrong sign, clock or focal length makes frames worse: its subtraction increases the offsets.
 
     Args:
-        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames, tensor or NumPy array; NaN marks pixels that
-            were not measured.
+        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames, tensor or NumPy array; NaN marks missing
+            pixels.
         timing: The sensor.
         motion: A vibration or free motion in image axes, on the clock of the frames.
         registration: ``"ncc"``, ``"phase"`` or ``"projection"``.
@@ -74,9 +72,20 @@ def check_motion(
         ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out.
         full_scale: Count that means 1.0, for integer frames.
 
+    Returns:
+        Rms offsets with and without the motion, and a verdict.
+
     Raises:
         TypeError: If frames are not numbers.
         ValueError: If frames or motion are a batch, or the frames cannot be registered.
+
+    Example:
+        >>> from rsvib_torch import Vibration
+        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=256)
+        >>> check_motion(torch.rand(1, 256, 256), timing, Vibration(amplitude=1.0, frequency=50.0, phase=0.0))
+        Traceback (most recent call last):
+        ...
+        ValueError: at least 2 frames are needed, got 1
     """
     stack = grey_frames(frames, timing, full_scale, ignore)
     if stack.batched or motion.batch_shape:
@@ -86,18 +95,17 @@ def check_motion(
     measured = measurements_of_curve(curve, rowwise, band_step)
     turned = motion.to(stack.images.device).to_row_order(timing)
     offsets = _offsets(measured.displacements)
-    left = offsets - _offsets(_averaged(turned, measured))
-    known = measured.weights[0].amin(-1) > 0
-    # image axes have x first, whatever the scan
-    before, after = (offsets_from_row_order(_size(v[known]), timing).abs() for v in (offsets, left))
+    residual = offsets - _offsets(_averaged(turned, measured))
+    used = measured.weights[0].amin(-1) > 0
+    before, after = (offsets_from_row_order(_rms(values[used]), timing).abs() for values in (offsets, residual))
     reasons = []
     for axis, name in enumerate("xy"):
         moved, rest = float(before[axis]), float(after[axis])
-        if rest > moved + _NOTHING:
+        if rest > moved + _MIN_CHANGE:
             reasons.append(
-                f"rows are further apart along {name} less the motion: {rest:.3g} px, {moved:.3g} px with it"
+                f"rows are further apart along {name} without the motion: {rest:.3g} px instead of {moved:.3g} px"
             )
-        elif rest > max(_MOST_LEFT * moved, _NOTHING) and moved > 2 * _NOTHING:
+        elif rest > max(0.5 * moved, _MIN_CHANGE) and moved > 2 * _MIN_CHANGE:
             reasons.append(f"the motion leaves {rest:.3g} px of the {moved:.3g} px that rows move along {name}")
     return MotionCheck(before, after, float(after.norm()) < float(before.norm()), tuple(reasons))
 
@@ -110,12 +118,15 @@ def _offsets(displacements: Tensor) -> Tensor:
 def _averaged(motion: Motion, measured: Measurements) -> Tensor:
     """Mean displacement (1, N, 2, 2) over exposure and rows of the bands."""
     duration = measured.average_times[1]
-    places = [0.5 * duration * math.sqrt(0.6) * place for place in (-1, 0, 1)]
-    values = [motion.mean_displacement(measured.moments + place, measured.exposure_time) for place in places]
-    return (5 * values[0] + 8 * values[1] + 5 * values[2]) / 18  # Gauss-Legendre
+    nodes, weights = gauss_legendre(3)
+    mean = torch.zeros_like(measured.displacements)
+    for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
+        times = measured.moments + (node - 0.5) * duration
+        mean = mean + weight * motion.mean_displacement(times, measured.exposure_time)
+    return mean
 
 
-def _size(offsets: Tensor) -> Tensor:
-    """(2,) rms of the smallest offsets (N, 2)."""
+def _rms(offsets: Tensor) -> Tensor:
+    """(2,) rms of the smallest nine tenths of offsets (N, 2)."""
     square = offsets.square().sort(dim=0).values
-    return square[: max(1, math.ceil(_COUNTED * len(square)))].mean(0).sqrt()
+    return square[: max(1, math.ceil(0.9 * len(square)))].mean(0).sqrt()

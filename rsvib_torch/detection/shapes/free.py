@@ -1,5 +1,12 @@
-"""Motion of any shape from consecutive frames, with what cannot be known of it."""
+"""Free motion: a displacement of any shape, fitted as a spline in time whose power spectrum is estimated from the data.
 
+Frames are registered to each other, so only differences of displacement between frames that contain the same scene row
+are measured. A penalised spline (P-spline) whose smoothness maximises the marginal likelihood gives a first estimate;
+then the power spectrum of the motion is estimated by expectation maximisation, which yields realistic uncertainties of
+the components that the differences do not determine.
+"""
+
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,48 +15,49 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.splines import bspline_weights, gauss_legendre
 from rsvib_torch.detection.band_curve import band_curve, measurements_of_curve
 from rsvib_torch.detection.grey_frames import GreyFrames, grey_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
-from rsvib_torch.detection.shapes.spline_fit import SplineFit, fit_spline
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import offsets_from_row_order
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOptions
 
-__all__ = ["MotionDetection", "detect_motion", "start_curve"]
-
-_MOST_KNOTS = 3000
-_LOOKS = 32  # rows of a frame at which the motion is reported
-_EXPLAINED = 0.15  # of the motion that rows may show beyond the fit
-_FINEST = 0.03  # px, that never matters
-_SURE = 0.3  # px
-_LEAST_FOUND = 0.25  # of the row bands
-_FAR = 0.25  # of the frame, from where on a steady motion is that of the image
+__all__ = [
+    "MotionDetection",
+    "detect_motion",
+    "precision_of_axis",
+    "residual_of_motion",
+    "rms_motion",
+    "start_curve",
+    "unexplained_reason",
+]
 
 
 @dataclass(frozen=True, eq=False)
 class MotionDetection:
-    """A motion of any shape, and how well it is known. A batch of stacks leads all tensors but ``times``.
+    """A motion of any shape with its uncertainty. A batch of stacks leads all tensors but ``times``.
 
-    Rows tell how far they moved between frames. A warp that is fixed to the scene they do not tell: frames of a warped
-    scene look the same, D(t) of the row that shows scene row s being larger by w(s) in every frame. For w the motion's
-    own power at other frequencies decides, and ``std`` is larger than ``std_seen``. The mean over the record is never
-    known, nor counted.
+    Only differences of displacement between frames are measured. A warp that is fixed to the scene is not visible:
+    frames of a warped scene look the same if D(t) of the row that contains scene row s is larger by w(s) in every
+    frame. This component is estimated from the power of the motion at other frequencies, and ``std`` is therefore
+    larger than ``std_seen``. The mean over the record is undetermined and not included.
 
     Attributes:
         motion: The motion in image axes.
         times: (T, R) s, mid-exposures of rows spread over the frames.
         displacement: (..., T, R, 2) px, the motion there, less its mean over the record.
-        std: (..., T, R, 2) px, standard deviation of that.
-        std_seen: (..., 2) px, root mean square of the standard deviation of what rows tell: the displacement of the
-            rows that show one scene row, less its mean over the frames.
-        unseen: (..., 2) px, root mean square of the standard deviation of that mean: of the warp.
+        std: (..., T, R, 2) px, its standard deviation.
+        std_seen: (..., 2) px, rms standard deviation of the visible component: the displacement of the rows that
+            contain one scene row, less its mean over the frames.
+        unseen: (..., 2) px, rms standard deviation of that mean, the warp.
         unexplained: (..., 2) px, rms displacement of rows that the motion does not explain, beyond their noise.
-        reliable: (..., 2) bool, whether the motion explains what the rows show.
+        reliable: (..., 2) bool, whether the motion explains the measurements.
         reasons: Why not, for each axis (x, y); a tuple of those for a batch.
     """
 
@@ -87,17 +95,18 @@ def detect_motion(
 ) -> MotionDetection:
     """Detect a motion of any shape from consecutive frames: the free model.
 
-    Row bands are registered between frames for a start. Then the frames are warped to the scene with the motion found
-    so far, every block of rows tells what it still misses in each frame, and a spline in time is fitted to all
-    of them. How smooth it is the data tell: a power spectrum is learned with up to 800 knots, one number beyond.
+    Row bands are registered between frames for a start. Then the frames are warped to the scene with the current
+    motion, the residual displacement of every block of rows is measured in each frame, and a spline in time is fitted
+    to all of them. Its smoothness is chosen by the marginal likelihood; with up to 800 knots the power spectrum of the
+    motion is estimated as well.
 
     Args:
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, tensor or NumPy array;
-            floats, or integers of known full scale. NaN marks pixels that were not measured.
+            floats, or integers of known full scale. NaN marks missing pixels.
         timing: The sensor.
         registration: ``"ncc"``, ``"phase"`` or ``"projection"``, for the start.
-        knot_rows: Rows read from one knot of the spline to the next: tones up to ``1 / (2 knot_rows T_row)`` fit in.
-            Long stacks take more, so that there are 3000 knots at most.
+        knot_rows: Row times from one knot of the spline to the next, which then resolves frequencies up to
+            ``1 / (2 knot_rows T_row)``. In long stacks the spacing is larger, for 3000 knots at most.
         iterations: Rounds of measuring and fitting.
         band_rows: Rows of a band of the start.
         band_step: Rows from one band to the next.
@@ -110,25 +119,29 @@ def detect_motion(
 
     Raises:
         TypeError: If frames are not numbers.
-        ValueError: If there are fewer than two frames, a frame is constant or has hardly a pixel that counts, the
-            motion is beyond the search range, or an option is out of range.
+        ValueError: If there are fewer than two frames, a frame is constant or has too few valid pixels, the motion is
+            beyond the search range, or an option is out of range.
+
+    Example:
+        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=256)
+        >>> detect_motion(torch.rand(1, 256, 256), timing)
+        Traceback (most recent call last):
+        ...
+        ValueError: at least 2 frames are needed, got 1
     """
     check_whole_number("knot_rows", knot_rows, at_least=4)
     check_whole_number("iterations", iterations, at_least=1)
     stacks = grey_frames(frames, timing, full_scale, ignore)
     bands = RegistrationOptions(registration, band_rows, band_step, search)
-    found = [_detect(stacks.one(i), timing, bands, knot_rows, iterations) for i in range(len(stacks.images))]
-    return _stacked(found) if stacks.batched else found[0]
-
-
-def _stacked(found: list[MotionDetection]) -> MotionDetection:
-    """Results of stacks as one of a batch."""
+    results = [_detect(stacks.one(i), timing, bands, knot_rows, iterations) for i in range(len(stacks.images))]
+    if not stacks.batched:
+        return results[0]
     names = ("displacement", "std", "std_seen", "unseen", "unexplained", "reliable")
     return MotionDetection(
-        motion=FreeMotion.stacked([one.motion for one in found]),
-        times=found[0].times,
-        reasons=tuple(one.reasons for one in found),
-        **{name: torch.stack([getattr(one, name) for one in found]) for name in names},
+        motion=FreeMotion.stacked([one.motion for one in results]),
+        times=results[0].times,
+        reasons=tuple(one.reasons for one in results),
+        **{name: torch.stack([getattr(one, name) for one in results]) for name in names},
     )
 
 
@@ -136,131 +149,308 @@ def _detect(
     stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions, knot_rows: int, iterations: int
 ) -> MotionDetection:
     """``detect_motion`` of one stack."""
-    grey, valid = stack.images, stack.valid
+    grey = stack.images
     rowwise, curve, record = start_curve(stack, timing, bands)
-    starts = rowwise.frame_starts(grey.shape[1], grey.device)
-    spacing = max(knot_rows * rowwise.row_time, (record[1] - record[0]) / _MOST_KNOTS)
+    spacing = max(knot_rows * rowwise.row_time, (record[1] - record[0]) / 3000)  # the cost grows with knots^3
     size = (grey.shape[-2], grey.shape[-1])
     measured = measurements_of_curve(curve, rowwise, bands.band_step)
-    fit = fit_spline(measured, max(spacing, 0.5 * bands.band_rows * rowwise.row_time), record)
+    fit = _fit_spline(measured, max(spacing, 0.5 * bands.band_rows * rowwise.row_time), record)
+    # while iterating, any drift is an image motion, which the scene rows of the groups follow
     motion = _motion(fit, size, 0.0)
-    groups = frame_groups(stack_spectra(grey, valid), rowwise, motion)
+    groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, motion)
     for step in range(iterations):
         measured, _ = measure_groups(groups, rowwise, motion)
-        if step:  # blocks that show something that moves by itself have less say
-            measured = measured.reweighted(_left(measured, motion))
-        fit = fit_spline(measured, spacing, record)
-        motion = _motion(fit, size, 0.0)  # groups follow the image as it moves on
-    left = _left(measured, motion)
-    weighed = measured.reweighted(left)
-    share = weighed.independent_fraction(left) * measured.share_counted(left)
-    fit = fit_spline(replace(weighed, independent=share), spacing, record, learn=True)
-    motion = _motion(fit, size, _FAR)
-    return _report(motion, fit, measured, _left(measured, motion), timing, starts, size[0])
+        if step:  # objects that move by themselves get less weight
+            measured = measured.reweighted(residual_of_motion(measured, motion[0]))
+        fit = _fit_spline(measured, spacing, record)
+        motion = _motion(fit, size, 0.0)
+    residual = residual_of_motion(measured, motion[0])
+    weighed = measured.reweighted(residual)
+    share = weighed.independent_fraction(residual) * measured.share_counted(residual)
+    fit = _fit_spline(replace(weighed, independent=share), spacing, record, learn=True)
+    motion = _motion(fit, size, 0.25)
+    starts = rowwise.frame_starts(grey.shape[1], grey.device)
+    return _report(motion[0], fit, measured, timing, starts, size[0])
 
 
 def start_curve(
     stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions
 ) -> tuple[RowTiming, OffsetCurve, tuple[float, float]]:
-    """Timing in row order, the offsets of the row bands of one stack, start and end of the record.
+    """Timing in row order, the offsets of the row bands of one stack, start and end of the record in seconds.
 
     Raises:
-        ValueError: If the frames do not fit the timing, or hardly a band is found.
+        ValueError: If the frames do not fit the timing, or fewer than a quarter of the bands are found.
     """
     frames = stack.images
     rowwise = timing.in_row_order()
     rowwise.check_rows(frames.shape[-2])
     curve = band_curve(frames, stack.valid, rowwise, bands, mere_start=True)
-    found = float(curve.good.double().mean())
-    if found < _LEAST_FOUND:
+    share = float(curve.good.double().mean())
+    if share < 0.25:
         raise ValueError(
-            f"only {found:.0%} of the row bands are found in the next frame: the motion is beyond "
-            f"search={bands.search} px within a frame, or the frames show different scenes"
+            f"only {share:.0%} of the row bands are found in the next frame: the motion exceeds "
+            f"search={bands.search} px within a frame (use a larger search), or the frames show different scenes"
         )
     starts = rowwise.frame_starts(frames.shape[1])
     end = float(starts[-1]) + frames.shape[-2] * rowwise.row_time + rowwise.exposure_time
     return rowwise, curve, (float(starts[0]), end)
 
 
-def _left(measured: Measurements, motion: FreeMotion) -> Tensor:
-    """What a motion leaves of the displacements (1, N, G, 2)."""
-    one = FreeMotion(motion.coefficients[0], motion.start, motion.spacing, motion.tones[0])
-    predicted = one.mean_displacement(measured.moments, measured.exposure_time)
+def residual_of_motion(measured: Measurements, motion: Motion) -> Tensor:
+    """Residual displacements (1, N, G, 2) in px of a motion (not a batch)."""
+    predicted = motion.mean_displacement(measured.moments, measured.exposure_time)
     return measured.relative(measured.displacements - predicted)
 
 
-def _motion(fit: SplineFit, size: tuple[int, int], far: float) -> FreeMotion:
-    """The spline as a motion that is a batch of one; an image motion of ``far`` frames in the record is told apart."""
+def rms_motion(measured: Measurements, motion: Motion) -> Tensor:
+    """(2,) px, rms displacement of scene rows about their mean over the frames, by a motion (not a batch)."""
+    moved = measured.relative(motion.mean_displacement(measured.moments, measured.exposure_time))[0]
+    return moved.square().sum(1).div(measured.differences[0].clamp(min=1.0)[:, None]).mean(0).sqrt()
+
+
+def unexplained_reason(residual: Tensor, moved: Tensor, model: str) -> list[str]:
+    """Reason against a fit whose rms ``residual`` in px exceeds 15 % of the rms motion ``moved``, and 0.03 px."""
+    if float(residual) <= max(0.15 * float(moved), 0.03):
+        return []
+    return [f"rows move by {float(residual):.3g} px that no {model} explains"]
+
+
+def _motion(fit: "_SplineFit", size: tuple[int, int], frames: float) -> FreeMotion:
+    """The spline as a batch of one motion; a drift by more than ``frames`` frame sizes becomes its image motion."""
     knots = fit.knots
-    apart = knots - knots.mean()
-    speed = (fit.coefficients * apart).sum(-1) / apart.square().sum()
+    centred = knots - knots.mean()
+    speed = (fit.coefficients * centred).sum(-1) / centred.square().sum()
     extent = torch.tensor([size[1], size[0]], dtype=torch.float64, device=knots.device)
-    speed = torch.where(speed.abs() * float(knots[-1] - knots[0]) > far * extent, speed, 0.0)
+    speed = torch.where(speed.abs() * float(knots[-1] - knots[0]) > frames * extent, speed, 0.0)
     drift = Vibration(torch.zeros_like(speed)[None, :, None], 0.0, 0.0, speed[None])
     return FreeMotion((fit.coefficients - speed[:, None] * knots)[None], fit.start, fit.spacing, drift)
 
 
-def _variance(columns: Tensor, covariance: Tensor) -> Tensor:
-    """Variances (S,) of what columns (S, N) make of coefficients of this covariance."""
-    return ((columns @ covariance) * columns).sum(-1).clamp(min=0.0)
+# --- Spline fit ---
 
 
-def _told_and_common(fit: SplineFit, moments: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-    """Columns (S, N) of what the frames (N, G) that see a row of the scene tell of it, and (R, N) of their mean."""
-    several = seen.sum(-1) > 1
-    seen = seen[several]
-    columns = fit.columns(moments[several].flatten()).unflatten(0, seen.shape)
-    mean = (seen[..., None] * columns).sum(1) / seen.sum(-1)[:, None]
-    return (columns - mean[:, None])[seen > 0], mean
+@dataclass(frozen=True, eq=False)
+class _SplineFit:
+    """Cubic spline ``sum_n c_n B((t - start) / spacing - n + 1)`` of each axis.
+
+    Attributes:
+        coefficients: (2, N) float64 px.
+        covariance: (2, N, N) float64 px^2 of each axis.
+        start: Time of the first knot in seconds.
+        spacing: Seconds between knots.
+    """
+
+    coefficients: Tensor
+    covariance: Tensor
+    start: float
+    spacing: float
+
+    @property
+    def knots(self) -> Tensor:
+        """(N,) s, times of the coefficients."""
+        count = self.coefficients.shape[-1]
+        places = torch.arange(count, dtype=torch.float64, device=self.coefficients.device) - 1.0
+        return self.start + places * self.spacing
+
+    def columns(self, times: Tensor) -> Tensor:
+        """Derivatives (S, N) of the motion at times (S,) by the coefficients."""
+        count = self.coefficients.shape[-1]
+        place = ((times - self.start) / self.spacing).clamp(0.0, count - 3.0)
+        cell = place.floor().clamp(max=count - 4.0)
+        index = cell.to(torch.int64)[..., None] + torch.arange(4, device=times.device)
+        columns = torch.zeros(len(times), count, dtype=torch.float64, device=times.device)
+        return columns.scatter(-1, index, bspline_weights(place - cell, 3))
+
+
+def _fit_spline(
+    measurements: Measurements, spacing: float, record: tuple[float, float], *, learn: bool = False
+) -> _SplineFit:
+    """Fit a spline to the measurements of one stack, each axis by itself.
+
+    Minimises ``sum w (d - relative(D))^2 + lambda |D''|^2``; lambda maximises the marginal likelihood.
+
+    Args:
+        measurements: Of one stack (B = 1).
+        spacing: Seconds between knots.
+        record: First and last time of the spline in seconds.
+        learn: Whether to estimate the power spectrum of the motion, for splines of up to 800 knots.
+    """
+    first, last = record
+    count = math.ceil((last - first) / spacing) + 3
+    device = measurements.moments.device
+    shape = _SplineFit(
+        torch.zeros(2, count, dtype=torch.float64, device=device), torch.zeros(2, 0, 0, device=device), first, spacing
+    )
+    values, covariances = zip(*(_fit_axis(measurements, shape, axis, learn) for axis in range(2)), strict=True)
+    return replace(shape, coefficients=torch.stack(values), covariance=torch.stack(covariances))
+
+
+def _fit_axis(measurements: Measurements, shape: _SplineFit, axis: int, learn: bool) -> tuple[Tensor, Tensor]:
+    """Coefficients (N,) of one axis and their covariance (N, N)."""
+    values = (measurements.displacements[..., axis] * measurements.seen)[0]
+    weight = precision_of_axis(measurements.information[0], axis)
+    count = shape.coefficients.shape[-1]
+    gram = torch.zeros(count, count, dtype=torch.float64, device=values.device)
+    right = torch.zeros(count, dtype=torch.float64, device=values.device)
+    for begin in range(0, len(values), 128):  # scene rows at a time: their columns are (128 G, N)
+        part = slice(begin, begin + 128)
+        design = _design(measurements, shape, axis, part)
+        used = (design != 0).flatten(0, 1).any(0).nonzero()[:, 0]
+        flat = design[..., used].flatten(0, 1)
+        weighted = flat * weight[part, None].expand(-1, design.shape[1]).flatten()[:, None]
+        gram[used[:, None], used] += flat.mT @ weighted
+        right[used] += weighted.mT @ values[part].flatten()
+    energy = (weight[:, None] * values.square()).sum()
+    rounding = 1e-12 * energy  # error of the sums that make the residual energy
+    known = ((measurements.differences[0] * (weight > 0)).sum() * measurements.independent).clamp(min=1.0)
+    scale = gram.diagonal().mean() + 1e-300
+    second = torch.eye(count, dtype=torch.float64, device=values.device).diff(n=2, dim=0)
+    bend = second.mT @ second
+    base = gram + scale * 1e-3 / count  # on every element: the undetermined mean becomes 0
+
+    def solution(smoothness: float) -> tuple[Tensor, Tensor]:
+        """Coefficients and Cholesky factor of the normal matrix."""
+        factor = torch.linalg.cholesky(base + smoothness * scale * bend)
+        return torch.cholesky_solve(right[:, None], factor)[:, 0], factor
+
+    def evidence(smoothness: float) -> Tensor:
+        """Logarithm of the marginal likelihood."""
+        coefficients, factor = solution(smoothness)
+        residual = torch.maximum(energy - right @ coefficients, rounding) + 1e-300
+        logarithm = 2 * factor.diagonal().log().sum() - (count - 2) * math.log(smoothness)
+        return -0.5 * (known * (residual / known).log() + logarithm)
+
+    decade = max((10.0**power for power in range(-8, 5)), key=lambda tried: float(evidence(tried)))
+    thirds = (decade * 10 ** (step / 3) for step in (0, -2, -1, 1, 2))
+    smoothness = max(thirds, key=lambda tried: float(evidence(tried)))
+    coefficients, factor = solution(smoothness)
+    noise = float(torch.maximum(energy - right @ coefficients, rounding) / known)
+    if learn and count <= 800 and noise > 0:  # the cost grows with knots^3, 20 times
+        return _fit_with_spectrum(gram, right, noise, smoothness * float(scale))
+    return coefficients, noise * torch.cholesky_inverse(factor)
+
+
+def _design(measurements: Measurements, shape: _SplineFit, axis: int, part: slice) -> Tensor:
+    """Derivatives (n, G, N) of the relative displacements of some scene rows by the coefficients of an axis."""
+    moments = measurements.moments[0, part]
+    average = measurements.average_times[axis] + measurements.exposure_time
+    nodes, weights = gauss_legendre(3 + math.ceil(2 * average / shape.spacing))
+    first = moments + 0.5 * (measurements.exposure_time - average)
+    columns = torch.zeros(*moments.shape, 1, dtype=torch.float64, device=moments.device)
+    for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
+        at = (first + average * node).flatten()
+        columns = columns + weight * shape.columns(at).unflatten(0, moments.shape)
+    seen = measurements.seen[0, part][..., None]
+    mean = (seen * columns).sum(1, keepdim=True) / seen.sum(1, keepdim=True).clamp(min=1.0)
+    return seen * (columns - mean)
+
+
+def precision_of_axis(information: Tensor, axis: int) -> Tensor:
+    """(N,) inverse variance of one axis from information (N, 2, 2), the other axis being unknown too."""
+    other = information[:, 1 - axis, 1 - axis]
+    own = information[:, axis, axis]
+    cross = information[:, 0, 1].square() / torch.where(other > 0, other, 1.0)
+    return torch.where(other > 0, own - cross, own).clamp(min=0.0)
+
+
+def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: float) -> tuple[Tensor, Tensor]:
+    """Coefficients (N,) of a spline and their covariance (N, N), with the power of each frequency estimated.
+
+    The smoothness penalty assumes how fast the power of a motion falls with frequency. A motion with a resonance has
+    more power there, and may have more in undetermined components of similar frequency. The coefficients are a straight
+    line and cosines, ``c = sum_j a_j cos(w_j (n + 1/2))`` with a_j of variance s_j. Expectation maximisation alternates
+    between a for given s, and s_j = mean of ``a_j^2 + var(a_j)`` over neighbouring frequencies, relative to the
+    penalty.
+
+    Args:
+        gram: (N, N) normal matrix of the coefficients.
+        right: (N,) right-hand side.
+        noise: Variance of measurements of unit weight.
+        smoothness: Weight of the squares of second differences in the sum of squares, to start with.
+    """
+    count = len(right)
+    margin = max(10, count // 16)  # knots beyond the record, as cosines have zero slope at their ends
+    length = count + 2 * margin
+    order = torch.arange(length, dtype=torch.float64, device=right.device)
+    place = torch.arange(count, dtype=torch.float64, device=right.device)
+    angle = math.pi / length * order
+    waves = torch.cos(angle * (place[:, None] + margin + 0.5)) * math.sqrt(2 / length)
+    line = place - place.mean()
+    columns = torch.cat([waves, (line / line.norm())[:, None]], 1)
+    matrix = columns.mT @ gram @ columns / noise
+    target = columns.mT @ right / noise
+    expected = noise / smoothness * (2 * torch.sin(0.5 * angle[1:])) ** -4
+    window = torch.exp(-0.5 * ((order[1:, None] - order[1:]) / 2.0) ** 2)  # standard deviation: one cycle in the record
+    window = window / window.sum(1, keepdim=True)
+    anchor = (1e-9 * matrix.diagonal().mean()).expand(1)  # makes the undetermined mean 0
+    power = expected
+    amplitude, covariance = torch.zeros_like(target), matrix
+    for _ in range(20):
+        whole = matrix + torch.diag(torch.cat([anchor, anchor + 1 / power, anchor]))
+        covariance = torch.cholesky_inverse(torch.linalg.cholesky(whole))
+        amplitude = covariance @ target
+        second_moment = amplitude[1:-1].square() + covariance.diagonal()[1:-1]
+        power = (window @ (second_moment / expected)) * expected
+    return columns @ amplitude, columns @ covariance @ columns.mT
+
+
+# --- Report ---
 
 
 def _report(
-    motion: FreeMotion,
-    fit: SplineFit,
-    measured: Measurements,
-    left: Tensor,
-    timing: SensorTiming,
-    starts: Tensor,
-    num_rows: int,
+    motion: FreeMotion, fit: _SplineFit, measured: Measurements, timing: SensorTiming, starts: Tensor, num_rows: int
 ) -> MotionDetection:
-    """The motion in image axes and how well it is known at some rows of every frame."""
-    rows = torch.linspace(0, num_rows - 1, min(_LOOKS, num_rows), dtype=torch.float64, device=starts.device)
+    """The motion in image axes, and its uncertainty at up to 32 rows of every frame."""
+    rows = torch.linspace(0, num_rows - 1, min(32, num_rows), dtype=torch.float64, device=starts.device)
     times = starts[:, None] + rows * timing.row_time + 0.5 * timing.exposure_time
-    moments = measured.moments[0] + 0.5 * measured.exposure_time
-    stds, seen, unseen = [], [], []
-    for axis in range(2):
-        columns = fit.columns(times.flatten())
-        centred = columns - columns.mean(0)
-        stds.append(_variance(centred, fit.covariance[axis]).sqrt().unflatten(0, times.shape))
-        told, common = _told_and_common(fit, moments, measured.seen[0])
-        seen.append(_variance(told, fit.covariance[axis]).mean().sqrt())
-        unseen.append(_variance(common - columns.mean(0), fit.covariance[axis]).mean().sqrt())
-    beside = measured.unexplained(left)[0]
-    value = motion[0].displacement(times)
+    columns = fit.columns(times.flatten())
+    mean = columns.mean(0)
+    visible, common = _visible_and_common(fit, measured)
+
+    def variance(of: Tensor) -> Tensor:
+        """Variances (S, 2) of linear functions (S, N) of the coefficients of each axis."""
+        return torch.stack([((of @ own) * of).sum(-1).clamp(min=0.0) for own in fit.covariance], -1)
+
+    std = variance(columns - mean).sqrt().unflatten(0, times.shape)
+    std_seen = variance(visible).mean(0).sqrt()
+    unseen = variance(common - mean).mean(0).sqrt()
+    rest = measured.unexplained(residual_of_motion(measured, motion))[0]
+    value = motion.displacement(times)
     value = value - value.mean((0, 1))
-    relative = (value - value.mean(0)).square().mean((0, 1)).sqrt()
+    moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     reasons = []
     for axis in range(2):
-        much, sure, moved = float(beside[axis]), float(seen[axis]), float(relative[axis])
-        found = []
-        if much > max(_EXPLAINED * moved, _FINEST):
-            found.append(f"rows move by {much:.3g} px that no smooth motion explains")
-        if sure > _SURE:
-            found.append(f"rows tell the motion to {sure:.3g} px only: they may show different scenes")
-        reasons.append(tuple(found))
-    reliable = torch.tensor([not found for found in reasons], device=beside.device)
-    swap = timing.scan_axis == -1
-    per_axis = [torch.stack(values, -1) for values in (stds, seen, unseen)]
-    per_axis += [beside, reliable]
-    spread, seen_std, unseen_std, rest, good = ((v.flip(-1) if swap else v) for v in per_axis)
+        against = unexplained_reason(rest[axis], moved[axis], "smooth motion")
+        if float(std_seen[axis]) > 0.3:
+            against.append(
+                f"the motion is determined to {float(std_seen[axis]):.3g} px only: the frames may show different scenes"
+            )
+        reasons.append(tuple(against))
+    reliable = torch.tensor([not against for against in reasons], device=rest.device)
+    order = [1, 0] if timing.scan_axis == -1 else [0, 1]
     return MotionDetection(
-        motion=motion[0].from_row_order(timing),
+        motion=motion.from_row_order(timing),
         times=times,
         displacement=offsets_from_row_order(value, timing),
-        std=spread,
-        std_seen=seen_std,
-        unseen=unseen_std,
-        unexplained=rest,
-        reliable=good,
-        reasons=(reasons[1], reasons[0]) if swap else (reasons[0], reasons[1]),
+        std=std[..., order],
+        std_seen=std_seen[order],
+        unseen=unseen[order],
+        unexplained=rest[order],
+        reliable=reliable[order],
+        reasons=tuple(reasons[axis] for axis in order),
     )
+
+
+def _visible_and_common(fit: _SplineFit, measured: Measurements) -> tuple[Tensor, Tensor]:
+    """Linear functions of the coefficients, for scene rows in several frames.
+
+    Returns:
+        (S, N), the displacement in each frame less the mean over the frames; (R, N), that mean.
+    """
+    seen = measured.seen[0]
+    several = seen.sum(-1) > 1
+    seen = seen[several]
+    moments = measured.moments[0, several] + 0.5 * measured.exposure_time
+    columns = fit.columns(moments.flatten()).unflatten(0, seen.shape)
+    mean = (seen[..., None] * columns).sum(1) / seen.sum(-1)[:, None]
+    return (columns - mean[:, None])[seen > 0], mean

@@ -1,4 +1,4 @@
-"""Tones that fade or change their frequency: one of them an axis, from all frames of a stack."""
+"""Swept tones: one tone of each axis whose amplitude decays or grows and whose frequency changes linearly."""
 
 import math
 from collections.abc import Callable
@@ -15,8 +15,13 @@ from rsvib_torch.detection.band_curve import measurements_of_curve
 from rsvib_torch.detection.grey_frames import GreyFrames, grey_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
-from rsvib_torch.detection.shapes.free import start_curve
-from rsvib_torch.detection.shapes.spline_fit import precision_of_axis
+from rsvib_torch.detection.shapes.free import (
+    precision_of_axis,
+    residual_of_motion,
+    rms_motion,
+    start_curve,
+    unexplained_reason,
+)
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -24,21 +29,12 @@ from rsvib_torch.registration import Registration, RegistrationOptions
 
 __all__ = ["SweptTone", "detect_swept_tone"]
 
-_DECAYS = (-4.0, 0.0, 4.0, 10.0, 20.0)  # e-folds in the record
-_MOST_SWEEP = 1.5  # of the frequency in the middle, over the record
-_STARTS = 6
-_CHUNK = 32  # candidates tried together
-_ROUNDS = 25
-_SIGNIFICANT = 14.0  # of chi-square per parameter, as for tones that stay
-_EXPLAINED, _FINEST = 0.15, 0.03  # of the motion, and px, that may be left
-_NODES = 4  # in an exposure or band
-_SAMPLES = 24  # of the motion in the shortest period
-_NAMES = ("amplitude", "frequency", "decay", "chirp", "phase")
+_F_THRESHOLD = 14.0  # decrease of chi-square per parameter: the maximum of noise over the grid of starts stays below
 
 
 @dataclass(frozen=True, eq=False)
 class SweptTone:
-    """One tone an axis that fades and sweeps: ``A exp(-g t) sin(2 pi (f t + c t^2 / 2) + phi) + v t``.
+    """One tone an axis that decays and sweeps: ``A exp(-g t) sin(2 pi (f t + c t^2 / 2) + phi) + v t``.
 
     All values are those at the time origin, in image axes (x, y); an axis without a significant tone has amplitude 0.
     A batch of stacks leads all tensors.
@@ -90,14 +86,14 @@ def detect_swept_tone(
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
 ) -> SweptTone:
-    """Detect one tone an axis whose amplitude decays or grows and whose frequency changes steadily.
+    """Detect one tone an axis whose amplitude decays or grows exponentially and whose frequency changes linearly.
 
-    Start values come from the offsets of row bands, over a grid of frequencies, sweeps and decays; then the fit is
-    repeated on displacements measured around it on the images, row by row.
+    Start values come from the offsets of row bands, over a grid of frequencies, sweeps and decays. The fit is then
+    repeated with displacements measured on the images around it, row by row.
 
     Args:
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, tensor or NumPy array. NaN
-            marks pixels that were not measured.
+            marks missing pixels.
         timing: The sensor.
         registration: ``"ncc"``, ``"phase"`` or ``"projection"``, for the start.
         iterations: Rounds of measuring and fitting.
@@ -107,79 +103,97 @@ def detect_swept_tone(
         ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out (dead, saturated).
         full_scale: Count that means 1.0, for integer frames.
 
+    Returns:
+        Parameters of both axes at the time origin, with standard deviations and verdict.
+
     Raises:
         TypeError: If frames are not numbers.
         ValueError: If they cannot be registered, see ``detect_motion``, or an option is out of range.
+
+    Example:
+        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=256)
+        >>> detect_swept_tone(torch.rand(1, 256, 256), timing)
+        Traceback (most recent call last):
+        ...
+        ValueError: at least 2 frames are needed, got 1
     """
     check_whole_number("iterations", iterations, at_least=1)
     stacks = grey_frames(frames, timing, full_scale, ignore)
     bands = RegistrationOptions(registration, band_rows, band_step, search)
-    found = [_detect(stacks.one(index), timing, bands, iterations) for index in range(len(stacks.images))]
-    return _stacked(found, timing) if stacks.batched else found[0].tone
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """A result with the parameters, about the middle of the record, that it comes from."""
-
-    tone: SweptTone
-    fits: list[Tensor]
-    record: tuple[float, float]
-
-
-def _stacked(found: list[_Found], timing: SensorTiming) -> SweptTone:
-    """Results of stacks as one of a batch, their motions sampled as finely as the fastest of them needs."""
-    step = min(_step(one.fits, one.record, timing) for one in found)
-    motions = [_in_image(_motion(one.fits, one.record, timing, step), timing) for one in found]
-    tones = [one.tone for one in found]
-    names = (*_NAMES, "image_motion", "unexplained", "reliable")
+    fitted = [_detect(stacks.one(index), timing, bands, iterations) for index in range(len(stacks.images))]
+    step = min(_step(one.fits, one.record, timing) for one in fitted)  # motions of a batch have common knots
+    tones = [_report(one, timing, step) for one in fitted]
+    if not stacks.batched:
+        return tones[0]
+    names = ("amplitude", "frequency", "decay", "chirp", "phase", "image_motion", "unexplained", "reliable")
     return SweptTone(
         **{name: torch.stack([getattr(tone, name) for tone in tones]) for name in names},
-        std={name: torch.stack([tone.std[name] for tone in tones]) for name in _NAMES},
-        motion=FreeMotion.stacked(motions),
+        std={name: torch.stack([tone.std[name] for tone in tones]) for name in tones[0].std},
+        motion=FreeMotion.stacked([tone.motion for tone in tones]),
         reasons=tuple(tone.reasons for tone in tones),
     )
 
 
-def _in_image(motion: FreeMotion, timing: SensorTiming) -> FreeMotion:
-    """A batch of one motion in row order as a single one in image axes."""
-    return motion[0].from_row_order(timing)
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """Fit of one stack, in row order.
+
+    Attributes:
+        fits: (2, 6) parameters [a, b, f, g, c, v] of each axis about the middle of the record:
+            ``exp(-g s) (a cos(theta) + b sin(theta)) + v s``, ``theta = 2 pi (f s + c s^2 / 2)``, s = t - middle.
+        covariances: (2, 6, 6).
+        record: Its start and end in seconds.
+        moved: (2,) px, rms motion of the rows.
+        unexplained: (2,) px, rms displacement of rows beside it.
+    """
+
+    fits: Tensor
+    covariances: Tensor
+    record: tuple[float, float]
+    moved: Tensor
+    unexplained: Tensor
 
 
-def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions, iterations: int) -> _Found:
-    """``detect_swept_tone`` of one stack."""
+def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions, iterations: int) -> _Fitted:
+    """Fit of one stack: start, then rounds of measuring and fitting."""
     rowwise, curve, record = start_curve(stack, timing, bands)
     measured = measurements_of_curve(curve, rowwise, bands.band_step)
     highest = 0.5 / (bands.band_rows * rowwise.row_time)
-    fits = [_start(measured, axis, record, highest) for axis in range(2)]
-    groups = frame_groups(stack_spectra(stack.images, stack.valid), rowwise, _motion(fits, record, rowwise))
+    fits = torch.stack([_start(measured, axis, record, highest) for axis in range(2)])
+
+    def motion_of(values: Tensor) -> FreeMotion:
+        return _motion(values, record, _step(values, record, rowwise))
+
+    groups = frame_groups(stack_spectra(stack.images, stack.valid), rowwise, motion_of(fits).expanded(1))
     for _ in range(iterations):
-        motion = _motion(fits, record, rowwise)
-        measured, _ = measure_groups(groups, rowwise, motion)
-        weighed = measured.reweighted(_left(measured, motion))
-        fits = [_settle(weighed, axis, record, fit[None])[0][0] for axis, fit in enumerate(fits)]
-    solved = [_settle(weighed, axis, record, fit[None]) for axis, fit in enumerate(fits)]
-    covariances = [covariance[0] for _, covariance, _ in solved]
-    fits = [torch.where(gain > _SIGNIFICANT, fit[0], _still(fit[0])) for fit, _, gain in solved]
-    motion = _motion(fits, record, rowwise)
-    left = _left(measured, motion)
-    honest = weighed.independent_fraction(left) * measured.share_counted(left)
-    tone = _report(fits, covariances, honest, motion, measured.unexplained(left)[0], measured, record, timing)
-    return _Found(tone, fits, record)
+        motion = motion_of(fits)
+        measured, _ = measure_groups(groups, rowwise, motion.expanded(1))
+        weighed = measured.reweighted(residual_of_motion(measured, motion))
+        fits = torch.cat([_settle(weighed, axis, record, fits[axis, None])[0] for axis in range(2)])
+    solved = [_settle(weighed, axis, record, fits[axis, None]) for axis in range(2)]
+    fits, covariances, gains = (torch.cat(values) for values in zip(*solved, strict=True))
+    fits = torch.where(gains[:, None] > _F_THRESHOLD, fits, _still(fits))
+    motion = motion_of(fits)
+    residual = residual_of_motion(measured, motion)
+    independent = weighed.independent_fraction(residual) * measured.share_counted(residual)
+    rest = measured.unexplained(residual)[0]
+    return _Fitted(fits, covariances / independent, record, rms_motion(measured, motion), rest)
 
 
-def _still(fit: Tensor) -> Tensor:
-    return fit * fit.new_tensor([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
+def _still(fits: Tensor) -> Tensor:
+    """Parameters (..., 6) with amplitude 0."""
+    return fits * fits.new_tensor([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
 
 
 def _waves(times: Tensor, fits: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine and sine part at times S from the middle, of [a, b, f, g, c, v] (..., 6) broadcast against S."""
+    """Cosine and sine part at times S from the middle, of parameters (..., 6) broadcast against S."""
     envelope = torch.exp(-fits[..., 3] * times)
     angle = 2 * math.pi * (fits[..., 2] * times + 0.5 * fits[..., 4] * times.square())
     return envelope * angle.cos(), envelope * angle.sin()
 
 
 def _value(times: Tensor, fits: Tensor) -> Tensor:
+    """Displacement in px at times S from the middle."""
     cosine, sine = _waves(times, fits)
     return fits[..., 0] * cosine + fits[..., 1] * sine + fits[..., 5] * times
 
@@ -193,31 +207,23 @@ def _columns(times: Tensor, fits: Tensor) -> Tensor:
     return torch.stack(whole, -1)
 
 
-def _averaged(measured: Measurements, axis: int, middle: float) -> tuple[list[Tensor], list[float]]:
-    """Times (N, G) from the middle of the record over which a measured displacement is a mean, and their weights."""
-    duration = measured.exposure_time + measured.average_times[axis]
-    nodes, weights = gauss_legendre(_NODES)
-    first = measured.moments[0] + 0.5 * (measured.exposure_time - duration) - middle
-    return [first + duration * node for node in nodes.tolist()], weights.tolist()
-
-
 def _relative(measured: Measurements, values: Tensor) -> Tensor:
-    """Values (N, G, P) less their mean over the frames that see the row."""
+    """Values (N, G, P) less their mean over the frames that contain the row."""
     return measured.relative(values[None])[0]
 
 
 def _start(measured: Measurements, axis: int, record: tuple[float, float], highest: float) -> Tensor:
-    """Parameters (6,) from a grid of frequencies, sweeps and decays, the best of a few settled ones."""
+    """Parameters (6,) from a grid of frequencies, sweeps and decays; the best six are fitted."""
     middle, span = 0.5 * (record[0] + record[1]), record[1] - record[0]
     device = measured.moments.device
     grid = []
     for frequency in torch.arange(0.5 / span, highest, 0.5 / span).tolist():
-        sweep = _MOST_SWEEP * frequency / span
+        sweep = 1.5 * frequency / span  # Hz/s, at most
         steps = max(1, round(sweep * span**2 / 2.0))
         grid += [
             (0.0, 0.0, frequency, decay / span, sweep * step / steps, 0.0)
             for step in range(-steps, steps + 1)
-            for decay in _DECAYS
+            for decay in (-4.0, 0.0, 4.0, 10.0, 20.0)  # e-folds in the record
         ]
     fits = torch.tensor(grid, dtype=torch.float64, device=device)
     weight = precision_of_axis(measured.information[0], axis)
@@ -225,20 +231,19 @@ def _start(measured: Measurements, axis: int, record: tuple[float, float], highe
     times = measured.moments[0] + 0.5 * measured.exposure_time - middle
     drift = _relative(measured, times[..., None])[..., 0]
     gains = []
-    for part in fits.split(_CHUNK):
+    for part in fits.split(32):  # (N, G, 32, 3) values at a time
         cosine, sine = _waves(times[..., None], part)
         columns = [_relative(measured, wave) for wave in (cosine, sine)] + [drift[..., None].expand_as(cosine)]
-        design = torch.stack(columns, -1)  # (N, G, C, 3)
+        design = torch.stack(columns, -1)
         gram = torch.einsum("ngcp,n,ngcq->cpq", design, weight, design)
         right = torch.einsum("ngcp,n,ng->cp", design, weight, values[..., 0])
         ridge = torch.diag_embed(1e-9 * gram.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300))
         gains.append((right * torch.linalg.solve(gram + ridge, right[..., None])[..., 0]).sum(-1))
-    best = torch.cat(gains).argsort(descending=True)
     chosen: list[int] = []
-    for place in best.tolist():
+    for place in torch.cat(gains).argsort(descending=True).tolist():
         if all(abs(grid[place][2] - grid[other][2]) > 0.6 / span for other in chosen):
             chosen.append(place)
-        if len(chosen) == _STARTS:
+        if len(chosen) == 6:
             break
     settled, _, gained = _settle(measured, axis, record, fits[chosen])
     start: Tensor = settled[gained.argmax()]
@@ -252,81 +257,77 @@ def _settle(
 
     Args:
         measured: Displacements of one stack.
-        axis: Which of theirs.
-        record: Its first and last moment in seconds.
+        axis: Axis to fit.
+        record: Start and end of the record in seconds.
         fits: (S, 6) start parameters.
 
     Returns:
-        Parameters (S, 6), their covariances (S, 6, 6), and chi-square (S,) that the tone gains per parameter.
+        Parameters (S, 6), their covariances (S, 6, 6), and decrease of chi-square per parameter (S,) by the tone.
     """
     middle = 0.5 * (record[0] + record[1])
     weight = precision_of_axis(measured.information[0], axis)
     values = measured.displacements[0, ..., axis] * measured.seen[0]
-    times, shares = _averaged(measured, axis, middle)
     known = ((measured.differences[0] * (weight > 0)).sum() * measured.independent).clamp(min=7.0)
     row_weight = weight[:, None].expand_as(values)
+    # a displacement is a mean over the exposure and the rows of a band
+    duration = measured.exposure_time + measured.average_times[axis]
+    first = measured.moments[0] + 0.5 * (measured.exposure_time - duration) - middle
+    nodes, shares = gauss_legendre(4)
+    quadrature = list(zip(nodes.tolist(), shares.tolist(), strict=True))
 
     def averaged(function: Callable[[Tensor, Tensor], Tensor], at: Tensor) -> Tensor:
-        """(S, N, G, P) relative means over exposures of what (N, G, S, P) a function makes of times and fits."""
-        mean = torch.stack([share * function(time[..., None], at) for time, share in zip(times, shares, strict=True)])
-        relative: Tensor = _relative(measured, mean.sum(0).flatten(2)).unflatten(-1, (len(at), -1))
+        """(S, N, G, P) relative means over exposures of a function (N, G, S, P) of times and parameters."""
+        each = [share * function((first + duration * node)[..., None], at) for node, share in quadrature]
+        relative: Tensor = _relative(measured, torch.stack(each).sum(0).flatten(2)).unflatten(-1, (len(at), -1))
         return relative.movedim(2, 0)
 
-    def left_of(at: Tensor) -> Tensor:
+    def residual_of(at: Tensor) -> Tensor:
         return values - averaged(lambda time, fit: _value(time, fit)[..., None], at)[..., 0]
 
-    def cost_of(left: Tensor) -> Tensor:
-        return (row_weight * left.square()).sum((1, 2))
+    def cost_of(residual: Tensor) -> Tensor:
+        return (row_weight * residual.square()).sum((1, 2))
 
-    left = left_of(fits)
-    cost, damping = cost_of(left), torch.full_like(fits[:, 0], 1e-3)
+    residual = residual_of(fits)
+    cost, damping = cost_of(residual), torch.full_like(fits[:, 0], 1e-3)
     settled = torch.zeros_like(cost, dtype=torch.bool)
-    for _ in range(_ROUNDS):
+    for _ in range(25):
         design = averaged(_columns, fits).flatten(1, 2)  # (S, N G, 6)
         weighted = (design * row_weight.flatten()[:, None]).mT
-        gram, right = weighted @ design, weighted @ left.flatten(1)[..., None]
+        gram, right = weighted @ design, weighted @ residual.flatten(1)[..., None]
         size = torch.where(gram.diagonal(dim1=-2, dim2=-1) > 0, gram.diagonal(dim1=-2, dim2=-1), 1.0)
-        tried = fits + torch.linalg.solve(gram + torch.diag_embed(damping[:, None] * size), right)[..., 0]
-        further = left_of(tried)
-        gained = cost - cost_of(further)
+        trial = fits + torch.linalg.solve(gram + torch.diag_embed(damping[:, None] * size), right)[..., 0]
+        trial_residual = residual_of(trial)
+        gained = cost - cost_of(trial_residual)
         better = (gained > 0) & ~settled
         settled = settled | (better & (gained < 1e-9 * (cost - gained))) | (~better & (damping > 1e7))
-        fits = torch.where(better[:, None], tried, fits)
-        left = torch.where(better[:, None, None], further, left)
+        fits = torch.where(better[:, None], trial, fits)
+        residual = torch.where(better[:, None, None], trial_residual, residual)
         cost = torch.where(better, cost - gained, cost)
         damping = torch.where(better, (0.1 * damping).clamp(min=1e-12), 10 * damping)
         if bool(settled.all()):
             break
-    without = left_of(_still(fits))
-    drift = _relative(measured, times[0][..., None])[..., 0]
+    without = residual_of(_still(fits))
+    drift = _relative(measured, (first + duration * quadrature[0][0])[..., None])[..., 0]
     norm = (row_weight * drift.square()).sum() + 1e-300
-    alone = cost_of(without) - (row_weight * drift * without).sum((1, 2)).square() / norm
+    drift_only = cost_of(without) - (row_weight * drift * without).sum((1, 2)).square() / norm
     noise = cost / known
     scale = size.sqrt()[..., None]
     inverse = torch.linalg.pinv(gram / scale / scale.mT, rtol=1e-12, hermitian=True) / scale / scale.mT
-    return fits, noise[:, None, None] * inverse, (alone - cost) / (5 * noise + 1e-300)
+    return fits, noise[:, None, None] * inverse, (drift_only - cost) / (5 * noise + 1e-300)
 
 
-def _step(fits: list[Tensor], record: tuple[float, float], timing: SensorTiming) -> float:
-    """Time between the knots of a motion: fine enough for its fastest part."""
+def _step(fits: Tensor, record: tuple[float, float], timing: SensorTiming) -> float:
+    """Seconds between the knots of a motion: 24 in the shortest period, for an error of its spline below 1e-4."""
     span = record[1] - record[0]
-    fastest = max(float(fit[2].abs() + 0.5 * fit[4].abs() * span) for fit in fits)
-    return max(min(1 / (_SAMPLES * fastest + 1e-9), span / 64), timing.row_time)
+    fastest = float((fits[:, 2].abs() + 0.5 * fits[:, 4].abs() * span).amax())
+    return max(min(1 / (24 * fastest + 1e-9), span / 64), timing.row_time)
 
 
-def _motion(
-    fits: list[Tensor], record: tuple[float, float], timing: SensorTiming, step: float | None = None
-) -> FreeMotion:
-    """Both axes as one motion, sampled finely, as a batch of one."""
+def _motion(fits: Tensor, record: tuple[float, float], step: float) -> FreeMotion:
+    """Both axes as one spline with knots every ``step`` seconds."""
     middle, span = 0.5 * (record[0] + record[1]), record[1] - record[0]
-    step = _step(fits, record, timing) if step is None else step
-    times = torch.linspace(*record, math.ceil(span / step) + 1, dtype=torch.float64, device=fits[0].device)
-    return FreeMotion.through(times, torch.stack([_value(times - middle, fit) for fit in fits], -1)).expanded(1)
-
-
-def _left(measured: Measurements, motion: FreeMotion) -> Tensor:
-    predicted = motion[0].mean_displacement(measured.moments, measured.exposure_time)
-    return measured.relative(measured.displacements - predicted)
+    times = torch.linspace(*record, math.ceil(span / step) + 1, dtype=torch.float64, device=fits.device)
+    return FreeMotion.through(times, torch.stack([_value(times - middle, fit) for fit in fits], -1))
 
 
 def _at_origin(fit: Tensor, middle: float) -> Tensor:
@@ -337,46 +338,33 @@ def _at_origin(fit: Tensor, middle: float) -> Tensor:
     return torch.stack([amplitude, frequency - chirp * middle, decay, chirp, phase])
 
 
-def _report(
-    fits: list[Tensor],
-    covariances: list[Tensor],
-    honest: float,
-    motion: FreeMotion,
-    unexplained: Tensor,
-    measured: Measurements,
-    record: tuple[float, float],
-    timing: SensorTiming,
-) -> SweptTone:
+def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
     """Parameters at the time origin and in image axes, with standard deviations and verdict."""
-    middle = 0.5 * (record[0] + record[1])
+    middle = 0.5 * (fitted.record[0] + fitted.record[1])
+    reverse = timing.readout_direction == "reverse"
     values, stds, reasons = [], [], []
-    moved = measured.relative(motion[0].mean_displacement(measured.moments, measured.exposure_time))[0]
-    size = moved.square().sum(1).div(measured.differences[0].clamp(min=1.0)[:, None]).mean(0).sqrt()
-    for axis, (fit, covariance) in enumerate(zip(fits, covariances, strict=True)):
+    for axis, (fit, covariance) in enumerate(zip(fitted.fits, fitted.covariances, strict=True)):
         present = bool(fit[:2].abs().sum() > 0)
         value = _at_origin(fit, middle)
         slope = torch.autograd.functional.jacobian(lambda p: _at_origin(p, middle), fit)
-        std = (slope @ covariance @ slope.mT / honest).diagonal().clamp(min=0.0).sqrt()
-        value[4] = torch.remainder(value[4] + math.pi, 2 * math.pi) - math.pi
+        std = (slope @ covariance @ slope.mT).diagonal().clamp(min=0.0).sqrt()
+        turned = math.pi if reverse and axis == 1 else 0.0  # displacement along the scan changes its sign
+        value[4] = torch.remainder(value[4] + turned + math.pi, 2 * math.pi) - math.pi
         values.append(value if present else 0 * value)
         stds.append(std if present else 0 * std)
-        found = [] if present else ["no tone stands out"]
-        if float(unexplained[axis]) > max(_EXPLAINED * float(size[axis]), _FINEST):
-            found.append(f"rows move by {float(unexplained[axis]):.3g} px that no swept tone explains")
-        reasons.append(tuple(found))
-    if timing.readout_direction == "reverse":
-        values[1][4] = torch.remainder(values[1][4], 2 * math.pi) - (math.pi if values[1][0] > 0 else 0.0)
-    drift = [fits[0][5], -fits[1][5] if timing.readout_direction == "reverse" else fits[1][5]]
+        against = [] if present else ["no tone stands out"]
+        against += unexplained_reason(fitted.unexplained[axis], fitted.moved[axis], "swept tone")
+        reasons.append(tuple(against))
+    drift = fitted.fits[:, 5] * fitted.fits.new_tensor([1.0, -1.0 if reverse else 1.0])
     order = [1, 0] if timing.scan_axis == -1 else [0, 1]
-    whole, spread = torch.stack(values)[order], torch.stack(stds)[order]
-    reasons = [reasons[axis] for axis in order]
-    named = dict(zip(_NAMES, whole.unbind(-1), strict=True))
+    names = ("amplitude", "frequency", "decay", "chirp", "phase")
+    reliable = torch.tensor([not against for against in reasons], device=drift.device)
     return SweptTone(
-        **named,
-        image_motion=torch.stack(drift)[order],
-        std=dict(zip(_NAMES, spread.unbind(-1), strict=True)),
-        motion=_in_image(motion, timing),
-        unexplained=unexplained[order],
-        reliable=torch.tensor([not found for found in reasons], device=unexplained.device),
-        reasons=(reasons[0], reasons[1]),
+        **dict(zip(names, torch.stack(values)[order].unbind(-1), strict=True)),
+        image_motion=drift[order],
+        std=dict(zip(names, torch.stack(stds)[order].unbind(-1), strict=True)),
+        motion=_motion(fitted.fits, fitted.record, step).from_row_order(timing),
+        unexplained=fitted.unexplained[order],
+        reliable=reliable[order],
+        reasons=tuple(reasons[axis] for axis in order),
     )
