@@ -1,4 +1,4 @@
-"""What a camera does not say of itself, from frames of flickering light."""
+"""Calibration of row time, readout direction and exposure from frames of flickering light."""
 
 from rsvib_torch.calibration.calibrate import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
 

@@ -8,9 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.calibration.period import BandFit
-from rsvib_torch.calibration.profiles import Profiles, row_profiles
-from rsvib_torch.calibration.search import find_bands
+from rsvib_torch.calibration.bands import BandFit, Profiles, find_bands, row_profiles
 from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
 from rsvib_torch.core.checks import check_choice, check_number
 
@@ -19,18 +17,12 @@ __all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_ex
 ScanAxis = Literal[-2, -1, "y", "x"]
 
 _AXES: dict[object, int] = {-2: -2, "y": -2, -1: -1, "x": -1}
-_CLOCKS = 1e-4  # relative error of frame rate and flicker frequency together, in the comparison of frames
-_CLEAR_TURNS = 0.03  # from a whole or half number, that a light must turn from frame to frame
-_CLEAR, _CLEAR_MISFIT = 4.0, 0.01  # by which one readout direction must fit better than the other
-_TURNS_ALIKE = 0.1  # misfit of bands that move as they should
-_TEXTURE_PRICE = {2: 0.3, 3: 0.03}  # of a pattern that stays, which two frames cannot tell from one that moves
-_GOOD_SHAPE = 0.3  # misfit over brightness up to which bands count as those of a light that is on and off
-_MOST_CLIPPED = 0.02  # of the pixels, for the shape of bands
+_MAX_STROBE_MISFIT = 0.3  # of the brightness, for bands of an on-off light
 
 
 @dataclass(frozen=True)
 class RowTimeCalibration:
-    """What frames of flickering light tell of a camera; what they do not tell is None, and ``notes`` says why.
+    """Result of a calibration with flickering light; undetermined values are None, with the reason in ``notes``.
 
     Attributes:
         row_time: T_row in seconds.
@@ -42,7 +34,7 @@ class RowTimeCalibration:
         readout_direction: ``"forward"`` or ``"reverse"``, from bands that move between frames.
         exposure_time: T_e in seconds.
         exposure_time_std: Its standard deviation.
-        notes: What could not be found, and why; what to be careful about.
+        notes: Reasons for undetermined values, and warnings.
     """
 
     row_time: float
@@ -70,12 +62,12 @@ def calibrate_row_time(
 ) -> RowTimeCalibration:
     """Row time from frames of a light that flickers at a known frequency: ``T_row = 1 / (f P)``, bands of P rows.
 
-    The brightness of the rows is fitted as that of the scene times a waveform that repeats every P rows, with as many
-    harmonics as pay. Shading along the rows is part of the fit, texture drops out where several frames of a still
-    scene are given whose bands lie at different rows.
+    The brightness of the rows is fitted as that of the scene times a waveform that repeats every P rows, with the
+    number of harmonics that maximises the evidence. Shading along the rows is part of the fit; several frames of a
+    still scene whose bands lie at different rows eliminate its texture.
 
-    With a frame rate the bands' phase from frame to frame, ``f / frame_rate`` turns, tells the readout direction,
-    where it is clearly neither a whole nor a half number of turns. The exposure follows from the shape of the bands
+    With a frame rate the bands' phase from frame to frame, ``f / frame_rate`` turns, determines the readout direction,
+    unless it is close to a whole or half number of turns. The exposure follows from the shape of the bands
     of a light that is on for a known fraction of time, or from the contrast of the bands of a light whose own
     contrast is known: ``sinc(f T_e)`` of it.
 
@@ -84,14 +76,14 @@ def calibrate_row_time(
         flicker_frequency: f in Hz. Mains light flickers at twice the frequency of the mains.
         frame_rate: Frames per second, T >= 2 consecutive ones.
         on_fraction: Fraction of time that an on-off light is on (0.5 for a square wave).
-        light_contrast: Amplitude over mean of the light's own fundamental, for a light that swings like a sine.
+        light_contrast: Amplitude over mean of the light's own fundamental, for a sinusoidal light.
         scan_axis: Axis along which rows follow each other, as in ``SensorTiming``.
         gamma: Pixels are raised to this power to make them proportional to light (about 2.2 for photographs). The
             row time does not depend on it, the exposure does.
         full_scale: Count that means 1.0, for integers other than 8 bit.
 
     Returns:
-        Row time with its standard deviation, and what else could be found.
+        Row time with its standard deviation, and the other values that the arguments determine.
 
     Raises:
         TypeError: If an argument is not a number.
@@ -111,16 +103,14 @@ def calibrate_row_time(
         if frequency < 1.5 * frame_rate:
             raise ValueError(
                 f"flicker_frequency={frequency:g} Hz is slower than a frame of {frame_rate:g} per second: fewer than "
-                "1.5 periods fit into one; take a faster flicker"
+                "1.5 periods fit into one; use a faster flicker"
             )
     if on_fraction is not None:
         check_number("on_fraction", on_fraction, above=0.0, at_most=0.999)
     if light_contrast is not None:
         check_number("light_contrast", light_contrast, above=0.0, at_most=2.0)
     if on_fraction is not None and light_contrast is not None:
-        raise ValueError(
-            "give on_fraction for a light that is on and off, or light_contrast for one that swings, not both"
-        )
+        raise ValueError("pass on_fraction for an on-off light, or light_contrast for a sinusoidal one, not both")
     profiles = row_profiles(frames, _axis(scan_axis), full_scale, gamma)
     bands, scene = find_bands(profiles)
     height = profiles.rows.shape[1]
@@ -129,7 +119,7 @@ def calibrate_row_time(
     if frame_rate is not None:
         _check_readout(row_time, frequency, height, frame_rate)
     if scene == "smooth" and len(profiles.rows) > 1:
-        notes.append("the bands lie at the same rows in all frames, or the scene moves: texture does not drop out")
+        notes.append("the bands lie at the same rows in all frames, or the scene moves: its texture is not eliminated")
     direction, contrast, why = _direction(bands, frequency, frame_rate)
     notes += [f"readout direction unknown: {why}"] if why else []
     exposure, exposure_std, why = _exposure(profiles, bands, contrast, row_time, on_fraction, light_contrast)
@@ -158,8 +148,8 @@ def calibrate_row_time_by_exposure(
 ) -> RowTimeCalibration:
     """Row time from frames of a strobe of unknown frequency taken with different known exposures.
 
-    A row is lit if its exposure meets the pulse: bright bands are as tall as pulse and exposure together, so that a
-    longer exposure makes them taller by ``(T_e2 - T_e1) / T_row`` rows. The overlap of pulse and exposure is fitted to
+    A row is lit if its exposure overlaps the pulse: the height of a bright band is the sum of pulse and exposure, and a
+    longer exposure increases it by ``(T_e2 - T_e1) / T_row`` rows. The overlap of pulse and exposure is fitted to
     the brightness of the rows of all frames, with pulse, period and row time in common.
 
     Args:
@@ -181,18 +171,18 @@ def calibrate_row_time_by_exposure(
     if len(exposures) != len(profiles.rows):
         raise ValueError(f"{len(exposures)} exposure times do not fit {len(profiles.rows)} frames; one a frame")
     if max(exposures) < 1.05 * min(exposures):
-        raise ValueError(f"exposure_times {exposures} must differ: the row time is in the difference of the bands")
-    # frames of other exposures are other waveforms: nothing drops out between them
+        raise ValueError(
+            f"exposure_times {exposures} must differ by at least 5 %: the row time follows from the change of the bands"
+        )
+    # the waveform depends on the exposure, so each frame is fitted by itself
     singles = [
         find_bands(Profiles(r[None], p[None], 0.0))[0] for r, p in zip(profiles.rows, profiles.parts, strict=True)
     ]
     period = sum(s.period / s.period_std**2 for s in singles) / sum(1 / s.period_std**2 for s in singles)
     phases = [float(s.coefficients[0, 0].angle()) for s in singles]
     fit = fit_strobe(profiles.rows, period, phases, exposures=exposures)
-    if fit.misfit > _GOOD_SHAPE:
-        raise ValueError(
-            f"the bands do not have the shape of a light that is on and off (misfit {fit.misfit:.0%} of the mean)"
-        )
+    if fit.misfit > _MAX_STROBE_MISFIT:
+        raise ValueError(f"the bands do not have the shape of an on-off light (misfit {fit.misfit:.0%} of the mean)")
     row_time = max(exposures) / float(fit.exposure_rows.max())
     shortest = min(range(len(exposures)), key=exposures.__getitem__)
     return RowTimeCalibration(
@@ -205,7 +195,7 @@ def calibrate_row_time_by_exposure(
         readout_direction=None,
         exposure_time=exposures[shortest],
         exposure_time_std=0.0,
-        notes=("readout direction unknown: it takes the flicker frequency and the frame rate",),
+        notes=("readout direction unknown: it requires the flicker frequency and the frame rate",),
     )
 
 
@@ -215,7 +205,7 @@ def _axis(scan_axis: ScanAxis) -> int:
 
 
 def _check_readout(row_time: float, frequency: float, height: int, frame_rate: float) -> None:
-    """Refuse where the rows do not fit into a frame, or another row time would show the same bands."""
+    """Raise if the rows do not fit into a frame, or if another row time would cause the same bands."""
     longest = 1 / (frame_rate * height)
     if row_time > 1.001 * longest:
         raise ValueError(
@@ -231,53 +221,51 @@ def _check_readout(row_time: float, frequency: float, height: int, frame_rate: f
     if len(possible) > 1:
         listed = ", ".join(f"{1e6 * time:.3f}" for time in possible[:5])
         raise ValueError(
-            f"flicker_frequency={frequency:g} Hz is faster than rows may sample: row times of {listed} us show the "
-            f"same bands; stay below {0.5 / longest:.0f} Hz"
+            f"flicker_frequency={frequency:g} Hz is ambiguous: row times of {listed} us cause the same bands; "
+            f"use at most {0.5 / longest:.0f} Hz"
         )
 
 
 def _direction(
     bands: BandFit, frequency: float, frame_rate: float | None
 ) -> tuple[Literal["forward", "reverse"] | None, float, str]:
-    """Readout direction from consecutive frames, contrast of the light, and why the direction cannot be told.
+    """Readout direction from consecutive frames, contrast of the light, and why the direction is undetermined.
 
-    From frame to frame the light turns by ``f / frame_rate``, the scene's own pattern stays: the fundamental of frame
-    p is ``d + a exp(-2 pi j p f / frame_rate)`` where rows run forward, and has the other sign where they do not.
+    The phase of the light advances by ``f / frame_rate`` turns per frame, the pattern of the scene does not move: the
+    fundamental of frame p is ``d + a exp(-2 pi j p f / frame_rate)`` for forward readout, with the opposite sign of the
+    exponent for reverse readout.
     """
     first = bands.coefficients[:, 0]
     contrast = float(first.abs().mean())
     if len(first) < 2:
-        return None, contrast, "it takes two consecutive frames"
+        return None, contrast, "it requires two consecutive frames"
     if frame_rate is None:
-        return None, contrast, "it takes the frame rate"
+        return None, contrast, "it requires the frame rate"
     turns = frequency / frame_rate
-    if abs(_wrapped(2 * turns)) / 2 < _CLEAR_TURNS + turns * _CLOCKS * (len(first) - 1):
-        return None, contrast, f"the light makes {turns:.3f} turns a frame, too near to a whole or half number"
+    # turns from the nearest whole or half number; the clocks of light and camera may differ by 1e-4
+    if abs((2 * turns + 0.5) % 1.0 - 0.5) / 2 < 0.03 + 1e-4 * turns * (len(first) - 1):
+        return None, contrast, f"the light makes {turns:.3f} turns a frame, too close to a whole or half number"
     misfits, amplitudes = zip(*(_turning(first, sign * turns) for sign in (-1, 1)), strict=True)
     good, bad = min(misfits), max(misfits)
-    if good > _TURNS_ALIKE:
-        why = "the bands do not move as flicker frequency and frame rate say (29.97 is not 30)"
+    if good > 0.1:
+        why = "the motion of the bands does not agree with flicker frequency and frame rate (29.97 is not 30)"
         return None, contrast, f"{why}: {turns % 1:.3f} turns a frame"
-    if bad < _CLEAR * good + _CLEAR_MISFIT:
-        return None, contrast, "texture of the scene hides how the bands move; take more frames, or a plain scene"
+    if bad < 4.0 * good + 0.01:
+        return None, contrast, "texture of the scene hides the motion of the bands; use more frames, or a plain scene"
     forward = misfits[0] < misfits[1]
     return ("forward" if forward else "reverse"), amplitudes[0 if forward else 1], ""
 
 
 def _turning(values: Tensor, turns: float) -> tuple[float, float]:
-    """Misfit of ``d + a exp(2 pi j p turns)`` to values (T,) over their power, d being held small, and |a|."""
+    """Misfit of ``d + a exp(2 pi j p turns)`` to values (T,) over their power with a penalty on d, and |a|."""
     count = len(values)
     angle = 2 * math.pi * turns * torch.arange(count, dtype=torch.float64)
     columns = torch.stack([torch.ones(count, dtype=values.dtype), torch.polar(torch.ones_like(angle), angle)], 1)
-    small = _TEXTURE_PRICE[min(count, 3)]
-    gram = columns.mH @ columns + torch.diag(torch.tensor([small, 0.0])).to(values.dtype)
-    found = torch.linalg.solve(gram, columns.mH @ values)
-    cost = (values - columns @ found).abs().square().sum() + small * found[0].abs().square()
-    return float(cost / values.abs().square().sum()), float(found[1].abs())
-
-
-def _wrapped(turns: float) -> float:
-    return (turns + 0.5) % 1.0 - 0.5
+    penalty = 0.3 if count == 2 else 0.03  # two frames alone cannot separate d from a
+    gram = columns.mH @ columns + torch.diag(torch.tensor([penalty, 0.0])).to(values.dtype)
+    solution = torch.linalg.solve(gram, columns.mH @ values)
+    cost = (values - columns @ solution).abs().square().sum() + penalty * solution[0].abs().square()
+    return float(cost / values.abs().square().sum()), float(solution[1].abs())
 
 
 def _exposure(
@@ -288,10 +276,10 @@ def _exposure(
     on_fraction: float | None,
     light_contrast: float | None,
 ) -> tuple[float | None, float | None, str]:
-    """Exposure in seconds with its standard deviation, or why it cannot be told."""
+    """Exposure in seconds with its standard deviation, or why it is undetermined."""
     if on_fraction is None and light_contrast is None:
-        return None, None, "it takes on_fraction of an on-off light, or light_contrast of one that swings"
-    if profiles.clipped > _MOST_CLIPPED:
+        return None, None, "it requires on_fraction of an on-off light, or light_contrast of a sinusoidal one"
+    if profiles.clipped > 0.02:
         return None, None, f"{profiles.clipped:.0%} of the pixels are saturated, which changes the shape of the bands"
     if light_contrast is not None:
         noise = float((bands.coefficients[:, 0].abs().square().sum() / max(bands.certainty, 1e-9)).sqrt())
@@ -302,6 +290,6 @@ def _exposure(
     phases = [float(value.angle()) for value in bands.coefficients[:, 0]]
     even = profiles.rows / (bands.scene / bands.scene.mean(1, keepdim=True))
     fit = fit_strobe(even, bands.period, phases, on_fraction=on_fraction)
-    if fit.misfit > _GOOD_SHAPE:
-        return None, None, f"the bands do not have the shape of a light that is on and off (misfit {fit.misfit:.0%})"
+    if fit.misfit > _MAX_STROBE_MISFIT:
+        return None, None, f"the bands do not have the shape of an on-off light (misfit {fit.misfit:.0%})"
     return float(fit.exposure_rows[0]) * row_time, fit.std["exposure_rows"] * row_time, ""

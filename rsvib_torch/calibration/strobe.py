@@ -1,4 +1,4 @@
-"""Exposure from the shape of bands: light that is on and off, or that swings as a sine."""
+"""Exposure from the shape of the bands of an on-off light, or from the contrast of those of a sinusoidal light."""
 
 import math
 from collections.abc import Sequence
@@ -10,10 +10,6 @@ from scipy.optimize import brentq, least_squares
 from torch import Tensor
 
 __all__ = ["StrobeFit", "exposure_from_contrast", "fit_strobe", "lit_fraction"]
-
-_DEGREE = 3  # of the polynomial for the scene along the rows
-_LONGEST = 3.0  # periods of exposure
-_STARTS = 9
 
 Array = NDArray[np.float64]
 
@@ -41,7 +37,7 @@ def lit_fraction(begin: Array, exposure: float, on_time: float, period: float) -
 
 @dataclass(frozen=True)
 class StrobeFit:
-    """Bands of a light that is on and off, in rows.
+    """Bands of an on-off light, in rows.
 
     Attributes:
         period: P.
@@ -59,13 +55,13 @@ class StrobeFit:
 
 
 def _residuals(brightness: Array, smooth: Array, shape: Array) -> Array:
-    """What bands of this shape (T, H) miss, the scene being any cubic along the rows of each frame."""
-    missing = []
+    """Residuals of bands of this shape (T, H) times a cubic along the rows of each frame, fitted to the brightness."""
+    residuals = []
     for values, waves in zip(brightness, shape, strict=True):
         columns = smooth * waves[:, None]
         weight, *_ = np.linalg.lstsq(columns, values, rcond=None)
-        missing.append(values - columns @ weight)
-    return np.concatenate(missing)
+        residuals.append(values - columns @ weight)
+    return np.concatenate(residuals)
 
 
 def fit_strobe(
@@ -76,17 +72,17 @@ def fit_strobe(
     on_fraction: float | None = None,
     exposures: Sequence[float] | None = None,
 ) -> StrobeFit:
-    """Fit bands of a light that is on and off: the overlap of its pulses with the exposure of each row.
+    """Fit the bands of an on-off light: the overlap of its pulses with the exposure of each row.
 
-    Either the fraction of time that the light is on is known, and the exposure is found; or the exposures of two or
-    more frames are known up to the row time, and with it the on-time is found.
+    Given the fraction of time that the light is on, the exposure is estimated; given the exposures of two or more
+    frames in seconds, the row time and the on-time.
 
     Args:
         brightness: (T, H), in proportion to light.
         period: Period of the bands in rows, to start with.
         phases: Phase of the fundamental in each frame, ``cos(2 pi i / P - phase)``, to start with.
         on_fraction: Fraction of the period that the light is on.
-        exposures: Exposures in seconds, one a frame; ``std["row_time"]`` and ``exposure_rows`` then tell the row time.
+        exposures: Exposures in seconds, one a frame; ``std["row_time"]`` then holds that of the row time.
 
     Returns:
         The best fit from several starts.
@@ -94,7 +90,7 @@ def fit_strobe(
     values = (brightness / brightness.mean(1, keepdim=True)).numpy()
     height = values.shape[1]
     rows = np.arange(height, dtype=np.float64)
-    smooth = np.polynomial.chebyshev.chebvander(2 * rows / (height - 1) - 1, _DEGREE)
+    smooth = np.polynomial.chebyshev.chebvander(2 * rows / (height - 1) - 1, 3)
     count = len(values)
 
     def exposure_rows(parameters: Array) -> Array:
@@ -108,7 +104,7 @@ def fit_strobe(
 
     def residuals(parameters: Array) -> Array:
         long, lit = exposure_rows(parameters), on_rows(parameters)
-        # the middle of the exposure meets the middle of the pulse in the brightest row
+        # the brightest row is exposed symmetrically about the pulse
         shape = np.stack(
             [
                 lit_fraction(rows - middle - 0.5 * e + 0.5 * lit, e, lit, parameters[0])
@@ -119,20 +115,21 @@ def fit_strobe(
 
     middles = [phase / (2 * math.pi) * period for phase in phases]
     best = None
-    for step in range(1, _STARTS + 1):
+    starts, longest_exposure = 9, 3.0  # periods
+    for step in range(1, starts + 1):
         if exposures is None:
-            guess = [period, _LONGEST * period * (step / _STARTS) ** 2]
-            lower, upper = [0.8 * period, 1e-3], [1.25 * period, (_LONGEST + 0.5) * period]
+            guess = [period, longest_exposure * period * (step / starts) ** 2]
+            lower, upper = [0.8 * period, 1e-3], [1.25 * period, (longest_exposure + 0.5) * period]
         else:
             longest = max(exposures)
-            guess = [period, longest / (period * 0.8 * step / _STARTS), 0.3 * period]
+            guess = [period, longest / (period * 0.8 * step / starts), 0.3 * period]
             lower, upper = [0.8 * period, longest / (4 * period)], [1.25 * period, longest]
             lower, upper = [*lower, 1e-3], [*upper, 1.1 * period]
         bounds = ([*lower, *(m - period for m in middles)], [*upper, *(m + period for m in middles)])
         start = np.clip([*guess, *middles], np.asarray(bounds[0]) * 1.0, np.asarray(bounds[1]))
-        found = least_squares(residuals, start, bounds=bounds, x_scale=np.maximum(np.abs(start), 1e-12))
-        if best is None or found.cost < best.cost:
-            best = found
+        trial = least_squares(residuals, start, bounds=bounds, x_scale=np.maximum(np.abs(start), 1e-12))
+        if best is None or trial.cost < best.cost:
+            best = trial
     assert best is not None
     misfit = math.sqrt(2 * best.cost / values.size)
     names = ["period", "exposure_rows"] if exposures is None else ["period", "row_time", "on_rows"]
