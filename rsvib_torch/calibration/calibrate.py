@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.calibration.bands import BandFit, Profiles, find_bands, row_profiles
+from rsvib_torch.calibration.flicker import BandFit, Profiles, find_bands, row_profiles
 from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
 from rsvib_torch.core.checks import check_choice, check_number
 
