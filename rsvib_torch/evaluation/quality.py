@@ -12,7 +12,7 @@ from rsvib_torch.frames.arrays import ArrayLike, as_tensor
 
 __all__ = ["offset_endpoint_error", "psnr", "ssim"]
 
-_SSIM_WINDOW = 11  # taps of scikit-image's Gaussian window of sigma 1.5 px, cut at 3.5 sigma
+_SSIM_WINDOW = 11  # px, of a Gaussian of 1.5 px cut at 3.5 standard deviations, as in scikit-image
 
 
 def _compared(image: ArrayLike, reference: ArrayLike, rim: int) -> tuple[Tensor, Tensor]:
@@ -29,7 +29,7 @@ def _compared(image: ArrayLike, reference: ArrayLike, rim: int) -> tuple[Tensor,
         raise ValueError(f"reference of shape {tuple(reference.shape)} does not fit image {tuple(image.shape)}")
     rim = check_whole_number("rim", rim, at_least=0)
     if min(image.shape[-2:]) <= 2 * rim:
-        raise ValueError(f"rim={rim} leaves nothing of an image of {image.shape[-2]} x {image.shape[-1]} px")
+        raise ValueError(f"rim={rim} is too large for an image of {image.shape[-2]} x {image.shape[-1]} px")
     try:
         pair = torch.broadcast_tensors(image, reference)
     except RuntimeError as error:
@@ -61,7 +61,7 @@ def psnr(image: ArrayLike, reference: ArrayLike, data_range: float, *, rim: int 
     Args:
         image: (H, W), or a stack (T, H, W), (T, C, H, W) or (B, T, C, H, W).
         reference: The truth, same shape, or one that broadcasts: one scene for all frames.
-        data_range: Full scale of the values: 1 for frames as ``read_stack`` gives them.
+        data_range: Full scale of the values: 1 for frames as ``read_stack`` returns them.
         rim: Pixels to leave out at each border.
 
     Returns:
@@ -69,7 +69,7 @@ def psnr(image: ArrayLike, reference: ArrayLike, data_range: float, *, rim: int 
 
     Raises:
         TypeError: If the images are not tensors or arrays of real numbers.
-        ValueError: If the shapes do not fit, the rim leaves nothing, or the data range is not positive.
+        ValueError: If the shapes do not fit, the rim is too large, or the data range is not positive.
 
     Example:
         >>> psnr(torch.full((2, 8, 8), 0.6), torch.full((8, 8), 0.5), 1.0)
@@ -91,7 +91,7 @@ def ssim(image: ArrayLike, reference: ArrayLike, data_range: float, *, rim: int 
     Args:
         image: (H, W), or a stack (T, H, W), (T, C, H, W) or (B, T, C, H, W).
         reference: The truth, same shape, or one that broadcasts: one scene for all frames.
-        data_range: Full scale of the values: 1 for frames as ``read_stack`` gives them.
+        data_range: Full scale of the values: 1 for frames as ``read_stack`` returns them.
         rim: Pixels to leave out at each border.
 
     Returns:
@@ -114,7 +114,7 @@ def ssim(image: ArrayLike, reference: ArrayLike, data_range: float, *, rim: int 
             f"ssim needs at least {_SSIM_WINDOW} x {_SSIM_WINDOW} px within the rim, "
             f"got {first.shape[-2]} x {first.shape[-1]}"
         )
-    # Images ride on the channel axis: the separable filters run several times faster there than on the batch axis.
+    # the separable filters are several times faster along the channel axis than along the batch axis
     folded = [value.flatten(0, 1)[None] for value in (first, second)]
     similarity = kornia_ssim(folded[0], folded[1], _SSIM_WINDOW, max_val=data_range, eps=0.0, padding="valid")
     return _per_image(similarity[0].unflatten(0, first.shape[:2]).flatten(1).mean(1, dtype=torch.float64), image)
@@ -136,8 +136,8 @@ def offset_endpoint_error(
 ) -> Tensor:
     """Distance between measured and true offsets in px.
 
-    ``|measured - truth|`` as vectors (x, y). Bands that registration gave up (NaN) do not count towards the mean:
-    how many those are is a figure of its own, ``isfinite(measured)``.
+    ``|measured - truth|`` as vectors (x, y). Bands where registration failed (NaN) are left out of the
+    mean; ``isfinite(measured)`` counts the others.
 
     Args:
         measured: (..., N, 2) px, axes (x, y); NaN where registration failed.

@@ -197,9 +197,9 @@ NOISE = 0.008 * np.random.default_rng(0).standard_normal((120, 80))
     [
         (NOISE, r"no edge: a straight edge explains 0 % of the variance, expected at least 50 %"),
         (np.full((120, 80), 0.5), r"no edge: all pixels are 0\.5"),
-        (draw_edge(1.5, 0.5), r"hardly slanted: 1\.50 degrees .* expected 2 \.\.\. 40"),
-        (draw_edge(0.0, 0.5) + NOISE, "hardly slanted"),
-        (draw_edge(43.0, 0.5, (90, 90)), r"too near to 45 degrees: 43\.00"),
+        (draw_edge(1.5, 0.5), r"not slanted enough: 1\.50 degrees .* expected 2 \.\.\. 40"),
+        (draw_edge(0.0, 0.5) + NOISE, "not slanted enough"),
+        (draw_edge(43.0, 0.5, (90, 90)), r"too close to 45 degrees: 43\.00"),
         (draw_edge(5.0, 0.5, (15, 80)), "at least 16 x 16 px, got 15 x 80"),
         (draw_edge(2.5, 0.5, (18, 80)), r"crosses 0\.79 px over 18 px of length"),
         (draw_edge(5.0, 0.5, offset=(33.0, 0.0)), r"within 1\.\d px of the border of the roi, expected at least 4\.0"),

@@ -1,4 +1,4 @@
-"""How well a vibration can be known at all: the Cramér-Rao bound of its parameters."""
+"""Cramér-Rao bound of the parameters of a vibration: the smallest standard deviation of an unbiased estimate."""
 
 import math
 from collections.abc import Callable
@@ -28,22 +28,21 @@ _METHODS: dict[str, Callable[[Recording, float], Tensor]] = {
     "gradients": lambda recording, _: gradient_information(recording),
     "random": random_information,
 }
-_BLIND = 1e-8  # of the information with a known scene: less is none
 
 # axis, name of the field, tone
 _Parameter = tuple[int, str, int]
 
 
 def _parameters(motion: Vibration, acceleration: bool) -> list[_Parameter]:
-    """What is unknown: all parameters of the tones that are there, and the image motion of both axes."""
-    found: list[_Parameter] = []
+    """Unknown parameters: those of all tones of non-zero amplitude, and the image motion of both axes."""
+    parameters: list[_Parameter] = []
     for axis in range(2):
         for tone in range(motion.amplitude.shape[-1]):
             if float(motion.amplitude[axis, tone]) > 0:
-                found += [(axis, name, tone) for name in ("amplitude", "frequency", "phase")]
-        found += [(axis, "image_motion", 0)]
-        found += [(axis, "image_acceleration", 0)] if acceleration else []
-    return found
+                parameters += [(axis, name, tone) for name in ("amplitude", "frequency", "phase")]
+        parameters += [(axis, "image_motion", 0)]
+        parameters += [(axis, "image_acceleration", 0)] if acceleration else []
+    return parameters
 
 
 def _sensitivity(motion: Vibration, parameter: _Parameter, times: Tensor) -> Tensor:
@@ -65,14 +64,15 @@ def _deviations(information: Tensor, typical: Tensor) -> Tensor:
 
     Args:
         information: (P, P).
-        typical: (P,), what it would be if the scene were known: the scale on which nothing is nothing.
+        typical: (P,), information for a known scene; eigenvalues below 1e-8 of it count as zero.
     """
     scale = typical.clamp(min=1e-300).rsqrt()
     values, vectors = torch.linalg.eigh(information * scale[:, None] * scale)
-    blind = values < _BLIND
+    least = 1e-8
+    blind = values < least
     shares = vectors.square()
-    variance = shares @ torch.where(blind, 0.0, 1 / values.clamp(min=_BLIND))
-    variance = torch.where(shares @ blind.double() > _BLIND, math.inf, variance)
+    variance = shares @ torch.where(blind, 0.0, 1 / values.clamp(min=least))
+    variance = torch.where(shares @ blind.double() > least, math.inf, variance)
     deviations: Tensor = variance.sqrt() * scale
     return deviations
 
@@ -91,10 +91,10 @@ def cramer_rao_bound(
     """Cramér-Rao bound of the parameters of a vibration, for white Gaussian noise and an unknown scene.
 
     No unbiased estimate has a smaller standard deviation. With D the derivatives of the frames by the parameters and
-    A the operator that forms the frames, ``J = D' (1 - A (A' A)^-1 A') D / noise^2`` is the information that is left
-    when the scene has to be found from the same frames, and the bound is the root of the diagonal of its inverse.
-    All parameters are unknown together: amplitude, frequency and phase (at the time origin) of the tones that are
-    there, and the image motion. ``docs/bound.md`` has the derivation.
+    A the operator that forms the frames, ``J = D' (1 - A (A' A)^-1 A') D / noise^2`` is the information if the scene is
+    unknown too, and the bound is the root of the diagonal of its inverse.
+    All parameters are unknown together: amplitude, frequency and phase (at the time origin) of all tones, and the
+    image motion. ``docs/bound.md`` has the derivation.
 
     Args:
         scene: (H, W) noise-free still scene, floating point, full scale 1, larger than the frames.
@@ -105,13 +105,13 @@ def cramer_rao_bound(
         frame_size: (height, width) of the frames, as in ``simulate_frames``.
         method: ``"projection"``, exact for an unknown deterministic scene; ``"gradients"``, its closed approximation
             row by row, several times faster; or ``"random"``, the same for a random Gaussian scene with the power
-            spectrum of this one: larger where the noise hides part of the spectrum, since an estimate has to learn
-            the scene from the same frames.
+            spectrum of this one: larger if part of the spectrum is below the noise, since the scene is estimated
+            from the same frames.
         acceleration: Whether the image acceleration is unknown as well (else it is known).
 
     Returns:
-        Standard deviations in the layout of ``detection.std``: infinite where the frames tell nothing (a blind
-        frequency: amplitude and phase), 0 for tones of amplitude 0 and for an acceleration that is known.
+        Standard deviations in the layout of ``detection.std``: infinite without information (amplitude and phase
+        at a blind frequency), 0 for tones of amplitude 0 and for a known acceleration.
 
     Raises:
         TypeError: If the scene is not a floating-point tensor.
@@ -133,7 +133,7 @@ def cramer_rao_bound(
         raise ValueError(f"scene must have shape (H, W), got {tuple(scene.shape)}")
     if num_frames < 2:
         raise ValueError(f"num_frames must be at least 2, got {num_frames}")
-    # what the frames are like, and whether there can be any, is for the simulation to say
+    # the simulation checks the sizes and the motion
     frames = simulate_frames(scene.double(), timing, vibration, num_frames, frame_size=frame_size)
     motion = vibration.to_row_order(timing).to(scene.device)
     parameters = _parameters(motion, acceleration)

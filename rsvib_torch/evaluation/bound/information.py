@@ -1,4 +1,4 @@
-"""Fisher information that frames of one unknown scene hold about the parameters of a motion."""
+"""Fisher information about the parameters of a motion in frames of one unknown scene."""
 
 import math
 from collections.abc import Callable
@@ -23,19 +23,16 @@ __all__ = [
     "scale_of_information",
 ]
 
-# Of the spline across rows, and the band of the scene, in cycles per row, that it can follow: what lies above would
-# be seen as its aliases, and those would tell of motions that nobody can see.
-_DEGREE = 13
-_BAND = (0.35, 0.45)
+_DEGREE = 13  # of the spline across rows
+_BAND = (0.35, 0.45)  # cycles per row, transition of the low-pass of the scene: the spline has aliases above
 _MARGIN = 16  # columns over which the scene closes to a period
-_RIDGE = 1e-10  # of the largest element: scene rows that nobody sees stay finite
+_RIDGE = 1e-10  # of the largest element, for scene rows outside all frames
 _CHUNK = 1 << 17  # rows of all frames times frequencies worked on at a time
-_SMOOTH = 9  # frequencies, along each axis, over which a power spectrum is averaged
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A still scene, the frames taken of it, and the parameters asked for, in row order.
+    """A still scene, the frames taken of it, and the parameters of the bound, in row order.
 
     Attributes:
         scene: (Hs, Ws) float64; frames are centred on it.
@@ -57,7 +54,7 @@ class Recording:
 
     @property
     def origin(self) -> tuple[int, int]:
-        """Scene pixel (row, column) that frame pixel (0, 0) shows at rest."""
+        """Scene pixel (row, column) of frame pixel (0, 0) at rest."""
         return (self.scene.shape[0] - self.size[0]) // 2, (self.scene.shape[1] - self.size[1]) // 2
 
     @property
@@ -73,7 +70,7 @@ class Recording:
         return values[..., None] * along.reshape(-1, *(1,) * starts.ndim, 2)
 
     def others_showing(self) -> tuple[Tensor, Tensor]:
-        """Where the content of each frame row is found in each frame q.
+        """Position of the content of each frame row in each frame q.
 
         Returns:
             Rows (T, R, q) and displacement along them (T, R, q) px.
@@ -84,13 +81,13 @@ class Recording:
         begin = self.timing.frame_starts(count, starts.device)
         found = rows_showing(content[..., None].expand(-1, -1, count), begin, self.timing, self.motion)
         own = torch.eye(count, dtype=torch.bool, device=starts.device)[:, None]
-        found = torch.where(own, rows[:, None], found)  # to the last digit, or first and last rows would fall out
+        found = torch.where(own, rows[:, None], found)  # exactly, so that the first and last rows stay inside
         moments = begin + found * self.timing.row_time
         return found, self.motion.mean_displacement(moments, self.timing.exposure_time)[..., 0]
 
 
 def scale_of_information(recording: Recording) -> Tensor:
-    """Rough information (P,) of each parameter for a known scene and unit noise: what little is little of."""
+    """Approximate information (P,) of each parameter for a known scene and unit noise."""
     slope = recording.scene.diff(dim=0).square().mean() + recording.scene.diff(dim=1).square().mean()
     return recording.sensitivity(recording.starts).square().sum((1, 2)) * slope * recording.size[1]
 
@@ -98,11 +95,11 @@ def scale_of_information(recording: Recording) -> Tensor:
 def projected_information(recording: Recording) -> Tensor:
     """Information of the parameters when the scene is unknown, for unit noise.
 
-    ``J = D' (1 - A (A' A)^-1 A') D``: D are the derivatives of the frames, A takes a scene to its frames, and what
-    any scene could explain of D tells nothing. Rows of a frame see the scene through a phase ramp along the row, so
-    that A is a banded matrix for each frequency along the row and the projection is worked out without iterations.
-    The scene is taken as periodic along rows, and without detail above 0.4 cycles per row; only pixels count that
-    another frame shows as well.
+    ``J = D' (1 - A (A' A)^-1 A') D``: D are the derivatives of the frames, A takes a scene to its frames, and the
+    part of D that a scene could explain contains no information. The displacement along a row is a phase ramp, so that
+    A is a banded matrix for each frequency along the row and the projection needs no iterations.
+    The scene is taken as periodic along rows, and without detail above 0.4 cycles per row; only pixels count whose
+    content is visible in another frame.
 
     Returns:
         Matrix (P, P).
@@ -113,12 +110,12 @@ def projected_information(recording: Recording) -> Tensor:
     spectra = torch.fft.rfft(extend_rows(coefficients, length, hold=0.0))
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=spectra.device)
     step = max(1, _CHUNK // place.first.numel())
-    left = []
+    residuals = []
     for begin in range(0, len(u), step):
         part = slice(begin, begin + step)
-        left.append(_unexplained(place, spectra[:, part], u[part]))
+        residuals.append(_unexplained(place, spectra[:, part], u[part]))
     columns = slice(recording.origin[1], recording.origin[1] + recording.size[1])
-    images = torch.fft.irfft(torch.cat(left, dim=-1), n=length)[..., columns]  # (P, T, R, W)
+    images = torch.fft.irfft(torch.cat(residuals, dim=-1), n=length)[..., columns]  # (P, T, R, W)
     images = (images * _shown_twice(recording)).flatten(1)
     information: Tensor = images @ images.T
     return information
@@ -137,7 +134,7 @@ def _within_band(scene: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Which coefficients of the scene each row sees at the N nodes of its exposure.
+    """Observation operator: coefficients of the scene for each row at the N nodes of its exposure.
 
     Attributes:
         first: (T, R) first scene row.
@@ -183,7 +180,7 @@ class _Places:
 
 
 def _unexplained(place: _Places, spectra: Tensor, u: Tensor) -> Tensor:
-    """What no scene explains of the derivatives of the spectra of all rows, (P, T, R, U)."""
+    """Derivatives of the spectra of all rows less the part that a scene explains, (P, T, R, U)."""
     angle = (-2 * math.pi) * place.along[..., None] * u
     ramps = torch.polar(torch.ones_like(angle), angle) * place.weights[:, None]  # (T, R, N, U)
     reach = place.taps.shape[-1]
@@ -213,12 +210,12 @@ def _unexplained(place: _Places, spectra: Tensor, u: Tensor) -> Tensor:
     explained = sum(
         (kernels[:, i, None] * solution[base + i] for i in range(reach)), start=torch.zeros((), dtype=rows.dtype)
     )
-    left: Tensor = (rows - explained).transpose(0, 1).unflatten(1, place.first.shape)
-    return left
+    residual: Tensor = (rows - explained).transpose(0, 1).unflatten(1, place.first.shape)
+    return residual
 
 
 def _shown_twice(recording: Recording) -> Tensor:
-    """(T, R, W) float64, 1 for pixels whose content at least one other frame shows."""
+    """(T, R, W) float64, 1 for pixels whose content is visible in another frame."""
     rows, shift = recording.others_showing()
     own = shift.diagonal(dim1=0, dim2=2).T  # (T, R)
     columns = torch.arange(recording.size[1], dtype=torch.float64, device=rows.device)
@@ -233,7 +230,7 @@ def gradient_information(recording: Recording) -> Tensor:
 
     ``J = sum_s sum_p (d_p - d)' M(s) (d_p - d)``: M(s) sums the gradient products of scene row s, d_p are the
     derivatives of its displacement in frame p and d their mean. For two frames this is half of what the derivatives
-    of the offset give. Blur within the exposure is neglected, and so is the reach of interpolation.
+    of the offset give. Blur within the exposure and the extent of interpolation kernels are neglected.
     """
     return _row_information(recording, None)
 
@@ -241,8 +238,8 @@ def gradient_information(recording: Recording) -> Tensor:
 def random_information(recording: Recording, noise: float) -> Tensor:
     """The information for a random Gaussian scene with the power spectrum S of this one, for noise of power N.
 
-    Gradients count by ``T S / (T S + N)``: where the noise hides the scene, there is no telling what moved. Otherwise
-    as ``gradient_information``, in the same units.
+    Gradients are weighted by ``T S / (T S + N)``, which is small for frequencies below the noise. Otherwise as
+    ``gradient_information``, in the same units.
     """
     return _row_information(recording, noise)
 
@@ -255,7 +252,7 @@ def _row_information(recording: Recording, noise: float | None) -> Tensor:
     rows = rows_showing(scene_rows[:, None] - top, begin.expand(len(scene_rows), count), timing, recording.motion)
     moments = begin + rows * timing.row_time
     middle = moments + 0.5 * timing.exposure_time
-    # how densely the rows of a frame lie on the scene
+    # rows of a frame per row of the scene
     density = 1 / (1 - recording.motion.velocity(middle)[..., 1] * timing.row_time)
     seen = ((rows >= 0) & (rows <= height - 1)) * density  # (S, T)
     shift = recording.motion.mean_displacement(moments, timing.exposure_time)[..., 0]
@@ -284,12 +281,12 @@ def _gradient_products(scene: Tensor, window: Tensor, noise: float | None, num_f
         return values[:, : scene.shape[0], : scene.shape[1]]
 
     gradients = images(slopes)
-    weighed = gradients
+    weighted = gradients
     if noise is not None:
-        half = _SMOOTH // 2
-        power = functional.pad(spectrum.abs().square()[None, None], (half,) * 4, mode="circular")
-        power = num_frames * functional.avg_pool2d(power, _SMOOTH, 1)[0, 0]
-        weighed = images(slopes * (power / (power + noise**2 * spectrum.numel())))
-    products = torch.einsum("asx,sx,bsx->sab", gradients, window, weighed)
+        size = 9  # frequencies along each axis, over which the power spectrum is averaged
+        power = functional.pad(spectrum.abs().square()[None, None], (size // 2,) * 4, mode="circular")
+        power = num_frames * functional.avg_pool2d(power, size, 1)[0, 0]
+        weighted = images(slopes * (power / (power + noise**2 * spectrum.numel())))
+    products = torch.einsum("asx,sx,bsx->sab", gradients, window, weighted)
     symmetric: Tensor = 0.5 * (products + products.transpose(-2, -1))
     return symmetric

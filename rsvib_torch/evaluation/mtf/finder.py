@@ -1,4 +1,4 @@
-"""Slanted edges in a picture of a chart."""
+"""Search for ROIs of slanted edges in the image of a chart."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,22 +8,24 @@ from scipy import ndimage
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_number, check_whole_number
-from rsvib_torch.evaluation.mtf.edge_checks import as_real, check_edge, uneven_patches
-from rsvib_torch.evaluation.mtf.edge_geometry import EdgeFit, Scatter, fit_edge, linearised, start_edge, straighten
+from rsvib_torch.evaluation.mtf.edge import (
+    EdgeFit,
+    Scatter,
+    as_real,
+    check_edge,
+    fit_edge,
+    linearised,
+    start_edge,
+    straighten,
+    uneven_patches,
+)
 from rsvib_torch.frames.arrays import ArrayLike, as_tensor
 
 __all__ = ["SlantedEdge", "find_slanted_edges"]
 
-_BLUR = 1.2  # px, before gradients
-_TAPS = 5
-_ANGLES = (2.0, 30.0)  # degrees, of edges to look for
-_STRAIGHT = 0.7  # px, of the ridge of the gradient around its line, root mean square
-_ENDS = 5  # px cut off the ends of an edge, where corners are
-_BESIDE = (40, 32, 24, 16, 12, 8)  # px of either side to try, the widest first
-_EXPLAINED = 0.985  # of the variance in the ROI, by the edge
-_NEAR = 5.0  # px from the edge that blur may reach, at a first look
-_EVEN = 0.06  # of the contrast: the sides away from the edge, root mean square, at a first look
-_TEXTURE = 0.01  # of the contrast: patches of the sides, root mean square, beside noise
+_BLUR, _TAPS = 1.2, 5  # px, of the Gaussian before the gradient, and its half length
+_ANGLES = (2.0, 30.0)  # degrees from an image axis
+_ENDS = 5  # px removed at the ends of an edge, because of corners
 _Side = Literal["left", "right", "top", "bottom"]
 
 
@@ -61,8 +63,8 @@ def find_slanted_edges(
 ) -> list[SlantedEdge]:
     """Find ROIs for ``slanted_edge_mtf``: straight edges, 2 ... 30 degrees off an axis, between even sides.
 
-    Ridges of the gradient are followed and fitted by lines; around each, the widest ROI is taken in which the edge
-    is all there is.
+    Ridges of the gradient are fitted by lines; around each line, the widest ROI is used that contains only the edge
+    and even sides.
 
     Args:
         image: (H, W), tensor or NumPy array, linear in light; any scale.
@@ -96,23 +98,23 @@ def find_slanted_edges(
     least = min_contrast * float(high - low)
     if least == 0.0:
         return []
-    found = []
+    edges = []
     for near_vertical in (True, False):
         turned = values if near_vertical else values.mT
         for line, rows in _lines(turned, least, min_length, max_length):
             edge = _roi_around(turned, line, rows, near_vertical, least)
             if edge is not None:
-                found.append(edge)
-    found.sort(key=lambda edge: -edge.contrast * (edge.height if edge.near_vertical else edge.width))
+                edges.append(edge)
+    edges.sort(key=lambda edge: -edge.contrast * (edge.height if edge.near_vertical else edge.width))
     kept: list[SlantedEdge] = []
-    for edge in found:
+    for edge in edges:
         if all(_overlap(edge, other) < 0.5 for other in kept):
             kept.append(edge)
     return kept
 
 
 def _gradients(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives (right, down) of the image behind a Gaussian."""
+    """Derivatives (right, down) of the image after a Gaussian filter."""
     offset = torch.arange(-_TAPS, _TAPS + 1, dtype=values.dtype, device=values.device)
     smooth = torch.exp(-0.5 * (offset / _BLUR).square())
     smooth = smooth / smooth.sum()
@@ -162,12 +164,12 @@ def _split(
     design = torch.stack([torch.ones_like(y), y], dim=1)
     line = torch.linalg.lstsq(design, place[:, None]).solution[:, 0]
     apart = (place - design @ line).abs()
-    if float(apart.square().mean().sqrt()) > _STRAIGHT:
-        # corners pull most: cut at the pixel farthest from the chord between the ends
+    if float(apart.square().mean().sqrt()) > 0.7:  # px: not straight
+        # usually a corner: split at the pixel farthest from the chord between the ends
         chord = place[0] + (place[-1] - place[0]) * (y - y[0]) / (y[-1] - y[0])
         cut = int((place - chord).abs().argmax())
         parts = [slice(None, max(cut - 2, 0)), slice(cut + 3, None)]
-        return [found for part in parts for found in _split(right, rows[part], columns[part], min_length, max_length)]
+        return [piece for part in parts for piece in _split(right, rows[part], columns[part], min_length, max_length)]
     angle = abs(float(line[1].atan().rad2deg()))
     begin, end = int(rows[0]) + _ENDS, int(rows[-1]) + 1 - _ENDS
     surplus = max(end - begin - max_length, 0) // 2
@@ -180,14 +182,14 @@ def _split(
 def _roi_around(
     values: Tensor, line: tuple[float, float], rows: range, near_vertical: bool, least: float
 ) -> SlantedEdge | None:
-    """The widest ROI around a line in which there is nothing but the edge; None where there is none."""
+    """The widest ROI around a line that contains only the edge and even sides; None if there is none."""
     ends = sorted(line[0] + line[1] * row for row in (rows[0], rows[-1]))
-    for beside in _BESIDE:
+    for beside in (40, 32, 24, 16, 12, 8):  # px on either side
         begin, end = round(ends[0]) - beside, round(ends[1]) + beside + 1
         if begin < 0 or end > values.shape[1]:
             continue
         roi = values[rows.start : rows.stop, begin:end]
-        if not _even_sides(roi, (line[0] + line[1] * rows.start - begin, line[1]), least):
+        if not _plain_sides(roi, (line[0] + line[1] * rows.start - begin, line[1]), least):
             continue
         scatter, columns, upright, mirrored = straighten(roi)
         if not upright:
@@ -204,44 +206,39 @@ def _roi_around(
     return None
 
 
-def _even_sides(roi: Tensor, line: tuple[float, float], least: float) -> bool:
-    """Whether both sides of a line are plain: planes fitted to them, but for what is near the line (cheap)."""
+def _plain_sides(roi: Tensor, line: tuple[float, float], least: float) -> bool:
+    """Fast check that both sides of a line, more than 5 px from it, are planes to 9 % of the contrast."""
     height, width = roi.shape
     y, x = (torch.arange(n, dtype=roi.dtype, device=roi.device) for n in (height, width))
     distance = x - line[0] - line[1] * y[:, None]
     levels, uneven = [], []
-    for side in (distance < -_NEAR, distance > _NEAR):
+    for side in (distance < -5.0, distance > 5.0):
         at = side.nonzero().to(roi.dtype)
         design = torch.cat([torch.ones_like(at[:, :1]), at / max(height, width) - 0.5], dim=1)
         normal = design.T @ design
         normal.diagonal().add_(1e-9 * len(at))
         plane = torch.linalg.solve(normal, design.T @ roi[side])
-        left = roi[side] - design @ plane
+        residual = roi[side] - design @ plane
         levels.append(float(roi[side].mean()))
-        uneven.append(float(left.square().mean().sqrt()))
+        uneven.append(float(residual.square().mean().sqrt()))
     step = abs(levels[1] - levels[0])
-    return step > 0.8 * least and max(uneven) < 1.5 * _EVEN * step
+    return step > 0.8 * least and max(uneven) < 0.09 * step
 
 
 def _alone(fit: EdgeFit, scatter: Scatter, columns: int, least: float) -> bool:
-    """Whether the edge explains its ROI, and the sides are even."""
+    """Whether the edge explains 98.5 % of the variance of its ROI, and the sides are even to 1 % of the contrast."""
     try:
         check_edge(fit, scatter, columns, (-torch.inf, torch.inf))
     except ValueError:
         return False
     model, _, _ = linearised(fit, scatter)
-    left = scatter.value - model
+    residual = scatter.value - model
     contrast = float(fit.contrast)
-    explained = 1 - float(left.var() / scatter.value.var())
+    explained = 1 - float(residual.var() / scatter.value.var())
     tilt = float(fit.sides[:, 1:].abs().max())
     patches, noise = uneven_patches(fit, scatter, columns)
     uneven = float(patches.square().mean().sqrt())
-    return (
-        contrast >= least
-        and explained >= _EXPLAINED
-        and tilt < 0.5 * contrast
-        and uneven < _TEXTURE * contrast + 1.5 * noise
-    )
+    return contrast >= least and explained >= 0.985 and tilt < 0.5 * contrast and uneven < 0.01 * contrast + 1.5 * noise
 
 
 def _overlap(first: SlantedEdge, second: SlantedEdge) -> float:

@@ -1,4 +1,4 @@
-"""Still scenes drawn by the program itself: a resolution chart, and a landscape seen from above."""
+"""Drawn still scenes: a resolution chart, and a landscape from above."""
 
 from rsvib_torch.evaluation.scenes.chart import resolution_chart
 from rsvib_torch.evaluation.scenes.landscape import city_and_fields

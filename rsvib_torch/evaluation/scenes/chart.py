@@ -1,4 +1,4 @@
-"""A resolution chart in the manner of ISO 12233."""
+"""A resolution chart similar to that of ISO 12233."""
 
 import math
 from collections.abc import Callable
@@ -30,14 +30,14 @@ def resolution_chart(height: int, width: int, *, sigma: float = 0.6, seed: int =
 
     A star in the middle, wedges along both axes that end at Nyquist, slanted squares on the diagonals,
     dark on light and light on dark in turn, and bar groups, rings, stars and textured grey steps between them, on
-    paper with a fine grain. Edges are error functions of the distance: no pixel is jagged at any size.
+    paper with a fine grain. Edges are error functions of the distance, without aliasing at any size.
 
     Args:
         height: Rows, at least 64.
         width: Columns, at least 64.
         sigma: Blur of the optics in px (Gaussian, pixel area included).
         seed: Seed of the grain and texture.
-        field: px, wanted size of a field of the chart, at least 32.
+        field: px, approximate size of a field of the chart, at least 32.
 
     Returns:
         float32 tensor (height, width) with values in 0 ... 1.
@@ -64,7 +64,7 @@ def resolution_chart(height: int, width: int, *, sigma: float = 0.6, seed: int =
     rows, columns = (max(3, 2 * round((size - 4 * rim) / (2 * field) - 0.5) + 1) for size in (height, width))
     pitch = ((width - 4 * rim) / columns, (height - 4 * rim) / rows)
     size = min(pitch)
-    relief = torch.full((2, height, width), 0.02)  # how strongly grain and texture show
+    relief = torch.full((2, height, width), 0.02)  # amplitude of grain and texture
     relief[1] = 0.012
     for i in range(rows):
         for j in range(columns):
@@ -77,13 +77,13 @@ def resolution_chart(height: int, width: int, *, sigma: float = 0.6, seed: int =
         for side in (-1, 1):
             _draw_wedge(canvas, middle, side, axis, begin=0.55 * pitch_along, length=(reach - 0.1) * pitch_along)
     _draw_border(canvas, rim)
-    # grain and texture follow the tone: black ink has less of either
+    # grain and texture are proportional to the tone
     image = canvas.image * (1.0 + relief[0] * grain + relief[1] * texture)
     return image.clamp(0.0, 1.0)
 
 
 def _draw_field(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, steps: tuple[int, int]) -> None:
-    """Draw what belongs in the field so many steps down and to the right of the middle one."""
+    """Draw the field at a position (down, right) from the middle one."""
     down, right = steps
     if down == 0 and right == 0:
         _draw_star(canvas, centre, 0.42 * size, 72)
@@ -147,20 +147,20 @@ def _draw_slanted_square(
         return rectangle(x, y, 0.46 * size, 0.46 * size, sigma)
 
     canvas.paint(centre, 0.46 * size, ground, frame)
-    for layer in relief:  # clean, for measurements of the edges
+    for layer in relief:  # no grain, for measurements of the edges
         Canvas(layer, sigma).paint(centre, 0.46 * size, 0.0, frame)
     canvas.paint(centre, 1.2 * half, tone, lambda x, y: rectangle(*rotated(x, y, turn), half, half, sigma))
 
 
 def _draw_bar_groups(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ring: int) -> None:
-    """Groups of five bars, upright and lying, of four frequencies."""
+    """Groups of five bars, vertical and horizontal, of four frequencies."""
     sigma, count, length = canvas.sigma, 5, 0.085 * size
     for place, share in enumerate((1.0, 0.7, 0.48, 0.32)):
         half = 0.18 * size * share
         frequency = 0.5 * (count - 0.5) / half
         for lying in (False, True):
             middle = (centre[0] + (0.23 if lying else -0.23) * size, centre[1] + (0.345 - 0.23 * place) * size)
-            if lying:  # as tall as the upright bars are long
+            if lying:  # as tall as the vertical bars are long
                 frequency = 0.5 * (count - 0.5) / (length * share)
 
             def coverage(x: Tensor, y: Tensor, f: float = frequency, turned: bool = lying) -> Tensor:
@@ -179,7 +179,7 @@ def _draw_rings(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ri
     def coverage(x: Tensor, y: Tensor) -> Tensor:
         r = torch.hypot(x, y)
         frequency = (finest * r / radius).clamp(min=0.5 * finest / radius)
-        cycles = 0.25 + 0.5 * finest * r.square() / radius  # the middle of a bar is the middle of the rings
+        cycles = 0.25 + 0.5 * finest * r.square() / radius  # a bar is centred on the rings
         return bars(torch.remainder(cycles, 1.0) + 2.0, frequency, 6, sigma) * edge(radius - r, sigma)
 
     canvas.paint(centre, radius, _INK, coverage)

@@ -1,7 +1,7 @@
-"""Shapes as seen through Gaussian optics: coverages between 0 and 1 without a jagged edge.
+"""Shapes behind Gaussian optics: coverages between 0 and 1 without aliasing.
 
-A straight edge blurred by a Gaussian is an error function of the signed distance, and so are products and sums of
-edges at right angles or in parallel: rectangles and bars come out exact, curved edges as good as exact.
+A straight edge blurred by a Gaussian is an error function of the signed distance. Rectangles and bars are products and
+sums of such edges and exact; curved edges are nearly so.
 """
 
 import math
@@ -53,7 +53,7 @@ def bars(cycles: Tensor, frequency: Tensor | float, count: int, sigma: float) ->
 
 
 def sectors(x: Tensor, y: Tensor, count: int, sigma: float) -> Tensor:
-    """Coverage of a star of ``count`` sectors; right where the radius exceeds ``count / pi`` px (Nyquist)."""
+    """Coverage of a star of ``count`` sectors; valid where the radius exceeds ``count / pi`` px (Nyquist)."""
     frequency = count / (2 * math.pi * torch.hypot(x, y).clamp(min=1e-3))
     cycles = torch.remainder(torch.atan2(y, x) * (count / (2 * math.pi)), 1.0) + 2.0
     return bars(cycles, frequency, 6, sigma).clamp(0.0, 1.0)
@@ -114,12 +114,12 @@ class Canvas:
         tone: float | Callable[[Tensor], Tensor],
         coverage: Callable[[Tensor, Tensor], Tensor],
     ) -> None:
-        """Lay a tone over the image.
+        """Paint a tone over the image.
 
         Args:
             centre: Column and row of the origin of the shape's coordinates.
             reach: Half size (x, y) of the window in px, or one number for both.
-            tone: Value to lay over, or a function of what lies beneath.
+            tone: Value to paint, or a function of the values of the image.
             coverage: Function of the coordinates x (1, w) and y (h, 1) in px from the centre.
         """
         half = reach if isinstance(reach, tuple) else (reach, reach)
@@ -136,5 +136,5 @@ class Canvas:
         x = torch.arange(begin[0], end[0], dtype=torch.float32)[None] - centre[0]
         y = torch.arange(begin[1], end[1], dtype=torch.float32)[:, None] - centre[1]
         window = self.image[begin[1] : end[1], begin[0] : end[0]]
-        wanted = tone(window) if callable(tone) else tone
-        window += coverage(x, y) * (wanted - window)
+        painted = tone(window) if callable(tone) else tone
+        window += coverage(x, y) * (painted - window)

@@ -1,24 +1,29 @@
-"""A landscape from above: towns, fields, woods, roads and a river."""
+"""A landscape from above: towns with small buildings, fields, woods, roads and a river."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.checks import check_number, check_whole_number
-from rsvib_torch.evaluation.scenes.buildings import BuildingPlan, draw_buildings
-from rsvib_torch.evaluation.scenes.drawing import fractal_texture, rotated, smoothed
+from rsvib_torch.evaluation.scenes.drawing import edge, fractal_texture, rectangle, rotated, smoothed
 
 __all__ = ["city_and_fields"]
 
 _DISTRICT = 400.0  # px, mean size of a district
-_OVERSAMPLING = 2  # points per px along each axis, where the ground is laid out
-_STRIP = 96  # rows laid out at a time
+_OVERSAMPLING = 2  # points of the ground per px along each axis
+_STRIP = 96  # rows at a time
 _PIXEL_VARIANCE = 1.0 / 12.0  # px^2, of averaging over a pixel
 _FIELDS, _TOWN, _WORKS, _WOOD = range(4)
-_TABLE = 4096  # random numbers that parcels draw from
+_TABLE = 4096  # random numbers for parcels
+
+_SUN = math.radians(215.0)  # direction in which shadows fall
+_SHADE = 0.62  # decrease of the light in a shadow
+_SHADOW_STEPS = 4  # copies of the outline in a shadow
+_CHUNK = 256  # buildings drawn at a time
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,7 @@ class _Lines:
 
 
 def city_and_fields(height: int, width: int, seed: int, *, sigma: float = 0.6) -> Tensor:
-    """Draw towns and fields as seen from above, through Gaussian optics.
+    """Draw towns and fields from above, with Gaussian optics.
 
     Fractal ground in districts of different direction: fields with furrows and hedges, streets with rows of small
     gabled buildings and their shadows, larger works, woods, country roads and a river.
@@ -92,7 +97,7 @@ def city_and_fields(height: int, width: int, seed: int, *, sigma: float = 0.6) -
     ground, wildness = smoothed(torch.cat(strips, dim=1), math.sqrt(sigma**2 - _PIXEL_VARIANCE))
     image = ground * (1.0 + 0.09 * relief + (0.025 + 0.2 * wildness) * detail)
     plan = _plan_buildings(districts, lines, height, width, generator)
-    return draw_buildings(image, plan, sigma).clamp(0.0, 1.0)
+    return _draw_buildings(image, plan, sigma).clamp(0.0, 1.0)
 
 
 def _points(begin: int, end: int) -> Tensor:
@@ -109,7 +114,7 @@ def _lay_out_districts(height: int, width: int, generator: torch.Generator) -> _
 
     grid = torch.stack(torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy"), dim=-1)
     place = (grid - 1 + 0.15 + 0.7 * uniform(rows, columns, 2)) * pitch
-    # Thirds of town and fields, and the rest in equal parts, in an order that mixes them at any size.
+    # about equal parts of fields and town, and a quarter of works and woods, mixed at any image size
     draw = torch.remainder(torch.arange(rows * columns) * 0.618034 + uniform(1), 1.0).view(rows, columns)
     kind = torch.bucketize(draw, torch.tensor([0.37, 0.75, 0.87]))
     sizes = torch.tensor([[110.0, 70.0], [104.0, 64.0], [150.0, 110.0], [1e4, 1e4]])
@@ -163,7 +168,7 @@ def _border_distance(x: Tensor, y: Tensor, first: Tensor, second: Tensor, distri
 def _borders(strip: tuple[int, int], width: int, districts: _Districts) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Sample points x, y of a strip of rows with their districts, and the distances to the districts' borders.
 
-    The two nearest districts are found for pixels, and which of the two is nearer for each point.
+    The two nearest districts are those of the pixel; which of the two is nearer is computed for each point.
     """
     rows, columns = (torch.arange(*limits, dtype=torch.float32) for limits in (strip, (0, width)))
     pair = _two_nearest_districts(columns[None], rows[:, None], districts)
@@ -175,14 +180,14 @@ def _borders(strip: tuple[int, int], width: int, districts: _Districts) -> tuple
 
 
 def _lay_out_ground(rows: tuple[int, int], width: int, districts: _Districts, lines: _Lines, table: Tensor) -> Tensor:
-    """Tone of the ground and how wildly it is overgrown, (2, points down, points across)."""
+    """Tone of the ground and density of its vegetation, (2, points down, points across)."""
     x, y, nearest, border = _borders(rows, width, districts)
     kind = districts.kind.view(-1)[nearest]
     place_x, place_y, size_u, size_v, cosine, sine = districts.table.T.contiguous()[:, nearest]
     right, down = x - place_x, y - place_y
     u, v = right * cosine + down * sine, down * cosine - right * sine
     lot_v = (v / size_v).floor()
-    # fields of one row are set off against those of the next, streets go straight on
+    # rows of fields are shifted against each other, streets are straight
     shifted = (kind == _FIELDS) * table[(lot_v.long() * 37 + nearest).remainder(_TABLE), 0]
     u = u + shifted * size_u
     lot_u = (u / size_u).floor()
@@ -215,23 +220,62 @@ def _lay_out_ground(rows: tuple[int, int], width: int, districts: _Districts, li
     return torch.stack([tone, wildness])
 
 
+# --- Buildings ---
+
+
+@dataclass(frozen=True)
+class _BuildingPlan:
+    """N buildings that do not overlap.
+
+    Attributes:
+        centre: (N, 2) px, x and y.
+        half: (N, 2) px, half of the sides.
+        angle: (N,) rad, direction of the first side.
+        tone: (N,) of the roofs.
+        rise: (N,) px, length of the shadows.
+        gabled: (N,) 1 where the two sides of the roof differ in tone, 0 where the roof is flat.
+    """
+
+    centre: Tensor
+    half: Tensor
+    angle: Tensor
+    tone: Tensor
+    rise: Tensor
+    gabled: Tensor
+
+    @staticmethod
+    def joined(plans: Sequence["_BuildingPlan"]) -> "_BuildingPlan":
+        """All buildings of several plans."""
+        empty = [torch.zeros(0, 2), torch.zeros(0, 2), *(torch.zeros(0) for _ in range(4))]
+        return _BuildingPlan(
+            *(
+                torch.cat([none, *(getattr(plan, field.name) for plan in plans)])
+                for field, none in zip(fields(_BuildingPlan), empty, strict=True)
+            )
+        )
+
+    def where(self, chosen: Tensor) -> "_BuildingPlan":
+        """The buildings at an index or mask."""
+        return _BuildingPlan(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+
 def _plan_buildings(
     districts: _Districts, lines: _Lines, height: int, width: int, generator: torch.Generator
-) -> BuildingPlan:
+) -> _BuildingPlan:
     """Rows of buildings along the streets of every town and works district, and a few farms in the fields."""
     plans = []
     for index, kind in enumerate(districts.kind.view(-1).tolist()):
         if kind == _WOOD:
             continue
         plans.append(_plan_district(index, kind, districts, lines, generator))
-    plan = BuildingPlan.joined(plans)
+    plan = _BuildingPlan.joined(plans)
     inside = (plan.centre > -40).all(-1) & (plan.centre[:, 0] < width + 40) & (plan.centre[:, 1] < height + 40)
     return plan.where(inside)
 
 
 def _plan_district(
     index: int, kind: int, districts: _Districts, lines: _Lines, generator: torch.Generator
-) -> BuildingPlan:
+) -> _BuildingPlan:
     parcel = districts.parcel.view(-1, 2)[index]
     place, angle = districts.place.view(-1, 2)[index], float(districts.angle.view(-1)[index])
     street, share = {_FIELDS: (12.0, 0.12), _TOWN: (7.5, 0.93), _WORKS: (10.0, 0.85)}[kind]
@@ -263,6 +307,59 @@ def _plan_district(
     tone = 0.3 + 0.5 * random[:, 5]
     tone = torch.where(random[:, 6] < 0.12, 0.82, tone)
     rise = (3.0 + 5.0 * random[:, 7]) * (1.0 if kind == _TOWN else 1.3)
-    return BuildingPlan(
+    return _BuildingPlan(
         centre, half, torch.full((count,), angle), tone, rise, torch.full((count,), float(kind != _WORKS))
     ).where(keep)
+
+
+def _draw_buildings(image: Tensor, plan: _BuildingPlan, sigma: float) -> Tensor:
+    """Draw shadows, then roofs, over the ground.
+
+    Args:
+        image: (H, W) ground.
+        plan: The buildings.
+        sigma: Blur of the optics in px.
+
+    Returns:
+        Image of the same shape.
+    """
+    height, width = image.shape
+    room = torch.linalg.vector_norm(plan.half, dim=-1) + plan.rise + 5 * sigma
+    order = room.argsort()
+    plan, room = plan.where(order), room[order]
+    pad = int(room.max()) + 64 if len(room) else 0
+    # logarithm of the light, tone and coverage of the roofs
+    layers = torch.zeros(3, height + 2 * pad, width + 2 * pad)
+    for begin in range(0, len(room), _CHUNK):
+        part = plan.where(slice(begin, begin + _CHUNK))  # type: ignore[arg-type]
+        reach = math.ceil(float(room[begin : begin + _CHUNK].max()))
+        steps = torch.arange(-reach, reach + 1)
+        corner = part.centre.round().long()
+        fraction = corner - part.centre
+        x = (steps + fraction[:, :1])[:, None, :]
+        y = (steps + fraction[:, 1:])[:, :, None]
+        windows = _draw_windows(x, y, part, sigma)
+        rows = corner[:, 1, None, None] + steps[:, None] + pad
+        columns = corner[:, 0, None, None] + steps + pad
+        index = (rows * layers.shape[-1] + columns).flatten()
+        layers.view(3, -1).index_add_(1, index, windows.flatten(1))
+    light, roofs, coverage = layers[:, pad : pad + height, pad : pad + width]
+    drawn: Tensor = image * light.exp() * (1.0 - coverage) + roofs
+    return drawn
+
+
+def _draw_windows(x: Tensor, y: Tensor, plan: _BuildingPlan, sigma: float) -> Tensor:
+    """Light, tone and coverage (3, N, h, w) of each building in its own window."""
+    angle, tone, rise, gabled = (t[:, None, None] for t in (plan.angle, plan.tone, plan.rise, plan.gabled))
+    half_u, half_v = plan.half[:, 0, None, None], plan.half[:, 1, None, None]
+    shadow = torch.zeros(())
+    for step in range(1, _SHADOW_STEPS + 1):
+        share = step / _SHADOW_STEPS
+        u, v = rotated(x - share * rise * math.cos(_SUN), y - share * rise * math.sin(_SUN), angle)
+        shadow = torch.maximum(shadow, rectangle(u, v, half_u, half_v, sigma))
+    u, v = rotated(x, y, angle)
+    coverage = rectangle(u, v, half_u, half_v, sigma)
+    # the side of the roof that faces away from the light is darker
+    facing = torch.sin(_SUN - angle)
+    tones = tone * (1.0 - 0.45 * gabled * facing * (edge(v, sigma) - 0.5))
+    return torch.stack([torch.log1p(-_SHADE * shadow), coverage * tones, coverage])

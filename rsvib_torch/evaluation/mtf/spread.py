@@ -1,0 +1,440 @@
+"""Edge spread function of any shape: Gaussian optics and square pixels plus a random departure.
+
+The departure from the Gaussian model is a smooth random function of the distance from the edge: a cubic B-spline with
+Gaussian-process priors, and a tail beyond the ROI, as light scattered that far reduces the contrast within the ROI. Its
+strength, smoothness and reach are averaged over priors weighted by their restricted likelihood, so that it shrinks to
+zero where the pixels agree with the Gaussian model.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.evaluation.mtf.edge import EdgeFit, Scatter, edge_spread, linearised, moved
+
+__all__ = ["Spread", "Tail", "fit_spread"]
+
+_SMOOTHNESS = (0.4, 0.8, 1.8)  # px, correlation lengths of the departures
+_DECAY = ((1.0, 2), (2.5, 2), (6.0, 2), (2.0, 1))  # px and power of the decay of departures with distance
+_SLOPES = 2  # coefficients before those of the spline: slopes of the two sides across the edge
+_STRENGTH = (0.0, *(10.0 ** (0.5 * k) for k in range(-10, 0)))  # of the departures over the contrast
+_SHADING = (0.0, 0.1)  # slope of the sides across the edge over the contrast, per half ROI
+_RANDOM = [6, 9]  # columns of the fit with a prior: slopes of the sides across the edge
+_FIXED = [0, 1, 2, 3, 4, 5, 7, 8, 10]
+
+
+# --- Departure from the Gaussian model and its priors ---
+
+
+@dataclass(frozen=True)
+class Tail:
+    """Part of an edge spread function that decays as slowly as diffraction: ``-x w / (x^2 + w^2)``.
+
+    Its Fourier transform has a closed form, so that it need not be sampled to infinity.
+
+    Args:
+        width: w in px.
+    """
+
+    width: float
+
+    def esf(self, distance: Tensor) -> Tensor:
+        """Value at distances in px from the edge."""
+        return -distance * self.width / (distance.square() + self.width**2)
+
+    def lsf(self, distance: Tensor) -> Tensor:
+        """Derivative of the value, per px."""
+        squared, width = distance.square(), self.width
+        return (squared - width**2) * width / (squared + width**2).square()
+
+    def transfer(self, position: Tensor, lsf: Tensor, far: Tensor, frequency: Tensor) -> Tensor:
+        """Complex transfer of line spread functions, 1 at frequency 0.
+
+        Args:
+            position: (N,) px, evenly spaced.
+            lsf: (..., N), containing the tail times ``far``.
+            far: (...).
+            frequency: (F,) cycles/px.
+
+        Returns:
+            (..., F).
+        """
+        angle = -2 * math.pi * frequency[:, None] * position
+        ramps = torch.polar(torch.ones_like(angle), angle)
+        sampled, step = self.lsf(position), position[1] - position[0]
+        whole = -2 * (math.pi * self.width) * math.pi * frequency * torch.exp(-2 * math.pi * self.width * frequency)
+        missing = whole / step - ramps @ sampled.to(ramps.dtype)
+        total = lsf.sum(-1) - far * sampled.sum()
+        return (lsf.to(ramps.dtype) @ ramps.mT + far[..., None] * missing) / total[..., None]
+
+
+@dataclass(frozen=True)
+class Knots:
+    """Cubic B-splines, evenly spaced in ``u = stretch asinh(distance / stretch)``.
+
+    Attributes:
+        place: (K,) values of u.
+        step: Between them.
+        stretch: px.
+        tail: Departure beyond them.
+    """
+
+    place: Tensor
+    step: float
+    stretch: float
+    tail: Tail
+
+    @property
+    def distance(self) -> Tensor:
+        """(K,) px from the edge."""
+        return self.stretch * torch.sinh(self.place / self.stretch)
+
+    def taps(self, distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The four splines that are not zero at each distance (N,): indices, values and derivatives per px, (N, 4)."""
+        position = (self.stretch * torch.asinh(distance / self.stretch) - self.place[0]) / self.step
+        cell = position.floor()
+        t = (position - cell)[:, None]
+        index = cell.long()[:, None] + torch.arange(-1, 3, device=distance.device)
+        s = 1 - t
+        value = torch.cat([s**3, 4 - 6 * t**2 + 3 * t**3, 4 - 6 * s**2 + 3 * s**3, t**3], dim=1) / 6
+        slope = torch.cat([-(s**2), (3 * t - 4) * t, (4 - 3 * s) * s, t**2], dim=1) / 2
+        density = torch.rsqrt(1 + (distance / self.stretch).square()) / self.step
+        inside = (index >= 0) & (index < len(self.place))
+        return index.clamp(0, len(self.place) - 1), value * inside, slope * inside * density[:, None]
+
+    def matrices(self, distance: Tensor) -> tuple[Tensor, Tensor]:
+        """Values and derivatives per px of all splines and of the tail, (N, K + 1)."""
+        index, *taps = self.taps(distance)
+        empty = distance.new_zeros(len(distance), len(self.place))
+        value, slope = (
+            torch.cat([empty.scatter_add(1, index, tap), beyond[:, None]], dim=1)
+            for tap, beyond in zip(taps, (self.tail.esf(distance), self.tail.lsf(distance)), strict=True)
+        )
+        return value, slope
+
+
+def lay_knots(room: float, width: float, like: Tensor) -> Knots:
+    """Knots for an edge with ``room`` px on either side and a line spread function of standard deviation ``width``."""
+    stretch = 10.0 * max(1.0, width)
+    reach = stretch * math.asinh(room / stretch)
+    step = max(0.25, 2 * reach / 220)  # px at the edge; at most 220 knots
+    half = max(int(reach / step) - 2, 2)  # splines within the ROI
+    place = step * torch.arange(-half, half + 1, dtype=like.dtype, device=like.device)
+    return Knots(place, step, stretch, Tail(_DECAY[-1][0] * max(1.0, width)))
+
+
+def prior_roots(knots: Knots, width: float) -> Tensor:
+    """Square roots (P, K + 1, K + 1) of prior covariances of splines and tail, at strength 1 in the middle."""
+    scale = max(1.0, width)
+    distance = knots.distance.abs()
+    apart = (knots.place[:, None] - knots.place).square()
+    smooth = torch.stack([torch.exp(-0.5 * apart / (scale * length) ** 2) for length in _SMOOTHNESS])
+    fade = torch.stack([(1 + (distance / (scale * reach)).square()) ** (-0.5 * power) for reach, power in _DECAY])
+    prior = (smooth[:, None] * fade[:, :, None] * fade[:, None, :]).flatten(0, 1)
+    prior.diagonal(dim1=-2, dim2=-1).add_(1e-9)
+    prior = torch.nn.functional.pad(prior, (0, 1, 0, 1))
+    # only the slowest decay has a tail beyond the ROI
+    slow = [1.0 if power == 1 else 1e-12 for _ in _SMOOTHNESS for _, power in _DECAY]
+    prior[:, -1, -1] = prior.new_tensor(slow)
+    roots: Tensor = torch.linalg.cholesky(prior)
+    return roots
+
+
+# --- Posterior ---
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Normal equations of weighted least squares: free parameters, slopes, then the K coefficients of the departure.
+
+    Attributes:
+        matrix: (F + 2 + K, F + 2 + K).
+        right: (F + 2 + K,).
+        free: F.
+    """
+
+    matrix: Tensor
+    right: Tensor
+    free: int
+
+    @classmethod
+    def of(cls, dense: Tensor, index: Tensor, taps: Tensor, count: int, residual: Tensor) -> "Equations":
+        """Equations of ``residual = dense @ first + sum of taps of ``count`` coefficients + dense[:, -1] last``."""
+        columns = dense.shape[1]
+        matrix = dense.new_zeros(columns + count, columns + count)
+        matrix[:columns, :columns] = dense.T @ dense
+        products = (taps[:, :, None] * taps[:, None, :]).flatten()
+        places = (index[:, :, None] * count + index[:, None, :]).flatten()
+        matrix[columns:, columns:] = dense.new_zeros(count * count).index_add_(0, places, products).view(count, count)
+        mixed, right = dense.new_zeros(count, columns), dense.new_zeros(count)
+        for tap in range(taps.shape[1]):
+            mixed.index_add_(0, index[:, tap], dense * taps[:, tap, None])
+            right.index_add_(0, index[:, tap], residual * taps[:, tap])
+        matrix[columns:, :columns], matrix[:columns, columns:] = mixed, mixed.T
+        order = [*range(columns - 1), *range(columns, columns + count), columns - 1]
+        right = torch.cat([dense.T @ residual, right])[order]
+        return cls(matrix[order][:, order], right, columns - 1 - _SLOPES)
+
+    def solution(self) -> Tensor:
+        """Least-squares solution, all parameters free, with slight damping."""
+        size = self.matrix.diagonal().sqrt().clamp(min=1e-12 * float(self.matrix.diagonal().max()) ** 0.5)
+        scaled = self.matrix / size / size[:, None]
+        scaled.diagonal().add_(1e-9)
+        solution: Tensor = torch.linalg.solve(scaled, self.right / size) / size
+        return solution
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Free parameters, and slopes and coefficients for every prior of at least 0.1 % of the best weight.
+
+    Attributes:
+        weights: (A,) of the priors.
+        coefficients: (A, 2 + K) under each of them.
+        roots: (A, 2 + K, 2 + K) square roots of their covariances.
+        mean: (2 + K,) coefficients over all priors.
+        fixed: (F,) free parameters at the mean coefficients.
+        projection: (F, 2 + K) negative derivatives of the free parameters by the coefficients.
+        fixed_root: (F, F) square root of their covariance at given coefficients.
+        used: (P,) spline priors with weight.
+    """
+
+    weights: Tensor
+    coefficients: Tensor
+    roots: Tensor
+    mean: Tensor
+    fixed: Tensor
+    projection: Tensor
+    fixed_root: Tensor
+    used: Tensor
+
+
+def posterior(equations: Equations, roots: Tensor, contrast: Tensor) -> Posterior:
+    """Average over priors, each weighted by its restricted likelihood, for noise of variance 1.
+
+    Args:
+        equations: Of all parameters.
+        roots: (P, K, K) square roots of the prior covariances of the departure's coefficients at strength 1.
+        contrast: () of the edge.
+    """
+    free = equations.free
+    size = equations.matrix.diagonal()[:free].sqrt()
+    size = size.clamp(min=1e-12 * float(size.max()))
+    normal = equations.matrix[:free, :free] / size / size[:, None]
+    normal.diagonal().add_(1e-13)
+    factor = torch.linalg.cholesky(normal)
+    mixed = equations.matrix[:free, free:] / size[:, None]
+    projection = torch.cholesky_solve(mixed, factor)
+    start = torch.cholesky_solve((equations.right[:free] / size)[:, None], factor)[:, 0]
+    gram = equations.matrix[free:, free:] - mixed.T @ projection
+    right = equations.right[free:] - mixed.T @ start
+
+    solutions = [_under_shading(gram, right, roots, shading * contrast) for shading in _SHADING]
+    best = torch.stack([evidence.max() for evidence, *_ in solutions]).max()
+    weights, coefficients, spreads = [], [], []
+    used = torch.zeros(len(roots), dtype=torch.bool, device=roots.device)
+    for evidence, modes, shrunk, mean, gain in solutions:
+        weight = torch.exp(evidence - best)
+        kept = weight > 1e-3
+        which = kept.nonzero()[:, 0]
+        used |= kept.any(1)
+        weights.append(weight[kept])
+        spline = (modes[which] @ mean[kept][..., None])[..., 0]
+        follow = -gain @ gram[:_SLOPES, _SLOPES:]
+        coefficients.append(torch.cat([gain @ right[:_SLOPES] + spline @ follow.T, spline], dim=1))
+        root = modes[which] * shrunk[kept].sqrt()[:, None]
+        spread = root.new_zeros(len(root), *gram.shape)
+        spread[:, :_SLOPES, :_SLOPES] = torch.linalg.cholesky_ex(gain)[0]
+        spread[:, :_SLOPES, _SLOPES:], spread[:, _SLOPES:, _SLOPES:] = follow @ root, root
+        spreads.append(spread)
+    weight, coefficient = torch.cat(weights), torch.cat(coefficients)
+    weight = weight / weight.sum()
+    average = weight @ coefficient
+    return Posterior(
+        weight,
+        coefficient,
+        torch.cat(spreads),
+        average,
+        (start - projection @ average) / size,
+        projection / size[:, None],
+        torch.linalg.inv(factor).T / size[:, None],
+        used,
+    )
+
+
+def _under_shading(
+    gram: Tensor, right: Tensor, roots: Tensor, shading: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Log likelihood (P, S), modes (P, K, K), their variances and means (P, S, K), covariance of the slopes (2, 2)."""
+    slopes, rest = slice(None, _SLOPES), slice(_SLOPES, None)
+    # elimination of the slopes, with their own prior, from the equations of the spline
+    informed = gram[slopes, slopes] * shading**2 + torch.eye(_SLOPES, dtype=gram.dtype, device=gram.device)
+    gain = shading**2 * torch.linalg.inv(informed)
+    gain = 0.5 * (gain + gain.T)
+    spline_gram = gram[rest, rest] - gram[rest, slopes] @ gain @ gram[slopes, rest]
+    spline_right = right[rest] - gram[rest, slopes] @ gain @ right[slopes]
+    values, vectors = torch.linalg.eigh(roots.mT @ spline_gram @ roots)
+    values = values.clamp(min=0.0)[:, None]
+    modes = roots @ vectors
+    projected = (modes.mT @ spline_right)[:, None]
+    strength = gram.new_tensor(_STRENGTH).square()[:, None]
+    shrunk = strength / (1 + strength * values)
+    evidence = 0.5 * (shrunk * projected.square() - torch.log1p(strength * values)).sum(-1)
+    evidence = evidence + 0.5 * (right[slopes] @ gain @ right[slopes] - torch.logdet(informed))
+    return evidence, modes, shrunk, shrunk * projected, gain
+
+
+# --- Fit and result ---
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Edge and line spread function with their uncertainty.
+
+    Attributes:
+        fit: Edge, Gaussian blur and sides without the departure.
+        position: (N,) px.
+        esf: (N,) edge spread function.
+        lsf: (N,) its derivative.
+        tail: Shape of the tail beyond ``position``.
+        far: () amplitude of the tail in ``esf`` and ``lsf``.
+        alternatives: (A, N) line spread functions by prior.
+        alternative_far: (A,) amplitude of the tail in each.
+        weights: (A,) of the alternatives.
+        basis: (N, R) derivatives of the line spread function by the uncertain parameters.
+        roots: (A, R, S) square roots of the covariance of these parameters, by prior.
+        noise: () standard deviation of the noise of a pixel.
+    """
+
+    fit: EdgeFit
+    position: Tensor
+    esf: Tensor
+    lsf: Tensor
+    tail: Tail
+    far: Tensor
+    alternatives: Tensor
+    alternative_far: Tensor
+    weights: Tensor
+    basis: Tensor
+    roots: Tensor
+    noise: Tensor
+
+    def mtf(self, frequency: Tensor) -> Tensor:
+        """MTF at frequencies (F,)."""
+        return self.tail.transfer(self.position, self.lsf, self.far, frequency).abs()
+
+    def std(self, frequency: Tensor) -> Tensor:
+        """Standard deviation of the MTF at frequencies (F,)."""
+        mean = self.tail.transfer(self.position, self.lsf, self.far, frequency)
+        mtf, phase = mean.abs(), mean.angle()
+        ramps = torch.cos(2 * math.pi * frequency[:, None] * self.position + phase[:, None]) / self.lsf.sum()
+        within = (ramps @ self.basis @ self.roots).square().sum(-1)
+        others = self.tail.transfer(self.position, self.alternatives, self.alternative_far, frequency)
+        between = (others.abs() - mtf).square()
+        return (self.weights @ (within + between)).sqrt()
+
+
+def _quantisation(values: Tensor) -> float:
+    """Standard deviation of rounding to steps; 0 for values that are not on steps."""
+    levels = values.unique()
+    if len(levels) > len(values) // 4:
+        return 0.0
+    return float(levels.diff().min()) / math.sqrt(12)
+
+
+def fit_spread(fit: EdgeFit, scatter: Scatter, room: float) -> Spread:
+    """Fit the edge spread function without assuming a shape.
+
+    Args:
+        fit: Edge and blur from ``fit_edge``.
+        scatter: The pixels.
+        room: px from the edge to the nearer of the ROI's borders alongside it.
+    """
+    knots = lay_knots(room, float(fit.width), scatter.x)
+    roots = prior_roots(knots, float(fit.width))
+    result: Posterior | None = None
+    noise = torch.ones_like(scatter.value)
+    for count in range(3):
+        model, jacobian, distance = linearised(fit, scatter)
+        sides = fit.planes(scatter)[0]
+        contrast = sides[:, 1] - sides[:, 0]
+        index, values, slopes = knots.taps(distance)
+        if result is not None:
+            steeper = (slopes * result.mean[_SLOPES:][index]).sum(1) + knots.tail.lsf(distance) * result.mean[-1]
+            jacobian[:, :4] += (contrast * steeper)[:, None] * fit.distance(scatter)[1]
+        beyond = contrast * knots.tail.esf(distance)
+        dense = torch.cat([jacobian[:, _FIXED + _RANDOM], beyond[:, None]], dim=1)
+        taps = contrast[:, None] * values
+        # the prior of the slopes is centred on 0, not on their last estimate
+        residual = scatter.value - model + jacobian[:, _RANDOM] @ fit.sides[:, 1]
+        if count == 0:
+            plain = Equations.of(dense, index, taps, len(knots.place), residual).solution()
+            front = dense.shape[1] - 1
+            unexplained = (
+                residual - dense @ torch.cat([plain[:front], plain[-1:]]) - (taps * plain[front:][index]).sum(1)
+            )
+            bright = ((model - sides[:, 0]) / contrast).clamp(0.0, 1.0)
+            floor = max(1e-6 * float(fit.contrast), _quantisation(scatter.value))
+            noise = _noise(unexplained, bright, len(plain), floor)
+        equations = Equations.of(
+            dense / noise[:, None], index, taps / noise[:, None], len(knots.place), residual / noise
+        )
+        result = posterior(equations, roots, fit.contrast)
+        roots = roots[result.used]
+        step = torch.zeros_like(jacobian[0])
+        step[_FIXED] = result.fixed
+        step[_RANDOM] = result.mean[:_SLOPES] - fit.sides[:, 1]
+        before, fit = fit, moved(fit, step)
+    assert result is not None
+    return _sampled(before, result, knots, scatter, noise)
+
+
+def _noise(residual: Tensor, bright: Tensor, parameters: int, floor: float) -> Tensor:
+    """Standard deviation of the noise of every pixel: a variance linear in the grey value (shot noise)."""
+    freedom = len(residual) / max(len(residual) - parameters, 0.3 * len(residual))
+    share = torch.stack([1 - bright, bright])
+    variances = freedom * (share @ residual.square()) / share.sum(1)
+    noise: Tensor = (variances @ share).clamp(min=floor**2).sqrt()
+    return noise
+
+
+def _sampled(fit: EdgeFit, found: Posterior, knots: Knots, scatter: Scatter, noise: Tensor) -> Spread:
+    """Spread functions on an even grid."""
+    span = max(float(knots.distance[-1]) + 3 * knots.step, 8.0 * float(fit.width))
+    samples = 16  # per px
+    count = math.ceil(samples * (span + 2.0))
+    position = torch.arange(-count, count + 1, dtype=noise.dtype, device=noise.device) / samples
+    slope = fit.slope(scatter)
+    esf, lsf, _ = edge_spread(position, fit.sigma, slope)
+    values, slopes = knots.matrices(position)
+    # derivative of both by log sigma
+    change = 1e-3
+    wider, narrower = (edge_spread(position, fit.sigma * math.exp(sign * change), slope) for sign in (1, -1))
+    esf_by_blur, by_blur = ((a - b) / (2 * change) for a, b in zip(wider[:2], narrower[:2], strict=True))
+    shrink = fit.contrast / (fit.contrast + found.fixed[7] - found.fixed[5])
+    mean = found.mean
+    blur, followed = found.fixed[4], found.projection[4]
+    alternatives = lsf + shrink * (
+        (blur - (found.coefficients - mean) @ followed)[:, None] * by_blur + found.coefficients[:, _SLOPES:] @ slopes.T
+    )
+    basis = torch.cat([slopes.new_zeros(len(slopes), _SLOPES), slopes], dim=1) - by_blur[:, None] * followed
+    own = found.fixed_root[4:5].expand(len(alternatives), 1, -1)
+    (k, m), n = found.roots.shape[1:], own.shape[-1]
+    roots = own.new_zeros(len(own), k + 1, m + n)
+    roots[:, :k, :m], roots[:, k:, m:] = found.roots, own
+    return Spread(
+        fit,
+        position,
+        esf + shrink * (blur * esf_by_blur + values @ mean[_SLOPES:]),
+        lsf + shrink * (blur * by_blur + slopes @ mean[_SLOPES:]),
+        knots.tail,
+        shrink * mean[-1],
+        alternatives,
+        shrink * found.coefficients[:, -1],
+        found.weights,
+        shrink * torch.cat([basis, by_blur[:, None]], dim=1),
+        roots,
+        noise.square().mean().sqrt(),
+    )
