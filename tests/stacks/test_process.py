@@ -274,10 +274,12 @@ def test_colour_and_axis_order_are_kept(place, tmp_path):
     tifffile.imwrite(tmp_path / "colour.tif", colour, photometric="rgb", metadata=None, resolution=(300, 300))
     process_small(tmp_path / "colour.tif", tmp_path / "out.tif")
     process_small(tmp_path / "colour.tif", tmp_path / "out.zarr")
+    process_small(tmp_path / "colour.tif", tmp_path / "out.npy")
     out = tifffile.imread(tmp_path / "out.tif")
     assert out.shape == colour.shape
     reader = open_stack(tmp_path / "out.zarr")
     assert reader.info.stored_axes == "THWC"
     np.testing.assert_array_equal(np.moveaxis(out[3], -1, 0), reader.frame(3))
+    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.moveaxis(out, -1, 1))
     write_stack(tmp_path / "one.tif", torch.rand(2, 1, 8, 9), dtype="float32")
     assert tifffile.imread(tmp_path / "one.tif").size == 144
