@@ -24,7 +24,7 @@ from rsvib_torch.frames.orientation import (
     offsets_from_row_order,
 )
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.motion.vibration import VibrationStd, blind_frequencies
+from rsvib_torch.motion.vibration import blind_frequencies
 from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOptions
 
 __all__ = ["DetectionMethod", "VibrationDetector", "VibrationModel", "detect_vibration"]
@@ -296,7 +296,7 @@ def _detect(frames: Tensor, valid: Tensor | None, timing: SensorTiming, options:
     in_image = vibration.from_row_order(timing)
     return DetectionResult(
         vibration=in_image,
-        std=_swap_std(std) if swap else std,
+        std=std.from_row_order(timing),
         offsets=replace(
             curve,
             offsets=offsets_from_row_order(curve.offsets, timing),
@@ -307,17 +307,6 @@ def _detect(frames: Tensor, valid: Tensor | None, timing: SensorTiming, options:
         residual=difference.flip(-1) if swap else difference,
         reliable=reliable.flip(-1) if swap else reliable,
         reasons=reasons,
-    )
-
-
-def _swap_std(std: VibrationStd) -> VibrationStd:
-    return VibrationStd(
-        std.amplitude.flip(-2),
-        std.frequency.flip(-2),
-        std.period.flip(-2),
-        std.phase.flip(-2),
-        std.image_motion.flip(-1),
-        std.image_acceleration.flip(-1),
     )
 
 

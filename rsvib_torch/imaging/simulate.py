@@ -17,7 +17,8 @@ from rsvib_torch.motion.timing import RowTiming, SensorTiming
 __all__ = ["simulate_frames"]
 
 _DEGREE = 9  # degree of the spline across rows; its error is 2e-5 of the amplitude at a quarter cycle per pixel
-_MARGIN = 16  # px between the visible part and the edge of the scene; the prefilter of the spline decays within it
+# px between the visible part and the edge of the scene; the prefilter of the spline decays to 4e-4 within it
+_MARGIN = 16
 
 
 def simulate_frames(

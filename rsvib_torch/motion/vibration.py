@@ -265,6 +265,15 @@ class VibrationStd:
         """The standard deviations of one stack of a batch."""
         return VibrationStd(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
+    def from_row_order(self, timing: SensorTiming) -> "VibrationStd":
+        """The standard deviations, given in row order, in image axes: as ``Motion.from_row_order`` without signs."""
+        if timing.scan_axis == -2:
+            return self
+        tones = (self.amplitude, self.frequency, self.period, self.phase)
+        amplitude, frequency, period, phase = (values.flip(-2) for values in tones)
+        motion, acceleration = self.image_motion.flip(-1), self.image_acceleration.flip(-1)
+        return VibrationStd(amplitude, frequency, period, phase, motion, acceleration)
+
 
 def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
     """Frequencies up to ``highest`` Hz that cannot be measured from the frames.

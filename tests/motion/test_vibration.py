@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from rsvib_torch import SensorTiming, Vibration, blind_frequencies
+from rsvib_torch import SensorTiming, Vibration, VibrationStd, blind_frequencies
 
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 AMPLITUDE = np.array([[3.1, 0.4], [5.2, 0.7]])
@@ -163,3 +163,13 @@ def test_gradients_reach_the_parameters():
 def test_bad_values(values, message):
     with pytest.raises(ValueError, match=message):
         Vibration(**values)
+
+
+@pytest.mark.parametrize(("scan_axis", "order"), [(-2, [0, 1]), (-1, [1, 0])])
+def test_standard_deviations_in_image_axes(scan_axis, order):
+    tones = [torch.arange(4.0).reshape(2, 2) + offset for offset in (0, 4, 8, 12)]
+    axes = [torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0])]
+    camera = replace(TIMING, scan_axis=scan_axis, readout_direction="reverse")
+    std = VibrationStd(*tones, *axes).from_row_order(camera)
+    for name, values in zip(VibrationStd.__dataclass_fields__, (*tones, *axes), strict=True):
+        assert torch.equal(getattr(std, name), values[order])
