@@ -21,8 +21,7 @@ from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.exact import exact
 from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import frame_motion
-from rsvib_torch.restoration.scene_model.observation import Observation, row_kernels, smooth_kernels
-from rsvib_torch.restoration.scene_model.row_kernel import scene_weights
+from rsvib_torch.restoration.scene_model.observation import Observation, row_kernels, scene_weights, smooth_kernels
 from rsvib_torch.restoration.scene_model.row_prior import ORDER
 
 REAL, COMPLEX = 4, 8  # bytes

@@ -12,7 +12,7 @@ from rsvib_torch.restoration.noise.high_pass import estimate_noise
 from rsvib_torch.restoration.noise.motion_blur import noise_of_blurred_frames
 from rsvib_torch.restoration.noise.policy import ESTIMATORS, noise_levels
 from rsvib_torch.restoration.noise.spectral_floor import noise_floor
-from rsvib_torch.restoration.scene_model.row_kernel import (
+from rsvib_torch.restoration.scene_model.observation import (
     interpolation_error,
     kernel_spectrum,
     kernel_weights,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
-from rsvib_torch.restoration.scene_model.row_kernel import REACH, kernel_samples
+from rsvib_torch.restoration.scene_model.observation import REACH, kernel_samples
 
 __all__ = ["PRIORS", "Prior", "PriorOptions", "shrink_patches"]
 

@@ -19,8 +19,7 @@ from rsvib_torch.core.banded_solver import BandedFactor, factor_banded, solve_sk
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.core.splines import correlated
-from rsvib_torch.restoration.scene_model.observation import Observation
-from rsvib_torch.restoration.scene_model.row_kernel import SCENE_REACH, scene_weights
+from rsvib_torch.restoration.scene_model.observation import SCENE_REACH, Observation, scene_weights
 
 __all__ = ["Partition", "SceneProblem", "SceneSolver", "join_windows", "row_windows"]
 
@@ -84,9 +83,9 @@ class Partition:
             keep: Whether the factors of all frequencies are kept.
         """
         cpu = device.type == "cpu"
-        # values of the bands in memory: 64 MB on a CPU, 2 GB on a GPU, or 16 times the spectrum of a large scene,
+        # values of the bands in memory: 64 MB on a CPU, 2 GB on a GPU, or 8 times the spectrum of a large scene,
         # for two chunks at a time on a CPU, so that results do not depend on the number of threads
-        values = max(1 << (23 if cpu else 28), 16 * rows * frequencies) // (2 if cpu else 1)
+        values = max(1 << (23 if cpu else 28), 8 * rows * frequencies) // (2 if cpu else 1)
         most = frequencies if keep else max(1, values // (rows * (2 * width + 1)))
         rounds = -(-frequencies // most)
         chunk = self.chunk or -(-frequencies // (8 * rounds)) * 8  # rows begin at full cache lines
@@ -95,7 +94,7 @@ class Partition:
             return runs(frequencies, chunk), [slice(0, rows)]
         # values that a step of the elimination changes, so that they take longer than its call, and rows of a window,
         # of which the overlap is a small part
-        step, least = (20_000, 512) if cpu else (1 << 22, 256)
+        step, least = (8_000, 512) if cpu else (1 << 22, 256)
         work = chunk * max(width, 1) ** (1 if keep else 2)
         count = self.segments or min(-(-step // work), max(1, rows // least))
         return runs(frequencies, chunk), row_windows(rows, count)

@@ -12,7 +12,7 @@ from rsvib_torch.core.fourier import extend_rows, squared_modulus, waves
 from rsvib_torch.core.splines import mirrored
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.scene_model.row_kernel import interpolation_error, kernel_spectrum
+from rsvib_torch.restoration.scene_model.observation import interpolation_error, kernel_spectrum
 
 __all__ = ["ORDER", "RowPrior", "autoregressive_prior", "brightness", "fit_prior"]
 
