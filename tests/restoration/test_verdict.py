@@ -1,3 +1,5 @@
+"""Verdict on restorations of frames from an independent camera, with right, wrong and invented vibrations."""
+
 import math
 import warnings
 from types import SimpleNamespace
@@ -9,6 +11,8 @@ from truth import Motion, crop, decibel, draw_scene, take_frames
 from rsvib_torch import SensorTiming, Vibration
 from rsvib_torch.evaluation import city_and_fields, resolution_chart
 from rsvib_torch.restoration import RestorationWarning, judge_restoration, predict_noise_gain, restore
+from rsvib_torch.restoration.verdict.judge import _outcome
+from rsvib_torch.restoration.verdict.pairs import misfit, pairs_to_judge
 
 HEIGHT, WIDTH, MARGIN = 512, 192, 40
 FREQUENCY = (71.0, 113.0)
@@ -129,7 +133,7 @@ def test_an_invented_vibration_is_caught(scene, name, noise, scale):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.005])
-def test_a_blind_vibration_cannot_be_told(scene, noise):
+def test_a_blind_vibration_is_unknown(scene, noise):
     motion = shaking(frequency=BLIND)
     frames = frames_of(scene("city"), camera(), motion, noise)
     for vibration in (motion.vibration(), motion.scaled(0.5).vibration()):
@@ -207,7 +211,7 @@ def test_turned_frames_give_the_same_verdict_with_axes_swapped(scene):
     assert verdict.reasons[0].startswith("y: ")
 
 
-def test_colour_counts_and_holes_are_judged(scene):
+def test_colour_integers_and_missing_pixels_are_judged(scene):
     timing, motion = camera(), shaking()
     grey = frames_of(scene("city"), timing, motion, 0.005)
     colour = torch.stack([grey, 0.5 * grey], dim=1)
@@ -266,7 +270,7 @@ def test_frames_may_differ_in_brightness(scene, joint, gain, offset):
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_little_too_much_along_one_axis_is_not_held_against_the_other(scene, axis):
+def test_a_small_false_motion_beside_a_large_true_one_is_accepted(scene, axis):
     timing = camera()
     large = [3.1, 5.2]
     large[axis] = 0.0
@@ -293,7 +297,7 @@ def test_invented_image_motion_is_warned_of(scene, invented):
         restore(frames, camera(), moving, method="dewarp")
 
 
-def test_whatever_restore_takes_and_gives_is_judged(scene):
+def test_dtypes_and_detections_of_restore_are_accepted(scene):
     timing, motion = camera(), shaking()
     frames, vibration = frames_of(scene("city"), timing, motion, 0.005), motion.vibration()
     restored = restore(frames, timing, vibration)
@@ -321,8 +325,90 @@ def test_whatever_restore_takes_and_gives_is_judged(scene):
         ({"frames": torch.full((2, 96, 96), math.nan)}, ValueError, "ignore leaves no pixel"),
     ],
 )
-def test_bad_input_is_named(change, error, message):
+def test_invalid_arguments_are_named(change, error, message):
     arguments = {"frames": torch.rand(2, 96, 96), "restored": torch.rand(2, 96, 96)}
     arguments |= {"timing": camera(), "vibration": Vibration(1.0, 50.0)}
     with pytest.raises(error, match=message):
         judge_restoration(**{**arguments, **change})
+
+
+def outcome(before, after, gain=5.0, *, resolution=(0.01, 0.01), moves=(True, True), offset=(1.0, 1.0), **options):
+    return _outcome([*before], [*after], [*resolution], [*moves], [*offset], gain, **options)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "options", "expected"),
+    [
+        ((2.0, 2.0), (0.1, 0.69), {}, "helps"),
+        ((2.0, 2.0), (0.1, 0.71), {}, "partly"),
+        ((2.0, 2.0), (0.71, 0.1), {}, "partly"),
+        ((2.0, 2.0), (1.59, 0.1), {}, "partly"),
+        ((2.0, 2.0), (1.61, 0.1), {"gain": 1.9}, "worse"),
+        ((2.0, 2.0), (1.61, 0.1), {"gain": 2.1}, "partly"),
+        ((2.0, 2.0), (1.61, 0.1), {"gain": 2.1, "one_image": True}, "worse"),
+        ((0.005, 2.0), (0.2, 0.1), {}, "worse"),  # a motion along x that does not exist
+        ((0.005, 2.0), (0.2, 0.1), {"gain": 30.0}, "worse"),
+        ((0.005, 2.0), (0.09, 0.1), {"gain": 30.0}, "helps"),  # within the crosstalk of y
+        ((0.005, 0.1), (0.02, 0.02), {}, "helps"),  # finer than any image needs
+        ((0.02, 0.02), (0.02, 0.02), {"offset": (0.02, 0.02)}, "unknown"),
+        ((0.02, 0.02), (0.02, 0.02), {"offset": (0.02, 0.04)}, "unknown"),
+        ((0.02, 0.02), (0.02, 0.02), {"offset": (0.04, 0.04)}, "helps"),
+        ((0.4, 0.4), (0.4, 0.4), {"resolution": (0.5, 0.5), "offset": (0.1, 0.1)}, "unknown"),
+        ((0.0, 0.0), (0.0, 0.0), {"resolution": (math.inf, 0.01), "offset": (1.0, 1.0)}, "unknown"),
+        ((2.0, 2.0), (2.0, 0.1), {"moves": (False, True)}, "helps"),
+        ((2.0, 2.0), (2.0, 0.1), {"moves": (False, True), "gain": -9.0}, "helps"),  # the gain includes x
+        ((0.01, 2.0), (0.01, 0.1), {"moves": (False, True), "gain": -2.1}, "worse"),
+        ((2.0, 2.0), (0.1, 0.1), {"gain": -1.9}, "helps"),
+        ((2.0, 2.0), (0.1, 0.1), {"gain": -2.1}, "worse"),
+        ((2.0, 2.0), (1.0, 0.1), {"gain": -9.0}, "partly"),
+        ((2.0, 2.0), (2.0, 2.0), {"moves": (False, False)}, "unknown"),
+    ],
+)
+def test_outcome_of_a_pair(before, after, options, expected):
+    found, reason = outcome(before, after, **options)
+    assert found == expected
+    assert (reason == "") == (found == "helps")
+
+
+def test_reasons_name_the_axes_of_the_outcome():
+    found, reason = outcome((2.0, 2.0), (1.0, 3.0), 0.0)
+    assert (found, reason) == ("worse", "y: frames lie 2 px apart, 3 px remain unexplained")
+    found, reason = outcome((2.0, 2.0), (1.0, 1.1), 0.0)
+    assert (
+        reason
+        == "x: frames lie 2 px apart, 1 px remain unexplained; y: frames lie 2 px apart, 1.1 px remain unexplained"
+    )
+    assert "all are displaced alike" in outcome((0.0, 0.0), (0.0, 0.0), offset=(0.0, 0.0))[1]
+    assert "no contrast" in outcome((0.0, 0.0), (0.0, 0.0), resolution=(math.inf, math.inf))[1]
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.5, 0.0), (0.0, -1.5), (3.0, 2.0)])
+@pytest.mark.parametrize("noise", [0.0, 0.005])
+def test_misfit_is_the_displacement(scene, shift, noise):
+    image = torch.from_numpy(scene("buildings"))
+    spectrum = torch.fft.rfft2(image)
+    u, v = torch.fft.rfftfreq(image.shape[1]), torch.fft.fftfreq(image.shape[0])[:, None]
+    moved = torch.fft.irfft2(spectrum * torch.exp(-2j * math.pi * (u * shift[0] + v * shift[1])), image.shape)
+    generator = torch.Generator().manual_seed(0)
+    first, second = (
+        (part[None, 20:-20, 20:-20] + noise * torch.randn(1, 552, 232, generator=generator)).float()
+        for part in (image, moved)
+    )
+    size, resolution = misfit(first, second)
+    crosstalk = 0.05 * max(map(abs, shift))
+    assert size.tolist() == pytest.approx([abs(step) for step in shift], rel=0.1, abs=max(0.04, crosstalk))
+    assert (resolution < 0.3).all()
+    assert (misfit(10 * first, 10 * second)[0] - size).abs().max() < 1e-3
+    if shift == (0.0, 0.0) and noise:
+        assert (size < 1.5 * resolution).all()
+    flat = misfit(torch.full_like(first, 0.3), torch.full_like(first, 0.4))
+    assert flat[0].tolist() == [0.0, 0.0]
+    assert flat[1].isinf().all()
+
+
+def test_pairs_to_judge():
+    assert pairs_to_judge(4, False) == [(0, 1), (1, 2), (2, 3)]
+    assert pairs_to_judge(4, 3) == [(0, 1), (1, 2), (2, 3)]
+    assert pairs_to_judge(4, True) == [(2, 0), (2, 1), (2, 3)]
+    assert pairs_to_judge(9, False, 3) == [(0, 1), (4, 5), (7, 8)]
+    assert pairs_to_judge(3, False, 2) == [(0, 1), (1, 2)]
