@@ -24,8 +24,8 @@ LAYERS = (
 )
 INNER_LAYERS = {
     "detection": (
-        {"measurements", "result", "grey_frames"},
-        {"band_curve", "tones"},
+        {"measurements", "result"},
+        {"start", "tones"},
         {"rows", "reliability"},
         {"shapes"},
         {"recorded"},

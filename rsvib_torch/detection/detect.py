@@ -1,4 +1,4 @@
-"""Frames in, vibration out."""
+"""``detect_vibration``: entry point of detection, with the tables of models and methods."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -9,20 +9,17 @@ from torch import Tensor, nn
 
 from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.detection.band_curve import band_curve, measurements_of_curve
-from rsvib_torch.detection.grey_frames import grey_frames
 from rsvib_torch.detection.reliability import judge
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, stacked
 from rsvib_torch.detection.rows.direct import refine_directly
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals, stack_spectra
 from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
+from rsvib_torch.detection.start import band_curve, grey_frames, measurements_of_curve
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, model_displacements, vibration_of_fit
 from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
 from rsvib_torch.frames.arrays import ArrayLike
-from rsvib_torch.frames.orientation import (
-    offsets_from_row_order,
-)
+from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import blind_frequencies
 from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOptions
@@ -32,12 +29,9 @@ __all__ = ["DetectionMethod", "VibrationDetector", "VibrationModel", "detect_vib
 DetectionMethod = Literal["direct", "bands"]
 VibrationModel = Literal["tones", "free", "swept"]
 
-_NEAR = 0.15  # px: rows as near as this to the start tell the rest themselves
-_FEWEST_COLUMNS = 64  # px: bands of fewer are hardly found again
 
-
-class _BandOptions(TypedDict, total=False):
-    """Options that all models take, as in ``detect_vibration``."""
+class BandOptions(TypedDict, total=False):
+    """Options of all models, see ``detect_vibration``."""
 
     registration: Registration
     band_rows: int
@@ -47,8 +41,8 @@ class _BandOptions(TypedDict, total=False):
     full_scale: float | None
 
 
-class _ToneOptions(_BandOptions, total=False):
-    """Options of steady tones, as in ``detect_vibration``."""
+class ToneOptions(BandOptions, total=False):
+    """Options of the model of tones, see ``detect_vibration``."""
 
     method: DetectionMethod
     tones: Literal["auto"] | int
@@ -59,75 +53,100 @@ class _ToneOptions(_BandOptions, total=False):
     window_step: int | None
 
 
-@dataclass(frozen=True)
-class _Options:
-    """Options of ``detect_vibration`` behind the door."""
+# Methods: how tones are fitted
 
-    method: DetectionMethod
+
+@dataclass(frozen=True)
+class _FitOptions:
+    """Options of a method.
+
+    Attributes:
+        tones: Number of tones of each axis; None to select it by significance.
+        model: Harmonics and order of the image motion.
+        bands: Registration of the row bands.
+    """
+
     tones: int | None
     model: MotionModel
     bands: RegistrationOptions
 
 
-def _tones_of_bands(curve: OffsetCurve, timing: RowTiming, options: _Options, enough: float = 0.0) -> ToneFit:
-    """A fit of tones to the offsets of row bands."""
+_Fit = Callable[[OffsetCurve, Tensor, Tensor | None, RowTiming, _FitOptions], tuple[ToneFit, OtherMotion | None]]
+
+
+@dataclass(frozen=True)
+class _Method:
+    """A method of detection: ``fit(curve, frames, valid, timing, options)`` -> fit, other motion.
+
+    The arguments of ``fit`` are the offset curve (B, P, N) in px with NaN where a band could not be registered, the
+    grey frames (B, T, H, W) in row order, their valid pixels (bool of that shape, or None for all), the sensor in row
+    order, and the options. It returns the fit of all B stacks, with the covariance of its parameters, and the motion
+    that it does not explain, or None if the method does not measure it. Stacks of a batch must not affect each other.
+
+    Attributes:
+        fit: The function.
+        max_group_frames: Number of frames that are compared with each other; it decides which tones have a gain.
+        needs_whole_curve: Whether the accuracy depends on the offset curve, or the curve is only a start.
+    """
+
+    fit: _Fit
+    max_group_frames: int
+    needs_whole_curve: bool
+
+
+def _fit_bands(
+    curve: OffsetCurve,
+    frames: Tensor,
+    valid: Tensor | None,
+    timing: RowTiming,
+    options: _FitOptions,
+    accuracy: float = 0.0,
+) -> tuple[ToneFit, None]:
+    """The paper's method: tones are fitted to the offsets of row bands."""
     measurements = measurements_of_curve(curve, timing, options.bands.band_step)
     interval = options.bands.band_step * timing.row_time
     blind = blind_frequencies(timing, 0.5 / interval).to(curve.offsets.device)
-    return find_tones(measurements, interval, options.tones, options.model, blind=blind, accuracy=enough)
+    return find_tones(measurements, interval, options.tones, options.model, blind=blind, accuracy=accuracy), None
 
 
-def _detect_bands(
-    curve: OffsetCurve, frames: Tensor, valid: Tensor | None, timing: RowTiming, options: _Options
-) -> tuple[ToneFit, OtherMotion | None]:
-    """The paper's method."""
-    return _tones_of_bands(curve, timing, options), None
-
-
-def _detect_direct(
-    curve: OffsetCurve, frames: Tensor, valid: Tensor | None, timing: RowTiming, options: _Options
-) -> tuple[ToneFit, OtherMotion | None]:
-    """The bands' result, refined on the images themselves, row by row."""
-    start = _tones_of_bands(curve, timing, options, _NEAR)
+def _fit_direct(
+    curve: OffsetCurve, frames: Tensor, valid: Tensor | None, timing: RowTiming, options: _FitOptions
+) -> tuple[ToneFit, OtherMotion]:
+    """The fit to bands, refined on the images."""
+    # px; the gradients of rows reach a few tenths of a pixel, so that a start with this error converges
+    start, _ = _fit_bands(curve, frames, valid, timing, options, accuracy=0.15)
     found = refine_directly(stack_spectra(frames, valid), timing, start, options.tones)
     return found.fit, found.other_motion
 
 
-_METHODS: dict[
-    str,
-    Callable[
-        [OffsetCurve, Tensor, Tensor | None, RowTiming, _Options],
-        tuple[ToneFit, OtherMotion | None],
-    ],
-] = {"direct": _detect_direct, "bands": _detect_bands}
+_METHODS: dict[DetectionMethod, _Method] = {
+    "direct": _Method(_fit_direct, MAX_GROUP_FRAMES, needs_whole_curve=False),
+    "bands": _Method(_fit_bands, 2, needs_whole_curve=True),
+}
 
 
+# Models: what is fitted
+
+# A model is a function ``model(frames, timing, **options)`` of the user's frames and timing. All models take
+# ``BandOptions``. The result is in image axes and has ``reliable`` (..., 2) bool, ``reasons`` for each axis, and a
+# motion that ``restore`` accepts. "tones" also takes ``ToneOptions`` and is implemented by ``detect_vibration``.
 _OTHER_MODELS: dict[str, Callable[..., MotionDetection | SweptTone]] = {
     "free": detect_motion,
     "swept": detect_swept_tone,
 }
-_DEFAULTS: dict[str, object] = {
-    "method": "direct",
-    "tones": "auto",
-    "harmonics": 1,
-    "image_acceleration": False,
-    "columns": None,
-    "window": None,
-    "window_step": None,
-}
 
 
 @overload
 def detect_vibration(
-    frames: ArrayLike, timing: SensorTiming, *, model: Literal["tones"] = "tones", **options: Unpack[_ToneOptions]
+    frames: ArrayLike, timing: SensorTiming, *, model: Literal["tones"] = "tones", **options: Unpack[ToneOptions]
 ) -> DetectionResult: ...
 @overload
 def detect_vibration(
-    frames: ArrayLike, timing: SensorTiming, *, model: Literal["free"], **options: Unpack[_BandOptions]
+    frames: ArrayLike, timing: SensorTiming, *, model: Literal["free"], **options: Unpack[BandOptions]
 ) -> MotionDetection: ...
 @overload
 def detect_vibration(
-    frames: ArrayLike, timing: SensorTiming, *, model: Literal["swept"], **options: Unpack[_BandOptions]
+    frames: ArrayLike, timing: SensorTiming, *, model: Literal["swept"], **options: Unpack[BandOptions]
 ) -> SweptTone: ...
 @outside_graphs
 @full_precision
@@ -153,44 +172,43 @@ def detect_vibration(
 ) -> DetectionResult | MotionDetection | SweptTone:
     """Detect the vibration of the camera from consecutive frames (Sec. 2 of Liu et al. 2023).
 
-    Row bands are registered between frames, and the offset curve is fitted with sinusoids and a uniform motion
-    (Eq. 5) whose gain, exposure, band average and coupling with the scan are part of the model (Eqs. 4, 6-8). Start
-    values come from the data. The direct method then warps the frames to the scene with what was found, lets every
-    row tell what it still misses, and fits again: all frames of a stack together, down to the noise. The result is a
-    measurement: no gradient flows back through it.
+    Row bands are registered between frames, and sinusoids and a uniform motion (Eq. 5) are fitted to the offset curve.
+    Gain, exposure, band average and coupling with the scan are part of the model (Eqs. 4, 6-8); no initial guess is
+    needed. The direct method then warps the frames to the scene by this motion, measures the residual displacement of
+    every row, and fits again: all frames of a stack together, down to the noise. No gradient flows through the result.
 
     Args:
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, tensor or NumPy array;
-            floats, or integers of known full scale. NaN marks pixels that were not measured.
-        timing: The sensor. Frame start times of its own (dropped frames) open frequencies that even ones are blind to.
-        model: ``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape; ``"swept"``: one tone an
-            axis that decays or grows and sweeps. The last two take the options of ``registration`` to ``search``,
-            ``ignore`` and ``full_scale``; ``detect_motion`` and ``detect_swept_tone`` have others of their own.
-        method: ``"direct"``, or ``"bands"`` (the paper's method), in half the time and ten times less accurate.
+            floating point, or integers of known full scale. NaN marks missing pixels.
+        timing: The sensor. Frame start times at unequal intervals (dropped frames) remove blind frequencies.
+        model: ``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape; ``"swept"``: one tone per
+            axis whose amplitude decays or grows and whose frequency sweeps. The last two take the options from
+            ``registration`` to ``search``, ``ignore`` and ``full_scale``; ``detect_motion`` and ``detect_swept_tone``
+            have further ones.
+        method: ``"direct"``, or ``"bands"`` (the paper's method), in half the time with ten times larger errors.
         registration: ``"ncc"``, ``"phase"`` or ``"projection"``.
-        tones: Number of tones of each axis, 1 to 4, or ``"auto"`` to choose it from the data.
-        harmonics: Every tone comes with its multiples up to this one, tied to one frequency; 1 leaves tones free.
-        image_acceleration: Whether the image motion may change its speed steadily.
-        window: Frames that one result comes from: the vibration is followed through the stack, and the result is a
-            batch of one entry a window (a leading dimension behind B). None for one result from all frames.
-        window_step: Frames from one window to the next; half a window when not given.
+        tones: Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance.
+        harmonics: Number of multiples of every tone, with one common base frequency; 1 for independent tones.
+        image_acceleration: Whether the image motion has a constant acceleration.
+        window: Number of frames of one result: the vibration is followed through the stack, and the result is a batch
+            with one entry per window (a leading dimension behind B). None for one result from all frames.
+        window_step: Frames from one window to the next; half a window by default.
         band_rows: Rows of a band.
         band_step: Rows from one band to the next.
         search: Search range in px around the whole-frame offset.
-        columns: Look at so many neighbouring pixels of every row only, those with the most detail: every column shows
-            the same vibration, and a quarter of them tells it in two thirds of the time, half as accurately. None for
-            all.
-        ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out (dead, saturated).
+        columns: Use only this number of neighbouring columns, those with the most detail: all columns contain the same
+            vibration, and a quarter of them takes two thirds of the time for half the accuracy. None for all.
+        ignore: Bool, broadcastable to (..., H, W) of the frames: True for missing pixels (dead, saturated).
         full_scale: Count that means 1.0, for integer frames.
 
     Returns:
-        The vibration in image axes (x, y) with standard deviations, verdict, and the curve it stands on: a
+        The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve: a
         ``DetectionResult``, or the ``MotionDetection`` of the free and the ``SweptTone`` of the swept model.
 
     Raises:
         TypeError: If frames are not numbers.
-        ValueError: If there are fewer than two frames, a frame has no detail or hardly a pixel that counts, or an
-            option is out of range.
+        ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or an option
+            is out of range.
 
     Example:
         >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -201,12 +219,21 @@ def detect_vibration(
     """
     check_choice("model", model, ("tones", *_OTHER_MODELS))
     if model != "tones":
-        given: dict[str, object] = {"method": method, "tones": tones, "harmonics": harmonics}
-        given |= {"image_acceleration": image_acceleration, "columns": columns}
-        given |= {"window": window, "window_step": window_step}
-        wrong = [name for name, value in given.items() if value != _DEFAULTS[name]]
-        if wrong:
-            raise ValueError(f"{wrong[0]}={given[wrong[0]]!r} goes with model='tones', not with model={model!r}")
+        tone_options = (
+            ("method", method, "direct"),
+            ("tones", tones, "auto"),
+            ("harmonics", harmonics, 1),
+            ("image_acceleration", image_acceleration, False),
+            ("columns", columns, None),
+            ("window", window, None),
+            ("window_step", window_step, None),
+        )
+        for name, value, default in tone_options:
+            if value != default:
+                valid = ", ".join(sorted(BandOptions.__optional_keys__))
+                raise ValueError(
+                    f"{name}={value!r} goes with model='tones', not with model={model!r}, which takes {valid}"
+                )
         return _OTHER_MODELS[model](
             frames,
             timing,
@@ -224,23 +251,31 @@ def detect_vibration(
             raise ValueError(f"tones must be 'auto' or 1 to {MAX_TONES}, got {tones}")
     check_whole_number("harmonics", harmonics, at_least=1)
     if columns is not None:
-        check_whole_number("columns", columns, at_least=_FEWEST_COLUMNS)
-    stacks = grey_frames(frames, timing, full_scale, ignore)
-    stacks = stacks if columns is None else stacks.narrowed(columns)
-    grey, valid, batched = stacks.images, stacks.valid, stacks.batched
+        check_whole_number("columns", columns, at_least=64)  # px; narrower bands are often registered wrongly
     bands = RegistrationOptions(registration, band_rows, band_step, search)
-    options = _Options(
-        method, None if tones == "auto" else tones, MotionModel(harmonics, 2 if image_acceleration else 1), bands
+    options = _FitOptions(
+        None if tones == "auto" else tones, MotionModel(harmonics, 2 if image_acceleration else 1), bands
     )
+    stacks = grey_frames(frames, timing, full_scale, ignore)
+    if columns is not None:
+        stacks = stacks.narrowed(columns)
+    grey, valid_pixels = stacks.images, stacks.valid
     if window is None:
-        result = _detect(grey, valid, timing, options)
-        return result if batched else result[0]
-    results = [
-        _detect(grey[:, part], None if valid is None else valid[:, part], within, options)
-        for part, within in _windows(grey.shape[1], window, window_step, timing)
-    ]
-    followed = stacked(results)
-    return followed if batched else followed[0]
+        found = _detect(grey, valid_pixels, timing, _METHODS[method], options)
+    else:
+        found = stacked(
+            [
+                _detect(
+                    grey[:, part],
+                    None if valid_pixels is None else valid_pixels[:, part],
+                    window_timing,
+                    _METHODS[method],
+                    options,
+                )
+                for part, window_timing in _windows(grey.shape[1], window, window_step, timing)
+            ]
+        )
+    return found if stacks.batched else found[0]
 
 
 def _windows(num_frames: int, window: int, step: int | None, timing: SensorTiming) -> list[tuple[slice, SensorTiming]]:
@@ -260,39 +295,39 @@ def _windows(num_frames: int, window: int, step: int | None, timing: SensorTimin
     ]
 
 
-def _detect(frames: Tensor, valid: Tensor | None, timing: SensorTiming, options: _Options) -> DetectionResult:
+def _detect(
+    frames: Tensor, valid: Tensor | None, timing: SensorTiming, method: _Method, options: _FitOptions
+) -> DetectionResult:
     """``detect_vibration`` of grey frames (B, T, H, W) in row order; the result is a batch in image axes."""
-    in_rows = timing.in_row_order()
-    curve = band_curve(frames, valid, in_rows, options.bands, mere_start=options.method != "bands")
-    fit, other_motion = _METHODS[options.method](curve, frames, valid, in_rows, options)
+    row_timing, bands = timing.in_row_order(), options.bands
+    curve = band_curve(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve)
+    fit, other_motion = method.fit(curve, frames, valid, row_timing, options)
     vibration, std = vibration_of_fit(fit)
-    predicted = model_displacements(measurements_of_curve(curve, in_rows, options.bands.band_step), fit)
+    predicted = model_displacements(measurements_of_curve(curve, row_timing, bands.band_step), fit)
     fitted = (predicted[:, :, 1] - predicted[:, :, 0]).unflatten(1, curve.quality.shape[1:])
-    difference = (curve.offsets - fitted).abs().nanmean(dim=(1, 2))
+    residual = (curve.offsets - fitted).abs().nanmean(dim=(1, 2))
 
-    # bands that an image motion has carried out of the later frame cannot be found there
+    # an image motion may carry bands out of the later frame
     later = curve.rows + fitted[..., 1]
-    shown = (later >= 0.5 * options.bands.band_rows) & (later <= frames.shape[-2] - 1 - 0.5 * options.bands.band_rows)
-    duration = float(curve.later_times.max() - curve.times.min()) + options.bands.band_rows * timing.row_time
-    largest = 2 if options.method == "bands" else MAX_GROUP_FRAMES
-    intervals = compared_intervals(in_rows, frames.shape[1], largest, frames.device)
+    visible = (later >= 0.5 * bands.band_rows) & (later <= frames.shape[-2] - 1 - 0.5 * bands.band_rows)
+    duration = float(curve.later_times.max() - curve.times.min()) + bands.band_rows * timing.row_time
+    intervals = compared_intervals(row_timing, frames.shape[1], method.max_group_frames, frames.device)
     verdicts = [
         judge(
             vibration[index],
             std[index],
             offsets=curve.offsets[index].flatten(0, 1),
             fitted=fitted[index].flatten(0, 1),
-            shown=shown[index].flatten(),
+            visible=visible[index].flatten(),
             intervals=intervals,
             duration=duration,
-            timing=in_rows,
+            timing=row_timing,
             other_motion=None if other_motion is None else other_motion[index],
         )
         for index in range(len(frames))
     ]
     reliable = torch.stack([verdict[0] for verdict in verdicts])
     swap = timing.scan_axis == -1
-    reasons = tuple((r[1], r[0]) if swap else r for _, r in verdicts)
     in_image = vibration.from_row_order(timing)
     return DetectionResult(
         vibration=in_image,
@@ -304,33 +339,45 @@ def _detect(frames: Tensor, valid: Tensor | None, timing: SensorTiming, options:
         ),
         fitted=offsets_from_row_order(fitted, timing),
         gain=in_image.gain(float(intervals[0])),
-        residual=difference.flip(-1) if swap else difference,
+        residual=residual.flip(-1) if swap else residual,
         reliable=reliable.flip(-1) if swap else reliable,
-        reasons=reasons,
+        reasons=tuple((reasons[1], reasons[0]) if swap else reasons for _, reasons in verdicts),
     )
 
 
 class VibrationDetector(nn.Module):
     """``detect_vibration`` with fixed timing and options as a module, for one stack or a batch of stacks.
 
-    It has no weights. Autocast does not reach it, and ``torch.compile`` calls it as it is, at one break of the graph.
+    It has no weights. Autocast does not affect it, and ``torch.compile`` calls it uncompiled, at one graph break.
 
     Args:
         timing: The sensor.
-        **options: Options of ``detect_vibration`` for steady tones.
+        model: Only ``"tones"``.
+        **options: Options of ``detect_vibration`` for tones.
 
     Raises:
-        ValueError: If another model is asked for.
+        TypeError: If an option is unknown.
+        ValueError: If another model is given.
+
+    Example:
+        >>> detector = VibrationDetector(SensorTiming(20.52e-6, 20, 2048), method="bands", tones=1)
+        >>> detector.options
+        {'method': 'bands', 'tones': 1}
     """
 
-    def __init__(self, timing: SensorTiming, **options: object) -> None:
+    def __init__(
+        self, timing: SensorTiming, *, model: Literal["tones"] = "tones", **options: Unpack[ToneOptions]
+    ) -> None:
         super().__init__()
-        if options.get("model", "tones") != "tones":
-            raise ValueError(f"a VibrationDetector finds steady tones; model={options['model']!r} is a function's")
+        if model != "tones":
+            raise ValueError(f"a VibrationDetector finds steady tones; for model={model!r} call detect_vibration")
+        unknown = sorted(set(options) - ToneOptions.__optional_keys__)
+        if unknown:
+            valid = ", ".join(sorted(ToneOptions.__optional_keys__))
+            raise TypeError(f"unknown option {unknown[0]!r} of VibrationDetector; the options are {valid}")
         self.timing = timing
         self.options = options
 
     def forward(self, frames: Tensor) -> DetectionResult:
         """Detect the vibration in a stack of frames."""
-        found: DetectionResult = detect_vibration(frames, self.timing, **self.options)  # type: ignore[call-overload]
-        return found
+        return detect_vibration(frames, self.timing, **self.options)

@@ -1,4 +1,4 @@
-"""Whether a detected vibration can be trusted, and why not."""
+"""The verdict on a detected vibration: for each axis whether it is reliable, and the reasons if it is not."""
 
 import math
 
@@ -8,19 +8,10 @@ from torch import Tensor
 from rsvib_torch.detection.result import OtherMotion
 from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
 from rsvib_torch.detection.tones.selection import MIN_OFFSET, MIN_SIGNIFICANCE
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
 __all__ = ["judge"]
-
-_LARGEST_UNCERTAINTY = 0.1  # of a frequency
-_LEAST_GOOD = 0.5  # of the bands
-_MAJORITY = 0.75  # of the bands: things that move by themselves may cover the others
-_LARGEST_MISFIT = 0.3  # mean absolute residual over mean absolute offset about its mean
-_SMALLEST_MISFIT = 0.05  # px, residuals below this are never held against a fit
-_SMALLEST_OTHER = 0.03  # px, other motion below this is never held against a fit
-_LARGEST_OTHER = 0.05  # of the rms offset that the tones make
-_ROW_MOTION = 0.1  # px within a row time, condition (24)
 
 
 def judge(
@@ -29,58 +20,58 @@ def judge(
     *,
     offsets: Tensor,
     fitted: Tensor,
-    shown: Tensor,
+    visible: Tensor,
     intervals: Tensor,
     duration: float,
-    timing: SensorTiming,
+    timing: RowTiming,
     other_motion: OtherMotion | None = None,
+    min_bands: float = 0.5,
 ) -> tuple[Tensor, tuple[tuple[str, ...], tuple[str, ...]]]:
     """Verdict on one vibration (not a batch).
 
     Args:
-        vibration: What was found.
+        vibration: The detected vibration.
         std: Its standard deviations.
-        offsets: (M, 2) px measured offsets, NaN where unknown.
-        fitted: (M, 2) px, what the result predicts.
-        shown: (M,) bool, bands that both frames show.
-        intervals: Times between the frames compared, s.
+        offsets: (M, 2) px, measured offsets of row bands, NaN where a band could not be registered.
+        fitted: (M, 2) px, offsets predicted by the vibration.
+        visible: (M,) bool, bands that both frames contain.
+        intervals: Times between the frames that were compared, s.
         duration: Length of the record in seconds.
-        timing: The sensor.
-        other_motion: What the rows tell that the vibration does not explain, where they were asked.
+        timing: The sensor, in row order.
+        other_motion: Motion that the vibration does not explain; None if it was not measured.
+        min_bands: Fraction of the visible bands that must be registered.
 
     Returns:
         (2,) bool and the reasons against each axis.
     """
     reasons: tuple[list[str], list[str]] = ([], [])
-    good = torch.isfinite(offsets).all(-1) & shown
-    share = float(good.double().sum() / shown.double().sum().clamp(min=1))
-    # a uniform motion is smeared exactly at any speed: condition (24) is for what changes within a row time
-    of_tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
-    within_row = of_tones.displacement_within(timing.row_time).tolist()
+    good = torch.isfinite(offsets).all(-1) & visible
+    share = float(good.double().sum() / visible.double().sum().clamp(min=1))
+    # condition (24) concerns the tones only: the blur by a uniform motion is exact at any speed
+    tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
+    within_row, max_within_row = tones.displacement_within(timing.row_time).tolist(), 0.1  # px
     gain = offset_gain(vibration.frequency, intervals)
-    for axis, found in enumerate(reasons):
+    for axis, against in enumerate(reasons):
         amplitude = vibration.amplitude[axis]
-        if share < _LEAST_GOOD:
-            found.append(
-                f"too few good bands: {share:.0%} of {int(shown.sum())}; the motion is beyond the search range, or the "
-                "frames show no detail or different scenes"
+        if share < min_bands:
+            against.append(
+                f"only {share:.0%} of {int(visible.sum())} row bands can be registered, {min_bands:.0%} are needed: "
+                "increase search, and check that the frames contain the same scene and enough detail"
             )
         if not bool((amplitude > 0).any()):
-            found.append("no significant tone")
-        for k in amplitude.nonzero()[:, 0].tolist():
-            found.extend(_against_tone(vibration, std, axis, k, float(gain[axis, k]), duration, timing))
+            against.append("no significant tone: the offsets are those of a uniform motion, or below their noise")
+        for tone in amplitude.nonzero()[:, 0].tolist():
+            against.extend(_against_tone(vibration, std, axis, tone, float(gain[axis, tone]), duration, timing))
         if bool(good.any()):
-            values, model = offsets[good, axis], fitted[good, axis]
-            misfits = (values - model).abs().sort().values
-            misfit = float(misfits[: math.ceil(_MAJORITY * len(misfits))].mean())
-            swing = float((values - values.mean()).abs().mean())
-            if misfit > max(_SMALLEST_MISFIT, _LARGEST_MISFIT * swing):
-                found.append(f"fit does not explain the curve: residual {misfit:.3g} px of {swing:.3g} px")
+            against.extend(_against_fit(offsets[good, axis], fitted[good, axis]))
         if other_motion is not None:
-            found.extend(_held_against(other_motion, axis, vibration.amplitude[axis] * gain[axis]))
-        if within_row[axis] > _ROW_MOTION:
-            found.append(f"moves {within_row[axis]:.2g} px within a row time, condition (24) allows {_ROW_MOTION} px")
-    reliable = torch.tensor([not found for found in reasons], device=vibration.device)
+            against.extend(_against_other_motion(other_motion, axis, amplitude * gain[axis]))
+        if within_row[axis] > max_within_row:
+            against.append(
+                f"the image moves {within_row[axis]:.2g} px within a row time, condition (24) allows "
+                f"{max_within_row} px: this is no vibration of the whole camera, or row_time is wrong"
+            )
+    reliable = torch.tensor([not against for against in reasons], device=vibration.device)
     return reliable, (tuple(reasons[0]), tuple(reasons[1]))
 
 
@@ -91,36 +82,76 @@ def _against_tone(
     tone: int,
     gain: float,
     duration: float,
-    timing: SensorTiming,
+    timing: RowTiming,
+    *,
+    max_frequency_std: float = 0.1,
 ) -> list[str]:
-    """Reasons against one tone."""
+    """Reasons against one tone; ``max_frequency_std`` is a fraction of its frequency."""
     size, hertz = float(vibration.amplitude[axis, tone]), float(vibration.frequency[axis, tone])
     size_std, hertz_std = float(std.amplitude[axis, tone]), float(std.frequency[axis, tone])
     name = f"tone of {hertz:.4g} Hz"
-    found = []
+    against = []
     if size < MIN_SIGNIFICANCE * size_std:
-        found.append(f"{name} not significant: amplitude {size:.3g} +- {size_std:.2g} px")
-    elif size * gain < MIN_OFFSET:
-        found.append(f"{name} too small: offsets of {size * gain:.2g} px, below {MIN_OFFSET} px")
-    elif hertz_std > _LARGEST_UNCERTAINTY * hertz:
-        found.append(f"{name} not known well enough: frequency {hertz:.4g} +- {hertz_std:.2g} Hz")
-    if gain < MIN_GAIN:
-        found.append(f"{name} nearly blind: gain {gain:.3f} (every frame is displaced alike)")
-    if hertz * duration < 1.0:
-        found.append(f"{name} has a period longer than the record of {1e3 * duration:.3g} ms")
-    if hertz * timing.exposure_time > 1.0:
-        found.append(f"{name} is above 1/T_e = {1 / timing.exposure_time:.4g} Hz: the exposure averages it out")
-    return found
-
-
-def _held_against(other: OtherMotion, axis: int, swing: Tensor) -> list[str]:
-    """Reasons from motion that no vibration explains, given the offset amplitudes (K,) of the tones."""
-    allowed = max(_SMALLEST_OTHER, _LARGEST_OTHER * float(swing.square().sum().sqrt()) / 2**0.5)
-    found = []
-    if float(other.unexplained[axis]) > allowed:
-        found.append(f"rows move by {float(other.unexplained[axis]):.3g} px that no tone explains")
-    if float(other.slant[axis]) > allowed:
-        found.append(
-            f"left and right halves of the rows move apart by {float(other.slant[axis]):.3g} px: rotation or parallax"
+        against.append(
+            f"{name} is not significant: its amplitude is {size:.3g} ± {size_std:.2g} px, and {MIN_SIGNIFICANCE:g} "
+            "standard deviations are needed; use more frames"
         )
-    return found
+    elif size * gain < MIN_OFFSET:
+        against.append(
+            f"{name} is too small: its offsets of {size * gain:.2g} px are below {MIN_OFFSET} px, where errors of "
+            "interpolation may cause them"
+        )
+    elif hertz_std > max_frequency_std * hertz:
+        against.append(
+            f"{name} is uncertain: its frequency is {hertz:.4g} ± {hertz_std:.2g} Hz, {max_frequency_std:.0%} are "
+            "allowed; use more frames"
+        )
+    if gain < MIN_GAIN:
+        against.append(
+            f"{name} is nearly blind: its gain is {gain:.3f}, {MIN_GAIN} is needed, because every frame is displaced "
+            "alike; use frames at other or unequal intervals"
+        )
+    if hertz * duration < 1.0:
+        against.append(
+            f"{name} has a period of {1e3 / hertz:.3g} ms, longer than the record of {1e3 * duration:.3g} ms; use more "
+            "frames"
+        )
+    if hertz * timing.exposure_time > 1.0:
+        against.append(
+            f"{name} is above 1/T_e = {1 / timing.exposure_time:.4g} Hz, where the exposure averages it out; use a "
+            "shorter exposure"
+        )
+    return against
+
+
+def _against_fit(offsets: Tensor, fitted: Tensor, *, counted: float = 0.75) -> list[str]:
+    """Reasons from the residual of the best ``counted`` of the bands: clouds may cover the others."""
+    residuals = (offsets - fitted).abs().sort().values
+    residual = float(residuals[: math.ceil(counted * len(residuals))].mean())
+    size = float((offsets - offsets.mean()).abs().mean())
+    allowed = max(0.05, 0.3 * size)  # px; smaller residuals are errors of registration
+    if residual <= allowed:
+        return []
+    return [
+        f"the fit does not explain the offset curve: mean residual {residual:.3g} px, {allowed:.3g} px are allowed for "
+        f"offsets of {size:.3g} px; try more tones or model='free'"
+    ]
+
+
+def _against_other_motion(other: OtherMotion, axis: int, offset_amplitudes: Tensor) -> list[str]:
+    """Reasons from motion that no vibration explains, given the offset amplitudes (K,) of the tones in px."""
+    rms_offset = float(offset_amplitudes.square().sum().sqrt()) / 2**0.5
+    allowed = max(0.03, 0.05 * rms_offset)  # px; smaller values are errors of interpolation
+    unexplained, differential = float(other.unexplained[axis]), float(other.differential[axis])
+    against = []
+    if unexplained > allowed:
+        against.append(
+            f"rows move by {unexplained:.3g} px that no tone explains, {allowed:.2g} px are allowed; try more tones or "
+            "model='free'"
+        )
+    if differential > allowed:
+        against.append(
+            f"left and right halves of the rows move apart by {differential:.3g} px, {allowed:.2g} px are allowed: the "
+            "camera rotates, or the scene has parallax"
+        )
+    return against

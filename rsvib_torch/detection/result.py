@@ -1,10 +1,11 @@
-"""What detection returns: vibration, standard deviations, verdict and the curve it stands on."""
+"""Result of detection: vibration, standard deviations, verdict, and the offset curve."""
 
 from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
@@ -14,34 +15,34 @@ __all__ = ["DetectionResult", "OtherMotion", "stacked"]
 
 @dataclass(frozen=True, eq=False)
 class OtherMotion:
-    """What rows tell that no vibration explains, per axis in px, with the part that noise explains taken out.
+    """Motion of the rows that no vibration explains, for each axis in px, without the part that noise explains.
 
     Attributes:
-        unexplained: (..., 2) rms displacement that the fit leaves.
-        slant: (..., 2) rms difference between what the right and the left half of the rows miss.
+        unexplained: (..., 2) rms residual displacement of the fit.
+        differential: (..., 2) rms difference of the residual displacements of the left and right halves of the rows.
     """
 
     unexplained: Tensor
-    slant: Tensor
+    differential: Tensor
 
     def __getitem__(self, index: int) -> "OtherMotion":
         """The part of one stack out of a batch."""
-        return OtherMotion(self.unexplained[index], self.slant[index])
+        return OtherMotion(self.unexplained[index], self.differential[index])
 
 
 @dataclass(frozen=True, eq=False)
 class DetectionResult:
-    """A detected vibration and how far it can be trusted. A batch of stacks, or of windows, leads all tensors.
+    """A detected vibration with its uncertainty and verdict. Batches of stacks or windows lead all tensors.
 
     Attributes:
         vibration: The vibration in image axes; an axis without a significant tone has amplitude 0.
         std: Standard deviations of its parameters.
-        offsets: The measured curve.
-        fitted: (..., P, N, 2) px, the offsets simulated again from the result at the same bands.
-        gain: (..., 2, K) gain of Eq. (7) from displacement to offset; near 0 the tone is nearly blind.
+        offsets: The measured offset curve.
+        fitted: (..., P, N, 2) px, offsets of the same bands predicted by the vibration.
+        gain: (..., 2, K) gain of Eq. (7) from displacement to offset; a tone with a gain near 0 is nearly blind.
         residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
         reliable: (..., 2) bool, verdict for each axis.
-        reasons: Why not, for each axis (x, y); a tuple of those for a batch.
+        reasons: Reasons against each axis (x, y) that is not reliable; a tuple of those for a batch.
     """
 
     vibration: Vibration
@@ -68,9 +69,9 @@ class DetectionResult:
 
 
 def stacked(results: list[DetectionResult]) -> DetectionResult:
-    """Results of the windows of a batch of stacks as one: (B, number of windows, ...).
+    """Results of the windows of a batch of stacks as one result (B, number of windows, ...).
 
-    Tones that only some windows have are padded with amplitude 0.
+    Tones that are missing in some windows have amplitude 0 there.
     """
     tones = max(result.gain.shape[-1] for result in results)
 
@@ -78,17 +79,17 @@ def stacked(results: list[DetectionResult]) -> DetectionResult:
         return torch.stack(values, dim=1)
 
     def padded(values: list[Tensor]) -> Tensor:
-        return joined([torch.nn.functional.pad(v, (0, tones - v.shape[-1])) for v in values])
+        return joined([functional.pad(value, (0, tones - value.shape[-1])) for value in values])
 
-    def each(part: str, name: str) -> Tensor:
-        values = [getattr(getattr(result, part), name) for result in results]
-        return joined(values) if name.startswith("image") else padded(values)
+    def parameters(parts: list[Any], kind: type[Any]) -> dict[str, Tensor]:
+        values = {field.name: [getattr(part, field.name) for part in parts] for field in fields(kind)}
+        return {name: joined(v) if name.startswith("image") else padded(v) for name, v in values.items()}
 
     curves = [result.offsets for result in results]
     batch = curves[0].offsets.shape[0]
     return DetectionResult(
-        vibration=Vibration(*(each("vibration", f.name) for f in fields(Vibration))),
-        std=VibrationStd(*(each("std", f.name) for f in fields(VibrationStd))),
+        vibration=Vibration(**parameters([result.vibration for result in results], Vibration)),
+        std=VibrationStd(**parameters([result.std for result in results], VibrationStd)),
         offsets=OffsetCurve(
             curves[0].pairs,
             curves[0].rows,

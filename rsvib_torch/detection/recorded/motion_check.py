@@ -8,10 +8,9 @@ from torch import Tensor
 
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.splines import gauss_legendre
-from rsvib_torch.detection.band_curve import measurements_of_curve
-from rsvib_torch.detection.grey_frames import grey_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.shapes.free import start_curve
+from rsvib_torch.detection.start import grey_frames, measurements_of_curve
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.motion.motion import Motion

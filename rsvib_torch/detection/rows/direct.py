@@ -114,9 +114,7 @@ def _refine(
     gradients: list[RowGradients] | None = None  # None: compute them from the warped frames
     steps: list[_Step] = []
     search_round = 1  # the first round removes the error of the band offsets; weak tones are significant after it
-    pattern_rounds = (
-        2  # a pattern biases the first motion that it is measured around: the second round removes the rest
-    )
+    pattern_rounds = 2  # a strong pattern biases the motion by which its first estimate is warped
     interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)  # exposures average out faster tones
     blind = blind_frequencies(timing, 0.5 / interval).to(motion.device)
     for number in range(max_rounds):
@@ -137,7 +135,7 @@ def _refine(
         same_tones = torch.equal(previous.active, fit.active)
         ratio = step.ratio_to(steps[-1]) if steps and same_tones else None
         if number >= search_round and _converged(previous, fit, ratio):
-            if not (pattern_rounds and remove_column_pattern(groups, timing, motion, gradients)):
+            if pattern_rounds == 0 or not remove_column_pattern(groups, timing, motion, gradients):
                 break
             pattern_rounds, search_round = pattern_rounds - 1, number + 1
             gradients, steps = None, []

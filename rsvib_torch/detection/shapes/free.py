@@ -16,10 +16,9 @@ from torch import Tensor
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.splines import bspline_weights, gauss_legendre
-from rsvib_torch.detection.band_curve import band_curve, measurements_of_curve
-from rsvib_torch.detection.grey_frames import GreyFrames, grey_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
+from rsvib_torch.detection.start import GreyFrames, band_curve, grey_frames, measurements_of_curve
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.motion.motion import Motion

@@ -11,8 +11,6 @@ from torch import Tensor
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.splines import gauss_legendre
-from rsvib_torch.detection.band_curve import measurements_of_curve
-from rsvib_torch.detection.grey_frames import GreyFrames, grey_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import (
@@ -22,6 +20,7 @@ from rsvib_torch.detection.shapes.free import (
     start_curve,
     unexplained_reason,
 )
+from rsvib_torch.detection.start import GreyFrames, grey_frames, measurements_of_curve
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming

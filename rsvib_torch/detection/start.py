@@ -1,0 +1,164 @@
+"""The start of every detection: grey frames, the offsets of their row bands, and the measurements these give."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.frames.arrays import ArrayLike
+from rsvib_torch.frames.pixels import detailed_columns
+from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.registration import OffsetCurve, RegistrationOptions
+from rsvib_torch.registration.register import register_rows
+
+__all__ = ["GreyFrames", "band_curve", "grey_frames", "measurements_of_curve"]
+
+
+@dataclass(frozen=True, eq=False)
+class GreyFrames:
+    """Stacks of frames as detection uses them.
+
+    Attributes:
+        images: (B, T, H, W) grey, in row order; missing pixels hold local means.
+        valid: (B, T, H, W) bool, False at missing pixels; None if there are none.
+        batched: Whether the user gave a batch.
+    """
+
+    images: Tensor
+    valid: Tensor | None
+    batched: bool
+
+    def _with(self, images: Tensor, valid: Tensor | None, batched: bool) -> "GreyFrames":
+        return GreyFrames(images, None if valid is None or bool(valid.all()) else valid, batched)
+
+    def narrowed(self, columns: int) -> "GreyFrames":
+        """The given number of neighbouring columns of each stack, those with the most detail."""
+        if columns >= self.images.shape[-1]:
+            return self
+        parts = [detailed_columns(stack[0], columns) for stack in self.images]
+
+        def cut(values: Tensor) -> Tensor:
+            return torch.stack([stack[..., part] for stack, part in zip(values, parts, strict=True)])
+
+        return self._with(cut(self.images), None if self.valid is None else cut(self.valid), self.batched)
+
+    def one(self, index: int) -> "GreyFrames":
+        """One stack out of the batch, as a batch of one."""
+        part = slice(index, index + 1)
+        return self._with(self.images[part], None if self.valid is None else self.valid[part], False)
+
+
+def grey_frames(
+    frames: ArrayLike,
+    timing: SensorTiming,
+    full_scale: float | None,
+    ignore: object,
+    *,
+    min_valid_fraction: float = 0.1,
+) -> GreyFrames:
+    """Check stacks of frames and convert them to grey frames in row order.
+
+    Args:
+        frames: (T, H, W), (T, C, H, W) or (B, T, C, H, W), tensor or array; NaN marks missing pixels.
+        timing: The sensor.
+        full_scale: Count that means 1.0, for integer frames.
+        ignore: Bool tensor or array, broadcastable to (..., H, W) of the frames: True for missing pixels.
+        min_valid_fraction: Fraction of the pixels of each frame that must not be missing.
+
+    Raises:
+        TypeError: If frames are not numbers or ``ignore`` is not bool.
+        ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or
+            ``ignore`` does not fit.
+    """
+    prepared = prepare_frames(frames, timing, full_scale=full_scale, ignore=ignore, minimum_frames=2)
+    images, valid = prepared.filled, None
+    if prepared.missing is not None:
+        valid = ~prepared.missing.any(2)
+        fraction = valid.float().mean((-2, -1))
+        if bool((fraction < min_valid_fraction).any()):
+            where = (fraction < min_valid_fraction).nonzero()[0].tolist()
+            raise ValueError(
+                f"frame {where[-1]} has only {fraction[*where]:.1%} of pixels with data, {min_valid_fraction:.0%} are "
+                "needed; mark fewer pixels by NaN or ignore"
+            )
+    # some rows are enough to find that a frame is not constant
+    if bool(_constant(images[..., ::16, :]).any()) and bool((constant := _constant(images)).any()):
+        raise ValueError(
+            f"frame {constant.nonzero()[0].tolist()[-1]} is constant: without detail there is nothing to register"
+        )
+    images = images.mean(2) if images.shape[2] > 1 else images[:, :, 0]
+    return GreyFrames(images, valid, prepared.batched)
+
+
+def _constant(frames: Tensor) -> Tensor:
+    """(B, T) bool, frames (B, T, C, H, W) with equal pixels, to rounding."""
+    low, high = frames.amin((-3, -2, -1)), frames.amax((-3, -2, -1))
+    return high - low <= 1e-6 * torch.maximum(low.abs(), high.abs())
+
+
+def band_curve(
+    frames: Tensor,
+    valid: Tensor | None,
+    timing: RowTiming,
+    options: RegistrationOptions,
+    *,
+    mere_start: bool,
+    start_columns: int = 512,
+) -> OffsetCurve:
+    """Offsets of the row bands of grey frames, NaN for bands with more than half of their pixels missing.
+
+    Args:
+        frames: (B, T, H, W) in row order.
+        valid: (B, T, H, W) bool, False at missing pixels; None if there are none.
+        timing: The sensor, in row order.
+        options: How the bands are registered.
+        mere_start: Whether the offsets are only the start of a fit to rows. Of wide frames, the middle
+            ``start_columns`` are used then, unless a fifth of their bands cannot be registered.
+        start_columns: Columns that give a start of sufficient accuracy.
+    """
+    first = (frames.shape[-1] - start_columns) // 2
+    curve = None
+    if mere_start and first > 0:
+        curve = register_rows(frames[..., first : first + start_columns], timing, options)
+    if curve is None or float(curve.good.double().mean((1, 2)).amin()) <= 0.8:
+        curve = register_rows(frames, timing, options)
+    if valid is None:
+        return curve
+    height = max(curve.heights)
+    tops = (curve.rows - 0.5 * (height - 1)).round().to(torch.int64)
+    share = functional.avg_pool1d(valid.double().mean(-1), height, stride=1)[..., tops]  # (B, T, N)
+    missing = torch.minimum(share[:, curve.pairs[:, 0]], share[:, curve.pairs[:, 1]]) < 0.5
+    return replace(
+        curve,
+        offsets=torch.where(missing[..., None], torch.nan, curve.offsets),
+        quality=torch.where(missing, 0.0, curve.quality),
+    )
+
+
+def measurements_of_curve(curve: OffsetCurve, timing: RowTiming, band_step: int) -> Measurements:
+    """Measurements of a batch of offset curves (B, P, N), weighted by the quality of the bands.
+
+    A correlation q of two noisy bands means a ratio of noise to signal of (1 - q) / q. Weights are its inverse, bounded
+    so that no band dominates.
+    """
+    offsets = curve.offsets.flatten(1, 2)
+    good = torch.isfinite(offsets).all(-1)
+    noise = 1.0 - curve.quality.flatten(1, 2).clamp(max=1.0)
+    weight = torch.where(good, 1.0 / (noise + 0.05), 0.0)
+    typical = weight.sum(1, keepdim=True) / good.sum(1, keepdim=True).clamp(min=1)
+    weight = weight / typical.clamp(min=1e-300)
+    offsets = torch.where(good[..., None], offsets, 0.0)
+    # content that moves by y along the scan axis is exposed y row times later in the later frame
+    later = curve.later_times.flatten() + offsets[..., 1] * timing.row_time
+    return Measurements.of_pairs(
+        starts=curve.times.flatten().expand(len(offsets), -1),
+        later_starts=later,
+        offsets=offsets,
+        information=torch.diag_embed(weight[..., None].expand(-1, -1, 2)),
+        exposure_time=timing.exposure_time,
+        average_times=(curve.heights[0] * timing.row_time, curve.heights[1] * timing.row_time),
+        independent=min(1.0, band_step / max(curve.heights)),
+    )
