@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""The whole chain on two drawn scenes: simulate a vibrating camera, detect, restore, compare with the truth.
+"""Simulate frames of a vibrating camera of two drawn scenes, detect, restore, and compare with the truth.
 
 The camera is that of Liu et al. 2023 (Sensors 23, 5953), with 12-bit counts and noise; the vibration has its
 amplitudes and frequencies, and random phases.
@@ -37,7 +37,7 @@ TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 AMPLITUDE, FREQUENCY = (3.1, 5.2), (50.0, 30.0)
 FULL_SCALE, NOISE = 4095, 0.003
 MARGIN = 32  # px of scene around the frame, on every side
-RIM = 32  # px at the border that no figure counts: the camera did not see all of them
+RIM = 32  # px at the border that are not evaluated, because they are partly outside the frame
 SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
     "chart": lambda height, width, seed: resolution_chart(height, width, seed=seed),
     "city": city_and_fields,
@@ -46,16 +46,16 @@ SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
 
 @dataclass
 class Trial:
-    """One scene on its way through the chain."""
+    """One scene with its options and the times of its steps."""
 
     name: str
     seed: int
-    methods: dict[str, dict[str, str]]  # of detection and restoration, where not the default
+    methods: dict[str, dict[str, str]]  # options of detection and restoration
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def step(self, what: str) -> Iterator[None]:
-        """Show what is being done and note how long it takes."""
+        """Show the progress of a step and record its time."""
         begin = time.perf_counter()
         with working(f"{self.name}: {what}"):
             yield
@@ -63,7 +63,7 @@ class Trial:
 
 
 def method_used(function: Callable[..., Any], options: dict[str, str]) -> str:
-    """Method that a function follows with these options."""
+    """Method of a function with these options."""
     return options.get("method", inspect.signature(function).parameters["method"].default)
 
 
@@ -73,7 +73,7 @@ def wrapped(angle: float) -> float:
 
 
 def compare(truth: rsv.Vibration, detected: rsv.Vibration) -> list[dict[str, Any]]:
-    """True and detected values of each axis, with the error in the unit of the goal that it has to meet."""
+    """True and detected values of each axis, with the relative error, or the error of the phase in π."""
     lines = []
     for axis, name in enumerate("xy"):
         for quantity, unit, scale in (("period", "ms", 1e3), ("amplitude", "px", 1.0), ("phase", "π", 1 / math.pi)):
@@ -114,19 +114,19 @@ def show(console: Console, trial: Trial, lines: list[dict[str, Any]], quality: d
 
 
 def before_after(frame: Tensor, restored: Tensor, still: Tensor) -> Figure:
-    """Draw a column of the frame with its bends magnified, a detail, and the detail's difference from the truth."""
+    """Draw the stretched middle columns, a detail, and its difference from the truth, before and after restoration."""
     middle, strip, size = frame.shape[-1] // 2, 40, 160
     places = detailed_places(still[2 * RIM : -2 * RIM, 2 * RIM : -2 * RIM], size, 1)
     row, column = (place + 2 * RIM for place in places[0])
     detail = (slice(row, row + size), slice(column, column + size))
     figure = Figure(figsize=(12.0, 8.4), layout="constrained")
     panels = figure.subplots(2, 3)
-    for line, (name, image) in enumerate((("as taken", frame), ("restored", restored))):
+    for line, (name, image) in enumerate((("input", frame), ("restored", restored))):
         error = (image - still)[RIM:-RIM, RIM:-RIM]
         shown = (
-            (image[:, middle - strip : middle + strip], f"{name}: middle columns, widened", {"aspect": "auto"}),
+            (image[:, middle - strip : middle + strip], f"{name}: middle columns, stretched", {"aspect": "auto"}),
             (image[detail], f"{name}: detail", {}),
-            ((image - still)[detail], "minus the still scene", {"vmin": -0.3, "vmax": 0.3}),
+            ((image - still)[detail], "difference from the scene at rest", {"vmin": -0.3, "vmax": 0.3}),
         )
         for panel, (part, title, options) in zip(panels[line], shown, strict=True):
             panel.imshow(part.numpy(), cmap="gray", interpolation="nearest", **{"vmin": 0.0, "vmax": 1.0, **options})
@@ -138,7 +138,7 @@ def before_after(frame: Tensor, restored: Tensor, still: Tensor) -> Figure:
 
 
 def run(trial: Trial, size: tuple[int, int], out: Path, console: Console) -> None:
-    """Take one scene through the chain and leave everything in ``out``."""
+    """Simulate, detect, restore and evaluate one scene, and write all results to ``out``."""
     generator = torch.Generator().manual_seed(trial.seed)
     phase = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1) * math.pi
     truth = rsv.Vibration(AMPLITUDE, FREQUENCY, phase)
@@ -160,7 +160,7 @@ def run(trial: Trial, size: tuple[int, int], out: Path, console: Console) -> Non
         }
     lines = compare(truth, detection.vibration)
     show(console, trial, lines, quality)
-    with trial.step("writing files and pictures"), whole_folder(out) as folder:
+    with trial.step("writing files and figures"), whole_folder(out) as folder:
         rsv.write_stack(folder / "frames.tif", frames, dtype="uint16", full_scale=FULL_SCALE)
         rsv.write_stack(folder / "restored.tif", restored, dtype="uint16", full_scale=FULL_SCALE)
         write_vibration(folder / "vibration.json", detection, TIMING)
@@ -206,7 +206,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in SCENES:
         with warnings_in_one_line():
             run(Trial(name, options.seed, methods), (2048, 320 if options.quick else 2048), options.out / name, console)
-    console.print(f"{time.perf_counter() - begin:.0f} s; frames, pictures and figures are in {options.out}")
+    console.print(f"{time.perf_counter() - begin:.0f} s; results are in {options.out}")
 
 
 if __name__ == "__main__":

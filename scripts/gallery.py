@@ -1,8 +1,7 @@
 #!/usr/bin/env python
-"""Pictures of what the package does, for docs/gallery.md: every one drawn from a scene, a camera and a seed given here.
+"""Figures for docs/gallery.md, each drawn from a scene, a camera and a seed given here.
 
-``scripts/gallery.py --out docs/gallery`` draws them anew. They show one case each; figures with their spread are in
-docs/accuracy.md.
+``scripts/gallery.py --out docs/gallery`` draws them again. Each figure is one case; statistics are in docs/accuracy.md.
 """
 
 import argparse
@@ -21,12 +20,12 @@ from rsvib_torch.report.plots import offset_figure, psf_figure, save_figure
 
 SEED = 3
 ROW_TIME, FRAME_ROWS = 20.52e-6, 2048
-VIBRATION = rsv.Vibration([3.1, 5.2], [50.0, 30.0], [0.7, -1.9])  # that of Liu et al. 2023, phases of its own
+VIBRATION = rsv.Vibration([3.1, 5.2], [50.0, 30.0], [0.7, -1.9])  # amplitudes and frequencies of Liu et al. 2023
 MARGIN = 32  # px of scene around the frame
 
 
 def camera(exposure_rows: int) -> rsv.SensorTiming:
-    """The camera of Liu et al. 2023 with an exposure of so many rows."""
+    """The camera of Liu et al. 2023 with another exposure."""
     return rsv.SensorTiming(row_time=ROW_TIME, exposure_rows=exposure_rows, frame_rows=FRAME_ROWS)
 
 
@@ -51,12 +50,12 @@ def offsets() -> Figure:
 
 
 def kernels() -> Figure:
-    """Point spread functions down a frame whose rows are exposed for 8.2 ms."""
+    """Point spread functions of rows that are exposed for 8.2 ms."""
     return psf_figure(VIBRATION, camera(400), FRAME_ROWS)
 
 
 def ways_to_restore() -> Figure:
-    """One crop of a long exposure: as taken, and restored in four ways."""
+    """One crop of a long exposure: input, and restored by four methods."""
     timing, size = camera(400), 640
     scene = resolution_chart(size + 2 * MARGIN, size + 2 * MARGIN, seed=SEED)
     still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
@@ -81,7 +80,7 @@ def ways_to_restore() -> Figure:
 
 
 def training_data() -> Figure:
-    """One image under four random vibrations, with a box and keypoints that move with it."""
+    """One image with four random vibrations, with a box and keypoints that are displaced with it."""
     scene = resolution_chart(256, 256, seed=SEED).expand(4, 1, 256, 256)
     points = torch.tensor([[64.0, 64.0], [192.0, 64.0], [64.0, 192.0], [192.0, 192.0]]).expand(4, 4, 2)
     boxes = torch.tensor([[[96.0, 96.0, 160.0, 160.0]]]).expand(4, 1, 4)
@@ -110,7 +109,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
 
 
 def main() -> None:
-    """Draw the pictures."""
+    """Draw the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/gallery"), help="folder (default: out/gallery)")
     parser.add_argument("--only", choices=PICTURES, nargs="+", default=list(PICTURES), help="pictures to draw")

@@ -115,7 +115,7 @@ def test_row_loops_and_unwarping_restore_either_frame(taken, index):
         before, after = (float(np.square(error).mean()) for error in errors)
         assert after < before / 6, name
         assert figure.seconds > 0
-        assert figure.told
+        assert figure.setting
 
 
 def test_deepinv_forms_the_frame_and_restores_it(taken):

@@ -1,12 +1,12 @@
 """Restoration by deepinv: ``TiledSpaceVaryingBlur`` and its ``least_squares``, a Lanczos-4 kernel for every 8 rows.
 
-Tiles are as wide as the frame and blend into each other; the scene is larger than the frame by what kernels reach to.
+Tiles are as wide as the frame and overlap; the scene is larger than the frame by the size of the kernels.
 """
 
 import math
 import time
 
-import einops  # noqa: F401 - TiledSpaceVaryingBlur asks for it only when it is used
+import einops  # noqa: F401 - TiledSpaceVaryingBlur imports it only when it is used
 import torch
 from benchmarks.restoration_peers import Peer, row_kernels
 from deepinv.optim.linear import least_squares
@@ -21,7 +21,7 @@ DAMPINGS = (1e-3, 1e-2, 2e-2, 0.1, 0.3)
 
 
 def frame_physics(shape: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibration) -> TiledSpaceVaryingBlur:
-    """The operator that forms frame 0 of that shape from a scene that the kernels reach to."""
+    """The operator that forms frame 0 of that shape from the scene that its kernels cover."""
     height, width = shape
     reach = row_kernels(torch.zeros(1).numpy(), timing, truth, "float32").shape[-2:]
     scene = height + reach[0] - 1, width + reach[1] - 1
@@ -33,7 +33,7 @@ def frame_physics(shape: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.V
 
 
 def tiled_restore(frame: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration, still: Tensor, rim: int) -> Peer:
-    """Restore a frame by conjugate gradients; damping and number of iterations are the best for the truth."""
+    """Restore a frame by conjugate gradients, with the damping and number of iterations of the highest PSNR."""
     height, width = frame.shape
     physics = frame_physics((height, width), timing, truth)
     top, left = ((size - 1) // 2 for size in physics.filters.shape[-2:])

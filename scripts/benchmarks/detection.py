@@ -1,7 +1,7 @@
-"""Detection held against the Cramér-Rao bound, and against goals on cases that it was not tuned on.
+"""Accuracy of detection, compared with the Cramér-Rao bound, and with goals on cases not used for development.
 
 Frames come from benchmarks/independent_camera.py, which shares no code with the package. Monte Carlo: pairs of many
-noise seeds, phases and scenes; errors over the bound for an unknown scene, and how often the 95 % intervals hold the
+noise seeds, phases and scenes; errors over the bound for an unknown scene, and how often the 95 % intervals contain the
 truth. Cases: largest and root-mean-square error in per cent and π.
 """
 
@@ -22,11 +22,11 @@ import rsvib_torch as rsv
 
 NOISES = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05)
 SEED = 11
-NEAR = 0.05  # of the frequency: a tone found further off is not the one looked for
+NEAR = 0.05  # of the frequency; a tone with a larger error is a different one
 
 
 def errors_of(found: rsv.DetectionResult, shake: Shake) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Errors and their stated standard deviations of each true tone (2, K); NaN where it was not found."""
+    """Errors and estimated standard deviations of each true tone (2, K); NaN if it was not detected."""
     errors = {name: np.full(shake.amplitude.shape, np.nan) for name in NAMES}
     stated = {name: np.full(shake.amplitude.shape, np.nan) for name in NAMES}
     vibration, std = found.vibration, found.std
@@ -46,7 +46,7 @@ def errors_of(found: rsv.DetectionResult, shake: Shake) -> tuple[dict[str, Array
 
 
 def trial(taken: Take, noise: float, seed: int, method: str) -> dict[str, Any]:
-    """Detect in noisy frames: errors, and what they are in units of the stated standard deviation."""
+    """Detect in noisy frames: errors, also in units of the estimated standard deviation."""
     generator = np.random.default_rng(seed)
     frames = torch.from_numpy(taken.frames + noise * generator.standard_normal(taken.frames.shape)).float()
     begin = time.perf_counter()
@@ -72,7 +72,7 @@ def trial(taken: Take, noise: float, seed: int, method: str) -> dict[str, Any]:
 
 
 def monte_carlo(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Errors over the bound, for every motion and noise and pooled over scenes, phases and seeds."""
+    """Errors over the bound for every motion and noise, pooled over scenes, phases and seeds."""
     size = tuple(options.detection_size)
     sources = [SEED + i for i in range(options.detection_scenes)] + list(options.detection_images)
     results = []
@@ -98,7 +98,7 @@ def monte_carlo(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def hash_seed(*values: float) -> list[int]:
-    """A seed of its own for every trial."""
+    """A different seed for every trial."""
     return [int(1e6 * value) for value in values]
 
 
@@ -108,7 +108,7 @@ def _rms(values: Array) -> float:
 
 
 def pooled(trials: list[dict[str, Any]]) -> dict[str, Any]:
-    """Figures of many trials of one motion and noise, lists of (x, y) where they are for each axis."""
+    """Statistics of many trials of one motion and noise; values per axis are lists (x, y)."""
     result: dict[str, Any] = {"trials": len(trials), "seconds": float(np.median([t["seconds"] for t in trials]))}
     for name in NAMES:
         ratio = np.array([t["errors"][name] / t["bound"][name] for t in trials])
@@ -126,7 +126,7 @@ def pooled(trials: list[dict[str, Any]]) -> dict[str, Any]:
     stated = np.array([[t["over_stated"][name] for name in NAMES] for t in trials])
     known = np.isfinite(stated)
     covered = float((np.abs(stated[known]) <= 1.96).mean()) if known.any() else math.nan
-    independent = max(known.sum() / len(NAMES), 1.0)  # the parameters of a tone err together
+    independent = max(known.sum() / len(NAMES), 1.0)  # the errors of the parameters of a tone are correlated
     result["over_bound"] = _rms(everything)
     squares = np.array([_rms(one) ** 2 for one in everything])
     squares = squares[np.isfinite(squares)]
@@ -178,7 +178,7 @@ def held_out_cases(options: argparse.Namespace) -> list[dict[str, Any]]:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this part."""
     group = parser.add_argument_group("detection")
-    group.add_argument("--quick", action="store_true", help="few trials of small frames, few cases")
+    group.add_argument("--quick", action="store_true", help="fewer trials and cases")
     group.add_argument("--detection-method", default="direct", help="method of detect_vibration (default: direct)")
     group.add_argument("--detection-size", type=int, nargs=2, default=(1024, 512), help="rows, columns of the trials")
     group.add_argument("--detection-noises", type=float, nargs="+", default=NOISES, help="noise levels of full scale")
@@ -186,21 +186,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--detection-phases", type=int, default=4, help="draws of the phases (default: 4)")
     group.add_argument("--detection-repeats", type=int, default=4, help="draws of the noise (default: 4)")
     group.add_argument("--detection-images", type=Path, nargs="*", default=[], help="image files as further scenes")
-    group.add_argument("--cases", action="store_true", help="the held-out cases as well")
+    group.add_argument("--cases", action="store_true", help="also run the held-out cases")
     group.add_argument("--case-size", type=int, nargs=2, default=(2048, 1024), help="rows, columns of the cases")
     group.add_argument("--case-scenes", type=int, default=2, help="scenes of each case (default: 2)")
     group.add_argument("--case-phases", type=int, default=3, help="draws of the phases of each case (default: 3)")
 
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Monte Carlo, then the cases if they are asked for."""
+    """The Monte Carlo trials, and with ``--cases`` the cases."""
     if options.quick:
         options = argparse.Namespace(**vars(options) | quick_options())
     return monte_carlo(options) + (held_out_cases(options) if options.cases else [])
 
 
 def quick_options() -> dict[str, Any]:
-    """What ``--quick`` stands for."""
+    """Options that ``--quick`` sets."""
     return {
         "detection_noises": (0.002, 0.01, 0.05),
         "detection_scenes": 1,

@@ -1,4 +1,4 @@
-"""Vibrations to detect, with the goals for them, and frames of them."""
+"""Vibrations to detect with the largest errors allowed, and simulated frames."""
 
 import math
 from dataclasses import dataclass
@@ -11,14 +11,14 @@ from benchmarks.independent_camera import Array, Shake, closed, take_frames
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields, cramer_rao_bound
 
-RIM = 24  # px over which a scene fades at its borders
-ROW_TIME, EXPOSURE_ROWS, FRAME_ROWS = 20.52e-6, 20.0, 2048  # of the camera; lower frames get slower rows
+RIM = 24  # px; width of the border over which a scene fades to its mean
+ROW_TIME, EXPOSURE_ROWS, FRAME_ROWS = 20.52e-6, 20.0, 2048  # the camera; frames with fewer rows have slower rows
 NAMES = ("amplitude", "frequency", "phase")
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A vibration whose phases are drawn, one list of tones for each axis (x, y)."""
+    """A vibration with random phases, one list of tones for each axis (x, y)."""
 
     name: str
     amplitude: tuple[tuple[float, ...], tuple[float, ...]]
@@ -26,7 +26,7 @@ class Motion:
     image_motion: tuple[float, float] = (0.0, 0.0)
 
     def shake(self, generator: np.random.Generator) -> Shake:
-        """The motion with random phases; an image motion goes either way along its axis."""
+        """The motion with random phases and a random sign of the image motion."""
         phase = generator.uniform(-math.pi, math.pi, np.shape(self.amplitude))
         motion = np.array(self.image_motion) * generator.choice([-1.0, 1.0])
         return Shake(np.array(self.amplitude), np.array(self.frequency), phase, motion)
@@ -34,7 +34,7 @@ class Motion:
 
 PAPER = Motion("3.1 px 50 Hz, 5.2 px 30 Hz", ((3.1,), (5.2,)), ((50.0,), (30.0,)))
 SMALL = Motion("0.2 px and 0.13 px 155 Hz", ((0.2,), (0.13,)), ((155.0,), (155.0,)))
-TWO_TONES = Motion("two tones an axis", ((1.5, 0.5), (1.1, 0.4)), ((41.0, 133.0), (67.0, 180.0)))
+TWO_TONES = Motion("two tones per axis", ((1.5, 0.5), (1.1, 0.4)), ((41.0, 133.0), (67.0, 180.0)))
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ CASES = (
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """Frames without noise, and what is true of them."""
+    """Frames without noise, with the true scene, motion and timing."""
 
     frames: Array
     scene: Array
@@ -76,7 +76,7 @@ class Take:
 
     @property
     def truth(self) -> rsv.Vibration:
-        """The motion as the package has it."""
+        """The motion as a ``Vibration``."""
         values = (self.shake.amplitude, self.shake.frequency, self.shake.phase, self.shake.image_motion)
         return rsv.Vibration(*(torch.from_numpy(value) for value in values))
 
@@ -95,13 +95,13 @@ class Take:
 
 
 def camera(num_rows: int) -> rsv.SensorTiming:
-    """The camera with fewer and slower rows, so that frame period and exposure stay what they are."""
+    """The camera with fewer and slower rows; frame period and exposure time are unchanged."""
     slower = FRAME_ROWS / num_rows
     return rsv.SensorTiming(row_time=ROW_TIME * slower, exposure_rows=EXPOSURE_ROWS / slower, frame_rows=num_rows)
 
 
 def scene_of(source: int | Path, height: int, width: int) -> Array:
-    """A drawn scene of a seed, or the middle of an image file scaled to 0 ... 1 by its percentiles."""
+    """A drawn scene of a seed, or the centre of an image file scaled to 0 ... 1 by its percentiles."""
     if isinstance(source, int):
         return city_and_fields(height, width, source).double().numpy()
     image = rsv.read_stack(source, full_scale=65535.0)
@@ -115,7 +115,7 @@ def scene_of(source: int | Path, height: int, width: int) -> Array:
 
 
 def take(motion: Motion, source: int | Path, size: tuple[int, int], num_frames: int, seed: int) -> Take:
-    """Frames of a motion with phases drawn from a seed."""
+    """Frames of a motion with random phases of a seed."""
     shake = motion.shake(np.random.default_rng(seed))
     timing = camera(size[0])
     reach = np.ceil(shake.reach((num_frames + 1) * timing.frame_period)).astype(int) + RIM + 8

@@ -1,4 +1,4 @@
-"""Cost of detection: seconds and FFT round trips (rfft2 and irfft2 of one frame) of pairs and of longer stacks."""
+"""Time of detection in seconds and in FFT round trips (rfft2 and irfft2 of one frame), for two and four frames."""
 
 import argparse
 from typing import Any
@@ -14,7 +14,7 @@ MARGIN = 40
 
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Time of each method for two and four frames, in turns with the round trip."""
+    """Time of each method for two and four frames, alternating with the round trip."""
     timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=options.size)
     vibration = rsv.Vibration([3.1, 5.2], [50.0, 30.0], [0.7, 2.1])
     scene = city_and_fields(options.size + 2 * MARGIN, options.size + 2 * MARGIN, seed=SEED)

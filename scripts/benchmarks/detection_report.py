@@ -1,4 +1,4 @@
-"""Figures of the detection benchmark as tables and pictures."""
+"""Tables and figures of the detection benchmark."""
 
 import argparse
 from pathlib import Path
@@ -29,12 +29,12 @@ def lines(results: Results, options: argparse.Namespace) -> list[str]:
         own = [r for r in trials if r["motion"] == motion]
         height, width = own[0]["size"]
         text += [
-            f"{motion}: pairs of {height} x {width} px, {own[0]['trials']} trials a row, {own[0]['seconds']:.1f} s "
-            "each. Errors are root-mean-square for x, y; the bound is that for an unknown scene, in brackets how much "
-            "larger the one for a random scene is.",
+            f"{motion}: pairs of {height} x {width} px, {own[0]['trials']} trials per line, "
+            f"{own[0]['seconds']:.1f} s each. Errors are root-mean-square values for x, y; the bound is that for an "
+            "unknown scene, in brackets the ratio of the bound for a random scene to it.",
             "",
             "| noise | period (%) | amplitude (%) | phase (π) | error / bound: amplitude | frequency | phase | all "
-            "| error / stated | in 95 % interval | lost | extra tones | reliable |",
+            "| error / estimated std | in 95 % interval | missed | extra tones | reliable |",
             "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
         ]
         for r in own:
@@ -60,10 +60,10 @@ def lines(results: Results, options: argparse.Namespace) -> list[str]:
     if cases:
         height, width = cases[0]["size"]
         text += [
-            f"Cases, {height} x {width} px, {cases[0]['trials']} takes each: largest error (root-mean-square), goal.",
+            f"Cases, {height} x {width} px, {cases[0]['trials']} trials each: largest error (root-mean-square), goal.",
             "",
             "| case | frames | noise | period (%) | goal | amplitude (%) | goal | phase (π) | goal | error / bound "
-            "| lost | extra tones | seconds |",
+            "| missed | extra tones | seconds |",
             "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
         ]
     for r in cases:
@@ -83,7 +83,7 @@ def lines(results: Results, options: argparse.Namespace) -> list[str]:
 
 
 def draw(results: Results, out: Path) -> None:
-    """Write a picture of root-mean-square errors and bounds over the noise for every motion."""
+    """Draw root-mean-square errors and bounds over the noise, one figure for every motion."""
     trials = [r for r in results if r["part"] == "monte carlo"]
     for number, motion in enumerate(dict.fromkeys(r["motion"] for r in trials)):
         own = sorted((r for r in trials if r["motion"] == motion), key=lambda r: r["noise"])

@@ -1,9 +1,9 @@
-"""Frames of a vibrating rolling-shutter camera, made without the package: NumPy, float64.
+"""Simulated frames of a vibrating rolling-shutter camera, independent of the package: NumPy, float64.
 
 The scene is a periodic, band-limited function. It is interpolated densely by Fourier transforms along both axes: a
 phase ramp along rows, and across rows zero padding to eight times as many, between which a polynomial of eight points
-is exact to 1e-6. An exposure is the mean over its moments, by Gauss-Legendre quadrature: evenly spread moments would
-have to be hundreds where it is long.
+is exact to 1e-6. The mean over an exposure is computed by Gauss-Legendre quadrature; equidistant times would require
+hundreds of samples for long exposures.
 """
 
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-FINER = 8  # rows interpolated for every row of the scene
-POINTS = 8  # of the polynomial between them
-MOMENTS = (8, 4.0)  # of an exposure, and more for every px that its fastest part could go
+FINER = 8  # interpolated rows per row of the scene
+POINTS = 8  # of the polynomial between interpolated rows
+MOMENTS = (8, 4.0)  # nodes of an exposure: minimum, and per px of the longest possible path
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,13 @@ class Shake:
         return self.amplitude.sum(1) + np.abs(self.image_motion) * duration
 
     def longest_path(self, duration: float) -> float:
-        """Bound on the path in px within a duration: at full speed, or from end to end of every period."""
+        """Upper bound of the path in px within a duration, from the largest speed or from the range of every period."""
         cycles = np.minimum(np.pi * self.frequency * duration, 2.0 + 4.0 * self.frequency * duration)
         return float((2 * self.amplitude * cycles).sum(1).max() + np.abs(self.image_motion).max() * duration)
 
 
 def closed(scene: Array, rim: int) -> Array:
-    """The scene faded to its mean over ``rim`` px at all borders, so that it closes to a period without a jump."""
+    """The scene faded to its mean over ``rim`` px at all borders, so that it is periodic without a discontinuity."""
     faded = scene - scene.mean()
     for axis, size in enumerate(scene.shape):
         place = np.minimum(np.arange(size) + 0.5, size - 0.5 - np.arange(size))
@@ -75,7 +75,7 @@ def polynomial_weights(fraction: Array) -> Array:
 
 
 def exposure_moments(shake: Shake, duration: float) -> tuple[Array, Array]:
-    """Moments of an exposure, parts of it, and their shares."""
+    """Quadrature nodes of an exposure, as fractions of it, and their weights."""
     least, for_a_px = MOMENTS
     nodes, weights = np.polynomial.legendre.leggauss(least + int(np.ceil(for_a_px * shake.longest_path(duration))))
     return 0.5 * (nodes + 1), 0.5 * weights
@@ -91,7 +91,7 @@ def take_frames(
     num_frames: int,
     size: tuple[int, int],
 ) -> Array:
-    """Frames (T, H, W) without noise, centred on a scene that closes to a period."""
+    """Frames (T, H, W) without noise, centred on a periodic scene."""
     rows = fine_rows(scene)
     top, left = ((whole - part) // 2 for whole, part in zip(scene.shape, size, strict=True))
     u = np.fft.rfftfreq(scene.shape[1])

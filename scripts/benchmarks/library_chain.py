@@ -1,8 +1,8 @@
-"""What the paper describes, with OpenCV, SciPy and NumPy alone: the peer of ``detect_vibration``, and kernels of rows.
+"""The paper's detection and its kernels of rows with OpenCV, SciPy and NumPy, for comparison with the package.
 
 Bands are registered by ``cv2.matchTemplate`` with a parabola, and the offsets of each axis are fitted by
 ``scipy.optimize.curve_fit`` with Eqs. (4), (6)-(8) of Liu et al. 2023: a sine of amplitude A, frequency f and phase φ
-seen through an exposure T_e and a frame period m T_row. It starts from the best of a grid of frequencies.
+averaged over an exposure T_e, between frames m T_row apart. The fit starts from the best frequency of a grid.
 """
 
 from collections.abc import Callable
@@ -17,9 +17,9 @@ import rsvib_torch as rsv
 
 BAND_ROWS, BAND_STEP = 32, 16
 _LEAST_BANDS = 8
-_LOWEST_GAIN = 0.2  # frequencies that a pair hardly sees start no fit
+_LOWEST_GAIN = 0.2  # smallest gain of a frequency of the grid
 _LARGEST = 32.0  # px of amplitude
-_OUTLIER = 0.1  # px: offsets that are further off count less and less
+_OUTLIER = 0.1  # px; scale of the robust loss
 _GRID_STEP = 0.25  # of the frequency resolution
 
 
@@ -57,7 +57,7 @@ def start_values(times: Array, offsets: Array, timing: rsv.SensorTiming) -> list
 
 
 def fit_axis(times: Array, offsets: Array, timing: rsv.SensorTiming) -> Array:
-    """Amplitude in px, frequency in Hz, phase in rad and motion in px/s of one axis; NaN where no fit was found."""
+    """Amplitude in px, frequency in Hz, phase in rad and motion in px/s of one axis; NaN if the fit failed."""
     known = np.isfinite(offsets)
     if known.sum() < _LEAST_BANDS:
         return np.full(4, np.nan)
@@ -77,7 +77,7 @@ def fit_axis(times: Array, offsets: Array, timing: rsv.SensorTiming) -> Array:
             f_scale=_OUTLIER,
             max_nfev=200,
         )
-    except RuntimeError:  # it does not converge
+    except RuntimeError:  # no convergence
         return np.array(start)
     return np.asarray(found, dtype=float)
 
@@ -88,18 +88,18 @@ def detect_by_libraries(frames: NDArray[np.float32], timing: rsv.SensorTiming) -
     offsets = by_match_template(frames, tops, BAND_ROWS)
     times = (np.array(tops) + 0.5 * (BAND_ROWS - 1)) * timing.row_time
     values = np.stack([fit_axis(times, offsets[:, axis], timing) for axis in range(2)], axis=1)
-    amplitude, frequency, phase, _ = torch.from_numpy(np.nan_to_num(values))  # the constant takes what is no vibration
+    amplitude, frequency, phase, _ = torch.from_numpy(np.nan_to_num(values))  # the constant models the image motion
     return rsv.Vibration(amplitude, frequency, phase)
 
 
 def kernel_of_row(vibration: rsv.Vibration, start: float, timing: rsv.SensorTiming, moved: int) -> Array:
-    """The kernel of a row whose exposure begins at ``start``, by bilinear splats of Eqs. (26)-(39), centred.
+    """The centred kernel of a row whose exposure begins at ``start``, by bilinear spreading (Eqs. 26-39).
 
     Args:
         vibration: One tone on either axis.
         start: Seconds.
         timing: The camera.
-        moved: Rows that the slab around the row is already moved by.
+        moved: Displacement of the slab around the row, in rows.
     """
     count = int(np.ceil(timing.exposure_rows))
     times = start + (np.arange(count) + 0.5) / count * timing.exposure_time

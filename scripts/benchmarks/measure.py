@@ -1,4 +1,4 @@
-"""How all benchmarks measure: pieces of work in turns, medians and spread, peak memory, and the machine."""
+"""Measurement for all benchmarks: alternating timed runs, medians and ranges, peak memory, and the machine."""
 
 import argparse
 import os
@@ -15,9 +15,8 @@ from typing import Any
 
 import torch
 
-# what a process has to be told before it starts: PyTorch to ask for huge pages, as NumPy does by itself; and glibc to
-# keep freed memory for the next call, that of all threads, which systems whose memory is lent to them take long to have
-# back
+# Environment variables that must be set before a process starts. PyTorch uses huge pages, as NumPy does by default.
+# glibc keeps freed memory of all threads for the next call; virtual machines may take long to provide memory again.
 HUGE_PAGES = "THP_MEM_ALLOC_ENABLE"
 KEPT = {
     "MALLOC_MMAP_THRESHOLD_": str(1 << 40),
@@ -38,10 +37,10 @@ _LIBRARIES = {
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """Timed runs of a piece of work.
+    """Timed runs of a task.
 
     Attributes:
-        result: What the work returned.
+        result: Return value of the task.
         runs: Seconds of each run.
     """
 
@@ -54,25 +53,25 @@ class Timed:
         return statistics.median(self.runs)
 
     def __add__(self, other: "Timed") -> "Timed":
-        """Both one after the other, turn by turn; the result is that of the latter."""
+        """Sum of the times of two tasks, run by run; the result is that of the second."""
         return Timed(other.result, tuple(a + b for a, b in zip(self.runs, other.runs, strict=True)))
 
     def scaled(self, factor: float) -> "Timed":
-        """As if it had been that many times as much work."""
+        """Times multiplied by a factor."""
         return Timed(self.result, tuple(factor * seconds for seconds in self.runs))
 
     def figures(self) -> dict[str, float]:
-        """Median, fastest and slowest run, for the results of a benchmark."""
+        """Median, shortest and longest time."""
         return {"seconds": self.seconds, "seconds_least": min(self.runs), "seconds_most": max(self.runs)}
 
 
 def shown_seconds(row: dict[str, Any]) -> str:
-    """Figures of ``Timed`` as a cell of a table."""
+    """Median and range of ``Timed.figures`` as a cell of a table."""
     return f"{row['seconds']:.3f} ({row['seconds_least']:.3f} to {row['seconds_most']:.3f})"
 
 
 def seconds_of(work: Callable[[], Any]) -> float:
-    """Seconds of one run; what a GPU has still to do counts."""
+    """Seconds of one run, including the pending work of a GPU."""
     _finish()
     begin = time.perf_counter()
     work()
@@ -81,14 +80,14 @@ def seconds_of(work: Callable[[], Any]) -> float:
 
 
 def _finish() -> None:
-    """Wait for a GPU, if one is at work."""
+    """Wait for a GPU, if it is used."""
     if torch.cuda.is_initialized():
         torch.cuda.synchronize()
 
 
 def in_turns(works: dict[str, Callable[[], Any]], runs: int) -> dict[str, Timed]:
-    """Timed runs of each piece of work, all taking turns so that a busy moment hits all alike."""
-    results = {name: work() for name, work in works.items()}  # warms up
+    """Timed runs of each task; the tasks alternate, so that other load on the machine affects all of them alike."""
+    results = {name: work() for name, work in works.items()}  # warm-up
     seconds: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(max(1, runs)):
         for name, work in works.items():
@@ -97,14 +96,14 @@ def in_turns(works: dict[str, Callable[[], Any]], runs: int) -> dict[str, Timed]
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options that all parts share."""
+    """Options of all sections."""
     there = devices()
     parser.add_argument(
         "--device",
         choices=there,
         nargs="+",
         default=there,
-        help="devices that the package is timed on; peers run on the CPU (default: all that are there)",
+        help="devices that the package is timed on; peers run on the CPU (default: all available)",
     )
 
 
@@ -114,12 +113,12 @@ def devices() -> list[str]:
 
 
 def named(name: str, device: str) -> str:
-    """A name for a piece of work on a device."""
+    """Name of a task on a device."""
     return name if device == "cpu" else f"{name} on {device}"
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were taken on."""
+    """Processor, devices, libraries and settings of this machine."""
     return {
         "cores": os.cpu_count() or 1,
         "threads": torch.get_num_threads(),
@@ -154,7 +153,7 @@ def _version(library: str) -> str | None:
 
 
 def plain_environment() -> dict[str, str]:
-    """The environment for processes whose memory is measured: freed memory goes where it went before."""
+    """Environment of processes whose memory is measured, without the settings that keep freed memory."""
     return {name: value for name, value in os.environ.items() if name not in KEPT}
 
 
@@ -196,14 +195,14 @@ print(peak - before)
 
 
 def peak_memory(work: str, num_frames: int, height: int, width: int, device: str = "cpu") -> float | None:
-    """Bytes that a piece of work adds at its peak, in a process of its own; None where the system does not tell.
+    """Peak of the additional memory of a task in bytes, measured in a separate process; None if it cannot be measured.
 
     Args:
         work: ``"detection"``, or a method of restoration.
         num_frames: Frames of the stack.
-        height: Their rows.
-        width: Their columns.
-        device: Where the frames are.
+        height: Rows of a frame.
+        width: Columns of a frame.
+        device: Device of the frames.
     """
     numbers = [str(number) for number in (num_frames, height, width)]
     command = [sys.executable, "-c", _MEMORY_PROBE, device, str(torch.get_num_threads()), work, *numbers]

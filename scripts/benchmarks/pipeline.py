@@ -1,10 +1,10 @@
-"""From a pair of frames to both restored: chains of libraries and the package side by side, accuracy and time.
+"""Detection and restoration of a pair of frames: accuracy and time of the package and of chains of other libraries.
 
 The paper's chain: bands by ``cv2.matchTemplate`` with a parabola, ``scipy.optimize.curve_fit`` of Eqs. (4), (6)-(8) of
 Liu et al. 2023, and ``skimage.restoration.wiener`` row by row (on some rows, its time scaled to all of them). The
-fastest chain that anyone could write: the same detection, and ``cv2.remap``. Nobody is told more than frames and
-camera, but for the balance of the Wiener filter, which is the best of several for the truth. Frames whose accuracy is
-compared come from a camera made without the package.
+fastest chain: the same detection, and ``cv2.remap``. All chains use only the frames and the timing of the camera,
+except that the balance of the Wiener filter has the highest PSNR of several values. Frames of the accuracy figures come
+from a camera made without the package.
 """
 
 import argparse
@@ -62,28 +62,28 @@ __all__ = ["add_options", "behind_libraries", "lines", "rows", "targets"]
 
 WIENER = "skimage wiener, row loop"
 TIMED_BALANCE = 0.01
-REGISTRATION = "ncc"  # of detect_vibration unless told otherwise
+REGISTRATION = "ncc"  # default of detect_vibration
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this part; scenes, exposures, noises and the width of the frames are those of restoration."""
+    """Options of this section; scenes, exposures, noises and the width of the frames are those of restoration."""
     parser.add_argument(
         "--pipeline-rows", type=int, default=2048, help="rows of the frames where chains are compared (default: 2048)"
     )
 
 
 def bands_chain(registration: str) -> str:
-    """The name of the chain of the package's fastest methods."""
+    """Name of the chain of the fastest methods of the package."""
     return f'"bands" by "{registration}", "dewarp"'
 
 
 def quarter(frames: Tensor) -> int:
-    """Columns that are enough where time counts."""
+    """Number of columns of the faster chains: a quarter, at least 96."""
     return max(96, frames.shape[-1] // 4)
 
 
 def camera(exposure: float, num_rows: int) -> rsv.SensorTiming:
-    """The paper's camera; with fewer rows they are slower, so that frame period and exposure stay what they are."""
+    """The paper's camera; fewer rows are slower, so that frame period and exposure time are unchanged."""
     slower = 2048 / num_rows
     return rsv.SensorTiming(row_time=20.52e-6 * slower, exposure_rows=exposure / slower, frame_rows=num_rows)
 
@@ -140,7 +140,7 @@ def compare_chains(
     for name, (vibration_of, restore) in chains.items():
         try:
             psnr = min(quality(figure, still) for figure in restore())
-        except ValueError:  # a row loop whose kernels are larger than its slabs: the detection was far off
+        except ValueError:  # kernels of a row loop are larger than its slabs, because the detection failed
             psnr = math.nan
         reliable = bool(found[name][0].reliable.all()) if name in found else None
         results.append({"chain": name, **errors_of(vibration_of), "psnr_db": psnr, "reliable": reliable})
@@ -189,7 +189,7 @@ def wiener_loop(
 
 
 def _of_libraries(frames: Tensor, timing: rsv.SensorTiming) -> dict[str, Callable[[], Any]]:
-    """Pieces of work of the libraries, on the CPU."""
+    """Tasks of the libraries, on the CPU."""
     array = frames.numpy()
     found = detect_by_libraries(array, timing)
     rows = sampled_rows(frames.shape[-2], RIM)
@@ -201,7 +201,7 @@ def _of_libraries(frames: Tensor, timing: rsv.SensorTiming) -> dict[str, Callabl
 
 
 def _of_the_package(frames: Tensor, timing: rsv.SensorTiming, registrations: list[str]) -> dict[str, Callable[[], Any]]:
-    """Pieces of work of the package, where the frames are."""
+    """Tasks of the package, on the device of the frames."""
     found = rsv.detect_vibration(frames, timing).vibration
     works: dict[str, Callable[[], Any]] = {
         "round trip": lambda: fft_round_trip(frames[0]),
@@ -219,7 +219,7 @@ def _of_the_package(frames: Tensor, timing: rsv.SensorTiming, registrations: lis
 def speed(
     options: argparse.Namespace, frames: Tensor, timing: rsv.SensorTiming, registrations: list[str]
 ) -> list[dict[str, Any]]:
-    """Seconds of every chain, of its two halves, and these in FFT round trips of one frame."""
+    """Seconds of every chain, of detection and of restoration, also in FFT round trips of one frame."""
     results = []
     for device in options.device:
         taken = frames.to(device)
@@ -260,7 +260,7 @@ def _figures(detection: Timed, restoration: Timed, round_trip: Timed) -> dict[st
 
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Accuracy of all chains, their time, and what is met of what is aimed at."""
+    """Accuracy and time of all chains, and the targets."""
     size, timing = options.size, camera(20, options.size)
     scene = SCENES["city"](size + 2 * MARGIN, size + 2 * MARGIN, SEED)
     noise, generator = rsv.SensorNoise(read_noise=TIMED_NOISE), torch.Generator().manual_seed(SEED)

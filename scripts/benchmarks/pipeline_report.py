@@ -1,4 +1,4 @@
-"""What the comparison of whole chains comes to: targets met and missed, losses, tables."""
+"""Tables of the comparison of chains: accuracy, time, targets, and cases in which other libraries are better."""
 
 import argparse
 import math
@@ -13,7 +13,10 @@ NARROW_DEWARP = 'detect_vibration on a quarter of the columns, "dewarp"'
 NARROW_BANDS = '"bands" on a quarter of the columns, "dewarp"'
 NAMES = {"amplitude_percent": "amplitude", "period_percent": "period", "psnr_db": "PSNR"}
 FIGURES = tuple(NAMES)
-CAMERA_RATE, GOAL_RATE = 24.0, 100.0  # frames a second: the paper's camera, and what a large GPU should restore
+CAMERA_RATE, GOAL_RATE = (
+    24.0,
+    100.0,
+)  # frames per second: of the paper's camera, and the goal for restoration on a large GPU
 
 
 def _target(target: str, value: float, goal: float, *, at_least: bool = False) -> dict[str, Any]:
@@ -23,7 +26,7 @@ def _target(target: str, value: float, goal: float, *, at_least: bool = False) -
 
 
 def targets(compared: list[dict[str, Any]], timed: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What is aimed at, and whether it is met."""
+    """Targets, and whether they are met."""
     speed_of = {row["chain"]: row for row in timed}
     found = []
     if OURS in speed_of:
@@ -49,9 +52,12 @@ def targets(compared: list[dict[str, Any]], timed: list[dict[str, Any]]) -> list
         restored = on_gpu["frames_restored_a_second"]
         found += [
             _target(
-                "frames a second on cuda, detected and restored", on_gpu["frames_a_second"], CAMERA_RATE, at_least=True
+                "frames per second on cuda, detected and restored",
+                on_gpu["frames_a_second"],
+                CAMERA_RATE,
+                at_least=True,
             ),
-            _target("frames restored a second on cuda", restored, GOAL_RATE, at_least=True),
+            _target("frames restored per second on cuda", restored, GOAL_RATE, at_least=True),
         ]
     for chain in (OURS, NARROW):
         behind = behind_libraries(compared, chain)
@@ -63,7 +69,7 @@ def targets(compared: list[dict[str, Any]], timed: list[dict[str, Any]]) -> list
 
 
 def behind_libraries(compared: list[dict[str, Any]], chain: str) -> list[dict[str, Any]]:
-    """Where the better chain of libraries is more accurate than ``chain``: case, figure, by whom and both values."""
+    """Cases in which the better chain of libraries is more accurate: case, figure, peer and both values."""
     cases: dict[tuple[Any, ...], dict[str, dict[str, Any]]] = {}
     for row in compared:
         cases.setdefault((row["scene"], row["exposure_rows"], row["noise"]), {})[row["chain"]] = row
@@ -85,9 +91,9 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
     """The figures as Markdown tables."""
     of_part = {part: [r for r in results if r["part"] == part] for part in ("accuracy", "speed", "target")}
     text = [
-        f"From a pair of frames to both restored, {options.pipeline_rows} x {options.grid_size} px. Errors of "
-        "amplitude and period in % on the worse axis, PSNR in dB of the worse frame. The row loop is run on some rows, "
-        "and its time, with that of making its kernels by NumPy, scaled to all.",
+        f"Detection and restoration of a pair of frames, {options.pipeline_rows} x {options.grid_size} px. Errors of "
+        "amplitude and period in % on the worse axis, PSNR in dB of the worse frame. The row loop processes "
+        "a sample of the rows; its time, with that of computing its kernels by NumPy, is scaled to all rows.",
     ]
     chains = list(dict.fromkeys(row["chain"] for row in of_part["accuracy"]))
     for scene, exposure in dict.fromkeys((r["scene"], r["exposure_rows"]) for r in of_part["accuracy"]):
@@ -104,7 +110,7 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
     text += [
         "",
         f"| a pair of {options.size} x {options.size} px | seconds | detection | restoration "
-        "| FFT round trips: detection | restoration a frame | frames a second |",
+        "| FFT round trips: detection | restoration per frame | frames per second |",
         "|---|---|---|---|---|---|---|",
     ]
     for r in of_part["speed"]:
@@ -114,9 +120,9 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         )
     text += [
         "",
-        f"Medians of {options.runs} runs in turns (fastest to slowest).",
+        f"Medians of {options.runs} alternating runs (range).",
         "",
-        "| target | goal | found | |",
+        "| target | goal | measured | |",
         "|---|---|---|---|",
     ]
     text += [
@@ -124,20 +130,22 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         for r in of_part["target"]
     ]
     if not any(r["chain"].endswith("on cuda") for r in of_part["speed"]):
-        text += ["", "Frames a second on a GPU: not measured, there is none here or it was left out."]
+        text += ["", "Frames per second on a GPU: not measured."]
     unsure = [row for row in of_part["accuracy"] if row["chain"] == OURS and not row["reliable"]]
-    text += ["", f"Cases whose detection says of itself that it is not reliable: {len(unsure)}."]
+    text += ["", f"Cases in which the detection is not reliable according to its own verdict: {len(unsure)}."]
     return [*text, "", *_losses(of_part["accuracy"], chains)]
 
 
 def _losses(compared: list[dict[str, Any]], chains: list[str]) -> list[str]:
-    """Where chains of the package are behind those of libraries: each case of the default, numbers of the others."""
+    """Cases in which chains of libraries are better: listed for the default chain, counted for the others."""
     text = []
     for chain in (chain for chain in chains if chain not in (PAPER, FASTEST)):
         behind = behind_libraries(compared, chain)
         cases = len({(row["scene"], row["exposure_rows"], row["noise"]) for row in compared})
         counts = ", ".join(f"{NAMES[name]} {sum(row['figure'] == name for row in behind)}" for name in FIGURES)
-        text.append(f"- {chain} is behind a chain of libraries in so many of {cases} cases: {counts}.")
+        text.append(
+            f"- {chain} is less accurate than a chain of libraries in these numbers of {cases} cases: {counts}."
+        )
         for row in behind if chain == OURS else ():
             scene, exposure, noise = row["case"]
             text.append(

@@ -1,7 +1,7 @@
 """Restoration by CGLS on ``pylops.signalprocessing.NonStationaryConvolve2D``: a Lanczos-4 kernel for every 8 rows.
 
-That operator lets the pixel that gives choose the kernel. Here the row that receives does, so its adjoint, with
-flipped kernels, forms the frame.
+In that operator the source pixel selects the kernel. Here the output row does, so its adjoint, with flipped kernels,
+forms the frame.
 """
 
 import math
@@ -19,7 +19,7 @@ from torch import Tensor
 import rsvib_torch as rsv
 
 ROWS_PER_KERNEL = 8
-ITERATIONS, PATIENCE = 40, 4  # at most, and without a better result
+ITERATIONS, PATIENCE = 40, 4  # largest number, and number without a better result
 DAMPINGS = (1e-3, 1e-2, 5e-2, 0.15, 0.4)
 
 
@@ -39,13 +39,13 @@ def frame_operator(
 
 
 def cgls_restore(frame: np.ndarray, timing: rsv.SensorTiming, truth: rsv.Vibration, still: Tensor, rim: int) -> Peer:
-    """Restore a frame; damping and number of iterations are the best for the truth, compiling is not counted."""
+    """Restore a frame with the damping and number of iterations of the highest PSNR; compilation is not timed."""
     operator = frame_operator(frame.shape, timing, truth)
     mean = float(frame.mean())
     data = (frame - mean).astype(np.float32).ravel()
     operator.H @ (operator @ data)
     truth_inside = still.numpy()[rim:-rim, rim:-rim]
-    best, told, error, seconds = frame, "", math.inf, 0.0
+    best, setting, error, seconds = frame, "", math.inf, 0.0
     for damping in DAMPINGS:
         solver, spent, since_best = CGLS(operator), 0.0, 0
         begin = time.perf_counter()
@@ -58,6 +58,6 @@ def cgls_restore(frame: np.ndarray, timing: rsv.SensorTiming, truth: rsv.Vibrati
             since_best += 1
             if wrong < error:
                 best, error, seconds, since_best = restored, wrong, spent, 0
-                told = f"damping {damping:g}, {solver.iiter} iterations"
+                setting = f"damping {damping:g}, {solver.iiter} iterations"
             begin = time.perf_counter()
-    return Peer(torch.from_numpy(best), seconds, told)
+    return Peer(torch.from_numpy(best), seconds, setting)

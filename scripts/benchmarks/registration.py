@@ -1,4 +1,4 @@
-"""Registration: all bands of a pair of frames, against OpenCV and scikit-image band by band."""
+"""Registration of all bands of a pair of frames, compared with OpenCV and scikit-image band by band."""
 
 import argparse
 import math
@@ -34,18 +34,18 @@ def true_offsets(rows: Tensor, height: int, timing: rsv.SensorTiming, truth: rsv
 def _accuracy(
     offsets: Tensor, heights: tuple[int, int], tops: list[int], timing: rsv.SensorTiming, truth: rsv.Vibration
 ) -> dict[str, Any]:
-    """Root-mean-square error of the bands that are near the truth, and the share of the others."""
+    """Root-mean-square error of the bands within ``OUTLIER`` of the truth, and the fraction of the others."""
     rows = torch.tensor(tops, dtype=torch.float64) + 0.5 * (BAND_ROWS - 1)
     wanted = torch.stack([true_offsets(rows, h, timing, truth)[:, a] for a, h in enumerate(heights)], dim=-1)
     error = (offsets - wanted).abs()
-    off = ~(error < OUTLIER).all(-1)  # NaN, a band given up, counts as off
+    off = ~(error < OUTLIER).all(-1)  # includes NaN, a failed band
     return {"rms_px": error[~off].square().mean(0).sqrt().tolist(), "share_off": off.double().mean().item()}
 
 
 def benchmark_registration(
     frames: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration, options: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    """Time and error of each way to register all bands of the pair."""
+    """Time and error of each method for all bands of the pair."""
     band = {"band_rows": BAND_ROWS, "band_step": BAND_STEP}
     array = frames.numpy()
     tops = list(range(0, frames.shape[-2] - BAND_ROWS + 1, BAND_STEP))
@@ -65,12 +65,12 @@ def benchmark_registration(
 
 
 def with_ratios(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The results, each with how many times faster it is than the loop of skimage, which is the last one."""
+    """The results with their speed relative to the loop of skimage, which is the last one."""
     return [{**result, "ratio": results[-1]["seconds"] / result["seconds"]} for result in results]
 
 
 def fastest_method(frames: Tensor, timing: rsv.SensorTiming, runs: int) -> tuple[str, dict[str, Timed]]:
-    """The registration of the package that takes the least time here, and the times of all."""
+    """The fastest registration method of the package, and the times of all."""
     works = {m: lambda m=m: rsv.register_bands(frames, timing, method=m) for m in METHODS}
     done = in_turns(works, runs)
     return min(done, key=lambda method: done[method].seconds), done
@@ -93,9 +93,9 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
     bands = (options.size - BAND_ROWS) // BAND_STEP + 1
     lines = [
         f"Registration: {options.size} x {options.size} px, noise {100 * NOISE:g} % of full scale. Seconds are medians "
-        f"of {options.runs} runs in turns (fastest to slowest).",
+        f"of {options.runs} alternating runs (range).",
         "",
-        f"| registration of {bands} bands | seconds | skimage loop / this | rms x, y (px) | given up or off "
+        f"| registration of {bands} bands | seconds | skimage loop / this | rms x, y (px) | failed or error "
         f"> {OUTLIER} px |",
         "|---|---|---|---|---|",
     ]

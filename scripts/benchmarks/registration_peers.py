@@ -1,6 +1,6 @@
-"""Registration of row bands by what OpenCV and scikit-image have, one band after another.
+"""Registration of row bands with OpenCV and scikit-image, one band after another.
 
-Offsets are (x, y) in px, the displacement in the later frame less that in the earlier one; NaN where a peer gave up.
+Offsets are (x, y) in px, the displacement in the later frame minus that in the earlier one; NaN for a failed band.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,30 +14,30 @@ Array = NDArray[np.float64]
 
 SEARCH = 16  # px
 _ECC_STEPS, _ECC_CHANGE = 50, 1e-4
-_ECC_SMOOTHING = 5  # px, the filter that findTransformECC smooths with unless told otherwise
+_ECC_SMOOTHING = 5  # px; default size of the smoothing filter of findTransformECC
 
 
 def by_skimage(frames: NDArray[np.float32], tops: Sequence[int], band_rows: int) -> Array:
-    """Phase correlation; skimage gives (y, x) of the way back."""
+    """Phase correlation; skimage returns the reverse displacement (y, x)."""
     shifts = [phase_cross_correlation(*frames[:, top : top + band_rows], upsample_factor=100)[0][::-1] for top in tops]
     return -np.stack(shifts)
 
 
 def by_phase_correlate(frames: NDArray[np.float32], tops: Sequence[int], band_rows: int) -> Array:
-    """``cv2.phaseCorrelate`` under a Hann window; it gets copies, as it may overwrite what it is given."""
+    """``cv2.phaseCorrelate`` with a Hann window, on copies, because it may overwrite its inputs."""
     window = cv2.createHanningWindow((frames.shape[-1], band_rows), cv2.CV_32F)
     bands = [frames[:, top : top + band_rows].copy() for top in tops]
     return np.array([cv2.phaseCorrelate(*band, window)[0] for band in bands])
 
 
 def _between(before: float, at: float, after: float) -> float:
-    """Where between -1/2 and 1/2 the parabola through three values has its peak."""
+    """Position of the maximum of the parabola through three values, between -1/2 and 1/2."""
     bend = before - 2.0 * at + after
     return 0.5 * (before - after) / bend if bend < 0 else 0.0
 
 
 def _window(frames: NDArray[np.float32], top: int, band_rows: int) -> tuple[NDArray[np.float32], int]:
-    """The part of the later frame that a band may be found in, and its first row."""
+    """The part of the later frame in which a band is searched for, and its first row."""
     first = max(0, top - SEARCH)
     return frames[1, first : top + band_rows + SEARCH], first
 
@@ -54,7 +54,7 @@ def by_match_template(frames: NDArray[np.float32], tops: Sequence[int], band_row
         score = cv2.matchTemplate(window, _template(frames, top, band_rows), cv2.TM_CCOEFF_NORMED)
         y, x = np.unravel_index(int(score.argmax()), score.shape)
         if not (0 < x < score.shape[1] - 1 and 0 < y < score.shape[0] - 1):
-            offsets.append((np.nan, np.nan))  # the peak may lie further off
+            offsets.append((np.nan, np.nan))  # the maximum may be outside
             continue
         fine_x = _between(*score[y, x - 1 : x + 2].tolist())
         fine_y = _between(*score[y - 1 : y + 2, x].tolist())
@@ -63,7 +63,7 @@ def by_match_template(frames: NDArray[np.float32], tops: Sequence[int], band_row
 
 
 def by_ecc(frames: NDArray[np.float32], tops: Sequence[int], band_rows: int) -> Array:
-    """``cv2.findTransformECC`` (translation), started from ``cv2.matchTemplate``: from 0 it stays where it is."""
+    """``cv2.findTransformECC`` (translation), started from ``cv2.matchTemplate``; it does not converge from 0."""
     enough = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ECC_STEPS, _ECC_CHANGE)
     offsets = by_match_template(frames, tops, band_rows)
     for found, top in zip(offsets, tops, strict=True):
@@ -73,7 +73,7 @@ def by_ecc(frames: NDArray[np.float32], tops: Sequence[int], band_rows: int) -> 
         template = _template(frames, top, band_rows)
         try:
             warp = cv2.findTransformECC(template, window, warp, cv2.MOTION_TRANSLATION, enough, None, _ECC_SMOOTHING)[1]
-        except cv2.error:  # it says so when it does not converge
+        except cv2.error:  # no convergence
             found[:] = np.nan
             continue
         found[:] = warp[0, 2] - SEARCH, warp[1, 2] - (top - first)

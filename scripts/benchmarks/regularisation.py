@@ -1,4 +1,4 @@
-"""Regularisation estimated from the data, compared with the best factor on it, over scenes, noise and exposures.
+"""Regularisation estimated from the data, compared with the best factor, over scenes, noise and exposures.
 
 Every scene is restored with the regularisation estimated from the frames, and with that multiplied by several factors,
 the best of which is chosen by comparison with the true scene. Frames come from a camera made without the package.

@@ -1,10 +1,10 @@
-"""Restoration next to its peers: quality over scenes, exposures and noise, speed in FFT round trips, memory.
+"""Restoration compared with other software: quality over scenes, exposures and noise, speed, memory.
 
 Peers: unwarping by ``cv2.remap`` (Lanczos-4), loops of ``skimage.restoration.wiener`` and ``richardson_lucy`` over the
 rows, CGLS on ``pylops.signalprocessing.NonStationaryConvolve2D`` where pylops is installed (extra ``compare``), and
-``deepinv.physics.TiledSpaceVaryingBlur`` with its solver of least squares where deepinv can be imported. What a peer
-has to be told (balance, damping, iterations) is the best of several for the truth; ours chooses for itself. Frames come
-from a camera made without the package.
+``deepinv.physics.TiledSpaceVaryingBlur`` with its least-squares solver where deepinv can be imported. Parameters of
+peers (balance, damping, iterations) have the highest PSNR of several values; the package estimates its own from the
+frames. Frames come from a camera made without the package.
 """
 
 import argparse
@@ -25,7 +25,7 @@ import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields, resolution_chart
 from rsvib_torch.restoration.restore import METHODS
 
-LEFT_OUT: dict[str, str] = {}  # peers that cannot be had here, and why
+LEFT_OUT: dict[str, str] = {}  # peers that are not available, with the reason
 try:
     from benchmarks.pylops_peer import cgls_restore
 except ImportError as missing:  # pylops or numba is not installed
@@ -49,16 +49,16 @@ SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this part."""
+    """Options of this section."""
     parser.add_argument(
         "--grid-size", type=int, default=512, help="frame side where quality is compared (default: 512)"
     )
     parser.add_argument("--exposures", type=int, nargs="+", default=EXPOSURES, help="exposures in row times")
     parser.add_argument("--noises", type=float, nargs="+", default=NOISES, help="noise levels of full scale")
     parser.add_argument("--scenes", choices=SCENES, nargs="*", default=list(SCENES), help="drawn scenes to compare on")
-    parser.add_argument("--images", type=Path, nargs="*", default=[], help="images to compare on as well")
-    parser.add_argument("--no-pylops", action="store_true", help="leave pylops out: it takes minutes")
-    parser.add_argument("--no-deepinv", action="store_true", help="leave deepinv out: it takes minutes")
+    parser.add_argument("--images", type=Path, nargs="*", default=[], help="image files as further scenes")
+    parser.add_argument("--no-pylops", action="store_true", help="without pylops, which takes minutes")
+    parser.add_argument("--no-deepinv", action="store_true", help="without deepinv, which takes minutes")
 
 
 def camera(exposure_rows: int) -> rsv.SensorTiming:
@@ -67,14 +67,14 @@ def camera(exposure_rows: int) -> rsv.SensorTiming:
 
 
 def vibration() -> rsv.Vibration:
-    """The paper's vibration, with phases of its own."""
+    """The paper's vibration with random phases."""
     generator = torch.Generator().manual_seed(SEED)
     phase = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1) * math.pi
     return rsv.Vibration(AMPLITUDE, FREQUENCY, phase)
 
 
 def read_picture(path: Path) -> Tensor:
-    """A grey picture (H, W) whose values fill the range from 0.05 to 0.95, whatever its counts are."""
+    """A grey image (H, W), scaled so that its values cover 0.05 to 0.95."""
     info = rsv.read_stack_info(path)
     largest = np.iinfo(info.dtype).max if info.is_integer and info.full_scale is None else None
     image = rsv.read_stack(path, full_scale=largest)[0]
@@ -84,20 +84,20 @@ def read_picture(path: Path) -> Tensor:
 
 
 def scenes(options: argparse.Namespace) -> dict[str, Tensor]:
-    """Scenes to compare on, a margin larger than the frames."""
+    """Scenes of the comparison, larger than the frames by a margin."""
     size = options.grid_size + 2 * MARGIN
     found = {name: SCENES[name](size, size, SEED) for name in options.scenes}
     for path in options.images:
         image = read_picture(path)
         if min(image.shape) < size:
-            raise SystemExit(f"{path}: at least {size} x {size} px are needed, got {tuple(image.shape)}")
+            raise SystemExit(f"{path}: at least {size} x {size} px required, got {tuple(image.shape)}")
         top, left = ((side - size) // 2 for side in image.shape)
         found[path.stem] = image[top : top + size, left : left + size].contiguous()
     return found
 
 
 def quality(figure: Peer, still: Tensor) -> float:
-    """PSNR in dB without the rim."""
+    """PSNR in dB without the border."""
     rows = list(range(RIM, len(still) - RIM)) if figure.rows is None else figure.rows
     restored = figure.restored[RIM:-RIM] if figure.rows is None else figure.restored
     return float(rsv.psnr(restored[:, RIM:-RIM], still[rows, RIM:-RIM], 1.0))
@@ -112,9 +112,9 @@ def methods(
     *,
     timed: bool,
 ) -> dict[str, Callable[[], Peer]]:
-    """Every way to restore the first frame; ours take nothing but frames, camera and vibration.
+    """Every method that restores the first frame; those of the package use only frames, timing and vibration.
 
-    Where they are timed, they are run once before, as the peers warm up.
+    Timed methods are run once before, as warm-up.
     """
 
     def ours(number: int = 1, **chosen: Any) -> Callable[[], Peer]:
@@ -166,27 +166,34 @@ def compare(name: str, scene: Tensor, exposure: int, options: argparse.Namespace
         timed = noise == timed_noise(options)
         figures |= {name: run() for name, run in methods(frames, timing, truth, still, options, timed=timed).items()}
         for method, figure in figures.items():
-            row = {"scene": name, "exposure_rows": exposure, "method": method, "psnr_db": {}, "seconds": {}, "told": {}}
+            row = {
+                "scene": name,
+                "exposure_rows": exposure,
+                "method": method,
+                "psnr_db": {},
+                "seconds": {},
+                "setting": {},
+            }
             row = results.setdefault(method, row)
             row["psnr_db"][str(noise)] = quality(figure, still)
             row["seconds"][str(noise)] = figure.seconds
-            row["told"][str(noise)] = figure.told
+            row["setting"][str(noise)] = figure.setting
     return list(results.values())
 
 
 def timed_noise(options: argparse.Namespace) -> float:
-    """Noise at which seconds are shown."""
+    """Noise level of the timed runs."""
     return TIMED_NOISE if TIMED_NOISE in options.noises else float(options.noises[0])
 
 
 def fft_round_trip(frame: Tensor) -> Tensor:
-    """The unit of time: there and back by ``torch.fft`` in float32."""
+    """The unit of time: forward and inverse ``torch.fft`` in float32."""
     image: Tensor = torch.fft.irfft2(torch.fft.rfft2(frame), s=frame.shape)
     return image
 
 
 def speed(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Seconds, FFT round trips and peak memory of our methods on one large frame."""
+    """Seconds, FFT round trips and peak memory of the methods of the package for one large frame."""
     size = options.size
     timing, truth = camera(20), vibration()
     scene = city_and_fields(size + 2 * MARGIN, size + 2 * MARGIN, SEED)
@@ -236,8 +243,8 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
     noises = [str(noise) for noise in options.noises]
     timed = str(timed_noise(options))
     text = [
-        f"PSNR in dB without a rim of {RIM} px, frames of {options.grid_size} x {options.grid_size} px, true vibration "
-        f"given; seconds at noise {timed}. Peers are told the best setting for the truth.",
+        f"PSNR in dB without a border of {RIM} px, frames of {options.grid_size} x {options.grid_size} px, true "
+        f"vibration given; seconds at noise {timed}. Peers use the setting with the highest PSNR.",
     ]
     for scene, exposure in dict.fromkeys((row["scene"], row["exposure_rows"]) for row in compared):
         text += [
@@ -261,10 +268,10 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         text.append(f"| {row['method']} | {shown_seconds(row)} | {row['round_trips']:.1f} | {shown} |")
     text += [
         "",
-        "The best of each column has a star. The row loops of skimage are run on some rows only: their time is scaled "
-        f"to all of them, their PSNR is that of those rows. Speed: medians of {options.runs} runs in turns (fastest to "
-        "slowest); memory over that of the frame in complex64.",
+        "The best value of each column has a star. The row loops of skimage process a sample of the rows: their time "
+        f"is scaled to all rows, their PSNR is that of the sample. Speed: medians of {options.runs} alternating runs "
+        "(range); memory relative to the frame in complex64.",
     ]
     for row in (row for row in results if row["part"] == "left out"):
-        text.append(f"Not compared with {row['peer']}, which cannot be imported here: {row['why'].splitlines()[0]}.")
+        text.append(f"Not compared with {row['peer']}, which cannot be imported: {row['why'].splitlines()[0]}.")
     return text

@@ -1,4 +1,4 @@
-"""What others would do: unwarping with OpenCV, and deconvolution by scikit-image row by row."""
+"""Restoration with other software: unwarping with OpenCV, and deconvolution with scikit-image row by row."""
 
 import math
 import time
@@ -23,32 +23,32 @@ ITERATIONS = (5, 20, 60)  # of skimage.restoration.richardson_lucy
 
 @dataclass(frozen=True, eq=False)
 class Peer:
-    """What a method made of a frame.
+    """Result of a method for one frame.
 
     Attributes:
         restored: (H, W), or only some rows of it.
-        seconds: For the whole frame.
-        told: What was chosen for the truth.
-        rows: Which rows; None for all.
+        seconds: Time for the whole frame.
+        setting: Parameters with the highest PSNR.
+        rows: The restored rows; None for all.
     """
 
     restored: Tensor
     seconds: float
-    told: str
+    setting: str
     rows: list[int] | None = None
 
 
 def rows_and_displacements(
     scene_rows: Tensor, timing: rsv.SensorTiming, truth: rsv.Vibration, index: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """Rows of frame ``index`` that show rows of the scene, and their mean displacements (N, 2)."""
+    """Rows of frame ``index`` in which rows of the scene appear, and their mean displacements (N, 2)."""
     start = timing.frame_starts(index + 1)[index]
     shown_by = rows_showing(scene_rows.double(), start, timing, truth)
     return shown_by, truth.mean_displacement(start + shown_by * timing.row_time, timing.exposure_time)
 
 
 def remap_lanczos(frame: np.ndarray, timing: rsv.SensorTiming, truth: rsv.Vibration, index: int = 0) -> Peer:
-    """Every pixel fetched from where its row's mean displacement put it, by Lanczos-4."""
+    """Unwarp with the mean displacement of every row, by Lanczos-4."""
     begin = time.perf_counter()
     height, width = frame.shape
     shown_by, mean = rows_and_displacements(torch.arange(height), timing, truth, index)
@@ -69,7 +69,7 @@ def slab_kernels(
     kernels, (left, top) = psf.dense()
     padded = []
     for kernel, moved in zip(kernels, (middles - scene_rows).tolist(), strict=True):
-        # centred on displacement (0, moved): the slab already follows its middle row
+        # centred on displacement (0, moved), because the slab follows its middle row
         height, width = kernel.shape
         y, x = top - moved, left
         half = max(abs(y), abs(y + height - 1)), max(abs(x), abs(x + width - 1))
@@ -88,7 +88,7 @@ def lanczos(place: np.ndarray) -> np.ndarray:
 
 
 def row_kernels(rows: np.ndarray, timing: rsv.SensorTiming, truth: rsv.Vibration, dtype: str) -> np.ndarray:
-    """Kernels (N, KH, KW) of frame rows, centred: how far content moved during their exposures."""
+    """Centred kernels (N, KH, KW) of frame rows: the motion during their exposures."""
     times = torch.from_numpy(rows * timing.row_time)[:, None] + timing.exposure_time * (
         (torch.arange(SAMPLES, dtype=torch.float64) + 0.5) / SAMPLES
     )
@@ -116,25 +116,25 @@ def restore_rows(
 
 
 def sampled_rows(height: int, rim: int, count: int = SAMPLED_ROWS) -> Tensor:
-    """Rows of a frame drawn at random, so far inside that a slab fits around each."""
+    """Random rows of a frame whose slabs are inside the frame."""
     safe = rim + HALF_ROWS
     generator = torch.Generator().manual_seed(0)
     return (torch.randperm(height - 2 * safe, generator=generator)[:count] + safe).sort().values
 
 
 def by_wiener(balance: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """``skimage.restoration.wiener`` with that balance."""
+    """``skimage.restoration.wiener`` with a balance."""
     return lambda slab, kernel: wiener(slab, kernel, balance, clip=False)
 
 
 def by_richardson_lucy(iterations: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """``skimage.restoration.richardson_lucy`` with that many iterations."""
+    """``skimage.restoration.richardson_lucy`` with a number of iterations."""
     return lambda slab, kernel: richardson_lucy(slab, kernel, iterations, clip=False, filter_epsilon=1e-6)
 
 
 @dataclass(frozen=True, eq=False)
 class _Loop:
-    """A loop over sampled rows of a frame, with several settings to choose from."""
+    """A loop over sampled rows of a frame, with several settings."""
 
     settings: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]]
     count: int
@@ -159,18 +159,18 @@ def loop_rows(
     rim: int,
     index: int = 0,
 ) -> Peer:
-    """Rows drawn at random and restored one by one, with the setting that is best for the truth."""
+    """Random rows restored one by one, with the setting of the highest PSNR."""
     height = frame.shape[0]
     sampled = sampled_rows(height, rim, LOOPS[name].count)
     middles, kernels = slab_kernels(sampled, timing, truth, index)
     best, error = None, math.inf
-    for told, deconvolve in LOOPS[name].settings.items():
+    for setting, deconvolve in LOOPS[name].settings.items():
         begin = time.perf_counter()
         found = torch.from_numpy(restore_rows(frame, middles, kernels, deconvolve))
         seconds = (time.perf_counter() - begin) * height / len(sampled)
         wrong = float((found - still[sampled])[:, rim:-rim].square().mean())
         if wrong < error:
-            best, error = Peer(found, seconds, told, sampled.tolist()), wrong
+            best, error = Peer(found, seconds, setting, sampled.tolist()), wrong
     if best is None:
         raise ValueError(f"{name}: no setting gives finite values")
     return best

@@ -1,9 +1,9 @@
-"""Roofline of the exact restoration: bytes and operations of one frame against what the device copies and multiplies.
+"""Roofline of the exact restoration: memory traffic and operations of one frame, compared with the rates of the device.
 
-Counted from the shapes of its steps, complex64. "Least" is what a step has to read and write if it keeps to itself what
-is in between; "moved" is what its tensor operations read and write one by one, caches or not. A complex product and sum
-is eight operations, a real Fourier transform of L values 2.5 L log2 L. Estimates of noise and prior are not counted,
-but they are in the measured time; so is what overlapping segments of rows do twice on a GPU.
+Counted from the shapes of the steps, complex64. "Least" is the input and output of a step without its intermediate
+values; "moved" is the input and output of each of its tensor operations, without regard to caches. A complex product
+and sum is eight operations, a real Fourier transform of L values 2.5 L log2 L. The estimation of noise and prior is not
+counted, but it is part of the measured time; so is the repeated work of overlapping segments of rows on a GPU.
 """
 
 import argparse
@@ -36,14 +36,14 @@ class Shapes:
     Attributes:
         rows: H.
         columns: W.
-        length: Period that rows are continued to.
-        frequencies: Along a row; one system each.
+        length: Period of the extended rows.
+        frequencies: Frequencies along a row; one system each.
         unknowns: Scene rows in a system.
-        taps: Scene rows that a row of the frame sees.
+        taps: Scene rows that contribute to a row of the frame.
         width: Half-width of the band.
-        kernel_terms: Terms that kernels are put together from at each frequency.
-        band_terms: Terms that entries of the band are put together from.
-        chunks: Parts that the frequencies are solved in.
+        kernel_terms: Terms of the sum that forms the kernels at each frequency.
+        band_terms: Terms of the sum that forms the entries of the band.
+        chunks: Groups of frequencies that are solved together.
     """
 
     rows: int
@@ -123,7 +123,7 @@ def steps(s: Shapes) -> list[dict[str, Any]]:
 
 
 def _device(options: argparse.Namespace, device: str, frame: torch.Tensor, timing: rsv.SensorTiming) -> dict[str, Any]:
-    """What the device copies and multiplies a second, and how long restoration takes on it, in the same run."""
+    """Rates of copying and of multiplication of a device, and the time of restoration, in the same run."""
     source = torch.ones(COPIED // REAL, device=device)
     target, taken = torch.empty_like(source), frame.to(device)
     left, right = torch.ones(2, MULTIPLIED, MULTIPLIED, device=device)
@@ -156,7 +156,7 @@ def _device(options: argparse.Namespace, device: str, frame: torch.Tensor, timin
 
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """The count, and every device that is there."""
+    """The counts, and the measurement on every device."""
     size, timing, truth = options.size, camera(20), vibration()
     if size > timing.frame_rows:
         timing = rsv.SensorTiming(timing.row_time, timing.exposure_rows, size)
@@ -168,7 +168,7 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
-    """The count and the devices as Markdown tables."""
+    """The counts and the measurements as Markdown tables."""
     counted = [row for row in results if row["part"] == "step"]
     on_devices = [row for row in results if row["part"] == "device"]
     shapes = on_devices[0]["shapes"]
@@ -179,8 +179,8 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         f'Roofline of restore(method="exact"), one frame of {options.size} x {options.size} px: '
         f"{shapes['frequencies']} systems of {shapes['unknowns']} unknowns, "
         f"half-width of the band {shapes['width']}. "
-        "At best: least bytes at the rate of copying, or operations at that of multiplying matrices, whichever takes "
-        "longer; the rates are measured in the same run.",
+        "Limit: the least bytes at the rate of copying, or the operations at that of matrix multiplication, whichever "
+        "takes longer; the rates are measured in the same run.",
         "",
         "| step | Gop | MB at least | MB moved | operations / byte moved |",
         "|---|---|---|---|---|",
@@ -192,7 +192,7 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
     ]
     text += [
         "",
-        "| device | copies (GB/s) | multiplies (Gop/s, float32) | at best (s) | operation by operation (s) "
+        "| device | copies (GB/s) | multiplies (Gop/s, float32) | limit (s) | operation by operation (s) "
         "| measured (s) | share of the bandwidth | of the operations |",
         "|---|---|---|---|---|---|---|---|",
     ]
@@ -203,5 +203,5 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
             f"| {100 * row['share_of_bandwidth']:.0f} % | {100 * row['share_of_operations']:.0f} % |"
         )
     if all(row["device"] == "cpu" for row in on_devices):
-        text += ["", "No CUDA device here, or it was left out: the CPU alone."]
+        text += ["", "No CUDA device, or not measured on it."]
     return text

@@ -1,4 +1,4 @@
-"""How time and memory grow: one quantity varied at a time around two frames of 1024 x 1024 px.
+"""Scaling of time and memory: one quantity at a time is varied around two frames of 1024 x 1024 px.
 
 Seconds of ``detect_vibration`` and ``restore`` with their defaults, against height, width, number of frames, exposure,
 bandwidth (the amplitude across the rows, with a long exposure) and tones; peak memory at a few sizes.
@@ -17,22 +17,22 @@ from benchmarks.roofline import shapes_of
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
 
-PERIOD = 42.0e-3  # s from frame to frame
+PERIOD = 42.0e-3  # s; frame period
 TONES = ((2.0, 61.0, 0.4), (0.7, 133.0, -1.1), (0.4, 187.0, 2.0))  # amplitude in px, Hz, rad; the same on both axes
-BLURRED = 0.1  # of the frame period: the exposure that bandwidth is varied at
+BLURRED = 0.1  # of the frame period; exposure of the cases that vary the bandwidth
 
 
 @dataclass(frozen=True)
 class Case:
-    """What frames look like.
+    """A case of the benchmark.
 
     Attributes:
         height: Rows.
         width: Columns.
         num_frames: Frames.
-        exposure: Of the frame period.
-        amplitude: Of the strongest tone across the rows, px.
-        tones: Number on either axis.
+        exposure: Fraction of the frame period.
+        amplitude: Amplitude of the strongest tone across the rows, px.
+        tones: Number of tones of each axis.
     """
 
     height: int
@@ -70,14 +70,14 @@ class Case:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this part."""
+    """Options of this section."""
     parser.add_argument(
-        "--scaling-size", type=int, default=1024, help="scaling: rows and columns that sizes are varied around"
+        "--scaling-size", type=int, default=1024, help="scaling: rows and columns of the reference case"
     )
 
 
 def cases(size: int) -> dict[tuple[str, str], Case]:
-    """Every case, under what is varied and its value."""
+    """Every case, by the quantity that is varied and its value."""
     usual = Case(size, size)
     half, double = size // 2, 2 * size
     blurred = replace(usual, exposure=BLURRED)
@@ -101,7 +101,7 @@ def cases(size: int) -> dict[tuple[str, str], Case]:
 
 
 def measure(case: Case, device: str, runs: int) -> dict[str, Any]:
-    """Seconds of both on a device, and how far off the amplitudes that were found are."""
+    """Seconds of detection and restoration on a device, and the error of the detected amplitudes."""
     frames, timing, truth = case.frames().to(device), case.timing, case.vibration
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rsv.RestorationWarning)
@@ -155,10 +155,10 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
     text = [
         f"Scaling around two frames of {size} x {size} px, exposure {0.01 * size:.0f} rows, one tone of "
         f"{TONES[0][0]:g} px and {TONES[0][1]:g} Hz on both axes; bandwidth with an exposure of {BLURRED * size:.0f} "
-        f"rows. Medians of {options.runs} runs in turns (fastest to slowest).",
+        f"rows. Medians of {options.runs} alternating runs (range).",
         "",
-        "| varied | value | half-width of the band | detection (s) | ns a pixel | restoration (s) | ns a pixel "
-        "| amplitude off by (%) |",
+        "| varied | value | half-width of the band | detection (s) | ns per pixel | restoration (s) | ns per pixel "
+        "| amplitude error (%) |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in (row for row in results if row["part"] == "time"):
@@ -177,6 +177,8 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
     ]
     for row in (row for row in results if row["part"] == "memory"):
         name = {"detection": "detect_vibration", "exact": "restore"}[row["work"]]
-        figures = "not told | " if row["bytes"] is None else f"{row['bytes'] / 1e6:.0f} | {row['frames_of_memory']:.1f}"
+        figures = (
+            "not measured | " if row["bytes"] is None else f"{row['bytes'] / 1e6:.0f} | {row['frames_of_memory']:.1f}"
+        )
         text.append(f"| {named(name, row['device'])} | {row['height']} x {row['width']} | {figures} |")
     return text

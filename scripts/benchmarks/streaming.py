@@ -1,7 +1,7 @@
-"""Long stacks: memory and time a frame against the number of frames, overlap of reading and writing.
+"""Long stacks: memory and time per frame over the number of frames, overlap of computation with input and output.
 
-Frames are written over and over from a few simulated ones, so that long stacks cost no time to make. Every run is a
-process of its own, so that its peak of memory is its own.
+A few simulated frames are repeated to form long stacks. Every run is a separate process, in which peak memory is
+measured.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from rsvib_torch.stacks import process_stack
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.windows import cut_windows
 
-_DRAWN, WINDOW = 14, 8  # frames after which the vibration repeats itself, and the stack with it
+_DRAWN, WINDOW = 14, 8  # frames; period of the vibration, and of the stack
 DETECTION = {"method": "bands", "tones": 1, "band_step": 32, "search": 8}
 RESTORATION = {"method": "dewarp"}
 _RUN = """
@@ -37,14 +37,14 @@ print(json.dumps(streaming.one_run(**json.loads(sys.argv[1]))))
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this part."""
+    """Options of this section."""
     parser.add_argument("--frames", type=int, nargs="+", default=[100, 1000], help="streaming: lengths of the stacks")
     parser.add_argument("--frame-size", type=int, default=1024, help="streaming: rows and columns (default: 1024)")
     parser.add_argument("--memory", default="2GB", help="streaming: memory of the process (default: 2GB)")
 
 
 def timing_of(size: int) -> rsv.SensorTiming:
-    """A camera whose frames have as many rows, and some blanking."""
+    """A camera with this number of rows, and some blanking rows."""
     return rsv.SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=size + 32)
 
 
@@ -64,11 +64,11 @@ def write_long(path: Path, count: int, size: int) -> None:
 
 
 def peak_memory() -> float:
-    """Peak of this process in bytes: what the kernel counts since it began, not its parent's."""
+    """Peak memory of this process in bytes."""
     for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
         if line.startswith("VmHWM:"):
             return 1024.0 * int(line.split()[1])
-    raise OSError("the kernel does not tell the peak of memory")
+    raise OSError("the kernel does not report peak memory")
 
 
 def one_run(
@@ -81,7 +81,7 @@ def one_run(
     restoration: dict[str, Any] | None = None,
 ) -> Any:
     """Process a stack in this process."""
-    import resource  # noqa: PLC0415 - where there is none, there is no streaming benchmark
+    import resource  # noqa: PLC0415 - not available on all systems
 
     begin = time.perf_counter()
     report = process_stack(
@@ -110,7 +110,7 @@ def one_run(
 
 
 def run_apart(**arguments: Any) -> dict[str, Any]:
-    """``one_run`` in a process of its own."""
+    """``one_run`` in a separate process."""
     done = subprocess.run(
         [sys.executable, "-c", _RUN, json.dumps(arguments)],
         cwd=Path(__file__).parents[1],
@@ -124,7 +124,7 @@ def run_apart(**arguments: Any) -> dict[str, Any]:
 
 
 def _computing_alone(source: Path, size: int, windows: int) -> float:
-    """Seconds a frame of computing alone: frames are in memory, and nothing is written; one thread."""
+    """Seconds per frame of computation only: frames are in memory, and nothing is written; one thread."""
     reader = rsv.open_stack(source)
     job = StackJob(source, reader.info, timing_of(size), 4095.0, DETECTION, RESTORATION)
     cut = cut_windows(reader.info.shape[0], WINDOW)[:windows]
@@ -138,7 +138,7 @@ def _computing_alone(source: Path, size: int, windows: int) -> float:
 
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Runs of each length; then one worker with and without reading and writing in turns."""
+    """Runs of each length; then one worker with and without input and output, alternating."""
     import torch  # noqa: PLC0415
 
     results: list[dict[str, Any]] = []
@@ -157,26 +157,26 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
         common |= {"source": str(folder / "few.npy"), "memory": None}
         torch.set_num_threads(1)
         works: dict[str, Callable[[], Any]] = {
-            "computing alone, one thread": lambda: _computing_alone(folder / "few.npy", size, 3),
-            "read, computed, written, one worker": lambda: one_run(**common, workers=1),
+            "computation only, one thread": lambda: _computing_alone(folder / "few.npy", size, 3),
+            "with input and output, one worker": lambda: one_run(**common, workers=1),
         }
         best = dict.fromkeys(works, math.inf)
         for turn in range(1 + options.runs):
             for what, work in works.items():
                 result = work()
                 seconds = result if isinstance(result, float) else result["seconds_a_frame"]
-                best[what] = min(best[what], seconds if turn else math.inf)  # the first warms up
+                best[what] = min(best[what], seconds if turn else math.inf)  # the first run is a warm-up
         results += [{"name": name, "seconds_a_frame": seconds} for name, seconds in best.items()]
         results[-1]["rate"] = results[-2]["seconds_a_frame"] / results[-1]["seconds_a_frame"]
     return results
 
 
 def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
-    """The table in words."""
+    """The figures as Markdown tables."""
     table = [
         f"Stacks of {options.frame_size} x {options.frame_size} 16-bit frames, windows of {WINDOW}, bands and dewarp.",
         "",
-        "| run | s a frame | CPU s a frame | peak memory (GB) |",
+        "| run | s per frame | CPU s per frame | peak memory (GB) |",
         "|---|---|---|---|",
     ]
     for row in results:
@@ -188,6 +188,6 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         ratios = [
             runs[-1][name] / runs[0][name] for name in ("peak_memory_gb", "seconds_a_frame", "cpu_seconds_a_frame")
         ]
-        table += ["", "Longest over shortest: memory {:.3f}, time a frame {:.3f}, CPU time {:.3f}.".format(*ratios)]
+        table += ["", "Longest over shortest: memory {:.3f}, time per frame {:.3f}, CPU time {:.3f}.".format(*ratios)]
     rate = next(row["rate"] for row in results if "rate" in row)
-    return [*table, "", f"Reading and writing on the side: {100 * rate:.0f} % of the rate of computing alone."]
+    return [*table, "", f"With reading and writing: {100 * rate:.0f} % of the rate of computation only."]

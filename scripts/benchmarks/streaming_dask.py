@@ -1,7 +1,7 @@
-"""Dask on one machine: time a frame with one and two workers, what a frame costs each process, and bytes moved.
+"""Dask on one machine: time per frame with one and two workers, CPU time of each process, and bytes transferred.
 
 Workers are processes with one thread each; they start, import and warm up before anything is timed. Costs are CPU
-seconds, which other work on the machine changes little; where it stops being linear is reckoned from them.
+seconds, which depend little on other load of the machine; the limit of linear scaling is computed from them.
 """
 
 import argparse
@@ -20,11 +20,11 @@ from rsvib_torch.stacks import process_stack
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.windows import cut_windows
 
-_LINKS = {"1 Gbit/s": 125e6, "10 Gbit/s": 1250e6}  # bytes a second
+_LINKS = {"1 Gbit/s": 125e6, "10 Gbit/s": 1250e6}  # bytes per second
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this part."""
+    """Options of this section."""
     parser.add_argument("--dask-frames", type=int, default=113, help="dask: length of the stack (default: 113)")
     parser.add_argument("--dask-size", type=int, default=512, help="dask: rows and columns (default: 512)")
     parser.add_argument("--dask-workers", type=int, nargs="+", default=[1, 2], help="dask: numbers of workers")
@@ -44,7 +44,7 @@ def _process(source: Path, sink: Path, size: int, **options: Any) -> Any:
 
 
 def _local_bytes() -> int | None:
-    """Bytes that this machine has sent to itself, where the system tells."""
+    """Bytes sent through the loopback interface, if the system reports them."""
     path = Path("/proc/net/dev")
     if not path.exists():
         return None
@@ -53,7 +53,7 @@ def _local_bytes() -> int | None:
 
 
 def _payload(source: Path, size: int) -> dict[str, float]:
-    """Bytes of one window as they are read, and as they come back, for each frame that it writes."""
+    """Bytes read and bytes returned by a window, per frame that it writes."""
     reader = open_stack(source)
     info = replace(reader.info, full_scale=4095.0)
     job = StackJob(source, info, streaming.timing_of(size), 4095.0, streaming.DETECTION, streaming.RESTORATION)
@@ -74,7 +74,7 @@ def _one_cluster(workers: int, source: Path, few: Path, sink: Path, size: int, r
         ) as cluster,
         distributed.Client(cluster, set_as_default=False) as client,
     ):
-        _process(few, sink, size, scheduler=cluster.scheduler_address)  # every worker has imported and warmed up
+        _process(few, sink, size, scheduler=cluster.scheduler_address)  # imports and warm-up of every worker
         timed = []
         for _ in range(runs):
             there, here = sum(client.run(time.process_time).values()), time.process_time()
@@ -113,11 +113,11 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
-    """The table in words, and the model."""
+    """The figures as a Markdown table, and the limits of linear scaling."""
     table = [
         f"Dask on this machine: {options.dask_frames} frames of {options.dask_size} x {options.dask_size} px, 16 bit.",
         "",
-        "| run | s a frame | CPU s of workers | CPU s of scheduler, client and writer | MB over the local network "
+        "| run | s per frame | CPU s of workers | CPU s of scheduler, client and writer | MB over the local network "
         "| same bytes |",
         "|---|---|---|---|---|---|",
     ]
@@ -137,9 +137,9 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
     read, sent = results[0]["read"], results[0]["sent"]
     work, here = clusters[0]["worker_cpu_a_frame"], min(row["here_cpu_a_frame"] for row in clusters)
     limits = {"this process": work / here, **{link: work * rate / sent for link, rate in _LINKS.items()}}
-    table += ["", f"A frame: {read / 1e6:.2f} MB read by a worker, {sent / 1e6:.2f} MB sent back."]
+    table += ["", f"Per frame: {read / 1e6:.2f} MB read by a worker, {sent / 1e6:.2f} MB returned."]
     table.append(
-        "Linear until the writing process is busy all the time, or its link is full: "
+        "Linear scaling ends when the writing process or its network link is saturated: "
         + ", ".join(f"{name} at {count:.0f} workers" for name, count in limits.items())
         + "."
     )

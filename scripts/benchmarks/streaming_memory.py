@@ -1,4 +1,4 @@
-"""Memory that is asked for, and the peak that is measured: for every way of restoring, one and two windows at once."""
+"""Memory limit and measured peak, for every restoration method with one and two windows at a time."""
 
 import argparse
 import tempfile
@@ -23,13 +23,13 @@ RESTORATIONS: list[dict[str, Any]] = [
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this part."""
+    """Options of this section."""
     parser.add_argument("--memory-sizes", type=int, nargs="+", default=[512], help="memory: rows and columns")
     parser.add_argument("--memory-windows", type=int, nargs="+", default=[1, 2], help="memory: windows at once")
 
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Runs that may take no more than a window, or two, are reckoned to need."""
+    """Runs whose memory limit is the estimated requirement of one or two windows."""
     results = []
     with tempfile.TemporaryDirectory() as name:
         source, sink = Path(name) / "frames.npy", Path(name) / "out.tif"
@@ -56,11 +56,11 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
-    """The table in words."""
+    """The figures as a Markdown table."""
     table = [
-        f"Memory of a run, windows of {streaming.WINDOW} frames, bands.",
+        f"Memory of a run with windows of {streaming.WINDOW} frames, detection by bands.",
         "",
-        "| frames | restoration | windows at once | asked for (GB) | peak (GB) | of it |",
+        "| frames | restoration | windows at a time | limit (GB) | peak (GB) | peak / limit |",
         "|---|---|---|---|---|---|",
     ]
     for row in results:
@@ -69,4 +69,4 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         numbers = f"{row['windows_at_once']} | {asked:.2f} | {peak:.2f} | {100 * peak / asked:.0f} %"
         table.append(f"| {row['size']} x {row['size']} | {how} | {numbers} |")
     most = max(row["peak_memory_gb"] / row["asked_gb"] for row in results)
-    return [*table, "", f"At most {100 * most:.0f} % of what was asked for."]
+    return [*table, "", f"At most {100 * most:.0f} % of the limit."]

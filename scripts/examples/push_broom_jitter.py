@@ -2,9 +2,10 @@
 """Jitter of a push-broom satellite from the parallax of its sensor lines.
 
 The lines of a push-broom sensor see the same ground one after another. Registered to the ground, their images are
-frames whose rows are read at the same pace, each begun its delay later. Two lines are blind to jitter at multiples of
-one over their delay; a third line opens those. The jitter along the lines here is at such a frequency. Printed: what
-two and three lines find, and how near the restored image comes to the ground.
+frames with the same row time, whose start times differ by the delays of the lines. Two lines are blind to jitter at
+multiples of the inverse of their delay; a third line with another delay is not. The jitter along the lines of this
+example has such a frequency. Printed: the jitter detected with two and with three lines, and the accuracy of the
+restored image.
 """
 
 import argparse
@@ -20,9 +21,9 @@ import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
 
 LINE_TIME = 1e-4  # s
-DELAYS = (0.0, 73 * LINE_TIME, 200 * LINE_TIME)  # when each line sees the ground
+DELAYS = (0.0, 73 * LINE_TIME, 200 * LINE_TIME)  # s; delay of each line
 JITTER = rsv.Vibration(amplitude=[0.9, 1.3], frequency=[1 / DELAYS[1], 41.0], phase=[0.4, 1.3])
-MARGIN, RIM = 24, 24  # px of ground beyond the images; px of the images that do not count
+MARGIN, RIM = 24, 24  # px of ground beyond the images; px of the images that are not evaluated
 NOISE = 0.004  # of full scale
 
 
@@ -53,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for axis in range(2)
         ]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rsv.RestorationWarning)  # that an axis is refused is in the table
+            warnings.simplefilter("ignore", rsv.RestorationWarning)  # the table contains the verdict
             restored = rsv.restore(images[:count], lines, found, joint=True, check=False)
         table.add_row(f"{count} lines", *told, f"{quality(restored):.1f} dB restored")
     Console(highlight=False, width=140).print(table)

@@ -1,10 +1,10 @@
 #!/usr/bin/env python
 """Refine a vibration by gradient descent, through the restoration of two frames.
 
-The frames are restored with a vibration that is a few percent off. Where it is wrong they disagree; the mean square of
-their difference is differentiable, so L-BFGS brings it down in amplitude, frequency and phase. Printed: the parameters
-before, after, and the truth. (``detect_vibration`` finds them faster, and from nothing; this shows that a loss of
-one's own can take its place.)
+The frames are restored with a vibration that has errors of a few percent. These cause a difference between the restored
+frames; its mean square is differentiable, so that L-BFGS minimises it over amplitude, frequency and phase. Printed: the
+parameters before and after, and the truth. ``detect_vibration`` is faster and needs no initial values; the example
+demonstrates how to minimise a different loss.
 """
 
 import argparse
@@ -22,9 +22,9 @@ from rsvib_torch.evaluation import city_and_fields
 
 TIMING = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=600)
 TRUTH = rsv.Vibration(amplitude=[2.4, 3.1], frequency=[65.0, 50.0], phase=[0.7, -0.4])
-MARGIN, RIM = 32, 24  # px of scene beyond the frame; px of the frame that do not count
+MARGIN, RIM = 32, 24  # px of scene beyond the frame; px of the frame that are not evaluated
 NOISE = 0.003  # of full scale
-UNITS = torch.tensor([[1.0], [10.0], [1.0]])  # px, Hz and rad that a step may go alike
+UNITS = torch.tensor([[1.0], [10.0], [1.0]])  # px, Hz and rad; scales of the parameters
 
 
 def disagreement(restorer: rsv.VibrationRestorer, frames: Tensor, parameters: Tensor) -> Tensor:
@@ -34,7 +34,7 @@ def disagreement(restorer: rsv.VibrationRestorer, frames: Tensor, parameters: Te
 
 
 def refine(frames: Tensor, start: Tensor, steps: int) -> tuple[Tensor, list[float]]:
-    """Parameters (3, 2) after ``steps`` steps of L-BFGS, and the disagreement on the way."""
+    """Parameters (3, 2) after ``steps`` steps of L-BFGS, and the loss of every step."""
     restorer = rsv.VibrationRestorer(TIMING, method="dewarp", check=False)
     units = UNITS.to(start)
     unknown = (start / units).requires_grad_()

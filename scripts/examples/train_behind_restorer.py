@@ -1,9 +1,9 @@
 #!/usr/bin/env python
 """Train a small network behind the restorer, for a few steps on the CPU.
 
-Clips of drawn ground are taken by ``RollingShutterVibration`` with a vibration of their own, and made noisy. A model
-denoises the frames a little, restores them, and denoises what came out: gradients pass through the restoration on
-their way to the first layer. Printed: the loss, and the PSNR of clips that it was not trained on.
+``RollingShutterVibration`` simulates clips of a drawn scene with random vibrations, and noise is added. A model
+denoises the frames, restores them, and denoises the result: the gradients of the first layer pass through the
+restoration. Printed: the loss, and the PSNR of clips that were not used for training.
 """
 
 import argparse
@@ -24,7 +24,7 @@ NOISE = 0.05  # of full scale
 
 
 class Denoiser(nn.Module):
-    """Three convolutions that start from doing nothing."""
+    """Three convolutions, initialised to the identity."""
 
     def __init__(self, channels: int = 12) -> None:
         super().__init__()
@@ -39,7 +39,7 @@ class Denoiser(nn.Module):
         nn.init.zeros_(self.layers[-1].bias)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Denoise images (B, T, 1, H, W), each for itself."""
+        """Denoise each of the images (B, T, 1, H, W)."""
         return images + self.layers(images.flatten(0, 1)).unflatten(0, images.shape[:2])
 
 
@@ -57,7 +57,7 @@ class RestoringModel(nn.Module):
 
 
 def take_clips(ground: Tensor, count: int, camera: rsv.RollingShutterVibration) -> tuple[Tensor, Tensor, rsv.Vibration]:
-    """Noisy clips (B, 2, 1, H, W), the still patches they show, and the vibration of each clip."""
+    """Noisy clips (B, 2, 1, H, W), the scenes at rest, and the vibration of each clip."""
     corners = torch.randint(0, min(ground.shape) - PATCH, (count, 2)).tolist()
     still = torch.stack([ground[row : row + PATCH, column : column + PATCH] for row, column in corners])
     still = still[:, None, None].expand(-1, 2, -1, -1, -1)
@@ -66,12 +66,12 @@ def take_clips(ground: Tensor, count: int, camera: rsv.RollingShutterVibration) 
 
 
 def decibel(images: Tensor, still: Tensor) -> float:
-    """PSNR within the rim."""
+    """PSNR without the border."""
     return rsv.psnr(images, still, 1.0, rim=RIM).mean().item()
 
 
 def train(steps: int, batch: int, seed: int) -> dict[str, list[float]]:
-    """Losses on the way, and PSNR of unseen clips: as taken, restored, and behind the model."""
+    """Losses of all steps, and PSNR of clips not used for training: input, restored, and after the model."""
     torch.manual_seed(seed)
     ground = city_and_fields(320, 320, seed)
     unseen = city_and_fields(320, 320, seed + 1)
@@ -96,7 +96,7 @@ def train(steps: int, batch: int, seed: int) -> dict[str, list[float]]:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=150, help="training steps (default: 150)")
-    parser.add_argument("--batch", type=int, default=8, help="clips a step (default: 8)")
+    parser.add_argument("--batch", type=int, default=8, help="clips per step (default: 8)")
     parser.add_argument("--seed", type=int, default=1, help="seed of ground, vibrations, noise and weights")
     options = parser.parse_args(arguments)
     begin = time.perf_counter()
