@@ -2,8 +2,8 @@
 """Speed and accuracy of the package and of other software, in one run on one machine.
 
 Sections (see benchmarks/sections.py): registration, cost, detection, restoration, pipeline, scaling, roofline,
-streaming, memory, dask, regularisation, difficulty, slanted_edge. Results are printed as Markdown tables and written
-to --out; with --store also to scripts/benchmarks/results, from which scripts/benchmark_page.py generates
+streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict. Results are printed as Markdown tables and
+written to --out; with --store also to scripts/benchmarks/results, from which scripts/benchmark_page.py generates
 docs/benchmarks.md.
 """
 
@@ -27,6 +27,7 @@ from benchmarks import (
     streaming,
     streaming_dask,
     streaming_memory,
+    verdict_roc,
 )
 from benchmarks.sections import SECTIONS, machine_line
 from benchmarks.store import write_result
@@ -48,8 +49,9 @@ def main() -> None:
     parser.add_argument("--store", action="store_true", help="store the results for docs/benchmarks.md")
     parser.add_argument("--size", type=int, default=2048, help="rows and columns of the frames (default: 2048)")
     parser.add_argument("--runs", type=int, default=5, help="timed runs of each method (default: 5)")
+    default = [name for name, section in SECTIONS.items() if section.by_default]
     parser.add_argument(
-        "--only", choices=SECTIONS, nargs="+", default=list(SECTIONS), help="sections to run (default: all)"
+        "--only", choices=SECTIONS, nargs="+", default=default, help="sections to run (default: all but verdict)"
     )
     for part in (
         measure,
@@ -63,6 +65,7 @@ def main() -> None:
         regularisation,
         difficulty,
         slanted_edge,
+        verdict_roc,
     ):
         part.add_options(parser)
     options = parser.parse_args()

@@ -1,8 +1,8 @@
 #!/usr/bin/env python
-"""Liu et al. 2023 (Sensors 23, 5953), reproduced: Tables 2, 3 and 4, the figures, and two claims.
+"""Reproduce Tables 2, 3 and 4, the figures and two claims of Liu et al. 2023 (Sensors 23, 5953).
 
-The paper's values stand beside those of its methods and of the default methods, over trials with random phases and
-noise. Writes reproduction.md, reproduction.json, one HTML page that needs no network, and the figures as PNG files.
+The values of the paper are compared with those of its methods and of the default methods, over trials with random
+phases and noise. Writes reproduction.md, reproduction.json, a self-contained HTML page, and the figures as PNG files.
 """
 
 import argparse
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.set_defaults(plan="whole")
     options = parser.parse_args(arguments)
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    torch.set_num_threads(1)  # two processes share the work
+    torch.set_num_threads(1)  # two processes run at the same time
     plan, begin = PLANS[options.plan], time.perf_counter()
 
     def say(what: str) -> None:

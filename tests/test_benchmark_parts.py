@@ -317,3 +317,20 @@ def test_one_command_writes_markdown_and_json(monkeypatch, tmp_path, capsys):
     assert text in capsys.readouterr().out + "\n"
     assert "skimage" in text
     assert rsv.__version__
+
+
+def test_verdict(tmp_path):
+    from benchmarks import verdict_roc
+
+    case = {"hypothesis": "correct", "group": "correct", "moves": [True, True], "resolution": [0.0, 0.0]}
+    good = case | {"outcome": "helps", "gain_db": 6.0, "predicted_gain": 5.0}
+    good |= {"misfit_before": [1.0, 1.0], "misfit_after": [0.1, 0.0]}
+    wrong = case | {"group": "wrong", "outcome": "worse", "gain_db": -4.0, "predicted_gain": -3.0}
+    wrong |= {"misfit_before": [1.0, 1.0], "misfit_after": [1.5, 0.2]}
+    noisy = good | {"gain_db": -1.0, "predicted_gain": -2.0, "outcome": "worse"}
+    results = [good, wrong, noisy]
+    text = verdict_roc.lines(results, options())
+    assert "| > 0.3 dB | 1 | 0 | 0 | 0 |" in text
+    assert "| < -0.3 dB | 0 | 0 | 0 | 2 |" in text
+    assert sum(" 1.000 | " in line for line in text) == 2  # both scores separate these cases
+    assert verdict_roc.lines(*stored("verdict", results, options(), tmp_path)) == text

@@ -143,7 +143,7 @@ def test_a_tiny_run(tmp_path, capsys):
     for axis, true in (("x", 2.409), ("y", 6.205)):  # 50 and 30 Hz less multiples of 23.795 Hz
         assert data["global_shutter"]["found"][axis] == pytest.approx(true, abs=0.02)
     text = (out / "reproduction.md").read_text(encoding="utf-8")
-    for title in ("Table 2", "Table 3", "Table 4", "MTF", "Push-scan", "50 Hz from 24 frames a second"):
+    for title in ("Table 2", "Table 3", "Table 4", "MTF", "Push-scan", "50 Hz from 24 frames per second"):
         assert re.search(rf"^## {title}", text, re.MULTILINE)
     assert "nan" not in text
     page = (out / "reproduction.html").read_text(encoding="utf-8")

@@ -19,6 +19,7 @@ from benchmarks import (
     streaming,
     streaming_dask,
     streaming_memory,
+    verdict_roc,
 )
 
 __all__ = ["SECTIONS", "Section", "machine_line"]
@@ -34,11 +35,13 @@ class Section:
         title: Heading on the page.
         rows: Measures with the options of the command line; returns figures as numbers, texts, lists and tables.
         lines: Tables in Markdown of these figures and options, without further measurement.
+        by_default: Whether it runs without ``--only``; sections of more than a quarter of an hour do not.
     """
 
     title: str
     rows: Callable[[argparse.Namespace], Rows]
     lines: Callable[[Rows, argparse.Namespace], list[str]]
+    by_default: bool = True
 
 
 # A new section is one module with rows, lines and, for options of its own, add_options; and one line here.
@@ -56,6 +59,7 @@ SECTIONS: dict[str, Section] = {
     "regularisation": Section("Regularisation from the data", regularisation.rows, regularisation.lines),
     "difficulty": Section("Scenes of equal difficulty", difficulty.rows, difficulty.lines),
     "slanted_edge": Section("Slanted-edge MTF", slanted_edge.rows, slanted_edge.lines),
+    "verdict": Section("Verdict on restorations", verdict_roc.rows, verdict_roc.lines, by_default=False),
 }
 
 

@@ -1,18 +1,16 @@
 """Receiver operating characteristic of the verdict on a restoration.
 
-``python -m benchmarks.verdict_roc`` in ``scripts``. Random scenes, vibrations, exposures and noise levels are restored
-with the correct, a partly correct and a wrong vibration. The truth is the PSNR against the still scene, of the restored
-frames minus that of the raw frames, in dB. Printed are the outcomes by the truth, the area under the ROC curve of each
-score, and the thresholds with the largest sum of sensitivity and specificity. Frames come from a camera that is
-independent of the package.
+Random scenes with random vibrations, exposures and noise levels are restored with the correct, a partly correct and a
+wrong vibration. The true gain is the PSNR of the restored frames minus that of the input frames in dB, relative to the
+scene at rest. The tables contain the outcomes by the true gain, the area under the ROC curve of each score, and the
+thresholds with the largest sum of sensitivity and specificity. Frames come from a camera that is independent of the
+package.
 """
 
 import argparse
-import json
 import math
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -159,48 +157,46 @@ def residual(row: dict[str, Any]) -> float:
     return max(ratios, default=0.0)
 
 
-def print_tables(rows: list[dict[str, Any]], tie: float = 0.3) -> None:
-    """Outcomes by the true gain, then the ROC of both scores."""
-    counts = Counter(((row["gain_db"] > tie) - (row["gain_db"] < -tie), row["outcome"]) for row in rows)
-    print("| true gain | " + " | ".join(OUTCOMES) + " |")
-    print("|---" * (len(OUTCOMES) + 1) + "|")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this section."""
+    parser.add_argument("--verdict-draws", type=int, default=60, help="verdict: random recordings (default: 60)")
+    parser.add_argument("--verdict-seed", type=int, default=0, help="verdict: seed of the first recording")
+
+
+def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """All cases of the random recordings."""
+    return [row for draw in range(options.verdict_draws) for row in cases(options.verdict_seed + draw)]
+
+
+def lines(results: list[dict[str, Any]], options: argparse.Namespace, tie: float = 0.3) -> list[str]:
+    """Outcomes by the true gain, and the ROC of both scores; gains within ``tie`` dB count as equal."""
+    counts = Counter(((row["gain_db"] > tie) - (row["gain_db"] < -tie), row["outcome"]) for row in results)
+    text = ["| true gain | " + " | ".join(OUTCOMES) + " |", "|---" * (len(OUTCOMES) + 1) + "|"]
     for name, sign in ((f"> {tie} dB", 1), (f"within {tie} dB", 0), (f"< -{tie} dB", -1)):
-        print(f"| {name} | " + " | ".join(str(counts[sign, outcome]) for outcome in OUTCOMES) + " |")
-    visible = [row for row in rows if row["outcome"] != "unknown"]
+        text.append(f"| {name} | " + " | ".join(str(counts[sign, outcome]) for outcome in OUTCOMES) + " |")
+    visible = [row for row in results if row["outcome"] != "unknown"]
     motion = [row for row in visible if row["hypothesis"] != "amplitude +10 %" and row["group"] != "smoothing"]
     right = [row for row in visible if residual(row) < 0.35 and abs(row["gain_db"]) > tie]
     scores = {
-        "residual displacement: wrong motion": (
+        "residual displacement, for a wrong motion": (
             [residual(row) for row in motion],
             [row["group"] != "correct" for row in motion],
         ),
-        "negated gain in dB, where the motion is right: worse than raw": (
+        "negated gain in dB, for a loss with the correct motion": (
             [-row["predicted_gain"] for row in right],
             [row["gain_db"] < 0 for row in right],
         ),
     }
+    text += [
+        "",
+        "| score | area under the curve | best threshold | sensitivity | specificity | cases |",
+        "|---" * 6 + "|",
+    ]
     for name, (score, positive) in scores.items():
         values, truth = torch.tensor(score, dtype=torch.float64), torch.tensor(positive)
+        if not bool(truth.any()) or bool(truth.all()):
+            continue  # no curve without both kinds of cases
         threshold, sensitivity, specificity = best_threshold(values, truth)
-        print(
-            f"{name}: area {area_under_curve(values, truth):.3f}, best threshold {threshold:.2f} "
-            f"(sensitivity {sensitivity:.2f}, specificity {specificity:.2f}; {len(truth)} cases)"
-        )
-
-
-def main() -> None:
-    """Collect the cases and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=60, help="random recordings (default: 60, about half an hour)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first recording")
-    parser.add_argument("--json", type=Path, help="where to write all figures")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    rows = [row for draw in range(options.draws) for row in cases(options.seed + draw)]
-    print_tables(rows)
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main()
+        area = area_under_curve(values, truth)
+        text.append(f"| {name} | {area:.3f} | {threshold:.2f} | {sensitivity:.2f} | {specificity:.2f} | {len(truth)} |")
+    return text

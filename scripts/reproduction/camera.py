@@ -1,8 +1,8 @@
-"""A camera whose pixels sample a finer scene: rolling or global shutter, made without the package, in NumPy.
+"""Simulated camera with rolling or global shutter and aliasing, independent of the package, in NumPy.
 
-The scene is drawn on a grid twice as fine as the pixels and is blurred enough for that grid to hold all of it. Frames
-take every second sample, wherever the motion has put it: what the pixels cannot resolve shows as aliasing, as it does
-in a real camera. Interpolation is that of benchmarks/independent_camera.py.
+The scene is drawn on a grid with half the pixel pitch and blurred so that this grid samples it without aliasing. Frames
+take every second sample at the displaced positions, so that detail beyond the Nyquist frequency of the pixels appears
+as aliasing, as in a real camera. Interpolation is that of benchmarks/independent_camera.py.
 """
 
 from dataclasses import dataclass
@@ -11,14 +11,14 @@ import numpy as np
 from benchmarks.independent_camera import POINTS, Array, Shake, closed, fine_rows, polynomial_weights
 from numpy.typing import NDArray
 
-PITCH = 2  # samples of the scene from pixel to pixel
-RIM = 32  # px of scene beyond the largest displacement, over which it fades to close to a period
-_FINER = 4  # rows interpolated for every row of the scene
-_NODES = 5  # Gauss-Legendre nodes of an exposure: exact to 1e-6 for half a pixel of smear, to 1e-4 for 3 px
+PITCH = 2  # samples of the scene per pixel
+RIM = 32  # px of scene beyond the largest displacement, over which it fades so that it is periodic
+_FINER = 4  # interpolated rows per row of the scene
+_NODES = 5  # Gauss-Legendre nodes of an exposure: exact to 1e-6 for half a pixel of motion blur, to 1e-4 for 3 px
 
 
 def margins(shake: Shake, duration: float) -> tuple[int, int]:
-    """Scene needed beside the frame (down, across), px of the camera."""
+    """Margin of the scene around the frame (down, across), px of the camera."""
     across, down = np.ceil(shake.reach(duration)).astype(int) + RIM
     return int(down), int(across)
 
@@ -28,9 +28,9 @@ class Scene:
     """A still scene around a frame.
 
     Attributes:
-        samples: (PITCH (h + 2 down), PITCH (w + 2 across)), closing to a period.
+        samples: (PITCH (h + 2 down), PITCH (w + 2 across)), periodic.
         spectra: Its rows' spectra, interpolated across rows.
-        still: (h, w), what a still camera without noise sees.
+        still: (h, w), frame of a camera at rest, without noise.
         margin: (down, across) px.
     """
 
@@ -41,7 +41,7 @@ class Scene:
 
     @classmethod
     def around(cls, drawn: Array, margin: tuple[int, int]) -> "Scene":
-        """The scene of a picture drawn at ``PITCH`` samples a pixel, with a margin in px."""
+        """The scene of an image drawn at ``PITCH`` samples per pixel, with a margin in px."""
         samples = closed(drawn, (RIM - 8) * PITCH)
         down, across = (PITCH * m for m in margin)
         still = samples[down : len(samples) - down : PITCH, across : samples.shape[1] - across : PITCH]
@@ -76,7 +76,7 @@ def take_frames(
 
 
 def with_noise(frames: Array, noise: float, bits: int, generator: np.random.Generator) -> Array:
-    """Frames with Gaussian noise (fraction of full scale), as counts of so many bits."""
+    """Frames with Gaussian noise (fraction of full scale), as counts of this number of bits."""
     levels = 2**bits - 1
     noisy = frames + noise * generator.standard_normal(frames.shape)
     return np.round(np.clip(noisy, 0.0, 1.0) * levels) / levels

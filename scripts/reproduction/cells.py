@@ -1,4 +1,4 @@
-"""Cells of Tables 2, 3 and 4: the paper's value, ours by the paper's methods, ours by the default ones."""
+"""Cells of Tables 2, 3 and 4: values of the paper, of its methods and of the default methods."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,19 +29,19 @@ class Spread:
 
 @dataclass(frozen=True)
 class Cell:
-    """One number of the paper's, and ours.
+    """A value of the paper and the reproduced values.
 
     Attributes:
-        table: Where it stands.
+        table: Table of the paper.
         target: Scene.
-        row: What it is.
+        row: Quantity.
         column: Frame or axis.
-        unit: Unit, or nothing.
-        digits: To show.
+        unit: Unit, or an empty text.
+        digits: Decimals.
         paper: The paper's value.
-        ours: Mean and worst by ``"paper"``'s methods, by the ``"default"`` ones, and of frames restored ``"joint"``ly.
-        higher_is_better: Errors are not.
-        still: What a still camera with the same noise has, where that means something.
+        ours: Mean and worst value of the methods ``"paper"`` and ``"default"``, and of ``"joint"`` restoration.
+        higher_is_better: False for errors.
+        still: Value of a camera at rest with the same noise, where applicable.
     """
 
     table: str
@@ -56,7 +56,7 @@ class Cell:
     still: float | None = None
 
     def better(self, method: str, which: str = "worst") -> bool:
-        """Whether ours is ahead of the paper, in the worst trial or on average; nothing is detected jointly."""
+        """Whether a method is better than the paper in the worst trial or on average."""
         value = getattr(self.ours[method if method in self.ours else "default"], which)
         return bool(value > self.paper if self.higher_is_better else value < self.paper)
 
@@ -67,7 +67,7 @@ def at_noise(trials: Trials, noise: float) -> list[dict[str, Any]]:
 
 
 def spread(values: Sequence[float], *, higher_is_better: bool) -> Spread:
-    """Mean and worst; NaN where a value is missing."""
+    """Mean and worst; NaN if a value is missing."""
     array = np.asarray(values, dtype=float)
     return Spread(float(array.mean()), float(array.min() if higher_is_better else array.max()))
 
@@ -130,7 +130,7 @@ def all_cells(trials: dict[Target, Trials], still: dict[Target, Trials], noise: 
 
 
 def mtf_against_still(trials: Trials, still: dict[str, Any], method: str, axis: str, kind: str) -> np.ndarray:
-    """MTF of restored frames over that of the still camera, (trials and frames, F)."""
+    """MTF of restored frames over that of the camera at rest, (trials and frames, F)."""
     if kind not in still["mtf"][0][axis]:
         return np.empty((0, 0))
     reference = np.array(still["mtf"][0][axis][kind]["curve"])
@@ -145,5 +145,5 @@ def mtf_against_still(trials: Trials, still: dict[str, Any], method: str, axis: 
 
 
 def collected(trials: Trials, value: Callable[[dict[str, Any]], float]) -> np.ndarray:
-    """One number of each trial."""
+    """One value of each trial."""
     return np.array([value(trial) for trial in trials])

@@ -1,4 +1,4 @@
-"""Two claims of the paper: image motion does not matter (Sec. 2.3), and 24 frames a second are enough for 50 Hz."""
+"""Two claims of the paper: image motion is not a limitation (Sec. 2.3), and 24 frames per second suffice for 50 Hz."""
 
 import math
 from typing import Any
@@ -11,25 +11,24 @@ from reproduction.targets import shake_of
 from reproduction.trials import BITS, clean_frames, run_trial
 from skimage.registration import phase_cross_correlation
 
-SPEEDS = (0.0, 500.0, 4000.0)  # px/s along x: 21 and 168 px from frame to frame, 0.2 and 1.6 px of smear
-_SHUTTER_FRAMES = 24  # a second
+SPEEDS = (0.0, 500.0, 4000.0)  # px/s along x: 21 and 168 px from frame to frame, 0.2 and 1.6 px of motion blur
+_SHUTTER_FRAMES = 24  # one second
 _SHUTTER_NOISE = 0.005
-_FINEST = 100  # steps a pixel, of the registration of whole frames
-_CANDIDATES = 4000  # frequencies tried, up to half the frame rate
+_FINEST = 100  # steps per pixel of the registration of whole frames
+_CANDIDATES = 4000  # number of trial frequencies up to half the frame rate
 
 
 def push_scan_trial(scene: Scene, speed: float, noise: float, seed: int) -> dict[str, Any]:
-    """Detection with an image motion along the rows, either way."""
+    """Detection with an image motion along the rows, with either sign."""
     shake = shake_of(seed, (speed * (-1) ** seed, 0.0))
     values = run_trial(scene, shake, clean_frames(scene, shake), noise, seed, restore=False).values
     return {"speed": speed, "detection": values["detection"]}
 
 
 def global_shutter(scene: Scene, seed: int) -> dict[str, Any]:
-    """What frames of a global shutter of the same frame rate say of the vibration: its alias.
+    """Frequency of the vibration in frames of a global shutter of the same frame rate: its alias.
 
-    Whole frames are registered by scikit-image; the tone that explains their displacements best is looked for up to
-    half the frame rate, beyond which there is nothing to choose from.
+    Whole frames are registered by scikit-image. The best-fitting tone is searched for up to half the frame rate.
     """
     shake, period = shake_of(seed), FRAME_ROWS * ROW_TIME
     frames = take_frames(
@@ -62,7 +61,7 @@ def global_shutter(scene: Scene, seed: int) -> dict[str, Any]:
 
 
 def _best_frequency(times: Array, values: Array, highest: float) -> float:
-    """Frequency of the sine and constant that leave the least of some values."""
+    """Frequency of the sinusoid and constant with the smallest residual."""
     candidates = np.linspace(0.0, highest, _CANDIDATES + 1)[1:-1]
     left = []
     for frequency in candidates:

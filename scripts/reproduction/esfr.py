@@ -1,13 +1,13 @@
-"""The slanted-edge MTF as ISO 12233 prints it, straight line and all: NumPy, independent of the package.
+"""The slanted-edge MTF of ISO 12233 with a straight line: NumPy, independent of the package.
 
-An instrument that fits a straight line sees the bends of an edge as blur. That is what a frame of a vibrating camera
-is measured to be by the usual tools, and presumably in the paper.
+With a straight line, the distortion of an edge counts as blur. The usual tools, and presumably the paper, measure
+frames of a vibrating camera in this way.
 """
 
 import numpy as np
 from benchmarks.independent_camera import Array
 
-_FINER = 4  # bins a pixel
+_FINER = 4  # bins per pixel
 
 
 def _centroids(roi: Array, window: Array) -> Array:
@@ -31,7 +31,7 @@ def straight_edge_mtf(roi: Array, frequency: Array) -> Array:
         roi = roi[:, ::-1]
     rows, places = np.arange(height), np.arange(width - 1)
     window = np.hamming(width - 1)[None].repeat(height, 0)
-    for _ in range(2):  # the second time with windows that follow the edge
+    for _ in range(2):  # in the second pass the windows follow the edge
         slope, start = np.polyfit(rows, _centroids(roi, window), 1)
         middle = start + slope * rows
         apart = (places[None] + 0.5 - middle[:, None]) / (0.5 * (width - 1))
@@ -57,7 +57,7 @@ def straight_edge_mtf(roi: Array, frequency: Array) -> Array:
 
 
 def crossing(frequency: Array, mtf: Array, level: float = 0.5) -> float:
-    """Frequency at which an MTF first falls to a level; NaN where it does not."""
+    """Frequency at which an MTF first falls to a level; NaN if it does not."""
     below = np.flatnonzero(mtf <= level)
     if not len(below) or below[0] == 0:
         return float("nan")

@@ -1,4 +1,4 @@
-"""The reproduction as one self-contained page."""
+"""The reproduction as a self-contained HTML page."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ def _cells(line: str) -> list[str]:
 
 
 def _section(title: str, words: str, lines: list[str]) -> dict[str, Any]:
-    """A section with its Markdown table taken apart."""
+    """A section with the cells of its Markdown table."""
     rows = [_cells(line) for line in lines if line.startswith("|")]
     return {"title": title, "words": words, "head": rows[0], "rows": rows[2:]}
 

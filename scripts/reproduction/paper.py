@@ -1,7 +1,7 @@
-"""What Liu et al. 2023 (Sensors 23, 5953) state: the camera, Table 1, and the results of Tables 2, 3 and 4.
+"""Values of Liu et al. 2023 (Sensors 23, 5953): the camera, Table 1, and the results of Tables 2, 3 and 4.
 
-Table 3 has its two columns of relative errors exchanged: 19.890 ms instead of 20 ms is 0.55 %, which stands under
-amplitude. Here each error stands with the values that it follows from.
+In Table 3 the two columns of relative errors are exchanged: 19.890 ms instead of 20 ms is 0.55 %, which is printed in
+the column of the amplitude. Here each error is with its values.
 """
 
 from dataclasses import dataclass

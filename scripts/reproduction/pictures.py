@@ -1,4 +1,4 @@
-"""Figures like the paper's 4 to 9, and of what it claims."""
+"""Figures 4 to 9 of the paper, reproduced, and figures of its claims."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ def _show(panel: Axes, image: Array, title: str, **options: Any) -> None:
 
 
 def frames_figure(frames: Array) -> Figure:
-    """Frames p and p + 1 side by side, as Figures 4 and 7."""
+    """Frames p and p + 1 side by side, like Figures 4 and 7."""
     figure = Figure(figsize=(7.6, 0.3 + 3.8 * frames.shape[1] / frames.shape[2]), layout="constrained")
     step = max(1, frames.shape[1] // 1024)
     for panel, frame, title in zip(figure.subplots(1, 2), frames, ("(a) frame p", "(b) frame p + 1"), strict=True):
@@ -41,7 +41,7 @@ def frames_figure(frames: Array) -> Figure:
 
 
 def windows_figure(frames: Array) -> Figure:
-    """Bands of rows of both frames beneath each other, as Figure 5."""
+    """Bands of rows of both frames below each other, like Figure 5."""
     rows = np.linspace(0.1, 0.85, 6) * frames.shape[1]
     figure = Figure(figsize=(7.6, 5.2), layout="constrained")
     panels = figure.subplots(len(rows), 2)
@@ -55,7 +55,7 @@ def windows_figure(frames: Array) -> Figure:
 
 
 def restored_figure(found: Found, target: Any) -> Figure:
-    """Details before and after restoration, and the difference from the still scene, as Figures 8 and 9."""
+    """Details before and after restoration, and the difference from the scene at rest, like Figures 8 and 9."""
     images, still = found.images[target], found.scenes[target].still
     rim = 48
     inner = torch.from_numpy(still[rim:-rim, rim:-rim])
@@ -67,14 +67,14 @@ def restored_figure(found: Found, target: Any) -> Figure:
     for panel_pair, (name, image) in zip(panels.T, {"still scene": still, **shown}.items(), strict=True):
         _show(panel_pair[0], image[detail], name)
         error = image - still
-        _show(panel_pair[1], error[detail], "minus the still scene", vmin=-0.05, vmax=0.05)
+        _show(panel_pair[1], error[detail], "difference from the scene at rest", vmin=-0.05, vmax=0.05)
         rms = float(np.sqrt(np.mean(error[rim:-rim, rim:-rim] ** 2)))
         panel_pair[1].set_xlabel(f"whole frame: rms {rms:.4f}", fontsize=9)
     return figure
 
 
 def mtf_figure(found: Found, plan: Plan, axis: str) -> Figure:
-    """MTF curves of the chart's edges, straight line: still camera, degraded, restored."""
+    """MTF curves of the chart's edges, straight line: camera at rest, degraded, restored."""
     noise = plan.noises[0]
     trials, still = at_noise(found.trials["chart"], noise), at_noise(found.still["chart"], noise)[0]
     kinds = {
@@ -125,7 +125,7 @@ def errors_figure(found: Found, plan: Plan) -> Figure:
 
 
 def sampling_figure(found: Found) -> Figure:
-    """What a global shutter sees of 50 Hz at the same frame rate: samples, the truth, and its alias."""
+    """50 Hz sampled by a global shutter of the same frame rate: samples, true vibration, and alias."""
     shutter = found.global_shutter
     figure = Figure(figsize=(5.6, 4.2), layout="constrained")
     panel = figure.subplots()
@@ -157,7 +157,7 @@ def _sine(angle: float, times: Array) -> Array:
 
 @dataclass(frozen=True)
 class Gallery:
-    """All pictures: figures by section, and overviews with a divider."""
+    """All figures by section, and overviews with a divider."""
 
     figures: dict[str, list[Drawing]]
     overviews: dict[str, BeforeAfter]
@@ -208,8 +208,8 @@ def gallery(found: Found, plan: Plan) -> Gallery:
             f"figure_{number}",
             lambda target=target: restored_figure(found, target),
             f"As Figure {number}",
-            f"A detail of the {TARGETS[target]} target before and after restoration; below, ten times stronger, "
-            "what differs from the still scene.",
+            f"A detail of the {TARGETS[target]} target before and after restoration; below, the "
+            "difference from the scene at rest, ten times amplified.",
         )
     for axis in AXES:
         add(
@@ -224,7 +224,8 @@ def gallery(found: Found, plan: Plan) -> Gallery:
         "sampling",
         lambda: sampling_figure(found),
         "50 Hz through a global shutter",
-        "24 frames a second cannot tell 50 Hz from 2.4 Hz; two frames of a rolling shutter can.",
+        "24 frames per second of a global shutter cannot distinguish 50 Hz from 2.4 Hz; two frames of a rolling "
+        "shutter can.",
     )
     overviews = {
         name: before_after(

@@ -1,4 +1,4 @@
-"""The two targets: a resolution chart in the manner of ISO 12233, and a landscape seen from above."""
+"""The two targets: a resolution chart similar to ISO 12233, and an aerial landscape."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,7 +14,7 @@ from torch import Tensor
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields, resolution_chart
 
-OPTICS = 0.5  # px, Gaussian; square pixels come on top
+OPTICS = 0.5  # px; sigma of the Gaussian optics, in addition to square pixels
 SEED = 2023
 _FIELD = 230.0  # px of the camera, fields of the chart
 _DRAWN: dict[Target, Callable[[int, int, float], Tensor]] = {
@@ -26,7 +26,7 @@ _DRAWN: dict[Target, Callable[[int, int, float], Tensor]] = {
 
 
 def shake_of(seed: int, image_motion: Sequence[float] = (0.0, 0.0)) -> Shake:
-    """The paper's vibration with phases drawn from a seed."""
+    """The paper's vibration with random phases of a seed."""
     amplitude, frequency = (np.array([[values[axis]] for axis in AXES]) for values in (AMPLITUDE, FREQUENCY))
     phase = np.random.default_rng(seed).uniform(-math.pi, math.pi, (2, 1))
     return Shake(amplitude, frequency, phase, np.array(image_motion))
@@ -34,32 +34,32 @@ def shake_of(seed: int, image_motion: Sequence[float] = (0.0, 0.0)) -> Shake:
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A slanted edge of the still chart, found in it.
+    """A slanted edge that was found in the chart at rest.
 
     Attributes:
-        axis: Axis that it measures: a near-vertical edge measures x.
-        roi: Where it lies, with the room that a displaced edge needs.
+        axis: Axis of the measured MTF: x for a near-vertical edge.
+        roi: Its position, with a margin for the displacement.
     """
 
     axis: str
     roi: rsv.SlantedEdge
 
     def crop(self, image: Array) -> Array:
-        """The ROI of an image, turned so that its edge is near the vertical."""
+        """The ROI of an image, transposed if necessary so that its edge is near-vertical."""
         roi: Array = self.roi.crop(image)  # type: ignore[arg-type, assignment]
         return roi if self.axis == "x" else roi.T
 
 
 def draw(target: Target, size: tuple[int, int], image_motion: Sequence[float] = (0.0, 0.0)) -> Scene:
-    """A target around frames of a size in px, with room for two frames of the paper's vibration."""
+    """A target for frames of a size in px, with a margin for two frames of the paper's vibration."""
     margin = margins(shake_of(0, image_motion), 2 * FRAME_ROWS * ROW_TIME)
     height, width = (PITCH * (s + 2 * m) for s, m in zip(size, margin, strict=True))
-    sigma = PITCH * math.sqrt(OPTICS**2 + 1 / 12)  # a pixel blurs about as a Gaussian of 1/12 px^2
+    sigma = PITCH * math.sqrt(OPTICS**2 + 1 / 12)  # the variance of a pixel is 1/12 px^2
     return Scene.around(_DRAWN[target](height, width, sigma).double().numpy(), margin)
 
 
 def edges_of(still: Array, count: int) -> list[Edge]:
-    """The strongest slanted edges of a still chart, so many for each axis, far from its border."""
+    """The strongest slanted edges of the chart at rest for each axis, away from its border."""
     found = rsv.find_slanted_edges(torch.from_numpy(still))
     return [
         Edge(axis, roi)

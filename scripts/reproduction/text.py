@@ -1,4 +1,4 @@
-"""The tables in Markdown."""
+"""The tables of the reproduction in Markdown."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +10,11 @@ from reproduction.trials import FREQUENCY as MTF_FREQUENCY
 from reproduction.trials import METHODS, RESTORED_BY
 from reproduction.work import Found, Plan
 
-GOAL_FREQUENCY, GOAL_SHARE, GOAL_OVERSHOOT = 0.4, 0.95, 1.05  # of the restored MTF over the still camera's
+GOAL_FREQUENCY, GOAL_SHARE, GOAL_OVERSHOOT = (
+    0.4,
+    0.95,
+    1.05,
+)  # goals for the restored MTF relative to the camera at rest
 _METRIC_NAMES = {
     "psnr": "PSNR (dB)",
     "ssim": "SSIM",
@@ -39,7 +43,7 @@ def _range(values: Sequence[float]) -> str:
 
 
 def cells_table(cells: Sequence[Cell], *, column: str) -> list[str]:
-    """The paper's value, ours both ways as mean (worst), and whether the worst trial is ahead."""
+    """Values of the paper and of all methods as mean (worst), and whether the default method is better."""
     rows = []
     for cell in cells:
         unit = f" ({cell.unit})" if cell.unit else ""
@@ -50,9 +54,9 @@ def cells_table(cells: Sequence[Cell], *, column: str) -> list[str]:
             + ([_number(cell.still, cell.digits) if cell.still is not None else ""] if column == "frame" else [])
             + [ahead]
         )
-    still = ["still camera"] if column == "frame" else []
+    still = ["camera at rest"] if column == "frame" else []
     names = [NAMES[method] for method in cells[0].ours]
-    return table(["", column, "paper", *names, *still, "default ahead of the paper"], rows)
+    return table(["", column, "paper", *names, *still, "default better than the paper"], rows)
 
 
 def detected_table(target: Target, trials: Sequence[dict[str, Any]]) -> list[str]:
@@ -77,7 +81,7 @@ def detected_table(target: Target, trials: Sequence[dict[str, Any]]) -> list[str
 
 
 def degraded_table(target: Target, trials: Sequence[dict[str, Any]]) -> list[str]:
-    """What the frames were before, next to the paper's."""
+    """Quality of the degraded frames, and that of the paper."""
     rows = []
     for name, printed in RESTORED[target].items():
         for frame, column in enumerate(FRAMES):
@@ -89,7 +93,7 @@ def degraded_table(target: Target, trials: Sequence[dict[str, Any]]) -> list[str
 
 
 def noise_table(found: Found, plan: Plan) -> list[str]:
-    """How results change with the noise."""
+    """Results for all noise levels."""
     rows = []
     for target, name in TARGETS.items():
         for noise in sorted(plan.noises):
@@ -107,20 +111,20 @@ def noise_table(found: Found, plan: Plan) -> list[str]:
                     + [f"{q.mean():.{d}f} ({q.min():.{d}f})" for q, d in zip(quality, (2, 4), strict=True)]
                     + [f"{still['psnr'][0]:.2f}, {still['ssim'][0]:.4f}"]
                 )
-    head = ("scene", "noise", "by", "period error (%)", "amplitude error (%)", "PSNR (dB)", "SSIM", "still camera")
+    head = ("scene", "noise", "by", "period error (%)", "amplitude error (%)", "PSNR (dB)", "SSIM", "camera at rest")
     return table(head, rows)
 
 
 def mtf_table(found: Found, plan: Plan) -> list[str]:
-    """MTF of degraded and restored frames, and of the still camera: value at Nyquist, at 0.25 cycles/px, and MTF50."""
+    """MTF of degraded and restored frames and of the camera at rest: at 0.25 cycles/px, 0.4 and Nyquist, and MTF50."""
     noise = plan.noises[0]
     trials, still = at_noise(found.trials["chart"], noise), at_noise(found.still["chart"], noise)[0]
     places = [int(np.argmin(np.abs(MTF_FREQUENCY - wanted))) for wanted in (0.25, GOAL_FREQUENCY)]
     rows = []
     for axis in AXES:
-        for kind, words in (("straight", "straight line, ISO 12233"), ("along", "along the edge as it is")):
+        for kind, words in (("straight", "straight line, ISO 12233"), ("along", "along the distorted edge")):
             kinds = {
-                "still camera": [still["mtf"]],
+                "camera at rest": [still["mtf"]],
                 "degraded": [t["degraded"]["mtf"] for t in trials],
                 **{NAMES[m]: [t["restoration"][m]["mtf"] for t in trials] for m in RESTORED_BY},
             }
@@ -137,7 +141,7 @@ def mtf_table(found: Found, plan: Plan) -> list[str]:
 
 
 def closing_values(found: Found, noise: float) -> list[dict[str, Any]]:
-    """Restored MTF over the still camera's: least up to the goal's frequency, largest anywhere below Nyquist."""
+    """Restored MTF over that of the camera at rest: smallest up to the frequency of the goal, largest up to Nyquist."""
     trials, still = at_noise(found.trials["chart"], noise), at_noise(found.still["chart"], noise)[0]
     inside = (MTF_FREQUENCY > 0) & (MTF_FREQUENCY <= GOAL_FREQUENCY + 1e-9)
     values = []
@@ -167,7 +171,7 @@ def closing_values(found: Found, noise: float) -> list[dict[str, Any]]:
 
 
 def closing_table(found: Found, noise: float) -> list[str]:
-    """The closing values as a table."""
+    """The comparison with the camera at rest as a table."""
     rows = [
         [
             NAMES[v["method"]],
@@ -184,7 +188,7 @@ def closing_table(found: Found, noise: float) -> list[str]:
         "restored by",
         "axis",
         "measured",
-        f"mean curve over still camera's, up to {GOAL_FREQUENCY:g} cycles/px",
+        f"mean curve over that of the camera at rest, up to {GOAL_FREQUENCY:g} cycles/px",
         "single frames",
         f"at least {GOAL_SHARE:g}",
         f"at most {GOAL_OVERSHOOT:g}",
@@ -218,7 +222,7 @@ def push_scan_table(found: Found, plan: Plan) -> list[str]:
 
 
 def shutter_table(found: Found, plan: Plan) -> list[str]:
-    """What a global shutter of the same frame rate sees."""
+    """Frequencies detected with a global shutter of the same frame rate."""
     shutter, rows = found.global_shutter, []
     for axis in AXES:
         trials = at_noise(found.trials["landscape"], plan.noises[0])

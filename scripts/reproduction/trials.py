@@ -1,6 +1,6 @@
 """One trial: frames of a target, detection and restoration by the paper's methods and by the default ones.
 
-The default restoration makes each frame from itself, as the paper does, and once more from both frames jointly.
+The default restoration is done frame by frame, as in the paper, and also jointly from both frames.
 """
 
 from collections.abc import Sequence
@@ -20,20 +20,20 @@ from torch import Tensor
 import rsvib_torch as rsv
 
 BITS = 12
-RIM = 32  # px at the border of a frame that no figure counts: the camera did not see all of them
+RIM = 32  # px at the border that are not evaluated, because they are partly outside the frame
 FREQUENCY = np.linspace(0.0, 0.5, 51)  # cycles/px, of MTF curves
 METHODS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # options of detection and restoration
     "paper": ({"method": "bands", "registration": "projection"}, {"method": "banded"}),
     "default": ({}, {}),
 }
-JOINT: dict[str, Any] = {"joint": 2}  # what the default restoration is told to make every frame from both
+JOINT: dict[str, Any] = {"joint": 2}  # options of the joint restoration
 RESTORED_BY = (*METHODS, "joint")
 _PER_AXIS = ("period", "amplitude", "phase")
 
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """What a trial leaves for pictures, with the values it measured."""
+    """Values of a trial, and images for the figures."""
 
     values: dict[str, Any]
     frames: Array
@@ -42,7 +42,7 @@ class Images:
 
 
 def camera(rows: int) -> rsv.SensorTiming:
-    """The paper's camera; with fewer rows, slower ones, so that frame period and exposure time stay what they are."""
+    """The paper's camera; fewer rows are slower, so that frame period and exposure time are unchanged."""
     slower = FRAME_ROWS / rows
     return rsv.SensorTiming(row_time=ROW_TIME * slower, exposure_rows=EXPOSURE_ROWS / slower, frame_rows=rows)
 
@@ -78,7 +78,7 @@ def detection_values(result: rsv.DetectionResult, shake: Shake) -> dict[str, dic
 
 
 def mtf_values(image: Array, edges: Sequence[Edge]) -> dict[str, Any]:
-    """Mean MTF over the edges of each axis: by a straight line as ISO 12233 prints it, and along the edge as it is."""
+    """Mean MTF over the edges of each axis: with a straight line as in ISO 12233, and along the distorted edge."""
     values: dict[str, Any] = {}
     for axis in sorted({edge.axis for edge in edges}):
         straight, along, refused = [], [], []
@@ -101,7 +101,7 @@ def mtf_values(image: Array, edges: Sequence[Edge]) -> dict[str, Any]:
 
 
 def quality(images: Array, still: Array, edges: Sequence[Edge]) -> dict[str, Any]:
-    """PSNR and SSIM (scikit-image's) and MTF of frames, one entry a frame."""
+    """PSNR and SSIM (of scikit-image) and MTF of frames, one entry per frame."""
     inner = (slice(RIM, -RIM), slice(RIM, -RIM))
     pairs = [(still[inner].astype(np.float32), image[inner].astype(np.float32)) for image in images]
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
@@ -113,7 +113,7 @@ def quality(images: Array, still: Array, edges: Sequence[Edge]) -> dict[str, Any
 
 
 def as_frames(images: Array) -> Tensor:
-    """Frames as a user has them."""
+    """Noisy frames as float32 tensor."""
     return torch.from_numpy(images).float()
 
 
@@ -127,7 +127,7 @@ def run_trial(
     *,
     restore: bool = True,
 ) -> Images:
-    """Add noise, detect, restore, and measure against the still scene."""
+    """Add noise, detect, restore, and compare with the scene at rest."""
     taken = with_noise(clean, noise, BITS, np.random.default_rng([seed, round(1e6 * noise)]))
     values: dict[str, Any] = {"seed": seed, "noise": noise, "detection": {}, "restoration": {}}
     images, timing = Images(values, taken), camera(len(scene.still))
@@ -149,6 +149,6 @@ def run_trial(
 
 
 def still_values(scene: Scene, noise: float, edges: Sequence[Edge]) -> dict[str, Any]:
-    """What a still camera with this noise has."""
+    """Quality of a camera at rest with this noise."""
     taken = with_noise(scene.still[None], noise, BITS, np.random.default_rng(round(1e6 * noise)))
     return quality(taken, scene.still, edges)

@@ -1,4 +1,4 @@
-"""All trials of a reproduction, shared among processes."""
+"""All trials of a reproduction, run in several processes."""
 
 import multiprocessing
 from collections.abc import Iterator
@@ -17,15 +17,15 @@ _SHUTTER_SIZE = (192, 256)
 
 @dataclass(frozen=True)
 class Plan:
-    """What to run.
+    """Size and number of the trials.
 
     Attributes:
         size: (rows, columns) of the frames.
-        seeds: Trials: phases and noise of each are its own.
-        noises: Standard deviations, fractions of full scale; the first is that of the tables.
-        edges: Slanted edges measured for each axis.
-        speeds: px/s, image motions.
-        processes: At a time.
+        seeds: Number of trials, each with random phases and noise.
+        noises: Standard deviations, fractions of full scale; the first is used for the tables.
+        edges: Number of slanted edges per axis.
+        speeds: Image motions in px/s.
+        processes: Number of processes at a time.
     """
 
     size: tuple[int, int]
@@ -38,7 +38,7 @@ class Plan:
 
 @dataclass(eq=False)
 class Found:
-    """What came out: trials of each target, the still camera, the claims, and images of the first trial."""
+    """Results: trials of each target, the camera at rest, the claims, and images of the first trial."""
 
     trials: dict[Target, list[dict[str, Any]]] = field(default_factory=dict)
     still: dict[Target, list[dict[str, Any]]] = field(default_factory=dict)
@@ -48,7 +48,7 @@ class Found:
     scenes: dict[Target, Scene] = field(default_factory=dict)
 
 
-_scene: Scene  # of the tasks at hand; processes inherit them
+_scene: Scene  # of the current tasks; inherited by the processes
 _edges: list[Edge]
 _plan: Plan
 
@@ -70,7 +70,7 @@ def _start_process() -> None:
 
 
 def _shared(function: Any, tasks: list[Any]) -> Iterator[Any]:
-    """Results of tasks in processes of their own, in the order of the tasks."""
+    """Results of tasks that run in separate processes, in the order of the tasks."""
     if _plan.processes == 1:
         yield from map(function, tasks)
         return
@@ -79,8 +79,8 @@ def _shared(function: Any, tasks: list[Any]) -> Iterator[Any]:
 
 
 def run(plan: Plan, say: Any = print) -> Found:
-    """Run all trials; ``say`` is told how far it is."""
-    global _scene, _edges, _plan  # noqa: PLW0603  # scenes are too large to be sent to every process
+    """Run all trials; ``say`` is called with messages of progress."""
+    global _scene, _edges, _plan  # noqa: PLW0603  # scenes are too large to be sent to the processes
     _plan, found = plan, Found()
     for target, name in TARGETS.items():
         say(f"{name}: drawing the scene")
@@ -94,7 +94,7 @@ def run(plan: Plan, say: Any = print) -> Found:
             if images is not None:
                 found.images[target] = images
     for speed in plan.speeds:
-        if speed == 0:  # the trials of the table
+        if speed == 0:  # the trials of the tables
             still = [t for t in found.trials["landscape"] if t["noise"] == plan.noises[0]]
             found.push_scan += [{"speed": speed, "detection": t["detection"]} for t in still]
             continue

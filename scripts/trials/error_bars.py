@@ -1,13 +1,13 @@
 #!/usr/bin/env python
-"""Whether error bars are honest: errors over what is stated for them, on simulated recordings.
+"""Validation of standard deviations: errors over estimated standard deviations, on simulated recordings.
 
-Free motions are random walks, smooth motions, sums of three tones, and lone tones within 8 % of the frequency at which
-all frames are displaced alike; five frames of drawn cities, noise 0.005. Printed: root mean square of error over
-standard deviation for what rows tell of the motion, and for all of it.
+Free motions are random walks, smooth motions, sums of three tones, and single tones within 8 % of the frequency at
+which all frames are displaced alike; five frames of drawn cities, noise 0.005. Printed: root mean square of error over
+standard deviation of the part of the motion that differs between frames, and of the whole motion.
 
 Calibrations have random row times and LED frequencies, in front of a plain wall, with 20 times the noise, of textured
-scenes in one frame, strong and weak, and in four frames. Printed: how many were found, and root mean square and median
-size of error over standard deviation; 1 and 0.67 are expected.
+scenes in one frame, strong and weak, and in four frames. Printed: number of successful calibrations, root mean square
+and median absolute value of error over standard deviation; 1 and 0.67 are expected.
 """
 
 import argparse
@@ -79,8 +79,9 @@ def free_motion(kind: str, motions: int, seeds: int) -> str:
             seen.append(rms(left[:, RIM:-RIM]) / found.std_seen.numpy())
     size = np.abs(pulls)
     return (
-        f"{kind}, {motions} motions, {seeds} seeds: what rows tell {np.sqrt(np.mean(np.square(seen))):.2f}; "
-        f"all {np.sqrt(np.mean(size**2)):.2f} (median {np.median(size):.2f}; {np.mean(size < 2):.0%} within two)"
+        f"{kind}, {motions} motions, {seeds} seeds: differences between frames "
+        f"{np.sqrt(np.mean(np.square(seen))):.2f}; whole motion {np.sqrt(np.mean(size**2)):.2f} (median "
+        f"{np.median(size):.2f}; {np.mean(size < 2):.0%} within two)"
     )
 
 
@@ -117,7 +118,7 @@ def calibration(kind: str, count: int) -> str:
             continue
         pulls.append((found.row_time - row_time) / found.row_time_std)
     return (
-        f"{kind}: {len(pulls)} of {count} found, {np.sqrt(np.mean(np.square(pulls))):.2f}, median "
+        f"{kind}: {len(pulls)} of {count} successful, {np.sqrt(np.mean(np.square(pulls))):.2f}, median "
         f"{np.median(np.abs(pulls)):.2f}, largest {np.max(np.abs(pulls)):.1f}"
     )
 
@@ -126,7 +127,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", choices=("motion", "calibration"))
     parser.add_argument("--motions", type=int, default=12)
-    parser.add_argument("--seeds", type=int, default=1, help="of the noise, for each motion")
+    parser.add_argument("--seeds", type=int, default=1, help="noise seeds of each motion")
     parser.add_argument("--recordings", type=int, default=40)
     options = parser.parse_args()
     if options.only != "calibration":

@@ -1,21 +1,22 @@
 #!/usr/bin/env python
-"""Free-form motion on a measured jitter profile: Mars Reconnaissance Orbiter's, its time axis compressed.
+"""Free motion with a measured jitter profile of the Mars Reconnaissance Orbiter, its time axis compressed.
 
 The profile is not part of this project. FILE is mroJitter.txt as the planetary software ISIS writes it (sample offset
-px, line offset px, time s; image PSP_008469_2040). Frames of drawn cities, or of the images given, are taken by the
-independent camera of the tests while the profile goes by in a fraction of a second.
+px, line offset px, time s; image PSP_008469_2040). Frames of drawn cities, or of the images given, are simulated by the
+independent camera of the tests with the profile compressed to a fraction of a second.
 
-What frames cannot tell is a warp w that is fixed to the scene: frames that show row s of a scene at r = s + Y(r) show
-row s - w(s) of a warped scene at the same r if the motion is larger by w(s). So w is what the errors of the rows that
-show one scene row have in common. Printed, in px rms for x and y over all rows:
+Frames do not determine a warp w that is fixed to the scene: frames in which row s of a scene appears at r = s + Y(r)
+are equal to frames of a warped scene, with row s - w(s) at the same r, if the motion is larger by w(s). w is therefore
+the common part of the errors of all rows that contain one scene row. Printed, in px rms for x and y over all rows:
 
   offsets   error of the offsets between any two frames that the motion predicts: where content at each row of the one
-            lies in the other. Nothing is taken out here, and no warp changes it. Also for no motion, and half of it
-  seen      error less w, and what is stated for it
-  by rows   error less its mean over the frames at equal rows of the frames: w enters where it has moved
-  all       error less its mean over the record, and what is stated for w
+            lies in the other; not affected by a warp. Also for no motion, and for half of it
+  seen      error minus w, and its estimated standard deviation
+  by rows   error minus its mean over the frames at equal rows; includes the part of w that has moved
+  all       error minus its mean over the record, and the estimated standard deviation of w
 
-and PSNR in dB of the frames as they are, restored with the truth, with what was found less w, and with what was found.
+and PSNR in dB of the frames: input, restored with the true motion, with the detected motion minus w, and with the
+detected motion.
 """
 
 import argparse
@@ -46,12 +47,12 @@ SETTINGS = (  # compression, frames, rows, row time in s
     (80, 8, 256, 3e-5),
     (100, 8, 256, 2e-5),
     (100, 8, 512, 1e-5),
-    (60, 8, 512, 3e-5),  # one tone turns once a frame: blind
+    (60, 8, 512, 3e-5),  # includes a blind frequency
 )
 
 
 def profile(path: Path) -> tuple[Array, Array]:
-    """Times from the first, and displacement (N, 2) less its mean."""
+    """Times relative to the first, and displacement (N, 2) minus its mean."""
     lines = [
         line.split() for line in path.read_text().splitlines() if line.strip() and line.strip()[0] in "-0123456789"
     ]
@@ -60,19 +61,19 @@ def profile(path: Path) -> tuple[Array, Array]:
 
 
 class Jitter(Motion):
-    """The profile, its time axis compressed; it stands still after its end."""
+    """The profile with a compressed time axis, constant after its end."""
 
     def __init__(self, times: Array, path: Array, squeeze: float) -> None:
         object.__setattr__(self, "curve", CubicSpline(times / squeeze, path))
         object.__setattr__(self, "end", times[-1] / squeeze)
 
     def displacement(self, moments: Array) -> Array:
-        """Displacement in px at moments in seconds."""
+        """Displacement in px at times in seconds."""
         return np.asarray(self.curve(np.clip(moments, 0, self.end)))  # type: ignore[attr-defined]
 
 
 def scene_of(source: int | Path, height: int, width: int) -> Array:
-    """A drawn city, or the middle of an image, its brightness within 0 ... 1."""
+    """A drawn city, or the centre of an image, scaled to 0 ... 1."""
     if isinstance(source, int):
         return draw_scene(height, width, source)
     image = rsv.read_stack(source, full_scale=65535)[0].double().numpy()
@@ -83,7 +84,7 @@ def scene_of(source: int | Path, height: int, width: int) -> Array:
     return np.clip((part - low) / (high - low), 0.0, 1.0)
 
 
-def told(values: Array) -> str:
+def numbers(values: Array) -> str:
     return ", ".join(f"{value:.3f}" for value in values)
 
 
@@ -100,15 +101,17 @@ def trial(source: int | Path, curve: tuple[Array, Array], squeeze: float, frames
     error = motion - truth
     seen = error - common_warp(error, truth)
     name = source if isinstance(source, int) else source.stem
-    print(f"x{squeeze:g}, {frames} frames of {rows} rows, {timing.frame_rate:.0f} a second, scene {name}:", end=" ")
-    print(f"moves by {told(rms(truth - truth.mean((0, 1))))}")
+    print(f"x{squeeze:g}, {frames} frames of {rows} rows, {timing.frame_rate:.0f} per second, scene {name}:", end=" ")
+    print(f"displacement {numbers(rms(truth - truth.mean((0, 1))))}")
     still, half = (offset_error(part * truth, truth) for part in (0.0, 0.5))
-    print(f"    offsets {told(offset_error(motion, truth))}; none {told(still)}; half {told(half)}")
-    print(f"    seen {told(rms(seen))} (stated {told(found.std_seen.numpy())}); by rows", end=" ")
-    print(f"{told(rms(error - error.mean(0)))}; all {told(rms(error))} (stated {told(found.unseen.numpy())})")
+    print(f"    offsets {numbers(offset_error(motion, truth))}; none {numbers(still)}; half {numbers(half)}")
+    print(f"    seen {numbers(rms(seen))} (estimated {numbers(found.std_seen.numpy())}); by rows", end=" ")
+    print(
+        f"{numbers(rms(error - error.mean(0)))}; all {numbers(rms(error))} (estimated {numbers(found.unseen.numpy())})"
+    )
     sharp = crop(scene, MARGIN)
-    values = [f"{decibel(taken.numpy(), sharp, RIM):.2f} as taken"]
-    for label, path in (("truth", truth), ("found less w", truth + seen), ("found", motion)):
+    values = [f"{decibel(taken.numpy(), sharp, RIM):.2f} input"]
+    for label, path in (("truth", truth), ("detected minus w", truth + seen), ("detected", motion)):
         moving = rsv.FreeMotion.from_samples(moments.ravel(), path.reshape(-1, 2), spacing=8 * time)
         values.append(f"{decibel(rsv.restore(taken, timing, moving, check=False).numpy(), sharp, RIM):.2f} {label}")
     print(f"    PSNR {', '.join(values)}", flush=True)
@@ -121,7 +124,7 @@ def main() -> int:
     options = parser.parse_args()
     for path in (options.file, *options.images):
         if not path.is_file():
-            print(f"{path} is not there", file=sys.stderr)
+            print(f"{path} does not exist", file=sys.stderr)
             return 2
     curve = profile(options.file)
     for source in options.images or SEEDS:

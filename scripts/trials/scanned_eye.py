@@ -1,10 +1,11 @@
 #!/usr/bin/env python
-"""Registration on a scanned video of a moving eye, whose vignette stays with the sensor.
+"""Registration of a scanned video of a moving eye, with a vignette that is fixed to the sensor.
 
 The recordings are not part of this project: FOLDER holds tslo-dark.avi and tslo-stim.avi of
-github.com/lowvisionresearch/ReVAS (512 rows, 30 frames a second). Printed: correlation of consecutive frames before
-and after moving every row by its offset, of the frames as they are and without vignette (local mean and contrast
-taken out); how well offsets p to p + 1 and p + 1 to p + 2 add up to p to p + 2; the verdict of detection.
+github.com/lowvisionresearch/ReVAS (512 rows, 30 frames per second). Printed: correlation of consecutive frames before
+and after correction of every row by its offset, with and without the vignette (local mean and contrast removed); the
+difference between the sum of the offsets p to p + 1 and p + 1 to p + 2 and the offset p to p + 2; the verdict of
+detection.
 """
 
 import argparse
@@ -27,7 +28,7 @@ Array = NDArray[np.float64]
 
 
 def offsets(frames: torch.Tensor, first: int, second: int, method: Registration, tall: int) -> tuple[Array, Array]:
-    """Rows and offsets (N, 2) between two frames, bands that were not found left out."""
+    """Rows and offsets (N, 2) between two frames, without failed bands."""
     timing = rsv.SensorTiming(PERIOD / ROWS, 1, ROWS, frame_start_times=[first * PERIOD, second * PERIOD])
     curve = rsv.register_bands(frames[[first, second]], timing, method=method, band_rows=tall)
     found = curve.offsets[0].numpy()
@@ -40,7 +41,7 @@ def at(rows: Array, place: Array, values: Array) -> Array:
 
 
 def evened(frame: Array) -> Array:
-    """A frame without what changes slowly over it."""
+    """A frame without its slow variations."""
     low = ndimage.gaussian_filter(frame, 12.0)
     spread = np.sqrt(ndimage.gaussian_filter((frame - low) ** 2, 12.0))
     return np.asarray((ndimage.gaussian_filter(frame, 1.0) - low) / (spread + 1e-3))
@@ -55,7 +56,7 @@ def report(path: Path, method: Registration, tall: int) -> str:
     frames = rsv.read_stack(path).mean(1)
     pictures = frames.double().numpy()
     down, across = np.mgrid[: frames.shape[-2], : frames.shape[-1]].astype(float)
-    told: list[list[float]] = []
+    correlations: list[list[float]] = []
     misfits, sizes = [], []
     for p in range(len(frames) - 1):
         rows, found = offsets(frames, p, p + 1, method, tall)
@@ -66,18 +67,18 @@ def report(path: Path, method: Registration, tall: int) -> str:
         for one, other in ((pictures[p], pictures[p + 1]), (evened(pictures[p]), evened(pictures[p + 1]))):
             back = ndimage.map_coordinates(other, place, order=3, mode="nearest")
             values += [correlation(one, other), correlation(one, back)]
-        told.append(values)
+        correlations.append(values)
         if p + 2 < len(frames):
             next_rows, step = offsets(frames, p + 1, p + 2, method, tall)
             both_rows, both = offsets(frames, p, p + 2, method, tall)
             misfits.append(np.abs(found + at(rows + found[:, 1], next_rows, step) - at(rows, both_rows, both)))
-    raw, after, even, even_after = np.mean(told, axis=0)
+    raw, after, even, even_after = np.mean(correlations, axis=0)
     apart = np.median(np.concatenate(misfits), axis=0)
     size = np.mean(sizes, axis=0)
     return (
         f"{path.name} {method:>5}, bands of {tall} rows: offsets {size[0]:.2f}, {size[1]:.2f} px; "
         f"correlation {raw:.3f} -> {after:.3f}, without vignette {even:.3f} -> {even_after:.3f}; "
-        f"add up to {apart[0]:.3f}, {apart[1]:.3f} px (median x, y)"
+        f"closure {apart[0]:.3f}, {apart[1]:.3f} px (median x, y)"
     )
 
 
@@ -87,7 +88,7 @@ def main() -> int:
     folder = parser.parse_args().folder
     missing = [name for name in FILES if not (folder / name).is_file()]
     if missing:
-        print(f"{folder}: {', '.join(missing)} not there", file=sys.stderr)
+        print(f"{folder}: {', '.join(missing)} missing", file=sys.stderr)
         return 2
     for name in FILES:
         for method, tall in METHODS:
