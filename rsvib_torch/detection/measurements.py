@@ -20,10 +20,10 @@ class Measurements:
     displacements, and from every model that is compared with them.
 
     Attributes:
-        moments: (B, N, G) float64 s, exposure start of the row of each frame that contains scene row n.
+        exposure_starts: (B, N, G) float64 s, exposure start of the row of each frame that contains scene row n.
         displacements: (B, N, G, 2) float64 px, axes (x, y), with zero mean over the frames that contain the row; 0 in
             the others.
-        seen: (B, N, G) float64, 1 where a frame contains the row, else 0.
+        visible: (B, N, G) float64, 1 where a frame contains the row, else 0.
         information: (B, N, 2, 2) float64 px^-2, inverse covariance of the displacement in one frame up to a common
             factor; 0 where nothing was measured.
         exposure_time: T_e in seconds.
@@ -31,9 +31,9 @@ class Measurements:
         independent: Fraction of the measurements that are independent (bands may overlap).
     """
 
-    moments: Tensor
+    exposure_starts: Tensor
     displacements: Tensor
-    seen: Tensor
+    visible: Tensor
     information: Tensor
     exposure_time: float
     average_times: tuple[float, float] = (0.0, 0.0)
@@ -64,28 +64,30 @@ class Measurements:
     @cached_property
     def _mean_weights(self) -> Tensor:
         """(B, N, G) weights of the mean over the frames that contain a row."""
-        return self.seen / self.seen.sum(2, keepdim=True).clamp(min=1.0)
+        return self.visible / self.visible.sum(2, keepdim=True).clamp(min=1.0)
 
     @cached_property
     def centre(self) -> Tensor:
         """(B,) mid-time of the record in seconds: phases are fitted there, where they depend least on frequency."""
-        return 0.5 * (self.moments.amin((1, 2)) + self.moments.amax((1, 2)) + self.exposure_time)
+        return 0.5 * (self.exposure_starts.amin((1, 2)) + self.exposure_starts.amax((1, 2)) + self.exposure_time)
 
     @cached_property
     def middles(self) -> Tensor:
         """(B, N, G, 1, 1) mid-exposures in seconds from the centre of the record."""
-        return (self.moments + (0.5 * self.exposure_time - self.centre)[:, None, None])[..., None, None]
+        return (self.exposure_starts + (0.5 * self.exposure_time - self.centre)[:, None, None])[..., None, None]
 
     @cached_property
     def smearing_times(self) -> Tensor:
         """(2, 1, 2, 1) seconds over which displacements (x, y) are averages: the exposure, the rows of a band."""
         times = [(self.exposure_time, self.exposure_time), self.average_times]
-        return torch.tensor(times, dtype=self.moments.dtype, device=self.moments.device)[:, None, :, None]
+        return torch.tensor(times, dtype=self.exposure_starts.dtype, device=self.exposure_starts.device)[
+            :, None, :, None
+        ]
 
     @property
     def duration(self) -> Tensor:
         """(B,) seconds from the first to the last row of the record, in any frame but the last of a group."""
-        first = self.moments.amin(-1)
+        first = self.exposure_starts.amin(-1)
         return first.amax(1) - first.amin(1)
 
     @property
@@ -94,14 +96,14 @@ class Measurements:
         return self.information.diagonal(dim1=-2, dim2=-1)
 
     @property
-    def differences(self) -> Tensor:
+    def num_differences(self) -> Tensor:
         """(B, N) independent differences within each group: one less than the frames that contain the row."""
-        return (self.seen.sum(-1) - 1).clamp(min=0.0)
+        return (self.visible.sum(-1) - 1).clamp(min=0.0)
 
     @property
-    def known(self) -> Tensor:
+    def num_measurements(self) -> Tensor:
         """(B, 2) number of independent measurements of each axis."""
-        return ((self.weights > 0) * self.differences[..., None]).sum(1) * self.independent
+        return ((self.weights > 0) * self.num_differences[..., None]).sum(1) * self.independent
 
     def repeated(self, count: int) -> "Measurements":
         """Every stack ``count`` times in a row."""
@@ -109,16 +111,16 @@ class Measurements:
 
     def in_segments(self, count: int) -> "Measurements":
         """The record cut into ``count`` pieces of equal length, as a batch (B count, N / count, ...)."""
-        rows = self.moments.shape[1] // count * count
+        rows = self.exposure_starts.shape[1] // count * count
         return self._mapped(lambda values: values[:, :rows].unflatten(1, (count, -1)).flatten(0, 1))
 
     def _mapped(self, function: Callable[[Tensor], Tensor]) -> "Measurements":
         """The measurements with a function applied to all tensors."""
         return replace(
             self,
-            moments=function(self.moments),
+            exposure_starts=function(self.exposure_starts),
             displacements=function(self.displacements),
-            seen=function(self.seen),
+            visible=function(self.visible),
             information=function(self.information),
         )
 
@@ -140,8 +142,8 @@ class Measurements:
     def relative(self, values: Tensor) -> Tensor:
         """Values (B, N, G, ...) less their mean over the frames that contain the row; 0 in the other frames."""
         ones = (1,) * (values.ndim - 3)
-        mean = (self._mean_weights.reshape(*self.seen.shape, *ones) * values).sum(2, keepdim=True)
-        return self.seen.reshape(*self.seen.shape, *ones) * (values - mean)
+        mean = (self._mean_weights.reshape(*self.visible.shape, *ones) * values).sum(2, keepdim=True)
+        return self.visible.reshape(*self.visible.shape, *ones) * (values - mean)
 
     # Residuals of a fit, (B, N, G, 2) px
 
@@ -155,14 +157,14 @@ class Measurements:
 
     def distances(self, residual: Tensor) -> Tensor:
         """(B, N, 2) rms residual of each row in px; NaN where nothing was measured."""
-        measured = (self.weights > 0) & (self.differences[..., None] > 0)
-        square = residual.square().sum(2) / self.differences[..., None].clamp(min=1.0)
+        measured = (self.weights > 0) & (self.num_differences[..., None] > 0)
+        square = residual.square().sum(2) / self.num_differences[..., None].clamp(min=1.0)
         return torch.where(measured, square.sqrt(), torch.nan)
 
     def unexplained(self, residual: Tensor) -> Tensor:
         """(B, 2) px, rms residual without the part that is explained by noise."""
-        measured = (self.weights > 0) & (self.differences[..., None] > 0)
-        square = residual.square().sum(2) / self.differences[..., None].clamp(min=1.0)
+        measured = (self.weights > 0) & (self.num_differences[..., None] > 0)
+        square = residual.square().sum(2) / self.num_differences[..., None].clamp(min=1.0)
         excess = square - 1 / self.weights.clamp(min=1e-300)
         return trimmed_mean(torch.where(measured, excess, torch.nan)).clamp(min=0.0).sqrt()
 

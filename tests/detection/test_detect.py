@@ -258,7 +258,7 @@ def synthetic_measurements(noise, seed, batch):
 
 
 def fitted_vibration(measurements, start=(52.0, 28.5)):
-    batch = len(measurements.moments)
+    batch = len(measurements.exposure_starts)
     frequencies = torch.tensor(start, dtype=torch.float64).expand(batch, 2)[..., None].clone()
     fit = fit_tones(measurements, frequencies, torch.ones(batch, 2, 1, dtype=torch.bool))
     return vibration_of_fit(fit)

@@ -40,7 +40,7 @@ def test_residual_displacements_about_the_true_motion_are_zero(pairs):
     truth = of_each_stack(MOTION)
     groups = frame_groups(stack_spectra(frames, None), camera, truth, pairs_if_blurred_differently=True)
     found, _ = measure_groups(groups, camera, truth)
-    expected = found.relative(truth.mean_displacement(found.moments, found.exposure_time))
+    expected = found.relative(truth.mean_displacement(found.exposure_starts, found.exposure_time))
     wrong = (found.displacements - expected)[:, 8:-8, 0].unflatten(1, (-1, 8)).mean(2)  # of 64 rows each
     assert bool((wrong.square().mean(1).sqrt() < torch.tensor([8e-4, 1.5e-3])).all())
 

@@ -77,14 +77,14 @@ def test_interpolation_error_depends_on_the_blur_of_each_frame():
     height = frames.shape[-2]
     motion = frame_motion(MOTION.vibration().expanded(1), timing, 2, height)
     prior = fit_prior(frames, motion, 0, torch.full((2,), 0.001), 256)
-    assert prior.blind.shape == (2, 129)
+    assert prior.interpolation_power.shape == (2, 129)
     times = (2048 * np.arange(2)[:, None, None] + np.arange(height)[:, None] + np.arange(0, 200, 5)) * timing.row_time
     across = MOTION.displacement(times)[..., 1]
     path = (across.max(-1) - across.min(-1)).mean(-1)  # px, length of the blur of the rows in each frame
     assert path[0] < 0.8 * path[1]
-    assert prior.blind[0].mean() > 3 * prior.blind[1].mean()
-    torch.testing.assert_close(prior.of([0, 1]).blind, prior.blind.mean(0))
-    torch.testing.assert_close(prior.of([1]).blind, prior.blind[1])
+    assert prior.interpolation_power[0].mean() > 3 * prior.interpolation_power[1].mean()
+    torch.testing.assert_close(prior.of([0, 1]).interpolation_power, prior.interpolation_power.mean(0))
+    torch.testing.assert_close(prior.of([1]).interpolation_power, prior.interpolation_power[1])
 
 
 @pytest.mark.parametrize(

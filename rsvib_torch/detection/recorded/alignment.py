@@ -203,10 +203,10 @@ def _best_offset(
     measured: Measurements, recorded: FreeMotion, low: float, high: float, timing: SensorTiming
 ) -> tuple[float, float | None]:
     """The offset of the least residual, with a free drift, and another local minimum below twice the least square."""
-    every = max(1, measured.moments.shape[1] // 400)  # 400 scene rows are enough for a start
+    every = max(1, measured.exposure_starts.shape[1] // 400)  # 400 scene rows are enough for a start
     used = (measured.weights[0] > 0).all(-1).nonzero()[::every, 0]
-    moments = measured.moments[0, used] + 0.5 * measured.exposure_time
-    seen = measured.seen[0, used]
+    exposure_starts = measured.exposure_starts[0, used] + 0.5 * measured.exposure_time
+    seen = measured.visible[0, used]
     values = (measured.displacements[0, used] * seen[..., None]).flatten(0, 1)
     weight = (measured.weights[0, used, None] * seen[..., None]).flatten(0, 1)
 
@@ -214,7 +214,7 @@ def _best_offset(
         mean = (of * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)
         return ((of - mean) * seen[..., None]).flatten(-3, -2)
 
-    drift = relative(moments[..., None].expand(-1, -1, 2))
+    drift = relative(exposure_starts[..., None].expand(-1, -1, 2))
     norm = (weight * drift.square()).sum(0).clamp(min=1e-300)
     step = max(0.5 * recorded.spacing, 4 * timing.row_time, (high - low) / 20000)  # at most 20,000 offsets
     grid = torch.linspace(
@@ -222,7 +222,7 @@ def _best_offset(
     )
     costs = []
     for part in grid.split(128):  # (128, N G, 2) values at a time
-        residual = values - relative(recorded.displacement(part[:, None, None] + moments))
+        residual = values - relative(recorded.displacement(part[:, None, None] + exposure_starts))
         along = (weight * drift * residual).sum(-2) / norm
         # both axes together, as one of them may be at rest; without the largest fifth: clouds
         size = (weight * (residual - along[:, None] * drift).square()).sum(-1)
@@ -242,15 +242,15 @@ def _refine(
     measured: Measurements, recorded: FreeMotion, clock: _Clock, fit_scale: bool, fit_gain: bool
 ) -> tuple[_Clock, Tensor]:
     """Gauss-Newton on clock reading, scale, gain and drift (6 parameters), with their covariance (6, 6)."""
-    moments = measured.moments
-    middle = moments + 0.5 * measured.exposure_time - clock.middle
-    free = torch.tensor([True, fit_scale, fit_gain, fit_gain, True, True], device=moments.device)
-    covariance = torch.zeros(6, 6, dtype=torch.float64, device=moments.device)
+    exposure_starts = measured.exposure_starts
+    middle = exposure_starts + 0.5 * measured.exposure_time - clock.middle
+    free = torch.tensor([True, fit_scale, fit_gain, fit_gain, True, True], device=exposure_starts.device)
+    covariance = torch.zeros(6, 6, dtype=torch.float64, device=exposure_starts.device)
     for _ in range(12):
         own = recorded.retimed(clock.offset, clock.scale)
-        gain = moments.new_tensor(clock.gain)
-        speed = own.velocity(moments + 0.5 * measured.exposure_time) * gain / clock.scale
-        value = own.mean_displacement(moments, measured.exposure_time)
+        gain = exposure_starts.new_tensor(clock.gain)
+        speed = own.velocity(exposure_starts + 0.5 * measured.exposure_time) * gain / clock.scale
+        value = own.mean_displacement(exposure_starts, measured.exposure_time)
         zero = torch.zeros_like(value[..., 0])
         columns = torch.stack(
             [
@@ -270,7 +270,7 @@ def _refine(
         scale = torch.where(gram.diagonal() > 0, gram.diagonal(), 1.0).sqrt()
         inverse = torch.linalg.pinv(gram / scale / scale[:, None], rtol=1e-10, hermitian=True) / scale / scale[:, None]
         change = inverse @ right
-        known = measured.known.sum().clamp(min=7.0) - free.sum()
+        known = measured.num_measurements.sum().clamp(min=7.0) - free.sum()
         covariance = inverse * (measured.square(residual).sum() / known)
         at, speedup, gain_x, gain_y, drift_x, drift_y = change.tolist()
         clock = _Clock(

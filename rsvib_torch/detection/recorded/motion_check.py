@@ -120,7 +120,7 @@ def _averaged(motion: Motion, measured: Measurements) -> Tensor:
     nodes, weights = gauss_legendre(3)
     mean = torch.zeros_like(measured.displacements)
     for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
-        times = measured.moments + (node - 0.5) * duration
+        times = measured.exposure_starts + (node - 0.5) * duration
         mean = mean + weight * motion.mean_displacement(times, measured.exposure_time)
     return mean
 

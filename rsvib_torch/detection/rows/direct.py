@@ -171,7 +171,7 @@ class _Step:
     def between(cls, measurements: Measurements, warped_by: Motion, fitted: Motion) -> "_Step":
         """Step from the motion that the frames were warped by to the fitted motion."""
         before, after = (
-            measurements.relative(motion.mean_displacement(measurements.moments, measurements.exposure_time))
+            measurements.relative(motion.mean_displacement(measurements.exposure_starts, measurements.exposure_time))
             for motion in (warped_by, fitted)
         )
         return cls(after, after - before)
@@ -253,14 +253,14 @@ def _mirrored_frequencies(found: DirectFit, start: ToneFit, tried: Tensor) -> tu
     """
     measurements, fit = found.measurements, strongest_only(found.fit)
     residual = measurements.sizes(residual_of(measurements, found.fit)).nanmedian(1).values.nan_to_num(0.0)  # (B, 2)
-    moments = measurements.moments
-    duration = (moments.amax(1) - moments.amin(1)).amax(-1)[:, None]
-    interval = (moments[:, :, 1] - moments[:, :, 0]).mean(1)[:, None]
+    exposure_starts = measurements.exposure_starts
+    duration = (exposure_starts.amax(1) - exposure_starts.amin(1)).amax(-1)[:, None]
+    interval = (exposure_starts[:, :, 1] - exposure_starts[:, :, 0]).mean(1)[:, None]
     frequency = strongest_only(start).frequencies[..., 0]
     mirrored = 2 * (frequency * interval).round() / interval - frequency
     unresolved = ((mirrored - frequency).abs() * duration < 0.35) & (mirrored > 0) & fit.active[..., 0]
     where = unresolved & ~tried & (residual > 3.0) & (residual == residual.amax(-1, keepdim=True))
-    if fit.model.harmonics > 1 or moments.shape[2] > 2:
+    if fit.model.harmonics > 1 or exposure_starts.shape[2] > 2:
         where = torch.zeros_like(where)
     return torch.where(where, mirrored, fit.frequencies[..., 0])[..., None], where
 

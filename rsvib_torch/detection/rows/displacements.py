@@ -62,14 +62,14 @@ class _Positions:
         columns: (B, 1, 1) px, displacement along the rows that is common to the group and is not taken out.
         rows: (B, G, S) frame rows that contain the scene rows.
         shift: (B, G, S) px, displacement along the rows to be taken out.
-        moments: (B, G, S) s, exposure starts of the frame rows.
+        exposure_starts: (B, G, S) s, exposure starts of the frame rows.
     """
 
     scene_rows: Tensor
     columns: Tensor
     rows: Tensor
     shift: Tensor
-    moments: Tensor
+    exposure_starts: Tensor
 
     @classmethod
     def of(cls, group: FrameGroup, timing: RowTiming, motion: Motion, step: int = 1) -> "_Positions":
@@ -87,9 +87,9 @@ class _Positions:
     ) -> "_Positions":
         """Positions of given scene rows in frames that start at ``starts`` (B, G, 1)."""
         rows = rows_showing(scene_rows, starts, timing, motion)
-        moments = starts + rows * timing.row_time
-        shift = motion.mean_displacement(moments, timing.exposure_time)[..., 0] - columns
-        return cls(scene_rows, columns, rows, shift, moments)
+        exposure_starts = starts + rows * timing.row_time
+        shift = motion.mean_displacement(exposure_starts, timing.exposure_time)[..., 0] - columns
+        return cls(scene_rows, columns, rows, shift, exposure_starts)
 
     def visible(self, height: int, block: int) -> Tensor:
         """(B, G, S) float64, 1 for blocks of scene rows that lie inside a frame of ``height`` rows, else 0."""
@@ -197,12 +197,12 @@ def measure_group(
     regular = torch.where(measured[..., None, None], information, eye)
     residual = torch.linalg.solve(regular[:, None], gradient[..., None])[..., 0]
     residual = torch.where(measured[:, None, :, None], residual, 0.0)
-    moments = _in_blocks(positions.moments).mean(3)
-    around = motion.mean_displacement(moments, timing.exposure_time)
+    exposure_starts = _in_blocks(positions.exposure_starts).mean(3)
+    around = motion.mean_displacement(exposure_starts, timing.exposure_time)
     measurements = Measurements(
-        moments=moments.transpose(1, 2),
+        exposure_starts=exposure_starts.transpose(1, 2),
         displacements=(around + residual).transpose(1, 2),
-        seen=_in_blocks(visible)[..., 0].transpose(1, 2),
+        visible=_in_blocks(visible)[..., 0].transpose(1, 2),
         information=torch.where(measured[..., None, None], information, 0.0),
         exposure_time=timing.exposure_time,
     )
@@ -230,19 +230,21 @@ def measure_groups(
 
 def _joined(parts: list[Measurements]) -> Measurements:
     """Measurements of all groups as one record; smaller groups get frames in which no row is visible."""
-    most = max(part.moments.shape[-1] for part in parts)
+    most = max(part.exposure_starts.shape[-1] for part in parts)
 
     def padded(values: Tensor) -> Tensor:
         return functional.pad(values, (0, 0) * (values.ndim - 3) + (0, most - values.shape[2]))
 
-    def repeated(moments: Tensor) -> Tensor:
-        return torch.cat([moments, moments[:, :, :1].expand(-1, -1, most - moments.shape[2])], 2)
+    def repeated(exposure_starts: Tensor) -> Tensor:
+        return torch.cat(
+            [exposure_starts, exposure_starts[:, :, :1].expand(-1, -1, most - exposure_starts.shape[2])], 2
+        )
 
     return replace(
         parts[0],
-        moments=torch.cat([repeated(part.moments) for part in parts], 1),
+        exposure_starts=torch.cat([repeated(part.exposure_starts) for part in parts], 1),
         displacements=torch.cat([padded(part.displacements) for part in parts], 1),
-        seen=torch.cat([padded(part.seen) for part in parts], 1),
+        visible=torch.cat([padded(part.visible) for part in parts], 1),
         information=torch.cat([part.information for part in parts], 1),
     )
 
@@ -294,11 +296,11 @@ def differential_motion(gradients: list[RowGradients], *, rows: int = 64) -> Ten
 # Frames that are blurred differently
 
 
-def _paths(moments: Tensor, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor]:
-    """Paths (B, G, S, N, 2) in px about their means during exposures that start at ``moments``, and weights (N,)."""
+def _paths(exposure_starts: Tensor, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor]:
+    """Paths (B, G, S, N, 2) in px about their means during exposures from ``exposure_starts``, and weights (N,)."""
     # two thirds of the nodes of the restoration: an accuracy of 1e-3 is enough for images that are blurred twice
     count = math.ceil(2 / 3 * gauss_node_count(motion, timing.exposure_time))
-    path, weights = exposure_trajectory(motion, moments, timing, "gauss", count)
+    path, weights = exposure_trajectory(motion, exposure_starts, timing, "gauss", count)
     weights = weights.to(path)
     return path - (path * weights[:, None]).sum(-2, keepdim=True), weights
 
@@ -308,9 +310,9 @@ def _second_moments(paths: Tensor, weights: Tensor) -> Tensor:
     return torch.einsum("bgsni,bgsnj,n->bgsij", paths, paths, weights)
 
 
-def _different(moments: Tensor, timing: RowTiming, motion: Motion) -> Tensor:
-    """(B,) bool, whether exposures that start at ``moments`` (B, G, S) blur the same scene row differently."""
-    paths, weights = _paths(moments[..., ::8], timing, motion)
+def _different(exposure_starts: Tensor, timing: RowTiming, motion: Motion) -> Tensor:
+    """(B,) bool, whether exposures that start at ``exposure_starts`` (B, G, S) blur the same scene row differently."""
+    paths, weights = _paths(exposure_starts[..., ::8], timing, motion)
     third = torch.einsum("bgsn,bgsni->bgsi", paths.square().sum(-1) * weights, paths)
 
     def spread(values: Tensor) -> Tensor:
@@ -350,15 +352,15 @@ def _warp_to_scene(
     """
     different = torch.zeros(len(positions.rows), dtype=torch.bool, device=positions.rows.device)
     if positions.rows.shape[1] == 2:
-        different = _different(positions.moments, timing, motion)
+        different = _different(positions.exposure_starts, timing, motion)
     if not bool(different.any()):
         return lambda part: spectra.warped(positions.rows[..., part], positions.shift[..., part])
-    paths, weights = _paths(positions.moments, timing, motion)
+    paths, weights = _paths(positions.exposure_starts, timing, motion)
     paths = paths * different[:, None, None, None, None]
     real = spectra.values.real.dtype
     moment_slope = 0.5 * torch.gradient(_second_moments(paths, weights), dim=2)[0].to(real)[..., None]
     x, y = paths.flip(1).unbind(-1)  # of the other frame
-    starts = (positions.moments - positions.rows * timing.row_time)[..., None]
+    starts = (positions.exposure_starts - positions.rows * timing.row_time)[..., None]
     nodes = _Positions.of_rows(
         positions.scene_rows[..., None] - y, positions.columns[..., None] + x, starts, timing, motion
     )

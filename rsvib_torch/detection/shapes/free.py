@@ -197,14 +197,14 @@ def start_curve(
 
 def residual_of_motion(measured: Measurements, motion: Motion) -> Tensor:
     """Residual displacements (1, N, G, 2) in px of a motion (not a batch)."""
-    predicted = motion.mean_displacement(measured.moments, measured.exposure_time)
+    predicted = motion.mean_displacement(measured.exposure_starts, measured.exposure_time)
     return measured.relative(measured.displacements - predicted)
 
 
 def rms_motion(measured: Measurements, motion: Motion) -> Tensor:
     """(2,) px, rms displacement of scene rows about their mean over the frames, by a motion (not a batch)."""
-    moved = measured.relative(motion.mean_displacement(measured.moments, measured.exposure_time))[0]
-    return moved.square().sum(1).div(measured.differences[0].clamp(min=1.0)[:, None]).mean(0).sqrt()
+    moved = measured.relative(motion.mean_displacement(measured.exposure_starts, measured.exposure_time))[0]
+    return moved.square().sum(1).div(measured.num_differences[0].clamp(min=1.0)[:, None]).mean(0).sqrt()
 
 
 def unexplained_reason(residual: Tensor, moved: Tensor, model: str) -> list[str]:
@@ -276,7 +276,7 @@ def _fit_spline(
     """
     first, last = record
     count = math.ceil((last - first) / spacing) + 3
-    device = measurements.moments.device
+    device = measurements.exposure_starts.device
     shape = _SplineFit(
         torch.zeros(2, count, dtype=torch.float64, device=device), torch.zeros(2, 0, 0, device=device), first, spacing
     )
@@ -286,7 +286,7 @@ def _fit_spline(
 
 def _fit_axis(measurements: Measurements, shape: _SplineFit, axis: int, learn: bool) -> tuple[Tensor, Tensor]:
     """Coefficients (N,) of one axis and their covariance (N, N)."""
-    values = (measurements.displacements[..., axis] * measurements.seen)[0]
+    values = (measurements.displacements[..., axis] * measurements.visible)[0]
     weight = precision_of_axis(measurements.information[0], axis)
     count = shape.coefficients.shape[-1]
     gram = torch.zeros(count, count, dtype=torch.float64, device=values.device)
@@ -301,7 +301,7 @@ def _fit_axis(measurements: Measurements, shape: _SplineFit, axis: int, learn: b
         right[used] += weighted.mT @ values[part].flatten()
     energy = (weight[:, None] * values.square()).sum()
     rounding = 1e-12 * energy  # error of the sums that make the residual energy
-    known = ((measurements.differences[0] * (weight > 0)).sum() * measurements.independent).clamp(min=1.0)
+    known = ((measurements.num_differences[0] * (weight > 0)).sum() * measurements.independent).clamp(min=1.0)
     scale = gram.diagonal().mean() + 1e-300
     second = torch.eye(count, dtype=torch.float64, device=values.device).diff(n=2, dim=0)
     bend = second.mT @ second
@@ -331,15 +331,15 @@ def _fit_axis(measurements: Measurements, shape: _SplineFit, axis: int, learn: b
 
 def _design(measurements: Measurements, shape: _SplineFit, axis: int, part: slice) -> Tensor:
     """Derivatives (n, G, N) of the relative displacements of some scene rows by the coefficients of an axis."""
-    moments = measurements.moments[0, part]
+    exposure_starts = measurements.exposure_starts[0, part]
     average = measurements.average_times[axis] + measurements.exposure_time
     nodes, weights = gauss_legendre(3 + math.ceil(2 * average / shape.spacing))
-    first = moments + 0.5 * (measurements.exposure_time - average)
-    columns = torch.zeros(*moments.shape, 1, dtype=torch.float64, device=moments.device)
+    first = exposure_starts + 0.5 * (measurements.exposure_time - average)
+    columns = torch.zeros(*exposure_starts.shape, 1, dtype=torch.float64, device=exposure_starts.device)
     for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
         at = (first + average * node).flatten()
-        columns = columns + weight * shape.columns(at).unflatten(0, moments.shape)
-    seen = measurements.seen[0, part][..., None]
+        columns = columns + weight * shape.columns(at).unflatten(0, exposure_starts.shape)
+    seen = measurements.visible[0, part][..., None]
     mean = (seen * columns).sum(1, keepdim=True) / seen.sum(1, keepdim=True).clamp(min=1.0)
     return seen * (columns - mean)
 
@@ -446,10 +446,10 @@ def _visible_and_common(fit: _SplineFit, measured: Measurements) -> tuple[Tensor
     Returns:
         (S, N), the displacement in each frame less the mean over the frames; (R, N), that mean.
     """
-    seen = measured.seen[0]
+    seen = measured.visible[0]
     several = seen.sum(-1) > 1
     seen = seen[several]
-    moments = measured.moments[0, several] + 0.5 * measured.exposure_time
-    columns = fit.columns(moments.flatten()).unflatten(0, seen.shape)
+    exposure_starts = measured.exposure_starts[0, several] + 0.5 * measured.exposure_time
+    columns = fit.columns(exposure_starts.flatten()).unflatten(0, seen.shape)
     mean = (seen[..., None] * columns).sum(1) / seen.sum(-1)[:, None]
     return (columns - mean[:, None])[seen > 0], mean

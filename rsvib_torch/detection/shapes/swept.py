@@ -214,7 +214,7 @@ def _relative(measured: Measurements, values: Tensor) -> Tensor:
 def _start(measured: Measurements, axis: int, record: tuple[float, float], highest: float) -> Tensor:
     """Parameters (6,) from a grid of frequencies, sweeps and decays; the best six are fitted."""
     middle, span = 0.5 * (record[0] + record[1]), record[1] - record[0]
-    device = measured.moments.device
+    device = measured.exposure_starts.device
     grid = []
     for frequency in torch.arange(0.5 / span, highest, 0.5 / span).tolist():
         sweep = 1.5 * frequency / span  # Hz/s, at most
@@ -226,8 +226,8 @@ def _start(measured: Measurements, axis: int, record: tuple[float, float], highe
         ]
     fits = torch.tensor(grid, dtype=torch.float64, device=device)
     weight = precision_of_axis(measured.information[0], axis)
-    values = (measured.displacements[0, ..., axis] * measured.seen[0])[..., None]
-    times = measured.moments[0] + 0.5 * measured.exposure_time - middle
+    values = (measured.displacements[0, ..., axis] * measured.visible[0])[..., None]
+    times = measured.exposure_starts[0] + 0.5 * measured.exposure_time - middle
     drift = _relative(measured, times[..., None])[..., 0]
     gains = []
     for part in fits.split(32):  # (N, G, 32, 3) values at a time
@@ -265,12 +265,12 @@ def _settle(
     """
     middle = 0.5 * (record[0] + record[1])
     weight = precision_of_axis(measured.information[0], axis)
-    values = measured.displacements[0, ..., axis] * measured.seen[0]
-    known = ((measured.differences[0] * (weight > 0)).sum() * measured.independent).clamp(min=7.0)
+    values = measured.displacements[0, ..., axis] * measured.visible[0]
+    known = ((measured.num_differences[0] * (weight > 0)).sum() * measured.independent).clamp(min=7.0)
     row_weight = weight[:, None].expand_as(values)
     # a displacement is a mean over the exposure and the rows of a band
     duration = measured.exposure_time + measured.average_times[axis]
-    first = measured.moments[0] + 0.5 * (measured.exposure_time - duration) - middle
+    first = measured.exposure_starts[0] + 0.5 * (measured.exposure_time - duration) - middle
     nodes, shares = gauss_legendre(4)
     quadrature = list(zip(nodes.tolist(), shares.tolist(), strict=True))
 

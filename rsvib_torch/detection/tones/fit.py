@@ -335,8 +335,10 @@ def fit_tones(
     state = problem.solve(start, iterations=30, tolerance=1e-7)
     _, inverse = _step(state, problem.free, torch.zeros_like(state.cost))
     spent = problem.free.unflatten(1, (2, -1)).sum(-1)
-    # `known` counts independent measurements only: overlapping bands repeat each other
-    variance = measurements.square(state.residual).clamp(min=0.0) / (measurements.known - spent).clamp(min=1.0)
+    # `num_measurements` counts independent measurements only: overlapping bands repeat each other
+    variance = measurements.square(state.residual).clamp(min=0.0) / (measurements.num_measurements - spent).clamp(
+        min=1.0
+    )
     deviation = variance.sqrt().repeat_interleave(state.values.shape[-1], dim=1)
     covariance = (problem.to_all @ inverse @ problem.to_all.T) * deviation[:, :, None] * deviation[:, None]
     return problem.fit(state.values, covariance)

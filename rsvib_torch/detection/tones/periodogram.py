@@ -48,16 +48,16 @@ def power(measurements: Measurements, frequencies: Tensor, weights: Tensor) -> T
 
 def _power(measurements: Measurements, frequencies: Tensor, weights: Tensor, axes: slice) -> Tensor:
     """``power`` of some axes (B, S, A, F) at the same frequencies (B, F)."""
-    seen, group = measurements.seen[..., None], measurements.moments.shape[2]
+    seen, group = measurements.visible[..., None], measurements.exposure_starts.shape[2]
     of_rows = weights[..., axes].transpose(2, 3)  # (B, S, A, N)
     each = of_rows.repeat_interleave(group, dim=-1)  # (B, S, A, N G)
-    of_frames = (each * measurements.seen.flatten(1)[:, None, None]).flatten(1, 2)
-    of_means = (of_rows / measurements.seen.sum(2).clamp(min=1.0)[:, None, None]).flatten(1, 2)
+    of_frames = (each * measurements.visible.flatten(1)[:, None, None]).flatten(1, 2)
+    of_means = (of_rows / measurements.visible.sum(2).clamp(min=1.0)[:, None, None]).flatten(1, 2)
     drift = drift_response(measurements, 1)[..., 0].flatten(1)[:, None, None]  # (B, 1, 1, N G)
     values = measurements.displacements[..., axes].flatten(1, 2).transpose(1, 2)[:, None]  # (B, 1, A, N G)
     drift_drift, drift_value = ((each * drift * other).sum(-1)[..., None] for other in (drift, values))
     drift_drift = drift_drift * (1 + 1e-12) + _TINY
-    prior = 0.5 * MIN_GAIN**2 * (of_rows * measurements.differences[:, None, None]).sum(-1)[..., None] + _TINY
+    prior = 0.5 * MIN_GAIN**2 * (of_rows * measurements.num_differences[:, None, None]).sum(-1)[..., None] + _TINY
     linear = torch.stack([each * drift, each * values], dim=-2).flatten(1, 3)  # (B, 2 S A, N G)
     shape = each.shape[1:3]
     smearing = measurements.smearing_times[:, None, :, axes]  # (2, 1, 1, A, 1)
@@ -69,7 +69,7 @@ def _power(measurements: Measurements, frequencies: Tensor, weights: Tensor, axe
 
     powers = []
     most = _CHUNK.get(frequencies.device.type, _LARGE_CHUNK)
-    for chunk in frequencies.split(max(1, most // measurements.moments.numel()), dim=-1):
+    for chunk in frequencies.split(max(1, most // measurements.exposure_starts.numel()), dim=-1):
         angle = 2 * math.pi * chunk[:, None, None] * measurements.middles[..., 0]
         waves = (angle.cos(), angle.sin())
         means = [(seen * wave).sum(2) for wave in waves]  # (B, N, F)
@@ -116,8 +116,8 @@ def strongest_frequencies(
         (B, S, 2, count) Hz, the highest peak first, and its height (B, S, 2). The height of a record that was searched
         in segments is an upper bound, as each segment has an amplitude of its own.
     """
-    batch, rows, _ = measurements.moments.shape
-    device = measurements.moments.device
+    batch, rows, _ = measurements.exposure_starts.shape
+    device = measurements.exposure_starts.device
 
     def score(of: Measurements, by: Tensor, segments: int, frequencies: Tensor) -> Tensor:
         parts = of.in_segments(segments)
@@ -128,7 +128,7 @@ def strongest_frequencies(
 
     whole = frequency_grid(float(measurements.duration.amax()), sample_interval, device)
     # at most 2^25 complex values, about a second on one core, and at least 64 rows a segment
-    pieces = len(whole) * 2 * measurements.moments.numel() / 2**25
+    pieces = len(whole) * 2 * measurements.exposure_starts.numel() / 2**25
     segments = 1 << max(0, int(pieces - 1).bit_length())
     segments = max(1, min(segments, rows // 64))
     longest = float(measurements.in_segments(segments).duration.amax())
@@ -191,8 +191,8 @@ def without_stretches(measurements: Measurements) -> Tensor:
 
     A stretch of outliers of up to 24 % of the rows lies within one of them.
     """
-    rows = measurements.moments.shape[1]
-    place = (torch.arange(rows, dtype=torch.float64, device=measurements.moments.device) + 0.5) / rows
+    rows = measurements.exposure_starts.shape[1]
+    place = (torch.arange(rows, dtype=torch.float64, device=measurements.exposure_starts.device) + 0.5) / rows
     first = torch.linspace(0, 0.65, 7, dtype=torch.float64, device=place.device)[:, None]
     kept = (place < first) | (place > first + 0.35)
     return torch.cat([torch.ones_like(kept[:1]), kept])
@@ -229,7 +229,7 @@ def best_candidate(
     parts, weights, peaks = measurements, weighed.weights[:, None], 4  # outliers may raise a wrong peak
     if leave_out:
         kept = without_stretches(measurements)
-        parts = measurements.repeated(len(kept)).only(kept.repeat(len(measurements.moments), 1))
+        parts = measurements.repeated(len(kept)).only(kept.repeat(len(measurements.exposure_starts), 1))
         weights, peaks = torch.cat([weights, kept[1:, :, None] * measurements.weights[:, None]], 1), 2
     unexplained = replace(measurements, displacements=residual)
     found, _ = strongest_frequencies(unexplained, sample_interval, harmonics, peaks, weights)  # (B, S, 2, C)

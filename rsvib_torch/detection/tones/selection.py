@@ -97,7 +97,9 @@ def find_tones(
         The fit, with K the largest number of tones of any axis (at least 1).
     """
     model = model or MotionModel()
-    none = measurements.moments.new_zeros(len(measurements.moments), 2, model.harmonics, dtype=torch.bool)
+    none = measurements.exposure_starts.new_zeros(
+        len(measurements.exposure_starts), 2, model.harmonics, dtype=torch.bool
+    )
     if start is None:
         accepted, (fit, weighed) = none[..., :0], robust_fit(measurements, none.double(), none, model)
     else:
@@ -135,7 +137,7 @@ def find_tones(
             before = trial_weighed.square(residual)
             after = trial_weighed.square(residual_of(measurements, trial))
             parameters = 2 * model.harmonics + 1
-            spare = measurements.known - parameters * active.sum(-1) // model.harmonics - 1
+            spare = measurements.num_measurements - parameters * active.sum(-1) // model.harmonics - 1
             needed = torch.maximum(_F_THRESHOLD * parameters * after / spare.clamp(min=1.0), least_gain * before)
             passed = open_axes & (before - after > needed) & _resolved(measurements, trial) & visible(trial)
             while bool(passed.any()) and not bool((passed == open_axes).all()):
@@ -157,7 +159,7 @@ def _disturbed(measurements: Measurements, fit: ToneFit) -> Tensor:
 
 def _resolved(measurements: Measurements, fit: ToneFit) -> Tensor:
     """(B, 2) bool: all tones of an axis are at least 0.7 of 1 / duration apart; closer ones fit one tone and noise."""
-    span = measurements.moments.amax((1, 2)) - measurements.moments.amin((1, 2))
+    span = measurements.exposure_starts.amax((1, 2)) - measurements.exposure_starts.amin((1, 2))
     order = torch.where(fit.active, fit.frequencies, torch.nan).sort(dim=-1).values
     return ~((order[..., 1:] - order[..., :-1]) * span[:, None, None] < 0.7).any(-1)
 
@@ -176,7 +178,9 @@ def _with_blind_tones(measurements: Measurements, weighed: Measurements, fit: To
         -1, keepdim=True
     )  # px, of the largest tone along the scan: side tones are smaller
     carrier = torch.where(size[:, 1] > weak_limit, fit.frequencies[:, 1], torch.nan)[:, None, None, None]  # (B,1,1,1,K)
-    span = (measurements.moments.amax((1, 2)) - measurements.moments.amin((1, 2)))[:, None, None, None, None]
+    span = (measurements.exposure_starts.amax((1, 2)) - measurements.exposure_starts.amin((1, 2)))[
+        :, None, None, None, None
+    ]
     tone, middle = fit.frequencies[..., None, None], blind[:, None]
     sides = torch.stack([middle + carrier, (middle - carrier).abs()], -1)  # (B, 1, 1, F, K, 2)
     distance = ((tone[..., None] - sides).abs() * span[..., None]).nan_to_num(torch.inf).amin((-2, -1))  # (B, 2, K, F)
@@ -199,7 +203,7 @@ def _with_blind_tones(measurements: Measurements, weighed: Measurements, fit: To
     other = fit_tones(weighed, frequencies, active, fit.model)
     before = weighed.square(residual_of(measurements, fit))
     after = weighed.square(residual_of(measurements, other))
-    spare = measurements.known - 3 * fit.active.sum(-1)
+    spare = measurements.num_measurements - 3 * fit.active.sum(-1)
     fewer = 3 * (fit.active.sum(-1) - active.sum(-1))
     better = suspected & (after / (spare + fewer).clamp(min=1.0) <= before / spare.clamp(min=1.0))
     if not bool(better.any()):

@@ -185,7 +185,7 @@ class _Stack:
             kernels = self.kernels(alike, reference)
             return prior_strength(self.frames[alike], kernels, prior, power, certain=certain)
 
-        return strengths.of(power / self.weights[alike].mean() + prior.blind.mean(), choose)
+        return strengths.of(power / self.weights[alike].mean() + prior.interpolation_power.mean(), choose)
 
     def problem(self, members: list[int], reference: int, strength: float, partition: Partition) -> SceneProblem:
         """The problem of one scene, with all missing values and boundary extensions filled."""

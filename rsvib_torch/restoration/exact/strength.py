@@ -62,7 +62,7 @@ def prior_strength(
     place = (chosen / width * 2 * (prior.power.shape[-1] - 1)).round().long()
     sample = sample_rows(images[..., top : top + count, :], part, chosen)
     # less noise than 200 times the interpolation error of the kernel cannot be distinguished from it
-    certain = certain and bool(noise_power > 200.0 * prior.blind.mean())
+    certain = certain and bool(noise_power > 200.0 * prior.interpolation_power.mean())
     strengths = [strength for strength in _STRENGTHS if certain or strength <= 1]
     reach = kernels.reach
     precisions = [prior.precision(noise_power, strength, reach)[..., place] for strength in strengths]

@@ -29,13 +29,13 @@ class RowPrior:
     Attributes:
         power: (U,) variance of a coefficient.
         reflections: (p, U) partial correlations, within -1 ... 1.
-        blind: (U,) power of the interpolation error of the kernel between rows, which counts as noise; (T, U) of each
+        interpolation_power: (U,) power of the interpolation error between rows, which counts as noise; (T, U) of each
             frame.
     """
 
     power: Tensor
     reflections: Tensor
-    blind: Tensor
+    interpolation_power: Tensor
 
     @classmethod
     def smooth(cls, u: Tensor) -> "RowPrior":
@@ -45,7 +45,7 @@ class RowPrior:
 
     def of(self, members: list[int]) -> "RowPrior":
         """The prior for restoring a scene from some of the frames; the interpolation error depends on their blur."""
-        return replace(self, blind=self.blind[members].mean(0))
+        return replace(self, interpolation_power=self.interpolation_power[members].mean(0))
 
     def filter(self) -> Tensor:
         """Coefficients 1, a_1 ... a_p of the whitening filter, (p + 1, U)."""
@@ -61,10 +61,12 @@ class RowPrior:
 
     def resampled(self, count: int) -> "RowPrior":
         """The prior at ``count`` frequencies spread over the same range."""
-        parts = [self.power.log()[None], self.reflections, torch.atleast_2d(self.blind).log()]
+        parts = [self.power.log()[None], self.reflections, torch.atleast_2d(self.interpolation_power).log()]
         stacked = torch.nn.functional.interpolate(torch.cat(parts)[None], count, mode="linear", align_corners=True)[0]
-        power, reflections, blind = stacked.split([len(part) for part in parts])
-        return RowPrior(power[0].exp(), reflections, blind.exp().reshape(*self.blind.shape[:-1], count))
+        power, reflections, interpolation = stacked.split([len(part) for part in parts])
+        return RowPrior(
+            power[0].exp(), reflections, interpolation.exp().reshape(*self.interpolation_power.shape[:-1], count)
+        )
 
     def precision(self, noise_power: Tensor, strength: float, reach: float = 0.0) -> Tensor:
         """Products ``a_k a_(k + d)`` of the filter in units of the data's noise, (p + 1, p + 1, U), 0 for k + d > p.
@@ -78,7 +80,7 @@ class RowPrior:
             reach: Largest displacement along the row in px during an exposure, from its middle.
         """
         a = self.filter()
-        ratio = (noise_power + self.blind) * strength / self.innovation()
+        ratio = (noise_power + self.interpolation_power) * strength / self.innovation()
         # noise power over variance of e. Above 1e3, the systems lose digits in single precision without a gain; below
         # 1e-4, rows displaced by half a pixel lose them. Long exposures observe every place from many rows, and allow
         # a bound lower by the length of the blur in px.
