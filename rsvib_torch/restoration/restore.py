@@ -203,9 +203,9 @@ def restore(
     Args:
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation; tensor or NumPy array.
         timing: The sensor.
-        vibration: The motion in image axes: one for all, or a batch (B,) for a batch of stacks. Or what
-            ``detect_vibration`` returned: axes without a reliable vibration are then left alone, see
-            ``trusted_vibration``.
+        vibration: The motion in image axes: one for all, or a batch (B,) for a batch of stacks. Or a
+            ``DetectionResult``: axes without a reliable vibration are then not corrected, see ``trusted_vibration``.
+            The results of the free and the swept model contain the motion as ``.motion``.
         method: ``"exact"``: all rows coupled, several frames jointly if requested; ``"banded"``: row by row within
             slabs (Sec. 3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest; ``"richardson-lucy"``: iterative,
             non-negative, several frames jointly if requested.

@@ -266,6 +266,11 @@ def test_methods_that_take_saturated_pixels_at_their_level(lamps, method):
     ("change", "error", "message"),
     [
         ({"vibration": 3.0}, TypeError, "vibration must be a Vibration or a detection, got float"),
+        (
+            {"vibration": SimpleNamespace(motion=None)},
+            TypeError,
+            "a detection, got SimpleNamespace; pass its .motion",
+        ),
         ({"saturation": -1.0}, ValueError, "saturation must be larger than 0, got -1"),
         ({"saturation": "high"}, TypeError, "saturation must be a number, got 'high'"),
         ({"frames": torch.ones(2, 16, 16), "saturation": 1.0}, ValueError, "every pixel is saturated"),

@@ -138,5 +138,6 @@ def vibration_to_undo(
     if isinstance(vibration, Motion):
         return vibration, ()
     if not all(hasattr(vibration, name) for name in ("vibration", "std", "reliable", "reasons")):
-        raise TypeError(f"vibration must be a Vibration or a detection, got {type(vibration).__name__}")
+        remedy = "; pass its .motion" if hasattr(vibration, "motion") else ""
+        raise TypeError(f"vibration must be a Vibration or a detection, got {type(vibration).__name__}{remedy}")
     return trusted_vibration(vibration, timing, num_frames, num_rows)
