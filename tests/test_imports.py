@@ -1,6 +1,7 @@
 """Imports run one way: between packages, between the parts of a package, and between modules (no cycles)."""
 
 import ast
+import re
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -142,6 +143,15 @@ def test_no_two_modules_share_a_name():
 
 def test_the_top_level_holds_packages_and_the_configuration():
     assert {path.name for path in PACKAGE.glob("*.py")} == {"__init__.py", "config.py"}
+
+
+def test_modules_that_use_a_displacement_per_row_state_the_invariant():
+    """Results on disk and commands only print displacements."""
+    uses = re.compile(r"\.(mean_)?displacement\(|\bexposure_trajectory\(|\brows_showing\(")
+    for path, module in modules():
+        source = path.read_text(encoding="utf-8")
+        if uses.search(source) and module.split(".")[1] not in {"motion", "report", "commands"}:
+            assert "Invariant: the displacement depends on the row only" in source, module
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,7 @@
-"""Images, masks, points and boxes of still scenes as a rolling-shutter camera records them, all with one motion."""
+"""Images, masks, points and boxes of still scenes as a rolling-shutter camera records them, all with one motion.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 from dataclasses import dataclass
 

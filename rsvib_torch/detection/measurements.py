@@ -1,4 +1,7 @@
-"""Displacements of scene rows between frames: the input of all fits, independent of images."""
+"""Displacements of scene rows between frames: the input of all fits, independent of images.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 from collections.abc import Callable
 from copy import copy

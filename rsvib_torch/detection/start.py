@@ -1,4 +1,7 @@
-"""The start of every detection: grey frames, the offsets of their row bands, and the measurements these give."""
+"""The start of every detection: grey frames, the offsets of their row bands, and the measurements these give.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 from dataclasses import dataclass, replace
 

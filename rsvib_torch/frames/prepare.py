@@ -1,8 +1,9 @@
 """Input preparation, once for all entry points: from the user's frames to floating-point images in row order.
 
 ``prepare_frames`` is the only place that converts dtypes, applies the full scale, builds masks, turns images and adds
-batch and channel axes; ``PreparedFrames.from_row_order`` is the way back. Code behind it relies on two invariants:
-rows lie on axis -2 in readout order, and images are float32 (float64 where the user gave float64).
+batch and channel axes; ``PreparedFrames.from_row_order`` is the way back. Two of the three invariants
+(docs/architecture.md) begin here: rows lie on axis -2 in readout order, and images are float32 (float64 if the user
+gave float64).
 """
 
 from dataclasses import dataclass, replace

@@ -1,4 +1,7 @@
-"""The row-varying blur operator and its exact adjoint."""
+"""The row-varying blur operator and its exact adjoint.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
 

@@ -1,4 +1,7 @@
-"""The point spread function of every row as batched sparse kernels."""
+"""The point spread function of every row as batched sparse kernels.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -1,4 +1,7 @@
-"""Simulation of the frames that a vibrating rolling-shutter camera takes of a still scene (Eq. 9)."""
+"""Simulation of the frames that a vibrating rolling-shutter camera takes of a still scene (Eq. 9).
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
 

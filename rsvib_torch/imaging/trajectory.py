@@ -1,4 +1,7 @@
-"""Motion during exposures: quadrature nodes within an exposure, and the frame rows that show given scene rows."""
+"""Motion during exposures: quadrature nodes within an exposure, and the frame rows that show given scene rows.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
 from typing import Literal

@@ -1,6 +1,8 @@
 """What all band registration methods share: the task, windows of rows, and peaks of correlation surfaces.
 
 Images have rows on axis -2 in readout order.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 from dataclasses import dataclass

@@ -11,7 +11,9 @@ it, cleaned by a Wiener filter, and e is the difference of a frame from that mea
 of the noise of these differences, so that b has no bias, and the filter brings the variance close to the Cramer-Rao
 bound. Detail of the scene is a third regressor beside the gradients, which removes differences in contrast.
 
-The displacement is assumed to depend on the row only; rows lie on axis -2 in readout order.
+Rows lie on axis -2 in readout order.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math

@@ -1,7 +1,9 @@
 """Offsets of row bands between consecutive frames: the offset curve (Sec. 2.2 of Liu et al. 2023).
 
-The whole-frame offset comes first, then the offset of every band by one of ``BAND_METHODS``. One offset per band
-assumes that the displacement depends on the row only.
+The whole-frame offset comes first, then the offset of every band by one of ``BAND_METHODS``. A band has one
+offset over its whole width.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 from dataclasses import dataclass, replace

@@ -1,7 +1,8 @@
 """Fourier transforms along the rows of frames: warping by a motion, differences of frames, fixed column patterns.
 
-The displacement is assumed to depend on the row only: a row is then displaced by a phase factor of its spectrum.
-Frames have rows on axis -2 in readout order.
+A row is displaced by a phase factor of its spectrum. Frames have rows on axis -2 in readout order.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math

@@ -1,4 +1,7 @@
-"""Row-banded restoration: every row is deconvolved within a slab of rows with the PSF of that row (Sec. 3.2)."""
+"""Row-banded restoration: every row is deconvolved within a slab of rows with the PSF of that row (Sec. 3.2).
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
 from collections.abc import Callable

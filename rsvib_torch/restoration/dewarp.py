@@ -1,4 +1,7 @@
-"""Restoration of the geometry only: every row is moved back by its mean displacement during the exposure."""
+"""Restoration of the geometry only: every row is moved back by its mean displacement during the exposure.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,7 @@
-"""Geometry of restored frames: scene coordinates, reference shift, visible pixels, frames restored together."""
+"""Geometry of restored frames: scene coordinates, reference shift, visible pixels, frames restored together.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,7 @@
-"""Restoration by Richardson-Lucy iterations on the row-varying blur; the result is non-negative."""
+"""Restoration by Richardson-Lucy iterations on the row-varying blur; the result is non-negative.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,7 @@
-"""Alignment of a motion that another instrument recorded with the clock of the frames."""
+"""Alignment of a motion that another instrument recorded with the clock of the frames.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
 from dataclasses import dataclass, replace

@@ -1,4 +1,7 @@
-"""Comparison of a given motion with the offsets between frames."""
+"""Comparison of a given motion with the offsets between frames.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
 from dataclasses import dataclass

@@ -8,6 +8,8 @@ Every round of ``_refine`` has four steps:
 4. stop if the next round would change the motion by much less than its standard deviation.
 
 Steps 1 and 2 do not depend on the model of the motion, step 3 does not depend on images.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import itertools

@@ -4,6 +4,8 @@ Frames are compared in groups that contain the same part of the scene. The frame
 the motion, and blurred alike if their exposures blurred them differently. ``registration.gradients`` then gives the
 residual displacement of every scene row in every frame and its information matrix, which are summed over
 ``BLOCK_ROWS`` rows. This is where images become measurements.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import itertools

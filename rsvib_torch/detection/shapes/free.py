@@ -4,6 +4,8 @@ Frames are registered to each other, so only differences of displacement between
 are measured. A penalised spline (P-spline) whose smoothness maximises the marginal likelihood gives a first estimate;
 then the power spectrum of the motion is estimated by expectation maximisation, which yields realistic uncertainties of
 the components that the differences do not determine.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math

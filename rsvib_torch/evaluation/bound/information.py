@@ -1,4 +1,7 @@
-"""Fisher information about the parameters of a motion in frames of one unknown scene."""
+"""Fisher information about the parameters of a motion in frames of one unknown scene.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,7 @@
-"""Exact restoration: all rows of a frame, each with its own PSF, solved together."""
+"""Exact restoration: all rows of a frame, each with its own PSF, solved together.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 from dataclasses import dataclass, replace
 from typing import Literal

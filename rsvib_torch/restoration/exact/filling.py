@@ -1,4 +1,7 @@
-"""Missing values of the data, replaced by the prediction of the restored scene."""
+"""Missing values of the data, replaced by the prediction of the restored scene.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
 from dataclasses import replace

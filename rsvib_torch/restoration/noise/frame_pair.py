@@ -1,4 +1,7 @@
-"""Noise of a stack from two of its frames: the residual after the scene that explains both best is subtracted."""
+"""Noise of a stack from two of its frames: the residual after the scene that explains both best is subtracted.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,7 @@
-"""Noise of frames with motion blur: the blur attenuates the scene, row by row, and leaves noise as it is."""
+"""Noise of frames with motion blur: the blur attenuates the scene, row by row, and leaves noise as it is.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
 

@@ -6,6 +6,8 @@ A row that is displaced by (x_n, y_n) at N times of its exposure has, at horizon
 ``K(u) = sum_n w_n h(. - y_n) exp(-2 pi i u x_n)``. Relative to the middle of the range of the row the x_n are small, so
 that kernels and their products are smooth in u: they are computed at a few Chebyshev nodes in double precision and
 interpolated to all frequencies by one matrix product. The phase of the middle is applied to the data.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math

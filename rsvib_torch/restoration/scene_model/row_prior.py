@@ -1,4 +1,7 @@
-"""Gaussian prior of a scene, an autoregressive model across rows, estimated from the frames."""
+"""Gaussian prior of a scene, an autoregressive model across rows, estimated from the frames.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,7 @@
-"""Comparison of two frames of one scene: common part, the later one predicted from the earlier one, misfit."""
+"""Comparison of two frames of one scene: common part, the later one predicted from the earlier one, misfit.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
 from collections.abc import Sequence
