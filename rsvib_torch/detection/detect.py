@@ -186,7 +186,7 @@ def detect_vibration(
             ``registration`` to ``search``, ``ignore`` and ``full_scale``; ``detect_motion`` and ``detect_swept_tone``
             have further ones.
         method: ``"direct"``, or ``"bands"`` (the paper's method), in half the time with ten times larger errors.
-        registration: ``"ncc"``, ``"phase"`` or ``"projection"``.
+        registration: Method of the band registration, as in ``register_bands``.
         tones: Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance.
         harmonics: Number of multiples of every tone, with one common base frequency; 1 for independent tones.
         image_acceleration: Whether the image motion has a constant acceleration.

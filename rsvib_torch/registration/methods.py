@@ -17,7 +17,7 @@ __all__ = ["BAND_METHODS", "Registration", "RegistrationOptions"]
 Registration = Literal["projection", "ncc", "phase"]
 
 # Contract of a band registration method. To add one, write ``register_<name>`` in a file of its own, add it to this
-# table, and its name to ``Registration``.
+# table, and its name to ``Registration``, from which configuration files take the valid names.
 #
 #   register(task: BandTask) -> (offsets, quality)
 #
@@ -27,9 +27,9 @@ Registration = Literal["projection", "ncc", "phase"]
 # offsets                  (L, N, 2) px, axes (x, y): position of the band's content in ``second`` less that in
 #                          ``first``, the whole-frame offset ``task.coarse`` included; within ``task.search`` px of it.
 # quality                  (L, N) in 0 ... 1: correlation of the matched bands. Detection weights a band by about
-#                          1 / (1 - quality); ``register_rows`` discards bands of quality 0.1 or less.
+#                          1 / (1 - quality); ``register.py`` discards bands of quality 0.1 or less.
 # A band without detail, or whose match lies at the edge of the search range or outside the frame, has offset NaN and
-# quality 0; a method does not raise for it. Results of one pair and band do not depend on the other pairs.
+# quality 0; a method does not raise for it. Pairs share only the width of the templates (``BandTask.width``).
 BAND_METHODS: dict[str, Callable[[BandTask], tuple[Tensor, Tensor]]] = {
     "projection": register_projection,
     "ncc": register_ncc,

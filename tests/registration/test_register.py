@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -6,11 +7,15 @@ import torch
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, register_bands
-from rsvib_torch.registration.methods import BAND_METHODS
+from rsvib_torch.registration.methods import BAND_METHODS, Registration
 
-METHODS = ("projection", "ncc", "phase")
+METHODS = get_args(Registration)
 # rms error in px along the rows and along the scan, good bands only; the offsets are 1.4 and 5 px rms
 RMS = {"projection": (0.08, 0.8), "ncc": (0.03, 0.08), "phase": (0.025, 0.04)}
+
+
+def test_type_of_the_methods_lists_the_table():
+    assert METHODS == tuple(BAND_METHODS)
 
 
 def float_frames(frames):

@@ -67,7 +67,7 @@ def check_motion(
             pixels.
         timing: The sensor.
         motion: A vibration or free motion in image axes, on the clock of the frames.
-        registration: ``"ncc"``, ``"phase"`` or ``"projection"``.
+        registration: Method of the band registration, as in ``register_bands``.
         band_rows: Rows of a band.
         band_step: Rows from one band to the next.
         search: Search range in px around the whole-frame offset.

@@ -105,7 +105,7 @@ def detect_motion(
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, tensor or NumPy array;
             floats, or integers of known full scale. NaN marks missing pixels.
         timing: The sensor.
-        registration: ``"ncc"``, ``"phase"`` or ``"projection"``, for the start.
+        registration: Method of the band registration, as in ``register_bands``; for the initial value.
         knot_rows: Row times from one knot of the spline to the next, which then resolves frequencies up to
             ``1 / (2 knot_rows T_row)``. In long stacks the spacing is larger, for 3000 knots at most.
         iterations: Rounds of measuring and fitting.

@@ -94,7 +94,7 @@ def detect_swept_tone(
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, tensor or NumPy array. NaN
             marks missing pixels.
         timing: The sensor.
-        registration: ``"ncc"``, ``"phase"`` or ``"projection"``, for the start.
+        registration: Method of the band registration, as in ``register_bands``; for the initial value.
         iterations: Rounds of measuring and fitting.
         band_rows: Rows of a band of the start.
         band_step: Rows from one band to the next.
