@@ -15,7 +15,7 @@ RMS = {"projection": (0.08, 0.8), "ncc": (0.03, 0.08), "phase": (0.025, 0.04)}
 
 
 def test_type_of_the_methods_lists_the_table():
-    assert METHODS == tuple(BAND_METHODS)
+    assert tuple(BAND_METHODS) == METHODS
 
 
 def float_frames(frames):
