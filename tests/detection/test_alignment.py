@@ -1,4 +1,4 @@
-"""Motion recorded on another clock: found again in the frames of an independent simulator."""
+"""Alignment of motion recorded on another clock with frames of an independent simulator."""
 
 import re
 
@@ -18,14 +18,14 @@ CONFIG = "[sensor]\nrow_time = 6e-5\nexposure_rows = 20\nframe_rows = 300\n"
 
 
 def angles(clock):
-    """A shaking hand: angles in rad on the clock of the gyroscope."""
+    """Camera shake of a hand: angles in rad on the clock of the gyroscope."""
     t = clock - 812.0
     x = 3e-3 * np.sin(2 * np.pi * 11.3 * t + 6 * np.sin(2.1 * t)) + 1e-3 * np.sin(2 * np.pi * 37.7 * t)
     y = 2e-3 * np.sin(2 * np.pi * 8.9 * t + 5 * np.sin(3.3 * t)) + 0.5e-3 * np.cos(2 * np.pi * 29.1 * t)
     return np.stack([x, y], axis=-1)
 
 
-class Shaken(Motion):
+class HandShake(Motion):
     def displacement(self, times):
         return FOCAL_LENGTH * np.tan(angles(SPEED * times + CLOCK)) + np.asarray(DRIFT) * times[..., None]
 
@@ -37,7 +37,7 @@ def make_scene():
 
 @pytest.fixture(scope="module", name="frames")
 def make_frames(scene):
-    return torch.from_numpy(take_frames(scene, TIMING, Shaken(), FRAMES, 0.005)).float()
+    return torch.from_numpy(take_frames(scene, TIMING, HandShake(), FRAMES, 0.005)).float()
 
 
 def log(path, clock, values, header="time,x,y"):
@@ -48,13 +48,13 @@ def log(path, clock, values, header="time,x,y"):
 
 @pytest.fixture(scope="module", name="gyroscope")
 def make_gyroscope(tmp_path_factory):
-    """Rates of one kilohertz over a second and a half, by differences of the angles."""
+    """Angular rates sampled at 1 kHz during 1.5 s, computed as differences of the angles."""
     clock = np.arange(811.9, 813.4, 1e-3)
     rates = (angles(clock + 1e-5) - angles(clock - 1e-5)) / 2e-5
     return log(tmp_path_factory.mktemp("gyroscope") / "rates.csv", clock, rates)
 
 
-def test_clock_and_drift_are_found_and_frames_restored(scene, frames, gyroscope):
+def test_clock_offset_and_drift_are_estimated_and_frames_restored(scene, frames, gyroscope):
     recorded = rsv.read_motion(gyroscope, unit="rad/s", focal_length=FOCAL_LENGTH)
     found = rsv.align_motion(frames, TIMING, recorded)
     assert found.reliable
@@ -64,30 +64,30 @@ def test_clock_and_drift_are_found_and_frames_restored(scene, frames, gyroscope)
     assert abs(found.scale - SPEED) < 4 * found.scale_std
     assert found.drift.tolist() == pytest.approx(DRIFT, abs=0.5)
     times = TIMING.row_starts(FRAMES, HEIGHT) + 0.5 * TIMING.exposure_time
-    error = found.motion.displacement(times).numpy() - Shaken().displacement(times.numpy())
+    error = found.motion.displacement(times).numpy() - HandShake().displacement(times.numpy())
     assert np.abs(error - error.mean((0, 1))).max() < 0.05
     shift = torch.from_numpy(error.mean((0, 1)))[:, None]
     placed = rsv.FreeMotion(
         found.motion.coefficients - shift, found.motion.start, found.motion.spacing, found.motion.tones
     )
     truth = rsv.FreeMotion.from_samples(
-        times.flatten(), torch.from_numpy(Shaken().displacement(times.flatten().numpy()))
+        times.flatten(), torch.from_numpy(HandShake().displacement(times.flatten().numpy()))
     )
     best, here = (decibel(rsv.restore(frames, TIMING, m).numpy(), crop(scene)) for m in (truth, placed))
     assert here > best - 0.3
     assert decibel(frames.numpy(), crop(scene)) < best - 12
 
 
-def test_a_wrong_focal_length_is_found(frames, gyroscope):
+def test_wrong_focal_length_is_corrected(frames, gyroscope):
     recorded = rsv.read_motion(gyroscope, unit="rad/s", focal_length=1.1 * FOCAL_LENGTH)
     found = rsv.align_motion(frames, TIMING, recorded, fit_gain=True)
     assert found.gain == pytest.approx((1 / 1.1, 1 / 1.1), rel=3e-3)
     assert found.offset == pytest.approx(CLOCK, abs=5e-5)
 
 
-def test_columns_read_one_after_another(scene, gyroscope, tmp_path):
+def test_columns_as_scan_axis(scene, gyroscope, tmp_path):
     timing = rsv.SensorTiming(6e-5, 20, 300, scan_axis=-1, readout_direction="reverse")
-    frames = torch.from_numpy(take_frames(scene, TIMING, Shaken(), FRAMES, 0.005)).float().flip(-2).transpose(-2, -1)
+    frames = torch.from_numpy(take_frames(scene, TIMING, HandShake(), FRAMES, 0.005)).float().flip(-2).transpose(-2, -1)
     clock = np.arange(811.9, 813.4, 1e-3)
     path = log(tmp_path / "angles.csv", clock, np.degrees(angles(clock)[:, ::-1]))
     recorded = rsv.read_motion(path, unit="deg", focal_length=FOCAL_LENGTH, signs=(-1, 1))
@@ -97,7 +97,7 @@ def test_columns_read_one_after_another(scene, gyroscope, tmp_path):
     assert found.reliable
 
 
-def test_a_recording_of_something_else_is_not_reliable(frames, tmp_path):
+def test_unrelated_recording_is_not_reliable(frames, tmp_path):
     clock = np.arange(0.0, 1.0, 1e-3)
     path = log(tmp_path / "other.csv", clock, 3 * np.stack([np.sin(170 * clock), np.cos(230 * clock**1.3)], -1))
     found = rsv.align_motion(frames, TIMING, rsv.read_motion(path, unit="px"))
@@ -105,7 +105,7 @@ def test_a_recording_of_something_else_is_not_reliable(frames, tmp_path):
     assert any("does not explain" in reason for reason in found.reasons)
 
 
-def test_a_motion_that_repeats_has_more_than_one_offset(tmp_path, scene):
+def test_periodic_motion_has_ambiguous_clock_offsets(tmp_path, scene):
     class Sine(Motion):
         def displacement(self, times):
             return np.stack([3 * np.sin(2 * np.pi * 31 * times), 2 * np.cos(2 * np.pi * 31 * times)], -1)
@@ -120,7 +120,7 @@ def test_a_motion_that_repeats_has_more_than_one_offset(tmp_path, scene):
     assert near.offset == pytest.approx(0.0, abs=1e-4)
 
 
-def test_offsets_that_the_recording_does_not_cover_are_named(frames, tmp_path):
+def test_clock_offsets_beyond_the_recording_are_reported(frames, tmp_path):
     clock = np.arange(5.0, 6.0, 1e-3)
     recorded = rsv.read_motion(log(tmp_path / "a.csv", clock, angles(clock)), unit="rad", focal_length=900)
     with pytest.raises(ValueError, match="covers the frames from 5"):
@@ -179,7 +179,7 @@ def test_command(frames, gyroscope, tmp_path, capsys):
         (slice(None), 1e3, "check time_unit='s'"),
     ],
 )
-def test_mistakes_in_a_recording_are_one_line(frames, tmp_path, capsys, place, size, message):
+def test_errors_in_a_recording_are_one_line(frames, tmp_path, capsys, place, size, message):
     (tmp_path / "camera.toml").write_text(CONFIG)
     rsv.write_stack(tmp_path / "frames.tif", frames)
     clock = np.arange(812.0, 813.0, 1e-3)
@@ -193,10 +193,10 @@ def test_mistakes_in_a_recording_are_one_line(frames, tmp_path, capsys, place, s
 
 
 def at(times, factor=1.0):
-    return rsv.FreeMotion.from_samples(times, factor * Shaken().displacement(times))
+    return rsv.FreeMotion.from_samples(times, factor * HandShake().displacement(times))
 
 
-def test_the_right_motion_explains_the_offsets_and_wrong_ones_do_not(frames):
+def test_correct_motion_explains_the_offsets_and_wrong_motions_do_not(frames):
     times = np.arange(-0.01, 0.1, 5e-4)
     right = rsv.check_motion(frames.numpy(), TIMING, at(times))
     assert right.helps
@@ -220,13 +220,13 @@ def test_axes_are_those_of_the_image(frames):
     timing = rsv.SensorTiming(6e-5, 20, 300, scan_axis=-1, readout_direction="reverse")
     times = np.arange(-0.01, 0.1, 5e-4)
     straight = rsv.check_motion(frames, TIMING, at(times))
-    turned = rsv.FreeMotion.from_samples(times, Shaken().displacement(times)[:, ::-1] * [-1, 1])
+    turned = rsv.FreeMotion.from_samples(times, HandShake().displacement(times)[:, ::-1] * [-1, 1])
     other = rsv.check_motion(frames.flip(-2).transpose(-2, -1), timing, turned)
     assert torch.allclose(other.before, straight.before.flip(0), rtol=1e-3)
     assert (other.after < 0.1).all()
 
 
-def test_pixels_that_were_not_measured_do_not_count(frames, gyroscope):
+def test_missing_pixels_do_not_change_the_result(frames, gyroscope):
     hole = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     hole[10:200, 60:85] = True
     dirty = torch.where(hole, 0.5 + 0.5 * torch.rand(HEIGHT, WIDTH), frames)
@@ -237,7 +237,7 @@ def test_pixels_that_were_not_measured_do_not_count(frames, gyroscope):
 
 
 @pytest.mark.parametrize("function", [rsv.align_motion, rsv.check_motion])
-def test_one_stack_and_one_motion_are_taken(frames, function):
+def test_batches_are_refused(frames, function):
     recorded = at(np.arange(-0.01, 0.1, 5e-4))
     with pytest.raises(ValueError, match="takes one"):
         function(frames[None, :, None], TIMING, recorded)

@@ -13,7 +13,7 @@ from rsvib_torch.detection.tones.fit import fit_tones, vibration_of_fit
 METHODS = ("projection", "ncc", "phase")
 ROW_TIME = 20.52e-6
 NOISE = 0.003
-# period %, amplitude %, phase in pi: what each registration has to hold on the paper's pair
+# error bounds of each registration for the pair of the paper: period %, amplitude %, phase in pi
 LIMITS = {"projection": (1.0, 2.0, 0.05), "ncc": (0.15, 1.0, 0.004), "phase": (0.15, 1.5, 0.004)}
 
 
@@ -23,7 +23,7 @@ def detect_bands(frames, timing, **options):
 
 @dataclass(frozen=True)
 class Tones:
-    """Several tones an axis, (2, K) each."""
+    """Several tones per axis: arrays (2, K)."""
 
     amplitude: tuple
     frequency: tuple
@@ -45,20 +45,20 @@ def random_phase(seed):
     return tuple(np.random.default_rng([7, seed]).uniform(-np.pi, np.pi, 2).tolist())
 
 
-def shoot(timing, motion, seed, num_frames=2, *, rows=2048, columns=384, noise=NOISE, margin=40):
-    """A noisy stack of a scene drawn from the seed, float32."""
+def noisy_frames(timing, motion, seed, num_frames=2, *, rows=2048, columns=384, noise=NOISE, margin=40):
+    """Noisy float32 frames of a scene generated from the seed."""
     scene = draw_scene(rows + 2 * margin, columns + 2 * margin, seed)
     frames = take_frames(scene, timing, motion, num_frames, noise, seed=seed, margin=margin, samples=6)
     return torch.from_numpy(frames).float()
 
 
 def phase_error(measured, truth):
-    """Difference of two phases, folded into -pi ... pi."""
+    """Difference of two phases, wrapped to -pi ... pi."""
     return np.abs((np.asarray(measured) - np.asarray(truth) + np.pi) % (2 * np.pi) - np.pi)
 
 
 def errors(result, motion):
-    """Largest error over the axes of the first tone: period %, amplitude %, phase in pi."""
+    """Largest error of the first tone over both axes: period %, amplitude %, phase in pi."""
     found = result.vibration
     period = np.abs(found.period[:, 0].numpy() * np.array(motion.frequency) - 1).max() * 100
     amplitude = np.abs(found.amplitude[:, 0].numpy() / np.array(motion.amplitude) - 1).max() * 100
@@ -67,9 +67,9 @@ def errors(result, motion):
 
 @pytest.fixture(scope="module")
 def pairs(paper_camera):
-    """Three pairs of the paper's case with their motions."""
+    """Three pairs of frames of the case of the paper, with their motions."""
     motions = [Motion(phase=random_phase(seed)) for seed in (11, 12, 13)]
-    return [(shoot(paper_camera, motion, 11 + i), motion) for i, motion in enumerate(motions)]
+    return [(noisy_frames(paper_camera, motion, 11 + i), motion) for i, motion in enumerate(motions)]
 
 
 @pytest.mark.parametrize("registration", METHODS)
@@ -90,7 +90,7 @@ def test_paper_pair(pairs, paper_camera, registration, case):
 @pytest.mark.parametrize("phase", [0.0, 1.5707963, 3.1, -1.2])
 def test_negative_gain(paper_camera, phase):
     motion = Motion(amplitude=(1.5, 2.5), frequency=(30.0, 30.0), phase=(phase, phase + 0.5))
-    result = detect_bands(shoot(paper_camera, motion, 3), paper_camera)
+    result = detect_bands(noisy_frames(paper_camera, motion, 3), paper_camera)
     period, amplitude, angle = errors(result, motion)
     assert period < 0.3
     assert amplitude < 1.0
@@ -112,7 +112,7 @@ def test_fitted_curve_and_residual(pairs, paper_camera, registration):
 @pytest.mark.parametrize("registration", METHODS)
 def test_image_motion_is_separated(paper_camera, registration):
     motion = Motion(phase=random_phase(5), image_motion=(500.0, -240.0))
-    frames = shoot(paper_camera, motion, 5, columns=704, margin=60)
+    frames = noisy_frames(paper_camera, motion, 5, columns=704, margin=60)
     result = detect_bands(frames, paper_camera, registration=registration)
     for error, limit in zip(errors(result, motion), LIMITS[registration], strict=True):
         assert error < limit
@@ -122,9 +122,9 @@ def test_image_motion_is_separated(paper_camera, registration):
 
 @pytest.mark.parametrize("registration", METHODS)
 @pytest.mark.parametrize("image_motion", [(0.0, 0.0), (300.0, 150.0)])
-def test_without_vibration_there_is_no_tone(paper_camera, registration, image_motion):
+def test_no_tone_is_detected_without_vibration(paper_camera, registration, image_motion):
     motion = Motion(amplitude=(0.0, 0.0), image_motion=image_motion)
-    result = detect_bands(shoot(paper_camera, motion, 4, margin=60), paper_camera, registration=registration)
+    result = detect_bands(noisy_frames(paper_camera, motion, 4, margin=60), paper_camera, registration=registration)
     assert bool((result.vibration.amplitude == 0).all())
     assert result.reliable.tolist() == [False, False]
     assert all(any("no significant tone" in reason for reason in reasons) for reasons in result.reasons)
@@ -136,16 +136,16 @@ def test_without_vibration_there_is_no_tone(paper_camera, registration, image_mo
 def test_blind_frequency_is_refused(paper_camera, seed, multiple):
     blind = multiple / (2048 * ROW_TIME)
     motion = Motion(frequency=(blind, blind), phase=random_phase(seed))
-    result = detect_bands(shoot(paper_camera, motion, seed), paper_camera)
+    result = detect_bands(noisy_frames(paper_camera, motion, seed), paper_camera)
     assert not bool(result.reliable[0])
-    # along the scan the coupling makes a blind tone visible in the second order, too weakly to be trusted
+    # along the scan axis, second-order coupling makes a blind tone visible, too weakly for a reliable measurement
     assert not bool(result.reliable[1])
     assert all(result.reasons)
 
 
 @pytest.mark.parametrize("registration", METHODS)
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_noise_is_no_vibration(paper_camera, registration, seed):
+def test_frames_of_noise_are_not_reliable(paper_camera, registration, seed):
     frames = torch.randn(2, 1024, 256, generator=torch.Generator().manual_seed(seed))
     result = detect_bands(frames, paper_camera, registration=registration)
     assert not bool(result.reliable.any())
@@ -153,7 +153,7 @@ def test_noise_is_no_vibration(paper_camera, registration, seed):
 
 def test_small_amplitudes(paper_camera):
     motion = Motion(amplitude=(0.2, 0.13), frequency=(155.0, 155.0), phase=(0.9, -2.0))
-    result = detect_bands(shoot(paper_camera, motion, 8, columns=640), paper_camera)
+    result = detect_bands(noisy_frames(paper_camera, motion, 8, columns=640), paper_camera)
     period, amplitude, phase = errors(result, motion)
     assert period < 0.5
     assert amplitude < 6.0
@@ -163,7 +163,7 @@ def test_small_amplitudes(paper_camera):
 
 def test_two_tones_over_four_frames(paper_camera):
     motion = Tones(((1.5, 0.6), (1.2, 0.5)), ((41.0, 110.0), (63.0, 180.0)), ((0.3, 1.0), (-0.7, 2.0)))
-    result = detect_bands(shoot(paper_camera, motion, 9, 4), paper_camera)
+    result = detect_bands(noisy_frames(paper_camera, motion, 9, 4), paper_camera)
     found = result.vibration
     assert found.amplitude.shape == (2, 2)
     assert found.frequency.numpy() == pytest.approx(np.array(motion.frequency), rel=2e-3)
@@ -181,12 +181,12 @@ def test_number_of_tones_can_be_set(pairs, paper_camera):
 
 
 @pytest.mark.parametrize("registration", METHODS)
-def test_batch_is_loop_of_singles(paper_camera, registration):
+def test_batch_equals_single_stacks(paper_camera, registration):
     timing = SensorTiming(row_time=40e-6, exposure_rows=10, frame_rows=1100)
     stacks = []
     for seed in (1, 2):
         motion = Motion(phase=random_phase(seed), frequency=(61.0, 47.0 + seed))
-        grey = shoot(timing, motion, seed, rows=640, columns=256)
+        grey = noisy_frames(timing, motion, seed, rows=640, columns=256)
         stacks.append(torch.stack([grey, 0.5 * grey, 0.2 + grey], dim=1))
     together = detect_bands(torch.stack(stacks), timing, registration=registration)
     assert together.vibration.batch_shape == (2,)
@@ -207,7 +207,7 @@ def test_batch_is_loop_of_singles(paper_camera, registration):
 @pytest.mark.parametrize("scan_axis", [-2, -1])
 @pytest.mark.parametrize("direction", ["forward", "reverse"])
 def test_orientation(pairs, paper_camera, scan_axis, direction):
-    """The transposed or flipped problem has the transposed or flipped answer."""
+    """The result for transposed or flipped frames is the transposed or flipped result."""
     frames, motion = pairs[0]
     upright = detect_bands(frames, paper_camera)
     turned = frames.flip(-2) if direction == "reverse" else frames
@@ -273,7 +273,7 @@ def test_inversion_is_exact_without_noise():
     assert vibration.image_motion[0].tolist() == pytest.approx(motion.image_motion, abs=1e-4)
 
 
-def test_error_bars_agree_with_scatter():
+def test_standard_deviations_agree_with_scatter():
     batch = 400
     measurements, motion = synthetic_measurements(0.03, 1, batch)
     vibration, std = fitted_vibration(measurements)
@@ -286,16 +286,16 @@ def test_error_bars_agree_with_scatter():
     assert claimed == pytest.approx(vibration.image_motion.numpy().std(0), rel=0.15)
     for name in ("amplitude", "frequency"):
         bias = getattr(vibration, name)[..., 0].mean(0).numpy() - np.array(getattr(motion, name))
-        # the mean of 400 runs may lie 4 of its own standard errors off
+        # the mean of 400 runs may differ by 4 of its own standard errors
         assert bool((np.abs(bias) < 4 * getattr(std, name)[..., 0].mean(0).numpy() / math.sqrt(batch)).all())
 
 
-def test_error_bars_of_frames_are_honest(paper_camera):
-    """Error over its standard deviation, over noise seeds, scenes and phases, is of order one, rather below it."""
+def test_standard_deviations_from_frames_agree_with_errors(paper_camera):
+    """Errors divided by their standard deviations are of order one for all noise seeds, scenes and phases."""
     ratios = []
     for seed in range(20, 26):
         motion = Motion(phase=random_phase(seed))
-        result = detect_bands(shoot(paper_camera, motion, seed, columns=256), paper_camera)
+        result = detect_bands(noisy_frames(paper_camera, motion, seed, columns=256), paper_camera)
         found, std = result.vibration, result.std
         for name in ("amplitude", "frequency"):
             error = getattr(found, name)[:, 0].numpy() - np.array(getattr(motion, name))
@@ -305,9 +305,9 @@ def test_error_bars_of_frames_are_honest(paper_camera):
 
 
 def test_dropped_frame_times(paper_camera):
-    """With frame start times of its own, a pair with a dropped frame in between is a longer baseline."""
+    """A dropped frame between two frames lengthens their baseline if the frame start times are given."""
     motion = Motion(phase=random_phase(2))
-    frames = shoot(paper_camera, motion, 2, 3)[[0, 2]]
+    frames = noisy_frames(paper_camera, motion, 2, 3)[[0, 2]]
     timing = replace(paper_camera, frame_start_times=[0.0, 2 * paper_camera.frame_period])
     result = detect_bands(frames, timing)
     period, amplitude, phase = errors(result, motion)
@@ -324,7 +324,7 @@ def test_integer_frames(pairs, paper_camera):
         assert error < limit
 
 
-def test_module_is_the_function(pairs, paper_camera):
+def test_module_equals_the_function(pairs, paper_camera):
     frames, _ = pairs[0]
     options = {"method": "bands", "registration": "phase", "band_step": 32}
     one = VibrationDetector(paper_camera, **options)(frames).vibration
@@ -339,7 +339,7 @@ def test_module_refuses_unknown_options(paper_camera):
 
 
 def test_agrees_with_the_simulator(paper_camera):
-    """The package's own simulator and its detection share one sign convention."""
+    """The simulator and the detection of the package use the same sign convention."""
     scene = torch.from_numpy(draw_scene(2048 + 40, 300 + 40, 6))
     vibration = Vibration([2.0, 3.0], [70.0, 36.0], [0.5, 2.5])
     result = detect_bands(simulate_frames(scene, paper_camera, vibration, frame_size=(2048, 300)), paper_camera)
@@ -350,8 +350,8 @@ def test_agrees_with_the_simulator(paper_camera):
 
 
 @pytest.mark.parametrize("method", ["bands", "direct"])
-def test_some_columns_are_those_with_detail(pairs, paper_camera, method):
-    """Columns of either stack that show the scene, among flat ones; and of one on its side."""
+def test_columns_with_detail_are_selected(pairs, paper_camera, method):
+    """Each stack has detail in different columns, the others are constant; also for a transposed stack."""
     (first, motion), (second, _), _ = pairs
     flat = torch.full_like(first[..., :80], 0.5)
     left, right = torch.cat([first[..., :192], flat, flat], -1), torch.cat([flat, second[..., :192], flat], -1)
@@ -371,7 +371,7 @@ def test_some_columns_are_those_with_detail(pairs, paper_camera, method):
     torch.testing.assert_close(turned.flip(0), found[0].vibration.amplitude, rtol=1e-4, atol=0)
 
 
-def test_more_columns_than_there_are_are_all(pairs, paper_camera):
+def test_columns_beyond_the_width_select_all(pairs, paper_camera):
     frames, _ = pairs[0]
     whole = detect_bands(frames, paper_camera).vibration.amplitude
     assert torch.equal(detect_bands(frames, paper_camera, columns=4000).vibration.amplitude, whole)

@@ -17,15 +17,15 @@ from rsvib_torch.registration.row_spectra import RowSpectra, differences
 MARGIN = 40
 
 
-def pair_of(camera, motion, seed, noise, rows=2048, columns=512, num_frames=2, samples=8):
-    """Noisy frames of a scene drawn from the seed."""
+def noisy_frames(camera, motion, seed, noise, rows=2048, columns=512, num_frames=2, samples=8):
+    """Noisy frames of a scene generated from the seed."""
     scene = draw_scene(rows + 2 * MARGIN, columns + 2 * MARGIN, seed)
     frames = take_frames(scene, camera, motion, num_frames, noise, seed=seed, samples=samples)
     return torch.from_numpy(frames).float()
 
 
 def errors(vibration, motion):
-    """Period %, amplitude %, phase in pi of each axis: (3, 2)."""
+    """Errors (3, 2) of each axis: period %, amplitude %, phase in pi."""
     truth = motion.vibration()
     turn = torch.remainder(vibration.phase - truth.phase + math.pi, 2 * math.pi) - math.pi
     period = 100 * (truth.frequency / vibration.frequency - 1)
@@ -44,7 +44,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_direct_at_the_limit(paper_camera, name):
     motion, noise, limits = CASES[name]
-    frames = pair_of(paper_camera, motion, 41, noise)
+    frames = noisy_frames(paper_camera, motion, 41, noise)
     result = detect_vibration(frames, paper_camera, method="direct")
     assert result.vibration.amplitude.shape == (2, 1)
     assert result.reliable.all()
@@ -52,9 +52,9 @@ def test_direct_at_the_limit(paper_camera, name):
         assert float(error.max()) < limit, (name, error.tolist(), limit)
 
 
-def test_direct_beats_bands_and_keeps_the_curve(paper_camera):
+def test_direct_is_more_accurate_than_bands_and_keeps_the_offset_curve(paper_camera):
     motion = Motion(phase=(0.9, 2.2))
-    frames = pair_of(paper_camera, motion, 42, 0.005)
+    frames = noisy_frames(paper_camera, motion, 42, 0.005)
     bands, direct = (detect_vibration(frames, paper_camera, method=method) for method in ("bands", "direct"))
     assert bool(
         (
@@ -63,12 +63,12 @@ def test_direct_beats_bands_and_keeps_the_curve(paper_camera):
         ).all()
     )
     assert bool((direct.std.amplitude < bands.std.amplitude).all())
-    # the curve is that of the bands, and the refined motion explains it as well as the bands' own fit
+    # the offset curve is that of the bands; the residual of the refined motion is that of the fit to the bands
     torch.testing.assert_close(direct.offsets.offsets, bands.offsets.offsets, equal_nan=True)
     assert bool((direct.residual < 1.2 * bands.residual + 1e-3).all())
 
 
-def test_what_long_exposures_do_to_detail_is_no_tone(paper_camera):
+def test_blur_of_long_exposures_adds_no_tone(paper_camera):
     camera = replace(paper_camera, exposure_rows=400)
     motion = Motion((3.1, 5.2), (50.0, 30.0), (-1.386, -1.422))
     frames = take_frames(draw_scene(2128, 592, 7), camera, motion, 2, 0.001, seed=7, samples=24)
@@ -78,7 +78,7 @@ def test_what_long_exposures_do_to_detail_is_no_tone(paper_camera):
 
 
 @pytest.mark.parametrize("exposure_rows", [200, 400])
-def test_long_exposures_that_blur_each_frame_in_its_own_way(paper_camera, exposure_rows):
+def test_long_exposures_with_different_blur_in_each_frame(paper_camera, exposure_rows):
     camera = replace(paper_camera, exposure_rows=exposure_rows)
     motion = Motion((3.1, 5.2), (50.0, 30.0), (2.5, 0.4))
     frames = take_frames(draw_scene(2128, 336, 66), camera, motion, 2, 0.005, seed=66, samples=24)
@@ -93,9 +93,9 @@ def test_long_exposures_that_blur_each_frame_in_its_own_way(paper_camera, exposu
 
 @pytest.mark.parametrize("seed", [66, 67])
 def test_long_exposures_of_half_a_frame(paper_camera, seed):
-    """One period of x and less of y, all blurred: rounds overshoot, and the bands ask for tones that are not there.
+    """One period of x and less of y, all rows blurred: iterations overshoot, and bands contain tones caused by blur.
 
-    What kernels that change from row to row leave in the rows, 0.01 px, is 0.04 px of the amplitude.
+    The residual displacement of 0.01 px due to kernels that differ between rows changes the amplitude by 0.04 px.
     """
     camera = replace(paper_camera, exposure_rows=400)
     motion = Motion((3.1, 5.2), (50.0, 30.0), (-1.39, -1.42))
@@ -110,41 +110,41 @@ def test_long_exposures_of_half_a_frame(paper_camera, seed):
     np.testing.assert_allclose(found.vibration.frequency[:, 0], (50.0, 30.0), rtol=5e-4)
 
 
-def pair_under(camera, exposure_rows, motion, seed, columns, num_frames):
-    """Frames of 768 rows with hardly any noise, and their camera."""
+def tall_frames(camera, exposure_rows, motion, seed, columns, num_frames):
+    """Frames of 768 rows with noise 0.001, and their camera."""
     exposed = replace(camera, exposure_rows=exposure_rows)
-    return pair_of(exposed, motion, seed, 0.001, 768, columns, num_frames, samples=16), exposed
+    return noisy_frames(exposed, motion, seed, 0.001, 768, columns, num_frames, samples=16), exposed
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_fast_vibration_blurs_each_frame_in_its_own_way(paper_camera, seed):
-    """Paths of 1.7 px that hardly differ between frames: they curve, and what that does to detail is made up for."""
+def test_fast_vibration_with_different_blur_in_each_frame(paper_camera, seed):
+    """Curved paths of 1.7 px that are similar in all frames: their effect on detail is corrected."""
     motion = Motion((1.2, 0.8), (188.3, 170.7), (0.4, -1.0))
-    found = detect_vibration(*pair_under(paper_camera, 60, motion, seed, 384, 6))
+    found = detect_vibration(*tall_frames(paper_camera, 60, motion, seed, 384, 6))
     wrong = (found.vibration.amplitude[:, 0] - motion.vibration().amplitude[:, 0]).abs()
     assert found.reliable.all(), found.reasons
     assert float(wrong.max()) < 0.0015, wrong
 
 
-def test_what_is_too_small_for_a_tone_does_not_refuse_the_one_that_is_there(paper_camera):
-    """Twelve frames tell of tones of 0.005 px, which are left over from blur and interpolation."""
+def test_residual_tones_do_not_make_the_true_tone_unreliable(paper_camera):
+    """Twelve frames measure tones of 0.005 px, which are residuals of blur and interpolation."""
     motion = Motion((1.2, 0.8), (188.3, 170.7), (0.8, -1.0))
-    found = detect_vibration(*pair_under(paper_camera, 60, motion, 2, 256, 12))
+    found = detect_vibration(*tall_frames(paper_camera, 60, motion, 2, 256, 12))
     assert found.reliable.all(), found.reasons
 
 
-def test_a_tone_of_which_next_to_nothing_is_known_moves_no_frames(paper_camera):
-    """Seven times the frame rate is 166.55 Hz: x is all but blind, and y is found all the same."""
+def test_almost_blind_tone_does_not_displace_frames(paper_camera):
+    """Seven times the frame rate is 166.55 Hz: x is almost blind; y is detected."""
     motion = Motion((0.57, 0.53), (166.9, 191.5), (0.4, -1.0))
     for seed in (1, 2):
-        found = detect_vibration(*pair_under(paper_camera, 150, motion, seed, 384, 2))
+        found = detect_vibration(*tall_frames(paper_camera, 150, motion, seed, 384, 2))
         assert not found.reliable[0]
         assert found.reliable[1], found.reasons
         assert float(found.vibration.amplitude[0].max()) < 5.0
 
 
-def test_a_tone_taken_for_its_mirror_image_beyond_a_blind_frequency_is_found(paper_camera):
-    """The bands of a sharp chart say 44.6 Hz, as far below 2 / (m T_row) = 47.6 Hz as 50 Hz is above."""
+def test_alias_on_the_other_side_of_a_blind_frequency_is_corrected(paper_camera):
+    """Bands of a sharp chart give 44.6 Hz, which mirrors 50 Hz at the blind frequency 2 / (m T_row) = 47.6 Hz."""
     camera = replace(paper_camera, exposure_rows=400)
     motion = Motion((3.1, 5.2), (50.0, 30.0), (-1.386, -1.422))
     chart = resolution_chart(1104, 1104, seed=7).double().numpy()
@@ -155,8 +155,8 @@ def test_a_tone_taken_for_its_mirror_image_beyond_a_blind_frequency_is_found(pap
     np.testing.assert_allclose(found.vibration.frequency[:, 0], motion.frequency, rtol=2e-3)
 
 
-def test_a_blind_tone_that_blur_asks_for_does_not_run_away():
-    """400 rows of a sharp chart without noise: a tone of 23.8 Hz, where the gain is nothing, would grow to 1000 px."""
+def test_amplitude_of_a_blind_tone_caused_by_blur_does_not_diverge():
+    """400 rows exposure of a sharp chart without noise: a tone of 23.8 Hz (gain 0) would grow to 1000 px."""
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=400, frame_rows=2048)
     generator = torch.Generator().manual_seed(7)
     phase = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1) * math.pi
@@ -168,15 +168,15 @@ def test_a_blind_tone_that_blur_asks_for_does_not_run_away():
     assert found.vibration.frequency[:, 0].tolist() == pytest.approx([50.0, 30.0], rel=0.001)
 
 
-def test_two_tones_over_four_frames_are_counted(paper_camera):
+def test_two_tones_over_four_frames_are_detected(paper_camera):
     first = Motion((1.5, 1.2), (41.0, 97.0), (0.7, 0.3))
     second = Motion((0.6, 0.4), (180.0, 66.0), (2.1, -2.0))
 
-    class Both:
+    class TwoTones:
         def displacement(self, times):
             return first.displacement(times) + second.displacement(times)
 
-    frames = pair_of(paper_camera, Both(), 43, 0.005, columns=384, num_frames=4)
+    frames = noisy_frames(paper_camera, TwoTones(), 43, 0.005, columns=384, num_frames=4)
     found = detect_vibration(frames, paper_camera, method="direct").vibration
     assert found.amplitude.shape == (2, 2)
     for k, motion in enumerate((first, second)):
@@ -186,11 +186,11 @@ def test_two_tones_over_four_frames_are_counted(paper_camera):
 
 
 @pytest.mark.parametrize("num_frames", [8, 10])
-def test_uneven_groups_of_frames_know_their_errors(num_frames):
-    """Ten frames make groups of five and six: what the smaller one has no frame for is no error."""
+def test_standard_deviations_of_groups_of_unequal_size(num_frames):
+    """Ten frames make groups of five and six: the frame that the smaller group lacks is not an error."""
     camera = SensorTiming(row_time=163e-6, exposure_rows=3, frame_rows=256)
     motion = Motion(phase=(0.4, -1.9))
-    frames = pair_of(camera, motion, 44, 0.01, 256, 192, num_frames)
+    frames = noisy_frames(camera, motion, 44, 0.01, 256, 192, num_frames)
     found = detect_vibration(frames, camera, tones=1)
     wrong = (found.vibration.amplitude - motion.vibration().amplitude).abs()
     assert bool((found.std.amplitude < 0.005).all()), found.std.amplitude
@@ -198,18 +198,18 @@ def test_uneven_groups_of_frames_know_their_errors(num_frames):
 
 
 def test_still_camera_and_blind_frequency_are_refused(paper_camera):
-    still = pair_of(paper_camera, Motion((0.0, 0.0), (0.0, 0.0), (0.0, 0.0)), 44, 0.005, columns=256)
+    still = noisy_frames(paper_camera, Motion((0.0, 0.0), (0.0, 0.0), (0.0, 0.0)), 44, 0.005, columns=256)
     result = detect_vibration(still, paper_camera, method="direct")
     assert not result.reliable.any()
     assert bool((result.vibration.amplitude == 0).all())
     blind = 1 / paper_camera.frame_period
-    frames = pair_of(paper_camera, Motion((2.0, 1.0), (blind, 90.0), (0.4, 1.0)), 45, 0.005, columns=256)
+    frames = noisy_frames(paper_camera, Motion((2.0, 1.0), (blind, 90.0), (0.4, 1.0)), 45, 0.005, columns=256)
     result = detect_vibration(frames, paper_camera, method="direct")
     assert result.reliable.tolist() == [False, True]
     assert result.vibration.frequency[1, 0].item() == pytest.approx(90.0, rel=2e-3)
 
 
-def test_parts_of_a_batch_are_warped_like_the_whole():
+def test_warping_some_rows_equals_warping_all_rows():
     frames = torch.rand(3, 5, 40, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     spectra = RowSpectra(frames, level=0.5 * torch.ones(3, 5, 1, 1), contrast=2.0 * torch.ones(3, 5, 1, 1))
     rows = 8 + 20 * torch.rand(3, 5, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
@@ -218,18 +218,18 @@ def test_parts_of_a_batch_are_warped_like_the_whole():
     torch.testing.assert_close(part.warped(rows[:, 1:4], shift[:, 1:4]), whole[:, 1:4])
     pattern = torch.rand(3, whole.shape[-1], generator=torch.Generator().manual_seed(4)).to(whole.dtype)
     part.subtract(pattern)
-    # it stands at the same columns of all rows, which are moved
+    # the pattern is at the same columns of all rows; the rows are displaced
     expected = whole[:, 1:4] - pattern[:, None, None] * spectra.ramp(shift[:, 1:4])
     torch.testing.assert_close(part.warped(rows[:, 1:4], shift[:, 1:4]), expected)
     torch.testing.assert_close(spectra.warped(rows, shift), whole)
-    # rows where they are: the frames themselves, standardised, within what single rows are continued by
+    # rows without displacement: the standardised frames, within the boundary extension
     there = torch.arange(12, 28, dtype=torch.float64).expand(3, 5, -1)
     own = torch.fft.irfft(spectra.warped(there, torch.zeros_like(there)), n=spectra.length)[..., :64]
     torch.testing.assert_close(own, (frames[:, :, 12:28] - 0.5) / 2, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("num_frames", [2, 3, 5])
-def test_differences_from_the_mean_of_the_frames_that_see_a_row(num_frames):
+def test_differences_from_the_mean_of_the_frames_in_which_a_row_is_visible(num_frames):
     generator = torch.Generator().manual_seed(num_frames)
     spectra = torch.randn(2, num_frames, 7, 5, dtype=torch.complex128, generator=generator)
     seen = (torch.rand(2, num_frames, 7, generator=generator) > 0.3).double()
@@ -244,7 +244,7 @@ def test_differences_from_the_mean_of_the_frames_that_see_a_row(num_frames):
 
 def test_further_rounds_change_the_result_by_less_than_its_std(paper_camera, monkeypatch):
     """Compared with a detection that uses all rounds."""
-    frames = pair_of(paper_camera, Motion((3.1, 5.2), (50.0, 30.0), (0.4, -1.1)), 91, 0.005)
+    frames = noisy_frames(paper_camera, Motion((3.1, 5.2), (50.0, 30.0), (0.4, -1.1)), 91, 0.005)
     rounds = []
     measure = direct.measure_groups
     monkeypatch.setattr(direct, "measure_groups", lambda *given: (rounds.append(1), measure(*given))[1])
@@ -258,8 +258,8 @@ def test_further_rounds_change_the_result_by_less_than_its_std(paper_camera, mon
         assert bool((change < 0.1 * getattr(found.std, name)).all())
 
 
-def fit_of(coefficients, frequencies):
-    """A fit of one tone an axis whose standard deviations are 0.01 px and 0.02 Hz."""
+def tone_fit(coefficients, frequencies):
+    """A fit of one tone per axis with standard deviations of 0.01 px and 0.02 Hz."""
     deviations = torch.tensor([0.01, 0.01, 0.02, 1.0] * 2, dtype=torch.float64)
     return ToneFit(
         torch.tensor(coefficients, dtype=torch.complex128).reshape(1, 2, 1),
@@ -286,19 +286,19 @@ def fit_of(coefficients, frequencies):
     ],
 )
 def test_convergence_follows_from_the_change_and_the_ratio_of_steps(change, ratio, converged):
-    before = fit_of([1.0, 2.0], [50.0, 30.0])
+    before = tone_fit([1.0, 2.0], [50.0, 30.0])
     ratio = None if ratio is None else torch.tensor([ratio], dtype=torch.float64)
     for after in (
-        fit_of([1.0 + 0.01 * change, 2.0], [50.0, 30.0]),
-        fit_of([1.0, 2.0], [50.0, 30.0 - 0.02 * change]),
+        tone_fit([1.0 + 0.01 * change, 2.0], [50.0, 30.0]),
+        tone_fit([1.0, 2.0], [50.0, 30.0 - 0.02 * change]),
     ):
         assert direct._converged(before, after, ratio) is converged
 
 
 @pytest.mark.parametrize("remaining", [0.0, 0.05, -0.3])
 @pytest.mark.parametrize("num_frames", [2, 3])
-def test_rows_tell_a_known_shift(remaining, num_frames):
-    """Frames moved along the rows by multiples of a shift: every row tells each frame's place about the mean."""
+def test_shift_estimated_from_rows(remaining, num_frames):
+    """Frames shifted along the rows by multiples of a shift: positions of the frames relative to their mean."""
     scene = draw_scene(96, 192, 46)
     u = np.fft.rfftfreq(192)
     moved = [
@@ -313,7 +313,7 @@ def test_rows_tell_a_known_shift(remaining, num_frames):
     gradients = row_gradients(spectra, [(slice(None), spectra.warped(rows, none))], rows, none, seen)
     expected = remaining * (torch.arange(num_frames) - (num_frames - 1) / 2)
 
-    def told(shift):
+    def estimated_shift(shift):
         runs = (slice(0, 40), slice(40, 96))
         warped = ((run, spectra.warped(rows[..., run], shift[..., run])) for run in runs)
         matrix, right = row_equations(residual_products(warped, gradients, seen), gradients, seen)
@@ -324,16 +324,16 @@ def test_rows_tell_a_known_shift(remaining, num_frames):
 
     again = residual_products([(slice(None), spectra.warped(rows, none))], gradients, seen)
     torch.testing.assert_close(gradients.residual_products, again, rtol=1e-9, atol=1e-9)
-    shifts = told(none)
+    shifts = estimated_shift(none)
     torch.testing.assert_close(shifts[:, 0], expected.double(), rtol=0.1, atol=2e-4)
     assert shifts[:, 1].abs().max() < 0.02 * abs(remaining) + 1e-5
-    # what is taken out beforehand does not remain
-    assert told(expected[None, :, None].expand(1, -1, 96).double()).abs().max() < 1e-3
+    # a shift that was removed before has no residual
+    assert estimated_shift(expected[None, :, None].expand(1, -1, 96).double()).abs().max() < 1e-3
 
 
 @dataclass(frozen=True)
 class Tones:
-    """Tones of both axes (2, K), with a drift that may speed up."""
+    """Tones of both axes (2, K) with a drift that may be accelerated."""
 
     amplitude: tuple
     frequency: tuple
@@ -388,8 +388,8 @@ def clipped_highlights(frames, random):
     return np.minimum(frames, np.quantile(frames, 0.95)), None
 
 
-def something_that_moves(frames, random):
-    """A fifth of the rows shows another scene, which moves on its own."""
+def moving_object(frames, random):
+    """A fifth of the rows shows another scene with a different motion."""
     frames, tall = frames.copy(), frames.shape[-2] // 5
     other = draw_scene(tall + 20, frames.shape[-1] + 20, 99)
     frames[0, 700 : 700 + tall] = other[5 : 5 + tall, 9:-11]
@@ -398,7 +398,7 @@ def something_that_moves(frames, random):
 
 
 def weak_detail(frames, random):
-    """A third of the rows shows next to nothing."""
+    """A third of the rows has very low contrast."""
     clean = np.ones(frames.shape[-2])
     clean[900:1500] = 0.01
     return 0.5 + (frames - 0.5) * clean[:, None], None
@@ -411,7 +411,7 @@ DISTURBANCES = (
     missing_pixels,
     ignored_pixels,
     clipped_highlights,
-    something_that_moves,
+    moving_object,
     weak_detail,
 )
 
@@ -441,7 +441,7 @@ def test_disturbed_frames(clean_pairs, paper_camera, disturb, motion):
 
 @pytest.mark.parametrize("method", ["direct", "bands"])
 def test_side_tones_of_a_blind_tone_are_not_reported_as_tones(paper_camera, method):
-    """Motion along the scan lets a blind tone through at its frequency plus and minus that of the motion."""
+    """Motion along the scan axis makes a blind tone visible at its frequency plus and minus that of the motion."""
     blind = 3 / paper_camera.frame_period
     motion = Motion((1.6, 5.2), (blind, 30.0), (0.4, 1.3))
     frames = take_frames(draw_scene(2128, 336, 64), paper_camera, motion, 2, 0.005, seed=64, samples=8)
@@ -452,7 +452,7 @@ def test_side_tones_of_a_blind_tone_are_not_reported_as_tones(paper_camera, meth
     assert (result.vibration.amplitude[0] > 0).sum() == 1
 
 
-def test_a_weak_tone_where_a_side_tone_would_be_is_a_tone(paper_camera):
+def test_weak_tone_at_the_frequency_of_a_side_tone_is_detected(paper_camera):
     motion = Motion((0.05, 5.2), (3 / paper_camera.frame_period + 30.0, 30.0), (0.4, 1.3))
     frames = take_frames(draw_scene(2128, 336, 65), paper_camera, motion, 2, 0.005, seed=65, samples=8)
     result = detect_vibration(torch.from_numpy(frames).float(), paper_camera)
@@ -463,8 +463,8 @@ def test_a_weak_tone_where_a_side_tone_would_be_is_a_tone(paper_camera):
 
 
 @pytest.mark.parametrize(("top", "move"), [(120, (-4, -6)), (700, (5, 0)), (1610, (2, 7))])
-def test_a_cloud_over_a_fifth_of_the_rows(paper_camera, top, move):
-    """Wherever it is and however it moves, slow tones are those of the other rows."""
+def test_moving_cloud_over_a_fifth_of_the_rows(paper_camera, top, move):
+    """Slow tones are measured on the other rows, for every position and motion of the cloud."""
     motion = Motion((3.1, 5.2), (50.0, 30.0), (0.7, 2.1))
     frames = take_frames(draw_scene(2128, 336, 61), paper_camera, motion, 2, samples=8)
     tall, wide = frames.shape[-2] // 5, frames.shape[-1]
@@ -482,7 +482,7 @@ def test_a_cloud_over_a_fifth_of_the_rows(paper_camera, top, move):
 
 
 def test_image_motion_of_almost_half_a_frame():
-    """Only what both frames show counts; short exposures keep the smear of the motion itself small."""
+    """Only the area visible in both frames is used; the blur by the image motion is small in short exposures."""
     camera = SensorTiming(20.52e-6, 10, 1100)
     period = camera.frame_period
     for move in ((0.45 * 700 / period, 0.0), (-0.2 * 700 / period, -0.45 * 1000 / period)):
@@ -499,7 +499,7 @@ def test_image_motion_of_almost_half_a_frame():
         torch.testing.assert_close(result.vibration.image_motion, torch.tensor(move).double(), rtol=0, atol=0.5)
 
 
-def test_uneven_frames_see_what_even_ones_are_blind_to(paper_camera):
+def test_uneven_frame_times_measure_a_blind_frequency(paper_camera):
     blind = 1 / paper_camera.frame_period
     motion = Motion((2.0, 1.0), (blind, 90.0), (0.4, 1.0))
     scene = draw_scene(2128, 336, 54)
@@ -528,7 +528,7 @@ def test_harmonics_share_a_frequency(paper_camera):
         ((base, 2 * base, 3 * base), (61.0, 122.0, 183.0)),
         ((0.1, 0.2, 0.3), (1.0, 2.0, 3.0)),
     )
-    frames = pair_of(paper_camera, motion, 55, 0.005, columns=256, num_frames=3)
+    frames = noisy_frames(paper_camera, motion, 55, 0.005, columns=256, num_frames=3)
     tied = detect_vibration(frames, paper_camera, harmonics=3)
     free = detect_vibration(frames, paper_camera)
     for result in (tied, free):
@@ -538,11 +538,11 @@ def test_harmonics_share_a_frequency(paper_camera):
         assert (found.amplitude / torch.tensor(motion.amplitude) - 1).abs().max() < 0.02
     multiples = tied.vibration.frequency / tied.vibration.frequency[:, :1]
     torch.testing.assert_close(multiples, torch.tensor([[1.0, 2.0, 3.0]] * 2).double(), rtol=1e-12, atol=0)
-    # what is tied is known better
+    # the constraint reduces the standard deviation
     assert bool((tied.std.frequency[:, 1:] < 0.5 * free.std.frequency[:, 1:]).all())
 
 
-def test_image_motion_that_speeds_up(paper_camera):
+def test_accelerated_image_motion(paper_camera):
     motion = Tones(((3.1,), (5.2,)), ((50.0,), (30.0,)), ((0.7,), (2.1,)), (200.0, -300.0), (900.0, -1500.0))
     scene = draw_scene(2048 + 200, 256 + 200, 56)
     frames = take_frames(scene, paper_camera, motion, 4, 0.005, seed=6, margin=100, samples=6)
@@ -557,15 +557,15 @@ def test_image_motion_that_speeds_up(paper_camera):
     assert not bool(uniform.reliable.any())
 
 
-def test_windows_follow_a_vibration_that_changes(paper_camera):
-    """Amplitude grows and frequency falls along the stack."""
+def test_windows_measure_a_changing_vibration(paper_camera):
+    """The amplitude increases and the frequency decreases during the stack."""
 
-    class Changing:
+    class ChangingTone:
         def displacement(self, times):
             x = (1.0 + 2.0 * times) * np.sin(2 * np.pi * (84.0 * times - 3.0 * times**2) + 0.3)
             return np.stack([x, 0.8 * np.sin(2 * np.pi * 64.0 * times)], axis=-1)
 
-    frames = pair_of(paper_camera, Changing(), 57, 0.003, columns=192, num_frames=7)
+    frames = noisy_frames(paper_camera, ChangingTone(), 57, 0.003, columns=192, num_frames=7)
     result = detect_vibration(frames, paper_camera, window=3, window_step=2, tones=1)
     assert result.vibration.amplitude.shape == (3, 2, 1)
     assert len(result.reasons) == 3
@@ -585,15 +585,17 @@ def test_windows_follow_a_vibration_that_changes(paper_camera):
 
 
 @pytest.mark.parametrize("noise", [0.001, 0.02])
-def test_drift_alone_is_no_vibration(paper_camera, noise):
-    frames = pair_of(paper_camera, Motion((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (300.0, -200.0)), 58, noise, columns=256)
+def test_drift_without_vibration_is_not_reliable(paper_camera, noise):
+    frames = noisy_frames(
+        paper_camera, Motion((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (300.0, -200.0)), 58, noise, columns=256
+    )
     result = detect_vibration(frames, paper_camera)
     assert not bool(result.reliable.any())
     torch.testing.assert_close(result.vibration.image_motion, torch.tensor([300.0, -200.0]).double(), rtol=0, atol=1.0)
 
 
-def test_rotation_is_not_taken_for_a_vibration(paper_camera):
-    """A camera that rolls between the frames: halves of the rows move apart."""
+def test_rotation_is_not_detected_as_vibration(paper_camera):
+    """A camera that rotates between the frames: the two halves of each row move in opposite directions."""
     scene = draw_scene(2128, 336, 59)
     frames = take_frames(scene, paper_camera, Motion((1.0, 1.0), (80.0, 80.0), (0.0, 1.0)), 2)
     rows = np.arange(frames.shape[1])[:, None]
@@ -607,9 +609,12 @@ def test_rotation_is_not_taken_for_a_vibration(paper_camera):
     assert any("move apart" in reason for reason in result.reasons[1])
 
 
-def test_batch_of_stacks_is_a_loop_of_singles(paper_camera):
+def test_batch_equals_single_stacks(paper_camera):
     stacks = torch.stack(
-        [pair_of(paper_camera, motion, 61 + i, 0.003, columns=192) for i, motion in enumerate((MIDDLING, Motion()))]
+        [
+            noisy_frames(paper_camera, motion, 61 + i, 0.003, columns=192)
+            for i, motion in enumerate((MIDDLING, Motion()))
+        ]
     )
     together = detect_vibration(stacks[:, :, None], paper_camera)
     for index in range(2):
@@ -636,7 +641,7 @@ def test_bad_options(paper_camera, options, error, message):
         detect_vibration(torch.rand(3, 256, 256), paper_camera, **options)
 
 
-def test_direct_refuses_what_bands_refuse(paper_camera):
+def test_direct_and_bands_refuse_the_same_input(paper_camera):
     with pytest.raises(ValueError, match="constant"):
         detect_vibration(torch.ones(2, 256, 256), paper_camera, method="direct")
     noise = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(1)).expand(2, -1, -1)

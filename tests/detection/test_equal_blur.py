@@ -20,7 +20,7 @@ def pairs(paper_camera):
     return torch.stack([torch.from_numpy(frames).float() for frames in taken]), camera
 
 
-def of_each_stack(motion: Motion) -> Vibration:
+def for_both_stacks(motion: Motion) -> Vibration:
     one = motion.vibration()
     values = (one.amplitude, one.frequency, one.phase, one.image_motion)
     return Vibration(*(value.expand(2, *value.shape) for value in values))
@@ -28,7 +28,7 @@ def of_each_stack(motion: Motion) -> Vibration:
 
 def prepared(frames, camera):
     """Spectra of the frames, the positions of the scene rows by the true motion, and the function that warps them."""
-    spectra, truth = RowSpectra(frames), of_each_stack(MOTION)
+    spectra, truth = RowSpectra(frames), for_both_stacks(MOTION)
     group = FrameGroup(spectra, camera.frame_starts(2).expand(2, -1))
     positions = displacements._Positions.of(group, camera, truth)
     return spectra, positions, displacements._warp_to_scene(spectra, positions, camera, truth)
@@ -37,7 +37,7 @@ def prepared(frames, camera):
 def test_residual_displacements_about_the_true_motion_are_zero(pairs):
     """Without the correction for kernels that change from row to row they would be 3e-3 px."""
     frames, camera = pairs
-    truth = of_each_stack(MOTION)
+    truth = for_both_stacks(MOTION)
     groups = frame_groups(stack_spectra(frames, None), camera, truth, pairs_if_blurred_differently=True)
     found, _ = measure_groups(groups, camera, truth)
     expected = found.relative(truth.mean_displacement(found.exposure_starts, found.exposure_time))

@@ -1,4 +1,4 @@
-"""Motion of any shape from frames of an independent simulator: what can be seen is found, what cannot is said."""
+"""Motion of any shape from frames of an independent simulator: observable and unobservable parts."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ SPAN = FRAMES * TIMING.frame_period
 
 
 class Jitter(Motion):
-    """A settling step along x, a chirp over a drift along y: no sum of sinusoids."""
+    """A settling step along x, a chirp with drift along y: not a sum of sinusoids."""
 
     def displacement(self, times):
         place = times / SPAN
@@ -25,8 +25,8 @@ class Jitter(Motion):
         return np.stack([x, y], axis=-1)
 
 
-def seen(values):
-    """Displacements (T, R, 2) less their mean over the frames, row by row: near enough to what frames tell here."""
+def without_frame_mean(values):
+    """Displacements (T, R, 2) minus the mean of each row over the frames: approximately the observable part."""
     return values - values.mean(0)
 
 
@@ -45,18 +45,18 @@ def make_found(frames):
     return rsv.detect_motion(frames, TIMING)
 
 
-def test_what_can_be_seen_is_found(found):
+def test_observable_displacement_is_measured(found):
     error = found.displacement.numpy() - Jitter().displacement(found.times.numpy())
-    assert (rms(seen(Jitter().displacement(found.times.numpy()))) > 1.0).all()
-    assert (rms(seen(error)) < 0.05).all()
+    assert (rms(without_frame_mean(Jitter().displacement(found.times.numpy()))) > 1.0).all()
+    assert (rms(without_frame_mean(error)) < 0.05).all()
     assert (rms(error - error.mean((0, 1))) < 0.4).all()
     assert found.reliable.all()
     assert found.reasons == ((), ())
 
 
-def test_error_bars_are_honest(found):
+def test_standard_deviations_agree_with_errors(found):
     error = found.displacement.numpy() - Jitter().displacement(found.times.numpy())
-    assert (rms(seen(error)) < 2.5 * found.std_seen.numpy()).all()
+    assert (rms(without_frame_mean(error)) < 2.5 * found.std_seen.numpy()).all()
     assert (found.std_seen.numpy() < 0.1).all()
     assert (rms(error - error.mean((0, 1))) < 2.5 * rms(found.std.numpy())).all()
     assert (found.unseen > found.std_seen).all()
@@ -64,11 +64,11 @@ def test_error_bars_are_honest(found):
     assert torch.allclose(found.displacement.mean((0, 1)), torch.zeros(2, dtype=torch.float64), atol=1e-9)
 
 
-def test_restoration_comes_within_half_a_decibel_of_the_truth(scene, frames, found):
+def test_restoration_is_within_half_a_decibel_of_the_true_motion(scene, frames, found):
     times = (TIMING.row_starts(FRAMES, HEIGHT) + 0.5 * TIMING.exposure_time).numpy()
     truth = Jitter().displacement(times)
     error = found.motion.displacement(torch.from_numpy(times)).numpy() - truth
-    common = truth + seen(error)  # what repeats in every frame cannot be seen
+    common = truth + without_frame_mean(error)  # motion that repeats in every frame is not observable
     best, here = (
         decibel(
             rsv.restore(frames, TIMING, FreeMotion.from_samples(times.ravel(), d.reshape(-1, 2))).numpy(), crop(scene)
@@ -89,7 +89,7 @@ def test_colour_and_scan_along_columns(scene, found):
     assert torch.allclose(other.std, found.std.flip(-1), rtol=1e-3)
 
 
-def test_image_motion_is_told_apart(scene):
+def test_image_motion_is_separated(scene):
     wide = draw_scene(HEIGHT + 2 * MARGIN + 160, WIDTH + 2 * MARGIN + 160, 6)
 
     class Scan(Motion):
@@ -101,10 +101,10 @@ def test_image_motion_is_told_apart(scene):
     found = rsv.detect_motion(torch.from_numpy(frames).float(), TIMING)
     assert found.motion.image_motion[1] == pytest.approx(-500.0, rel=5e-3)
     error = found.displacement.numpy() - Scan().displacement(found.times.numpy())
-    assert (rms(seen(error - error.mean((0, 1)))) < 0.1).all()
+    assert (rms(without_frame_mean(error - error.mean((0, 1)))) < 0.1).all()
 
 
-def test_one_pair_is_enough_for_a_slow_motion(scene):
+def test_two_frames_are_enough_for_a_slow_motion(scene):
     class Slow(Motion):
         def displacement(self, times):
             return np.stack([30.0 * times, 2 * np.sin(20 * times)], axis=-1)
@@ -112,10 +112,10 @@ def test_one_pair_is_enough_for_a_slow_motion(scene):
     frames = take_frames(scene, TIMING, Slow(), 2, 0.002)
     found = rsv.detect_motion(torch.from_numpy(frames).float(), TIMING)
     error = found.displacement.numpy() - Slow().displacement(found.times.numpy())
-    assert (rms(seen(error - error.mean((0, 1)))) < 0.02).all()
+    assert (rms(without_frame_mean(error - error.mean((0, 1)))) < 0.02).all()
 
 
-def test_a_scene_that_changes_is_not_reliable():
+def test_changing_scene_is_not_reliable():
     frames = np.stack([draw_scene(HEIGHT, WIDTH, seed) for seed in range(4)])
     try:
         found = rsv.detect_motion(torch.from_numpy(frames).float(), TIMING)
@@ -125,27 +125,27 @@ def test_a_scene_that_changes_is_not_reliable():
         assert not found.reliable.any()
 
 
-@pytest.fixture(scope="module", name="few")
-def make_few(frames):
+@pytest.fixture(scope="module", name="first_frames")
+def make_first_frames(frames):
     return frames[:3]
 
 
-@pytest.fixture(scope="module", name="few_found")
-def make_few_found(few):
-    return rsv.detect_motion(few, TIMING)
+@pytest.fixture(scope="module", name="first_found")
+def make_first_found(first_frames):
+    return rsv.detect_motion(first_frames, TIMING)
 
 
-def test_pixels_that_were_not_measured_do_not_count(few, few_found):
-    """Dirt on the sensor: bright spots that do not move with the scene."""
+def test_missing_pixels_do_not_change_the_result(first_frames, first_found):
+    """Bright spots of dirt on the sensor do not move with the scene."""
     hole = np.zeros((HEIGHT, WIDTH), dtype=bool)
     for top, left in np.random.default_rng(1).integers(0, (HEIGHT - 12, WIDTH - 12), (40, 2)):
         hole[top : top + 12, left : left + 12] = True
     assert 0.08 < hole.mean() < 0.3
-    dirty = torch.where(torch.from_numpy(hole), 0.9 + 0.1 * torch.rand(HEIGHT, WIDTH), few)
-    truth = Jitter().displacement(few_found.times.numpy())
+    dirty = torch.where(torch.from_numpy(hole), 0.9 + 0.1 * torch.rand(HEIGHT, WIDTH), first_frames)
+    truth = Jitter().displacement(first_found.times.numpy())
 
     def error(result):
-        return rms(seen(result.displacement.numpy() - truth)).max()
+        return rms(without_frame_mean(result.displacement.numpy() - truth)).max()
 
     masked = rsv.detect_motion(dirty, TIMING, ignore=hole)
     assert error(masked) < 0.05
@@ -154,25 +154,25 @@ def test_pixels_that_were_not_measured_do_not_count(few, few_found):
     assert torch.equal(holes.displacement, masked.displacement)
 
 
-def test_a_batch_is_a_loop_and_an_array_a_tensor(few, few_found):
-    other = few.flip(-1).contiguous()
-    both = rsv.detect_motion(torch.stack([few, other])[:, :, None].numpy(), TIMING)
-    for index, single in enumerate((few_found, rsv.detect_vibration(other, TIMING, model="free"))):
+def test_batches_and_arrays_equal_single_tensors(first_frames, first_found):
+    other = first_frames.flip(-1).contiguous()
+    both = rsv.detect_motion(torch.stack([first_frames, other])[:, :, None].numpy(), TIMING)
+    for index, single in enumerate((first_found, rsv.detect_vibration(other, TIMING, model="free"))):
         one = both[index]
         for name in ("times", "displacement", "std", "std_seen", "unseen", "unexplained", "reliable"):
             assert torch.equal(getattr(one, name), getattr(single, name)), name
         times = single.times + 1e-3
         assert torch.equal(one.motion.displacement(times), single.motion.displacement(times))
         assert one.reasons == single.reasons
-    assert torch.allclose(both.displacement[1, ..., 0], -few_found.displacement[..., 0], atol=0.05)
+    assert torch.allclose(both.displacement[1, ..., 0], -first_found.displacement[..., 0], atol=0.05)
     assert both.motion.displacement(both.times[None]).shape == (2, 3, 32, 2)
 
 
-def test_options_of_tones_do_not_go_with_other_models(few):
+def test_options_of_tones_are_refused_by_other_models(first_frames):
     with pytest.raises(ValueError, match=r"tones=2 goes with model='tones', not with model='free'"):
-        rsv.detect_vibration(few, TIMING, model="free", tones=2)
+        rsv.detect_vibration(first_frames, TIMING, model="free", tones=2)
     with pytest.raises(ValueError, match="model must be one of"):
-        rsv.detect_vibration(few, TIMING, model="spline")
+        rsv.detect_vibration(first_frames, TIMING, model="spline")
     with pytest.raises(ValueError, match="finds steady tones"):
         rsv.VibrationDetector(TIMING, model="free")
 
@@ -205,12 +205,12 @@ def test_command(scene, frames, tmp_path, capsys):
         (torch.rand(2, 300, 64), {}, "frame_rows=270"),
     ],
 )
-def test_bad_input_is_named(frames, options, message):
+def test_bad_input(frames, options, message):
     with pytest.raises(ValueError, match=message):
         rsv.detect_motion(frames, TIMING, **options)
 
 
-def test_motion_beyond_the_search_range_is_named(scene):
+def test_motion_beyond_the_search_range_is_reported(scene):
     class Far(Motion):
         def displacement(self, times):
             return np.stack([30 * np.sin(2 * np.pi * times / TIMING.frame_period * 0.7), 0 * times], axis=-1)
@@ -224,7 +224,7 @@ def test_motion_beyond_the_search_range_is_named(scene):
 
 
 class Ringing(Motion):
-    """Like a spacecraft's: two tones, one of them once a frame, over a drift along the scan."""
+    """Two tones and a drift along the scan axis, as on a spacecraft; one tone has the frame rate."""
 
     def displacement(self, times):
         turns = times / TIMING.frame_period
@@ -233,8 +233,8 @@ class Ringing(Motion):
         return np.stack([x, y], axis=-1)
 
 
-def test_offsets_between_any_two_frames_are_found_beside_what_no_frame_tells():
-    """A tone that turns once a frame is a warp of the scene: it is lost, and harms nothing else."""
+def test_offsets_of_all_pairs_are_measured_despite_an_unobservable_tone():
+    """A tone at the frame rate is equivalent to a warp of the scene: it is not observable and affects nothing else."""
     scene = draw_scene(HEIGHT + 2 * MARGIN, 112 + 2 * MARGIN, 12)
     frames = torch.from_numpy(take_frames(scene, TIMING, Ringing(), 8, 0.005)).float()
     found = rsv.detect_motion(frames, TIMING)

@@ -1,4 +1,4 @@
-"""Push-broom parallax pairs: two lines see the same ground, a delay shorter than the image apart."""
+"""Push-broom parallax pairs: two lines record the same ground with a delay shorter than the image."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ JITTER = Motion(amplitude=(1.4, 0.9), frequency=(31.0, 44.0), phase=(0.4, 1.3))
 
 
 def images(scene, delay_lines, motion=JITTER, noise=0.005):
-    """Images of lines that see the ground ``delay_lines`` apart; the simulator counts those as its frame period."""
+    """Images of two lines with a delay of ``delay_lines``, which is the frame period of the simulator."""
     lines = rsv.SensorTiming(row_time=LINE_TIME, exposure_rows=4, frame_rows=delay_lines)
     return torch.from_numpy(take_frames(scene, lines, motion, 2, noise)).float()
 
@@ -23,7 +23,7 @@ def make_ground():
 
 
 @pytest.mark.parametrize("delay_lines", [73, 260])
-def test_jitter_is_found_and_undone(ground, delay_lines):
+def test_jitter_is_measured_and_removed(ground, delay_lines):
     timing = rsv.SensorTiming.line_sensors(LINE_TIME, [0.0, delay_lines * LINE_TIME], LINES, 4)
     taken = images(ground, delay_lines)
     found = rsv.detect_vibration(taken, timing)
@@ -35,7 +35,7 @@ def test_jitter_is_found_and_undone(ground, delay_lines):
     assert decibel(restored.numpy(), crop(ground)) > decibel(taken.numpy(), crop(ground)) + 12
 
 
-def test_jitter_that_is_no_sine(ground):
+def test_jitter_without_a_sinusoid(ground):
     class Settling(Motion):
         def displacement(self, times):
             x = 4 * np.exp(-times / 0.03) * np.cos(2 * np.pi * 40 * times)
@@ -49,14 +49,14 @@ def test_jitter_that_is_no_sine(ground):
     assert found.reliable.all()
 
 
-def test_a_delay_that_is_a_period_is_blind(ground):
+def test_delay_of_one_period_is_blind(ground):
     delay = 1 / 31.0
     timing = rsv.SensorTiming.line_sensors(LINE_TIME, [0.0, delay], LINES, 4)
     found = rsv.detect_vibration(images(ground, delay / LINE_TIME), timing)
     assert not found.reliable[0]
 
 
-def test_bad_values_are_named():
+def test_bad_values():
     with pytest.raises(ValueError, match="two lines or more"):
         rsv.SensorTiming.line_sensors(1e-4, [0.0], 900)
     with pytest.raises(ValueError, match="strictly increasing"):

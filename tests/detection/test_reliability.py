@@ -1,4 +1,4 @@
-"""Reasons against a detected vibration, one by one."""
+"""Each reason for which a detected vibration is not reliable."""
 
 import math
 

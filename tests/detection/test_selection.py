@@ -23,39 +23,39 @@ def offsets_of(amplitude, frequency, generator, noise=0.003):
     return (places[1] - places[0] + errors)[None]
 
 
-def measured(offsets):
+def as_measurements(offsets):
     starts = (torch.arange(ROWS, dtype=torch.float64) * ROW_TIME).expand(len(offsets), -1)
     information = torch.eye(2, dtype=torch.float64).expand(len(offsets), ROWS, 2, 2)
     return Measurements.of_pairs(starts, starts + FRAME_PERIOD, offsets, information, 0.0)
 
 
-def test_stretches_are_left_out_only_where_rows_are_disturbed(monkeypatch):
+def test_only_disturbed_rows_are_excluded(monkeypatch):
     generator = torch.Generator().manual_seed(8)
     clean = offsets_of([3.1, 5.2], [50.0, 30.0], generator)
     cloudy = offsets_of([2.0, 1.1], [50.0, 35.0], generator)
-    cloudy[:, 30:58] += torch.linspace(2.0, 9.0, 28)[:, None]  # moves by itself
+    cloudy[:, 30:58] += torch.linspace(2.0, 9.0, 28)[:, None]  # an object with its own motion
     calls = []
     without_stretches = periodogram.without_stretches
     monkeypatch.setattr(periodogram, "without_stretches", lambda given: calls.append(1) or without_stretches(given))
     alone = []
     for offsets, disturbed in ((clean, False), (cloudy, True)):
         calls.clear()
-        alone.append(selection.find_tones(measured(offsets), ROW_TIME, 1))
+        alone.append(selection.find_tones(as_measurements(offsets), ROW_TIME, 1))
         assert bool(calls) == disturbed
     for fit, amplitude, frequency in zip(alone, ([3.1, 5.2], [2.0, 1.1]), ([50.0, 30.0], [50.0, 35.0]), strict=True):
         assert fit.coefficients.abs().flatten().tolist() == pytest.approx(amplitude, rel=0.01)
         assert fit.frequencies.flatten().tolist() == pytest.approx(frequency, rel=0.003)
-    together = selection.find_tones(measured(torch.cat([clean, cloudy])), ROW_TIME, 1)
+    together = selection.find_tones(as_measurements(torch.cat([clean, cloudy])), ROW_TIME, 1)
     for index, fit in enumerate(alone):
         torch.testing.assert_close(together.frequencies[index], fit.frequencies[0], rtol=1e-9, atol=0)
         torch.testing.assert_close(together.coefficients[index], fit.coefficients[0], rtol=1e-7, atol=0)
 
 
-def test_a_weak_tone_beside_a_strong_one_is_found_and_noise_is_not():
+def test_weak_tone_beside_a_strong_tone_is_detected_and_noise_is_not():
     generator = torch.Generator().manual_seed(4)
-    one = measured(offsets_of([3.1, 5.2], [50.0, 30.0], generator))
+    one = as_measurements(offsets_of([3.1, 5.2], [50.0, 30.0], generator))
     weak = offsets_of([0.006, 0.005], [88.0, 79.0], generator)
-    two = measured(one.displacements[:, :, 1] - one.displacements[:, :, 0] + weak)
+    two = as_measurements(one.displacements[:, :, 1] - one.displacements[:, :, 0] + weak)
     for measurements, tones in ((one, 1), (two, 2)):
         fit = selection.find_tones(measurements, ROW_TIME)
         assert fit.active.sum(-1).tolist() == [[tones, tones]]
@@ -74,7 +74,7 @@ def test_insignificant_and_small_tones_are_dropped(amplitude, frequency, stays):
     generator = torch.Generator().manual_seed(6)
     strong, weak = (offsets_of([a, a], [f, f], None, noise=0.0) for a, f in ((3.1, 50.0), (amplitude, frequency)))
     noise = 0.0006 * torch.randn(strong.shape, dtype=torch.float64, generator=generator)
-    measurements = measured(strong + weak + noise)
+    measurements = as_measurements(strong + weak + noise)
     start = torch.tensor([50.0, frequency], dtype=torch.float64).expand(1, 2, 2)
     fit = fit_tones(measurements, start, torch.ones(1, 2, 2, dtype=torch.bool))
     kept = selection.significant_only(measurements, fit, torch.tensor([FRAME_PERIOD], dtype=torch.float64))

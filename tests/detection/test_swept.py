@@ -1,4 +1,4 @@
-"""Tones that fade or sweep, from frames of an independent simulator."""
+"""Tones that decay or change frequency, in frames of an independent simulator."""
 
 import math
 import re
@@ -40,7 +40,7 @@ def make_found(frames):
     return rsv.detect_swept_tone(frames, TIMING)
 
 
-def test_decay_and_chirp_are_found(found):
+def test_decay_and_chirp_are_measured(found):
     assert found.amplitude.tolist() == pytest.approx(AMPLITUDE, rel=0.02)
     assert found.frequency.tolist() == pytest.approx(FREQUENCY, rel=0.01)
     assert found.decay.tolist() == pytest.approx(DECAY, abs=0.6)
@@ -56,7 +56,7 @@ def test_decay_and_chirp_are_found(found):
     ("name", "truth"),
     [("amplitude", AMPLITUDE), ("frequency", FREQUENCY), ("decay", DECAY), ("chirp", CHIRP), ("phase", PHASE)],
 )
-def test_error_bars_are_honest(found, name, truth):
+def test_standard_deviations_agree_with_errors(found, name, truth):
     off = np.abs(getattr(found, name).numpy() - truth)
     assert (off < 4 * found.std[name].numpy()).all()
     assert (found.std[name] > 0).all()
@@ -78,19 +78,19 @@ def test_columns_read_in_reverse(frames, found):
     assert other.phase.abs().max() <= math.pi
 
 
-def test_a_still_axis_has_no_tone(scene):
-    class Along(Motion):
+def test_axis_without_motion_has_no_tone(scene):
+    class MotionAlongX(Motion):
         def displacement(self, times):
             return np.stack([2 * np.exp(-10 * times) * np.sin(2 * np.pi * 45 * times), 0 * times], -1)
 
-    frames = torch.from_numpy(take_frames(scene, TIMING, Along(), 3, 0.005)).float()
+    frames = torch.from_numpy(take_frames(scene, TIMING, MotionAlongX(), 3, 0.005)).float()
     found = rsv.detect_swept_tone(frames, TIMING)
     assert found.amplitude[1] == 0
     assert found.reasons[1] == ("no tone stands out",)
     assert found.frequency[0].item() == pytest.approx(45.0, rel=0.02)
 
 
-def test_pixels_that_were_not_measured_do_not_count(frames):
+def test_missing_pixels_do_not_change_the_result(frames):
     hole = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     hole[20:230, 60:90] = True  # a bright strip on the sensor
     dirty = torch.where(hole, 0.5 + 0.5 * torch.rand(HEIGHT, WIDTH), frames)
@@ -101,7 +101,7 @@ def test_pixels_that_were_not_measured_do_not_count(frames):
     assert abs(plain.amplitude[1] - AMPLITUDE[1]) > 3 * abs(found.amplitude[1] - AMPLITUDE[1])
 
 
-def test_a_batch_is_a_loop(frames, found):
+def test_batch_equals_single_stacks(frames, found):
     other = frames.flip(-1).contiguous()
     both = rsv.detect_vibration(torch.stack([frames, other])[:, :, None], TIMING, model="swept")
     times = TIMING.row_starts(FRAMES, HEIGHT)
@@ -128,7 +128,7 @@ def test_command(frames, tmp_path, capsys):
     assert (error - error.mean((0, 1))).std() < 0.03
 
 
-def test_bad_values_are_named():
+def test_bad_values():
     with pytest.raises(ValueError, match="iterations"):
         rsv.detect_swept_tone(torch.rand(2, 64, 64), TIMING, iterations=0)
     with pytest.raises(ValueError, match="at least 2 frames"):
