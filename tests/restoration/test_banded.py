@@ -15,14 +15,14 @@ def as_tensor(array, dtype=torch.float32):
 
 @pytest.fixture(scope="module")
 def short():
-    """A short stack for the invariances: scene, frames and motion."""
+    """A short stack for tests of invariances: scene, frames and motion."""
     motion = Motion()
     scene = draw_scene(256, 192, seed=11)
     return crop(scene), take_frames(scene, TIMING, motion, 2, NOISE), motion
 
 
 @pytest.mark.parametrize("seed", [101, 102])
-def test_gains_over_12_db_on_both_frames_of_the_paper_camera(seed):
+def test_gain_exceeds_12_db_in_both_frames_of_the_paper_camera(seed):
     motion = Motion(phase=(0.9 * seed, 0.3 * seed))
     scene = draw_scene(2048, 336, seed)
     frames = take_frames(scene, TIMING, motion, 2, NOISE, seed=seed)
@@ -36,7 +36,7 @@ def test_gains_over_12_db_on_both_frames_of_the_paper_camera(seed):
     assert decibel(restored[0], truth) > 48.5  # a still camera has 50.5
 
 
-def test_long_exposure_is_sharpened_not_only_moved(short):
+def test_blur_of_long_exposures_is_removed(short):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=200, frame_rows=2048)
     motion = Motion(amplitude=(3.0, 3.0), frequency=(60.0, 60.0))
     scene = draw_scene(512, 256, seed=21)
@@ -44,7 +44,7 @@ def test_long_exposure_is_sharpened_not_only_moved(short):
     middle = timing.row_starts(1, frames.shape[1])
     moved = torch.from_numpy(motion.displacement((middle + timing.exposure_time / 2).numpy()))
     sharpened = decibel(restore(as_tensor(frames), timing, motion.vibration(), method="banded")[0], crop(scene))
-    # the same geometry from an exposure that does not blur
+    # the same geometry with an exposure without blur
     instant = SensorTiming(row_time=20.52e-6, exposure_rows=1, frame_rows=2048)
     vibration = motion.vibration()
     shrunk = vibration.amplitude * torch.sinc(vibration.frequency * timing.exposure_time)
@@ -54,7 +54,7 @@ def test_long_exposure_is_sharpened_not_only_moved(short):
     assert sharpened > decibel(geometry[0], crop(scene)) + 4
 
 
-def test_linear_interpolation_is_the_papers_and_blurs(short):
+def test_linear_interpolation_of_the_paper_blurs(short):
     truth, frames, motion = short
     linear, cubic = (
         decibel(restore(as_tensor(frames), TIMING, motion.vibration(), method="banded", interpolation=name), truth)
@@ -74,7 +74,7 @@ def test_flux_is_conserved(short):
     assert (blurred - lamp).abs().max() > 0.05
 
 
-def test_nothing_wraps_around():
+def test_boundaries_are_not_periodic():
     frames = torch.full((1, 128, 96), 0.2)
     frames[:, :, :12] = 1.0
     frames[:, :12] = 1.0
@@ -84,7 +84,7 @@ def test_nothing_wraps_around():
     assert restored.amax() > 0.8
 
 
-def test_batch_and_channels_equal_the_loop_of_singles(short):
+def test_batch_and_channels_equal_single_stacks(short):
     _, frames, _ = short
     stacks = as_tensor(frames)[None, :, None, :, :96] * torch.tensor([1.0, 0.5]).reshape(2, 1, 1, 1, 1)
     stacks = torch.cat([stacks, stacks.flip(-1)], dim=2)
@@ -101,7 +101,7 @@ def test_batch_and_channels_equal_the_loop_of_singles(short):
 
 
 @pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "forward"), (-1, "reverse")])
-def test_turned_problem_gives_turned_answer(short, scan_axis, direction):
+def test_orientation(short, scan_axis, direction):
     _, frames, _ = short
     frames = as_tensor(frames)
     motion = Motion(image_motion=(120.0, -90.0))
@@ -129,7 +129,7 @@ def test_chunks_do_not_change_the_result(short):
     torch.testing.assert_close(results[0], results[2], rtol=0, atol=2e-6)
 
 
-def test_float32_agrees_with_float64_and_dtypes_come_back(short):
+def test_float32_agrees_with_float64_and_dtypes_are_kept(short):
     _, frames, motion = short
     exact = restore(as_tensor(frames, torch.float64), TIMING, motion.vibration(), method="banded")
     single = restore(as_tensor(frames), TIMING, motion.vibration(), method="banded")
@@ -141,7 +141,7 @@ def test_float32_agrees_with_float64_and_dtypes_come_back(short):
     assert restore(as_tensor(frames, torch.float16), TIMING, motion.vibration(), method="banded").dtype == torch.float16
 
 
-def test_push_scan_frames_are_restored_where_they_look():
+def test_push_scan_frames_are_restored_in_their_own_coordinates():
     motion = Motion(amplitude=(1.5, 2.0), image_motion=(900.0, 400.0))  # 38 and 17 px from frame to frame
     margin = 160
     scene = draw_scene(160 + 2 * margin, 160 + 2 * margin, seed=31)
@@ -156,7 +156,7 @@ def test_push_scan_frames_are_restored_where_they_look():
         assert (error**2).mean() ** 0.5 < 0.012
 
 
-def test_noise_is_estimated_under_texture():
+def test_noise_is_estimated_in_textured_scenes():
     scene = draw_scene(256, 256, seed=3)
     for noise in (0.003, 0.02):
         frame = scene + noise * torch.randn(256, 256, generator=torch.Generator().manual_seed(1)).numpy()

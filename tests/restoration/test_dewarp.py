@@ -20,7 +20,7 @@ def short():
     return crop(scene), frames, motion
 
 
-def test_geometry_is_undone(short):
+def test_distortion_is_removed(short):
     truth, frames, motion = short
     for frame, restored in zip(frames, dewarp(frames, TIMING, motion.vibration()), strict=True):
         assert decibel(restored, truth) > decibel(frame, truth) + 25
@@ -28,7 +28,7 @@ def test_geometry_is_undone(short):
     assert decibel(half, truth) < decibel(frames, truth) + 12
 
 
-def test_sines_are_fetched_exactly():
+def test_sinusoids_are_interpolated_exactly():
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=1, frame_rows=2048)
     motion = Motion(phase=(0.2, 2.0))
     rows, columns = np.arange(300.0)[:, None], np.arange(200.0)
@@ -43,7 +43,7 @@ def test_sines_are_fetched_exactly():
     assert abs(frame.numpy() - scene(rows, columns))[16:-16, 24:-24].max() > 1
 
 
-def test_long_exposure_needs_more_than_geometry():
+def test_blur_of_long_exposures_is_not_removed():
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=400, frame_rows=2048)
     motion = Motion()
     scene = draw_scene(336, 288, seed=15)
@@ -52,7 +52,7 @@ def test_long_exposure_needs_more_than_geometry():
     assert exact > decibel(dewarp(frames, timing, motion.vibration()), crop(scene)) + 4
 
 
-def test_push_scan_batch_chunks_and_turned_frames(short):
+def test_push_scan_batches_chunks_and_orientation(short):
     _, frames, _ = short
     motion = Motion(amplitude=(1.5, 2.0), image_motion=(900.0, -400.0))
     stacks = torch.stack([frames, frames.flip(-1)])[:, :, None]

@@ -30,7 +30,7 @@ def test_patches_agree_with_a_loop_over_dct():
 
 
 @pytest.fixture(scope="module")
-def town():
+def buildings():
     scene = draw_scene(272, 240, seed=41)
     frames = torch.from_numpy(take_frames(scene, TIMING, Motion(), 2, 0.02)).float()
     return crop(scene), frames
@@ -47,8 +47,8 @@ def step(request):
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_psnr_exceeds_that_of_the_gaussian_prior(town, joint):
-    truth, frames = town
+def test_psnr_exceeds_that_of_the_gaussian_prior(buildings, joint):
+    truth, frames = buildings
     plain = restore(frames, TIMING, Motion().vibration(), joint=joint)
     kept = restore(frames, TIMING, Motion().vibration(), joint=joint, prior="edges")
     assert kept.shape == plain.shape

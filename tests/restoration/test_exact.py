@@ -33,7 +33,7 @@ def short():
 
 @pytest.fixture
 def prior_fitted_once(monkeypatch):
-    """Keep the prior of the first call, so that results depend on the frames through the solution only."""
+    """Reuse the prior of the first call, so that results depend on the frames only through the solution."""
     fitted = []
 
     def fit_once(*arguments):
@@ -45,14 +45,14 @@ def prior_fitted_once(monkeypatch):
     monkeypatch.setattr(exact_module, "fit_prior", fit_once)
 
 
-def noisy(frames, noise, seed=5, dtype=torch.float32):
+def with_noise(frames, noise, seed=5, dtype=torch.float32):
     return as_tensor(frames + noise * np.random.default_rng(seed).standard_normal(frames.shape), dtype)
 
 
 @pytest.mark.parametrize(("noise", "one", "two"), [(0.0, 64.0, 67.5), (0.005, 47.0, 49.2), (0.02, 38.0, 40.0)])
 def test_psnr_of_restored_frames(short, noise, one, two):
     truth, frames, motion = short
-    frames = noisy(frames, noise)
+    frames = with_noise(frames, noise)
     single = restore(frames, TIMING, motion.vibration())
     joint = restore(frames, TIMING, motion.vibration(), joint=True)
     assert joint.shape == (1, *truth.shape)
@@ -67,7 +67,7 @@ def test_long_exposures(rows, one, two):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     motion = Motion()
     scene = draw_scene(464, 288, seed=13)
-    frames = noisy(take_frames(scene, timing, motion, 2, samples=48), 0.005)
+    frames = with_noise(take_frames(scene, timing, motion, 2, samples=48), 0.005)
     single = restore(frames, timing, motion.vibration())
     joint = restore(frames, timing, motion.vibration(), joint=2)
     assert np.mean([decibel(frame, crop(scene)) for frame in single]) > one
@@ -78,7 +78,7 @@ def test_long_exposures(rows, one, two):
 @pytest.mark.parametrize("noise", [0.001, 0.005, 0.02, 0.05])
 def test_estimated_regularisation_is_close_to_the_best(short, noise):
     truth, frames, motion = short
-    frames = noisy(frames, noise)[:1]
+    frames = with_noise(frames, noise)[:1]
     found = decibel(restore(frames, TIMING, motion.vibration()), truth)
     for factor in (0.3, 3.0):
         by_hand = restore(frames, TIMING, motion.vibration(), regularisation=factor)
@@ -87,14 +87,14 @@ def test_estimated_regularisation_is_close_to_the_best(short, noise):
 
 def test_psnr_exceeds_that_of_the_banded_method(short):
     truth, frames, motion = short
-    frames = noisy(frames, 0.005)
+    frames = with_noise(frames, 0.005)
     slabs = restore_by_any_method(frames, TIMING, motion.vibration(), method="banded")
     assert decibel(restore(frames, TIMING, motion.vibration()), truth) > decibel(slabs, truth) + 1
 
 
 def test_noisier_frames_have_less_weight(short):
     truth, frames, motion = short
-    frames = torch.cat([noisy(frames[:1], 0.003), noisy(frames[1:], 0.01, seed=6)])
+    frames = torch.cat([with_noise(frames[:1], 0.003), with_noise(frames[1:], 0.01, seed=6)])
     alone = restore(frames[:1], TIMING, motion.vibration())
     joint = restore(frames, TIMING, motion.vibration(), joint=True)
     assert decibel(joint, truth) > decibel(alone, truth)
@@ -110,7 +110,7 @@ def test_flat_scene_stays_flat_and_flux_is_conserved():
     assert (restored - 0.2).sum().item() == pytest.approx((lamp - 0.2).sum().item(), rel=5e-3)
 
 
-def test_nothing_wraps_around(short, prior_fitted_once):
+def test_boundaries_are_not_periodic(short, prior_fitted_once):
     _, frames, motion = short
     frames = as_tensor(frames)
     other = frames.clone()
@@ -127,7 +127,7 @@ def test_nothing_wraps_around(short, prior_fitted_once):
 
 def test_results_do_not_depend_on_batch_chunks_and_channels(short):
     _, frames, motion = short
-    stacks = noisy(frames[:, :96, :80], 0.005, dtype=torch.float64)[None, :, None]
+    stacks = with_noise(frames[:, :96, :80], 0.005, dtype=torch.float64)[None, :, None]
     stacks = torch.cat([stacks, 0.5 * stacks], dim=0)
     vibrations = Vibration(
         torch.tensor([[[3.1], [5.2]], [[2.0], [1.0]]]), torch.tensor([[50.0], [30.0]]), torch.tensor([[0.4], [1.3]])
@@ -144,18 +144,18 @@ def test_results_do_not_depend_on_batch_chunks_and_channels(short):
 @pytest.mark.parametrize("joint", [False, 2])
 def test_results_do_not_depend_on_threads_and_gradients(short, joint, monkeypatch):
     _, frames, motion = short
-    stack = noisy(np.concatenate([frames, frames[::-1]])[:3, :120, :100], 0.005, dtype=torch.float64)
+    stack = with_noise(np.concatenate([frames, frames[::-1]])[:3, :120, :100], 0.005, dtype=torch.float64)
     allowed = torch.get_num_threads()
     options = {"joint": joint, "check": False}
     found = []
     parts = []
     solver = exact_module._Stack.problem
 
-    def noted(stack, members, reference, *others):
+    def recorded_call(stack, members, reference, *others):
         parts.append((threading.current_thread(), torch.is_grad_enabled()))
         return solver(stack, members, reference, *others)
 
-    monkeypatch.setattr(exact_module._Stack, "problem", noted)
+    monkeypatch.setattr(exact_module._Stack, "problem", recorded_call)
     try:
         for threads, workers in ((2, 2), (1, 1)):
             parts.clear()
@@ -177,7 +177,7 @@ def test_results_do_not_depend_on_threads_and_gradients(short, joint, monkeypatc
 @pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "forward"), (-1, "reverse")])
 def test_scan_axis_and_readout_direction(short, scan_axis, direction):
     _, frames, motion = short
-    frames = noisy(frames, 0.005)[..., :96]
+    frames = with_noise(frames, 0.005)[..., :96]
     expected = restore(frames, TIMING, motion.vibration())
     timing = SensorTiming(20.52e-6, 20, 2048, scan_axis=scan_axis, readout_direction=direction)
     axes = [[*motion.amplitude], [*motion.frequency], [*motion.phase]]
@@ -194,7 +194,7 @@ def test_push_scan_frames_are_joined_where_they_overlap():
     motion = Motion(amplitude=(1.5, 2.0), image_motion=(900.0, 400.0))  # 38 and 17 px from frame to frame
     margin, size = 180, 224
     scene = draw_scene(size + 2 * margin, size + 2 * margin, seed=31)
-    frames = noisy(take_frames(scene, TIMING, motion, 3, margin=margin), 0.01)
+    frames = with_noise(take_frames(scene, TIMING, motion, 3, margin=margin), 0.01)
     single = restore(frames, TIMING, motion.vibration())
     joint = restore(frames, TIMING, motion.vibration(), joint=True)
     _, shift = visible_pixels(TIMING, motion.vibration(), (size, size), 3)
@@ -207,7 +207,7 @@ def test_push_scan_frames_are_joined_where_they_overlap():
 
 def test_ignored_pixels_are_estimated_from_all_others(short):
     truth, frames, motion = short
-    frames = noisy(frames, 0.005)
+    frames = with_noise(frames, 0.005)
     ignore = torch.rand(frames.shape, generator=torch.Generator().manual_seed(2)) < 0.01
     ignore[0, 100:104, 120:124] = True
     incomplete = frames.masked_fill(ignore, float("nan"))
@@ -221,7 +221,7 @@ def test_ignored_pixels_are_estimated_from_all_others(short):
 
 def test_missing_rows_and_pixels_do_not_affect_others(short):
     truth, frames, motion = short
-    frames = noisy(frames, 0.005)[:1]
+    frames = with_noise(frames, 0.005)[:1]
     ignore = torch.rand(frames.shape, generator=torch.Generator().manual_seed(3)) < 0.01
     ignore[0, 120:122] = True
     starts = torch.arange(frames.shape[1]) * TIMING.row_time
@@ -279,7 +279,7 @@ def test_bad_input(options, error, message):
 @pytest.mark.parametrize("joint", [False, True])
 def test_results_do_not_depend_on_segments(short, joint, monkeypatch):
     _, frames, motion = short
-    frames = noisy(frames, 0.02)[..., :64]
+    frames = with_noise(frames, 0.02)[..., :64]
     frames = torch.cat([frames, frames.flip(-2)], dim=-2).requires_grad_()
     frames.data[:, 100:102, 40:42] = float("nan")
     whole, split = (
@@ -288,7 +288,7 @@ def test_results_do_not_depend_on_segments(short, joint, monkeypatch):
     torch.testing.assert_close(split, whole, rtol=0, atol=2e-5)
     gradients = [torch.autograd.grad(image[..., 150:, :].square().sum(), frames)[0] for image in (whole, split)]
     torch.testing.assert_close(gradients[1], gradients[0], rtol=0, atol=2e-4)
-    with torch.no_grad():  # in memory that is used again
+    with torch.no_grad():  # in memory that is reused
         for chunk in (None, 7, 1000):
             again = restore(
                 frames, TIMING, motion.vibration(), segments=3, chunk_frequencies=chunk, check=False, joint=joint
@@ -301,7 +301,7 @@ def test_results_do_not_depend_on_segments(short, joint, monkeypatch):
 
 
 @pytest.mark.parametrize("exposure", [20, 300])
-def test_rows_are_divided_only_without_blur(exposure, monkeypatch):
+def test_segments_are_used_only_without_blur(exposure, monkeypatch):
     """At 300 rows of exposure and no noise, errors of segments would exceed the brightness of the scene."""
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=exposure, frame_rows=2048)
     vibration = Vibration([3.1, 5.2], [50.0, 30.0], [0.7, 2.1])
@@ -310,12 +310,12 @@ def test_rows_are_divided_only_without_blur(exposure, monkeypatch):
     counts = []
     divide = Partition.divide
 
-    def counted(*arguments, **options):
+    def counted_call(*arguments, **options):
         parts, windows = divide(*arguments, **options)
         counts.append(len(windows))
         return parts, windows
 
-    monkeypatch.setattr(Partition, "divide", counted)
+    monkeypatch.setattr(Partition, "divide", counted_call)
     whole = restore(frames, timing, vibration, segments=1, check=False)
     assert set(counts) == {1}
     for options in ({}, {"segments": 4}):
@@ -343,13 +343,13 @@ def test_gradients_through_filled_pixels_and_ends(joint):
     assert torch.autograd.gradcheck(run, values, fast_mode=True)
 
 
-def test_a_prior_is_added_by_one_entry_of_the_table(short, monkeypatch):
+def test_prior_added_to_the_table(short, monkeypatch):
     _, frames, motion = short
-    frames = noisy(frames[:1, :96, :80], 0.005, dtype=torch.float64)
+    frames = with_noise(frames[:1, :96, :80], 0.005, dtype=torch.float64)
     options = []
 
     def toy(problem, chosen):
-        """Only the mean brightness."""
+        """A restoration that contains only the mean brightness."""
         options.append(chosen)
         return torch.zeros_like(problem.data[0])
 

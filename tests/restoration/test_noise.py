@@ -1,4 +1,4 @@
-"""Noise levels of frames: each estimator against drawn scenes with known noise, and the policy that combines them."""
+"""Noise levels of frames: each estimator with generated scenes of known noise, and the policy that combines them."""
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def test_two_frames_separate_texture_from_noise(image_motion):
 
 
 @pytest.mark.parametrize("shape", [(128, 96), (512, 512)])
-def test_blocks_with_ignored_pixels_do_not_count(shape):
+def test_blocks_with_ignored_pixels_are_excluded(shape):
     noise = 0.03 * torch.randn(8, *shape, generator=torch.Generator().manual_seed(0))
     hidden = torch.zeros(noise.shape, dtype=torch.bool)
     hidden[..., : shape[1] // 2] = True
@@ -124,7 +124,7 @@ def test_estimators_return_nan_where_they_cannot_estimate(name, case):
 
 
 def fractal(steepness, optics, size=320, seed=5):
-    """Texture whose amplitude falls like a power of the frequency, through Gaussian optics."""
+    """Texture whose amplitude is a power of the frequency, blurred by Gaussian optics."""
     frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size))
     frequency[0, 0] = np.inf
     noise = np.random.default_rng(seed).standard_normal((size, size))
@@ -217,7 +217,7 @@ def test_motion_blur_with_edges_and_flat_ground():
     assert noise_of_blurred_frames(frames, motion, 0)[0].sqrt().item() == pytest.approx(0.005, rel=0.1)
 
 
-def test_motion_blur_measures_every_frame_by_itself():
+def test_motion_blur_measures_every_frame_independently():
     frames, motion = blurred_frames(texture(420, 0.7), 400, 0.0, 2)
     levels = torch.tensor([0.002, 0.006])
     noise = torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
@@ -256,5 +256,5 @@ def test_kernel_between_rows():
         assert abs(seen - seen.mean()).std() ** 2 <= alias.item() * 1.01 + 1e-12
         assert (abs(seen - seen.mean()) ** 2).mean() == pytest.approx(alias.item(), rel=0.02)
         assert seen.mean() == pytest.approx(response.item(), abs=1e-5)
-        # a row of the scene is what the rows between which it lies see on average
+        # the kernel of a scene row is the mean of the kernels of the two neighbouring frame rows
         assert np.array(scene_weights()) @ wave[35:46] == pytest.approx(response.item(), rel=4e-3)

@@ -1,4 +1,4 @@
-"""The comparison with pylops is fair: its operator forms our frames, and its best result is known."""
+"""Comparison with pylops: its operator reproduces the frames, and its best result is the reference."""
 
 import sys
 from pathlib import Path
@@ -31,14 +31,14 @@ def peer():
 
 
 @pytest.fixture(scope="module")
-def taken():
-    """A scene, and a frame of it without noise; the frame shows the scene beyond its borders."""
+def scene_and_frame():
+    """A scene and a noiseless frame, whose motion blur includes content beyond the borders of the frame."""
     scene = draw_scene(192 + 2 * MARGIN, 160 + 2 * MARGIN, seed=61)
     return crop(scene), take_frames(scene, TIMING, MOTION, 1, samples=64)[0]
 
 
-def test_operator_forms_the_frame_and_has_its_adjoint(peer, taken):
-    scene, frame = taken
+def test_operator_forms_the_frame_and_has_its_adjoint(peer, scene_and_frame):
+    scene, frame = scene_and_frame
     operator = peer.frame_operator(scene.shape, TIMING, MOTION.vibration(), "float64")
     formed = (operator @ scene.ravel()).reshape(scene.shape)
     assert decibel(formed, frame, 16) > 55
@@ -48,8 +48,8 @@ def test_operator_forms_the_frame_and_has_its_adjoint(peer, taken):
     assert (operator @ x) @ y == pytest.approx(x @ (operator.H @ y), rel=1e-10)
 
 
-def test_exact_restoration_is_ahead_of_the_best_of_cgls(peer, taken):
-    scene, frame = taken
+def test_exact_restoration_is_more_accurate_than_the_best_of_cgls(peer, scene_and_frame):
+    scene, frame = scene_and_frame
     noisy = torch.from_numpy(frame + 0.005 * np.random.default_rng(1).standard_normal(frame.shape)).float()
     best = peer.cgls_restore(noisy.numpy(), TIMING, MOTION.vibration(), torch.from_numpy(scene), 32)
     assert decibel(best.restored, scene) > decibel(noisy, scene) + 15

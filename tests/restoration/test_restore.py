@@ -1,4 +1,4 @@
-"""``restore``: accepted input, options, axes that are left alone, missing and saturated pixels, warnings."""
+"""``restore``: accepted input, options, axes that are not restored, missing and saturated pixels, warnings."""
 
 import inspect
 import math
@@ -27,14 +27,14 @@ NOISE = 0.005
 
 
 @pytest.fixture(scope="module")
-def taken():
-    """A scene, and two frames of it."""
+def scene_and_frames():
+    """A scene and two frames of it."""
     scene = draw_scene(448 + 80, 192 + 80, seed=51)
     return crop(scene), torch.from_numpy(take_frames(scene, TIMING, MOTION, 2, NOISE)).float()
 
 
-def detected(vibration, relative=1e-3, reliable=(True, True), reasons=((), ())):
-    """A detection with standard deviations of so much of the amplitude, 1e-3 rad and 0.01 Hz."""
+def detection_of(vibration, relative=1e-3, reliable=(True, True), reasons=((), ())):
+    """A detection with standard deviations of ``relative`` times the amplitude, 1e-3 rad and 0.01 Hz."""
     std = SimpleNamespace(
         amplitude=relative * vibration.amplitude,
         frequency=torch.full_like(vibration.frequency, 0.01),
@@ -44,33 +44,35 @@ def detected(vibration, relative=1e-3, reliable=(True, True), reasons=((), ())):
     return SimpleNamespace(vibration=vibration, std=std, reliable=torch.tensor(reliable), reasons=reasons)
 
 
-def restored_quietly(*args, **options):
+def restored_without_warning(*args, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         return restore(*args, **options)
 
 
-def test_a_detection_is_taken_as_it_is(taken):
-    truth, frames = taken
+def test_reliable_detection_equals_its_vibration(scene_and_frames):
+    truth, frames = scene_and_frames
     found = detect_vibration(frames, TIMING)
     assert found.reliable.all()
-    from_detection = restored_quietly(frames, TIMING, found)
-    torch.testing.assert_close(from_detection, restored_quietly(frames, TIMING, found.vibration), rtol=0, atol=0)
-    known = restored_quietly(frames, TIMING, MOTION.vibration())
-    assert decibel(from_detection, truth) > decibel(known, truth) - 5  # so small a frame tells little
+    from_detection = restored_without_warning(frames, TIMING, found)
+    torch.testing.assert_close(
+        from_detection, restored_without_warning(frames, TIMING, found.vibration), rtol=0, atol=0
+    )
+    known = restored_without_warning(frames, TIMING, MOTION.vibration())
+    assert decibel(from_detection, truth) > decibel(known, truth) - 5  # the information in small frames is limited
     assert decibel(known, truth) > decibel(frames, truth) + 15
     module = VibrationRestorer(TIMING)
     torch.testing.assert_close(module(frames, found), from_detection, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_an_axis_that_is_not_reliable_is_left_alone(taken, axis):
-    _, frames = taken
+def test_unreliable_axis_is_not_restored(scene_and_frames, axis):
+    _, frames = scene_and_frames
     reliable = [True, True]
     reliable[axis] = False
     reasons = [(), ()]
     reasons[axis] = ("nearly blind", "too short")
-    doubtful = detected(MOTION.vibration(), reliable=reliable, reasons=tuple(reasons))
+    doubtful = detection_of(MOTION.vibration(), reliable=reliable, reasons=tuple(reasons))
     message = rf"{'xy'[axis]} is left alone: its vibration is not reliable \(nearly blind; too short\)"
     with pytest.warns(RestorationWarning, match=message):
         found = restore(frames, TIMING, doubtful, check=False)
@@ -78,25 +80,25 @@ def test_an_axis_that_is_not_reliable_is_left_alone(taken, axis):
     torch.testing.assert_close(found, restore(frames, TIMING, kept, check=False), rtol=0, atol=0)
 
 
-def test_image_motion_stays_where_it_was_measured():
-    vibration = Vibration([2.0, 1.0], [71.0, 113.0], 0.0, [500.0, 1.0])  # known to +- 0.5 px/s
+def test_measured_image_motion_of_an_unreliable_axis_is_kept():
+    vibration = Vibration([2.0, 1.0], [71.0, 113.0], 0.0, [500.0, 1.0])  # standard deviation 0.5 px/s
     trusted, notes = trusted_vibration(
-        detected(vibration, reliable=(False, False), reasons=(("a",), ("b",))), TIMING, 2, 448
+        detection_of(vibration, reliable=(False, False), reasons=(("a",), ("b",))), TIMING, 2, 448
     )
     assert trusted.amplitude.flatten().tolist() == [0.0, 0.0]
     assert trusted.image_motion.tolist() == [500.0, 0.0]
     assert len(notes) == 2
-    assert trusted_vibration(detected(vibration), TIMING, 2, 448)[0].image_motion.tolist() == [500.0, 1.0]
+    assert trusted_vibration(detection_of(vibration), TIMING, 2, 448)[0].image_motion.tolist() == [500.0, 1.0]
 
 
-def test_uncertainty_of_the_displacement_is_that_of_scattered_parameters():
+def test_uncertainty_of_the_displacement_equals_its_scatter_for_random_parameters():
     generator = np.random.default_rng(3)
     vibration = MOTION.vibration()
-    doubtful = detected(vibration, relative=0.05)
+    doubtful = detection_of(vibration, relative=0.05)
     doubtful.std.frequency = torch.tensor([[0.8], [1.5]], dtype=torch.float64)
     starts = TIMING.row_starts(2, 448).numpy()
     middle = 0.5 * (starts.min() + starts.max())
-    # phases known to 0.03 rad in the middle of the record: there they do not hang together with the frequency
+    # phases have a standard deviation of 0.03 rad at the middle time, where they do not correlate with the frequency
     at_middle = 0.03
     doubtful.std.phase = torch.sqrt(at_middle**2 + (2 * math.pi * middle * doubtful.std.frequency) ** 2)
     error, size = displacement_uncertainty(vibration, doubtful.std, TIMING, 2, 448)
@@ -115,9 +117,9 @@ def test_uncertainty_of_the_displacement_is_that_of_scattered_parameters():
         assert float(size[axis]) == pytest.approx(np.sqrt(np.mean(exact**2)), rel=0.1)
 
 
-def test_an_axis_that_is_known_too_badly_is_left_alone(taken):
-    _, frames = taken
-    doubtful = detected(MOTION.vibration())
+def test_axis_with_large_uncertainty_is_not_restored(scene_and_frames):
+    _, frames = scene_and_frames
+    doubtful = detection_of(MOTION.vibration())
     doubtful.std.phase = torch.tensor([[1.2], [0.1]], dtype=torch.float64)
     with pytest.warns(
         RestorationWarning, match=r"x is left alone: its displacement of 1\.5 px has a standard deviation of 1\.8"
@@ -129,10 +131,10 @@ def test_an_axis_that_is_known_too_badly_is_left_alone(taken):
     assert trusted_vibration(doubtful, TIMING, 2, 448)[0].amplitude.sum() == 0
 
 
-def test_each_stack_of_a_batch_is_trusted_for_itself(taken):
-    _, frames = taken
+def test_reliability_applies_to_each_stack_of_a_batch(scene_and_frames):
+    _, frames = scene_and_frames
     both = Vibration(*(torch.stack([getattr(MOTION.vibration(), name)] * 2) for name in vars(MOTION.vibration())))
-    doubtful = detected(both, reliable=((True, True), (False, True)), reasons=(((), ()), (("blind",), ())))
+    doubtful = detection_of(both, reliable=((True, True), (False, True)), reasons=(((), ()), (("blind",), ())))
     with pytest.warns(RestorationWarning, match="stack 1: x is left alone"):
         found = restore(torch.stack([frames, frames])[:, :, None], TIMING, doubtful, method="dewarp", check=False)
     known = restore(frames, TIMING, MOTION.vibration(), method="dewarp", check=False)
@@ -143,12 +145,12 @@ def test_each_stack_of_a_batch_is_trusted_for_itself(taken):
     torch.testing.assert_close(found[1, :, 0], only_y, rtol=0, atol=1e-6)
 
 
-def test_wrong_vibrations_are_warned_of_and_right_ones_are_not(taken):
-    _, frames = taken
+def test_warnings_are_issued_for_wrong_vibrations_only(scene_and_frames):
+    _, frames = scene_and_frames
     vibration = MOTION.vibration()
-    restored_quietly(frames, TIMING, vibration)
-    restored_quietly(frames, TIMING, vibration, joint=True)
-    restored_quietly(frames[:1], TIMING, MOTION.scaled(2.0).vibration())  # one frame cannot be judged
+    restored_without_warning(frames, TIMING, vibration)
+    restored_without_warning(frames, TIMING, vibration, joint=True)
+    restored_without_warning(frames[:1], TIMING, MOTION.scaled(2.0).vibration())  # a single frame has no verdict
     with pytest.warns(RestorationWarning, match="restoration helps in part only: x: frames lie .* px apart"):
         restore(frames, TIMING, MOTION.scaled(0.5).vibration())
     turned = Vibration(MOTION.amplitude, MOTION.frequency, [p + 3 for p in MOTION.phase])
@@ -161,39 +163,41 @@ def test_wrong_vibrations_are_warned_of_and_right_ones_are_not(taken):
             Vibration(*(torch.stack([getattr(v, name) for v in (vibration, turned)]) for name in vars(vibration))),
             method="dewarp",
         )
-    restored_quietly(frames, TIMING, turned, check=False)
-    restored_quietly(torch.rand(2, 24, 24), TIMING, turned)  # too small to be judged
-    restored_quietly(frames, TIMING, Vibration.still())
+    restored_without_warning(frames, TIMING, turned, check=False)
+    restored_without_warning(torch.rand(2, 24, 24), TIMING, turned)  # too small for a verdict
+    restored_without_warning(frames, TIMING, Vibration.still())
 
 
 @pytest.mark.parametrize("method", ["exact", "banded", "dewarp"])
-def test_missing_pixels_spoil_nothing(taken, method):
-    truth, frames = taken
-    spoiled = frames.clone()
-    spoiled[0, 100:104, 60:64] = math.nan
-    spoiled[1, 300, 100] = math.nan
-    restored = restore(spoiled, TIMING, MOTION.vibration(), method=method)
+def test_missing_pixels_do_not_affect_other_pixels(scene_and_frames, method):
+    truth, frames = scene_and_frames
+    with_missing = frames.clone()
+    with_missing[0, 100:104, 60:64] = math.nan
+    with_missing[1, 300, 100] = math.nan
+    restored = restore(with_missing, TIMING, MOTION.vibration(), method=method)
     whole = restore(frames, TIMING, MOTION.vibration(), method=method)
     assert torch.isfinite(restored).all()
     far = (restored - whole).abs()
     far[0, 80:124, 40:84] = 0
     far[1, 280:320, 80:120] = 0
     assert far[:, 24:-24, 24:-24].max() < 0.02
-    zeroed = restore(spoiled.nan_to_num(0.0), TIMING, MOTION.vibration(), method=method)
+    zeroed = restore(with_missing.nan_to_num(0.0), TIMING, MOTION.vibration(), method=method)
     hole = (0, slice(92, 112), slice(52, 72))
     before, after = (np.square(r[hole].numpy() - truth[hole[1:]]).mean() for r in (zeroed, restored))
     assert after < 0.3 * before
-    ignored = restore(spoiled.nan_to_num(7.0), TIMING, MOTION.vibration(), method=method, ignore=torch.isnan(spoiled))
+    ignored = restore(
+        with_missing.nan_to_num(7.0), TIMING, MOTION.vibration(), method=method, ignore=torch.isnan(with_missing)
+    )
     torch.testing.assert_close(ignored, restored, rtol=0, atol=1e-5)
 
 
 @pytest.fixture(scope="module")
 def lamps():
-    """A scene with lamps that the sensor cuts at 0.8, and its frames as 12-bit counts with that as full scale."""
-    return take_lamps(TIMING)
+    """A scene with lamps that saturate the sensor at 0.8, and its frames as 12-bit counts with this full scale."""
+    return frames_with_lamps(TIMING)
 
 
-def take_lamps(timing):
+def frames_with_lamps(timing):
     scene = draw_scene(256 + 80, 192 + 80, seed=52, blur=1.0) * 0.7
     rows, columns = np.mgrid[: scene.shape[0], : scene.shape[1]]
     for row, column in ((120, 100), (220, 180)):
@@ -205,27 +209,27 @@ def take_lamps(timing):
 
 
 @pytest.mark.parametrize(("rows", "better", "largest"), [(20, 1.0, 0.004), (100, 0.9, 0.02)])
-def test_saturated_counts_are_no_darker_than_their_level(rows, better, largest):
+def test_saturation_reduces_errors_around_lamps(rows, better, largest):
     timing = replace(TIMING, exposure_rows=rows)
-    truth, counts = take_lamps(timing)
+    truth, counts = frames_with_lamps(timing)
     near = np.zeros(truth.shape, dtype=bool)
     for row, column in ((80, 60), (180, 140)):
         near[row - 20 : row + 21, column - 20 : column + 21] = True
-    near &= truth < 0.75  # around the lamps: what they would ring into
+    near &= truth < 0.75  # around the lamps, where ringing would appear
     common = {"timing": timing, "vibration": MOTION.vibration(), "full_scale": 4095}
     known, unknown = (0.8 * restore(counts, saturation=level, **common).numpy() for level in ("auto", None))
     rms = [np.sqrt(np.mean(np.square(image - truth)[:, near])) for image in (known, unknown)]
     assert rms[0] < better * rms[1]
     assert rms[0] < largest
-    assert (known[:, truth > 0.9] > 0.75).all()  # no holes where it was too bright
+    assert (known[:, truth > 0.9] > 0.75).all()  # no dark pixels in saturated areas
 
 
 @pytest.mark.parametrize("scan_axis", [-2, -1])
 def test_saturated_pixels_are_passed_to_the_method(lamps, monkeypatch, scan_axis):
-    counts, told = lamps[1], []
+    counts, masks_of_calls = lamps[1], []
 
     def method(frames, motion, *, ignore=None, clipped=None):
-        told.append((ignore, clipped))
+        masks_of_calls.append((ignore, clipped))
         return frames
 
     monkeypatch.setitem(METHODS, "exact", replace(METHODS["exact"], function=method))
@@ -234,7 +238,7 @@ def test_saturated_pixels_are_passed_to_the_method(lamps, monkeypatch, scan_axis
 
     def masks(frames, **options):
         restore(frames, timing, vibration, check=False, **options)
-        return told.pop()
+        return masks_of_calls.pop()
 
     ignore, clipped = masks(counts, full_scale=4095)
     assert ignore is None
@@ -245,21 +249,21 @@ def test_saturated_pixels_are_passed_to_the_method(lamps, monkeypatch, scan_axis
     eight = (counts // 16).to(torch.uint8)
     assert (masks(eight)[1].sum() == (eight == 255).sum()).all()
     assert masks(counts, full_scale=4095, saturation=None) == (None, None)
-    assert masks(counts / 4095) == (None, None)  # floats do not say where they were cut
+    assert masks(counts / 4095) == (None, None)  # the saturation level of floats is unknown
     assert masks(counts, full_scale=5000) == (None, None)
-    spoiled = counts / 4095
-    spoiled[0, 3, 5] = math.nan
-    assert masks(spoiled)[0].nonzero().tolist() == [[0, 0, 0, 3, 5] if scan_axis == -2 else [0, 0, 0, 5, 3]]
+    with_missing = counts / 4095
+    with_missing[0, 3, 5] = math.nan
+    assert masks(with_missing)[0].nonzero().tolist() == [[0, 0, 0, 3, 5] if scan_axis == -2 else [0, 0, 0, 5, 3]]
 
 
 @pytest.mark.parametrize("method", ["dewarp", "banded"])
-def test_methods_that_take_saturated_pixels_at_their_level(lamps, method):
+def test_methods_without_saturation_use_the_saturated_values(lamps, method):
     counts = lamps[1]
     kept = restore(counts, TIMING, MOTION.vibration(), method=method, full_scale=4095)
     floats = restore(counts / 4095, TIMING, MOTION.vibration(), method=method)
     torch.testing.assert_close(kept, floats, rtol=0, atol=1e-6)
     back = (kept * 4095).round()
-    assert 0.9 * 4095 < back.max() < 1.2 * 4095  # counts stay counts of the camera
+    assert 0.9 * 4095 < back.max() < 1.2 * 4095  # counts keep their scale
 
 
 @pytest.mark.parametrize(
@@ -292,12 +296,12 @@ def test_bad_input(change, error, message):
         restore(**{**arguments, **change})
 
 
-def test_arrays_and_turned_sensors(taken):
-    _, frames = taken
+def test_arrays_and_orientation(scene_and_frames):
+    _, frames = scene_and_frames
     plain = restore(frames, TIMING, MOTION.vibration(), method="dewarp")
     torch.testing.assert_close(restore(frames.numpy(), TIMING, MOTION.vibration(), method="dewarp"), plain)
     turned = replace(TIMING, scan_axis=-1)
-    half = detected(Vibration(MOTION.amplitude[::-1], MOTION.frequency[::-1], MOTION.phase[::-1]))
+    half = detection_of(Vibration(MOTION.amplitude[::-1], MOTION.frequency[::-1], MOTION.phase[::-1]))
     half.reliable, half.reasons = torch.tensor([True, False]), ((), ("blind",))
     with pytest.warns(RestorationWarning, match="y is left alone"):
         found = restore(frames.transpose(-2, -1), turned, half, method="dewarp", check=False)

@@ -21,7 +21,7 @@ def folded(index, length):
 
 
 def dense_operator(timing, motion, height, width, frame=0, samples=400):
-    """Frame pixels from spline coefficients, pixel by pixel, the exposure as a fine midpoint sum."""
+    """Matrix from spline coefficients to frame pixels, one by one; the exposure is a midpoint sum with many samples."""
     basis = BSpline.basis_element(np.arange(5) - 2.0, extrapolate=False)
     matrix = np.zeros((height, width, height, width))
     for row in range(height):
@@ -55,15 +55,15 @@ def small():
     return motion, frame, dense_operator(SHORT, motion, 10, 9)
 
 
-@pytest.mark.parametrize("hidden", [False, True])
-def test_agrees_with_a_dense_loop(small, hidden):
+@pytest.mark.parametrize("masked", [False, True])
+def test_agrees_with_a_dense_loop(small, masked):
     motion, frame, operator = small
-    ignore = np.random.default_rng(5).random(frame.shape) < 0.1 if hidden else np.zeros(frame.shape, dtype=bool)
+    ignore = np.random.default_rng(5).random(frame.shape) < 0.1 if masked else np.zeros(frame.shape, dtype=bool)
     tensor, mask = torch.from_numpy(frame)[None], torch.from_numpy(ignore)[None]
-    options = {"ignore": mask} if hidden else {}
+    options = {"ignore": mask} if masked else {}
     found = lucy(tensor, SHORT, motion.vibration(), iterations=4, **options)[0].numpy()
     known = torch.from_numpy(frame)[None]
-    if hidden:
+    if masked:
         from rsvib_torch.frames.pixels import fill_with_means
 
         known = fill_with_means(known, mask)
@@ -72,8 +72,8 @@ def test_agrees_with_a_dense_loop(small, hidden):
     scene = np.maximum(start, 1e-4 * frame[~ignore].mean()).ravel()
     seen = operator.T @ weight  # of each pixel
     for _ in range(4):
-        pulled = operator.T @ (weight * frame.ravel() / (operator @ scene))
-        scene = np.where(seen > 0.1, scene * pulled / seen, scene)
+        gradient = operator.T @ (weight * frame.ravel() / (operator @ scene))
+        scene = np.where(seen > 0.1, scene * gradient / seen, scene)
     assert 0 < (seen <= 0.1).sum() < 0.2 * seen.size
     expected = spline_samples(scene.reshape(frame.shape))
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-4)
@@ -85,14 +85,14 @@ def test_positive_and_flux_is_conserved():
     lamp[0, 40:56, 40:60] = torch.rand(16, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     restored = lucy(lamp, TIMING, Vibration([1.5, 2.0], [50.0, 30.0]), iterations=5)
     assert restored.min() >= 0
-    # rows are sampled more densely or more sparsely than the scene, by as much as the motion runs along or against them
+    # rows are sampled more densely or less densely than the scene, depending on the velocity along the scan axis
     assert restored.sum().item() == pytest.approx(lamp.sum().item(), rel=0.02)
     still = lucy(lamp, TIMING, Vibration.still(), iterations=5)
     assert still.sum().item() == pytest.approx(lamp.sum().item(), rel=1e-9)
     assert (still - lamp).abs().max() > 1e-3
 
 
-def test_undoes_a_long_exposure_where_geometry_alone_does_not():
+def test_blur_of_long_exposures_is_removed_better_than_by_dewarping():
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=200, frame_rows=2048)
     motion = Motion()
     scene = draw_scene(272, 240, seed=21)
@@ -101,7 +101,7 @@ def test_undoes_a_long_exposure_where_geometry_alone_does_not():
     assert decibel(lucy(frames, timing, motion.vibration()), crop(scene)) > warped + 3
 
 
-def test_batch_channels_and_push_scan_change_nothing():
+def test_batch_and_channels_equal_single_stacks_of_a_push_scan():
     motion = Motion(amplitude=(1.0, 0.7), image_motion=(400.0, -300.0))
     frames = torch.rand(2, 2, 1, 40, 36, generator=torch.Generator().manual_seed(3), dtype=torch.float64) + 0.1
     together = lucy(frames, TIMING, motion.vibration(), iterations=3)
@@ -119,8 +119,8 @@ def test_bad_input():
         lucy(torch.zeros(2, 16, 16), TIMING, Vibration(1.0, 50.0), joint=0)
 
 
-def within(timing, motion, height, width, frame):
-    """Pixels whose kernels keep to the scene."""
+def inner_pixels(timing, motion, height, width, frame):
+    """Pixels whose kernels lie within the scene."""
     seen = np.zeros((height, width), dtype=bool)
     for row in range(height):
         times = (frame * timing.frame_rows + row) * timing.row_time + np.linspace(0, timing.exposure_time, 400)
@@ -131,10 +131,15 @@ def within(timing, motion, height, width, frame):
 
 
 def test_two_frames_agree_with_a_dense_loop():
-    motion = Motion(amplitude=(1.2, 0.8), frequency=(40.0, 31.0), phase=(0.1, 1.2))  # no row stops short of the next px
+    motion = Motion(
+        amplitude=(1.2, 0.8), frequency=(40.0, 31.0), phase=(0.1, 1.2)
+    )  # no row ends close to a pixel boundary
     frames = np.random.default_rng(6).uniform(0.3, 1.0, (2, 10, 9))
     operators = [dense_operator(SHORT, motion, 10, 9, frame, samples=120) for frame in (0, 1)]
-    weights = [within(SHORT, motion, 10, 9, 0).ravel().astype(float), np.ones(90)]  # the second one is the reference
+    weights = [
+        inner_pixels(SHORT, motion, 10, 9, 0).ravel().astype(float),
+        np.ones(90),
+    ]  # the second frame is the reference
     tensor = torch.from_numpy(frames)
     found = lucy(tensor, SHORT, motion.vibration(), iterations=4, joint=True)[0].numpy()
     start = restore(tensor, SHORT, motion.vibration(), method="dewarp", check=False).numpy().mean(0)
@@ -142,8 +147,8 @@ def test_two_frames_agree_with_a_dense_loop():
     assert scene.min() > 1e-3
     for _ in range(4):
         parts = zip(operators, weights, frames, strict=True)
-        pulled = sum(a.T @ (w * g.ravel() / (a @ scene)) for a, w, g in parts)
-        scene = scene * pulled / sum(a.T @ w for a, w in zip(operators, weights, strict=True))
+        gradient = sum(a.T @ (w * g.ravel() / (a @ scene)) for a, w, g in parts)
+        scene = scene * gradient / sum(a.T @ w for a, w in zip(operators, weights, strict=True))
     expected = spline_samples(scene.reshape(10, 9))
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-4)
     assert abs(expected - start).max() > 0.05
@@ -151,7 +156,7 @@ def test_two_frames_agree_with_a_dense_loop():
 
 
 @pytest.mark.parametrize("rows", [20, 200])
-def test_two_frames_beat_one(rows):
+def test_two_frames_are_more_accurate_than_one(rows):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     motion, scene = Motion(), draw_scene(272, 240, seed=31)
     frames = torch.from_numpy(take_frames(scene, timing, motion, 3, 0.02, samples=24)).float()
@@ -191,7 +196,7 @@ def test_joint_flux_is_conserved():
     assert moved.sum().item() == pytest.approx(0.5 * lamps.sum().item(), rel=0.02)
 
 
-def test_frames_that_lie_apart_are_joined_where_they_overlap():
+def test_displaced_frames_are_joined_where_they_overlap():
     motion = Motion(image_motion=(1500.0, -700.0))  # (63, -29) px from frame to frame
     scene = draw_scene(420, 420, seed=8)
     frames = torch.from_numpy(take_frames(scene, TIMING, motion, 2, 0.02, samples=16, margin=110)).float()
@@ -201,20 +206,20 @@ def test_frames_that_lie_apart_are_joined_where_they_overlap():
     truth = np.roll(scene, tuple(int(step) for step in shift[1].flip(0)), (0, 1))[110:-110, 110:-110]
     alone = lucy(frames, TIMING, motion.vibration())[1]
     joint = lucy(frames, TIMING, motion.vibration(), joint=True)[0]
-    shared = (slice(0, 200 + rows), slice(columns, None))  # of the second frame, whose coordinates these are
+    shared = (slice(0, 200 + rows), slice(columns, None))  # in the coordinates of the second frame
     apart = (slice(8, -8), slice(8, columns - 16))
     assert decibel(joint[shared], truth[shared], rim=12) > decibel(alone[shared], truth[shared], rim=12) + 1.5
     torch.testing.assert_close(joint[apart], alone[apart], rtol=0, atol=2e-3)
 
 
-def test_frames_with_nothing_in_common_are_not_joined():
+def test_frames_without_overlap_are_not_joined():
     motion = Motion(image_motion=(9000.0, 0.0))
     frames = torch.rand(2, 60, 64, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     joint = lucy(frames, TIMING, motion.vibration(), iterations=3, joint=2)
     torch.testing.assert_close(joint, lucy(frames, TIMING, motion.vibration(), iterations=3), rtol=0, atol=1e-12)
 
 
-def test_hidden_pixels_are_seen_by_the_other_frame():
+def test_masked_pixels_are_restored_from_the_other_frame():
     motion, scene = Motion(), draw_scene(240, 240, seed=12)
     frames = torch.from_numpy(take_frames(scene, TIMING, motion, 2, 0.005, samples=16)).float()
     ignore = torch.zeros(frames.shape, dtype=torch.bool)
@@ -227,7 +232,7 @@ def test_hidden_pixels_are_seen_by_the_other_frame():
 
 
 @pytest.mark.parametrize("amplitude", [(3.1, 5.2), (30.0, 1.0)])
-def test_what_no_frame_saw_stays_as_it_started(amplitude):
+def test_restoration_outside_the_visible_area_stays_bounded(amplitude):
     motion = Motion(amplitude=amplitude)
     scene = draw_scene(256, 256, seed=22)
     frames = torch.from_numpy(take_frames(scene, TIMING, motion, 2, 0.005, margin=64))

@@ -18,8 +18,8 @@ NUM_ROWS, WIDTH, NOISE = 264, 240, 0.005
 
 
 @pytest.fixture(scope="module", params=[20, 200])
-def taken(request):
-    """Two frames (2, 1, R, W), their kernels, frequencies, and the products of a prior at these."""
+def slab_data(request):
+    """Two frames (2, 1, R, W), their kernels, the frequencies, and the precision of the prior at these frequencies."""
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=request.param, frame_rows=2048)
     clean = take_frames(draw_scene(NUM_ROWS + 80, WIDTH + 80, 3), timing, Motion(), 2, samples=16)
     noise = NOISE * np.random.default_rng(2).standard_normal(clean.shape)
@@ -36,7 +36,7 @@ def taken(request):
 
 
 def dense(frames, kernels, u, products, rows):
-    """Power and freedom at one frequency of one slab, from whole matrices."""
+    """Residual power and degrees of freedom of one slab at one frequency, from dense matrices."""
     part = kernels.rows(rows.start, rows.stop - rows.start)
     taper = np.hanning(frames.shape[-1] + 2)[1:-1]
     waves = np.exp(-2j * np.pi * u * np.arange(frames.shape[-1]))
@@ -49,7 +49,7 @@ def dense(frames, kernels, u, products, rows):
     matrix = np.zeros((len(data), count), dtype=complex)
     for row, (begin, kernel) in enumerate(zip(first - first.min(), taps, strict=True)):
         matrix[row, begin : begin + len(kernel)] = kernel
-    # the precision of a stationary model: rows near either end have fewer neighbours
+    # the precision of a stationary model: rows near the ends have fewer neighbours
     penalty = np.zeros((count, count))
     for row in range(count):
         for lag in range(min(3, count - row)):
@@ -58,13 +58,13 @@ def dense(frames, kernels, u, products, rows):
     seen = matrix.conj().T @ matrix
     inverse = np.linalg.inv(seen + penalty)
     left = data - matrix @ (inverse @ (matrix.conj().T @ data))
-    followed = np.linalg.solve(seen + 1.2**0.5 * penalty, seen)  # the middle of the step that its derivative takes
+    followed = np.linalg.solve(seen + 1.2**0.5 * penalty, seen)  # the middle of the step of the derivative
     return np.square(np.abs(left)).sum() / np.square(taper).sum(), np.trace(followed).real
 
 
 @pytest.mark.parametrize("slab", [1000, 128, 80])
-def test_slabs_are_fitted_independently(taken, monkeypatch, slab):
-    frames, kernels, chosen, precision = taken
+def test_slabs_are_fitted_independently(slab_data, monkeypatch, slab):
+    frames, kernels, chosen, precision = slab_data
     monkeypatch.setattr(sampled_rows, "_SLAB", slab)
     found = sample_rows(frames, kernels, chosen).explain([precision, 0.25 * precision])
     number = max(1, NUM_ROWS // slab)

@@ -12,7 +12,7 @@ from rsvib_torch.restoration.exact.scene_solver import join_windows, row_windows
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
 
 
-def solved_in(windows, band, right_side):
+def solved_in_windows(windows, band, right_side):
     width = band.shape[1] - 1
     parts = torch.stack([skew_band(band)[window] for window in windows], dim=-2).flatten(-2)
     full = torch.cat([parts, parts.new_zeros(width, *parts.shape[1:])])
@@ -29,15 +29,15 @@ def test_overlapping_windows_agree_with_scipy(count):
     right_side = torch.randn(rows, 2, 3, dtype=torch.complex128, generator=generator)
     windows = row_windows(rows, count, overlap=24)
     assert len(windows) == count
-    found = solved_in(windows, band, right_side)
+    found = solved_in_windows(windows, band, right_side)
     for index in range(3):
         expected = solveh_banded(band[..., index].numpy().T.copy(), right_side[..., index].numpy(), lower=True)
         np.testing.assert_allclose(found[..., index].numpy(), expected, rtol=0, atol=1e-8)
-    wrong = solved_in(row_windows(rows, count, overlap=1), band, right_side)
+    wrong = solved_in_windows(row_windows(rows, count, overlap=1), band, right_side)
     assert (wrong - found).abs().max() > 1e-6
 
 
-def test_windows_that_overlap_everywhere_are_one():
+def test_windows_that_overlap_everywhere_are_merged():
     assert row_windows(100, 1) == row_windows(100, 4, 96) == [slice(0, 100)]
 
 
@@ -56,7 +56,7 @@ def test_windows_of_one_size_cover_all_rows(rows, count, overlap):
 
 
 @pytest.mark.parametrize("first", [torch.arange(90) // 2 * 2, torch.arange(90).clamp(min=85) * 4 - 340])
-def test_observation_operator_is_a_sum_over_taps_and_has_that_adjoint(first):
+def test_observation_operator_is_a_sum_over_taps_and_has_this_adjoint(first):
     generator = torch.Generator().manual_seed(3)
     taps = torch.randn(1, 90, 6, 2, dtype=torch.float64, generator=generator)
     along, middle = 0.3 * torch.randn(2, 1, 90, 2, dtype=torch.float64, generator=generator)

@@ -116,7 +116,7 @@ def test_power_of_pure_noise_is_close_to_zero(count):
 
 @pytest.mark.parametrize(("across", "along"), [(0.2, 0.05), (0.02, 0.1)])
 @pytest.mark.parametrize("joint", [False, True])
-def test_regular_patterns_are_restored_up_to_their_ends(across, along, joint):
+def test_regular_patterns_are_restored_up_to_the_boundaries(across, along, joint):
     rows, columns = np.mgrid[:336, :400]
     scene = 0.5 + 0.4 * np.sin(2 * np.pi * (across * rows + along * columns))
     motion = Motion(amplitude=(0.0, 2.0))  # all columns are visible at the ends of the rows

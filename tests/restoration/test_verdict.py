@@ -1,4 +1,4 @@
-"""Verdict on restorations of frames from an independent camera, with right, wrong and invented vibrations."""
+"""Verdict on restorations of frames of an independent camera, with correct, wrong and spurious vibrations."""
 
 import math
 import warnings
@@ -16,7 +16,7 @@ from rsvib_torch.restoration.verdict.pairs import misfit, pairs_to_judge
 
 HEIGHT, WIDTH, MARGIN = 512, 192, 40
 FREQUENCY = (71.0, 113.0)
-BLIND = (2 / (HEIGHT * 4e-5), 1 / (HEIGHT * 4e-5))  # one or two whole periods from frame to frame
+BLIND = (2 / (HEIGHT * 4e-5), 1 / (HEIGHT * 4e-5))  # one or two complete periods between frames
 SCENES = {
     "buildings": lambda: draw_scene(HEIGHT + 2 * MARGIN, WIDTH + 2 * MARGIN, seed=3),
     "soft": lambda: draw_scene(HEIGHT + 2 * MARGIN, WIDTH + 2 * MARGIN, seed=4, blur=2.5),
@@ -40,7 +40,7 @@ def shaking(scale=1.0, frequency=FREQUENCY):
 
 
 @pytest.fixture(scope="module", name="scene")
-def draw_once():
+def make_scene():
     drawn = {}
 
     def draw(name):
@@ -55,7 +55,7 @@ TAKEN = {}
 
 
 def frames_of(scene, timing, motion, noise, count=2):
-    """Frames of a scene, each kind taken once; noise comes afterwards."""
+    """Frames of a scene, simulated once for each case; noise is added afterwards."""
     key = (id(scene), timing, motion, count)
     if key not in TAKEN:
         samples = 24 if timing.exposure_rows > 50 else 10
@@ -72,7 +72,7 @@ def judged(frames, timing, vibration, **options):
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize(("noise", "scale"), [(0.0, 1.0), (0.005, 1.0), (0.02, 1.0), (0.005, 0.02), (0.02, 0.05)])
-def test_the_right_vibration_helps(scene, name, noise, scale):
+def test_correct_vibration_helps(scene, name, noise, scale):
     timing, motion = camera(), shaking(scale)
     frames = frames_of(scene(name), timing, motion, noise)
     verdict, restored = judged(frames, timing, motion.vibration())
@@ -96,7 +96,7 @@ def test_the_right_vibration_helps(scene, name, noise, scale):
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize(("rows", "noise"), [(150, 0.005)])
-def test_no_false_alarm_where_the_exposure_blurs(scene, name, rows, noise):
+def test_no_false_alarm_with_motion_blur(scene, name, rows, noise):
     timing, motion = camera(rows), shaking()
     frames = frames_of(scene(name), timing, motion, noise)
     with warnings.catch_warnings():
@@ -108,7 +108,7 @@ def test_no_false_alarm_where_the_exposure_blurs(scene, name, rows, noise):
 @pytest.mark.parametrize("name", ["buildings", "chart"])
 @pytest.mark.parametrize(("noise", "scale"), [(0.005, 1.0), (0.02, 0.05)])
 @pytest.mark.parametrize("wrong", WRONG)
-def test_a_wrong_vibration_is_caught(scene, name, noise, scale, wrong):
+def test_wrong_vibration_is_rejected(scene, name, noise, scale, wrong):
     timing, motion = camera(), shaking(scale)
     frames = frames_of(scene(name), timing, motion, noise)
     verdict, _ = judged(frames, timing, WRONG[wrong](motion).vibration())
@@ -123,7 +123,7 @@ def test_a_wrong_vibration_is_caught(scene, name, noise, scale, wrong):
 
 
 @pytest.mark.parametrize(("name", "noise", "scale"), [("soft", 0.0, 1.0), ("chart", 0.005, 1.0), ("city", 0.02, 0.05)])
-def test_an_invented_vibration_is_caught(scene, name, noise, scale):
+def test_vibration_that_does_not_exist_is_rejected(scene, name, noise, scale):
     frames = frames_of(scene(name), camera(), shaking(0.0), noise)
     verdict, _ = judged(frames, camera(), shaking(scale).vibration())
     assert verdict.overall == "worse"
@@ -133,7 +133,7 @@ def test_an_invented_vibration_is_caught(scene, name, noise, scale):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.005])
-def test_a_blind_vibration_is_unknown(scene, noise):
+def test_blind_vibration_is_unknown(scene, noise):
     motion = shaking(frequency=BLIND)
     frames = frames_of(scene("city"), camera(), motion, noise)
     for vibration in (motion.vibration(), motion.scaled(0.5).vibration()):
@@ -144,7 +144,7 @@ def test_a_blind_vibration_is_unknown(scene, noise):
 
 
 @pytest.mark.parametrize("joint", [True, 2])
-def test_joint_restoration_is_judged_as_well(scene, joint):
+def test_joint_restoration_is_judged(scene, joint):
     timing, motion = camera(), shaking()
     frames = frames_of(scene("city"), timing, motion, 0.01, count=3)
     verdict, _ = judged(frames, timing, motion.vibration(), joint=joint)
@@ -155,7 +155,7 @@ def test_joint_restoration_is_judged_as_well(scene, joint):
 
 
 @pytest.mark.parametrize("options", [{"regularisation": 1e-5}, {"method": "banded", "noise_to_signal": 0.0}])
-def test_noise_that_outweighs_what_was_undone_is_caught(scene, options):
+def test_added_noise_larger_than_the_correction_is_rejected(scene, options):
     timing, motion = camera(100), shaking()
     frames = frames_of(scene("soft"), timing, motion, 0.02)
     verdict, restored = judged(frames, timing, motion.vibration(), **options)
@@ -165,7 +165,7 @@ def test_noise_that_outweighs_what_was_undone_is_caught(scene, options):
         restore(frames, timing, motion.vibration(), **options)
 
 
-def test_smoothing_that_outweighs_what_was_undone_is_caught(scene):
+def test_smoothing_larger_than_the_correction_is_rejected(scene):
     timing, motion = camera(), shaking(0.05)
     frames = frames_of(scene("chart"), timing, motion, 0.005)
     verdict, restored = judged(frames, timing, motion.vibration(), regularisation=1e6)
@@ -174,7 +174,7 @@ def test_smoothing_that_outweighs_what_was_undone_is_caught(scene):
     assert float(verdict.chi_square) > 100
 
 
-def test_an_axis_left_alone_does_not_count(scene):
+def test_axis_that_is_not_restored_is_not_judged(scene):
     timing, motion = camera(), shaking()
     frames = frames_of(scene("city"), timing, motion, 0.005)
     only_y = Vibration([0.0, 5.2], FREQUENCY, (0.4, 1.3))
@@ -192,12 +192,12 @@ def test_push_scan_frames_are_compared_where_they_overlap(image_motion):
     verdict, _ = judged(frames, timing, motion.vibration())
     assert verdict.helped.all()
     assert verdict.outcome == ("helps", "helps")
-    assert (verdict.after < 0.01).all()  # noise 0.005 in two frames, and little else
+    assert (verdict.after < 0.01).all()  # mainly the noise of 0.005 in two frames
     wrong = Motion(motion.amplitude, motion.frequency, (motion.phase[0] + 3, motion.phase[1] + 3), image_motion)
     assert judged(frames, timing, wrong.vibration())[0].overall == "worse"
 
 
-def test_turned_frames_give_the_same_verdict_with_axes_swapped(scene):
+def test_transposed_frames_have_the_same_verdict_with_swapped_axes(scene):
     motion = shaking()
     frames = frames_of(scene("city"), camera(), motion, 0.005)
     half_x = Vibration([1.55, 5.2], FREQUENCY, (0.4, 1.3))
@@ -270,7 +270,7 @@ def test_frames_may_differ_in_brightness(scene, joint, gain, offset):
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_small_false_motion_beside_a_large_true_one_is_accepted(scene, axis):
+def test_small_wrong_motion_beside_a_large_correct_motion_is_accepted(scene, axis):
     timing = camera()
     large = [3.1, 5.2]
     large[axis] = 0.0
@@ -286,13 +286,13 @@ def test_a_small_false_motion_beside_a_large_true_one_is_accepted(scene, axis):
 
 
 @pytest.mark.parametrize(
-    "invented",
+    "wrong_motion",
     [{"image_motion": [1500.0, -1000.0]}, {"image_acceleration": [0.0, -4e4]}],
     ids=["motion", "acceleration"],
 )
-def test_invented_image_motion_is_warned_of(scene, invented):
+def test_image_motion_that_does_not_exist_causes_a_warning(scene, wrong_motion):
     frames = frames_of(scene("city"), camera(), shaking(0.0), 0.005)
-    moving = Vibration([0.0, 0.0], [0.0, 0.0], **invented)
+    moving = Vibration([0.0, 0.0], [0.0, 0.0], **wrong_motion)
     with pytest.warns(RestorationWarning, match="restored is no better than raw"):
         restore(frames, camera(), moving, method="dewarp")
 

@@ -1,4 +1,4 @@
-"""Frames and pixels that show nothing spoil no others, and are not held against a restoration."""
+"""Empty frames and missing pixels do not affect other frames or the verdict on a restoration."""
 
 import warnings
 from functools import partial
@@ -19,18 +19,18 @@ def camera(rows=20):
     return SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
 
 
-def taken(count=3, rows=20):
+def noisy_frames(count=3, rows=20):
     clean = take_frames(SCENE, camera(rows), MOTION, count, samples=24 if rows > 50 else 10)
     return torch.from_numpy(clean + NOISE * np.random.default_rng(1).standard_normal(clean.shape)).float()
 
 
 @pytest.mark.parametrize("method", ["exact", "banded", "dewarp", "richardson-lucy"])
 @pytest.mark.parametrize("rows", [20, 200])
-@pytest.mark.parametrize("dead", [0.0, 0.3, float("nan")])
-def test_a_dead_frame_harms_no_others(method, rows, dead):
-    frames = taken(rows=rows)
+@pytest.mark.parametrize("constant", [0.0, 0.3, float("nan")])
+def test_constant_frame_does_not_affect_the_others(method, rows, constant):
+    frames = noisy_frames(rows=rows)
     whole = quietly(frames, camera(rows), MOTION.vibration(), method=method)
-    frames[1] = dead
+    frames[1] = constant
     found = quietly(frames, camera(rows), MOTION.vibration(), method=method)
     assert torch.isfinite(found).all()
     for frame in (0, 2):
@@ -38,8 +38,8 @@ def test_a_dead_frame_harms_no_others(method, rows, dead):
 
 
 @pytest.mark.parametrize("rows", [20, 200])
-def test_a_frame_without_data_harms_no_joint_restoration(rows):
-    frames = taken(rows=rows)
+def test_frame_without_data_does_not_affect_joint_restoration(rows):
+    frames = noisy_frames(rows=rows)
     pair = quietly(frames[[0, 1]], camera(rows), MOTION.vibration(), joint=True)
     frames[2] = float("nan")
     found = quietly(frames, camera(rows), MOTION.vibration(), joint=True)
@@ -47,24 +47,24 @@ def test_a_frame_without_data_harms_no_joint_restoration(rows):
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5])
-def test_half_a_frame_tells_as_much_noise_as_a_whole_one(share):
-    frames = taken()
+def test_noise_level_of_frames_with_missing_columns(share):
+    frames = noisy_frames()
     columns = round(share * frames.shape[-1])
     frames[..., :columns] = float("nan")
     found = quietly(frames, camera(), MOTION.vibration())[..., columns:]
-    told = quietly(frames, camera(), MOTION.vibration(), noise=NOISE)[..., columns:]
+    given_noise = quietly(frames, camera(), MOTION.vibration(), noise=NOISE)[..., columns:]
     inner = crop(SCENE)[..., columns:]
-    assert decibel(found, inner) > decibel(told, inner) - 0.15
+    assert decibel(found, inner) > decibel(given_noise, inner) - 0.15
     assert (
         decibel(quietly(frames, camera(), MOTION.vibration(), noise=1e-5)[..., columns:], inner)
-        < decibel(told, inner) - 1
+        < decibel(given_noise, inner) - 1
     )
 
 
 @pytest.mark.parametrize("value", [0.0, 0.3, 0.5])
 @pytest.mark.parametrize("rows", [20, 200, 400])
 @pytest.mark.parametrize("count", [1, 2])
-def test_frames_that_show_nothing_stay_so_without_alarm(value, rows, count):
+def test_constant_frames_are_unchanged_without_a_warning(value, rows, count):
     frames = torch.full((count, 160, 140), value)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -85,8 +85,8 @@ def test_narrow_frames(shape, method):
 
 @pytest.mark.parametrize("columns", [5, 15])
 @pytest.mark.parametrize("count", [2, 4])
-def test_missing_columns_raise_no_alarm(columns, count):
-    frames = taken(count)[:, :128, :128]
+def test_missing_columns_cause_no_warning(columns, count):
+    frames = noisy_frames(count)[:, :128, :128]
     frames[..., 60 : 60 + columns] = float("nan")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -98,7 +98,7 @@ def test_missing_columns_raise_no_alarm(columns, count):
 
 
 def test_pairs_with_a_frame_without_data_are_not_judged():
-    frames = taken(3)
+    frames = noisy_frames(3)
     frames[2] = float("nan")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -108,10 +108,10 @@ def test_pairs_with_a_frame_without_data_are_not_judged():
     assert "100 % of the pixels are missing" in verdict.reasons[1]
 
 
-def test_a_stack_does_not_depend_on_its_neighbours_in_a_batch():
-    frames = taken(2, rows=100)[None, :, None]
-    calm, wild = Vibration([0.2, 0.1], [50.0, 30.0]), Vibration([40.0, 1.0], [50.0, 30.0])
-    for other in (calm, wild):
+def test_stacks_of_a_batch_are_independent():
+    frames = noisy_frames(2, rows=100)[None, :, None]
+    weak, strong = Vibration([0.2, 0.1], [50.0, 30.0]), Vibration([40.0, 1.0], [50.0, 30.0])
+    for other in (weak, strong):
         both = Vibration(
             *(
                 torch.stack([getattr(v, name) for v in (MOTION.vibration(), other)])
