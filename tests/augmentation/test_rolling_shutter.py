@@ -1,4 +1,4 @@
-"""The augmentation compared with the independent simulator, and in the containers of Kornia."""
+"""The augmentation compared with the independent simulator, and in containers of Kornia."""
 
 import copy
 import math
@@ -30,19 +30,19 @@ def fixed(motion=MOTION, timing=TIMING, **options):
 
 
 def mean_displacement(times, motion=MOTION, timing=TIMING):
-    """Mean over exposures that begin at ``times``, as a sum of 400 midpoints."""
+    """Mean displacement over exposures that begin at ``times``, as a sum of 400 midpoints."""
     nodes = (np.arange(400) + 0.5) / 400 * timing.exposure_time
     return motion.displacement(np.asarray(times, dtype=float)[..., None] + nodes).mean(-2)
 
 
-def place(point, motion=MOTION, timing=TIMING, start=0.0):
+def frame_position(point, motion=MOTION, timing=TIMING, start=0.0):
     """Position of a scene point in the frame: the root of ``r = y + Y(t(r))``."""
 
-    def shown(row):
+    def row_displacement(row):
         return mean_displacement(start + row * timing.row_time, motion, timing)
 
-    row = brentq(lambda r: r - point[1] - shown(r)[1], point[1] - 30, point[1] + 30, xtol=1e-10)
-    return point[0] + shown(row)[0], row
+    row = brentq(lambda r: r - point[1] - row_displacement(r)[1], point[1] - 30, point[1] + 30, xtol=1e-10)
+    return point[0] + row_displacement(row)[0], row
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_any_orientation(still, scan_axis, readout_direction):
     point = (60.0, 130.0)
     rows = WIDTH if swap else HEIGHT
     x, y = point[::-1] if swap else point
-    x, y = place((x, rows - 1 - y if sign < 0 else y), in_rows)
+    x, y = frame_position((x, rows - 1 - y if sign < 0 else y), in_rows)
     y = rows - 1 - y if sign < 0 else y
     augmentation = kornia_augmentation.AugmentationSequential(fixed(MOTION, timing), data_keys=["input", "keypoints"])
     _, found = augmentation(still[None, None], torch.tensor([[point]], dtype=torch.float64))
@@ -112,21 +112,21 @@ def test_keypoints_masks_and_boxes_follow_the_image(still):
     chain = kornia_augmentation.AugmentationSequential(fixed(), data_keys=["input", "mask", "keypoints", "bbox_xyxy"])
     image, moved_mask, points, boxes = chain(images, mask, centres[None], corners + torch.tensor([0, 0, 1.0, 1.0]))
 
-    expected = np.array([place(centre) for centre in centres.numpy()])
-    assert np.abs(expected - centres.numpy()).min(0).max() > 0.3  # something moves
+    expected = np.array([frame_position(centre) for centre in centres.numpy()])
+    assert np.abs(expected - centres.numpy()).min(0).max() > 0.3  # the motion is not negligible
     np.testing.assert_allclose(points[0].numpy(), expected, atol=1e-4)
     weight = image[0] / image[0].sum((-2, -1), keepdim=True)
     centroids = torch.stack([(weight * x).sum((-2, -1)), (weight * y).sum((-2, -1))], -1)
-    np.testing.assert_allclose(centroids.numpy(), points[0].numpy(), atol=0.3)  # a disc is not a point
+    np.testing.assert_allclose(centroids.numpy(), points[0].numpy(), atol=0.3)  # discs are extended, not points
     differing = ((image[0] > 0.5) != (moved_mask[0] > 0.5)).sum((-2, -1)).double()
     unmoved = ((image[0] > 0.5) != (mask[0] > 0.5)).sum((-2, -1)).double()
-    assert (differing < 25).all()  # of 75 pixels of the rim, whose sides blur and rounding shift by half a pixel
+    assert (differing < 25).all()  # of 75 pixels on the rim, which blur and rounding displace by half a pixel
     assert (unmoved > 50).all()
     assert set(moved_mask.unique().tolist()) == {0.0, 1.0}
     for index, (left, top, right, bottom) in enumerate((boxes - torch.tensor([0, 0, 1.0, 1.0]))[0].tolist()):
         rows, columns = (moved_mask[0, index] > 0).nonzero().unbind(-1)
         for side, edge in ((left, columns.min()), (top, rows.min()), (-right, -columns.max()), (-bottom, -rows.max())):
-            assert side <= float(edge) + 0.6  # nothing outside, but for rounding of the mask
+            assert side <= float(edge) + 0.6  # no pixel outside the box except by rounding of the mask
 
 
 @pytest.mark.parametrize("exposure_rows", [1, 30, 60])
@@ -139,7 +139,7 @@ def test_points_of_fast_vibrations_and_long_exposures(exposure_rows):
     augmentation = fixed(slow, timing)
     augmentation(torch.zeros(1, 1, HEIGHT, WIDTH))
     moved = augmentation.transform_keypoints(Keypoints(points[None]), augmentation._params, augmentation.flags).data[0]
-    expected = np.array([place(point, slow, timing) for point in points.numpy()])
+    expected = np.array([frame_position(point, slow, timing) for point in points.numpy()])
     assert np.abs(expected - points.numpy()).max() > 0.2
     np.testing.assert_allclose(moved.numpy(), expected, atol=2e-4)
 
@@ -155,10 +155,10 @@ def test_boxes_are_the_smallest_around_the_distorted_content():
     np.testing.assert_allclose(moved.to_tensor("xyxy")[0, 0], [50 + x.min(), 20, 91 + x.max(), 221], atol=1e-3)
     slanted = Boxes(torch.tensor([[[[50.0, 60.0], [80.0, 70.0], [70.0, 100.0], [40.0, 90.0]]]], dtype=torch.float64))
     corners = augmentation.transform_boxes(slanted, augmentation._params, augmentation.flags).data[0, 0]
-    np.testing.assert_allclose(corners, [place(p, motion) for p in slanted.data[0, 0].numpy()], atol=1e-4)
+    np.testing.assert_allclose(corners, [frame_position(p, motion) for p in slanted.data[0, 0].numpy()], atol=1e-4)
 
 
-def test_clip_is_one_recording(scene, still):
+def test_frames_of_a_clip_have_one_motion(scene, still):
     """Frames of a clip are consecutive frames of one camera; labels of the clip have the same motion."""
     truth = take_frames(scene, TIMING, MOTION, 3)
     clip = still.expand(1, 3, 1, -1, -1)
@@ -173,7 +173,7 @@ def test_clip_is_one_recording(scene, still):
     )
     _, points = labelled(clip, torch.tensor(point, dtype=torch.float64).expand(1, 3, 1, 2))
     for frame in range(3):
-        expected = place(point, start=frame * TIMING.frame_period)
+        expected = frame_position(point, start=frame * TIMING.frame_period)
         np.testing.assert_allclose(points.reshape(3, 2)[frame], expected, atol=1e-4)
 
 
@@ -187,7 +187,9 @@ def test_clips_of_a_batch_and_free_frames():
         alone |= {"forward_input_shape": torch.tensor([1, 1, 48, 40]), "video_batch_size": torch.tensor(1)}
         torch.testing.assert_close(augmentation(clips[clip], params=alone), taken[clip], rtol=0, atol=1e-3)
     drawn = augmentation.drawn_vibration(shared._params[0].data)
-    torch.testing.assert_close(drawn.frequency.float(), shared._params[0].data["frequency"][[0, 3]])  # one a clip
+    torch.testing.assert_close(
+        drawn.frequency.float(), shared._params[0].data["frequency"][[0, 3]]
+    )  # one sample per clip
     free = kornia_augmentation.VideoSequential(RollingShutterVibration(TIMING), same_on_frame=False)
     frames = free(clips)
     assert augmentation.drawn_vibration(free._params[0].data).frequency.shape == (6, 2, 1)
@@ -195,7 +197,7 @@ def test_clips_of_a_batch_and_free_frames():
     torch.testing.assert_close(augmentation(clips.flatten(0, 1), params=drawn), frames.flatten(0, 1))
 
 
-def test_draws_lie_in_their_ranges_and_fill_them():
+def test_samples_cover_their_ranges():
     augmentation = RollingShutterVibration(
         TIMING,
         amplitude=((0.0, 1.0), (2.0, 3.0)),
@@ -224,7 +226,7 @@ def test_draws_lie_in_their_ranges_and_fill_them():
 
 
 def test_every_image_has_its_own_motion_and_exposure(still):
-    """A batch equals its single images; the blur is that of the drawn exposure."""
+    """A batch equals its single images; the blur is that of the sampled exposure."""
     images = still[None, None].expand(3, 2, -1, -1)[..., 20:120, 20:100]
     augmentation = RollingShutterVibration(TIMING, exposure_rows=(2.0, 200.0), tones=2, image_motion=(-50.0, 50.0))
     together = augmentation(images)
@@ -278,7 +280,7 @@ def test_replay_same_on_batch_keepdim_probability():
     assert torch.equal((shifted == 15.0).flatten(1).all(1), left)
 
 
-def test_masks_of_many_kinds(still):
+def test_types_of_masks(still):
     """Integer labels, a list with one mask per image, and masks without channels have the same motion."""
     images = still[None, None].expand(2, -1, -1, -1).float()
     labels = (torch.arange(HEIGHT)[:, None] // 7 + torch.arange(WIDTH) // 5).remainder(9).expand(2, 1, -1, -1)
@@ -326,7 +328,7 @@ class Patches(torch.utils.data.Dataset):
         return self.augmentation(image), self.augmentation.drawn_vibration().amplitude[0]
 
 
-def test_workers_draw_differently_and_reproducibly():
+def test_workers_sample_independently_and_reproducibly():
     def run(workers):
         torch.manual_seed(7)
         loader = torch.utils.data.DataLoader(Patches(), batch_size=2, num_workers=workers)
@@ -339,7 +341,7 @@ def test_workers_draw_differently_and_reproducibly():
     assert torch.equal(images, again)
 
 
-def test_copies_draw_alike():
+def test_copies_sample_the_same_parameters():
     augmentation = RollingShutterVibration(TIMING, tones=2)
     images = torch.rand(2, 1, 40, 32)
     expected = augmentation(images)
@@ -351,7 +353,7 @@ def test_copies_draw_alike():
 
 
 def test_in_a_chain_with_other_augmentations():
-    """After a crop, rows are counted from the crop; keypoints of the chain agree with marks in the image."""
+    """Rows are counted from the top of a preceding crop; keypoints of the chain agree with marks in the image."""
     images = torch.zeros(1, 1, 96, 96, dtype=torch.float64)
     y, x = torch.meshgrid(torch.arange(96.0), torch.arange(96.0), indexing="ij")
     images[0, 0] = torch.exp(-((x - 50) ** 2 + (y - 40) ** 2) / 8)
@@ -390,7 +392,7 @@ def test_bad_options(options, error, match):
         RollingShutterVibration(TIMING, **options)
 
 
-def test_wrong_use_is_an_error():
+def test_wrong_use_is_refused():
     with pytest.raises(TypeError, match="timing must be a SensorTiming"):
         RollingShutterVibration(2e-5)
     augmentation = RollingShutterVibration(TIMING)

@@ -1,4 +1,4 @@
-"""Row time, readout direction and exposure from flickering light, against frames made from the definition in NumPy."""
+"""Row time, readout direction and exposure from flickering light, in frames computed from the definition with NumPy."""
 
 import math
 import re
@@ -25,7 +25,7 @@ def blink(time, frequency=1000.0, fraction=0.5):
     return 2.0 * ((time * frequency) % 1.0 < fraction)
 
 
-def film(
+def record_frames(
     light,
     *,
     frames=1,
@@ -52,14 +52,14 @@ def film(
 
 
 def shaded(height=HEIGHT, width=WIDTH):
-    """A plain wall with a vignette and a spot of light."""
+    """A uniform wall with vignetting and a light spot."""
     v, u = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
     return 0.35 * (1 - 0.5 * (u**2 + v**2)) + 0.1 * np.exp(-((u - 0.4) ** 2 + (v + 0.3) ** 2) / 0.3)
 
 
 @pytest.mark.parametrize("light", [sine, blink])
-def test_row_time_of_one_frame_is_found_within_its_error_bar(light):
-    found = calibrate_row_time(film(light, scene=shaded()), 1000.0)
+def test_row_time_of_one_frame_agrees_within_its_standard_deviation(light):
+    found = calibrate_row_time(record_frames(light, scene=shaded()), 1000.0)
     assert found.row_time == pytest.approx(ROW_TIME, rel=5e-4)
     assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std
     assert found.row_time_std < 3e-3 * ROW_TIME
@@ -68,21 +68,21 @@ def test_row_time_of_one_frame_is_found_within_its_error_bar(light):
     assert found.frame_rows is None
 
 
-def test_error_bars_cover():
+def test_standard_deviations_agree_with_scatter():
     ratios = []
     for seed in range(12):
         row_time = 1e-6 * (9 + 0.9 * seed)
-        frames = film(sine, row_time=row_time, noise=0.06, seed=seed)
+        frames = record_frames(sine, row_time=row_time, noise=0.06, seed=seed)
         found = calibrate_row_time(frames, 1000.0)
         ratios.append((found.row_time - row_time) / found.row_time_std)
     spread = math.sqrt(np.mean(np.square(ratios)))
     assert 0.3 < spread < 1.6
 
 
-def test_texture_drops_out_of_several_frames():
-    """Two per cent of flicker in a street scene: nothing to see in one frame, everything in four."""
+def test_texture_is_removed_by_several_frames():
+    """Flicker of 2 % in a textured scene: not detectable in one frame, accurate in four."""
     scene = 0.6 * draw_scene(HEIGHT, WIDTH, 3)
-    frames = film(lambda t: sine(t, 997.0, 0.02), frames=4, scene=scene)
+    frames = record_frames(lambda t: sine(t, 997.0, 0.02), frames=4, scene=scene)
     found = calibrate_row_time(frames, 997.0)
     assert found.row_time == pytest.approx(ROW_TIME, rel=2e-3)
     assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std
@@ -90,10 +90,10 @@ def test_texture_drops_out_of_several_frames():
         calibrate_row_time(frames[:1], 997.0)
 
 
-def test_texture_that_repeats_with_every_other_band_is_no_flicker():
-    """A pattern of twice the period takes the texture with it, but stays where it is."""
-    frequency, row_time = 583.7, 19.47e-6  # a third of a turn a frame, 88 rows
-    frames = film(
+def test_periodic_texture_is_not_detected_as_flicker():
+    """A pattern with twice the period also fits the texture, but it does not move between frames."""
+    frequency, row_time = 583.7, 19.47e-6  # the phase changes by a third of a period per frame; the period is 88 rows
+    frames = record_frames(
         lambda t: sine(t, frequency, 0.1),
         frames=4,
         scene=0.6 * draw_scene(HEIGHT, WIDTH, 22),
@@ -106,9 +106,9 @@ def test_texture_that_repeats_with_every_other_band_is_no_flicker():
     assert found.row_time == pytest.approx(row_time, rel=2e-3)
 
 
-def test_bands_of_a_photograph_are_found():
+def test_flicker_in_a_photograph():
     scene = np.stack([0.5 * draw_scene(HEIGHT, WIDTH, seed) for seed in (5, 6, 7)])
-    grey = torch.stack([film(sine, scene=channel)[0] for channel in scene])
+    grey = torch.stack([record_frames(sine, scene=channel)[0] for channel in scene])
     found = calibrate_row_time(grey[None], 1000.0)
     assert found.row_time == pytest.approx(ROW_TIME, rel=0.02)
     assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std
@@ -117,26 +117,26 @@ def test_bands_of_a_photograph_are_found():
 @pytest.mark.parametrize("reverse", [False, True])
 @pytest.mark.parametrize("light", [sine, blink])
 def test_readout_direction(light, reverse):
-    frames = film(light, frames=3, scene=shaded(), reverse=reverse)
+    frames = record_frames(light, frames=3, scene=shaded(), reverse=reverse)
     found = calibrate_row_time(frames, 1000.0, frame_rate=29.97)
     assert found.readout_direction == ("reverse" if reverse else "forward")
     assert found.frame_rows == pytest.approx(1 / (29.97 * ROW_TIME), rel=5e-4)
 
 
-def test_readout_direction_is_not_guessed():
-    in_step = film(sine, frames=3, frame_rate=25.0)
+def test_ambiguous_readout_direction_is_none():
+    in_step = record_frames(sine, frames=3, frame_rate=25.0)
     found = calibrate_row_time(in_step, 1000.0, frame_rate=25.0)
     assert found.readout_direction is None
     assert any("whole or half number" in note for note in found.notes)
     assert any("same rows in all frames" in note for note in found.notes)
-    moving = film(sine, frames=3)
+    moving = record_frames(sine, frames=3)
     wrong = calibrate_row_time(moving, 1000.0, frame_rate=29.9)
     assert wrong.readout_direction is None
     assert any("29.97 is not 30" in note for note in wrong.notes)
 
 
-def test_columns_may_be_read_one_after_another():
-    frames = film(sine, scene=shaded()).transpose(-2, -1)
+def test_columns_as_scan_axis():
+    frames = record_frames(sine, scene=shaded()).transpose(-2, -1)
     assert calibrate_row_time(frames, 1000.0, scan_axis="x").row_time == pytest.approx(ROW_TIME, rel=5e-4)
     with pytest.raises(ValueError, match="scan_axis"):
         calibrate_row_time(frames, 1000.0, scan_axis="z")
@@ -144,31 +144,31 @@ def test_columns_may_be_read_one_after_another():
 
 @pytest.mark.parametrize("exposure", [65e-6, 420e-6, 730e-6])
 def test_exposure_from_the_shape_of_bands(exposure):
-    found = calibrate_row_time(film(blink, scene=shaded(), exposure=exposure), 1000.0, on_fraction=0.5)
+    found = calibrate_row_time(record_frames(blink, scene=shaded(), exposure=exposure), 1000.0, on_fraction=0.5)
     assert found.exposure_time == pytest.approx(exposure, rel=0.03)
     assert abs(found.exposure_time - exposure) < max(5 * found.exposure_time_std, 0.01 * exposure)
 
 
 @pytest.mark.parametrize("exposure", [300e-6, 800e-6])
 def test_exposure_from_the_contrast_of_bands(exposure):
-    frames = film(sine, frames=3, scene=shaded(), exposure=exposure)
+    frames = record_frames(sine, frames=3, scene=shaded(), exposure=exposure)
     found = calibrate_row_time(frames, 1000.0, frame_rate=29.97, light_contrast=0.6)
     assert found.exposure_time == pytest.approx(exposure, rel=0.01)
     assert found.contrast == pytest.approx(0.6 * abs(np.sinc(1000 * exposure)), rel=0.02)
 
 
-def test_exposure_takes_a_gamma_of_photographs():
-    frames = film(blink, scene=shaded(), exposure=200e-6) ** (1 / 2.2)
+def test_exposure_with_gamma_of_photographs():
+    frames = record_frames(blink, scene=shaded(), exposure=200e-6) ** (1 / 2.2)
     found = calibrate_row_time(frames, 1000.0, on_fraction=0.5, gamma=2.2)
-    bent = calibrate_row_time(frames, 1000.0, on_fraction=0.5)
+    without_gamma = calibrate_row_time(frames, 1000.0, on_fraction=0.5)
     assert found.exposure_time == pytest.approx(200e-6, rel=0.03)
-    assert bent.row_time == pytest.approx(ROW_TIME, rel=5e-4)
-    assert abs(bent.exposure_time / 200e-6 - 1) > 0.1
+    assert without_gamma.row_time == pytest.approx(ROW_TIME, rel=5e-4)
+    assert abs(without_gamma.exposure_time / 200e-6 - 1) > 0.1
 
 
 def test_row_time_from_two_exposures_of_an_unknown_strobe():
     exposures = [1e-3, 0.25e-3]
-    frames = film(lambda t: blink(t, 300.0, 0.3), exposure=exposures, scene=shaded(720), frame_rate=8.1)
+    frames = record_frames(lambda t: blink(t, 300.0, 0.3), exposure=exposures, scene=shaded(720), frame_rate=8.1)
     found = calibrate_row_time_by_exposure(frames, exposures)
     assert found.row_time == pytest.approx(ROW_TIME, rel=0.01)
     assert abs(found.row_time - ROW_TIME) < 5 * found.row_time_std
@@ -182,17 +182,17 @@ def test_row_time_from_two_exposures_of_an_unknown_strobe():
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("count", [1, 2])
 def test_frames_without_flicker_are_refused(seed, count):
-    frames = film(np.ones_like, frames=count, scene=0.8 * draw_scene(HEIGHT, WIDTH, seed), noise=0.01)
+    frames = record_frames(np.ones_like, frames=count, scene=0.8 * draw_scene(HEIGHT, WIDTH, seed), noise=0.01)
     with pytest.raises(ValueError, match="no flicker found"):
         calibrate_row_time(frames, 100.0)
 
 
-def test_plain_frames_without_flicker_are_refused():
+def test_constant_frames_are_refused():
     with pytest.raises(ValueError, match="no flicker found"):
         calibrate_row_time(torch.full((2, 128, 64), 0.5), 1000.0)
 
 
-def test_slanted_stripes_are_no_flicker():
+def test_slanted_stripes_are_not_flicker():
     rows, columns = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), indexing="ij")
     stripes = 0.5 + 0.3 * np.sin(2 * np.pi * (rows + 0.5 * columns) / 40)
     with pytest.raises(ValueError, match="no flicker found"):
@@ -214,32 +214,32 @@ def test_slanted_stripes_are_no_flicker():
         (torch.full((1, 64, 64), 900, dtype=torch.int16), {}, "full_scale"),
     ],
 )
-def test_bad_input_is_named(frames, options, message):
+def test_bad_input(frames, options, message):
     options = {"flicker_frequency": 1000.0, **options}
     with pytest.raises(ValueError, match=message):
         calibrate_row_time(frames, **options)
 
 
 def test_flicker_too_fast_or_too_slow_for_the_rows():
-    fast = film(lambda t: sine(t, 9 / (10 * ROW_TIME)), frames=1, exposure=1e-6)
+    fast = record_frames(lambda t: sine(t, 9 / (10 * ROW_TIME)), frames=1, exposure=1e-6)
     with pytest.raises(ValueError, match="is ambiguous: row times of"):
         calibrate_row_time(fast, 9 / (10 * ROW_TIME), frame_rate=29.97)
-    finest = film(lambda t: sine(t, 1 / (3 * ROW_TIME)), frames=1, exposure=1e-6)
+    finest = record_frames(lambda t: sine(t, 1 / (3 * ROW_TIME)), frames=1, exposure=1e-6)
     with pytest.raises(ValueError, match=r"repeat every 3\.00 rows"):
         calibrate_row_time(finest, 1 / (3 * ROW_TIME))
-    slow = film(lambda t: sine(t, 100.0), frames=3, scene=shaded())  # 0.7 periods in a frame
+    slow = record_frames(lambda t: sine(t, 100.0), frames=3, scene=shaded())  # 0.7 periods per frame
     with pytest.raises(ValueError, match=r"slower than a frame|no flicker found"):
         calibrate_row_time(slow, 100.0)
     with pytest.raises(ValueError, match="does not fit"):
-        calibrate_row_time(film(sine, scene=shaded()), 100.0, frame_rate=29.97)
+        calibrate_row_time(record_frames(sine, scene=shaded()), 100.0, frame_rate=29.97)
 
 
 def test_command(tmp_path, capsys):
-    write_stack(tmp_path / "led.tif", film(blink, frames=3, scene=shaded(), reverse=True), dtype="uint8")
+    write_stack(tmp_path / "led.tif", record_frames(blink, frames=3, scene=shaded(), reverse=True), dtype="uint8")
     arguments = ["calibrate", str(tmp_path / "led.tif"), "--frequency", "1000", "--frame-rate", "29.97"]
     assert run_command([*arguments, "--on-fraction", "0.5", "--out", str(tmp_path / "sensor.toml")]) == 0
-    said = capsys.readouterr().out
-    assert float(re.search(r"row time ([\d.]+)", said).group(1)) == pytest.approx(1e6 * ROW_TIME, rel=5e-4)
+    printed = capsys.readouterr().out
+    assert float(re.search(r"row time ([\d.]+)", printed).group(1)) == pytest.approx(1e6 * ROW_TIME, rel=5e-4)
     timing = read_config(tmp_path / "sensor.toml").timing
     assert timing.row_time == pytest.approx(ROW_TIME, rel=5e-4)
     assert timing.exposure_time == pytest.approx(65e-6, rel=0.05)
@@ -247,9 +247,9 @@ def test_command(tmp_path, capsys):
     assert timing.frame_rate == pytest.approx(29.97, rel=1e-6)
 
 
-def test_command_takes_exposures_of_several_files(tmp_path, capsys):
+def test_command_with_exposures_of_several_files(tmp_path, capsys):
     exposures = [1e-3, 0.25e-3]
-    frames = film(lambda t: blink(t, 300.0, 0.3), exposure=exposures, scene=shaded(720), frame_rate=8.1)
+    frames = record_frames(lambda t: blink(t, 300.0, 0.3), exposure=exposures, scene=shaded(720), frame_rate=8.1)
     for name, frame in zip(("long.png", "short.png"), frames, strict=True):
         write_stack(tmp_path / name, frame[None], dtype="uint8")
     files = [str(tmp_path / "long.png"), str(tmp_path / "short.png")]
@@ -259,7 +259,7 @@ def test_command_takes_exposures_of_several_files(tmp_path, capsys):
     assert "# frame_rows = ?" in (tmp_path / "sensor.toml").read_text()
 
 
-def test_mistakes_on_the_command_line_are_one_line(tmp_path, capsys):
+def test_errors_on_the_command_line_are_one_line(tmp_path, capsys):
     write_stack(tmp_path / "plain.png", torch.full((1, 64, 64), 0.5), dtype="uint8")
     out = tmp_path / "sensor.toml"
     for arguments, message in (

@@ -23,7 +23,7 @@ def smooth_scene(height, width, seed=0, highest=0.2):
     return 0.5 + 0.12 * scene / scene.std()
 
 
-# --- a model of its own, dense: rows of pixels as matrices that act on spline coefficients -------------------------
+# --- independent dense model: matrices from spline coefficients to the pixels of the frames -------------------------
 
 DENSE_TIMING = rsv.SensorTiming(row_time=400e-6, exposure_rows=3, frame_rows=50)
 HEIGHT, WIDTH, EDGE, NODES = 36, 9, 12, 24
@@ -56,7 +56,7 @@ def dense_operator(values, num_frames):
 
 
 def dense_information(coefficients, num_frames, explain):
-    """What is left of the derivatives of the frames when the scene explains what it can."""
+    """Information in the derivatives of the frames after projection onto the complement of the scene."""
     order = ("ax", "fx", "px", "vx", "ay", "fy", "py", "vy")
     derivatives = []
     for name in order:
@@ -65,7 +65,7 @@ def dense_information(coefficients, num_frames, explain):
         derivatives.append((up - down) @ coefficients / (2 * step))
     derivatives = np.stack(derivatives, axis=1)
     operator = dense_operator(TRUTH, num_frames)
-    # columns that leave the frame on one side come back on the other, but only those within count
+    # columns are periodic; only those within the frame are used
     times = (np.arange(num_frames)[:, None] * DENSE_TIMING.frame_rows + np.arange(HEIGHT)) * DENSE_TIMING.row_time
     x, y = (displacement(times + 0.5 * DENSE_TIMING.exposure_time, axis, TRUTH) for axis in "xy")
     window = np.zeros((num_frames, HEIGHT, WIDTH))
@@ -74,8 +74,8 @@ def dense_information(coefficients, num_frames, explain):
         if q != p and found >= 0:
             place = np.arange(WIDTH) - x[p, r] + np.interp(found, np.arange(HEIGHT), x[q])
             window[p, r] += (place >= 0) & (place <= WIDTH - 1)
-    left = (derivatives - operator @ explain(operator, derivatives)) * (window.reshape(-1, 1) > 0)
-    return left.T @ left
+    residual = (derivatives - operator @ explain(operator, derivatives)) * (window.reshape(-1, 1) > 0)
+    return residual.T @ residual
 
 
 def ridge(operator, derivatives):
@@ -92,7 +92,7 @@ def least_squares(operator, derivatives):
     ("num_frames", "explain", "tolerance"), [(2, ridge, 5e-4), (2, least_squares, 1e-2), (3, ridge, 5e-4)]
 )
 def test_projection_equals_dense_algebra(monkeypatch, num_frames, explain, tolerance):
-    monkeypatch.setattr(information, "_MARGIN", 0)  # so that the scene is its own period
+    monkeypatch.setattr(information, "_MARGIN", 0)  # the scene is periodic
     monkeypatch.setattr(information, "fast_length", lambda minimum: minimum)
     monkeypatch.setattr(information, "_within_band", lambda scene: scene)
     monkeypatch.setattr(information, "bspline_coefficients", lambda scene, degree, dim: scene)
@@ -109,12 +109,12 @@ def test_projection_equals_dense_algebra(monkeypatch, num_frames, explain, toler
         lambda times: torch.stack([_sensitivity(motion, p, times) for p in parameters]),
     )
     found = information.projected_information(recording).numpy()
-    wanted = dense_information(coefficients.numpy().ravel(), num_frames, explain)
-    scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
-    assert np.abs((found - wanted) / scale).max() <= tolerance
+    expected = dense_information(coefficients.numpy().ravel(), num_frames, explain)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.abs((found - expected) / scale).max() <= tolerance
     nothing = dense_information(coefficients.numpy().ravel(), num_frames, lambda a, d: np.zeros((a.shape[1], 8)))
-    share = np.diag(wanted) / np.diag(nothing)
-    assert share.max() < 0.96  # the scene does explain a part of all of them, and of some most
+    share = np.diag(expected) / np.diag(nothing)
+    assert share.max() < 0.96  # the scene explains a part of all parameters, and more than half of some
     assert share.min() < 0.5
 
 
@@ -134,8 +134,8 @@ def test_closed_form_agrees_on_a_band_limited_scene(num_frames):
 
 
 @pytest.mark.parametrize("method", ["projection", "gradients"])
-def test_waves_along_rows_by_hand(method):
-    # a wave along x of amplitude a tells of x alone: J = (2 pi u a)^2 W / 4 noise^2 sum d offset d offset'
+def test_closed_form_of_a_wave_along_rows(method):
+    # a wave along x with amplitude a measures x only: J = (2 pi u a)^2 W / 4 noise^2 sum d offset d offset'
     u, a, width, noise = 0.1, 0.2, 480, 0.01
     columns = np.arange(width + 40)
     scene = torch.from_numpy(np.tile(0.5 + a * np.sin(2 * np.pi * u * columns), (340, 1)))
@@ -163,15 +163,15 @@ def test_waves_along_rows_by_hand(method):
     truth = np.array([amplitude, frequency, phase, 0.0])
     derivative = [(offset(truth + e) - offset(truth - e)) / 2e-5 for e in 1e-5 * np.eye(4)]
     information_ = (2 * np.pi * u * a / noise) ** 2 * width / 4 * (np.array(derivative) @ np.array(derivative).T)
-    wanted = np.sqrt(np.diag(np.linalg.inv(information_)))
+    expected = np.sqrt(np.diag(np.linalg.inv(information_)))
     found = [bound.amplitude[0, 0], bound.frequency[0, 0], bound.phase[0, 0], bound.image_motion[0]]
-    np.testing.assert_allclose([float(value) for value in found], wanted, rtol=0.02)
-    assert float(bound.period[0, 0]) == pytest.approx(wanted[1] / frequency**2, rel=0.02)
+    np.testing.assert_allclose([float(value) for value in found], expected, rtol=0.02)
+    assert float(bound.period[0, 0]) == pytest.approx(expected[1] / frequency**2, rel=0.02)
     assert torch.isinf(bound.image_motion[1])
 
 
 @pytest.mark.parametrize("method", ["projection", "gradients", "random"])
-def test_a_blind_tone_is_infinite_and_its_neighbour_is_not(method):
+def test_bound_is_infinite_for_a_blind_tone_only(method):
     scene = torch.from_numpy(smooth_scene(332, 80))
     blind = 1 / TIMING.frame_period
     bound, near = (
@@ -189,11 +189,11 @@ def test_a_blind_tone_is_infinite_and_its_neighbour_is_not(method):
     assert torch.isinf(bound.phase[0, 0])
     assert torch.isfinite(bound.image_motion).all()
     assert torch.isfinite(values_of(near)).all()
-    assert (bound.amplitude[1] == 0).all()  # tones that are not there
+    assert (bound.amplitude[1] == 0).all()  # tones that do not exist
 
 
 @pytest.mark.parametrize("method", ["projection", "gradients"])
-def test_uneven_frame_times_open_a_blind_frequency(method):
+def test_uneven_frame_times_make_a_blind_frequency_measurable(method):
     scene = torch.from_numpy(smooth_scene(332, 80))
     period = TIMING.frame_period
     uneven = rsv.SensorTiming(
@@ -215,7 +215,7 @@ def test_uneven_frame_times_open_a_blind_frequency(method):
 
 
 def test_random_scene_with_a_flat_spectrum():
-    # per frequency S^2 / (N (2 S + N)) instead of S / (2 N), and S the same all over the disc
+    # information per frequency is S^2 / (N (2 S + N)) instead of S / (2 N), with constant S inside the disc
     highest, noise = 0.3, 0.3
     generator = np.random.default_rng(1)
     shape = (332, 256)
@@ -229,9 +229,9 @@ def test_random_scene_with_a_flat_spectrum():
         for method in ("gradients", "random")
     ]
     power = 0.2**2 / (np.pi * highest**2)
-    wanted = np.sqrt((2 * power + noise**2) / (2 * power))
-    assert wanted > 1.14
-    np.testing.assert_allclose((bounds[1] / bounds[0]).numpy(), wanted, rtol=0.02)
+    expected = np.sqrt((2 * power + noise**2) / (2 * power))
+    assert expected > 1.14
+    np.testing.assert_allclose((bounds[1] / bounds[0]).numpy(), expected, rtol=0.02)
 
 
 def test_bound_follows_noise_and_orientation():
@@ -243,14 +243,14 @@ def test_bound_follows_noise_and_orientation():
     turned = rsv.SensorTiming(
         row_time=TIMING.row_time, exposure_rows=3, frame_rows=300, scan_axis="x", readout_direction="reverse"
     )
-    # the same camera on its side, read from the other end
+    # the same camera, transposed and read in reverse
     swapped = rsv.Vibration([2.1, 1.3], [30.0, 50.0], [1.3 + np.pi, 0.4], [30.0, 20.0])
     aside = cramer_rao_bound(scene.flip(0).T.contiguous(), turned, swapped, noise=0.01, frame_size=(32, 280))
     for name in FIELDS:
         torch.testing.assert_close(getattr(aside, name).flip(0), getattr(bound, name), rtol=1e-6, atol=0)
 
 
-def test_an_unknown_acceleration_costs_accuracy():
+def test_unknown_acceleration_increases_the_bound():
     scene = torch.from_numpy(smooth_scene(332, 80))
     motion = rsv.Vibration([1.3, 2.1], [50.0, 30.0], [0.4, 1.3], [20.0, -30.0], [100.0, 0.0])
     options = {"noise": 0.01, "frame_size": (280, 32)}
@@ -271,7 +271,7 @@ def test_an_unknown_acceleration_costs_accuracy():
         ({"frame_size": (400, 40)}, "too small"),
     ],
 )
-def test_bad_input_is_named(change, match):
+def test_bad_input(change, match):
     scene = change.pop("scene", torch.rand(128, 96))
     options = {"noise": 0.01, "frame_size": (80, 40)} | change
     with pytest.raises(ValueError, match=match):

@@ -1,4 +1,4 @@
-"""Slanted edges are found where a chart has them, and only there."""
+"""Detection of slanted edges: all edges of a chart, and no others."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def test_every_edge_of_the_chart_is_found_and_measures_the_optics():
 
 
 @pytest.mark.parametrize("turn", [3.0, -8.0])
-def test_a_turned_and_noisy_chart(turn):
+def test_rotated_and_noisy_chart(turn):
     chart = rotate(resolution_chart(512, 512).numpy(), turn, reshape=False, order=3, mode="nearest")
     chart = torch.from_numpy(chart + 0.01 * np.random.default_rng(0).standard_normal(chart.shape).astype(np.float32))
     longest = [edge for edge in rsv.find_slanted_edges(chart, min_length=45) if edge.contrast < 0.56]
@@ -38,7 +38,7 @@ def test_a_turned_and_noisy_chart(turn):
     for edge in squares:
         curve = rsv.slanted_edge_mtf(edge.crop(chart))
         assert curve.angle == pytest.approx(edge.angle, abs=0.4)
-        assert 0.26 < float(curve.mtf50) < 0.33  # 0.312 before it was turned
+        assert 0.26 < float(curve.mtf50) < 0.33  # 0.312 before rotation
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -59,7 +59,7 @@ def test_position_polarity_and_scale(turned):
     assert rsv.find_slanted_edges(-image)[0].bright_side == ("top" if turned else "left")
 
 
-def test_where_there_is_no_edge_none_is_found():
+def test_no_edge_is_found_in_images_without_edges():
     assert rsv.find_slanted_edges(city_and_fields(300, 300, seed=3)) == []
     assert rsv.find_slanted_edges(torch.zeros(100, 100)) == []
     assert rsv.find_slanted_edges(torch.zeros(8, 100)) == []

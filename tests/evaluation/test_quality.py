@@ -1,4 +1,4 @@
-"""Image quality against scikit-image, offset errors against hand-made ones."""
+"""Image quality compared with scikit-image, offset errors compared with explicit values."""
 
 import math
 
@@ -35,7 +35,9 @@ def reference_ssim(image, reference, data_range):
 @pytest.mark.parametrize("data_range", [1.0, 4095.0])
 def test_each_image_of_a_stack_agrees_with_scikit_image(data_range):
     scene, degraded = (data_range * t for t in smooth_pair((3, 61, 84), seed=4))
-    degraded[1] = 0.3 * degraded[1] + 0.7 * scene[1]  # pooling the stack would give all three the same value
+    degraded[1] = (
+        0.3 * degraded[1] + 0.7 * scene[1]
+    )  # an average over the stack would give the same value for all three images
     wanted_psnr = [
         peak_signal_noise_ratio(s.numpy(), d.numpy(), data_range=data_range)
         for s, d in zip(scene, degraded, strict=True)
@@ -47,16 +49,16 @@ def test_each_image_of_a_stack_agrees_with_scikit_image(data_range):
     assert np.ptp(wanted_ssim) > 0.1
 
 
-def test_rim_is_left_out_as_if_it_were_cropped():
+def test_excluding_the_rim_equals_cropping():
     scene, degraded = smooth_pair((60, 70), seed=5)
     degraded[:4] = 0.0
     degraded[:, -5:] = 1.0
     inner = (slice(5, -5), slice(5, -5))
-    wanted = reference_ssim(degraded[inner], scene[inner], 1.0)
-    assert ssim(degraded, scene, 1.0, rim=5).item() == pytest.approx(wanted, abs=1e-12)
-    assert ssim(degraded, scene, 1.0).item() < wanted - 0.02
-    wanted = peak_signal_noise_ratio(scene[inner].numpy(), degraded[inner].numpy(), data_range=1.0)
-    assert psnr(degraded, scene, 1.0, rim=5).item() == pytest.approx(wanted, rel=1e-12)
+    expected = reference_ssim(degraded[inner], scene[inner], 1.0)
+    assert ssim(degraded, scene, 1.0, rim=5).item() == pytest.approx(expected, abs=1e-12)
+    assert ssim(degraded, scene, 1.0).item() < expected - 0.02
+    expected = peak_signal_noise_ratio(scene[inner].numpy(), degraded[inner].numpy(), data_range=1.0)
+    assert psnr(degraded, scene, 1.0, rim=5).item() == pytest.approx(expected, rel=1e-12)
 
 
 def test_channels_belong_to_their_image():
@@ -64,12 +66,12 @@ def test_channels_belong_to_their_image():
     degraded[1, 0] = scene[1, 0] + 0.1
     assert psnr(degraded, scene, 1.0).shape == ssim(degraded, scene, 1.0).shape == (2, 2)
     assert psnr(degraded, scene, 1.0)[1, 0].item() == pytest.approx(20.0)
-    wanted = np.mean([reference_ssim(degraded[0, 1, c], scene[0, 1, c], 1.0) for c in range(3)])
-    assert ssim(degraded, scene, 1.0)[0, 1].item() == pytest.approx(wanted, abs=1e-12)
-    assert ssim(degraded[0], scene[0], 1.0)[1].item() == pytest.approx(wanted, abs=1e-12)
+    expected = np.mean([reference_ssim(degraded[0, 1, c], scene[0, 1, c], 1.0) for c in range(3)])
+    assert ssim(degraded, scene, 1.0)[0, 1].item() == pytest.approx(expected, abs=1e-12)
+    assert ssim(degraded[0], scene[0], 1.0)[1].item() == pytest.approx(expected, abs=1e-12)
 
 
-def test_one_reference_serves_all_frames():
+def test_one_reference_is_compared_with_all_frames():
     scene, _ = smooth_pair((40, 30), seed=7)
     frames = torch.stack([scene + 0.01, scene - 0.1])
     np.testing.assert_allclose(psnr(frames, scene, 1.0).numpy(), [40.0, 20.0], rtol=1e-9)
@@ -85,16 +87,16 @@ def test_identical_images():
 
 
 @pytest.mark.parametrize(("level", "contrast"), [(0.0, 1.0), (0.9, 0.02)])
-def test_float32_is_close_and_counts_lose_nothing(level, contrast):
+def test_float32_is_accurate_and_integers_are_exact(level, contrast):
     scene, degraded = (level + contrast * t for t in smooth_pair((64, 64), seed=9))
     pair = degraded.float(), scene.float()
     assert ssim(*pair, 1.0).item() == pytest.approx(reference_ssim(degraded, scene, 1.0), abs=1e-5)
     assert ssim(*pair, 1.0).dtype == psnr(*pair, 1.0).dtype == torch.float64
     counts = [(4095 * t.clamp(0, 1)).round().to(torch.int32) for t in pair]
-    wanted = peak_signal_noise_ratio(*(t.numpy() for t in counts), data_range=4095)
-    assert psnr(*counts, 4095).item() == pytest.approx(wanted, rel=1e-9)
-    wanted = reference_ssim(*(t.double() for t in counts), 4095)
-    assert ssim(*counts, 4095).item() == pytest.approx(wanted, abs=1e-12)
+    expected = peak_signal_noise_ratio(*(t.numpy() for t in counts), data_range=4095)
+    assert psnr(*counts, 4095).item() == pytest.approx(expected, rel=1e-9)
+    expected = reference_ssim(*(t.double() for t in counts), 4095)
+    assert ssim(*counts, 4095).item() == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +113,7 @@ def test_float32_is_close_and_counts_lose_nothing(level, contrast):
     ],
 )
 @pytest.mark.parametrize("measure", [psnr, ssim])
-def test_what_does_not_fit_is_refused(measure, image, reference, options, match):
+def test_bad_input(measure, image, reference, options, match):
     with pytest.raises(ValueError, match=match):
         measure(image, reference, **{"data_range": 1.0, **options})
 

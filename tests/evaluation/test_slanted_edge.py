@@ -22,7 +22,7 @@ def worst_error(curve, mtf):
     return np.abs(curve.at(FREQUENCIES).numpy() - mtf(FREQUENCIES.numpy())).max()
 
 
-def test_the_drawn_truth_is_the_integral_over_the_pixel():
+def test_reference_edge_is_the_integral_over_the_pixel():
     image, angle = draw_edge(5.3, 0.5, (9, 9), (0.0, 1.0), (0.2, 0.1)), np.deg2rad(5.3)
     for row, column in ((4, 4), (2, 5), (7, 3)):
         x, y = column - 4.2, row - 4.1
@@ -89,7 +89,7 @@ OTHER_OPTICS = {
 
 
 @pytest.mark.parametrize("cutoff", [0.6, 1.2])
-def test_light_beyond_the_roi_is_not_taken_for_contrast(cutoff):
+def test_scattered_light_beyond_the_roi_does_not_bias_the_mtf(cutoff):
     def diffraction(f):
         s = np.clip(np.abs(f) / cutoff, 0, 1)
         return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
@@ -98,7 +98,7 @@ def test_light_beyond_the_roi_is_not_taken_for_contrast(cutoff):
     curve = measure(draw_edge_of(diffraction, 5.2))
     assert worst_error(curve, truth) < 2e-4
     assert float(curve.mtf50) == pytest.approx(mtf50_of(truth), rel=2e-4)
-    # its far light is a straight fall from 1 at frequency 0, which no window of this width shows
+    # the scattered light decreases the MTF linearly near frequency 0, where the window has no resolution
     np.testing.assert_allclose(curve.at(torch.tensor([0.002, 0.005])), truth(np.array([0.002, 0.005])), atol=2e-4)
 
 
@@ -114,7 +114,7 @@ def test_optics_of_any_shape(name):
     assert float(noisy.mtf50) == pytest.approx(mtf50_of(truth), rel=0.02)
 
 
-def test_turning_mirroring_and_inverting_change_nothing():
+def test_rotation_mirroring_and_inversion_do_not_change_the_result():
     image = draw_edge(5.2, 0.6) + 0.008 * np.random.default_rng(5).standard_normal((120, 80))
     curve = measure(image)
     turned = {
@@ -133,7 +133,8 @@ def test_turning_mirroring_and_inverting_change_nothing():
 
 
 def test_the_angle_is_positive_clockwise():
-    upright = draw_edge(-5.0, 0.6)  # leans to the right, going up, where it rises to the right
+    upright = draw_edge(-5.0, 0.6)
+    # an edge that leans to the right (its column is larger at the top) has a positive angle
     top, bottom = (np.abs(upright[row] - 0.5).argmin() for row in (5, -5))
     curve = measure(upright)
     assert math.copysign(1, curve.angle) == math.copysign(1, top - bottom)
@@ -142,16 +143,16 @@ def test_the_angle_is_positive_clockwise():
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.005])
-def test_shading_does_not_pass_for_blur(noise):
+def test_shading_does_not_affect_the_mtf(noise):
     y, x = np.mgrid[-1:1:120j, -1:1:80j]
     image = draw_edge(5.0, 0.8) * (1 + 0.15 * x + 0.1 * y)
     curve = measure(image + noise * np.random.default_rng(2).standard_normal(image.shape))
     assert float(curve.mtf50) == pytest.approx(mtf50_of(through_pixels(gaussian(0.8), 5.0)), rel=1e-5 + noise)
 
 
-def test_a_curved_edge_is_followed():
+def test_curved_edge():
     y, x = np.mgrid[:120, :80].astype(float)
-    radius = 900.0  # bends by 2 px over the ROI
+    radius = 900.0  # curvature of 2 px over the ROI
     distance = radius - np.hypot(x - 40 - radius * np.cos(0.09), y - 60 - radius * np.sin(0.09))
     curve = measure(ndtr(distance / 0.8))
     truth = gaussian(0.8)
@@ -160,7 +161,7 @@ def test_a_curved_edge_is_followed():
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32])
-def test_integers_are_counts(dtype):
+def test_integer_images(dtype):
     counts = 200 * (draw_edge(5.0, 0.8) + 0.008 * np.random.default_rng(3).standard_normal((120, 80)))
     curve = measure(counts.round().astype(dtype))
     torch.testing.assert_close(curve.mtf, measure(counts).mtf, rtol=0, atol=2e-3)
@@ -180,9 +181,11 @@ def test_shot_noise_leaves_black_without_noise():
     assert float(curve.mtf50) == pytest.approx(mtf50_of(through_pixels(gaussian(0.8), 5.0)), rel=0.01)
 
 
-def test_a_curve_that_stays_above_half_has_no_mtf50():
+def test_mtf_above_one_half_has_no_mtf50():
     y, x = np.mgrid[:120, :80]
-    sharp = 0.1 + 0.8 * ndtr((x - 40 + 0.1 * (y - 60)) / math.hypot(1, 0.1) / 0.15)  # in points, not over pixels
+    sharp = 0.1 + 0.8 * ndtr(
+        (x - 40 + 0.1 * (y - 60)) / math.hypot(1, 0.1) / 0.15
+    )  # point samples without integration over pixels
     curve = measure(sharp)
     assert float(curve.at(0.5)) == pytest.approx(gaussian(0.15)(0.5), abs=0.02)
     assert math.isnan(float(curve.mtf50))
@@ -220,7 +223,7 @@ NOISE = 0.008 * np.random.default_rng(0).standard_normal((120, 80))
         (draw_edge(5.0, 0.5)[None], r"one grey image \(h, w\), got shape \(1, 120, 80\)"),
     ],
 )
-def test_what_cannot_be_measured_is_refused(image, message):
+def test_bad_input(image, message):
     with pytest.raises(ValueError, match=message):
         measure(image)
 

@@ -1,4 +1,4 @@
-"""Drawn scenes: shapes against fine supersampling, and what registration needs of a scene."""
+"""Generated scenes: shapes compared with supersampling, and the requirements of registration."""
 
 import math
 
@@ -16,8 +16,8 @@ SCENES = {
 }
 
 
-def seen_through_optics(inside, size, sigma, fine=9):
-    """A hard shape sampled ``fine`` times per px, blurred, and taken at the pixel centres."""
+def blurred_shape(inside, size, sigma, fine=9):
+    """A binary shape, sampled ``fine`` times per px, blurred, and evaluated at the pixel centres."""
     position = (np.arange(size * fine) - (fine - 1) / 2) / fine - size // 2
     hard = inside(position[None], position[:, None]).astype(np.float64)
     blurred = gaussian_filter(hard, sigma * fine, truncate=7)
@@ -29,7 +29,7 @@ def pixel_grid(size):
     return position[None], position[:, None]
 
 
-def test_a_turned_rectangle_is_exact_to_its_corners():
+def test_rotated_rectangle_is_exact_at_its_corners():
     angle, sigma = 0.3, 0.6
     drawn = rectangle(*rotated(*pixel_grid(41), angle), 9.3, 5.2, sigma).numpy()
 
@@ -37,7 +37,7 @@ def test_a_turned_rectangle_is_exact_to_its_corners():
         u, v = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
         return (abs(u) <= 9.3) & (abs(v) <= 5.2)
 
-    np.testing.assert_allclose(drawn, seen_through_optics(inside, 41, sigma), atol=0.004)
+    np.testing.assert_allclose(drawn, blurred_shape(inside, 41, sigma), atol=0.004)
 
 
 @pytest.mark.parametrize("frequency", [0.05, 0.21, 0.45])
@@ -55,11 +55,11 @@ def test_bars_keep_their_contrast_up_to_nyquist(frequency):
 def test_star_and_disc_against_supersampling():
     x, y = pixel_grid(61)
     drawn = sectors(x, y, 16, 0.6).numpy()
-    wanted = seen_through_optics(lambda x, y: (np.arctan2(y, x) * 8 / math.pi) % 1.0 < 0.5, 61, 0.6, fine=21)
+    wanted = blurred_shape(lambda x, y: (np.arctan2(y, x) * 8 / math.pi) % 1.0 < 0.5, 61, 0.6, fine=21)
     radius = np.hypot(*(t.numpy() for t in (x, y)))
     ring = (radius > 16 / math.pi + 2) & (radius < 27)
     assert np.abs(drawn - wanted)[ring].max() < 0.02
-    wanted = seen_through_optics(lambda x, y: np.hypot(x, y) <= 12.4, 61, 0.6, fine=21)
+    wanted = blurred_shape(lambda x, y: np.hypot(x, y) <= 12.4, 61, 0.6, fine=21)
     np.testing.assert_allclose(disc(x, y, 12.4, 0.6).numpy(), wanted, atol=0.02)
 
 
@@ -89,7 +89,7 @@ def test_scenes_are_band_limited(name):
     scene = SCENES[name](512, 512)
 
     def aliased(image):
-        """Share of the variance beyond 0.45 cycles/px along either axis, borders tapered."""
+        """Share of the variance beyond 0.45 cycles/px along either axis, with tapered borders."""
         taper = torch.hann_window(512)
         power = torch.fft.rfft2((image - image.mean()) * taper * taper[:, None]).abs().square()
         power[:, 1:-1] *= 2
@@ -100,7 +100,7 @@ def test_scenes_are_band_limited(name):
     assert aliased((scene > scene.median()).float()) > 5 * aliased(scene)
 
 
-def test_the_seed_decides_everything():
+def test_equal_seeds_give_equal_scenes():
     first = city_and_fields(200, 300, seed=1)
     assert torch.equal(first, city_and_fields(200, 300, seed=1))
     other = city_and_fields(200, 300, seed=2)
