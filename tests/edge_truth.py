@@ -1,4 +1,4 @@
-"""Slanted edges integrated exactly over square pixels, and their MTF, in NumPy and SciPy alone."""
+"""Slanted edges integrated exactly over square pixels, and their MTF, in NumPy and SciPy."""
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -7,9 +7,9 @@ from scipy.special import ndtr
 
 
 def draw_edge(angle, sigma, size=(120, 80), levels=(0.1, 0.9), offset=(0.3, -0.2)):
-    """Edge through Gaussian optics, ``angle`` degrees from the vertical, in the second of the two levels right.
+    """Edge blurred by Gaussian optics, ``angle`` degrees from the vertical; ``levels`` are those to its left and right.
 
-    Over the width of a pixel the integral is taken in closed form, over its height by 24 Gauss-Legendre nodes.
+    The integral over the width of a pixel is in closed form, that over its height has 24 Gauss-Legendre nodes.
     """
     cosine, sine = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
     y, x = (np.arange(n) - (n - 1) / 2 - o for n, o in zip(size, offset[::-1], strict=True))
@@ -41,7 +41,7 @@ def mtf50_of(mtf):
 
 
 def draw_edge_of(optics, angle, size=(120, 80), levels=(0.1, 0.9), offset=(0.3, 0.1)):
-    """Edge through optics of any transfer function, from the Fourier integral of its line spread function."""
+    """Edge blurred by optics with any transfer function, by the Fourier integral of the line spread function."""
     step, count = 1 / 64, 2**17
     frequency = np.fft.rfftfreq(count, step)
     cosine, sine = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))

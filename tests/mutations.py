@@ -1,4 +1,4 @@
-"""Randomly damaged files; reading them must give frames or a one-line error."""
+"""Randomly damaged files: reading them must return frames or raise a one-line error."""
 
 import json
 import random

@@ -1,4 +1,4 @@
-"""The config of the small stacks that tests go through; what comes behind is a test's own."""
+"""Configuration of the small test stacks; each test appends its own sections."""
 
 CAMERA = """
 [sensor]

@@ -30,7 +30,7 @@ STILL = crop(SCENE)
 
 
 def fork_server():
-    """A context in which processes start quickly, because the libraries are loaded once for all of them."""
+    """A multiprocessing context in which processes start quickly because libraries are loaded only once."""
     context = multiprocessing.get_context("forkserver")
     libraries = ["rsvib_torch.stacks", "scipy.ndimage", "scipy.interpolate", "h5py", "zarr", "pytest", "_pytest.config"]
     context.set_forkserver_preload(libraries)

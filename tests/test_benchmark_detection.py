@@ -1,4 +1,4 @@
-"""The benchmark of detection: its own camera against waves by hand, and one small run of it all."""
+"""The benchmark of detection: its camera compared with analytic waves, and one complete run at small size."""
 
 import argparse
 import sys
@@ -24,7 +24,7 @@ def scripts(monkeypatch):
 @pytest.mark.usefixtures("scripts")
 @pytest.mark.parametrize("exposure", [4.0, 55.0])
 @pytest.mark.parametrize("wave", [(7, 0), (0, 9), (-11, 20)])
-def test_camera_takes_waves_as_they_are(wave, exposure):
+def test_frames_of_the_camera_equal_the_integral_of_a_wave(wave, exposure):
     from benchmarks.independent_camera import Shake, take_frames
 
     height, width, size = 96, 80, (48, 40)
@@ -43,12 +43,12 @@ def test_camera_takes_waves_as_they_are(wave, exposure):
                 moved[axis] = moved[axis] + a * np.sin(2 * np.pi * f * times + phase)
         angle = (turn[1] * (rows[:, None] + 24 - moved[1]) - turn[0] * moved[0])[:, None, :]
         angle = angle + (turn[0] * (columns + 20))[None, :, None]
-        wanted = 0.5 + 0.3 * np.cos(angle).mean(-1)
-        np.testing.assert_allclose(frames[p], wanted, rtol=0, atol=3e-6)
+        expected = 0.5 + 0.3 * np.cos(angle).mean(-1)
+        np.testing.assert_allclose(frames[p], expected, rtol=0, atol=3e-6)
 
 
 @pytest.mark.usefixtures("scripts")
-def test_errors_are_those_of_the_tone_that_is_meant():
+def test_errors_refer_to_the_corresponding_tone():
     from benchmarks.detection import errors_of
     from benchmarks.independent_camera import Shake
 
@@ -64,7 +64,7 @@ def test_errors_are_those_of_the_tone_that_is_meant():
     np.testing.assert_allclose(errors["amplitude"][0], [-0.4, 0.4])
     np.testing.assert_allclose(errors["frequency"][0], [0.2, 0.1])
     np.testing.assert_allclose(errors["phase"][0], [2 * np.pi - 6.2, 0.1])
-    assert np.isnan(errors["amplitude"][1]).all()  # too far off: lost
+    assert np.isnan(errors["amplitude"][1]).all()  # error too large: not detected
 
 
 @pytest.mark.usefixtures("scripts")

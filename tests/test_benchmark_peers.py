@@ -1,4 +1,4 @@
-"""What the benchmark compares with does its work: peers against offsets, tones and frames that are known."""
+"""Libraries in the benchmark: their results compared with known offsets, tones and frames."""
 
 import sys
 from pathlib import Path
@@ -22,7 +22,7 @@ def scripts(monkeypatch):
 
 
 def shifted_pair(shift, size=(160, 192)):
-    """A smooth random image, and the same moved by ``shift`` (x, y) px by its Fourier transform."""
+    """A smooth random image, and the same image displaced by ``shift`` (x, y) px with the Fourier transform."""
     generator = np.random.default_rng(5)
     v, u = np.fft.fftfreq(size[0])[:, None], np.fft.rfftfreq(size[1])[None]
     spectrum = np.fft.rfft2(generator.standard_normal(size)) * np.exp(-0.5 * ((u**2 + v**2) / 0.2**2))
@@ -49,21 +49,21 @@ def test_peers_register_bands(name, tolerance):
     tops = [0, 16, 64, 96, 128]
     found = PEERS[name](frames, tops, 32)
     np.testing.assert_array_equal(frames, before)
-    assert np.isfinite(found[1:]).all()  # what the first band shows has left the frame
+    assert np.isfinite(found[1:]).all()  # the content of the first band is outside the other frame
     np.testing.assert_allclose(np.median(found[1:], axis=0), shift, rtol=0, atol=tolerance)
 
 
 def test_libraries_fit_tones():
     from benchmarks.library_chain import fit_axis
 
-    # mean displacements by brute force, not by a formula
-    def place(starts, amplitude, frequency, phase):
+    # mean displacements by numerical integration
+    def mean_position(starts, amplitude, frequency, phase):
         inside = (np.arange(2000) + 0.5) / 2000 * TIMING.exposure_time
         return (amplitude * np.sin(2 * np.pi * frequency * (starts[:, None] + inside) + phase)).mean(1)
 
     times = (np.arange(0, 2017, 16) + 15.5) * TIMING.row_time
     for amplitude, frequency, phase in ((3.1, 50.0, 0.7), (5.2, 30.0, -2.1), (0.4, 155.0, 1.5)):
-        offsets = [place(start, amplitude, frequency, phase) for start in (times, times + TIMING.frame_period)]
+        offsets = [mean_position(start, amplitude, frequency, phase) for start in (times, times + TIMING.frame_period)]
         offsets = offsets[1] - offsets[0] + np.random.default_rng(0).normal(0, 1e-4, len(times))
         found = fit_axis(times, offsets, TIMING)
         np.testing.assert_allclose(found[:2], (amplitude, frequency), rtol=1e-3)
@@ -73,12 +73,12 @@ def test_libraries_fit_tones():
 
 
 @pytest.fixture(scope="module")
-def taken():
+def scene_and_frames():
     scene = draw_scene(160 + 2 * MARGIN, 144 + 2 * MARGIN, seed=61)
     return crop(scene), take_frames(scene, TIMING, Motion(), 2, samples=64)
 
 
-def noisy(frames):
+def with_noise(frames):
     return (frames + 0.005 * np.random.default_rng(1).standard_normal(frames.shape)).astype(np.float32)
 
 
@@ -89,7 +89,7 @@ def test_kernels_of_rows_are_those_of_the_package():
     motion, rows = Motion().vibration(), torch.tensor([3, 40, 700])
     middles, kernels = slab_kernels(rows, TIMING, motion)
     shown_by = rows.double()
-    for _ in range(30):  # the row r that shows s: r = s + displacement of r
+    for _ in range(30):  # scene row s appears at row r = s + displacement of r
         shown_by = rows + motion.mean_displacement(shown_by * TIMING.row_time, TIMING.exposure_time)[:, 1]
     for row, shown, middle, kernel in zip(rows.tolist(), shown_by.tolist(), middles, kernels, strict=True):
         found = kernel_of_row(motion, shown * TIMING.row_time, TIMING, middle - row)
@@ -100,11 +100,11 @@ def test_kernels_of_rows_are_those_of_the_package():
 
 
 @pytest.mark.parametrize("index", [0, 1])
-def test_row_loops_and_unwarping_restore_either_frame(taken, index):
+def test_row_loops_and_unwarping_restore_either_frame(scene_and_frames, index):
     from benchmarks.restoration_peers import LOOPS, loop_rows, remap_lanczos
 
-    scene, frames = taken
-    frame, motion = noisy(frames)[index], Motion().vibration()
+    scene, frames = scene_and_frames
+    frame, motion = with_noise(frames)[index], Motion().vibration()
     unwarped = remap_lanczos(frame, TIMING, motion, index).restored.numpy()
     assert decibel(unwarped, scene, 24) > decibel(frame, scene, 24) + 8
     for name in LOOPS:
@@ -118,12 +118,12 @@ def test_row_loops_and_unwarping_restore_either_frame(taken, index):
         assert figure.setting
 
 
-def test_deepinv_forms_the_frame_and_restores_it(taken):
+def test_deepinv_forms_the_frame_and_restores_it(scene_and_frames):
     try:
         from benchmarks.deepinv_peer import frame_physics, tiled_restore
     except (ImportError, RuntimeError) as missing:
         pytest.skip(f"deepinv cannot be imported: {missing}")
-    scene, frames = taken
+    scene, frames = scene_and_frames
     motion = Motion().vibration()
     physics = frame_physics(scene.shape, TIMING, motion)
     top, left = ((size - 1) // 2 for size in physics.filters.shape[-2:])
@@ -131,5 +131,5 @@ def test_deepinv_forms_the_frame_and_restores_it(taken):
     seen = wide[MARGIN - top : len(wide) - MARGIN + top, MARGIN - left : wide.shape[1] - MARGIN + left]
     formed = physics.A(torch.from_numpy(seen).float()[None, None])[0, 0].numpy()
     assert decibel(formed, frames[0], 16) > 55
-    figure = tiled_restore(torch.from_numpy(noisy(frames)[0]), TIMING, motion, torch.from_numpy(scene), 24)
-    assert decibel(figure.restored.numpy(), scene, 24) > decibel(noisy(frames)[0], scene, 24) + 12
+    figure = tiled_restore(torch.from_numpy(with_noise(frames)[0]), TIMING, motion, torch.from_numpy(scene), 24)
+    assert decibel(figure.restored.numpy(), scene, 24) > decibel(with_noise(frames)[0], scene, 24) + 12

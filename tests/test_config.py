@@ -1,4 +1,4 @@
-"""Configuration files: the examples can be read, and every error is one line."""
+"""Configuration files: the examples are valid, and every error is one line."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The demonstration, with narrow frames: what it prints and writes, and that its figures meet the goals."""
+"""The demonstration with narrow frames: its output, files and figures, which must meet the goals."""
 
 import json
 import runpy
@@ -55,7 +55,7 @@ def test_files_are_those_of_the_command_line(demo, scene):
     timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
     kept = read_vibration(folder / "vibration.json", timing)
     torch.testing.assert_close(kept.vibration.amplitude[:, 0], torch.tensor([3.1, 5.2]).double(), rtol=0.02, atol=0)
-    # what the files hold gives the restored frames again, to the step of the 12-bit counts
+    # restoration from the files equals the restored frames up to rounding to 12-bit counts
     again = rsv.restore(frames, timing, kept.vibration)[:, 32:-32, 32:-32].clamp(0, 1)
     torch.testing.assert_close(again, restored[:, 32:-32, 32:-32], rtol=0, atol=0.6 / 4095)
     for picture in ("offsets.png", "before_after.png"):

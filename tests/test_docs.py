@@ -1,4 +1,4 @@
-"""The documentation: every page, public name and command is in the site; it builds without warnings."""
+"""The documentation contains every page, public name and command, and builds without warnings."""
 
 import importlib.util
 import re
@@ -60,7 +60,7 @@ def test_drawings_are_files_of_the_documentation(tmp_path):
     assert all(f"](drawings/{name})" in used for name in drawn)
 
 
-def test_links_out_of_the_site_are_plain_text(docs, tmp_path):
+def test_links_to_files_outside_the_site_are_plain_text(docs, tmp_path):
     (tmp_path / "method.md").touch()
     text = "[configs](configs) [the method](method.md#signs) [web](https://example.org) [lost](nowhere.md)"
     expected = "configs [the method](method.md#signs) [web](https://example.org) [lost](nowhere.md)"
@@ -81,5 +81,5 @@ def test_site_builds_without_a_warning(docs, tmp_path):
     assert "RollingShutterVibration" in page
     assert (tmp_path / "site" / "search" / "search_index.json").stat().st_size > 100_000
     home = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
-    assert not re.findall(r'<(?:script|link)[^>]*(?:src|href)="(?:https?:)?//', home)  # nothing from the network
+    assert not re.findall(r'<(?:script|link)[^>]*(?:src|href)="(?:https?:)?//', home)  # no resources from the network
     assert (tmp_path / "site" / "ml_pipeline" / "index.html").exists()

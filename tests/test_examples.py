@@ -1,4 +1,4 @@
-"""The example scripts in a quick form: they run, print, and reach what they promise."""
+"""The example scripts at small sizes: they run, print results, and reach the stated accuracy."""
 
 import re
 import runpy
@@ -27,7 +27,7 @@ def test_gradient_descent_refines_the_vibration(capsys):
     assert after < 0.2 * before
 
 
-def test_a_third_line_opens_what_two_are_blind_to(capsys):
+def test_third_line_makes_a_blind_frequency_measurable(capsys):
     printed = run("push_broom_jitter.py", ["--size", "448", "112"], capsys)
     truth, two, three = (line for line in printed.splitlines() if "px at" in line)
     assert "refused" in two
@@ -38,7 +38,7 @@ def test_a_third_line_opens_what_two_are_blind_to(capsys):
     assert blind > taken + 2
 
 
-def test_network_learns_behind_the_restorer(capsys):
+def test_network_after_the_restorer_is_trained(capsys):
     printed = run("train_behind_restorer.py", ["--steps", "25", "--batch", "6"], capsys)
     taken, restored, modelled = (float(value) for value in re.findall(r"(\S+) dB", printed))
     assert restored > taken + 2

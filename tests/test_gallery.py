@@ -1,4 +1,4 @@
-"""The gallery: every picture has its place on the page, and the quick ones are drawn."""
+"""The gallery: every picture is on the page, and those with short computations are drawn."""
 
 import runpy
 import sys
@@ -9,7 +9,7 @@ import cv2
 ROOT = Path(__file__).parents[1]
 
 
-def test_pictures_are_drawn_and_shown(tmp_path, monkeypatch):
+def test_pictures_are_drawn_and_on_the_page(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["gallery.py", "--out", str(tmp_path), "--only", "kernels", "training_data"])
     script = runpy.run_path(str(ROOT / "scripts" / "gallery.py"), run_name="gallery")
     script["main"]()

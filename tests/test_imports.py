@@ -1,4 +1,4 @@
-"""Imports run one way: between packages, between the parts of a package, and between modules (no cycles)."""
+"""Imports go downwards only: between packages, between the parts of a package, and between modules (no cycles)."""
 
 import ast
 import re
@@ -56,7 +56,7 @@ def layer_of(part, layers):
 def imported_modules(source, module):
     """Modules of rsvib_torch that a module imports anywhere in its file, with the line: [(line, dotted name)].
 
-    Functions, classes, ``if TYPE_CHECKING`` and ``try`` are searched as well, and imports by name.
+    Functions, classes, ``if TYPE_CHECKING`` and ``try`` are included, and imports by name.
     """
     package = module.split(".")
     found = []
@@ -113,7 +113,7 @@ def modules():
 
 
 @pytest.mark.parametrize(("path", "module"), [pytest.param(*both, id=both[1]) for both in modules()])
-def test_imports_run_one_way(path, module):
+def test_imports_go_downwards(path, module):
     assert wrong_imports(path.read_text(encoding="utf-8"), module) == []
 
 

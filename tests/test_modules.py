@@ -26,7 +26,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def frames(scene):
-    """A batch (2, 2, 1, 256, 160) of two stacks, each with a vibration of its own."""
+    """A batch (2, 2, 1, 256, 160) of two stacks with different vibrations."""
     stacks = [take_frames(scene, TIMING, motion, 2, 0.002, seed=seed) for seed, motion in enumerate(MOTIONS)]
     return torch.from_numpy(np.stack(stacks)[:, :, None]).float()
 
@@ -48,7 +48,7 @@ def blur():
 
 
 def modules(blur, vibration):
-    """Name, module, arguments for small frames."""
+    """Name, module and arguments for small frames."""
     small = torch.rand(2, 2, 1, 48, 40, generator=torch.Generator().manual_seed(1))
     yield "blur", blur, (small,)
     for method in METHODS:
@@ -56,7 +56,7 @@ def modules(blur, vibration):
 
 
 def test_batch_of_stacks_is_detected_and_restored(frames, vibration, scene):
-    """From frames to restored frames by the modules alone; a batch is the loop of its stacks."""
+    """From frames to restored frames with modules only; a batch equals its single stacks."""
     detector = rsv.VibrationDetector(TIMING, method="bands", tones=1)
     found = detector(frames)
     torch.testing.assert_close(found.vibration.amplitude, vibration.amplitude, rtol=0, atol=0.4)  # bands
@@ -96,8 +96,8 @@ def test_copies_and_state(blur, vibration):
     assert detector.options == {"method": "bands", "tones": 1}
 
 
-def test_deterministic_algorithms_suffice(blur, vibration):
-    """Nothing that a caller of ``use_deterministic_algorithms`` has refused is used, back and forth."""
+def test_only_deterministic_algorithms_are_used(blur, vibration):
+    """Forward and backward passes run with ``use_deterministic_algorithms`` and are reproducible."""
     torch.use_deterministic_algorithms(True)
     try:
         for name, module, (frames, *rest) in modules(blur, vibration):
@@ -111,8 +111,8 @@ def test_deterministic_algorithms_suffice(blur, vibration):
         torch.use_deterministic_algorithms(False)
 
 
-def test_state_of_the_blur_is_its_meaning(blur):
-    """Kernels for linear interpolation become those for cubic, with window and size, by loading the state."""
+def test_state_of_the_blur_is_complete(blur):
+    """Loading the state replaces linear by cubic kernels, including window and size."""
     scene = torch.rand(64, 60)
     options = {"frame_width": 40, "origin": (5, 7), "scene_size": (64, 60)}
     cubic = rsv.RowVaryingBlur(blur.psf, **options)
@@ -142,8 +142,8 @@ def test_half_precision_and_autocast(frames, vibration, blur):
         assert torch.equal(detector(frames[0]).vibration.amplitude, expected.amplitude)
 
 
-def test_compiler_leaves_one_break(blur, vibration):
-    """Around each module the model is compiled; the module itself runs as it is."""
+def test_compiled_models_have_one_graph_break(blur, vibration):
+    """The model is compiled before and after each module; the module itself is not compiled."""
     frames = torch.rand(2, 1, 48, 40, generator=torch.Generator().manual_seed(2))
     restorer = rsv.VibrationRestorer(TIMING, method="dewarp", check=False)
     motion = vibration[0]
@@ -155,7 +155,7 @@ def test_compiler_leaves_one_break(blur, vibration):
         return restorer(images * 2, motion) + 1
 
     for model in (blurred, restored):
-        torch.compile(model, backend="eager")(frames)  # at the first time there is one more break to prepare
+        torch.compile(model, backend="eager")(frames)  # the first call has one more graph break for preparation
         torch._dynamo.reset()
         explained = torch._dynamo.explain(model)(frames)
         assert (explained.graph_count, explained.graph_break_count) == (2, 1)
@@ -163,7 +163,7 @@ def test_compiler_leaves_one_break(blur, vibration):
 
 
 class Stacks(torch.utils.data.Dataset):
-    """Stacks that are detected and restored where they are loaded."""
+    """Stacks that are detected and restored in the process that loads them."""
 
     def __init__(self, frames):
         self.frames = frames
@@ -177,7 +177,7 @@ class Stacks(torch.utils.data.Dataset):
         return self.restorer(self.frames[index], self.detector(self.frames[index]).vibration)
 
 
-def test_workers_give_what_the_main_process_gives(frames):
+def test_workers_equal_the_main_process(frames):
     data = Stacks(frames)
     loader = torch.utils.data.DataLoader(data, batch_size=2, num_workers=2)
     torch.testing.assert_close(next(iter(loader)), torch.stack([data[0], data[1]]), rtol=0, atol=1e-6)
@@ -212,7 +212,7 @@ def test_gradients_reach_frames_and_vibration(method):
 
 
 def test_no_gradient_through_detection(frames):
-    """Frames from a layer that learns are detected and restored; its gradient is that of the restoration alone."""
+    """Frames from a trainable layer are detected and restored; its gradient is that of the restoration only."""
     images = frames[0].clone().requires_grad_()
     found = rsv.VibrationDetector(TIMING, method="bands", tones=1)(images).vibration
     assert not found.amplitude.requires_grad
@@ -228,10 +228,10 @@ def unit(kind, axis):
 
 
 def test_blur_is_the_linear_operator_of_a_solver():
-    """Least squares by conjugate gradients that know ``A`` and ``A_adjoint`` only brings the scene back."""
+    """Least squares by conjugate gradients, with only ``A`` and ``A_adjoint``, recovers the scene."""
     generator = torch.Generator().manual_seed(6)
     truth = torch.rand(1, 1, 72, 64, generator=generator, dtype=torch.float64)
-    truth = torch.nn.functional.avg_pool2d(truth, 9, 1)  # 64 rows, of which the frame shows 48
+    truth = torch.nn.functional.avg_pool2d(truth, 9, 1)  # 64 rows; the frame has 48
     short = rsv.SensorTiming(row_time=40e-6, exposure_rows=8, frame_rows=320)
     starts = short.row_starts(1, 48)[0]
     psf = rsv.row_psf(MOTIONS[0].vibration(), starts, short, interpolation="cubic", quadrature="gauss")
@@ -247,13 +247,13 @@ def test_blur_is_the_linear_operator_of_a_solver():
         energy, previous = residual.square().sum(), energy
         direction = residual + energy / previous * direction
     inner = (..., slice(8, -8), slice(8, -8))
-    seen = (..., slice(8, -8), slice(None))  # of the scene: the rows of the frame
+    seen = (..., slice(8, -8), slice(None))  # scene rows within the frame
     before, after = ((image - truth[seen])[inner].square().mean().sqrt() for image in (measured, scene[seen]))
     assert before > 0.01
     assert after < 0.1 * before
 
 
-def test_blur_is_a_physics_of_deepinv():
+def test_blur_is_a_valid_physics_of_deepinv():
     try:
         from deepinv.physics import LinearPhysics
     except (ImportError, RuntimeError) as missing:
@@ -274,7 +274,7 @@ def test_blur_is_a_physics_of_deepinv():
     assert after < 0.1 * before
 
 
-def strange_arrays(frames):
+def array_variants(frames):
     readonly = frames.copy()
     readonly.flags.writeable = False
     field = np.zeros(frames.shape, dtype=[("pixel", "f4"), ("flag", "u1")])
@@ -289,20 +289,20 @@ def strange_arrays(frames):
     }
 
 
-def test_arrays_are_as_good_as_tensors(frames, vibration):
+def test_arrays_equal_tensors(frames, vibration):
     tensor = frames[0, :, 0]
     restored = rsv.restore(tensor, TIMING, vibration[0], method="dewarp")
     amplitude = rsv.detect_vibration(tensor, TIMING, method="bands", tones=1).vibration.amplitude
-    for name, array in strange_arrays(tensor.numpy()).items():
+    for name, array in array_variants(tensor.numpy()).items():
         kept = array.copy()
-        # Not bit for bit: an array may begin where vector instructions pair other pixels.
+        # Not bit for bit: alignment of an array changes which pixels a vector instruction combines.
         again = rsv.restore(array, TIMING, vibration[0], method="dewarp")
         torch.testing.assert_close(again, restored, rtol=0, atol=1e-5, msg=name)
         found = rsv.detect_vibration(array, TIMING, method="bands", tones=1).vibration.amplitude
         torch.testing.assert_close(found, amplitude, rtol=1e-4, atol=1e-6, msg=name)
         agreement = rsv.psnr(array, tensor.numpy() + np.float32(0.1), 1.0)
         torch.testing.assert_close(agreement, rsv.psnr(tensor, tensor + 0.1, 1.0), rtol=1e-5, atol=0, msg=name)
-        np.testing.assert_array_equal(array, kept)  # nothing is written into what was lent
+        np.testing.assert_array_equal(array, kept)  # the input is not modified
     ignored = np.zeros(tensor.shape, dtype=bool)
     ignored[:, 20:30, 40:50] = True
     torch.testing.assert_close(
@@ -312,8 +312,8 @@ def test_arrays_are_as_good_as_tensors(frames, vibration):
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, ">u2", np.float32, np.float64, np.float16])
-def test_there_and_back_loses_nothing(frames, vibration, dtype):
-    """What comes in as an array leaves as an array of the same values, shape and, for floats, dtype."""
+def test_arrays_keep_values_shape_and_dtype(frames, vibration, dtype):
+    """Without motion, restored arrays have the values, shape and, for floats, dtype of the input."""
     array = (frames[0, :, 0].numpy() * (1 if np.dtype(dtype).kind == "f" else 255)).astype(dtype)
     still = rsv.Vibration.still()
     scale = None if np.dtype(dtype).kind == "f" else 255.0
@@ -327,7 +327,7 @@ def test_there_and_back_loses_nothing(frames, vibration, dtype):
     assert torch.equal(numbers.phase, vibration.phase)
 
 
-def test_what_is_no_array_is_named():
+def test_values_that_are_not_arrays_are_refused():
     for value in ("frames", np.array(["a", "b"]), np.zeros((2, 2), dtype=object)):
         with pytest.raises(TypeError, match=r"frames must be a tensor or array of numbers, got (str|ndarray)"):
             rsv.restore(value, TIMING, rsv.Vibration.still())

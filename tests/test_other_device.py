@@ -1,11 +1,11 @@
-"""All that works on tensors keeps to the device that they are on: shown on one that is not there."""
+"""Computations stay on the device of their tensors: tested on a simulated GPU."""
 
 import threading
 from dataclasses import replace
 
 import pytest
 import torch
-from elsewhere import ELSEWHERE, Elsewhere, NotHereError, elsewhere
+from simulated_gpu import SIMULATED_GPU, DeviceError, SimulatedGpuTensor, simulated_gpu
 
 import rsvib_torch as rsv
 from rsvib_torch.core.precision import full_precision
@@ -26,7 +26,7 @@ def frames(timing=TIMING):
     return (taken + 0.003 * torch.randn(taken.shape, generator=generator)).clamp(0.0, 1.0)
 
 
-def with_holes(images):
+def with_missing(images):
     images = images.clone()
     images[0, 30:38, 40:60] = torch.nan
     return images
@@ -77,7 +77,7 @@ WORK = {
         rsv.detect_vibration(images, timing, registration="projection").vibration
     ),
     "detect, few columns": lambda images, timing: rsv.detect_vibration(images, timing, columns=100).vibration,
-    "detect, holes": lambda images, timing: rsv.detect_vibration(with_holes(images), timing).vibration,
+    "detect, holes": lambda images, timing: rsv.detect_vibration(with_missing(images), timing).vibration,
     "detect, batch": lambda images, timing: rsv.detect_vibration(images[None].expand(2, -1, -1, -1), timing).vibration,
     "free": lambda images, timing: rsv.detect_vibration(images, timing, model="free").motion,
     "swept": lambda images, timing: rsv.detect_vibration(images, timing, model="swept").amplitude,
@@ -87,7 +87,7 @@ WORK = {
     "exact, long exposures": lambda images, timing: rsv.restore(images, timing, SHAKE),
     "joint": lambda images, timing: rsv.restore(images, timing, SHAKE, joint=True),
     "edges": lambda images, timing: rsv.restore(images, timing, SHAKE, prior="edges"),
-    "holes": lambda images, timing: rsv.restore(with_holes(images), timing, SHAKE),
+    "holes": lambda images, timing: rsv.restore(with_missing(images), timing, SHAKE),
     "saturated": lambda images, timing: rsv.restore(images.clamp(max=0.6), timing, SHAKE, saturation=0.6),
     "counts": lambda images, timing: rsv.restore((images * 255).byte(), timing, SHAKE),
     "colour, batch": lambda images, timing: rsv.restore(images[None, :, None].expand(2, -1, 3, -1, -1), timing, SHAKE),
@@ -113,39 +113,39 @@ def test_results_stay_on_the_device_and_are_those_of_the_cpu(name):
     timing = LONG if "long" in name else TIMING
     images = frames(timing)
     here = numbers(WORK[name](images, timing))
-    with elsewhere():
-        there = numbers(WORK[name](images.to(ELSEWHERE), timing))
+    with simulated_gpu():
+        there = numbers(WORK[name](images.to(SIMULATED_GPU), timing))
     assert here
     assert here.keys() == there.keys()
     for key, expected in here.items():
-        assert isinstance(there[key], Elsewhere), f"{key} came back to the CPU"
+        assert isinstance(there[key], SimulatedGpuTensor), f"{key} came back to the CPU"
         found = there[key].as_subclass(torch.Tensor)
         scale = max(1.0, float(expected.detach().double().nan_to_num().abs().amax()))
         torch.testing.assert_close(found, expected, rtol=0.0, atol=TOLERANCE * scale, equal_nan=True)
 
 
 @pytest.mark.parametrize("model", ["vibration", "motion"])
-def test_modules_move_with_their_frames(model):
+def test_modules_compute_on_the_device_of_their_frames(model):
     images = frames()
     module = rsv.VibrationRestorer(TIMING, method="dewarp")
     motion = SHAKE if model == "vibration" else rsv.FreeMotion(torch.zeros(2, 40), 0.0, 0.01, SHAKE)
-    with elsewhere():
-        restored = module(images.to(ELSEWHERE), motion)
-    assert isinstance(restored, Elsewhere)
+    with simulated_gpu():
+        restored = module(images.to(SIMULATED_GPU), motion)
+    assert isinstance(restored, SimulatedGpuTensor)
     torch.testing.assert_close(restored.as_subclass(torch.Tensor), module(images, motion), rtol=0, atol=1e-5)
 
 
 @pytest.mark.filterwarnings("ignore::rsvib_torch.RestorationWarning")
 @pytest.mark.parametrize("name", ["exact", "dewarp", "richardson-lucy", "gradient", "register"])
-def test_the_device_is_not_waited_for_row_by_row(name):
-    def waits(size):
+def test_synchronisations_do_not_grow_with_the_rows(name):
+    def count_synchronisations(size):
         timing = replace(TIMING, frame_rows=size)
         images = frames(timing)
-        with elsewhere() as device:
-            WORK[name](images.to(ELSEWHERE), timing)
-        return sum(device.waits.values())
+        with simulated_gpu() as device:
+            WORK[name](images.to(SIMULATED_GPU), timing)
+        return sum(device.synchronisations.values())
 
-    assert waits(256) <= waits(128) + 4
+    assert count_synchronisations(256) <= count_synchronisations(128) + 4
 
 
 REFUSED = {
@@ -153,7 +153,7 @@ REFUSED = {
     "in place": lambda here, there: there.add_(here),
     "stack": lambda here, there: torch.stack([here[0], there[0]]),
     "numbers in a stack": lambda here, there: torch.stack([here.sum(), there.sum()]),
-    "index elsewhere": lambda here, there: here[there.long()],
+    "index on the device": lambda here, there: here[there.long()],
     "gather": lambda here, there: there.gather(0, here.long()),
     "value": lambda here, there: there.__setitem__(slice(0, 2), here[:2]),
     "NumPy": lambda here, there: there.numpy(),
@@ -162,23 +162,23 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_the_device_refuses_what_a_gpu_refuses(name):
+def test_the_simulated_device_refuses_what_a_gpu_refuses(name):
     here = torch.arange(4.0)
-    with elsewhere(), pytest.raises(NotHereError):
-        REFUSED[name](here, here.to(ELSEWHERE))
+    with simulated_gpu(), pytest.raises(DeviceError):
+        REFUSED[name](here, here.to(SIMULATED_GPU))
 
 
-def test_the_device_is_a_device():
+def test_the_simulated_device_behaves_like_a_device():
     here = torch.arange(4.0)
-    with elsewhere() as device:
-        there = here.to(ELSEWHERE)
-        assert there.device == ELSEWHERE
-        assert torch.zeros(2, device=there.device).device == ELSEWHERE
-        assert there.new_zeros(2).device == there[1:].device == (2 * there).device == ELSEWHERE
+    with simulated_gpu() as device:
+        there = here.to(SIMULATED_GPU)
+        assert there.device == SIMULATED_GPU
+        assert torch.zeros(2, device=there.device).device == SIMULATED_GPU
+        assert there.new_zeros(2).device == there[1:].device == (2 * there).device == SIMULATED_GPU
         assert here.device.type == there.cpu().device.type == torch.zeros(2).device.type == "cpu"
         assert there[torch.tensor([0, 2])].tolist() == [0.0, 2.0]
         assert float(there.sum()) == 6.0
-    assert device.waits == {"tolist": 1, "__float__": 1}
+    assert device.synchronisations == {"tolist": 1, "__float__": 1}
 
 
 def formats():
@@ -188,14 +188,14 @@ def formats():
 
 @pytest.fixture
 def short_products():
-    """A program that allows float32 products in shorter formats."""
+    """Allow float32 products in formats of lower precision."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("medium")
     yield
     torch.set_float32_matmul_precision(before)
 
 
-def test_products_keep_their_digits_and_the_program_its_settings(short_products):
+def test_products_have_full_precision_and_settings_are_restored(short_products):
     allowed = formats()
     assert allowed != ["ieee"] * 3
     assert full_precision(formats)() == ["ieee"] * 3
@@ -210,7 +210,7 @@ def test_products_keep_their_digits_and_the_program_its_settings(short_products)
     assert torch.get_float32_matmul_precision() == "medium"
 
 
-def test_threads_that_overlap_give_the_settings_back(short_products):
+def test_overlapping_threads_restore_the_settings(short_products):
     allowed, begun, ended = formats(), threading.Event(), threading.Event()
 
     def long():

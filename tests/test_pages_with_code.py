@@ -67,7 +67,7 @@ def test_quick_start_page(tmp_path, monkeypatch, capsys):
 
 
 def test_recipes_of_the_architecture_page(tmp_path, monkeypatch):
-    """A toy registration method, prior and file format are added by the recipes, used, and removed."""
+    """The recipes add a minimal registration method, prior and file format, which are used and removed."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(formats, "FORMATS", dict(formats.FORMATS))
     tables = [(BAND_METHODS, dict(BAND_METHODS)), (PRIORS, dict(PRIORS))]

@@ -1,4 +1,4 @@
-"""The reproduction: its camera against waves by hand, its MTF against formulas, its book-keeping, and a tiny run."""
+"""The reproduction: its camera compared with analytic waves, its MTF with formulas, its statistics, and a small run."""
 
 import json
 import math
@@ -26,7 +26,7 @@ def scripts(monkeypatch):
 @pytest.mark.usefixtures("scripts")
 @pytest.mark.parametrize("wave", [(9, 0), (0, 11), (-40, 31)])
 @pytest.mark.parametrize("row_time", [2e-4, 0.0])
-def test_camera_samples_waves_where_they_are(wave, row_time):
+def test_frames_of_the_camera_equal_the_integral_of_a_wave(wave, row_time):
     from benchmarks.independent_camera import Shake, fine_rows
     from reproduction.camera import PITCH, Scene, take_frames
 
@@ -53,8 +53,8 @@ def test_camera_samples_waves_where_they_are(wave, row_time):
         place = [down + PITCH * (rows[:, None] - moved[1]), across - PITCH * moved[0]]
         angle = (turn[1] * place[0] + turn[0] * place[1])[:, None, :]
         angle = angle + (turn[0] * PITCH * columns)[None, :, None]
-        wanted = 0.5 + 0.3 * np.cos(angle).mean(-1)
-        np.testing.assert_allclose(frames[p], wanted, rtol=0, atol=3e-5)
+        expected = 0.5 + 0.3 * np.cos(angle).mean(-1)
+        np.testing.assert_allclose(frames[p], expected, rtol=0, atol=3e-5)
         assert np.abs(frames[p] - still).max() > 0.02
 
 
@@ -76,7 +76,7 @@ def test_straight_edge_mtf(angle):
 
 
 @pytest.mark.usefixtures("scripts")
-def test_errors_have_their_sign_and_wrap():
+def test_errors_are_signed_and_phases_wrapped():
     from reproduction.targets import shake_of
     from reproduction.trials import detection_values
 
@@ -94,7 +94,7 @@ def test_errors_have_their_sign_and_wrap():
 
 
 @pytest.mark.usefixtures("scripts")
-def test_cells_count_the_worst_trial():
+def test_cells_contain_the_worst_trial():
     from reproduction.cells import Cell, Spread, spread
 
     assert spread([0.1, 0.4], higher_is_better=False) == Spread(0.25, 0.4)
@@ -109,7 +109,7 @@ def test_cells_count_the_worst_trial():
 
 
 @pytest.mark.usefixtures("scripts")
-def test_the_papers_percentages_are_those_of_its_values():
+def test_percentages_of_the_paper_agree_with_its_values():
     from reproduction.paper import AMPLITUDE, DETECTED, PERIOD, RESTORED
 
     for lines in DETECTED.values():
@@ -123,7 +123,7 @@ def test_the_papers_percentages_are_those_of_its_values():
 
 
 @pytest.mark.usefixtures("scripts")
-def test_a_tiny_run(tmp_path, capsys):
+def test_small_run(tmp_path, capsys):
     import reproduce
 
     out = tmp_path / "reproduction"
@@ -156,7 +156,7 @@ def test_a_tiny_run(tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("scripts")
-def test_the_quick_form(tmp_path):
+def test_quick_option(tmp_path):
     import reproduce
 
     reproduce.main(["--quick", "--out", str(tmp_path)])

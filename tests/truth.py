@@ -1,7 +1,7 @@
-"""Truth for tests, made without the package: scenes, motion and frames in NumPy float64.
+"""Ground truth for tests, independent of the package: scenes, motion and frames in NumPy float64.
 
-Displacement along rows is a Fourier shift of a scene larger than the frame, across rows a quintic spline with
-SciPy's prefilter, and the exposure a plain midpoint sum.
+Displacement along rows is a Fourier shift of a scene larger than the frame, displacement across rows a quintic spline
+with the prefilter of SciPy, and the exposure a midpoint sum.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ MARGIN = 40
 
 @dataclass(frozen=True)
 class Motion:
-    """One tone an axis (x, y) and a uniform image motion; its own formula for the displacement."""
+    """One tone per axis (x, y) and uniform image motion, with an independent formula for the displacement."""
 
     amplitude: tuple[float, float] = (3.1, 5.2)
     frequency: tuple[float, float] = (50.0, 30.0)
@@ -39,7 +39,7 @@ class Motion:
 
 
 def draw_scene(height: int, width: int, seed: int, blur: float = 0.8) -> Array:
-    """Fractal ground with bright and dark buildings under Gaussian optics, values within 0 ... 1."""
+    """Fractal ground with bright and dark buildings, blurred by Gaussian optics, values within 0 ... 1."""
     generator = np.random.default_rng(seed)
     v, u = np.meshgrid(np.fft.fftfreq(height), np.fft.rfftfreq(width), indexing="ij")
     spectrum = np.fft.rfft2(generator.standard_normal((height, width))) / np.hypot(np.hypot(u, v), 2e-3) ** 1.1
@@ -89,11 +89,11 @@ def take_frames(
 
 
 def crop(scene: Array, margin: int = MARGIN) -> Array:
-    """The part of the scene that frames of a still camera would show."""
+    """The part of the scene in frames of a camera at rest."""
     return scene[margin:-margin, margin:-margin]
 
 
 def decibel(image: Array, truth: Array, rim: int = 32) -> float:
-    """PSNR in dB for full scale 1, without a rim."""
+    """PSNR in dB for full scale 1, excluding a rim."""
     error = (np.asarray(image, dtype=np.float64) - truth)[..., rim:-rim, rim:-rim]
     return float(-10 * np.log10(np.mean(error**2)))

@@ -17,7 +17,7 @@ def two_threads():
 
 
 def test_items_are_processed_in_parallel(two_threads):
-    both = threading.Barrier(2, timeout=20)  # two calls at once, or it breaks
+    both = threading.Barrier(2, timeout=20)  # requires two simultaneous calls, otherwise it breaks
 
     def work(item):
         both.wait()

@@ -21,7 +21,7 @@ def noise(*shape, seed=0):
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_weights_are_scipys_splines(degree):
+def test_weights_equal_those_of_scipy(degree):
     fraction = np.linspace(0, 1, 11)[:-1]
     basis = BSpline.basis_element(np.arange(degree + 2) - (degree + 1) / 2, extrapolate=False)
     taps = np.arange(degree + 1) - degree // 2
@@ -34,7 +34,7 @@ def test_weights_are_scipys_splines(degree):
 @pytest.mark.parametrize("degree", [3, 5])
 @pytest.mark.parametrize("length", [2, 7, 40])
 @pytest.mark.parametrize("dim", [-1, -2])
-def test_coefficients_are_scipys_prefilter(degree, length, dim):
+def test_coefficients_equal_those_of_scipy(degree, length, dim):
     samples = noise(length, 6) if dim == -2 else noise(6, length)
     expected = ndimage.spline_filter1d(samples.numpy(), order=degree, axis=dim, mode="mirror")
     found = bspline_coefficients(samples, degree, dim).numpy()

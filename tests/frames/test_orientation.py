@@ -22,7 +22,7 @@ def timing(scan_axis, direction):
 
 @pytest.mark.parametrize(("scan_axis", "direction"), ORIENTATIONS)
 def test_rows_in_read_order(scan_axis, direction):
-    """The row that is read first comes first, whole."""
+    """The row that is read first is the first row of the frame."""
     image = torch.arange(12.0).reshape(3, 4)
     rows = frames_to_row_order(image, timing(scan_axis, direction))
     index = -1 if direction == "reverse" else 0

@@ -114,7 +114,7 @@ def test_orientation(scan_axis, direction):
 
 
 def test_default_frame_has_a_margin():
-    """The margin is 16 px and the amplitude on every side."""
+    """The margin on every side is 16 px plus the amplitude."""
     scene = torch.from_numpy(draw_scene(140, 140, 4))
     frames = simulate_frames(scene, TIMING, Vibration([3.0, 5.0], [50.0, 30.0]))
     assert frames.shape == (2, 140 - 2 * 21, 140 - 2 * 19)

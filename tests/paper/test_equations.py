@@ -59,7 +59,7 @@ def test_equation_4_with_its_sign(amplitude, frequency, phase):
 
 @pytest.mark.parametrize(("amplitude", "frequency", "phase"), CASES[:3])
 def test_equations_6_to_8_invert_the_offsets(amplitude, frequency, phase):
-    """Amplitude and phase come back from the offset curve, positive gain or negative."""
+    """Amplitude and phase are recovered from the offset curve, for positive and negative gain."""
     ends = ROWS[::8] * CAMERA.row_time + CAMERA.exposure_time
     offset = integral(amplitude, frequency, phase, ends + CAMERA.frame_period) - integral(
         amplitude, frequency, phase, ends

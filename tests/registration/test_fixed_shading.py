@@ -1,4 +1,4 @@
-"""A scanned eye: tissue that moves under a fixed vignette and speckle; offsets must be those of the tissue."""
+"""Images of a scanned eye: tissue moves under fixed vignetting and speckle; offsets must be those of the tissue."""
 
 import numpy as np
 import pytest

@@ -10,7 +10,7 @@ from rsvib_torch import SensorTiming, register_bands
 from rsvib_torch.registration.methods import BAND_METHODS, Registration
 
 METHODS = get_args(Registration)
-# rms error in px along the rows and along the scan, good bands only; the offsets are 1.4 and 5 px rms
+# RMS error in px along the rows and along the scan axis, valid bands only; the offsets are 1.4 and 5 px RMS
 RMS = {"projection": (0.08, 0.8), "ncc": (0.03, 0.08), "phase": (0.025, 0.04)}
 
 
@@ -23,7 +23,7 @@ def float_frames(frames):
 
 
 def true_offsets(curve, timing, motion):
-    """Offsets (P, N, 2) by Eqs. (1), (2), integrated numerically, at the rows where the content went."""
+    """Offsets (P, N, 2) by Eqs. (1), (2), integrated numerically, at the rows to which the content moves."""
     steps = (np.arange(64) + 0.5) / 64 * timing.exposure_time
 
     def mean(times):
@@ -110,7 +110,7 @@ def test_push_scan_shift_of_hundreds_of_pixels(method, shift):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_failed_bands(method):
-    """Bands without texture are NaN with quality 0; the others stay good."""
+    """Bands without texture are NaN with quality 0; the others remain valid."""
     timing = SensorTiming(row_time=10e-6, exposure_rows=10, frame_rows=1024)
     frame = torch.from_numpy(draw_scene(1024, 256, 2)).float()
     flat = slice(256, 640)
@@ -132,7 +132,7 @@ def test_failed_bands(method):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("axis", [-1, -2])
 def test_peak_at_the_edge_of_the_search_range_fails(method, axis):
-    """Half the frame moves by more than the search range about the other half: never an offset at the edge."""
+    """Half of the frame moves by more than the search range: no band has an offset at the edge of the range."""
     timing = SensorTiming(row_time=10e-6, exposure_rows=10, frame_rows=1024)
     scene = torch.from_numpy(draw_scene(1100, 360, 3)).float()
     first = scene[40:1064, 40:320]

@@ -219,9 +219,9 @@ def test_colour_integers_and_missing_pixels_are_judged(scene):
     counts = (grey.clamp(0, 1) * 4095).round().to(torch.int32)
     restored = restore(counts, timing, motion.vibration(), full_scale=4095)
     assert judge_restoration(counts, restored, timing, motion.vibration(), full_scale=4095).overall == "helps"
-    spoiled = grey.clone()
-    spoiled[0, 100:103, 50:53] = math.nan
-    assert judged(spoiled, timing, motion.vibration())[0].overall == "helps"
+    with_missing = grey.clone()
+    with_missing[0, 100:103, 50:53] = math.nan
+    assert judged(with_missing, timing, motion.vibration())[0].overall == "helps"
 
 
 def test_noise_gain_is_that_of_the_operator(scene):

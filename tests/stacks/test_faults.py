@@ -319,12 +319,12 @@ def test_run_stops_if_the_input_is_removed_and_can_be_resumed(whole, tmp_path):
         (tmp_path / "in").mkdir(exist_ok=True)
         tifffile.imwrite(tmp_path / "in" / f"{index:02d}.tif", frame, photometric="minisblack", metadata=None)
 
-    def vanish(done, total):
+    def remove_input(done, total):
         if done == 4:
             (tmp_path / "in" / "12.tif").rename(tmp_path / "gone.tif")
 
     with pytest.raises(FileNotFoundError, match=r"12\.tif"):
-        process_small(tmp_path / "in", tmp_path / "out.npy", progress=vanish)
+        process_small(tmp_path / "in", tmp_path / "out.npy", progress=remove_input)
     assert not (tmp_path / "out.npy").exists()
     (tmp_path / "gone.tif").rename(tmp_path / "in" / "12.tif")
     report = process_small(tmp_path / "in", tmp_path / "out.npy", resume=True)
