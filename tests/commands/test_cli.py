@@ -49,7 +49,7 @@ read_noise = 0.003
 
 @pytest.fixture(scope="module", name="place")
 def make_place(tmp_path_factory):
-    """A folder with a config, a scene, and the frames that the camera takes of it."""
+    """A folder with a config, a scene, and simulated frames."""
     folder = tmp_path_factory.mktemp("camera")
     (folder / "camera.toml").write_text(CONFIG)
     texture = torch.rand(1, 1, 512, 320, generator=torch.Generator().manual_seed(11))
@@ -379,7 +379,7 @@ BAD_INPUT = {
 
 @pytest.mark.parametrize("case", BAD_INPUT)
 @pytest.mark.parametrize("command", ["detect", "run"])
-def test_bad_input_is_one_line_and_leaves_nothing(place, tmp_path, capfd, case, command):
+def test_errors_of_bad_input_are_one_line_and_leave_no_files(place, tmp_path, capfd, case, command):
     make, message = BAD_INPUT[case]
     frames, config = make(place, tmp_path)
     before = sorted(tmp_path.rglob("*"))

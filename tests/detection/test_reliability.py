@@ -68,7 +68,7 @@ def missing(count):
         ({"amplitude": 24.0, "frequency": 30.0}, None),
     ],
 )
-def test_reasons_against_a_tone(options, reason):
+def test_reasons_for_an_unreliable_tone(options, reason):
     reliable, reasons = verdict(**options)
     assert reliable.tolist()[0] == (reason is None), reasons
     if reason is not None:
@@ -78,7 +78,7 @@ def test_reasons_against_a_tone(options, reason):
 @pytest.mark.parametrize(
     ("unexplained", "slant", "expected"), [(0.02, 0.02, 0), (0.3, 0.0, 1), (0.0, 0.3, 1), (0.3, 0.3, 2)]
 )
-def test_other_motion_counts_against_the_axis(unexplained, slant, expected):
+def test_residual_motion_makes_an_axis_unreliable(unexplained, slant, expected):
     other = OtherMotion(torch.tensor([unexplained, 0.0]), torch.tensor([slant, 0.0]))
     reliable, reasons = verdict(other_motion=other)
     assert len(reasons[0]) == expected

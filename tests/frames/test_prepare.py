@@ -21,7 +21,7 @@ def sensor(scan_axis=-2, direction="forward"):
 @pytest.mark.parametrize(("scan_axis", "direction"), ORIENTATIONS)
 @pytest.mark.parametrize("shape", LAYOUTS)
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
-def test_there_and_back(shape, scan_axis, direction, dtype):
+def test_round_trip(shape, scan_axis, direction, dtype):
     frames = torch.rand(shape, dtype=torch.float64).to(dtype)
     prepared = prepare_frames(frames, sensor(scan_axis, direction))
     height, width = (5, 7) if scan_axis == -2 else (7, 5)
@@ -99,7 +99,7 @@ def test_bad_input(options, error, message):
         prepare_frames(arguments.pop("frames"), arguments.pop("timing"), **arguments)
 
 
-def test_float_frames_are_left_alone():
+def test_float_frames_are_not_scaled():
     for dtype in (torch.float16, torch.float32, torch.float64):
         frames = torch.rand(2, 4, 5, dtype=torch.float64).to(dtype) * 300 - 7
         assert as_float_frames(frames) is frames

@@ -78,7 +78,7 @@ def test_commands_use_and_keep_the_times_of_the_file(place):
 
 
 def test_without_its_times_the_stack_is_not_restored(place):
-    """Shows that the test above depends on the times."""
+    """The preceding test depends on the times."""
     frames = rsv.read_stack(place / "frames.raw")
     found = rsv.detect_vibration(frames, TIMING, method="bands", band_rows=16, band_step=8, search=6, tones=1)
     restored = rsv.restore(frames, TIMING, found.vibration, method="dewarp", check=False).numpy()

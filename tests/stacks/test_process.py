@@ -173,7 +173,7 @@ def test_window_without_two_usable_frames_is_written_unchanged(place, tmp_path):
         assert record.error.startswith(f"frame {frame} is constant")
 
 
-def test_stack_in_which_nothing_can_be_detected_leaves_nothing(tmp_path):
+def test_stack_without_detection_leaves_no_files(tmp_path):
     np.save(tmp_path / "frames.npy", np.full((40, 64, 64), 9, np.uint8))
     with pytest.raises(ValueError, match="frame 0 is constant"):
         rsv.process_stack(tmp_path / "frames.npy", tmp_path / "new" / "deep" / "out.npy", TIMING, window=3)
