@@ -61,7 +61,7 @@ def test_gradients(dtype):
 
 
 @pytest.mark.parametrize("width", [0, 2])
-def test_stored_factors_solve_other_right_sides(width):
+def test_stored_factors_give_the_same_solution(width):
     band, right_side = random_system(7, width)
     factor = factor_banded(skew_band(band))
     expected = solve_banded(band, right_side)
