@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from benchmarks.independent_camera import Shake, closed, take_frames
+from benchmarks.measure import one_thread
 from benchmarks.restoration import FADE, MARGIN, RIM, SEED, camera, scenes, vibration
 from torch import Tensor
 
@@ -80,7 +81,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     """PSNR with the regularisation from the data and with the best factor, for all scenes and cases."""
-    return [row for name, scene in scenes(options).items() for row in losses(name, scene, options)]
+    with one_thread():
+        return [row for name, scene in scenes(options).items() for row in losses(name, scene, options)]
 
 
 def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from benchmarks.measure import one_thread
 from scipy.special import j1
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
@@ -131,12 +132,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Errors of the MTF and of MTF50 for all optics."""
     fewer = max(options.seeds // 5, 1)
-    return [
-        *(gaussian_row(sigma, options.seeds) for sigma in SIGMAS),
-        *(other_row(name, fewer) for name in OTHERS),
-        eight_bits(0.0, 1),
-        eight_bits(1.0, fewer),
-    ]
+    with one_thread():
+        return [
+            *(gaussian_row(sigma, options.seeds) for sigma in SIGMAS),
+            *(other_row(name, fewer) for name in OTHERS),
+            eight_bits(0.0, 1),
+            eight_bits(1.0, fewer),
+        ]
 
 
 def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:

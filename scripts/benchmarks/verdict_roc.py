@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from benchmarks.independent_camera import Shake, closed, take_frames
+from benchmarks.measure import one_thread
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -165,7 +166,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     """All cases of the random recordings."""
-    return [row for draw in range(options.verdict_draws) for row in cases(options.verdict_seed + draw)]
+    with one_thread():
+        return [row for draw in range(options.verdict_draws) for row in cases(options.verdict_seed + draw)]
 
 
 def lines(results: list[dict[str, Any]], options: argparse.Namespace, tie: float = 0.3) -> list[str]:
