@@ -1,6 +1,5 @@
 """TOML configuration files: the camera, and the options of simulation, detection and restoration."""
 
-import inspect
 import os
 import tomllib
 from dataclasses import dataclass
@@ -11,12 +10,11 @@ from pydantic import Field, create_model, model_validator
 
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.validation import Section, checked, options_section, validate
-from rsvib_torch.detection import detect_vibration
-from rsvib_torch.imaging import SensorNoise, simulate_frames
+from rsvib_torch.detection.detect import ToneOptions
+from rsvib_torch.imaging import SensorNoise
 from rsvib_torch.io.schema import TimingRecord, VibrationRecord
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.restoration import restore
 from rsvib_torch.restoration.restore import METHODS
 from rsvib_torch.stacks import DEFAULT_WINDOW, BadFrames
 
@@ -92,7 +90,7 @@ class _SimulationSection(Section):
     """``[simulation]``."""
 
     vibration: VibrationSection
-    num_frames: int = inspect.signature(simulate_frames).parameters["num_frames"].default
+    num_frames: int = 2
     frame_size: list[int] | None = None
     noise: _NoiseSection | None = None  # type: ignore[valid-type]
     seed: int = 0
@@ -109,12 +107,12 @@ class _SimulationSection(Section):
     def simulation(self) -> Simulation:
         """The values as a ``Simulation``."""
         size = None if self.frame_size is None else (self.frame_size[0], self.frame_size[1])
-        noise = None if self.noise is None else SensorNoise(**dict(self.noise))
+        noise = None if self.noise is None else SensorNoise(**_given(self.noise))
         return Simulation(self.vibration.to_vibration(), self.num_frames, size, noise, self.seed)
 
 
 _DetectionSection = options_section(
-    "_DetectionSection", detect_vibration, skip=("model", "full_scale", "ignore", "window", "window_step")
+    "_DetectionSection", ToneOptions, skip=("full_scale", "ignore", "window", "window_step")
 )
 
 
@@ -127,10 +125,9 @@ class _StackSection(Section):
 
 def _restoration_section(method: object) -> Any:
     """``[restoration]``: the keys depend on the method."""
-    default = inspect.signature(restore).parameters["method"].default
-    chosen = METHODS[method if isinstance(method, str) and method in METHODS else default]
-    more = {"method": (Literal[*METHODS], default), "saturation": (float | None, None)}
-    return options_section("_RestorationSection", chosen.function, skip=chosen.masks, **more)
+    chosen = METHODS[method if isinstance(method, str) and method in METHODS else "exact"]
+    common = {"method": Literal[*METHODS], "saturation": float | None}
+    return options_section("_RestorationSection", chosen.options, skip=("full_scale", "saturation", "check"), **common)
 
 
 def read_config(path: str | os.PathLike[str]) -> Config:

@@ -98,7 +98,10 @@ VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
         (SENSOR + "[detection]\ntones = 'few'", "detection.tones: expected"),
         (SENSOR + "[detection.tones]\nx = 2", "detection.tones: expected"),
         (SENSOR + "[detection]\nregistration = 'sift'", "detection.registration: expected 'projection' or 'ncc' or"),
-        (SENSOR + "[detection]\nfull_scale = 9", "detection.full_scale: unknown key; expected one of method,"),
+        (
+            SENSOR + "[detection]\nfull_scale = 9",
+            "detection.full_scale: unknown key; expected one of registration,",
+        ),
         (SENSOR + "[restoration]\nmethod = 'magic'", "restoration.method: expected '"),
         (
             SENSOR + "[restoration]\nmethod = 'banded'\nhalf_row = 1",

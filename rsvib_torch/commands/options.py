@@ -1,6 +1,5 @@
 """Arguments and options that several commands share, and their combination with the configuration file."""
 
-import inspect
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,7 +10,6 @@ import typer
 from rsvib_torch.config import Config
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.io import StackInfo
-from rsvib_torch.restoration import restore
 from rsvib_torch.restoration.restore import METHODS, method_options
 
 __all__ = [
@@ -155,8 +153,7 @@ def restoration_options(
         ValueError: If the method is unknown, or a value is out of range.
     """
     options = dict(config.restoration)
-    default_method = inspect.signature(restore).parameters["method"].default
-    if overrides.method is not None and overrides.method != options.get("method", default_method):
+    if overrides.method is not None and overrides.method != options.get("method", "exact"):
         shared = ("saturation", *method_options(overrides.method))  # other options belong to the configured method
         options = {name: value for name, value in options.items() if name in shared}
     for name in ("method", "prior", "saturation"):

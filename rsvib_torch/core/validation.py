@@ -1,6 +1,5 @@
 """Checks of tables from TOML and JSON files against types, with one line per mistake."""
 
-import inspect
 import json
 import types
 from collections.abc import Callable, Mapping
@@ -23,25 +22,21 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
 
 
-def options_section(name: str, function: Callable[..., Any], *, skip: tuple[str, ...] = (), **more: Any) -> Any:
-    """Create a section whose keys, types and defaults are the options of a function.
+def options_section(name: str, options: type, *, skip: tuple[str, ...] = (), **more: Any) -> Any:
+    """Create a section with the keys and types of typed options; no key is required.
 
     Args:
         name: Name of the section class.
-        function: Function (its keyword-only parameters) or dataclass (all of its fields).
-        skip: Parameters that are not keys of the section.
-        **more: Further fields as pydantic takes them, ``(type, default)``.
+        options: ``TypedDict`` or dataclass of the options.
+        skip: Options that are not keys of the section.
+        **more: Types of further keys.
 
     Returns:
-        A subclass of ``Section``.
+        A subclass of ``Section``. Options that are not in a file are None in it and not in ``model_fields_set``.
     """
-    hints = get_type_hints(function)
-    fields = {
-        parameter.name: (hints[parameter.name], ... if parameter.default is parameter.empty else parameter.default)
-        for parameter in inspect.signature(function).parameters.values()
-        if (parameter.kind is parameter.KEYWORD_ONLY or isinstance(function, type)) and parameter.name not in skip
-    }
-    return create_model(name, __base__=Section, **{**fields, **more})
+    hints = {key: kind for key, kind in get_type_hints(options).items() if key not in skip} | more
+    fields: dict[str, Any] = {key: (kind, None) for key, kind in hints.items()}
+    return create_model(name, __base__=Section, **fields)
 
 
 def checked(build: Callable[..., _Result], *args: Any, **kwargs: Any) -> _Result:

@@ -370,7 +370,10 @@ BAD_INPUT = {
     "row time in ms": (edit_config("4e-5", "0.04"), "row_time=0.04 s is longer than 10 ms; row_time is in seconds"),
     "frame period": (edit_config("frame_rows = 512", "frame_rows = 512000"), "is a frame period of 20.48 s, longer"),
     "wrong type": (edit_config("4e-5", "'40 us'"), "sensor.row_time: expected a number, got '40 us'"),
-    "unknown key": (edit_config("band_step", "bandstep"), "detection.bandstep: unknown key; expected one of method"),
+    "unknown key": (
+        edit_config("band_step", "bandstep"),
+        "detection.bandstep: unknown key; expected one of registration",
+    ),
     "missing key": (edit_config("frame_rows = 512", ""), "sensor.frame_rows: missing key; expected a number"),
     "wrong value": (edit_config("search = 8", "search = 1"), "search must be at least 2, got 1"),
     "no TOML": (edit_config("[sensor]", "[sensor"), "bad.toml: not a TOML file"),
