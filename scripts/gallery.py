@@ -60,7 +60,7 @@ def ways_to_restore() -> Figure:
     scene = resolution_chart(size + 2 * MARGIN, size + 2 * MARGIN, seed=SEED)
     still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
     frames = taken(scene, timing, 0.01)
-    shown = {"as taken": frames[0]}
+    shown = {"input": frames[0]}
     for name, options in {
         'method="dewarp"': {"method": "dewarp"},
         'method="exact"': {},

@@ -39,11 +39,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)  # two processes run at the same time
     plan, begin = PLANS[options.plan], time.perf_counter()
 
-    def say(what: str) -> None:
+    def report(what: str) -> None:
         print(f"{time.perf_counter() - begin:5.0f} s  {what}", flush=True)
 
-    found = run(plan, say)
-    say("drawing")
+    found = run(plan, report)
+    report("drawing")
     pictures = gallery(found, plan)
     with whole_folder(options.out) as folder:
         (folder / "reproduction.md").write_text(markdown(found, plan), encoding="utf-8")
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for drawn in drawings:
                 (folder / f"{drawn.name}.png").write_bytes(drawn.png)
         write_reproduction_page(folder / "reproduction.html", found, plan, pictures)
-    say(f"{options.out}: reproduction.md, .json, .html and figures")
+    report(f"{options.out}: reproduction.md, .json, .html and figures")
 
 
 if __name__ == "__main__":

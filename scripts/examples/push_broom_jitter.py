@@ -45,18 +45,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return float(rsv.psnr(image[inside], still.expand_as(image)[inside], 1.0).mean())
 
     table = Table("", "along the lines (x)", "across (y)", "PSNR", box=box.SIMPLE_HEAD)
-    table.add_row("truth", *(_tone(JITTER, axis) for axis in range(2)), f"{quality(images[:1]):.1f} dB as taken")
+    table.add_row("truth", *(_tone(JITTER, axis) for axis in range(2)), f"{quality(images[:1]):.1f} dB input")
     for count in (2, 3):
         lines = rsv.SensorTiming.line_sensors(LINE_TIME, DELAYS[:count], size[0], exposure_lines=4)
         found = rsv.detect_vibration(images[:count], lines)
-        told = [
+        cells = [
             _tone(found.vibration, axis) if found.reliable[axis] else f"refused: {found.reasons[axis][0]}"
             for axis in range(2)
         ]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rsv.RestorationWarning)  # the table contains the verdict
             restored = rsv.restore(images[:count], lines, found, joint=True, check=False)
-        table.add_row(f"{count} lines", *told, f"{quality(restored):.1f} dB restored")
+        table.add_row(f"{count} lines", *cells, f"{quality(restored):.1f} dB restored")
     Console(highlight=False, width=140).print(table)
 
 

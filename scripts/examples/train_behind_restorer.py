@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     console = Console(highlight=False, width=100)
     first, last = (sum(part) / len(part) for part in (result["losses"][:5], result["losses"][-5:]))
     console.print(f"rms error of the first steps {first**0.5:.4f}, of the last {last**0.5:.4f} of full scale")
-    for name, value in zip(("as taken", "restored", "behind the model"), result["psnr"], strict=True):
+    for name, value in zip(("input", "restored", "after the model"), result["psnr"], strict=True):
         console.print(f"unseen clips {name}: {value:.2f} dB")
     console.print(f"{time.perf_counter() - begin:.1f} s")
 

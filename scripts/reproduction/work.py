@@ -78,18 +78,18 @@ def _shared(function: Any, tasks: list[Any]) -> Iterator[Any]:
         yield from pool.imap(function, tasks)
 
 
-def run(plan: Plan, say: Any = print) -> Found:
-    """Run all trials; ``say`` is called with messages of progress."""
+def run(plan: Plan, report: Any = print) -> Found:
+    """Run all trials; ``report`` is called with messages of progress."""
     global _scene, _edges, _plan  # noqa: PLW0603  # scenes are too large to be sent to the processes
     _plan, found = plan, Found()
     for target, name in TARGETS.items():
-        say(f"{name}: drawing the scene")
+        report(f"{name}: drawing the scene")
         _scene = found.scenes[target] = draw(target, plan.size)
         _edges = edges_of(_scene.still, plan.edges) if target == "chart" else []
         found.still[target] = [{"noise": noise, **still_values(_scene, noise, _edges)} for noise in plan.noises]
         found.trials[target] = []
         for seed, values, images in _shared(_restoration_task, list(range(plan.seeds))):
-            say(f"{name}: trial {seed + 1} of {plan.seeds} done")
+            report(f"{name}: trial {seed + 1} of {plan.seeds} done")
             found.trials[target] += values
             if images is not None:
                 found.images[target] = images
@@ -98,9 +98,9 @@ def run(plan: Plan, say: Any = print) -> Found:
             still = [t for t in found.trials["landscape"] if t["noise"] == plan.noises[0]]
             found.push_scan += [{"speed": speed, "detection": t["detection"]} for t in still]
             continue
-        say(f"push-scan: {speed:g} px/s")
+        report(f"push-scan: {speed:g} px/s")
         _scene = draw("landscape", plan.size, (speed, 0.0))
         found.push_scan += list(_shared(_push_scan_task, [(speed, seed) for seed in range(plan.seeds)]))
-    say("global shutter")
+    report("global shutter")
     found.global_shutter = claims.global_shutter(draw("landscape", _SHUTTER_SIZE), seed=0)
     return found
