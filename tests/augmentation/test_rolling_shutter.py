@@ -271,13 +271,13 @@ def test_replay_same_on_batch_keepdim_probability():
     half = RollingShutterVibration(TIMING, p=0.5)
     torch.manual_seed(0)
     moved = half(images.repeat(4, 1, 1, 1))
-    left = torch.tensor([torch.equal(a, b) for a, b in zip(moved, images.repeat(4, 1, 1, 1), strict=True)])
-    assert torch.equal(left, half._params["batch_prob"] < 0.5)
-    assert 0 < left.sum() < 16
-    assert torch.equal((half.drawn_vibration().amplitude == 0).all((1, 2)), left)
+    unchanged = torch.tensor([torch.equal(a, b) for a, b in zip(moved, images.repeat(4, 1, 1, 1), strict=True)])
+    assert torch.equal(unchanged, half._params["batch_prob"] < 0.5)
+    assert 0 < unchanged.sum() < 16
+    assert torch.equal((half.drawn_vibration().amplitude == 0).all((1, 2)), unchanged)
     points = Keypoints(torch.full((16, 1, 2), 15.0))
     shifted = half.transform_keypoints(points, half._params, half.flags).data
-    assert torch.equal((shifted == 15.0).flatten(1).all(1), left)
+    assert torch.equal((shifted == 15.0).flatten(1).all(1), unchanged)
 
 
 def test_types_of_masks(still):

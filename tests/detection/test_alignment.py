@@ -142,9 +142,11 @@ def test_command(frames, gyroscope, tmp_path, capsys):
     ]
     arguments += ["--motion", str(gyroscope), "--unit", "rad/s"]
     assert run_command([*arguments, "--focal-length", "900", "--device", "cpu"]) == 0
-    said = capsys.readouterr().out
-    assert "clock 812.34" in said
-    before, after = (float(value) for value in re.search(r"between frames: (\S+) and .* y, (\S+) and", said).groups())
+    printed = capsys.readouterr().out
+    assert "clock 812.34" in printed
+    before, after = (
+        float(value) for value in re.search(r"between frames: (\S+) and .* y, (\S+) and", printed).groups()
+    )
     assert before > 1.0
     assert after < 0.1 * before
     first = rsv.read_stack(tmp_path / "out.tif")

@@ -49,12 +49,12 @@ def test_warped_frames_of_a_pair_are_equal(pairs):
     frames, camera = pairs
     spectra, positions, warp = prepared(frames, camera)
 
-    def apart(warped):
+    def difference(warped):
         images = torch.fft.irfft(warped, n=spectra.length)[:, :, 40:-40, 40 : frames.shape[-1] - 40]
         return float((images[:, 0] - images[:, 1]).square().mean().sqrt())
 
     whole = warp(slice(None))
-    assert apart(whole) < 0.04 * apart(spectra.warped(positions.rows, positions.shift))
+    assert difference(whole) < 0.04 * difference(spectra.warped(positions.rows, positions.shift))
     parts = torch.cat([warp(slice(first, first + 300)) for first in range(0, frames.shape[-2], 300)], 2)
     torch.testing.assert_close(parts, whole, atol=1e-4, rtol=1e-4)
 

@@ -189,8 +189,8 @@ def test_command(scene, frames, tmp_path, capsys):
     known = ["known", str(tmp_path / "frames.tif"), str(tmp_path / "out.tif"), *config, "--unit", "px", "--offset", "0"]
     assert run_command([*known, "--motion", str(tmp_path / "motion.csv")]) == 0
     restored = rsv.read_stack(tmp_path / "out.tif")
-    apart = (restored[1:] - restored[:-1])[:, 32:-32, 32:-32].std()
-    assert apart < 0.3 * (frames[1:] - frames[:-1])[:, 32:-32, 32:-32].std()
+    difference = (restored[1:] - restored[:-1])[:, 32:-32, 32:-32].std()
+    assert difference < 0.3 * (frames[1:] - frames[:-1])[:, 32:-32, 32:-32].std()
 
 
 @pytest.mark.parametrize(
@@ -243,8 +243,8 @@ def test_offsets_of_all_pairs_are_measured_despite_an_unobservable_tone():
     assert (offset_error(motion, truth) < 0.03).all()
     assert (offset_error(0.5 * truth, truth) > 1.0).all()
     error = motion - truth - (motion - truth).mean((0, 1))
-    less = error - common_warp(error, truth)
-    assert (rms(less) < 0.03).all()
+    observable_error = error - common_warp(error, truth)
+    assert (rms(observable_error) < 0.03).all()
     assert rms(error)[0] > 0.5
     assert (found.std_seen.numpy() < 0.01).all()
     assert (found.unseen > 5 * found.std_seen).all()
@@ -253,6 +253,6 @@ def test_offsets_of_all_pairs_are_measured_despite_an_unobservable_tone():
         decibel(
             rsv.restore(frames, TIMING, FreeMotion.from_samples(times.ravel(), d.reshape(-1, 2))).numpy(), crop(scene)
         )
-        for d in (truth, truth + less)
+        for d in (truth, truth + observable_error)
     )
     assert here > best - 0.2

@@ -73,8 +73,8 @@ def test_columns_read_in_reverse(frames, found):
     assert torch.allclose(other.frequency, found.frequency.flip(0), rtol=1e-6)
     assert torch.allclose(other.amplitude, found.amplitude.flip(0), rtol=1e-6)
     turned = torch.stack([found.phase[1] + math.pi, found.phase[0]])
-    apart = torch.remainder(other.phase - turned + math.pi, 2 * math.pi) - math.pi
-    assert apart.abs().max() < 1e-6
+    difference = torch.remainder(other.phase - turned + math.pi, 2 * math.pi) - math.pi
+    assert difference.abs().max() < 1e-6
     assert other.phase.abs().max() <= math.pi
 
 
@@ -119,9 +119,9 @@ def test_command(frames, tmp_path, capsys):
     rsv.write_stack(tmp_path / "frames.tif", frames)
     config = ["--config", str(tmp_path / "camera.toml"), "--model", "swept", "--out", str(tmp_path / "motion.csv")]
     assert run_command(["motion", str(tmp_path / "frames.tif"), *config]) == 0
-    said = capsys.readouterr().out
-    assert float(re.search(r"chirp (\S+) ± \S+ Hz/s, .*\ny: .*", said).group(1)) == pytest.approx(0, abs=12)
-    assert said.count("; reliable") == 2
+    printed = capsys.readouterr().out
+    assert float(re.search(r"chirp (\S+) ± \S+ Hz/s, .*\ny: .*", printed).group(1)) == pytest.approx(0, abs=12)
+    assert printed.count("; reliable") == 2
     recorded = rsv.read_motion(tmp_path / "motion.csv", unit="px")
     times = TIMING.row_starts(FRAMES, HEIGHT)
     error = recorded.displacement(times).numpy() - Swept().displacement(times.numpy())

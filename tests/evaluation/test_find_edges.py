@@ -32,8 +32,8 @@ def test_rotated_and_noisy_chart(turn):
     chart = rotate(resolution_chart(512, 512).numpy(), turn, reshape=False, order=3, mode="nearest")
     chart = torch.from_numpy(chart + 0.01 * np.random.default_rng(0).standard_normal(chart.shape).astype(np.float32))
     longest = [edge for edge in rsv.find_slanted_edges(chart, min_length=45) if edge.contrast < 0.56]
-    wanted = {round(abs(turn - 5)), round(abs(turn + 5))}
-    squares = [edge for edge in longest if round(abs(edge.angle)) in wanted]
+    expected_angles = {round(abs(turn - 5)), round(abs(turn + 5))}
+    squares = [edge for edge in longest if round(abs(edge.angle)) in expected_angles]
     assert len(squares) >= 8
     for edge in squares:
         curve = rsv.slanted_edge_mtf(edge.crop(chart))

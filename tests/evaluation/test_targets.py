@@ -48,19 +48,19 @@ def test_bars_keep_their_contrast_up_to_nyquist(frequency):
     fine = 201
     cycles = ((np.arange(61 * fine) - fine // 2) / fine - 30) * frequency + 2.25
     hard = (cycles % 1.0 < 0.5) & (cycles >= 0) & (cycles < 4.5)
-    wanted = gaussian_filter(hard.astype(np.float64), 0.6 * fine, truncate=7)[fine // 2 :: fine]
-    np.testing.assert_allclose(drawn, wanted, atol=0.003)
+    expected = gaussian_filter(hard.astype(np.float64), 0.6 * fine, truncate=7)[fine // 2 :: fine]
+    np.testing.assert_allclose(drawn, expected, atol=0.003)
 
 
 def test_star_and_disc_against_supersampling():
     x, y = pixel_grid(61)
     drawn = sectors(x, y, 16, 0.6).numpy()
-    wanted = blurred_shape(lambda x, y: (np.arctan2(y, x) * 8 / math.pi) % 1.0 < 0.5, 61, 0.6, fine=21)
+    expected = blurred_shape(lambda x, y: (np.arctan2(y, x) * 8 / math.pi) % 1.0 < 0.5, 61, 0.6, fine=21)
     radius = np.hypot(*(t.numpy() for t in (x, y)))
     ring = (radius > 16 / math.pi + 2) & (radius < 27)
-    assert np.abs(drawn - wanted)[ring].max() < 0.02
-    wanted = blurred_shape(lambda x, y: np.hypot(x, y) <= 12.4, 61, 0.6, fine=21)
-    np.testing.assert_allclose(disc(x, y, 12.4, 0.6).numpy(), wanted, atol=0.02)
+    assert np.abs(drawn - expected)[ring].max() < 0.02
+    expected = blurred_shape(lambda x, y: np.hypot(x, y) <= 12.4, 61, 0.6, fine=21)
+    np.testing.assert_allclose(disc(x, y, 12.4, 0.6).numpy(), expected, atol=0.02)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -114,9 +114,9 @@ def test_equal_seeds_give_equal_scenes():
 
 def test_wider_optics_blur_the_chart():
     sharp, wide = (resolution_chart(256, 256, sigma=sigma).double().numpy() for sigma in (0.6, 1.2))
-    wanted = gaussian_filter(sharp, math.sqrt(1.2**2 - 0.6**2))
+    expected = gaussian_filter(sharp, math.sqrt(1.2**2 - 0.6**2))
     inner = np.s_[70:-70, 70:-70]  # star and wedges
-    error = np.sqrt(np.mean((wide - wanted)[inner] ** 2))
+    error = np.sqrt(np.mean((wide - expected)[inner] ** 2))
     assert error < 0.02
     assert error < 0.2 * np.sqrt(np.mean((wide - sharp)[inner] ** 2))
 

@@ -238,8 +238,8 @@ def test_temporary_folders_of_killed_processes_are_removed_unless_in_use(tmp_pat
             second.write_text("second")
         assert (tmp_path / "a[1].txt").read_text() == "second"
     assert (tmp_path / "a[1].txt").read_text() == "first"
-    left = {"a[1].txt", ".a[1].txt.linked00.part", *(folder.name for folder in others)}
-    assert {path.name for path in tmp_path.iterdir()} == left
+    remaining = {"a[1].txt", ".a[1].txt.linked00.part", *(folder.name for folder in others)}
+    assert {path.name for path in tmp_path.iterdir()} == remaining
 
 
 def test_file_systems_without_locks_are_written_to(tmp_path, monkeypatch):

@@ -104,21 +104,21 @@ class Free(Motion):
         return spline()(times)
 
 
-@pytest.fixture(scope="module", name="taken")
-def make_taken():
+@pytest.fixture(scope="module", name="scene_and_frames")
+def make_scene_and_frames():
     scene = draw_scene(320 + 2 * MARGIN, 192 + 2 * MARGIN, 2)
     return scene, take_frames(scene, TIMING, Free(), 3, 0.003)
 
 
-def test_simulated_frames_equal_those_of_the_independent_simulator(taken):
-    scene, _ = taken
+def test_simulated_frames_equal_those_of_the_independent_simulator(scene_and_frames):
+    scene, _ = scene_and_frames
     frames = rsv.simulate_frames(torch.from_numpy(scene), TIMING, motion(), 2, frame_size=(320, 192))
     assert decibel(frames.numpy(), take_frames(scene, TIMING, Free(), 2), rim=16) > 60
 
 
 @pytest.mark.parametrize(("method", "least"), [("exact", 38.0), ("dewarp", 33.0)])
-def test_frames_are_restored(taken, method, least):
-    scene, frames = taken
+def test_frames_are_restored(scene_and_frames, method, least):
+    scene, frames = scene_and_frames
     restored = rsv.restore(torch.from_numpy(frames).float(), TIMING, motion(), method=method)
     still = crop(scene)
     assert decibel(restored.numpy(), still) > least

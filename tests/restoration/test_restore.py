@@ -72,10 +72,10 @@ def test_unreliable_axis_is_not_restored(scene_and_frames, axis):
     reliable[axis] = False
     reasons = [(), ()]
     reasons[axis] = ("nearly blind", "too short")
-    doubtful = detection_of(MOTION.vibration(), reliable=reliable, reasons=tuple(reasons))
+    uncertain = detection_of(MOTION.vibration(), reliable=reliable, reasons=tuple(reasons))
     message = rf"{'xy'[axis]} is left alone: its vibration is not reliable \(nearly blind; too short\)"
     with pytest.warns(RestorationWarning, match=message):
-        found = restore(frames, TIMING, doubtful, check=False)
+        found = restore(frames, TIMING, uncertain, check=False)
     kept = Vibration([a * r for a, r in zip(MOTION.amplitude, reliable, strict=True)], MOTION.frequency, MOTION.phase)
     torch.testing.assert_close(found, restore(frames, TIMING, kept, check=False), rtol=0, atol=0)
 
@@ -94,14 +94,14 @@ def test_measured_image_motion_of_an_unreliable_axis_is_kept():
 def test_uncertainty_of_the_displacement_equals_its_scatter_for_random_parameters():
     generator = np.random.default_rng(3)
     vibration = MOTION.vibration()
-    doubtful = detection_of(vibration, relative=0.05)
-    doubtful.std.frequency = torch.tensor([[0.8], [1.5]], dtype=torch.float64)
+    uncertain = detection_of(vibration, relative=0.05)
+    uncertain.std.frequency = torch.tensor([[0.8], [1.5]], dtype=torch.float64)
     starts = TIMING.row_starts(2, 448).numpy()
     middle = 0.5 * (starts.min() + starts.max())
     # phases have a standard deviation of 0.03 rad at the middle time, where they do not correlate with the frequency
     at_middle = 0.03
-    doubtful.std.phase = torch.sqrt(at_middle**2 + (2 * math.pi * middle * doubtful.std.frequency) ** 2)
-    error, size = displacement_uncertainty(vibration, doubtful.std, TIMING, 2, 448)
+    uncertain.std.phase = torch.sqrt(at_middle**2 + (2 * math.pi * middle * uncertain.std.frequency) ** 2)
+    error, size = displacement_uncertainty(vibration, uncertain.std, TIMING, 2, 448)
     times = starts.ravel() + TIMING.exposure_time / 2
     for axis in range(2):
         amplitude, frequency, phase = MOTION.amplitude[axis], MOTION.frequency[axis], MOTION.phase[axis]
@@ -110,7 +110,7 @@ def test_uncertainty_of_the_displacement_equals_its_scatter_for_random_parameter
         wrong = []
         for _ in range(400):
             a, f, p = generator.standard_normal(3)
-            df = f * float(doubtful.std.frequency[axis, 0])
+            df = f * float(uncertain.std.frequency[axis, 0])
             angle = 2 * np.pi * (frequency * times + df * (times - middle)) + phase + p * at_middle
             wrong.append(amplitude * (1 + 0.05 * a) * shrink * np.sin(angle) - exact)
         assert float(error[axis]) == pytest.approx(np.sqrt(np.mean(np.square(wrong))), rel=0.15)
@@ -119,24 +119,24 @@ def test_uncertainty_of_the_displacement_equals_its_scatter_for_random_parameter
 
 def test_axis_with_large_uncertainty_is_not_restored(scene_and_frames):
     _, frames = scene_and_frames
-    doubtful = detection_of(MOTION.vibration())
-    doubtful.std.phase = torch.tensor([[1.2], [0.1]], dtype=torch.float64)
+    uncertain = detection_of(MOTION.vibration())
+    uncertain.std.phase = torch.tensor([[1.2], [0.1]], dtype=torch.float64)
     with pytest.warns(
         RestorationWarning, match=r"x is left alone: its displacement of 1\.5 px has a standard deviation of 1\.8"
     ):
-        found = restore(frames, TIMING, doubtful, check=False)
+        found = restore(frames, TIMING, uncertain, check=False)
     only_y = Vibration([0.0, 3.2], MOTION.frequency, MOTION.phase)
     torch.testing.assert_close(found, restore(frames, TIMING, only_y, check=False), rtol=0, atol=0)
-    doubtful.std.amplitude = torch.full_like(doubtful.std.amplitude, math.inf)
-    assert trusted_vibration(doubtful, TIMING, 2, 448)[0].amplitude.sum() == 0
+    uncertain.std.amplitude = torch.full_like(uncertain.std.amplitude, math.inf)
+    assert trusted_vibration(uncertain, TIMING, 2, 448)[0].amplitude.sum() == 0
 
 
 def test_reliability_applies_to_each_stack_of_a_batch(scene_and_frames):
     _, frames = scene_and_frames
     both = Vibration(*(torch.stack([getattr(MOTION.vibration(), name)] * 2) for name in vars(MOTION.vibration())))
-    doubtful = detection_of(both, reliable=((True, True), (False, True)), reasons=(((), ()), (("blind",), ())))
+    uncertain = detection_of(both, reliable=((True, True), (False, True)), reasons=(((), ()), (("blind",), ())))
     with pytest.warns(RestorationWarning, match="stack 1: x is left alone"):
-        found = restore(torch.stack([frames, frames])[:, :, None], TIMING, doubtful, method="dewarp", check=False)
+        found = restore(torch.stack([frames, frames])[:, :, None], TIMING, uncertain, method="dewarp", check=False)
     known = restore(frames, TIMING, MOTION.vibration(), method="dewarp", check=False)
     only_y = restore(
         frames, TIMING, Vibration([0.0, 3.2], MOTION.frequency, MOTION.phase), method="dewarp", check=False

@@ -207,9 +207,9 @@ def test_displaced_frames_are_joined_where_they_overlap():
     alone = lucy(frames, TIMING, motion.vibration())[1]
     joint = lucy(frames, TIMING, motion.vibration(), joint=True)[0]
     shared = (slice(0, 200 + rows), slice(columns, None))  # in the coordinates of the second frame
-    apart = (slice(8, -8), slice(8, columns - 16))
+    not_shared = (slice(8, -8), slice(8, columns - 16))
     assert decibel(joint[shared], truth[shared], rim=12) > decibel(alone[shared], truth[shared], rim=12) + 1.5
-    torch.testing.assert_close(joint[apart], alone[apart], rtol=0, atol=2e-3)
+    torch.testing.assert_close(joint[not_shared], alone[not_shared], rtol=0, atol=2e-3)
 
 
 def test_frames_without_overlap_are_not_joined():

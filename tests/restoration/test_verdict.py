@@ -35,7 +35,7 @@ def camera(exposure_rows=20):
     return SensorTiming(row_time=4e-5, exposure_rows=exposure_rows, frame_rows=HEIGHT)
 
 
-def shaking(scale=1.0, frequency=FREQUENCY):
+def scaled_motion(scale=1.0, frequency=FREQUENCY):
     return Motion((3.1 * scale, 5.2 * scale), frequency, (0.4, 1.3))
 
 
@@ -73,7 +73,7 @@ def judged(frames, timing, vibration, **options):
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize(("noise", "scale"), [(0.0, 1.0), (0.005, 1.0), (0.02, 1.0), (0.005, 0.02), (0.02, 0.05)])
 def test_correct_vibration_helps(scene, name, noise, scale):
-    timing, motion = camera(), shaking(scale)
+    timing, motion = camera(), scaled_motion(scale)
     frames = frames_of(scene(name), timing, motion, noise)
     verdict, restored = judged(frames, timing, motion.vibration())
     assert verdict.overall == "helps", verdict.summary
@@ -97,7 +97,7 @@ def test_correct_vibration_helps(scene, name, noise, scale):
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize(("rows", "noise"), [(150, 0.005)])
 def test_no_false_alarm_with_motion_blur(scene, name, rows, noise):
-    timing, motion = camera(rows), shaking()
+    timing, motion = camera(rows), scaled_motion()
     frames = frames_of(scene(name), timing, motion, noise)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -109,7 +109,7 @@ def test_no_false_alarm_with_motion_blur(scene, name, rows, noise):
 @pytest.mark.parametrize(("noise", "scale"), [(0.005, 1.0), (0.02, 0.05)])
 @pytest.mark.parametrize("wrong", WRONG)
 def test_wrong_vibration_is_rejected(scene, name, noise, scale, wrong):
-    timing, motion = camera(), shaking(scale)
+    timing, motion = camera(), scaled_motion(scale)
     frames = frames_of(scene(name), timing, motion, noise)
     verdict, _ = judged(frames, timing, WRONG[wrong](motion).vibration())
     assert verdict.overall in ("partly", "worse"), verdict.summary
@@ -124,17 +124,17 @@ def test_wrong_vibration_is_rejected(scene, name, noise, scale, wrong):
 
 @pytest.mark.parametrize(("name", "noise", "scale"), [("soft", 0.0, 1.0), ("chart", 0.005, 1.0), ("city", 0.02, 0.05)])
 def test_vibration_that_does_not_exist_is_rejected(scene, name, noise, scale):
-    frames = frames_of(scene(name), camera(), shaking(0.0), noise)
-    verdict, _ = judged(frames, camera(), shaking(scale).vibration())
+    frames = frames_of(scene(name), camera(), scaled_motion(0.0), noise)
+    verdict, _ = judged(frames, camera(), scaled_motion(scale).vibration())
     assert verdict.overall == "worse"
     assert "frames lie" in verdict.summary
-    joint, _ = judged(frames, camera(), shaking(scale).vibration(), joint=True)
+    joint, _ = judged(frames, camera(), scaled_motion(scale).vibration(), joint=True)
     assert joint.overall == "worse"
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.005])
 def test_blind_vibration_is_unknown(scene, noise):
-    motion = shaking(frequency=BLIND)
+    motion = scaled_motion(frequency=BLIND)
     frames = frames_of(scene("city"), camera(), motion, noise)
     for vibration in (motion.vibration(), motion.scaled(0.5).vibration()):
         verdict, _ = judged(frames, camera(), vibration)
@@ -145,7 +145,7 @@ def test_blind_vibration_is_unknown(scene, noise):
 
 @pytest.mark.parametrize("joint", [True, 2])
 def test_joint_restoration_is_judged(scene, joint):
-    timing, motion = camera(), shaking()
+    timing, motion = camera(), scaled_motion()
     frames = frames_of(scene("city"), timing, motion, 0.01, count=3)
     verdict, _ = judged(frames, timing, motion.vibration(), joint=joint)
     assert verdict.overall == "helps"
@@ -156,7 +156,7 @@ def test_joint_restoration_is_judged(scene, joint):
 
 @pytest.mark.parametrize("options", [{"regularisation": 1e-5}, {"method": "banded", "noise_to_signal": 0.0}])
 def test_added_noise_larger_than_the_correction_is_rejected(scene, options):
-    timing, motion = camera(100), shaking()
+    timing, motion = camera(100), scaled_motion()
     frames = frames_of(scene("soft"), timing, motion, 0.02)
     verdict, restored = judged(frames, timing, motion.vibration(), **options)
     assert decibel(restored, crop(scene("soft"))) < decibel(frames, crop(scene("soft"))) - 3
@@ -166,7 +166,7 @@ def test_added_noise_larger_than_the_correction_is_rejected(scene, options):
 
 
 def test_smoothing_larger_than_the_correction_is_rejected(scene):
-    timing, motion = camera(), shaking(0.05)
+    timing, motion = camera(), scaled_motion(0.05)
     frames = frames_of(scene("chart"), timing, motion, 0.005)
     verdict, restored = judged(frames, timing, motion.vibration(), regularisation=1e6)
     assert decibel(restored, crop(scene("chart"))) < decibel(frames, crop(scene("chart"))) - 10
@@ -175,7 +175,7 @@ def test_smoothing_larger_than_the_correction_is_rejected(scene):
 
 
 def test_axis_that_is_not_restored_is_not_judged(scene):
-    timing, motion = camera(), shaking()
+    timing, motion = camera(), scaled_motion()
     frames = frames_of(scene("city"), timing, motion, 0.005)
     only_y = Vibration([0.0, 5.2], FREQUENCY, (0.4, 1.3))
     verdict, _ = judged(frames, timing, only_y)
@@ -198,7 +198,7 @@ def test_push_scan_frames_are_compared_where_they_overlap(image_motion):
 
 
 def test_transposed_frames_have_the_same_verdict_with_swapped_axes(scene):
-    motion = shaking()
+    motion = scaled_motion()
     frames = frames_of(scene("city"), camera(), motion, 0.005)
     half_x = Vibration([1.55, 5.2], FREQUENCY, (0.4, 1.3))
     upright, _ = judged(frames, camera(), half_x)
@@ -212,7 +212,7 @@ def test_transposed_frames_have_the_same_verdict_with_swapped_axes(scene):
 
 
 def test_colour_integers_and_missing_pixels_are_judged(scene):
-    timing, motion = camera(), shaking()
+    timing, motion = camera(), scaled_motion()
     grey = frames_of(scene("city"), timing, motion, 0.005)
     colour = torch.stack([grey, 0.5 * grey], dim=1)
     assert judged(colour, timing, motion.vibration())[0].overall == "helps"
@@ -226,18 +226,18 @@ def test_colour_integers_and_missing_pixels_are_judged(scene):
 
 def test_noise_gain_is_that_of_the_operator(scene):
     timing = camera()
-    frames = frames_of(scene("soft"), timing, shaking(0.0), 0.01)
+    frames = frames_of(scene("soft"), timing, scaled_motion(0.0), 0.01)
     # a still camera: the Wiener filter with gradient prior, summed over its frequencies
     v, u = torch.fft.fftfreq(33, dtype=torch.float64)[:, None], torch.fft.fftfreq(256, dtype=torch.float64)
     prior = 4 * ((math.pi * v).sin().square() + (math.pi * u).sin().square())
     expected = (1 / (1 + 0.5 * prior)).square().mean().sqrt()
     found = predict_noise_gain(frames, timing, Vibration.still(), method="banded", noise_to_signal=0.5)
     assert float(found) == pytest.approx(float(expected), rel=0.03)
-    dewarped = predict_noise_gain(frames, timing, shaking().vibration(), method="dewarp")
+    dewarped = predict_noise_gain(frames, timing, scaled_motion().vibration(), method="dewarp")
     assert 0.8 < float(dewarped) < 1.0
-    blurred = frames_of(scene("soft"), camera(150), shaking(), 0.01)
-    weak = predict_noise_gain(blurred, camera(150), shaking().vibration(), regularisation=1e-4)
-    assert float(weak) > 2 * float(predict_noise_gain(blurred, camera(150), shaking().vibration()))
+    blurred = frames_of(scene("soft"), camera(150), scaled_motion(), 0.01)
+    weak = predict_noise_gain(blurred, camera(150), scaled_motion().vibration(), regularisation=1e-4)
+    assert float(weak) > 2 * float(predict_noise_gain(blurred, camera(150), scaled_motion().vibration()))
     with pytest.raises(ValueError, match="columns must be at least 64"):
         predict_noise_gain(frames, timing, Vibration.still(), columns=8)
 
@@ -260,7 +260,7 @@ def test_bad_input(frames, restored, motion, message):
 @pytest.mark.parametrize("joint", [False, True])
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.05), (1.1, 0.0), (0.8, 0.1)])
 def test_frames_may_differ_in_brightness(scene, joint, gain, offset):
-    timing, motion = camera(), shaking()
+    timing, motion = camera(), scaled_motion()
     frames = frames_of(scene("city"), timing, motion, 0.005)
     frames = torch.stack([frames[0], gain * frames[1] + offset])
     verdict, _ = judged(frames, timing, motion.vibration(), joint=joint)
@@ -291,14 +291,14 @@ def test_small_wrong_motion_beside_a_large_correct_motion_is_accepted(scene, axi
     ids=["motion", "acceleration"],
 )
 def test_image_motion_that_does_not_exist_causes_a_warning(scene, wrong_motion):
-    frames = frames_of(scene("city"), camera(), shaking(0.0), 0.005)
+    frames = frames_of(scene("city"), camera(), scaled_motion(0.0), 0.005)
     moving = Vibration([0.0, 0.0], [0.0, 0.0], **wrong_motion)
     with pytest.warns(RestorationWarning, match="restored is no better than raw"):
         restore(frames, camera(), moving, method="dewarp")
 
 
 def test_dtypes_and_detections_of_restore_are_accepted(scene):
-    timing, motion = camera(), shaking()
+    timing, motion = camera(), scaled_motion()
     frames, vibration = frames_of(scene("city"), timing, motion, 0.005), motion.vibration()
     restored = restore(frames, timing, vibration)
     for raw, clear in ((frames.half(), restored.half()), (frames.double(), restored), (frames, restored.double())):
