@@ -35,7 +35,7 @@ def verdict(amplitude=3.0, frequency=30.0, *, std=(0.01, 0.01), offsets=None, fi
         image_acceleration=torch.zeros(2),
     )
     visible = torch.ones(40, dtype=torch.bool) if visible is None else visible
-    return judge(vibration, std_of_tones, shown=visible, **{**arguments, **options})
+    return judge(vibration, std_of_tones, visible=visible, **{**arguments, **options})
 
 
 def missing(count):

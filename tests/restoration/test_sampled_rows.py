@@ -95,7 +95,7 @@ def test_weak_priors_are_tried_only_if_the_third_is_selected(monkeypatch):
             return Explained(errors.exp(), torch.zeros_like(errors), 100)
 
     class Prior:
-        power, blind = torch.ones(65), torch.full((65,), 1e-9)
+        power, interpolation_power = torch.ones(65), torch.full((65,), 1e-9)
 
         def precision(self, noise_power, factor, reach):
             return torch.zeros(3, 3, 65)
