@@ -50,7 +50,7 @@ def _sizes(info: StackInfo, window: int, restoration: Mapping[str, Any] | None) 
     """Bytes of the process without windows, and of each window."""
     if restoration is None:
         pixel_bytes = min(_PIXEL_BYTES.values())
-    elif restoration.get("prior") == "edges":
+    elif restoration.get("prior", "gaussian") != "gaussian":  # other priors need at most as much as "edges"
         pixel_bytes = _PIXEL_BYTES["edges"]
     else:
         pixel_bytes = _PIXEL_BYTES.get(restoration.get("method", "exact"), max(_PIXEL_BYTES.values()))
