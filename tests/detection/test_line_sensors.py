@@ -57,7 +57,7 @@ def test_delay_of_one_period_is_blind(ground):
 
 
 def test_bad_values():
-    with pytest.raises(ValueError, match="two lines or more"):
+    with pytest.raises(ValueError, match=r"delays must have at least two entries, got \[0.0\]"):
         rsv.SensorTiming.line_sensors(1e-4, [0.0], 900)
     with pytest.raises(ValueError, match="strictly increasing"):
         rsv.SensorTiming.line_sensors(1e-4, [0.0, 0.0], 900)

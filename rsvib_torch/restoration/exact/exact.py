@@ -70,7 +70,7 @@ def restore_exact(
         chunk_frequencies: Frequencies solved at a time; bounds the memory, does not change the result. None: as many
             as take 8 times the memory of the spectrum of the scene.
         segments: Overlapping segments of rows that are solved side by side, which changes the result by about 1e-5;
-            None: as many as make a step of the solver worth its call, of at least 512 rows on a CPU, 256 on a GPU.
+            None: segments of at least 512 rows on a CPU, 256 on a GPU.
             Always one where the displacement changes by more than a pixel during an exposure: rows then depend on
             distant rows.
 
