@@ -358,5 +358,5 @@ def test_prior_added_to_the_table(short, monkeypatch):
     assert options[0].regularisation == 2.0
     assert (restored - restored.mean()).abs().max() < 1e-12
     monkeypatch.delitem(PRIORS, "toy")
-    with pytest.raises(ValueError, match="prior must be one of .*; got 'toy'"):
+    with pytest.raises(ValueError, match=r"prior must be one of .*; got 'toy'"):
         restore(frames, TIMING, motion.vibration(), prior="toy")
