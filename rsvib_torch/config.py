@@ -15,6 +15,7 @@ from rsvib_torch.imaging import SensorNoise
 from rsvib_torch.io.schema import TimingRecord, VibrationRecord
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.restoration.exact.priors import PRIORS
 from rsvib_torch.restoration.restore import METHODS
 from rsvib_torch.stacks import DEFAULT_WINDOW, BadFrames
 
@@ -126,7 +127,9 @@ class _StackSection(Section):
 def _restoration_section(method: object) -> Any:
     """``[restoration]``: the keys depend on the method."""
     chosen = METHODS[method if isinstance(method, str) and method in METHODS else "exact"]
-    common = {"method": Literal[*METHODS], "saturation": float | None}
+    common: dict[str, Any] = {"method": Literal[*METHODS], "saturation": float | None}
+    if "prior" in chosen.options.__annotations__:
+        common["prior"] = Literal[*PRIORS]
     return options_section("_RestorationSection", chosen.options, skip=("full_scale", "saturation", "check"), **common)
 
 

@@ -103,6 +103,7 @@ VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
             "detection.full_scale: unknown key; expected one of registration,",
         ),
         (SENSOR + "[restoration]\nmethod = 'magic'", "restoration.method: expected '"),
+        (SENSOR + "[restoration]\nprior = 'magic'", "restoration.prior: expected '"),
         (
             SENSOR + "[restoration]\nmethod = 'banded'\nhalf_row = 1",
             "restoration.half_row: unknown key; expected one of half_rows, stride",

@@ -10,6 +10,7 @@ import typer
 from rsvib_torch.config import Config
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.io import StackInfo
+from rsvib_torch.restoration.exact.priors import PRIORS
 from rsvib_torch.restoration.restore import METHODS, method_options
 
 __all__ = [
@@ -69,7 +70,7 @@ JointOption = Annotated[
 ]
 PriorOption = Annotated[
     str | None,
-    typer.Option("--prior", help="Prior of the scene: gaussian or edges, for methods that have this option."),
+    typer.Option("--prior", help=f"Prior of the scene: {' or '.join(PRIORS)}, for methods that have this option."),
 ]
 SaturationOption = Annotated[
     float | None,
