@@ -56,7 +56,8 @@ def judge(
         if share < min_bands:
             against.append(
                 f"only {share:.0%} of {int(visible.sum())} row bands can be registered, {min_bands:.0%} are needed: "
-                "increase search, and check that the frames contain the same scene and enough detail"
+                "the motion is beyond the search range (increase search), or the frames lack detail or show different "
+                "scenes"
             )
         if not bool((amplitude > 0).any()):
             against.append("no significant tone: the offsets are those of a uniform motion, or below their noise")
