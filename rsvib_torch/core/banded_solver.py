@@ -8,8 +8,9 @@ Forward substitution solves ``U^H D y = g``, back substitution ``U x = y``. Ever
 batch of matrices.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,67 +19,93 @@ from torch.autograd.function import once_differentiable
 __all__ = ["BandedFactor", "factor_banded", "skew_band", "solve_banded", "solve_skewed"]
 
 
+class _Solution(NamedTuple):
+    """Memory of a solution.
+
+    Attributes:
+        x: (K + b, M, S).
+        rows: The K first rows.
+        runs: Rows j ... j + b - 1, for j = 0 ... K.
+    """
+
+    x: Tensor
+    rows: tuple[Tensor, ...]
+    runs: tuple[Tensor, ...]
+
+    @classmethod
+    def of(cls, right_side: Tensor, width: int) -> "_Solution":
+        """Memory for right sides (K, M, S)."""
+        x = right_side.new_empty(len(right_side) + width, *right_side.shape[1:])
+        return cls(x, x[: len(right_side)].unbind(), x.unfold(0, width, 1).movedim(-1, 1).unbind())
+
+
 @dataclass(frozen=True, eq=False)
 class BandedFactor:
     """``A = U^H D U`` of a batch of banded matrices.
 
+    The views of every step are kept with the memory of the solution, because creating them takes as long as a solution
+    of few systems. One factor must not solve in two threads at a time.
+
     Attributes:
-        skewed: (K + b, 2 b + 1, S). Entry ``[j, b]`` of the first K rows is ``d_j``, ``[j, b + i]`` is ``U[j, j + i]``,
-            ``[j + i, b - i]`` is ``U[j, j + i]^* d_j``.
-        inverse: (K, S), ``1 / d_j``.
+        upper: (K, b, S), ``[j, i - 1]`` is ``U[j, j + i]``; values beyond the last column have no meaning.
+        inverse: (K, S), ``1 / d_j``, real.
     """
 
-    skewed: Tensor
+    upper: Tensor
     inverse: Tensor
+    _solutions: dict[int, "_Solution"] = field(default_factory=dict)
 
-    @property
-    def pivots(self) -> Tensor:
-        """(K, S), the diagonal of D, real."""
-        diagonal = self.skewed[: len(self.inverse), self.skewed.shape[1] // 2]
-        return diagonal.real if diagonal.is_complex() else diagonal
+    @cached_property
+    def _rows(self) -> tuple[Tensor, ...]:
+        """U right of the diagonal, (b, 1, S) of each row."""
+        return self.upper[:, :, None].unbind()
+
+    @cached_property
+    def _columns(self) -> tuple[Tensor, ...]:
+        """U above the diagonal, (b, 1, S) of the columns from b on."""
+        (count, width, size), (line, entry, _) = self.upper.shape, self.upper.stride()
+        shape, first = (max(0, count - width), width, 1, size), self.upper.storage_offset() + (width - 1) * entry
+        return self.upper.as_strided(shape, (line, line - entry, entry, 1), first).unbind()
 
     def solve(self, right_side: Tensor) -> Tensor:
         """Solve ``A x = right_side`` for right sides (K, M, S)."""
-        count, width = len(self.inverse), self.skewed.shape[1] // 2
+        count, width = self.upper.shape[:2]
         if width == 0:
             return right_side * self.inverse[:, None]
-        x = torch.cat([right_side, right_side.new_zeros(width, *right_side.shape[1:])])
-        rows = x[:count].unbind()
-        following = x[1:].unfold(0, width, 1).movedim(-1, 1).unbind()  # the b rows after each row
-        for value, inverse, column, after in zip(
-            rows, self.inverse.unbind(), _columns(self.skewed).unbind(), following, strict=True
-        ):
-            after.addcmul_(column, value.mul_(inverse), value=-1)
-        upper = self.skewed[:count, width + 1 :, None].unbind()
-        for value, row, after in zip(rows[::-1], upper[::-1], following[::-1], strict=True):
-            value.sub_((row * after).sum(0))
-        return x[:count]
-
-
-def _columns(skewed: Tensor) -> Tensor:
-    """Entries below the diagonal of every column, (K, b, 1, S): ``[j, i - 1]`` is ``A[j + i, j]``."""
-    width, (line, entry, _) = skewed.shape[1] // 2, skewed.stride()
-    shape = (len(skewed) - width, width, 1, skewed.shape[2])
-    return skewed.as_strided(
-        shape, (line, line - entry, entry, 1), skewed.storage_offset() + line + (width - 1) * entry
-    )
+        if right_side.shape[1] not in self._solutions:
+            self._solutions[right_side.shape[1]] = _Solution.of(right_side, width)
+        x, rows, runs = self._solutions[right_side.shape[1]]
+        x[:count] = right_side.conj()  # U^H y = g is U^T y^* = g^*: both substitutions use the same U
+        x[count:] = 0
+        for value, row, below in zip(rows, self._rows, runs[1:], strict=True):
+            below.addcmul_(row, value, value=-1)
+        if x.is_complex():
+            x.conj_physical_()
+        x[:count] *= self.inverse[:, None]
+        for j in range(count - 1, width - 1, -1):
+            runs[j - width].addcmul_(self._columns[j - width], rows[j], value=-1)
+        for j in range(min(width, count) - 1, 0, -1):
+            column = torch.stack([self.upper[k, j - 1 - k] for k in range(j)])
+            x[:j].addcmul_(column[:, None], rows[j], value=-1)
+        return x[:count].clone()
 
 
 def factor_banded(skewed: Tensor) -> BandedFactor:
     """Factor Hermitian positive definite matrices (K + b, 2 b + 1, S) as from ``skew_band`` in their own memory."""
     width, (line, entry, _) = skewed.shape[1] // 2, skewed.stride()
-    count = len(skewed) - width
-    pivots = skewed[:count, width]
-    factor = BandedFactor(skewed, pivots.reciprocal())
+    count, first = len(skewed) - width, skewed.storage_offset() + line
+    pivots, upper = skewed[:count, width], skewed[:count, width + 1 :]
+    inverse = pivots.reciprocal()
     if width:
-        # the b x b entries that step j changes are one strided view, because row j + 1 begins one column further right
-        shape, strides = (count, width, width, skewed.shape[2]), (line, line - entry, entry, 1)
-        trailing = skewed.as_strided(shape, strides, skewed.storage_offset() + line + width * entry)
-        steps = (pivots, factor.inverse, skewed[:count, width + 1 :], _columns(skewed), trailing)
-        for pivot, inverse, row, column, rest in zip(*(values.unbind() for values in steps), strict=True):
-            torch.reciprocal(pivot, out=inverse)
-            rest.addcmul_(column, row.mul_(inverse), value=-1)
-    return factor
+        # A[i, j] of step j, and A[i, k]: strided views, because row j + 1 begins one column further right
+        strides = (line, line - entry, entry, 1)
+        below = skewed.as_strided((count, width, 1, skewed.shape[2]), strides, first + (width - 1) * entry)
+        trailing = skewed.as_strided((count, width, width, skewed.shape[2]), strides, first + width * entry)
+        steps = (pivots, inverse, upper, below, trailing)
+        for pivot, over, row, column, rest in zip(*(values.unbind() for values in steps), strict=True):
+            torch.reciprocal(pivot, out=over)
+            rest.addcmul_(column, row.mul_(over), value=-1)
+    return BandedFactor(upper, inverse.real if inverse.is_complex() else inverse)
 
 
 def skew_band(band: Tensor) -> Tensor:
@@ -105,28 +132,30 @@ class _Solve(torch.autograd.Function):
     """Solve; the gradients of ``x = A^-1 g`` are ``A^-1 dx`` for g and ``-(A^-1 dx) x^H`` for A."""
 
     @staticmethod
-    def forward(ctx: Any, skewed: Tensor, right_side: Tensor, factor: BandedFactor | None) -> Tensor:
-        if factor is None:
-            factor = factor_banded(skewed.clone() if ctx.needs_input_grad[0] else skewed)
+    def forward(ctx: Any, system: Tensor | BandedFactor, right_side: Tensor) -> Tensor:
+        if isinstance(system, BandedFactor):
+            factor = system
+        else:
+            factor = factor_banded(system.clone() if ctx.needs_input_grad[0] else system)
         solution = factor.solve(right_side)
         if any(ctx.needs_input_grad):
-            ctx.save_for_backward(factor.skewed, factor.inverse, solution)
+            ctx.save_for_backward(factor.upper, factor.inverse, solution)
         return solution
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor, None]:
-        skewed, inverse, x = ctx.saved_tensors
-        adjoint = BandedFactor(skewed, inverse).solve(gradient)
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor]:
+        upper, inverse, x = ctx.saved_tensors
+        adjoint = BandedFactor(upper, inverse).solve(gradient)
         if not ctx.needs_input_grad[0]:
-            return None, adjoint, None
-        width, count = skewed.shape[1] // 2, len(inverse)
-        of_matrix = torch.zeros_like(skewed)
+            return None, adjoint
+        count, width, size = upper.shape
+        of_matrix = upper.new_zeros(count + width, 2 * width + 1, size)
         for d in range(-min(width, count - 1), min(width, count - 1) + 1):
             rows = slice(max(0, -d), min(count, count - d))
             columns = slice(max(0, d), min(count, count + d))
             of_matrix[rows, width + d] = -(adjoint[rows] * x[columns].conj()).sum(1)
-        return of_matrix, adjoint, None
+        return of_matrix, adjoint
 
 
 def solve_skewed(system: Tensor | BandedFactor, right_side: Tensor) -> Tensor:
@@ -140,9 +169,7 @@ def solve_skewed(system: Tensor | BandedFactor, right_side: Tensor) -> Tensor:
     Returns:
         Solutions (K, M, S).
     """
-    factor = system if isinstance(system, BandedFactor) else None
-    skewed = system.skewed if isinstance(system, BandedFactor) else system
-    solution: Tensor = _Solve.apply(skewed, right_side, factor)  # type: ignore[no-untyped-call]
+    solution: Tensor = _Solve.apply(system, right_side)  # type: ignore[no-untyped-call]
     return solution
 
 

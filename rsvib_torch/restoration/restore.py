@@ -228,7 +228,7 @@ def restore(
         ValueError: If a value is out of range, or frames, timing and vibration do not fit together.
 
     Warns:
-        RestorationWarning: If an axis is left alone, or the restored frames are no better than the raw ones.
+        RestorationWarning: If an axis is not restored, or the restored frames are no better than the raw ones.
 
     Example:
         >>> import torch

@@ -162,8 +162,8 @@ def test_an_unreliable_axis_is_not_restored(place, tmp_path, capsys):
     assert run("restore", frames, tmp_path / "restored.tif", "--config", config, "--vibration", path) == 0
     shown = capsys.readouterr().out.splitlines()
     assert shown[:2] == [
-        "x is left alone: its vibration is not reliable (blind)",
-        "y is left alone: its vibration is not reliable (too short; noisy)",
+        "x is not restored: its vibration is not reliable (blind)",
+        "y is not restored: its vibration is not reliable (too short; noisy)",
     ]
     difference = read_stack(tmp_path / "restored.tif") - read_stack(frames)
     assert difference.abs().mean() < 0.01
@@ -250,7 +250,7 @@ def test_frames_without_vibration_are_unchanged(place, tmp_path, capsys):
     assert run("run", tmp_path / "still.tif", tmp_path / "out", "--config", place / "camera.toml") == 0
     shown = capsys.readouterr()
     assert "no vibration to remove: the frames are written unchanged" in shown.err
-    assert "x is left alone: its vibration is not reliable" in shown.out
+    assert "x is not restored: its vibration is not reliable" in shown.out
     assert (tifffile.imread(tmp_path / "out" / "restored.tif") == tifffile.imread(tmp_path / "still.tif")).all()
     assert json.loads((tmp_path / "out" / "restoration.json").read_text())["frames"] == "as taken"
 

@@ -83,3 +83,10 @@ def test_residual_motion_makes_an_axis_unreliable(unexplained, slant, expected):
     reliable, reasons = verdict(other_motion=other)
     assert len(reasons[0]) == expected
     assert reliable.tolist() == [expected == 0, True]
+
+
+@pytest.mark.parametrize(("unexplained", "accepted"), [(0.029, True), (0.031, False)])
+def test_residual_motion_of_a_small_tone_is_compared_with_errors_of_interpolation(unexplained, accepted):
+    other = OtherMotion(torch.tensor([unexplained, 0.0]), torch.zeros(2))
+    reliable, _ = verdict(0.3, other_motion=other)
+    assert bool(reliable[0]) == accepted

@@ -150,7 +150,7 @@ def test_standard_deviations_are_read_back(tmp_path, result):
     assert back.std.period[1, 1] == math.inf
     vibration, notes = trusted_vibration(back, TIMING, 3, 512)
     assert vibration.amplitude.tolist() == [[2.0, 0.5], [0.0, 0.0]]
-    assert notes == ("y is left alone: its vibration is not reliable (only one period is seen)",)
+    assert notes == ("y is not restored: its vibration is not reliable (only one period is seen)",)
 
 
 def test_restoration_json(tmp_path):
@@ -160,11 +160,11 @@ def test_restoration_json(tmp_path):
     options = {"method": "exact", "joint": True}
     path = tmp_path / "restoration.json"
     frames = torch.rand(2, 8, 8)
-    write_restoration(path, RestoredFrames(frames, False, ("y is left alone",), verdict, True), options)
+    write_restoration(path, RestoredFrames(frames, False, ("y is not restored",), verdict, True), options)
     data = json.loads(path.read_text())
     assert data["frames"] == "as taken"
     assert data["options"] == options
-    assert data["left_alone"] == ["y is left alone"]
+    assert data["left_alone"] == ["y is not restored"]
     assert data["outcome"] == "worse"
     assert data["summary"] == "restored is no better than raw: x: frames lie apart"
     assert data["pairs"]["misfit_before"] == [[0.1, None]]

@@ -73,7 +73,7 @@ def test_unreliable_axis_is_not_restored(scene_and_frames, axis):
     reasons = [(), ()]
     reasons[axis] = ("nearly blind", "too short")
     uncertain = detection_of(MOTION.vibration(), reliable=reliable, reasons=tuple(reasons))
-    message = rf"{'xy'[axis]} is left alone: its vibration is not reliable \(nearly blind; too short\)"
+    message = rf"{'xy'[axis]} is not restored: its vibration is not reliable \(nearly blind; too short\)"
     with pytest.warns(RestorationWarning, match=message):
         found = restore(frames, TIMING, uncertain, check=False)
     kept = Vibration([a * r for a, r in zip(MOTION.amplitude, reliable, strict=True)], MOTION.frequency, MOTION.phase)
@@ -122,7 +122,7 @@ def test_axis_with_large_uncertainty_is_not_restored(scene_and_frames):
     uncertain = detection_of(MOTION.vibration())
     uncertain.std.phase = torch.tensor([[1.2], [0.1]], dtype=torch.float64)
     with pytest.warns(
-        RestorationWarning, match=r"x is left alone: its displacement of 1\.5 px has a standard deviation of 1\.8"
+        RestorationWarning, match=r"x is not restored: its displacement of 1\.5 px has a standard deviation of 1\.8"
     ):
         found = restore(frames, TIMING, uncertain, check=False)
     only_y = Vibration([0.0, 3.2], MOTION.frequency, MOTION.phase)
@@ -135,7 +135,7 @@ def test_reliability_applies_to_each_stack_of_a_batch(scene_and_frames):
     _, frames = scene_and_frames
     both = Vibration(*(torch.stack([getattr(MOTION.vibration(), name)] * 2) for name in vars(MOTION.vibration())))
     uncertain = detection_of(both, reliable=((True, True), (False, True)), reasons=(((), ()), (("blind",), ())))
-    with pytest.warns(RestorationWarning, match="stack 1: x is left alone"):
+    with pytest.warns(RestorationWarning, match="stack 1: x is not restored"):
         found = restore(torch.stack([frames, frames])[:, :, None], TIMING, uncertain, method="dewarp", check=False)
     known = restore(frames, TIMING, MOTION.vibration(), method="dewarp", check=False)
     only_y = restore(
@@ -303,7 +303,7 @@ def test_arrays_and_orientation(scene_and_frames):
     turned = replace(TIMING, scan_axis=-1)
     half = detection_of(Vibration(MOTION.amplitude[::-1], MOTION.frequency[::-1], MOTION.phase[::-1]))
     half.reliable, half.reasons = torch.tensor([True, False]), ((), ("blind",))
-    with pytest.warns(RestorationWarning, match="y is left alone"):
+    with pytest.warns(RestorationWarning, match="y is not restored"):
         found = restore(frames.transpose(-2, -1), turned, half, method="dewarp", check=False)
     only_y = Vibration([0.0, 3.2], MOTION.frequency, MOTION.phase)
     expected = restore(frames, TIMING, only_y, method="dewarp", check=False)

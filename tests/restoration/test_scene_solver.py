@@ -8,8 +8,9 @@ import torch
 from scipy.linalg import solveh_banded
 
 from rsvib_torch.core.banded_solver import skew_band, solve_skewed
-from rsvib_torch.restoration.exact.scene_solver import join_windows, row_windows
+from rsvib_torch.restoration.exact.scene_solver import Partition, SceneSolver, join_windows, row_windows
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
+from rsvib_torch.restoration.scene_model.row_prior import RowPrior
 
 
 def solved_in_windows(windows, band, right_side):
@@ -77,3 +78,46 @@ def test_observation_operator_is_a_sum_over_taps_and_has_this_adjoint(first):
     back = observation.adjoint(data, u, part, length)
     left = (weight[:, None, :, None] * observed.conj() * data).sum()
     torch.testing.assert_close(left, (coefficients.conj() * back).sum(), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("reach", [0.0, 0.4, 1.4])
+def test_fast_path_agrees_with_the_plain_path(reach):
+    """The plain path is used where the precision requires its gradient."""
+    generator = torch.Generator().manual_seed(4)
+    rows, length = 60, 1200
+    taps = torch.rand(1, rows, 6, 2, dtype=torch.float64, generator=generator) / 6
+    along = torch.linspace(-reach, reach, 2, dtype=torch.float64).expand(1, rows, 2)
+    first = torch.arange(rows)[None] - 2
+    kernels = RowKernels(first, taps, torch.zeros(1, rows, dtype=torch.float64), along, torch.ones_like(first).double())
+    observation = Observation(kernels, rows, torch.float64)
+    u = torch.fft.rfftfreq(length, dtype=torch.float64)
+    precision = RowPrior.smooth(u).precision(0.01 * (1 + (10 * u).square()), 1.0)
+    data = torch.randn(1, 1, rows, length, dtype=torch.float64, generator=generator)
+    fast = SceneSolver(observation, precision, length, Partition(chunk=100)).fit(data)
+    plain = SceneSolver(observation, precision.clone().requires_grad_(), length, Partition(chunk=100)).fit(data)
+    assert plain.requires_grad
+    difference = (fast - plain.detach()).abs().square().mean().sqrt() / plain.detach().abs().square().mean().sqrt()
+    assert 1e-12 < difference < 1e-2  # interpolated, not factored: white noise is the least favourable data
+    repeated = SceneSolver(observation, precision, length, Partition(chunk=100), keep=True)
+    for _ in range(2):
+        torch.testing.assert_close(repeated.fit(data), plain.detach())
+
+
+def test_gradient_of_the_data_through_interpolated_factors():
+    """The solution is linear in the data: its gradient is the adjoint of the solution operator."""
+    rows, length = 40, 800
+    taps = torch.full((1, rows, 6, 1), 1 / 6, dtype=torch.float64)
+    zeros = torch.zeros(1, rows, dtype=torch.float64)
+    kernels = RowKernels(torch.arange(rows)[None] - 2, taps, zeros, zeros[..., None], zeros + 1)
+    observation = Observation(kernels, rows, torch.float64)
+    u = torch.fft.rfftfreq(length, dtype=torch.float64)
+    precision = RowPrior.smooth(u).precision(torch.full_like(u, 0.01), 1.0)
+    solver = SceneSolver(observation, precision, length, Partition(chunk=90))
+    generator = torch.Generator().manual_seed(5)
+    data, other = torch.randn(2, 1, 1, rows, length, dtype=torch.float64, generator=generator)
+    data.requires_grad_()
+    solution = solver.fit(data)
+    weights = torch.randn(solution.shape, dtype=torch.complex128, generator=generator)
+    (gradient,) = torch.autograd.grad((weights * solution).real.sum(), data)
+    expected = (weights * solver.fit(other)).real.sum()
+    torch.testing.assert_close((gradient * other).sum(), expected)

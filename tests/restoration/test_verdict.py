@@ -143,6 +143,17 @@ def test_blind_vibration_is_unknown(scene, noise):
         assert "all are displaced alike" in verdict.summary
 
 
+def test_disagreement_of_the_restored_frames_reduces_the_gain(scene):
+    """Only the later restored frame is changed: the prediction from the earlier one stays correct."""
+    timing, vibration = camera(), scaled_motion().vibration()
+    frames = frames_of(scene("city"), timing, scaled_motion(), 0.005)
+    restored = restore(frames, timing, vibration, check=False)
+    gain = judge_restoration(frames, restored, timing, vibration).predicted_gain
+    changed = restored.clone()
+    changed[1] += 0.05 * torch.randn(restored.shape[1:], generator=torch.Generator().manual_seed(1))
+    assert judge_restoration(frames, changed, timing, vibration).predicted_gain < gain - 5
+
+
 @pytest.mark.parametrize("joint", [True, 2])
 def test_joint_restoration_is_judged(scene, joint):
     timing, motion = camera(), scaled_motion()

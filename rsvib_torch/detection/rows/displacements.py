@@ -383,11 +383,13 @@ def _warp_to_scene(
         def neighbour(step: int) -> Tensor:
             return moment[:, :, 2 + step : len(index) - 2 + step]
 
-        # derivatives across rows, of fourth order
-        by_y = (8 * (neighbour(1) - neighbour(-1)) - (neighbour(2) - neighbour(-2))) / 12
-        by_yy = (16 * (neighbour(1) + neighbour(-1)) - (neighbour(2) + neighbour(-2)) - 30 * neighbour(0)) / 12
-        xx, xy, yy = (moment_slope[:, :, part, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-        result: Tensor = mean[:, :, 2:-2] + (xx * by_x * neighbour(0) + 2 * xy * by_y) * by_x + yy * by_yy
+        # derivatives across rows, of fourth order, in place: the rows stay in the cache
+        by_y = (neighbour(1) - neighbour(-1)).mul_(8 / 12).sub_(neighbour(2) - neighbour(-2), alpha=1 / 12)
+        by_yy = (neighbour(1) + neighbour(-1)).mul_(16 / 12).sub_(neighbour(2) + neighbour(-2), alpha=1 / 12)
+        by_yy.sub_(neighbour(0), alpha=30 / 12)
+        xx, xy, yy = (moment_slope[:, :, part, i, j].to(by_x.dtype) for i, j in ((0, 0), (0, 1), (1, 1)))
+        result: Tensor = (neighbour(0) * by_x).mul_(xx).addcmul_(by_y, xy, value=2).mul_(by_x)
+        result.add_(mean[:, :, 2:-2]).addcmul_(by_yy, yy)
         return result
 
     return warped

@@ -6,6 +6,9 @@ operators K_m, the weights w_m and the precision matrix P of a prior. The normal
     (sum_m K_m^H w_m K_m + P) c = sum_m K_m^H w_m g_m
 
 are banded, Hermitian and positive definite for every horizontal frequency.
+
+The plain path factors the system of every frequency, and is differentiable. The fast path factors the systems of some
+frequencies and interpolates the factors for all others.
 """
 
 from dataclasses import dataclass, field
@@ -17,6 +20,7 @@ from torch import Tensor
 
 from rsvib_torch.core.banded_solver import BandedFactor, factor_banded, solve_skewed
 from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.interpolated_factors import InterpolatedFactors, node_frequencies
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.core.splines import correlated
 from rsvib_torch.restoration.scene_model.observation import SCENE_REACH, Observation, scene_weights
@@ -133,9 +137,27 @@ class SceneSolver:
             keep=keep,
         )
         self._normal = normal.in_windows(self._windows)
-        self._factors: list[BandedFactor] | None = None
-        if keep and not self._differentiates():
+        self._factors: list[BandedFactor] = []
+        self._interpolated: InterpolatedFactors | None = None
+        if self._differentiates():
+            return
+        if keep:
             self._factors = [factor_banded(self._normal.at(self.u[p], precision[..., p])) for p in self._parts]
+        elif (nodes := self._nodes()) is not None:
+            systems = self._normal.at(self.u[nodes], precision[..., nodes])
+            self._interpolated = InterpolatedFactors.of(systems, nodes)
+
+    def _nodes(self) -> Tensor | None:
+        """Frequencies whose systems are factored; None: all.
+
+        The systems change with the frequency as the prior does, over 1/64 cycles per px, and as kernels that extend r
+        px along the row do, over 1/(140 r). Above 1.5 px, systems are too close to singular for interpolation.
+        """
+        reach = self.observation.kernels.reach
+        step = self.length * min(1 / 64, 1 / (140 * max(reach, 1e-9)))
+        nodes = node_frequencies(len(self.u), step, self.precision.device)
+        # above a fifth of the frequencies, interpolation takes as long as factoring
+        return nodes if reach <= 1.5 and 5 * len(nodes) <= len(self.u) else None
 
     def _differentiates(self, *values: Tensor) -> bool:
         given = (*values, self._normal.left, self.precision)
@@ -149,6 +171,7 @@ class SceneSolver:
             expected: (K, C, U) added to the right sides: P times the expectation of the prior.
         """
         spectra: Tensor = torch.fft.rfft(data)
+        interpolated: dict[int, BandedFactor] = {}  # of each thread, in memory that is used again
 
         def solve(number: int, thread: int | None = None) -> Tensor:
             part = self._parts[number]
@@ -156,7 +179,12 @@ class SceneSolver:
             right = self.observation.adjoint(spectra[..., part], u, part, self.length)
             right = right if expected is None else right + expected[..., part]
             right = torch.stack([right[window] for window in self._windows], dim=-2).flatten(-2)
-            if self._factors is not None:
+            if self._interpolated is not None:
+                factor = self._interpolated.at(part, None if thread is None else interpolated.get(thread))
+                if thread is not None:
+                    interpolated[thread] = factor
+                solution = solve_skewed(factor, right)
+            elif self._factors:
                 solution = solve_skewed(self._factors[number], right)
             else:
                 left = self._normal.left

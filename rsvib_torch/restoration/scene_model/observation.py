@@ -376,11 +376,11 @@ class Observation:
         """
         phases = shift_phases(self.kernels.middle, length, part, spectra.dtype)
         rows = (spectra * (phases * self.kernels.weight.to(self.dtype)[..., None])[:, None]).transpose(1, 2)
-        rows = rows.flatten(0, 1).conj().resolve_conj()
+        rows = rows.flatten(0, 1)
         total = rows.new_zeros(self.count, *rows.shape[1:])
-        for tap, kernel in enumerate(self._smooth.taps(u)):
+        for tap, kernel in enumerate(self._smooth.taps(-u)):  # kernels at -u are the conjugates of those at u
             total = total.index_add_(0, self._first + tap, kernel[:, None] * rows)
-        return total.conj().resolve_conj()
+        return total
 
     def forward(self, coefficients: Tensor, u: Tensor, part: slice, length: int) -> Tensor:
         """``K c``, (M, C, R, U), of coefficients (K, C, U); the other arguments as in ``adjoint``."""

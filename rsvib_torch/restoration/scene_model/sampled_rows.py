@@ -74,14 +74,14 @@ class SampledRows:
         step = 1.2
         products = torch.cat([*precisions, *(step * products for products in precisions)], dim=-1)
         factor = factor_banded(self.normal.at(self.u.repeat(2 * number), products))
-        logs = factor.pivots.log().to(torch.float64).sum(0).unflatten(-1, (slabs, -1)).sum(0)
+        logs = factor.inverse.log().to(torch.float64).sum(0).neg().unflatten(-1, (slabs, -1)).sum(0)
         growth = (logs[many:] - logs[:many]) / math.log(step)
         right = self.spectra.new_zeros(slabs * rows, *self.spectra.shape[1:])
         for i, tap in enumerate(self.taps):
             right.index_add_(0, self.base + i, tap.conj() * self.spectra * self.weight)
         sides = right.unflatten(0, (slabs, rows)).movedim(0, 2).repeat(1, 1, 1, number).flatten(-2)
         unchanged = (
-            values.unflatten(-1, (slabs, -1))[..., :many].flatten(-2) for values in (factor.skewed, factor.inverse)
+            values.unflatten(-1, (slabs, -1))[..., :many].flatten(-2) for values in (factor.upper, factor.inverse)
         )
         solved = BandedFactor(*unchanged).solve(sides).unflatten(-1, (slabs, -1))
         fitted = solved.movedim(2, 0).flatten(0, 1).unflatten(-1, (number, -1))

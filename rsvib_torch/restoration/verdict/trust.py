@@ -80,7 +80,7 @@ def trusted_vibration(
         num_rows: Rows of a frame, along the scan axis.
 
     Returns:
-        The vibration, and one sentence for each axis that is left alone.
+        The vibration, and one sentence for each axis that is not restored.
 
     Example:
         >>> from types import SimpleNamespace
@@ -90,7 +90,7 @@ def trusted_vibration(
         >>> doubtful = SimpleNamespace(vibration=found, std=small, reliable=(True, False), reasons=((), ("blind",)))
         >>> vibration, notes = trusted_vibration(doubtful, timing, 2, 512)
         >>> vibration.amplitude.flatten().tolist(), notes
-        ([3.0, 0.0], ('y is left alone: its vibration is not reliable (blind)',))
+        ([3.0, 0.0], ('y is not restored: its vibration is not reliable (blind)',))
     """
     vibration, std = detected.vibration, detected.std
     reliable = torch.as_tensor(detected.reliable, dtype=torch.bool, device=vibration.device)
@@ -109,10 +109,11 @@ def trusted_vibration(
         for axis, name in enumerate("xy"):
             here = (*at, axis)
             if not bool(reliable[here]):
-                notes.append(f"{where}{name} is left alone: its vibration is not reliable ({'; '.join(reasons[axis])})")
+                why = "; ".join(reasons[axis])
+                notes.append(f"{where}{name} is not restored: its vibration is not reliable ({why})")
             elif not bool(accurate[here]):
                 notes.append(
-                    f"{where}{name} is left alone: its displacement of {float(size[here]):.2g} px has a standard "
+                    f"{where}{name} is not restored: its displacement of {float(size[here]):.2g} px has a standard "
                     f"deviation of {float(error[here]):.2g} px; detect it from more frames"
                 )
     keep = reliable & accurate
@@ -130,7 +131,7 @@ def trusted_vibration(
 def vibration_to_undo(
     vibration: Motion | Detected, timing: SensorTiming, num_frames: int, num_rows: int
 ) -> tuple[Motion, tuple[str, ...]]:
-    """A given motion unchanged; of a detection the accurate part, and one sentence for each axis left alone.
+    """A given motion unchanged; of a detection the accurate part, and one sentence for each axis not restored.
 
     Raises:
         TypeError: If it is neither.
