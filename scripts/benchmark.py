@@ -2,9 +2,9 @@
 """Speed and accuracy of the package and of other software, in one run on one machine.
 
 Sections (see benchmarks/sections.py): registration, cost, detection, restoration, pipeline, scaling, roofline,
-streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict. Results are printed as Markdown tables and
-written to --out; with --store also to scripts/benchmarks/results, from which scripts/benchmark_page.py generates
-docs/benchmarks.md.
+streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict, honesty. Results are printed as Markdown
+tables and written to --out; with --store also to scripts/benchmarks/results, from which scripts/benchmark_page.py
+generates docs/benchmarks.md.
 """
 
 import argparse
@@ -18,6 +18,7 @@ from benchmarks import (
     detection,
     detection_report,
     difficulty,
+    honesty,
     measure,
     pipeline,
     regularisation,
@@ -51,7 +52,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=5, help="timed runs of each method (default: 5)")
     default = [name for name, section in SECTIONS.items() if section.by_default]
     parser.add_argument(
-        "--only", choices=SECTIONS, nargs="+", default=default, help="sections to run (default: all but verdict)"
+        "--only", choices=SECTIONS, nargs="+", default=default, help="default: all sections but verdict and honesty"
     )
     for part in (
         measure,
@@ -66,6 +67,7 @@ def main() -> None:
         difficulty,
         slanted_edge,
         verdict_roc,
+        honesty,
     ):
         part.add_options(parser)
     options = parser.parse_args()

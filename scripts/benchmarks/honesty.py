@@ -1,0 +1,238 @@
+"""Confident wrong answers of detection and restoration, counted over many recordings of benchmarks/honesty_cases.py.
+
+Each axis of a recording is correct, wrong or refused. It is wrong if it is called reliable and
+
+* the amplitude or frequency of a true tone differs by more than 5 standard deviations and more than 2 %, or
+* the displacement of the rows differs from the true one by more than 5 % rms, 5 times its standard deviation and
+  0.01 px. Mean and linear trend over the record do not count: the former is not observable, and a uniform motion moves
+  the restored frames only.
+
+Only tones with offsets above 0.05 px count. A refused axis whose displacement is within 2 % of the true one is known.
+A restoration is worse if the PSNR of the restored frames, each compared with the still scene displaced by the best
+constant, is more than 0.1 dB below that of the raw frames.
+"""
+
+import argparse
+import math
+import time
+import warnings
+from typing import Any
+
+import numpy as np
+import torch
+from benchmarks.honesty_camera import Array
+from benchmarks.honesty_cases import CLASSES, MODELLED, MORE, Recording, recording
+from benchmarks.measure import one_thread
+from scipy.ndimage import shift, spline_filter
+from scipy.optimize import linear_sum_assignment
+
+import rsvib_torch as rsv
+from rsvib_torch.restoration.verdict.trust import displacement_uncertainty
+
+MIN_OFFSET = 0.05  # px, amplitude of the offsets of a tone from which it must be correct
+MANY_STD, WRONG_SHARE = 5.0, 0.02  # of a parameter
+WRONG_DISPLACEMENT, WRONG_PX, KNOWN_DISPLACEMENT = 0.05, 0.01, 0.02  # share of its rms, px, share
+WORSE_DB = 0.1
+RIM = 1 / 12  # of the frame; pixels near the border are not compared
+WITHIN_95 = 1.96
+
+
+def without_trend(values: Array, times: Array) -> Array:
+    """Displacements (T, H) without mean and linear trend over the record."""
+    t = times.ravel() - times.mean()
+    flat = values.ravel() - values.mean()
+    return np.asarray((flat - t * (t @ flat) / (t @ t)).reshape(values.shape))
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def tone_errors(found: rsv.DetectionResult, taken: Recording, axis: int) -> list[dict[str, float]]:
+    """Relative errors and errors over the standard deviation of the true tones that have a counterpart."""
+    if taken.case.tones is None:
+        return []
+    first_rows = taken.starts[:, 0]
+    intervals = np.abs(first_rows[:, None] - first_rows)
+    true = []
+    for amplitude, frequency, _ in taken.case.tones[axis]:
+        gain = np.abs(2 * np.sin(np.pi * frequency * intervals)).max() * abs(np.sinc(frequency * taken.exposure))
+        if amplitude * gain > MIN_OFFSET:
+            true.append({"amplitude": amplitude, "frequency": frequency})
+    tones = (found.vibration.amplitude[axis] > 0).nonzero()[:, 0].tolist()
+    frequencies = found.vibration.frequency[axis].numpy()
+    miss = np.array([[abs(frequencies[tone] - one["frequency"]) for tone in tones] for one in true])
+    errors = []
+    for one, at in zip(*linear_sum_assignment(miss), strict=True) if miss.size else ():
+        pair = {}
+        for name, value in true[one].items():
+            error = float(getattr(found.vibration, name)[axis, tones[at]]) - value
+            std = float(getattr(found.std, name)[axis, tones[at]])
+            pair[f"{name}_error"], pair[f"{name}_z"] = error / value, error / std if std > 0 else math.inf
+        errors.append(pair)
+    return errors
+
+
+def judge_axis(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[str, Any]:
+    """Outcome of one axis with its figures."""
+    num_frames, height = taken.starts.shape
+    stated = taken.timing.row_starts(num_frames, height)
+    shown = found.vibration.mean_displacement(stated, taken.timing.exposure_time)[..., axis].numpy()
+    truth = without_trend(taken.displacement()[axis], taken.starts)
+    error, size = rms(without_trend(shown, stated.numpy()) - truth), rms(truth)
+    std = float(displacement_uncertainty(found.vibration, found.std, taken.timing, num_frames, height)[0][axis])
+    tones = tone_errors(found, taken, axis)
+    reliable = bool(found.reliable[axis])
+    wrong_parameter = any(
+        abs(tone[f"{name}_z"]) > MANY_STD and abs(tone[f"{name}_error"]) > WRONG_SHARE
+        for tone in tones
+        for name in ("amplitude", "frequency")
+    )
+    wrong_displacement = error > max(WRONG_DISPLACEMENT * size, MANY_STD * std, WRONG_PX)
+    if reliable:
+        outcome = "wrong" if wrong_parameter or wrong_displacement else "correct"
+    else:
+        outcome = "known" if error < KNOWN_DISPLACEMENT * size else "refused"
+    return {
+        "outcome": outcome,
+        "wrong_parameter": reliable and wrong_parameter,
+        "wrong_displacement": reliable and wrong_displacement,
+        "tones": tones,
+        "true_tones": 0 if taken.case.tones is None else len(taken.case.tones[axis]),
+        "found_tones": int((found.vibration.amplitude[axis] > 0).sum()),
+        "largest_z": max((abs(t[f"{name}_z"]) for t in tones for name in ("amplitude", "frequency")), default=0.0),
+        "displacement_px": size,
+        "displacement_error": error / size,
+        "displacement_std": std / size,
+        "reasons": list(found.reasons[axis]),
+    }
+
+
+def best_constant(image: Array, still: Array, rim: int, steps: int = 4) -> Array:
+    """Displacement (y, x) of a still frame with the smallest difference to an image."""
+    inner = (slice(rim, -rim), slice(rim, -rim))
+    window = np.outer(*(np.hanning(n) for n in image.shape))
+    spectra = [np.fft.rfft2(window * (one - one[inner].mean())) for one in (image, still)]
+    correlation = np.fft.irfft2(spectra[0] * spectra[1].conj(), s=image.shape)
+    peak = np.array(np.unravel_index(correlation.argmax(), image.shape), dtype=float)
+    at = (peak + 0.5 * np.array(image.shape)) % image.shape - 0.5 * np.array(image.shape)
+    coefficients = spline_filter(still, 3)
+    for _ in range(steps):
+        moved = shift(coefficients, at, order=3, mode="mirror", prefilter=False)
+        slope = np.stack([part[inner].ravel() for part in np.gradient(moved)], axis=1)
+        at = at - np.linalg.solve(slope.T @ slope, slope.T @ (image - moved)[inner].ravel())
+    return np.asarray(at)
+
+
+def psnr(frames: Array, taken: Recording) -> float:
+    """PSNR in dB of frames relative to the still scene, each displaced by the best constant."""
+    rim = int(RIM * frames.shape[-1])
+    errors = []
+    for number, frame in enumerate(frames):
+        y, x = best_constant(frame, taken.still(number), rim)
+        error = frame - taken.still(number, float(x), float(y))
+        errors.append(np.mean(error[rim:-rim, rim:-rim] ** 2))
+    return float(-10 * np.log10(np.mean(errors)))
+
+
+def judge_case(name: str, number: int, size: int) -> dict[str, Any]:
+    """Detection and restoration of a case."""
+    taken = recording(name, number, size)
+    frames = torch.from_numpy(taken.frames).float()
+    case: dict[str, Any] = {"class": name, "number": number, "num_frames": len(frames), "noise": taken.case.noise}
+    case["exposure"] = taken.case.exposure
+    begin = time.perf_counter()
+    try:
+        found = rsv.detect_vibration(frames, taken.timing)
+    except ValueError as error:
+        return case | {"error": str(error), "axes": []}
+    case["axes"] = [judge_axis(found, taken, axis) for axis in range(2)]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", rsv.RestorationWarning)
+        restored = rsv.restore(frames, taken.timing, found)
+    case["seconds"] = time.perf_counter() - begin
+    case["warnings"] = [str(one.message) for one in caught if one.category is rsv.RestorationWarning]
+    case["raw_db"] = psnr(taken.frames, taken)
+    case["restored_db"] = psnr(restored.double().numpy(), taken)
+    return case
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this section."""
+    group = parser.add_argument_group("honesty")
+    group.add_argument("--honesty-classes", nargs="+", choices=CLASSES, default=list(CLASSES), help="default: all")
+    group.add_argument(
+        "--honesty-cases", type=int, default=9, help="cases of each class, of some a multiple (default: 9, 333 in all)"
+    )
+    group.add_argument("--honesty-size", type=int, default=384, help="rows and columns of the frames (default: 384)")
+
+
+def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """All cases of the classes."""
+    with one_thread():
+        return [
+            judge_case(name, number, options.honesty_size)
+            for name in options.honesty_classes
+            for number in range(options.honesty_cases * MORE.get(name, 1))
+        ]
+
+
+def is_worse(case: dict[str, Any]) -> bool:
+    """Whether restoration lowered the PSNR."""
+    return "restored_db" in case and case["restored_db"] < case["raw_db"] - WORSE_DB
+
+
+def covered(axes: list[dict[str, Any]]) -> str:
+    """Share of 95 % intervals of amplitude and frequency that contain the truth, over axes called reliable."""
+    tones = [tone for axis in axes if axis["outcome"] in ("correct", "wrong") for tone in axis["tones"]]
+    if not tones:
+        return "| | | 0 |"
+    shares = [np.mean([abs(tone[f"{name}_z"]) < WITHIN_95 for tone in tones]) for name in ("amplitude", "frequency")]
+    return "| " + " | ".join(f"{share:.0%}" for share in shares) + f" | {len(tones)} |"
+
+
+def counts(name: str, cases: list[dict[str, Any]]) -> str:
+    """Line of the table for a class."""
+    axes = [axis for case in cases for axis in case["axes"]]
+    outcomes = [axis["outcome"] for axis in axes]
+    worse = [case["warnings"] for case in cases if is_worse(case)]
+    about_axes = [all("is not restored" in one for one in texts) for texts in worse if texts]
+    reliable = [axis["largest_z"] for axis in axes if axis["outcome"] in ("correct", "wrong")]
+    values = [
+        len(cases),
+        outcomes.count("correct"),
+        outcomes.count("wrong"),
+        sum(axis["wrong_parameter"] for axis in axes),
+        sum(axis["wrong_displacement"] for axis in axes),
+        outcomes.count("refused") + 2 * sum("error" in case for case in cases),
+        outcomes.count("known"),
+        sum(not texts for texts in worse),
+        sum(about_axes),
+        f"{max(reliable, default=0.0):.1f}",
+    ]
+    return f"| {name} | " + " | ".join(str(value) for value in values) + " " + covered(axes)
+
+
+def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+    """Counts of each class and in all, and the coverage of intervals."""
+    names = dict.fromkeys(case["class"] for case in results)
+    text = [
+        "Axes that are correct, wrong (by their parameters, by the displacement of the rows), refused, and refused",
+        "although the displacement is known; recordings whose restoration is worse than the frames, without a warning",
+        "and with a warning only that an axis is not restored; largest error of a tone of axes called reliable, in",
+        "standard deviations; share of 95 % intervals of amplitude and frequency that contain the truth. The true row",
+        "time cannot be found from frames without start times: its error changes all frequencies alike.",
+        "",
+        "| class | cases | correct | wrong | parameters | displacement | refused | although known | worse, no warning "
+        "| worse, only an axis named | largest error | amplitude within | frequency within | tones |",
+        "|---" * 14 + "|",
+        *(counts(name, [case for case in results if case["class"] == name]) for name in names),
+        counts("all", results),
+        "",
+        "| steady vibrations, timing correct | amplitude within | frequency within | tones |",
+        "|---" * 4 + "|",
+    ]
+    modelled = [axis for case in results if case["class"].startswith(MODELLED) for axis in case["axes"]]
+    text.append("| one tone " + covered([axis for axis in modelled if axis["true_tones"] == 1]))
+    text.append("| several tones " + covered([axis for axis in modelled if axis["true_tones"] > 1]))
+    return text

@@ -1,0 +1,156 @@
+"""The count of confident wrong answers: its camera compared with formulas, and a complete run of a case."""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+H, W = 64, 72
+PERIODS = np.array([9.0, 13.0])  # px, along rows and along the scan
+
+
+@pytest.fixture(autouse=True)
+def scripts(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    yield
+    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
+        monkeypatch.delitem(sys.modules, name)
+
+
+def waves():
+    """A scene of one wave along each axis as a layer, and its image at positions in px."""
+    from benchmarks.honesty_camera import FINER, MARGIN, OPTICS, fine_shape, layer
+
+    turn = 2 * np.pi / PERIODS
+    y, x = ((np.arange(n) + 0.5) / FINER - 0.5 - MARGIN for n in fine_shape(H, W))
+    fine = 0.5 + 0.2 * np.cos(turn[0] * x) + 0.15 * np.sin(turn[1] * y)[:, None]
+    # the mean over FINER points, and the optics
+    pixel = [np.sin(0.5 * t) / (FINER * np.sin(0.5 * t / FINER)) * np.exp(-0.5 * (OPTICS * t) ** 2) for t in turn]
+
+    def image(row, column):
+        return 0.5 + 0.2 * pixel[0] * np.cos(turn[0] * column) + 0.15 * pixel[1] * np.sin(turn[1] * row)
+
+    return layer(fine), image
+
+
+ROWS, COLUMNS = np.arange(H)[:, None] * 1.0, np.arange(W)[None, :] * 1.0
+STARTS = np.arange(H)[None, :] * 1e-4
+
+
+def test_a_constant_displacement_moves_the_scene():
+    from benchmarks.honesty_camera import standing, take_frames
+
+    scene, image = waves()
+    frame = take_frames([scene], standing(1.37, -2.61), STARTS, 1e-3, W)[0]
+    np.testing.assert_allclose(frame, image(ROWS + 2.61, COLUMNS - 1.37), rtol=0, atol=2e-5)
+
+
+def test_roll_and_zoom_keep_the_centre():
+    from benchmarks.honesty_camera import row_displacement, take_frames
+
+    scene, image = waves()
+    roll, zoom = 0.004, 0.01
+    frame = take_frames([scene], lambda t: np.stack([0 * t, 0 * t, 0 * t + roll, 0 * t]), STARTS, 1e-3, W)[0]
+    down, right = ROWS - 31.5, COLUMNS - 35.5
+    expected = image(31.5 + down - roll * right, 35.5 + right + roll * down)  # content turns from x towards y
+    np.testing.assert_allclose(frame, expected, rtol=0, atol=1e-4)
+    enlarged = lambda t: np.stack([0 * t, 0 * t, 0 * t, 0 * t + zoom])  # noqa: E731
+    frame = take_frames([scene], enlarged, STARTS, 1e-3, W)[0]
+    np.testing.assert_allclose(frame, image(31.5 + down / 1.01, 35.5 + right / 1.01), rtol=0, atol=2e-5)
+    x, y = row_displacement(enlarged, STARTS, 1e-3, W)
+    np.testing.assert_allclose(x, 0, atol=1e-12)
+    np.testing.assert_allclose(y[0], down[:, 0] * (1 - 1 / 1.01), rtol=1e-9)
+
+
+def test_an_exposure_attenuates_a_moving_wave_by_a_sinc():
+    from benchmarks.honesty_camera import row_displacement, take_frames
+
+    scene, image = waves()
+    exposure, speed = 3e-3, 2000.0  # 6 px
+    frame = take_frames([scene], lambda t: np.stack([speed * t, 0 * t, 0 * t, 0 * t]), STARTS, exposure, W)[0]
+    middle = speed * (STARTS[0] + 0.5 * exposure)
+    wave = image(ROWS, COLUMNS - middle[:, None]) - image(ROWS, np.full((1, W), 0.25 * PERIODS[0]))
+    still = image(ROWS, np.full((1, W), 0.25 * PERIODS[0]))
+    np.testing.assert_allclose(frame, still + np.sinc(speed * exposure / PERIODS[0]) * wave, rtol=0, atol=2e-5)
+    np.testing.assert_allclose(
+        row_displacement(lambda t: np.stack([speed * t, t, 0 * t, 0 * t]), STARTS, exposure, W)[0, 0], middle
+    )
+
+
+def test_rows_are_displaced_at_their_own_times():
+    from benchmarks.honesty_camera import take_frames
+
+    scene, image = waves()
+    starts = STARTS + np.array([[0.0], [0.02]])
+    frames = take_frames([scene], lambda t: np.stack([0 * t, 2 * np.sin(300 * t), 0 * t, 0 * t]), starts, 1e-9, W)
+    for frame, of_rows in zip(frames, starts, strict=True):
+        expected = image(ROWS - 2 * np.sin(300 * of_rows)[:, None], COLUMNS)
+        np.testing.assert_allclose(frame, expected, rtol=0, atol=2e-5)
+
+
+def test_a_layer_hides_the_scene_and_moves_by_itself():
+    from benchmarks.honesty_camera import fine_shape, layer, standing, take_frames
+
+    scene, image = waves()
+    cover = np.zeros(fine_shape(H, W))
+    cover[:, cover.shape[1] // 2 :] = 1.0
+    near = layer(np.full(cover.shape, 0.9), cover, (1000.0, 0.0))
+    frames = take_frames([scene, near], standing(), np.array([[0.0], [0.008]]).repeat(H, axis=1), 1e-9, W)
+    for frame, border in zip(frames, (36, 44), strict=True):
+        np.testing.assert_allclose(frame[:, border + 4 :], 0.9, atol=1e-3)
+        np.testing.assert_allclose(frame[:, : border - 4], image(ROWS, COLUMNS[:, : border - 4]), atol=1e-3)
+
+
+def test_registration_finds_the_constant_displacement():
+    from benchmarks.honesty import best_constant
+    from benchmarks.honesty_cases import recording
+
+    taken = recording("plain", 0, 128)
+    np.testing.assert_allclose(best_constant(taken.still(0, 3.3, -7.6), taken.still(0), 12), (-7.6, 3.3), atol=0.02)
+
+
+def test_a_plain_case_is_correct(tmp_path):
+    from benchmarks import honesty
+    from benchmarks.store import read_result, write_result
+
+    options = argparse.Namespace(honesty_classes=["plain"], honesty_cases=1, honesty_size=256)
+    results = honesty.rows(options)
+    assert [axis["outcome"] for axis in results[0]["axes"]] == ["correct", "correct"]
+    assert all(0 < axis["largest_z"] < 4 for axis in results[0]["axes"])
+    assert results[0]["restored_db"] > results[0]["raw_db"] + 5
+    text = honesty.lines(results, options)
+    assert any(line.startswith("| plain | 1 | 2 | 0 | 0 | 0 | 0 | 0 | 0 | 0 |") for line in text)
+    stored = read_result(write_result("honesty", results, options, 1.0, tmp_path))
+    assert honesty.lines(stored.rows, stored.options) == text
+
+
+def test_outcomes_of_an_axis_follow_the_criteria():
+    from dataclasses import replace
+
+    import torch
+    from benchmarks import honesty
+    from benchmarks.honesty_cases import recording
+
+    import rsvib_torch as rsv
+
+    taken = recording("plain", 0, 128)
+    true = [torch.tensor(np.stack([tones[:, i] for tones in taken.case.tones])) for i in range(3)]
+    found = rsv.detect_vibration(torch.from_numpy(taken.frames).float(), taken.timing)
+    std = replace(found.std, **{name: torch.full_like(true[0], 1e-4) for name in ("amplitude", "frequency", "phase")})
+
+    def outcome(vibration, *reliable):
+        claimed = replace(found, vibration=vibration, std=std, reliable=torch.tensor(reliable))
+        return [honesty.judge_axis(claimed, taken, axis) for axis in range(2)]
+
+    exact = outcome(rsv.Vibration(*true), True, False)
+    assert [axis["outcome"] for axis in exact] == ["correct", "known"]
+    assert max(axis["displacement_error"] for axis in exact) < 1e-6
+    louder = outcome(rsv.Vibration(1.03 * true[0], *true[1:]), True, False)
+    assert [axis["outcome"] for axis in louder] == ["wrong", "refused"]
+    assert (louder[0]["wrong_parameter"], louder[0]["wrong_displacement"]) == (True, False)
+    assert louder[0]["largest_z"] == pytest.approx(0.03 * float(true[0][0]) / 1e-4)
+    inverted = outcome(rsv.Vibration(*true[:2], true[2] + np.pi), True, True)
+    assert [(axis["wrong_parameter"], axis["wrong_displacement"]) for axis in inverted] == [(False, True)] * 2
