@@ -22,7 +22,8 @@ Motion = Callable[[Array], Array]  # times (...) in s -> (4, ...): x and y in px
 FINER = 4  # points of the scene per px and axis
 MARGIN = 44  # px of the scene beyond the frame on each side; the largest displacement is 25 px
 OPTICS = 0.4  # px, standard deviation of the optics; the MTF of optics and pixel at the Nyquist frequency is 0.29
-NODES = (5, 1.2, 64)  # of an exposure: minimum, per px of its path, maximum
+# nodes of an exposure: minimum, per px of its path, maximum; the rms error of a chart is below 2e-5 up to 74 px
+NODES = (5, 2.0, 160)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +103,9 @@ def take_frames(layers: Sequence[Layer], motion: Motion, starts: Array, exposure
     size = (starts.shape[1], width)
     fastest = max(float(np.hypot(*part.velocity)) for part in layers)
     least, for_a_px, most = NODES
-    count = int(min(most, least + np.ceil(for_a_px * longest_path(motion, starts, exposure, size, fastest))))
-    row, column = np.arange(size[0])[:, None], np.arange(width)[None, :]
+    path = longest_path(motion, starts, exposure, size, fastest)
+    count = int(min(most, least + np.ceil(for_a_px * path))) if path > 0 else 1
+    row, column = np.arange(float(size[0]))[:, None], np.arange(float(width))[None, :]
     frames = np.zeros((len(starts), *size))
     for number, of_rows in enumerate(starts):
         for moment, weight in zip(*exposure_nodes(count, exposure), strict=True):
@@ -122,7 +124,7 @@ def take_frames(layers: Sequence[Layer], motion: Motion, starts: Array, exposure
 def row_displacement(motion: Motion, starts: Array, exposure: float, width: int) -> Array:
     """Displacement (2, T, H) in px, axes (x, y): the mean over the columns of a row and its exposure."""
     moments, weights = exposure_nodes(NODES[2], exposure)
-    row, column = np.arange(starts.shape[1])[None, :, None], np.array(0.5 * (width - 1))
+    row, column = np.arange(float(starts.shape[1]))[None, :, None], np.array(0.5 * (width - 1))
     down, right = seen_positions(motion, starts[..., None] + moments, row, column, (starts.shape[1], width))
     return np.stack([(column - right) @ weights, (row - down) @ weights])
 

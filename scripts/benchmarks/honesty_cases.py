@@ -80,7 +80,7 @@ class Recording:
     def still(self, frame: int, x: float = 0.0, y: float = 0.0) -> Array:
         """A frame of a camera at rest that is displaced by a constant, without noise."""
         starts = self.starts[frame : frame + 1]
-        return take_frames(self.layers, standing(x, y), starts, self.exposure, self.frames.shape[-1])[0]
+        return np.asarray(take_frames(self.layers, standing(x, y), starts, self.exposure, self.frames.shape[-1])[0])
 
 
 def record(case: Case, generator: Generator, size: int) -> Recording:
@@ -96,10 +96,12 @@ def record(case: Case, generator: Generator, size: int) -> Recording:
     starts = taken[:, None] * FRAME_PERIOD + order * row_time
     frames = take_frames(layers, case.motion, starts, exposure_rows * row_time, size)
     frames += case.noise * generator.standard_normal(frames.shape)
-    true = {"row_time": row_time, "exposure_rows": exposure_rows, "frame_rows": BLANKING * size}
-    told = {name: value * case.stated.get(name, 1.0) for name, value in true.items()}
-    stamps = tuple(FRAME_PERIOD * taken) if case.time_stamps else None
-    timing = rsv.SensorTiming(**told, frame_start_times=stamps)
+    timing = rsv.SensorTiming(
+        row_time=row_time * case.stated.get("row_time", 1.0),
+        exposure_rows=exposure_rows * case.stated.get("exposure_rows", 1.0),
+        frame_rows=BLANKING * size * case.stated.get("frame_rows", 1.0),
+        frame_start_times=(FRAME_PERIOD * taken).tolist() if case.time_stamps else None,
+    )
     return Recording(case, frames, timing, starts, exposure_rows * row_time, tuple(layers))
 
 
@@ -254,7 +256,7 @@ def misstated(**factors: float) -> Build:
     return partial(plain, stated=factors)
 
 
-CLASSES: dict[str, Build] = {
+TIMING_CORRECT: dict[str, Build] = {
     "plain": plain,
     "random": random,
     "harmonics": harmonics,
@@ -273,6 +275,8 @@ CLASSES: dict[str, Build] = {
     "objects": partial(plain, in_front=partial(sliding, cars, 20.0)),
     "cloud": partial(plain, in_front=partial(sliding, cloud, 4.0)),
     "parallax": partial(plain, in_front=partial(sliding, near_half, 4.0)),
+}
+TIMING_WRONG: dict[str, Build] = {
     **{f"frame_rows {error:+.0%}": misstated(frame_rows=1 + error) for error in (0.02, 0.05, -0.10)},
     **{f"row_time {error:+.0%}": misstated(row_time=1 + error) for error in (0.01, 0.03, 0.10)},
     **{
@@ -286,6 +290,7 @@ CLASSES: dict[str, Build] = {
     "swapped frames": partial(plain, taken=(0, 2, 1, 3)),
     "reversed readout": partial(plain, reverse=True),
 }
+CLASSES = TIMING_CORRECT | TIMING_WRONG
 # classes whose motion is that of the model, observed with the stated timing: intervals must contain the truth
 MODELLED = ("plain", "random", "harmonics", "close pair", "long period", "large amplitude", "stars")
 MORE = {"random": 5}  # times as many cases as of the other classes
