@@ -1,5 +1,6 @@
 """``detect_vibration``: entry point of detection, with the tables of models and methods."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, TypedDict, Unpack, overload
@@ -16,12 +17,18 @@ from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_
 from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
 from rsvib_torch.detection.start import band_curve, grey_frames, measurements_of_curve
-from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, model_displacements, vibration_of_fit
+from rsvib_torch.detection.tones.fit import (
+    MotionModel,
+    ToneFit,
+    displacement_std,
+    model_displacements,
+    vibration_of_fit,
+)
 from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.motion.vibration import blind_frequencies
+from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOptions
 
 __all__ = ["DetectionMethod", "VibrationDetector", "VibrationModel", "detect_vibration"]
@@ -303,6 +310,11 @@ def _detect(
     curve = band_curve(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve)
     fit, other_motion = method.fit(curve, frames, valid, row_timing, options)
     vibration, std = vibration_of_fit(fit)
+    starts = row_timing.frame_starts(frames.shape[1], frames.device)[:, None]
+    starts = (starts + torch.arange(frames.shape[-2], device=frames.device)[::8] * row_timing.row_time).flatten()
+    std = replace(std, displacement=displacement_std(fit, starts, row_timing.exposure_time))
+    tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
+    moved = tones.mean_displacement(starts.expand(len(frames), -1), row_timing.exposure_time)
     predicted = model_displacements(measurements_of_curve(curve, row_timing, bands.band_step), fit)
     fitted = (predicted[:, :, 1] - predicted[:, :, 0]).unflatten(1, curve.quality.shape[1:])
     residual = (curve.offsets - fitted).abs().nanmean(dim=(1, 2))
@@ -310,7 +322,6 @@ def _detect(
     # an image motion may carry bands out of the later frame
     later = curve.rows + fitted[..., 1]
     visible = (later >= 0.5 * bands.band_rows) & (later <= frames.shape[-2] - 1 - 0.5 * bands.band_rows)
-    duration = float(curve.later_times.max() - curve.times.min()) + bands.band_rows * timing.row_time
     intervals = compared_intervals(row_timing, frames.shape[1], method.max_group_frames, frames.device)
     verdicts = [
         judge(
@@ -320,9 +331,10 @@ def _detect(
             fitted=fitted[index].flatten(0, 1),
             visible=visible[index].flatten(),
             intervals=intervals,
-            duration=duration,
+            displacement=moved[index].std(0, correction=0),
             timing=row_timing,
             other_motion=None if other_motion is None else other_motion[index],
+            max_tones=MAX_TONES if options.tones is None and options.model.harmonics == 1 else math.inf,
         )
         for index in range(len(frames))
     ]

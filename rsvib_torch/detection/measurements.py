@@ -151,8 +151,15 @@ class Measurements:
     # Residuals of a fit, (B, N, G, 2) px
 
     def square(self, residual: Tensor) -> Tensor:
-        """(B, 2) weighted sum of squares of residuals, each axis with its share of the cross terms."""
-        return torch.einsum("bnga,bnac,bngc->ba", residual, self.information, residual)
+        """(B, 2) sum of the squared residuals of each axis over their variance ``(W^-1)_aa``, W the information.
+
+        The residuals of one axis do not affect the sum of the other.
+        """
+        first, both, second = (self.information[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        conditional = torch.stack([first, second], -1)
+        explained = torch.where(conditional > 0, both[..., None].square() / conditional.clamp(min=1e-300), 0.0)
+        inverse_variance = (conditional - explained.flip(-1)).clamp(min=0.0)
+        return torch.einsum("bnga,bna->ba", residual.square(), inverse_variance)
 
     def sizes(self, residual: Tensor) -> Tensor:
         """(B, N, 2) rms residual of each row in standard deviations; NaN where nothing was measured."""
@@ -170,6 +177,19 @@ class Measurements:
         square = residual.square().sum(2) / self.num_differences[..., None].clamp(min=1.0)
         excess = square - 1 / self.weights.clamp(min=1e-300)
         return trimmed_mean(torch.where(measured, excess, torch.nan)).clamp(min=0.0).sqrt()
+
+    def correlated(self, residual: Tensor, *, significance: float = 1.645) -> Tensor:
+        """(B, 2) px, root of the weighted mean product of the residuals of neighbouring rows.
+
+        Noise is independent from row to row and does not contribute; an unmodelled motion, and a wrong timing, displace
+        neighbouring rows alike. Outliers (clouds) are left out. 0 if the mean is below ``significance`` of its standard
+        deviations (1.645: 95 %).
+        """
+        counted = self.weights.sqrt() * (self._biweight_argument(residual) < 1)
+        weight = counted[:, 1:] * counted[:, :-1]
+        product = (residual[:, 1:] * residual[:, :-1]).sum(2) / self.num_differences[:, 1:, None].clamp(min=1.0)
+        total, deviation = (weight * product).sum(1), (weight * product).square().sum(1).sqrt()
+        return torch.where(total > significance * deviation, total / weight.sum(1).clamp(min=1e-300), 0.0).sqrt()
 
     def independent_fraction(self, residual: Tensor, *, lags: int = 4) -> float:
         """Fraction of the rows that are independent, from the correlation rho(k) of residuals k rows apart.

@@ -22,12 +22,15 @@ def judge(
     fitted: Tensor,
     visible: Tensor,
     intervals: Tensor,
-    duration: float,
+    displacement: Tensor,
     timing: RowTiming,
     other_motion: OtherMotion | None = None,
+    max_tones: float = math.inf,
     min_bands: float = 0.5,
 ) -> tuple[Tensor, tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Verdict on one vibration (not a batch).
+    """Verdict on one vibration (not a batch), from the measurements that it was fitted to.
+
+    These are the displacements of rows if ``other_motion`` is given, else the offsets of bands.
 
     Args:
         vibration: The detected vibration.
@@ -36,37 +39,43 @@ def judge(
         fitted: (M, 2) px, offsets predicted by the vibration.
         visible: (M,) bool, bands that both frames contain.
         intervals: Times between the frames that were compared, s.
-        duration: Length of the record in seconds.
+        displacement: (2,) px, displacement of the rows by the tones without its mean, rms over the rows.
         timing: The sensor, in row order.
-        other_motion: Motion that the vibration does not explain; None if it was not measured.
-        min_bands: Fraction of the visible bands that must be registered.
+        other_motion: Motion of the rows that the vibration does not explain; None if it was fitted to bands.
+        max_tones: Largest number of tones that was tried on an axis; an axis with so many may have more.
+        min_bands: Fraction of the visible bands or rows that must be registered.
 
     Returns:
         (2,) bool and the reasons against each axis.
     """
     reasons: tuple[list[str], list[str]] = ([], [])
     good = torch.isfinite(offsets).all(-1) & visible
-    share = float(good.double().sum() / visible.double().sum().clamp(min=1))
     # condition (24) concerns the tones only: the blur by a uniform motion is exact at any speed
     tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
     within_row, max_within_row = tones.displacement_within(timing.row_time).tolist(), 0.1  # px
     gain = offset_gain(vibration.frequency, intervals)
+    of_all = _against_measurements(good, visible, other_motion, min_bands)
+    if other_motion is not None:
+        of_all += _against_rotation(other_motion, vibration.amplitude * gain) + _against_exposure(other_motion, timing)
     for axis, against in enumerate(reasons):
         amplitude = vibration.amplitude[axis]
-        if share < min_bands:
-            against.append(
-                f"only {share:.0%} of {int(visible.sum())} row bands can be registered, {min_bands:.0%} are needed: "
-                "the motion is beyond the search range (increase search), or the frames lack detail or show different "
-                "scenes"
-            )
+        against.extend(of_all)
         if not bool((amplitude > 0).any()):
             against.append("no significant tone: the offsets are those of a uniform motion, or below their noise")
+        if int(amplitude.count_nonzero()) >= max_tones:
+            against.append(
+                f"{max_tones} tones do not explain the motion: it is no sum of few tones, or the timing is wrong; try "
+                "model='free'"
+            )
         for tone in amplitude.nonzero()[:, 0].tolist():
-            against.extend(_against_tone(vibration, std, axis, tone, float(gain[axis, tone]), duration, timing))
-        if bool(good.any()):
-            against.extend(_against_fit(offsets[good, axis], fitted[good, axis]))
+            against.extend(_against_tone(vibration, std, axis, tone, float(gain[axis, tone]), timing))
+        if std.displacement is not None:
+            against.extend(_against_displacement(float(displacement[axis]), float(std.displacement[axis])))
         if other_motion is not None:
             against.extend(_against_other_motion(other_motion, axis, amplitude * gain[axis]))
+            continue
+        if bool(good.any()):
+            against.extend(_against_fit(offsets[good, axis], fitted[good, axis]))
         if within_row[axis] > max_within_row:
             against.append(
                 f"the image moves {within_row[axis]:.2g} px within a row time, condition (24) allows "
@@ -76,23 +85,33 @@ def judge(
     return reliable, (tuple(reasons[0]), tuple(reasons[1]))
 
 
-def _against_tone(
-    vibration: Vibration,
-    std: VibrationStd,
-    axis: int,
-    tone: int,
-    gain: float,
-    duration: float,
-    timing: RowTiming,
-    *,
-    max_frequency_std: float = 0.1,
+def _against_measurements(
+    good: Tensor, visible: Tensor, other_motion: OtherMotion | None, min_bands: float
 ) -> list[str]:
-    """Reasons against one tone; ``max_frequency_std`` is a fraction of its frequency."""
+    """Reasons from the share of rows or bands that were measured."""
+    share = float(good.double().sum() / visible.double().sum().clamp(min=1))
+    if other_motion is not None:
+        share = float(other_motion.measured)
+    if share >= min_bands:
+        return []
+    what = f"{int(visible.sum())} row bands" if other_motion is None else "the rows"
+    return [
+        f"only {share:.0%} of {what} can be registered, {min_bands:.0%} are needed: the motion is beyond the search "
+        "range (increase search), or the frames lack detail or show different scenes"
+    ]
+
+
+def _against_tone(
+    vibration: Vibration, std: VibrationStd, axis: int, tone: int, gain: float, timing: RowTiming
+) -> list[str]:
+    """Reasons against one tone."""
     size, hertz = float(vibration.amplitude[axis, tone]), float(vibration.frequency[axis, tone])
     size_std, hertz_std = float(std.amplitude[axis, tone]), float(std.frequency[axis, tone])
     name = f"tone of {hertz:.4g} Hz"
     against = []
-    if size < MIN_SIGNIFICANCE * size_std:
+    if not (0 < size_std < math.inf and 0 < hertz_std < math.inf):
+        against.append(f"the uncertainty of the {name} is unknown: too few rows were measured; use more frames")
+    elif size < MIN_SIGNIFICANCE * size_std and vibration.amplitude[axis].count_nonzero() == 1:
         against.append(
             f"{name} is not significant: its amplitude is {size:.3g} ± {size_std:.2g} px, and {MIN_SIGNIFICANCE:g} "
             "standard deviations are needed; use more frames"
@@ -102,20 +121,10 @@ def _against_tone(
             f"{name} is too small: its offsets of {size * gain:.2g} px are below {MIN_OFFSET} px, where errors of "
             "interpolation may cause them"
         )
-    elif hertz_std > max_frequency_std * hertz:
-        against.append(
-            f"{name} is uncertain: its frequency is {hertz:.4g} ± {hertz_std:.2g} Hz, {max_frequency_std:.0%} are "
-            "allowed; use more frames"
-        )
     if gain < MIN_GAIN:
         against.append(
             f"{name} is nearly blind: its gain is {gain:.3f}, {MIN_GAIN} is needed, because every frame is displaced "
             "alike; use frames at other or unequal intervals"
-        )
-    if hertz * duration < 1.0:
-        against.append(
-            f"{name} has a period of {1e3 / hertz:.3g} ms, longer than the record of {1e3 * duration:.3g} ms; use more "
-            "frames"
         )
     if hertz * timing.exposure_time > 1.0:
         against.append(
@@ -123,6 +132,16 @@ def _against_tone(
             "shorter exposure"
         )
     return against
+
+
+def _against_displacement(size: float, std: float, *, max_ratio: float = 0.5) -> list[str]:
+    """Reasons from the displacement of the rows in px and its standard deviation, rms over the rows."""
+    if size == 0 or std <= max_ratio * size:
+        return []
+    return [
+        f"the displacement of the rows is uncertain: {size:.2g} ± {std:.2g} px, and {max_ratio:.0%} are allowed; use "
+        "more frames"
+    ]
 
 
 def _against_fit(offsets: Tensor, fitted: Tensor, *, counted: float = 0.75) -> list[str]:
@@ -140,19 +159,48 @@ def _against_fit(offsets: Tensor, fitted: Tensor, *, counted: float = 0.75) -> l
 
 
 def _against_other_motion(other: OtherMotion, axis: int, offset_amplitudes: Tensor) -> list[str]:
-    """Reasons from motion that no vibration explains, given the offset amplitudes (K,) of the tones in px."""
-    rms_offset = float(offset_amplitudes.square().sum().sqrt()) / 2**0.5
-    allowed = max(0.03, 0.05 * rms_offset)  # px; smaller values are errors of interpolation
-    unexplained, differential = float(other.unexplained[axis]), float(other.differential[axis])
-    against = []
-    if unexplained > allowed:
-        against.append(
-            f"rows move by {unexplained:.3g} px that no tone explains, {allowed:.2g} px are allowed; try more tones or "
-            "model='free'"
-        )
-    if differential > allowed:
-        against.append(
-            f"left and right halves of the rows move apart by {differential:.3g} px, {allowed:.2g} px are allowed: the "
-            "camera rotates, or the scene has parallax"
-        )
-    return against
+    """Reasons from motion that no vibration explains, given the offset amplitudes (K,) of the tones in px.
+
+    Limits: docs/reliability.md. Errors of interpolation and of the correction for unequal blur are below them.
+    """
+    size = float(offset_amplitudes.square().sum().sqrt()) / 2**0.5
+    limits = (
+        ("rows", float(other.unexplained[axis]), max(0.03, 0.01 * size)),
+        ("neighbouring rows", float(other.correlated[axis]), max(0.01, 0.005 * size)),
+    )
+    for rows, unexplained, allowed in limits:
+        if unexplained > allowed:
+            return [
+                f"{rows} move by {unexplained:.3g} px that no tone explains, {allowed:.2g} px are allowed; try more "
+                "tones or model='free', and check frame_rows, row_time and the start times of the frames"
+            ]
+    return []
+
+
+def _against_rotation(other: OtherMotion, offset_amplitudes: Tensor) -> list[str]:
+    """Reasons against both axes: rotation and zoom move the halves of a row along one axis, and rows along both."""
+    size = float(offset_amplitudes.square().sum(-1).amin().sqrt()) / 2**0.5
+    differential, allowed = float(other.differential.amax()), max(0.03, 0.02 * size)
+    if differential <= allowed:
+        return []
+    return [
+        f"left and right halves of the rows move apart by {differential:.3g} px, {allowed:.2g} px are allowed: the "
+        "camera rotates, or the scene has parallax"
+    ]
+
+
+def _against_exposure(other: OtherMotion, timing: RowTiming) -> list[str]:
+    """Reasons against both axes from the blur of the frames, whose ratio is the square of that of the exposure times.
+
+    With correct exposure times the ratio was 0.7 to 2.3 (docs/reliability.md). It increases where little blur is
+    expected, because differences of interpolation add about 0.01 of the detail.
+    """
+    ratio, std, size = other.blur.tolist()
+    low = ratio < 0.6 and 1 - ratio > 3 * std
+    high = ratio > 2.5 and ratio - 1 > 5 * std and (ratio - 1) * size > 0.01
+    if not (low or high):
+        return []
+    return [
+        f"the blur of the frames is {ratio:.2g} times that of an exposure of {timing.exposure_rows:g} rows: about "
+        f"{timing.exposure_rows * math.sqrt(max(ratio, 0.0)):.2g} rows are likely; correct exposure_rows"
+    ]

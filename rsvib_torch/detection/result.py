@@ -19,15 +19,22 @@ class OtherMotion:
 
     Attributes:
         unexplained: (..., 2) rms residual displacement of the fit.
+        correlated: (..., 2) the part of it that neighbouring rows have in common.
         differential: (..., 2) rms difference of the residual displacements of the left and right halves of the rows.
+        measured: (...) fraction of the visible rows whose displacement was measured.
+        blur: (..., 3) measured difference of the blur of the frames relative to the expected one, its standard
+            deviation, and the size of the expected difference relative to the detail of the scene.
     """
 
     unexplained: Tensor
+    correlated: Tensor
     differential: Tensor
+    measured: Tensor
+    blur: Tensor
 
     def __getitem__(self, index: int) -> "OtherMotion":
         """The part of one stack out of a batch."""
-        return OtherMotion(self.unexplained[index], self.differential[index])
+        return OtherMotion(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +90,8 @@ def stacked(results: list[DetectionResult]) -> DetectionResult:
 
     def parameters(parts: list[Any], kind: type[Any]) -> dict[str, Tensor]:
         values = {field.name: [getattr(part, field.name) for part in parts] for field in fields(kind)}
-        return {name: joined(v) if name.startswith("image") else padded(v) for name, v in values.items()}
+        of_axes = ("image_motion", "image_acceleration", "displacement")  # the others have an entry for each tone
+        return {name: joined(v) if name in of_axes else padded(v) for name, v in values.items()}
 
     curves = [result.offsets for result in results]
     batch = curves[0].offsets.shape[0]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol, Self
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from torch import Tensor
 
 from rsvib_torch.core.validation import Section, checked
@@ -126,15 +126,26 @@ class StdRecord(Section):
     phase: list[Numbers]
     image_motion: Numbers
     image_acceleration: Numbers = Field(default_factory=lambda: list[float | None]([None, None]))
+    displacement: Numbers | None = None
 
     @classmethod
     def from_std(cls, std: VibrationStd) -> Self:
         """The record of the standard deviations of one vibration."""
-        return cls(**{name: to_json(getattr(std, name)) for name in cls.model_fields})
+        values = {name: getattr(std, name) for name in cls.model_fields}
+        return cls(**{name: to_json(value) for name, value in values.items() if value is not None})
+
+    @model_serializer(mode="wrap")
+    def _without_unknown(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Files of version 0.1.0 have no ``displacement``, and keep their hash."""
+        values: dict[str, Any] = handler(self)
+        return {name: value for name, value in values.items() if name != "displacement" or value is not None}
 
     def to_std(self) -> VibrationStd:
         """The standard deviations, infinite where unknown."""
-        return VibrationStd(**{name: _to_tensor(getattr(self, name), math.inf) for name in StdRecord.model_fields})
+        values = {name: getattr(self, name) for name in StdRecord.model_fields}
+        return VibrationStd(
+            **{name: _to_tensor(value, math.inf) for name, value in values.items() if value is not None}
+        )
 
 
 class Detection(Protocol):

@@ -252,7 +252,12 @@ class Vibration(Motion):
 
 @dataclass(frozen=True, eq=False)
 class VibrationStd:
-    """Standard deviations in the layout of ``Vibration``: px, Hz, s, rad (..., 2, K), px/s and px/s^2 (..., 2)."""
+    """Standard deviations in the layout of ``Vibration``: px, Hz, s, rad (..., 2, K), px/s and px/s^2 (..., 2).
+
+    ``displacement`` (..., 2) in px is that of the displacement of the rows of the record, rms over the rows and without
+    their mean. It contains the image motion and the correlations of all parameters: a record shorter than a period
+    leaves amplitude and frequency uncertain, and may still determine the displacement. None: not known.
+    """
 
     amplitude: Tensor
     frequency: Tensor
@@ -260,10 +265,12 @@ class VibrationStd:
     phase: Tensor
     image_motion: Tensor
     image_acceleration: Tensor
+    displacement: Tensor | None = None
 
     def __getitem__(self, index: int) -> "VibrationStd":
         """The standard deviations of one stack of a batch."""
-        return VibrationStd(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return VibrationStd(**{name: value[index] for name, value in values.items() if value is not None})
 
     def from_row_order(self, timing: SensorTiming) -> "VibrationStd":
         """The standard deviations, given in row order, in image axes: as ``Motion.from_row_order`` without signs."""
@@ -272,7 +279,8 @@ class VibrationStd:
         tones = (self.amplitude, self.frequency, self.period, self.phase)
         amplitude, frequency, period, phase = (values.flip(-2) for values in tones)
         motion, acceleration = self.image_motion.flip(-1), self.image_acceleration.flip(-1)
-        return VibrationStd(amplitude, frequency, period, phase, motion, acceleration)
+        displacement = None if self.displacement is None else self.displacement.flip(-1)
+        return VibrationStd(amplitude, frequency, period, phase, motion, acceleration, displacement)
 
 
 def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:

@@ -1,5 +1,6 @@
 """Restoration of frames: input preparation, one of the methods, and a check of the result."""
 
+import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -244,6 +245,8 @@ def restore(
     vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
     for note in left_alone:
         warnings.warn(note, RestorationWarning, stacklevel=4)  # the caller, above two decorators
+    if left_alone and not bool(vibration.moving_axes().any()):
+        return prepared.from_row_order(_unchanged(prepared, options.get("joint", False)))
     restored = restore_prepared(prepared, vibration, method, options)
     if check:
         _warn_if_worse(prepared, restored.detach(), vibration, options.get("joint", False))
@@ -275,6 +278,15 @@ def restore_prepared(
     images = frames.images if "ignore" in chosen.masks else frames.filled
     motion = _motion_in_row_order(frames, vibration)
     return chosen.function(images, frame_motion(motion, frames.timing, images.shape[1], images.shape[-2]), **options)
+
+
+def _unchanged(frames: PreparedFrames, joint: bool | int) -> Tensor:
+    """The frames as taken (B, T, C, H, W), NaN at missing pixels; with ``joint=True`` the middle one."""
+    images = frames.images
+    if frames.missing is not None:
+        images = images.masked_fill(frames.missing, math.nan)
+    middle = images.shape[1] // 2
+    return images[:, middle : middle + 1] if joint is True else images
 
 
 def _motion_in_row_order(frames: PreparedFrames, vibration: Motion) -> Motion:

@@ -553,8 +553,12 @@ def test_accelerated_image_motion(paper_camera):
     torch.testing.assert_close(found.image_acceleration, torch.tensor([900.0, -1500.0]).double(), rtol=0, atol=5.0)
     torch.testing.assert_close(found.image_motion, torch.tensor([200.0, -300.0]).double(), rtol=0, atol=0.5)
     assert (found.amplitude[:, 0] / torch.tensor([3.1, 5.2]) - 1).abs().max() < 0.005
-    uniform = detect_vibration(frames, paper_camera)
-    assert not bool(uniform.reliable.any())
+    # without an acceleration, a slow tone of uncertain amplitude takes its place; the displacement is known
+    slow = detect_vibration(frames, paper_camera)
+    starts = paper_camera.row_starts(4, 2048)
+    shown, true = (v.mean_displacement(starts, paper_camera.exposure_time) for v in (slow.vibration, found))
+    error = shown - true - (shown - true).mean((0, 1))
+    assert (error.square().mean((0, 1)).sqrt() < 5 * slow.std.displacement + 0.05).all()
 
 
 def test_windows_measure_a_changing_vibration(paper_camera):

@@ -13,7 +13,17 @@ from rsvib_torch.motion.vibration import VibrationStd
 TIMING = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=2048)
 
 
-def verdict(amplitude=3.0, frequency=30.0, *, std=(0.01, 0.01), offsets=None, fitted=None, visible=None, **options):
+def verdict(
+    amplitude=3.0,
+    frequency=30.0,
+    *,
+    std=(0.01, 0.01),
+    displacement_std=0.01,
+    offsets=None,
+    fitted=None,
+    visible=None,
+    **options,
+):
     """Verdict on a vibration along x (y: 2 px at 50 Hz) with 40 bands."""
     vibration = Vibration([amplitude, 2.0], [frequency, 50.0])
     size = torch.tensor([[std[0]], [0.01]], dtype=torch.float64)
@@ -23,7 +33,7 @@ def verdict(amplitude=3.0, frequency=30.0, *, std=(0.01, 0.01), offsets=None, fi
         "offsets": curve.double() if offsets is None else offsets(curve.double()),
         "fitted": curve.double() if fitted is None else fitted(curve.double()),
         "intervals": torch.tensor([0.04096], dtype=torch.float64),
-        "duration": 0.08,
+        "displacement": torch.tensor([amplitude, 2.0]) / 2**0.5,
         "timing": TIMING,
     }
     std_of_tones = VibrationStd(
@@ -33,6 +43,7 @@ def verdict(amplitude=3.0, frequency=30.0, *, std=(0.01, 0.01), offsets=None, fi
         period=size,
         image_motion=torch.zeros(2),
         image_acceleration=torch.zeros(2),
+        displacement=torch.tensor([displacement_std, 0.01]),
     )
     visible = torch.ones(40, dtype=torch.bool) if visible is None else visible
     return judge(vibration, std_of_tones, visible=visible, **{**arguments, **options})
@@ -55,12 +66,13 @@ def missing(count):
         ({"offsets": missing(21)}, "only 48% of 40 row bands"),
         ({"amplitude": 0.0}, "no significant tone"),
         ({"std": (2.0, 0.01)}, "not significant"),
-        ({"std": (0.01, 2.9)}, None),
-        ({"std": (0.01, 3.1)}, "Hz"),
+        ({"std": (0.0, 0.01)}, "uncertainty of the tone of 30 Hz is unknown"),
+        ({"std": (0.01, math.inf)}, "uncertainty of the tone of 30 Hz is unknown"),
+        ({"displacement_std": 1.05}, None),
+        ({"displacement_std": 1.07}, "displacement of the rows is uncertain: 2.1 ± 1.1 px"),
+        ({"max_tones": 1}, "1 tones do not explain the motion"),
         ({"amplitude": 0.002, "std": (1e-5, 0.01)}, "too small"),
         ({"frequency": 1 / 0.04096, "std": (1e-3, 1e-3)}, "nearly blind"),
-        ({"duration": 0.034}, None),
-        ({"duration": 0.033}, "has a period of 33.3 ms, longer than the record of 33 ms"),
         ({"frequency": 2600.0}, "above 1/T_e = 2500 Hz"),
         ({"fitted": lambda curve: curve + 0.5}, None),
         ({"fitted": lambda curve: 0.3 * curve}, "does not explain the offset curve"),
@@ -75,18 +87,54 @@ def test_reasons_for_an_unreliable_tone(options, reason):
         assert any(reason in text for text in reasons[0]), reasons
 
 
+def other_motion(unexplained=0.0, correlated=0.0, differential=0.0, measured=1.0, blur=(1.2, 0.1, 0.05)):
+    """Residual motion along x only."""
+    axes = (torch.tensor([value, 0.0]) for value in (unexplained, correlated, differential))
+    return OtherMotion(*axes, torch.tensor(measured), torch.tensor(blur))
+
+
 @pytest.mark.parametrize(
-    ("unexplained", "slant", "expected"), [(0.02, 0.02, 0), (0.3, 0.0, 1), (0.0, 0.3, 1), (0.3, 0.3, 2)]
+    ("residual", "against"),
+    [
+        ({"unexplained": 0.02, "correlated": 0.005, "differential": 0.02}, (0, 0)),
+        ({"unexplained": 0.3}, (1, 0)),
+        ({"correlated": 0.1}, (1, 0)),
+        ({"differential": 0.3}, (1, 1)),
+        ({"unexplained": 0.3, "differential": 0.3}, (2, 1)),
+        ({"measured": 0.4}, (1, 1)),
+        ({"blur": (0.5, 0.1, 0.05)}, (1, 1)),
+        ({"blur": (0.5, 0.2, 0.05)}, (0, 0)),
+        ({"blur": (4.0, 0.5, 0.05)}, (1, 1)),
+        ({"blur": (4.0, 0.7, 0.05)}, (0, 0)),
+        ({"blur": (4.0, 0.5, 0.003)}, (0, 0)),
+    ],
 )
-def test_residual_motion_makes_an_axis_unreliable(unexplained, slant, expected):
-    other = OtherMotion(torch.tensor([unexplained, 0.0]), torch.tensor([slant, 0.0]))
-    reliable, reasons = verdict(other_motion=other)
-    assert len(reasons[0]) == expected
-    assert reliable.tolist() == [expected == 0, True]
+def test_residual_motion_makes_axes_unreliable(residual, against):
+    """Differential motion affects the verdict of both axes."""
+    reliable, reasons = verdict(other_motion=other_motion(**residual))
+    assert tuple(len(axis) for axis in reasons) == against
+    assert reliable.tolist() == [count == 0 for count in against]
 
 
-@pytest.mark.parametrize(("unexplained", "accepted"), [(0.029, True), (0.031, False)])
-def test_residual_motion_of_a_small_tone_is_compared_with_errors_of_interpolation(unexplained, accepted):
-    other = OtherMotion(torch.tensor([unexplained, 0.0]), torch.zeros(2))
-    reliable, _ = verdict(0.3, other_motion=other)
+@pytest.mark.parametrize(
+    ("residual", "accepted"),
+    [
+        ({"unexplained": 0.029}, True),
+        ({"unexplained": 0.031}, False),
+        ({"correlated": 0.009}, True),
+        ({"correlated": 0.011}, False),
+        ({"differential": 0.029}, True),
+        ({"differential": 0.031}, False),
+    ],
+)
+def test_residual_motion_of_a_small_tone_is_compared_with_errors_of_interpolation(residual, accepted):
+    reliable, _ = verdict(0.3, displacement_std=0.001, other_motion=other_motion(**residual))
     assert bool(reliable[0]) == accepted
+
+
+def test_bands_are_not_judged_where_rows_were_measured():
+    """Missing bands, large residuals of bands and condition (24) concern fits to bands only."""
+    options = {"amplitude": 60.0, "frequency": 300.0, "fitted": lambda curve: 0.3 * curve}
+    assert not verdict(**options)[0][0]
+    assert not verdict(offsets=missing(30))[0][0]
+    assert verdict(**options, offsets=missing(30), other_motion=other_motion())[0].all()

@@ -80,15 +80,32 @@ def test_unreliable_axis_is_not_restored(scene_and_frames, axis):
     torch.testing.assert_close(found, restore(frames, TIMING, kept, check=False), rtol=0, atol=0)
 
 
-def test_measured_image_motion_of_an_unreliable_axis_is_kept():
-    vibration = Vibration([2.0, 1.0], [71.0, 113.0], 0.0, [500.0, 1.0])  # standard deviation 0.5 px/s
-    trusted, notes = trusted_vibration(
-        detection_of(vibration, reliable=(False, False), reasons=(("a",), ("b",))), TIMING, 2, 448
-    )
-    assert trusted.amplitude.flatten().tolist() == [0.0, 0.0]
-    assert trusted.image_motion.tolist() == [500.0, 0.0]
-    assert len(notes) == 2
-    assert trusted_vibration(detection_of(vibration), TIMING, 2, 448)[0].image_motion.tolist() == [500.0, 1.0]
+def test_image_motion_of_an_unreliable_axis_is_not_undone():
+    vibration = Vibration([2.0, 1.0], [71.0, 113.0], 0.0, [500.0, -300.0])  # standard deviation 0.5 px/s
+    for reliable, kept in (((False, False), [0.0, 0.0]), ((False, True), [0.0, -300.0])):
+        detection = detection_of(vibration, reliable=reliable, reasons=(("a",), ("b",)))
+        trusted, notes = trusted_vibration(detection, TIMING, 2, 448)
+        assert trusted.image_motion.tolist() == kept
+        assert trusted.amplitude.flatten().tolist() == [0.0, float(reliable[1])]
+        assert len(notes) == reliable.count(False)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.uint8])
+def test_frames_are_unchanged_if_both_axes_are_refused(dtype):
+    frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
+    frames = frames if dtype == torch.float32 else (255 * frames).to(dtype)
+    vibration = Vibration([2.0, 1.0], [71.0, 113.0], 0.0, [500.0, -300.0])
+    refused = detection_of(vibration, reliable=(False, False), reasons=(("a",), ("b",)))
+    expected = frames if dtype == torch.float32 else frames / 255
+    with pytest.warns(RestorationWarning, match="is not restored"):
+        assert torch.equal(restore(frames, TIMING, refused), expected)
+    if dtype == torch.float32:
+        frames[0, 3, 4] = torch.nan
+        with pytest.warns(RestorationWarning, match="is not restored"):
+            found = restore(frames, TIMING, refused)
+        torch.testing.assert_close(found, frames, rtol=0, atol=0, equal_nan=True)
+    with pytest.warns(RestorationWarning, match="is not restored"):
+        assert torch.equal(restore(frames, TIMING, refused, joint=True), expected[1:2])
 
 
 def test_uncertainty_of_the_displacement_equals_its_scatter_for_random_parameters():

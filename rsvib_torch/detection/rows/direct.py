@@ -26,6 +26,7 @@ from rsvib_torch.detection.rows.displacements import (
     BLOCK_ROWS,
     MAX_GROUP_FRAMES,
     FrameGroup,
+    blur_ratio,
     compared_intervals,
     differential_motion,
     differently_blurred,
@@ -97,6 +98,8 @@ def refine_directly(
             tried = tried | mirrored
             other, _ = robust_fit(found.measurements, frequencies, strongest_only(found.fit).active, start.model)
             found = _better_of_each(found, _refine(groups, timing, intervals, other, tones, max_rounds))
+    blur = torch.stack(blur_ratio(groups, timing, shrunk_motion(found.fit, intervals)), -1)
+    found = replace(found, other_motion=replace(found.other_motion, blur=blur))
     if tones is not None:
         return found
     return replace(found, fit=significant_only(found.measurements, found.fit, intervals))
@@ -293,4 +296,13 @@ def _conclude(measurements: Measurements, fit: ToneFit, gradients: list[RowGradi
     share = weighted.independent_fraction(residual) * measurements.share_counted(residual)
     weighted = replace(weighted, independent=share)
     fit = fit_tones(weighted, fit.frequencies, fit.active, fit.model)
-    return DirectFit(weighted, fit, OtherMotion(measurements.unexplained(residual), differential_motion(gradients)))
+    shown = measurements.num_differences > 0
+    measured = (shown & (measurements.weights > 0).any(-1)).double().sum(1) / shown.double().sum(1).clamp(min=1.0)
+    other = OtherMotion(
+        unexplained=measurements.unexplained(residual),
+        correlated=measurements.correlated(residual),
+        differential=differential_motion(gradients),
+        measured=measured,
+        blur=measured.new_tensor([1.0, 0.0, 0.0]).expand(len(measured), 3),  # replaced once the motion is final
+    )
+    return DirectFit(weighted, fit, other)

@@ -28,6 +28,7 @@ __all__ = [
     "BLOCK_ROWS",
     "MAX_GROUP_FRAMES",
     "FrameGroup",
+    "blur_ratio",
     "compared_intervals",
     "differential_motion",
     "differently_blurred",
@@ -322,6 +323,64 @@ def _different(exposure_starts: Tensor, timing: RowTiming, motion: Motion) -> Te
 
     # px, px^2 and px^3; third moments of this size displace fine detail by 0.001 px
     return (spread(paths) > 0.5) | (spread(_second_moments(paths, weights)) > 0.03) | (spread(third) > 0.0024)
+
+
+def blur_ratio(
+    groups: list[FrameGroup], timing: RowTiming, motion: Motion, *, block: int = 2, highest: float = 0.15
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Difference of the blur of neighbouring frames, relative to that of the exposure time and the motion.
+
+    An exposure blurs a row to second order by ``1 + M : grad grad / 2`` with the second moments M of the path. The
+    difference of two warped frames is fitted by ``ratio (M_2 - M_1) : grad grad m / 2 + gain m``, m their mean. The
+    offsets determine the motion, so that ``ratio = (T_e / stated T_e)^2`` for slow tones. Differences of interpolation
+    raise the ratio by about 0.005 / size; finite differences by 0.2.
+
+    Args:
+        groups: The frames.
+        timing: The sensor, in row order.
+        motion: Motion of each stack (B).
+        block: Rows that are averaged.
+        highest: Cycles/px along rows, below which the expansion is used.
+
+    Returns:
+        (B,) each: ratio, its standard deviation, and the size of the expected difference relative to m.
+    """
+    sums: list[tuple[Tensor, ...]] = []
+    for group in groups:
+        positions = _Positions.of(group, timing, motion)
+        u = group.spectra.frequencies
+        low = (u > 1 / 64) & (u < highest)  # without shading
+
+        def averaged(values: Tensor) -> Tensor:
+            rows = values.shape[2] // block
+            rows_of_blocks: Tensor = values[:, :, : rows * block].unflatten(2, (rows, block))
+            return rows_of_blocks.mean(3)
+
+        spectra = averaged(group.spectra.warped(positions.rows, positions.shift)[..., low])
+        moments = averaged(_second_moments(*_paths(positions.exposure_starts, timing, motion)))
+        visible = averaged(positions.visible(group.spectra.height, BLOCK_ROWS))
+        mean, difference = 0.5 * (spectra[:, 1:] + spectra[:, :-1]), spectra[:, 1:] - spectra[:, :-1]
+        change = (0.5 * (moments[:, 1:] - moments[:, :-1]))[:, :, 1:-1, None]
+        before, here, after = mean[:, :, :-2], mean[:, :, 1:-1], mean[:, :, 2:]
+        by_x = (2j * math.pi * u[low]).to(mean.dtype)
+        expected = change[..., 0, 0] * by_x.square() * here + change[..., 1, 1] * (after - 2 * here + before) / block**2
+        expected = expected + change[..., 0, 1] * by_x * (after - before) / block
+        both = (visible[:, 1:] * visible[:, :-1] == 1).double()
+        weight = (both[:, :, 1:-1] * both[:, :, 2:] * both[:, :, :-2])[..., None]
+        columns = torch.view_as_real(torch.stack([expected.to(mean.dtype), here], -1)).movedim(-1, -2)  # (..., 2, 2)
+        values = torch.view_as_real(difference[:, :, 1:-1])
+        columns, values = (part.double().flatten(1, -1 - rank) for part, rank in ((columns, 1), (values, 0)))
+        weight = weight[..., None].expand(*weight.shape[:-1], int(low.sum()), 2).flatten(1)
+        weighted = (columns * weight[..., None]).mT
+        right = (weighted @ values[..., None])[..., 0]
+        sums.append((weighted @ columns, right, (weight * values.square()).sum(1), weight.sum(1)))
+    normal, right, square, count = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
+    scale = normal.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).sqrt()
+    inverse = torch.linalg.inv(normal / (scale[:, :, None] * scale[:, None]) + 1e-9 * torch.eye(2).to(normal))
+    inverse = inverse / (scale[:, :, None] * scale[:, None])
+    solution = (inverse @ right[..., None])[..., 0]
+    variance = (square - (solution * right).sum(-1)).clamp(min=0.0) / count.clamp(min=1.0)
+    return solution[:, 0], (inverse[:, 0, 0] * variance).sqrt(), scale[:, 0] / scale[:, 1]
 
 
 def differently_blurred(starts: Tensor, height: int, timing: RowTiming, motion: Motion) -> Tensor:

@@ -24,6 +24,7 @@ __all__ = [
     "MotionModel",
     "ToneFit",
     "amplitude_std",
+    "displacement_std",
     "drift_response",
     "fit_roughly",
     "fit_tones",
@@ -145,13 +146,18 @@ def select_stacks(where: Tensor, one: Result, other: Result) -> Result:
 # --- Weighted least squares ---
 
 
-def _jacobian_of_tones(measurements: Measurements, coefficients: Tensor, frequencies: Tensor) -> Tensor:
-    """Derivatives (B, N, G, 2, 3 K) of the displacements by Re C, Im C and f (B, 2, K) of each tone."""
-    times = measurements.smearing_times
-    smeared, smeared_slope = _sinc(frequencies * times)
+def _jacobian_of_tones(smearing_times: Tensor, time: Tensor, coefficients: Tensor, frequencies: Tensor) -> Tensor:
+    """Derivatives (B, N, G, 2, 3 K) of mean displacements by Re C, Im C and f (B, 2, K) of each tone.
+
+    Args:
+        smearing_times: (2, 1, 2, 1) s, as in ``Measurements``.
+        time: (B, N, G, 1, 1) s, mid-exposures from the centre of the record.
+        coefficients: C.
+        frequencies: f in Hz.
+    """
+    smeared, smeared_slope = _sinc(frequencies * smearing_times)
     attenuation = smeared[0] * smeared[1]
-    slope = (smeared_slope * times * smeared.flip(0)).sum(0)
-    time = measurements.middles
+    slope = (smeared_slope * smearing_times * smeared.flip(0)).sum(0)
     angle = 2 * math.pi * frequencies[:, None, None] * time
     wave = torch.complex(angle.cos(), angle.sin())
     # the frequency changes the attenuation and the angle
@@ -159,7 +165,7 @@ def _jacobian_of_tones(measurements: Measurements, coefficients: Tensor, frequen
     by_angle = (2j * math.pi * attenuation * coefficients)[:, None, None]
     by_frequency = ((by_attenuation + time * by_angle) * wave).real
     by_parts = torch.view_as_real((attenuation[:, None, None] * wave).conj_physical())
-    return measurements.relative(torch.cat([by_parts, by_frequency[..., None]], dim=-1).flatten(-2))
+    return torch.cat([by_parts, by_frequency[..., None]], dim=-1).flatten(-2)
 
 
 def _sinc(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -242,11 +248,30 @@ class _Problem:
         centre = self.measurements.centre
         return ToneFit(coefficients, frequencies, self.active, drift, covariance, centre, self.model)
 
+    def jacobian(self, values: Tensor) -> Tensor:
+        """Derivatives (B, N, G, 2, P) of the displacements of each axis by its parameters (B, 2, P)."""
+        coefficients, frequencies, _ = self.unpack(values)
+        measurements = self.measurements
+        tones = _jacobian_of_tones(measurements.smearing_times, measurements.middles, coefficients, frequencies)
+        return torch.cat([measurements.relative(tones), self.drift_columns], dim=-1)
+
+    def covariance(self, state: _Estimate, deviation: Tensor) -> Tensor:
+        """Covariance (B, 2 P, 2 P) for errors of a row of the covariance ``S W^-1 S``, S the deviations (B, 2)."""
+        _, inverse = _step(state, self.free, torch.zeros_like(state.cost))
+        # W = R^T R, and the whitened errors R e have the covariance T T^T with the triangular T = R S R^-1
+        size, slant, rest = (self.root[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        (x, y), measured = deviation[:, None, None].unbind(-1), rest > 0
+        mixed = torch.where(measured, slant / torch.where(measured, rest, 1.0), 0.0) * (y - x)
+        first, second = self.jacobian(state.values).unbind(-2)  # (B, N, G, P)
+        upper = torch.cat([(size * x)[..., None] * first, (slant * x)[..., None] * second], -1)
+        both = torch.cat([(size * mixed)[..., None] * first, (slant * mixed + rest * y)[..., None] * second], -1)
+        columns = torch.cat([upper.flatten(1, 2), both.flatten(1, 2)], 1) @ (self.to_all @ inverse)
+        covariance: Tensor = self.to_all @ (columns.mT @ columns) @ self.to_all.T
+        return covariance
+
     def evaluate(self, values: Tensor) -> _Estimate:
         """Residual and normal equations at the parameters ``values`` (B, 2, P)."""
-        coefficients, frequencies, _ = self.unpack(values)
-        tones = _jacobian_of_tones(self.measurements, coefficients, frequencies)
-        jacobian = torch.cat([tones, self.drift_columns], dim=-1)  # (B, N, G, 2, P)
+        jacobian = self.jacobian(values)
         linear = torch.where(self.is_frequency, 0.0, values)[:, None, None]
         residual = self.measurements.displacements - (jacobian * linear).sum(-1)
         whitened = (self.root @ residual[..., None]).flatten(1)
@@ -329,19 +354,15 @@ def fit_tones(
         model: Structure of the motion.
 
     Returns:
-        The fit with its covariance, scaled by the observed residual variance of each axis.
+        The fit with its covariance. The variance of the errors of each axis is that of its residuals: with
+        ``S = diag(s_x, s_y)`` the errors of a row have the covariance ``S W^-1 S`` instead of the ``W^-1`` of the fit.
     """
     problem = _Problem(measurements, active, model or MotionModel())
     state = problem.solve(start, iterations=30, tolerance=1e-7)
-    _, inverse = _step(state, problem.free, torch.zeros_like(state.cost))
     spent = problem.free.unflatten(1, (2, -1)).sum(-1)
     # `num_measurements` counts independent measurements only: overlapping bands repeat each other
-    variance = measurements.square(state.residual).clamp(min=0.0) / (measurements.num_measurements - spent).clamp(
-        min=1.0
-    )
-    deviation = variance.sqrt().repeat_interleave(state.values.shape[-1], dim=1)
-    covariance = (problem.to_all @ inverse @ problem.to_all.T) * deviation[:, :, None] * deviation[:, None]
-    return problem.fit(state.values, covariance)
+    variance = measurements.square(state.residual) / (measurements.num_measurements - spent).clamp(min=1.0)
+    return problem.fit(state.values, problem.covariance(state, variance.sqrt()))
 
 
 # --- Inversion ---
@@ -400,6 +421,25 @@ def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
         image_acceleration=acceleration_variance.clamp(min=0.0).sqrt(),
     )
     return motion_of_fit(fit), deviations
+
+
+def displacement_std(fit: ToneFit, exposure_starts: Tensor, exposure_time: float) -> Tensor:
+    """Standard deviation (B, 2) in px of the displacement of rows without their mean, rms over the rows.
+
+    Args:
+        fit: With its covariance.
+        exposure_starts: (N,) s, exposure starts of the rows.
+        exposure_time: T_e in seconds.
+    """
+    time = (exposure_starts + 0.5 * exposure_time - fit.centre[:, None])[..., None, None, None]
+    smearing = torch.tensor([exposure_time, 0.0], dtype=time.dtype, device=time.device)[:, None, None, None]
+    tones = _jacobian_of_tones(smearing.expand(2, 1, 2, 1), time, fit.coefficients, fit.frequencies)
+    powers = [time, 0.5 * time.square()][: fit.drift.shape[-1]]
+    drift = torch.cat(powers, -1).expand(*tones.shape[:-1], -1)
+    jacobian = torch.cat([tones, drift], -1)[:, :, 0]  # (B, N, 2, P)
+    jacobian = jacobian - jacobian.mean(1, keepdim=True)
+    covariance = _covariance_of_axes(fit)
+    return torch.einsum("bnap,bapq,bnaq->bna", jacobian, covariance, jacobian).clamp(min=0.0).mean(1).sqrt()
 
 
 def amplitude_std(fit: ToneFit) -> Tensor:

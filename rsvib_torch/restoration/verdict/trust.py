@@ -38,7 +38,8 @@ def displacement_uncertainty(
 ) -> tuple[Tensor, Tensor]:
     """Root-mean-square error of the displacement of the rows by standard deviations, and the displacement itself.
 
-    For ``A sinc(f T_e) sin(2 pi f t + phi)``, the variance of a tone averaged over its period is
+    A ``std.displacement`` that is known is used; it contains all correlations. Otherwise, for
+    ``A sinc(f T_e) sin(2 pi f t + phi)``, the variance of a tone averaged over its period is
     ``sinc^2 (std_A^2 + A^2 std_angle^2) / 2``. The phase at the time origin and the frequency are correlated: the angle
     is most accurate in the middle of the record. Its variance there, plus the variance by the frequency with the mean
     squared distance from the middle, is ``std_angle^2``.
@@ -62,7 +63,9 @@ def displacement_uncertainty(
     attenuation = 0.5 * torch.sinc(vibration.frequency * timing.exposure_time).square()
     variance = attenuation * (std.amplitude.to(amplitude).square() + amplitude.square() * angle)
     variance = torch.where(moving, variance.nan_to_num(nan=math.inf), 0.0)
-    return variance.sum(-1).sqrt(), (attenuation * amplitude.square()).sum(-1).sqrt()
+    known = getattr(std, "displacement", None)
+    error = variance.sum(-1).sqrt() if known is None else torch.where(moving.any(-1), known.to(amplitude), 0.0)
+    return error, (attenuation * amplitude.square()).sum(-1).sqrt()
 
 
 def trusted_vibration(
@@ -70,8 +73,10 @@ def trusted_vibration(
 ) -> tuple[Vibration, tuple[str, ...]]:
     """The part of a detected vibration that is accurate enough to be undone.
 
-    The amplitude of an axis is set to zero if the axis is not reliable, or if the variance of its displacement exceeds
-    half of the mean square displacement. Its image motion is kept if it exceeds 4 standard deviations.
+    The amplitude and the image motion of an axis are set to zero if the axis is not reliable, or if the variance of its
+    displacement exceeds half of the mean square displacement: its rows stay where they are. Two frames that are
+    displaced as a whole have the same offsets as frames that move uniformly, so that an image motion without a
+    reliable tone is not known.
 
     Args:
         detected: A detection.
@@ -98,8 +103,6 @@ def trusted_vibration(
         value.to(vibration.device) for value in displacement_uncertainty(vibration, std, timing, num_frames, num_rows)
     )
     accurate = error.square() <= 0.5 * size.square()
-    motion = vibration.image_motion
-    measured = motion.abs() > 4.0 * std.image_motion.to(motion)
     batched = len(vibration.batch_shape) > 0
     notes = []
     for index in range(vibration.batch_shape[0] if batched else 1):
@@ -117,13 +120,12 @@ def trusted_vibration(
                     f"deviation of {float(error[here]):.2g} px; detect it from more frames"
                 )
     keep = reliable & accurate
-    drift = keep | measured
     trusted = Vibration(
         vibration.amplitude * keep[..., None],
         vibration.frequency,
         vibration.phase,
-        motion * drift,
-        vibration.image_acceleration * drift,
+        vibration.image_motion * keep,
+        vibration.image_acceleration * keep,
     )
     return trusted, tuple(notes)
 
