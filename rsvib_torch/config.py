@@ -16,7 +16,7 @@ from rsvib_torch.io.schema import TimingRecord, VibrationRecord
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.restoration.exact.priors import PRIORS
-from rsvib_torch.restoration.restore import METHODS
+from rsvib_torch.restoration.restore import METHODS, CommonOptions
 from rsvib_torch.stacks import DEFAULT_WINDOW, BadFrames
 
 __all__ = ["Config", "Simulation", "read_config"]
@@ -130,7 +130,9 @@ def _restoration_section(method: object) -> Any:
     common: dict[str, Any] = {"method": Literal[*METHODS], "saturation": float | None}
     if "prior" in chosen.options.__annotations__:
         common["prior"] = Literal[*PRIORS]
-    return options_section("_RestorationSection", chosen.options, skip=("full_scale", "saturation", "check"), **common)
+    return options_section(
+        "_RestorationSection", chosen.options, skip=("method", *CommonOptions.__annotations__), **common
+    )
 
 
 def read_config(path: str | os.PathLike[str]) -> Config:

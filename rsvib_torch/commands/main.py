@@ -16,7 +16,7 @@ __all__ = ["main", "run_command"]
 app = typer.Typer(name="rsvib", add_completion=False, pretty_exceptions_enable=False)
 app.command()(stack_commands.run)
 app.command()(stack_commands.detect)
-app.command()(stack_commands.restore)
+app.command("restore")(stack_commands.restore_frames)
 app.command()(stack_commands.report)
 app.command()(motion_commands.motion)
 app.command()(motion_commands.known)

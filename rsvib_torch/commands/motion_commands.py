@@ -19,7 +19,6 @@ from rsvib_torch.commands.options import (
     RestoredArgument,
     ScaleOption,
     full_scale_of,
-    torch_device,
 )
 from rsvib_torch.commands.stack_commands import load, save
 from rsvib_torch.commands.terminal import error_line, print_line, working
@@ -66,7 +65,7 @@ def motion(
     """
     settings = read_config(config)
     check_writable(out)
-    stack = load(frames, settings, full_scale, torch_device(device))
+    stack = load(frames, settings, full_scale, device)
     with working("detecting the motion"):
         if model == "free":
             names, table = _detect_free_motion(stack.frames, stack.timing, knot_rows, search)
@@ -164,7 +163,7 @@ def known(
     info = read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
     check_stack_target(restored, info.shape, dtype=info.dtype, full_scale=scale)
-    stack = load(frames, settings, full_scale, torch_device(device))
+    stack = load(frames, settings, full_scale, device)
     if offset is None:
         with working("aligning the recording with the frames"):
             found = align_motion(stack.frames, stack.timing, recorded, fit_gain=fit_gain)

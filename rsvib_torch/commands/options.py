@@ -42,57 +42,44 @@ FramesArgument = Annotated[
 RestoredArgument = Annotated[
     Path, typer.Argument(help="Stack to write, with the data type and full scale of the input.")
 ]
-ConfigOption = Annotated[Path, typer.Option("--config", help="TOML configuration file that describes the camera.")]
-DeviceOption = Annotated[
-    DeviceName, typer.Option("--device", help="Device for the computation; auto uses a GPU if there is one.")
-]
+ConfigOption = Annotated[Path, typer.Option(help="TOML configuration file that describes the camera.")]
+DeviceOption = Annotated[DeviceName, typer.Option(help="Device for the computation; auto uses a GPU if there is one.")]
 ScaleOption = Annotated[
     float | None,
     typer.Option(
-        "--full-scale",
         help="Count of an integer format that corresponds to full scale, e.g. 4095 for 12 bits.",
         show_default="from the file, or the configuration",
     ),
 ]
 MethodOption = Annotated[
     str | None,
-    typer.Option(
-        "--method", help=f"Restoration method: {', '.join(METHODS)}.", show_default="from the configuration, or exact"
-    ),
+    typer.Option(help=f"Restoration method: {', '.join(METHODS)}.", show_default="from the configuration, or exact"),
 ]
 JointOption = Annotated[
     str | None,
     typer.Option(
-        "--joint",
         help="Number of neighbouring frames that are restored jointly, or 'all' for one image of all frames (of each "
         "window).",
     ),
 ]
 PriorOption = Annotated[
     str | None,
-    typer.Option("--prior", help=f"Prior of the scene: {' or '.join(PRIORS)}, for methods that have this option."),
+    typer.Option(help=f"Prior of the scene: {' or '.join(PRIORS)}, for methods that have this option."),
 ]
 SaturationOption = Annotated[
     float | None,
-    typer.Option(
-        "--saturation",
-        help="Saturation level in the unit of the file.",
-        show_default="full scale for integer formats",
-    ),
+    typer.Option(help="Saturation level in the unit of the file.", show_default="full scale for integer formats"),
 ]
 ForceOption = Annotated[
     bool, typer.Option("--force", help="Write the restored frames even if they are judged no better than the input.")
 ]
 MemoryOption = Annotated[
     str | None,
-    typer.Option(
-        "--memory", help="Memory limit of the process, e.g. 2GB.", show_default="four fifths of the free memory"
-    ),
+    typer.Option(help="Memory limit of the process, e.g. 2GB.", show_default="four fifths of the free memory"),
 ]
 WorkersOption = Annotated[
     int | None,
     typer.Option(
-        "--workers",
         help="Number of windows that are processed at the same time, within the memory limit.",
         show_default="number of processors",
     ),

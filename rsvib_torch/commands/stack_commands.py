@@ -76,8 +76,9 @@ from rsvib_torch.stacks import (
     read_manifest,
     restore_trusted,
 )
+from rsvib_torch.stacks.job import RestoreOptions
 
-__all__ = ["Stack", "detect", "load", "report", "restore", "run", "save", "simulate"]
+__all__ = ["Stack", "detect", "load", "report", "restore_frames", "run", "save", "simulate"]
 
 
 @dataclass(frozen=True)
@@ -97,15 +98,16 @@ class Stack:
     timing: SensorTiming
 
 
-def load(path: Path, config: Config, full_scale: float | None, device: torch.device) -> Stack:
-    """Read a stack; ``full_scale`` is the option of the command line."""
+def load(path: Path, config: Config, full_scale: float | None, device: DeviceName) -> Stack:
+    """Read a stack; ``full_scale`` and ``device`` are options of the command line."""
+    target = torch_device(device)
     info = read_stack_info(path)
     scale = full_scale_of(path, info, config, full_scale)
     with working(f"reading {path}"):
         frames = read_stack(path, full_scale=scale)
     timing = timing_from_first_frame(config.timing, info)
     info = replace(info, frame_times=exposure_times(info, config.timing), times_of_playback=False)
-    return Stack(frames.to(device), info, scale, timing)
+    return Stack(frames.to(target), info, scale, timing)
 
 
 def save(path: Path, frames: Tensor, stack: Stack) -> None:
@@ -204,7 +206,7 @@ def detect(
     check_writable(out, folder=True)
     window = settings.stack.get("window") if window is None else window
     if window is None:
-        stack = load(frames, settings, full_scale, torch_device(device))
+        stack = load(frames, settings, full_scale, device)
         result = _detect(stack, settings)
         with whole_folder(out) as folder:
             names = _write_detection(folder, result, stack.timing)
@@ -237,7 +239,7 @@ def _warn_of_failures(windows: int) -> None:
         error_line(f"detection failed in {windows} windows: see manifest.json", "warning")
 
 
-def restore(
+def restore_frames(
     frames: FramesArgument,
     restored: RestoredArgument,
     *,
@@ -270,7 +272,7 @@ def restore(
         _restore_windows(frames, restored, settings, vibration, overrides, force, device, full_scale)
         return
     detected = read_vibration(vibration, timing_from_first_frame(settings.timing, read_stack_info(frames)))
-    stack = load(frames, settings, full_scale, torch_device(device))
+    stack = load(frames, settings, full_scale, device)
     shape = (1, *stack.info.shape[1:]) if joint == "all" else stack.info.shape
     check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale)
     if report is not None:
@@ -329,11 +331,9 @@ def run(
     config: ConfigOption,
     output: Annotated[
         str,
-        typer.Option("--output", help="Name of the restored stack in that folder; its extension selects the format."),
+        typer.Option(help="Name of the restored stack in that folder; its extension selects the format."),
     ] = "restored.tif",
-    compression: Annotated[
-        str | None, typer.Option("--compression", help="Compression of a TIFF stack: zlib or lzma.")
-    ] = None,
+    compression: Annotated[str | None, typer.Option(help="Compression of a TIFF stack: zlib or lzma.")] = None,
     method: MethodOption = None,
     joint: JointOption = None,
     prior: PriorOption = None,
@@ -342,7 +342,6 @@ def run(
     window: Annotated[
         int | None,
         typer.Option(
-            "--window",
             help="Largest number of frames that are processed together; longer stacks are divided into windows.",
             show_default=f"from the configuration, or {DEFAULT_WINDOW}",
         ),
@@ -350,7 +349,6 @@ def run(
     bad_frames: Annotated[
         BadFrames | None,
         typer.Option(
-            "--bad-frames",
             help="Frames that cannot be read or used: 'pass' writes them unchanged, 'skip' leaves them out.",
             show_default="from the configuration, or pass",
         ),
@@ -361,7 +359,6 @@ def run(
     scheduler: Annotated[
         str | None,
         typer.Option(
-            "--scheduler",
             help="Compute with Dask: address of a scheduler (tcp://HOST:PORT), or 'local' for processes on this "
             "machine.",
         ),
@@ -381,7 +378,7 @@ def run(
     info = read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
     options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation))
-    common: dict[str, Any] = {
+    common: RestoreOptions = {
         "window": settings.stack.get("window", DEFAULT_WINDOW) if window is None else window,
         "detection": settings.detection,
         "restoration": options,
@@ -475,7 +472,7 @@ def report(
     boxes = [_edge_box(text) for text in edge or []]
     settings = read_config(config)
     check_writable(out, folder=True)
-    stack = load(frames, settings, full_scale, torch_device(device))
+    stack = load(frames, settings, full_scale, device)
     options = restoration_options(stack.info, stack.full_scale, settings, Overrides(method, joint, prior, saturation))
     detection = _detect(stack, settings)
     print_detection(detection)

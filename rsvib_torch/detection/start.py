@@ -17,7 +17,7 @@ from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
 from rsvib_torch.registration.register import register_rows
 
-__all__ = ["GreyFrames", "band_curve", "grey_frames", "measurements_of_curve"]
+__all__ = ["GreyFrames", "band_curve", "constant_frame", "grey_frames", "measurements_of_curve"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +89,14 @@ def grey_frames(
             )
     # some rows are enough to find that a frame is not constant
     if bool(_constant(images[..., ::16, :]).any()) and bool((constant := _constant(images)).any()):
-        raise ValueError(
-            f"frame {constant.nonzero()[0].tolist()[-1]} is constant: without detail there is nothing to register"
-        )
+        raise ValueError(constant_frame(constant.nonzero()[0].tolist()[-1]))
     images = images.mean(2) if images.shape[2] > 1 else images[:, :, 0]
     return GreyFrames(images, valid, prepared.batched)
+
+
+def constant_frame(index: int) -> str:
+    """Message for a frame whose pixels are equal."""
+    return f"frame {index} is constant: without detail there is nothing to register"
 
 
 def _constant(frames: Tensor) -> Tensor:

@@ -178,10 +178,12 @@ def check_stack_target(
         The full scale that would be used; None for floats.
     """
     kind = np.dtype(dtype or np.float32)
-    check_info_target(Path(path), StackInfo(tuple(shape), kind.name, None))
     if kind.kind == "f":
-        return None
-    return required_full_scale(known_full_scale(kind) if full_scale is None else full_scale, kind, path)
+        full_scale = None
+    elif full_scale is None:
+        full_scale = known_full_scale(kind)
+    check_info_target(Path(path), StackInfo(tuple(shape), kind.name, full_scale))
+    return None if kind.kind == "f" else required_full_scale(full_scale, kind, path)
 
 
 def write_frames(

@@ -6,12 +6,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stack_info import StackInfo, readable_frame
 
 __all__ = [
     "FORMATS",
+    "ArrayReader",
     "FrameReader",
     "FrameWriter",
     "StackFormat",
@@ -35,6 +37,22 @@ class FrameReader(Protocol):
     def close(self) -> None:
         """Close the file, if it is open between frames."""
         return
+
+
+class ArrayReader(FrameReader):
+    """Frames of an array of HDF5 or Zarr, decoded on access; ``close`` closes its file."""
+
+    def __init__(self, path: Path, info: StackInfo, array: Any, close: Callable[[], None] = lambda: None) -> None:
+        self.info, self._path, self._array, self._close = info, path, array, close
+
+    def frame(self, index: int) -> Frame:
+        """Pixels of a frame as stored."""
+        with readable_frame(self._path, index):
+            return self.info.from_stored(np.asarray(self._array[index] if self._array.ndim > 2 else self._array[...]))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._close()
 
 
 class FrameWriter(Protocol):

@@ -10,6 +10,7 @@ from torch import Tensor
 from rsvib_torch.core.checks import check_number
 
 __all__ = [
+    "beyond_full_scale",
     "check_dtype",
     "check_full_scale",
     "counts_to_frames",
@@ -62,6 +63,11 @@ def required_full_scale(full_scale: float | None, dtype: np.dtype[Any], name: ob
     return check_full_scale(full_scale, dtype)
 
 
+def beyond_full_scale(largest: int, full_scale: float) -> str:
+    """Message for counts that exceed the full scale."""
+    return f"counts reach {largest}, beyond full_scale={full_scale:g}; pass a full_scale of at least the largest count"
+
+
 def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str) -> Tensor:
     """Convert pixels as stored to float32 frames; floats keep their values.
 
@@ -78,10 +84,7 @@ def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str) 
     full_scale = required_full_scale(full_scale, counts.dtype, name)
     largest = int(counts.max())
     if largest > full_scale:
-        raise ValueError(
-            f"{name}: counts reach {largest}, beyond full_scale={full_scale:g}; pass a full_scale of at least the "
-            "largest count"
-        )
+        raise ValueError(f"{name}: {beyond_full_scale(largest, full_scale)}")
     narrow = counts.dtype.itemsize <= 2  # float32 holds 16-bit counts exactly
     signed = counts.astype(np.int32 if narrow else np.int64)  # torch does not compute with all unsigned types
     return (torch.from_numpy(signed).to(torch.float32 if narrow else torch.float64) / full_scale).to(torch.float32)

@@ -4,12 +4,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
-from rsvib_torch.io.formats import StackFormat, needed_package
+from rsvib_torch.io.formats import ArrayReader, StackFormat, needed_package
 from rsvib_torch.io.full_scale import check_dtype
-from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_from_attributes, readable_frame, readable_stack
+from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_from_attributes, readable_stack
 
 __all__ = ["FORMAT"]
 
@@ -61,24 +60,7 @@ def _check_sizes(dataset: Any, file_size: int) -> None:
         raise ValueError(f"its chunks of {chunk} bytes are larger than the stack of {needed}")
 
 
-class _ChunkReader:
-    """Frames of a dataset that is stored in chunks."""
-
-    def __init__(self, path: Path, file: Any, dataset: Any, info: StackInfo) -> None:
-        self.info = info
-        self._path, self._file, self._dataset = path, file, dataset
-
-    def frame(self, index: int) -> NDArray[Any]:
-        """Pixels of a frame as stored."""
-        with readable_frame(self._path, index):
-            return self.info.from_stored(self._dataset[index] if self._dataset.ndim > 2 else self._dataset[()])
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
-def _open(path: Path) -> _ChunkReader | ContiguousReader:
+def _open(path: Path) -> ArrayReader | ContiguousReader:
     h5py = _h5py()
     with readable_stack(path, "HDF5"):
         file = h5py.File(path, "r", locking=False)
@@ -92,7 +74,7 @@ def _open(path: Path) -> _ChunkReader | ContiguousReader:
             if dataset.chunks is None and offset is not None:
                 return ContiguousReader(path, info, int(offset), dataset.dtype)
             keep_open = True
-            return _ChunkReader(path, file, dataset, info)
+            return ArrayReader(path, info, dataset, file.close)
         finally:
             if not keep_open:
                 file.close()

@@ -129,10 +129,6 @@ def _create_folder(path: Path, info: StackInfo, fresh: bool) -> _ImagesWriter:
     return _ImagesWriter([path / name for name in _frame_names(info)], info)
 
 
-def _create_image(path: Path, info: StackInfo, fresh: bool) -> _ImagesWriter:
-    return _ImagesWriter([path], info)
-
-
 def _check_channels(path: Path, info: StackInfo) -> None:
     if _ending(info) == ".png" and len(info.shape) == 4 and info.shape[1] not in (1, 3, 4):
         raise ValueError(f"{path}: PNG files hold 1, 3 or 4 channels, got {info.shape[1]}; write .tif")
@@ -156,5 +152,7 @@ def _check_folder(path: Path, info: StackInfo) -> None:
             )
 
 
-PNG_FORMAT = StackFormat("png", _PNG, _ImagesReader, _create_image, dtypes=_PNG_TYPES, check=_check_image)
+PNG_FORMAT = StackFormat(
+    "png", _PNG, _ImagesReader, lambda path, info, _: _ImagesWriter([path], info), dtypes=_PNG_TYPES, check=_check_image
+)
 FOLDER_FORMAT = StackFormat("image folder", ("",), _ImagesReader, _create_folder, check=_check_folder, kind="folder")

@@ -5,6 +5,7 @@ are ordered (x, y), with one list of tones for each axis; null stands for a valu
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, Self
 
@@ -31,26 +32,19 @@ Tones = list[float] | list[list[float]]
 Numbers = list[float | None]
 
 
+def _converted(values: Any, convert: Callable[[Any], Any]) -> Any:
+    """Nested lists with every value converted."""
+    return [_converted(value, convert) for value in values] if isinstance(values, list) else convert(values)
+
+
 def to_json(values: Tensor) -> Any:
     """Nested lists of the values of a tensor, with None where a value is not finite."""
-
-    def convert(value: Any) -> Any:
-        if isinstance(value, list):
-            return [convert(item) for item in value]
-        return value if math.isfinite(value) else None
-
-    return convert(values.detach().cpu().tolist())
+    return _converted(values.detach().cpu().tolist(), lambda value: value if math.isfinite(value) else None)
 
 
 def _to_tensor(values: Any, missing: float) -> Tensor:
     """Inverse of ``to_json``: a float64 tensor with ``missing`` in place of None."""
-
-    def convert(value: Any) -> Any:
-        if isinstance(value, list):
-            return [convert(item) for item in value]
-        return missing if value is None else value
-
-    return torch.tensor(convert(values), dtype=torch.float64)
+    return torch.tensor(_converted(values, lambda value: missing if value is None else value), dtype=torch.float64)
 
 
 class TimingRecord(Section):
@@ -149,31 +143,20 @@ class StdRecord(Section):
 
 
 class Detection(Protocol):
-    """What a ``DetectionRecord`` stores of a detection (not a batch), as ``detect_vibration`` returns it."""
+    """The attributes of ``DetectedVibration``; a ``DetectionResult`` that is not a batch has them as well."""
 
     @property
-    def vibration(self) -> Vibration:
-        """The vibration in image axes."""
-
+    def vibration(self) -> Vibration: ...
     @property
-    def std(self) -> VibrationStd:
-        """Standard deviations of its parameters."""
-
+    def std(self) -> VibrationStd: ...
     @property
-    def gain(self) -> Tensor:
-        """(2, K) gain of Eq. (7) from displacement to offset."""
-
+    def gain(self) -> Tensor: ...
     @property
-    def residual(self) -> Tensor:
-        """(2,) px, mean absolute difference of measured and fitted offsets."""
-
+    def residual(self) -> Tensor: ...
     @property
-    def reliable(self) -> Tensor:
-        """(2,) bool, verdict for each axis."""
-
+    def reliable(self) -> Tensor: ...
     @property
-    def reasons(self) -> tuple[Any, ...]:
-        """Why an axis is not reliable, for each axis."""
+    def reasons(self) -> tuple[Any, ...]: ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.validation import read_json
-from rsvib_torch.io.formats import FrameReader, FrameWriter, StackFormat, needed_package
+from rsvib_torch.io.formats import ArrayReader, FrameWriter, StackFormat, needed_package
 from rsvib_torch.io.full_scale import check_dtype
-from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_from_attributes, readable_frame, readable_stack
+from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_from_attributes, readable_stack
 
 __all__ = ["FORMAT"]
 
@@ -60,20 +60,7 @@ def _check_sizes(array: Any, info: StackInfo, folder: Path) -> None:
         )
 
 
-class _ZarrReader(FrameReader):
-    """Frames of a Zarr array."""
-
-    def __init__(self, path: Path, array: Any, info: StackInfo) -> None:
-        self.info = info
-        self._path, self._array = path, array
-
-    def frame(self, index: int) -> NDArray[Any]:
-        """Pixels of a frame as stored."""
-        with readable_frame(self._path, index):
-            return self.info.from_stored(np.asarray(self._array[index] if self._array.ndim > 2 else self._array[...]))
-
-
-def _open(path: Path) -> _ZarrReader:
+def _open(path: Path) -> ArrayReader:
     zarr = _zarr()
     with readable_stack(path, "Zarr"):
         if not (path / _HEADER).is_file():
@@ -87,7 +74,7 @@ def _open(path: Path) -> _ZarrReader:
         check_dtype(array.dtype)
         info = info_from_attributes(dict(array.attrs), tuple(int(size) for size in array.shape), array.dtype)
         _check_sizes(array, info, folder)
-        return _ZarrReader(path, array, info)
+        return ArrayReader(path, info, array)
 
 
 class _ZarrWriter(FrameWriter):

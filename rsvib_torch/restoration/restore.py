@@ -4,7 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypedDict, Unpack, overload
+from typing import Any, Literal, Required, TypedDict, Unpack, overload
 
 from torch import Tensor, nn
 
@@ -27,9 +27,10 @@ __all__ = ["METHODS", "RestorationMethod", "VibrationRestorer", "method_options"
 
 
 class CommonOptions(TypedDict, total=False):
-    """Options of ``restore`` and ``VibrationRestorer`` for all methods."""
+    """Options of ``restore`` and ``VibrationRestorer`` for all methods; ``ignore`` is one of ``restore`` only."""
 
     full_scale: float | None
+    ignore: Tensor | None
     saturation: Saturation
     check: bool
 
@@ -37,6 +38,7 @@ class CommonOptions(TypedDict, total=False):
 class ExactOptions(CommonOptions, total=False):
     """Options of method ``"exact"``, see ``restore_exact``."""
 
+    method: Literal["exact"]
     joint: bool | int
     prior: str
     noise: float | Literal["auto"]
@@ -48,6 +50,7 @@ class ExactOptions(CommonOptions, total=False):
 class BandedOptions(CommonOptions, total=False):
     """Options of method ``"banded"``, see ``restore_banded``."""
 
+    method: Required[Literal["banded"]]
     half_rows: int
     stride: int
     interpolation: Literal["linear", "cubic"]
@@ -58,12 +61,14 @@ class BandedOptions(CommonOptions, total=False):
 class DewarpOptions(CommonOptions, total=False):
     """Options of method ``"dewarp"``, see ``restore_dewarp``."""
 
+    method: Required[Literal["dewarp"]]
     chunk_rows: int
 
 
 class RichardsonLucyOptions(CommonOptions, total=False):
     """Options of method ``"richardson-lucy"``, see ``restore_richardson_lucy``."""
 
+    method: Required[Literal["richardson-lucy"]]
     joint: bool | int
     iterations: int
 
@@ -95,8 +100,8 @@ class RestorationMethod:
 #         option ``joint=True``.
 #
 # Frames of one stack must not affect other stacks, ``frames`` must not be changed, and gradients must flow to frames
-# and motion. A new method is one module, one TypedDict of its options, one line here, and one overload of ``restore``
-# and of ``VibrationRestorer``.
+# and motion. A new method is one module, one TypedDict of its name and options, one line here, and one overload of
+# ``restore`` and of ``VibrationRestorer``.
 METHODS: dict[str, RestorationMethod] = {
     "exact": RestorationMethod(restore_exact, ExactOptions, ("ignore", "clipped")),
     "banded": RestorationMethod(restore_banded, BandedOptions),
@@ -116,11 +121,12 @@ def method_options(method: str) -> tuple[str, ...]:
         ('chunk_rows',)
     """
     check_choice("method", method, tuple(METHODS))
-    return tuple(name for name in METHODS[method].options.__annotations__ if name not in CommonOptions.__annotations__)
+    common = ("method", *CommonOptions.__annotations__)
+    return tuple(name for name in METHODS[method].options.__annotations__ if name not in common)
 
 
 def _check_options(method: str, options: Mapping[str, Any]) -> None:
-    """Refuse options that the method does not have."""
+    """Refuse a method that does not exist, and options that the method does not have."""
     valid = method_options(method)
     for name in options:
         if name not in valid:
@@ -129,53 +135,23 @@ def _check_options(method: str, options: Mapping[str, Any]) -> None:
 
 @overload
 def restore(
-    frames: ArrayLike,
-    timing: SensorTiming,
-    vibration: Motion | Detected,
-    *,
-    method: Literal["exact"] = "exact",
-    ignore: Tensor | None = None,
-    **options: Unpack[ExactOptions],
+    frames: ArrayLike, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[ExactOptions]
 ) -> Tensor: ...
 @overload
 def restore(
-    frames: ArrayLike,
-    timing: SensorTiming,
-    vibration: Motion | Detected,
-    *,
-    method: Literal["banded"],
-    ignore: Tensor | None = None,
-    **options: Unpack[BandedOptions],
+    frames: ArrayLike, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[BandedOptions]
 ) -> Tensor: ...
 @overload
 def restore(
-    frames: ArrayLike,
-    timing: SensorTiming,
-    vibration: Motion | Detected,
-    *,
-    method: Literal["dewarp"],
-    ignore: Tensor | None = None,
-    **options: Unpack[DewarpOptions],
+    frames: ArrayLike, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[DewarpOptions]
 ) -> Tensor: ...
 @overload
 def restore(
-    frames: ArrayLike,
-    timing: SensorTiming,
-    vibration: Motion | Detected,
-    *,
-    method: Literal["richardson-lucy"],
-    ignore: Tensor | None = None,
-    **options: Unpack[RichardsonLucyOptions],
+    frames: ArrayLike, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[RichardsonLucyOptions]
 ) -> Tensor: ...
 @overload
 def restore(
-    frames: ArrayLike,
-    timing: SensorTiming,
-    vibration: Motion | Detected,
-    *,
-    method: str,
-    ignore: Tensor | None = None,
-    **options: Any,
+    frames: ArrayLike, timing: SensorTiming, vibration: Motion | Detected, *, method: str, **options: Any
 ) -> Tensor: ...
 @outside_graphs
 @full_precision
@@ -238,7 +214,6 @@ def restore(
         >>> round(restore(torch.full((2, 64, 48), 0.5), timing, Vibration(2.0, 50.0)).mean().item(), 5)
         0.5
     """
-    check_choice("method", method, tuple(METHODS))
     _check_options(method, options)
     prepared = prepare_frames(frames, timing, full_scale=full_scale, ignore=ignore, saturation=saturation)
     _, count, _, height, _ = prepared.images.shape
@@ -270,7 +245,6 @@ def restore_prepared(
         Restored frames (B, T, C, H, W) in row order.
     """
     options = dict(options or {})
-    check_choice("method", method, tuple(METHODS))
     _check_options(method, options)
     chosen = METHODS[method]
     masks = {"ignore": frames.missing, "clipped": frames.saturated}
@@ -352,21 +326,13 @@ class VibrationRestorer(nn.Module):
     """
 
     @overload
-    def __init__(
-        self, timing: SensorTiming, *, method: Literal["exact"] = "exact", **options: Unpack[ExactOptions]
-    ) -> None: ...
+    def __init__(self, timing: SensorTiming, **options: Unpack[ExactOptions]) -> None: ...
     @overload
-    def __init__(
-        self, timing: SensorTiming, *, method: Literal["banded"], **options: Unpack[BandedOptions]
-    ) -> None: ...
+    def __init__(self, timing: SensorTiming, **options: Unpack[BandedOptions]) -> None: ...
     @overload
-    def __init__(
-        self, timing: SensorTiming, *, method: Literal["dewarp"], **options: Unpack[DewarpOptions]
-    ) -> None: ...
+    def __init__(self, timing: SensorTiming, **options: Unpack[DewarpOptions]) -> None: ...
     @overload
-    def __init__(
-        self, timing: SensorTiming, *, method: Literal["richardson-lucy"], **options: Unpack[RichardsonLucyOptions]
-    ) -> None: ...
+    def __init__(self, timing: SensorTiming, **options: Unpack[RichardsonLucyOptions]) -> None: ...
     @overload
     def __init__(self, timing: SensorTiming, *, method: str, **options: Any) -> None: ...
     def __init__(
@@ -380,16 +346,9 @@ class VibrationRestorer(nn.Module):
         **options: Any,
     ) -> None:
         super().__init__()
-        check_choice("method", method, tuple(METHODS))
         _check_options(method, options)
         self.timing = timing
-        self.options = {
-            "method": method,
-            "full_scale": full_scale,
-            "saturation": saturation,
-            "check": check,
-            **options,
-        }
+        self.options = {"method": method, "full_scale": full_scale, "saturation": saturation, "check": check, **options}
 
     def forward(self, frames: Tensor, vibration: Motion | Detected, ignore: Tensor | None = None) -> Tensor:
         """Restore a stack of frames."""

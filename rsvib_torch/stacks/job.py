@@ -4,7 +4,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypedDict, get_args
 
 import numpy as np
 import torch
@@ -21,12 +21,30 @@ from rsvib_torch.io.stack_info import FrameError, StackInfo, timing_of_stack
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.memory import parse_memory, windows_at_once
 from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted
-from rsvib_torch.stacks.windows import Window, cut_windows, window_timing
+from rsvib_torch.stacks.windows import DEFAULT_WINDOW, Window, cut_windows, window_timing
 
 __all__ = ["BadFrames", "StackJob", "StoredWindow", "WindowFrames", "WindowReader", "WindowResult", "plan_job"]
 
 BadFrames = Literal["pass", "skip"]
 WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why a frame cannot be read
+
+
+class DetectOptions(TypedDict, total=False):
+    """Options of ``detect_stack``, see ``iterate_stack``."""
+
+    window: int
+    detection: Mapping[str, Any] | None
+    full_scale: float | None
+    memory: str | float | None
+    workers: int | None
+    device: str
+
+
+class RestoreOptions(DetectOptions, total=False):
+    """Options of ``iterate_stack`` and ``process_stack``."""
+
+    restoration: Mapping[str, Any] | None
+    force: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +95,7 @@ class StackJob:
         bad_frames: Whether frames that cannot be used are written unchanged or omitted.
         force: Whether to write restored frames even if they are judged worse than the raw ones.
         device: Device for the computation.
+        window: Maximum number of frames of a window.
     """
 
     source: Path
@@ -89,6 +108,7 @@ class StackJob:
     bad_frames: BadFrames = "pass"
     force: bool = False
     device: str = "cpu"
+    window: int = DEFAULT_WINDOW
 
     @property
     def joined(self) -> bool:
@@ -238,41 +258,46 @@ class WindowReader:
 def plan_job(
     source: PathLike,
     timing: SensorTiming,
+    options: Mapping[str, Any],
     *,
-    window: int,
-    detection: Mapping[str, Any] | None,
-    restoration: Mapping[str, Any] | None,
-    full_scale: float | None,
-    memory: str | float | None,
-    workers: int | None,
-    device: str,
+    restores: bool = True,
     given: Sequence[DetectedVibration | None] | None = None,
     bad_frames: BadFrames = "pass",
-    force: bool = False,
 ) -> tuple[StackJob, list[Window], int]:
-    """The job of a run, its windows, and how many of them to compute at once; arguments as in ``process_stack``.
+    """The job of a run, its windows, and how many of them to compute at once.
+
+    Args:
+        source: As in ``process_stack``.
+        timing: As in ``process_stack``.
+        options: ``RestoreOptions``, or ``DetectOptions`` if frames are not restored.
+        restores: Whether frames are restored.
+        given: As in ``process_stack``.
+        bad_frames: As in ``process_stack``.
 
     Raises:
         OSError: If the stack cannot be read.
         TypeError: If an option is unknown.
         ValueError: If a value is out of range or contradicts the stack.
     """
+    known = (RestoreOptions if restores else DetectOptions).__optional_keys__
+    if unknown := sorted(options.keys() - known):
+        raise TypeError(f"unknown option {unknown[0]!r}; the options are {', '.join(sorted(known))}")
     check_choice("bad_frames", bad_frames, get_args(BadFrames))
     info = read_stack_info(source)
+    full_scale = None
     if info.is_integer:
-        full_scale = info.full_scale if full_scale is None else full_scale
-        full_scale = required_full_scale(full_scale, np.dtype(info.dtype), source)
-    else:
-        full_scale = None
+        stated = options.get("full_scale")
+        full_scale = required_full_scale(info.full_scale if stated is None else stated, np.dtype(info.dtype), source)
     timing = timing_of_stack(timing, info)
     timing.frame_starts(info.shape[0])  # raises an error if there are too few frame start times
     timing.check_rows(info.shape[-1 if timing.scan_axis == -1 else -2])
-    options = dict(detection or {})
+    detection = dict(options.get("detection") or {})
     for name in ("window", "window_step"):
-        if name in options:
+        if name in detection:
             raise TypeError(f"{name!r} is not an option of detection here: a stack is cut into windows by window=")
-    if options.get("model", "tones") != "tones":
-        raise ValueError(f"model={options['model']!r}: in windows only tones are detected; see detect_vibration")
+    if detection.get("model", "tones") != "tones":
+        raise ValueError(f"model={detection['model']!r}: in windows only tones are detected; see detect_vibration")
+    device = options.get("device", "auto")
     check_choice("device", device.partition(":")[0], ("auto", "cpu", "cuda"))
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -281,19 +306,20 @@ def plan_job(
         info,
         timing,
         full_scale,
-        options,
-        None if restoration is None else dict(restoration),
+        detection,
+        dict(options.get("restoration") or {}) if restores else None,
         None if given is None else dict(enumerate(given)),
         bad_frames,
-        force,
+        options.get("force", False),
         device,
+        options.get("window", DEFAULT_WINDOW),
     )
-    windows = cut_windows(info.shape[0], window)
-    if workers is not None:
-        most = check_whole_number("workers", workers, at_least=1)
+    windows = cut_windows(info.shape[0], job.window)
+    if options.get("workers") is not None:
+        most = check_whole_number("workers", options["workers"], at_least=1)
     elif device != "cpu":
         most = 1
     else:
         most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    limit = None if memory is None else parse_memory(memory)
-    return job, windows, windows_at_once(info, window, memory=limit, most=most, restoration=job.restoration)
+    limit = None if options.get("memory") is None else parse_memory(options["memory"])
+    return job, windows, windows_at_once(info, job.window, memory=limit, most=most, restoration=job.restoration)

@@ -120,7 +120,7 @@ def fingerprint(path: Path, *, block: int = 1 << 16, blocks: int = 32, files: in
     return {"name": path.name, "bytes": sum(sizes), "sha256_of_samples": digest.hexdigest()}
 
 
-def manifest_header(job: StackJob, window: int, output: str | None, compression: str | None) -> dict[str, Any]:
+def manifest_header(job: StackJob, output: str | None, compression: str | None) -> dict[str, Any]:
     """Everything on which the result depends, as JSON: a run is resumed only if it is unchanged."""
     given = None
     if job.given is not None:
@@ -131,7 +131,7 @@ def manifest_header(job: StackJob, window: int, output: str | None, compression:
         "settings": {
             "sensor": TimingRecord.from_timing(job.timing).model_dump(),
             "full_scale": job.full_scale,
-            "window": window,
+            "window": job.window,
             "detection": dict(job.detection),
             "restoration": None if job.restoration is None else dict(job.restoration),
             "given": given,

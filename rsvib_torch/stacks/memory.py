@@ -46,8 +46,8 @@ def available_memory() -> int | None:
         return None
 
 
-def _sizes(info: StackInfo, window: int, restoration: Mapping[str, Any] | None) -> tuple[int, int]:
-    """Bytes of the process without windows, and of each window."""
+def memory_needed(info: StackInfo, window: int, restoration: Mapping[str, Any] | None, count: int = 1) -> int:
+    """Memory of the process in bytes while ``count`` windows are processed; arguments as in ``windows_at_once``."""
     if restoration is None:
         pixel_bytes = min(_PIXEL_BYTES.values())
     elif restoration.get("prior", "gaussian") != "gaussian":  # other priors need at most as much as "edges"
@@ -56,13 +56,7 @@ def _sizes(info: StackInfo, window: int, restoration: Mapping[str, Any] | None) 
         pixel_bytes = _PIXEL_BYTES.get(restoration.get("method", "exact"), max(_PIXEL_BYTES.values()))
     pixels = min(window, info.shape[0]) * int(np.prod(info.shape[1:], dtype=object))
     queued = 2 * pixels * np.dtype(info.dtype).itemsize  # frames read ahead, and frames to be written
-    return _PROCESS_BYTES + queued, _WINDOW_BYTES + pixels * pixel_bytes + queued
-
-
-def memory_needed(info: StackInfo, window: int, restoration: Mapping[str, Any] | None, count: int = 1) -> int:
-    """Memory of the process in bytes while ``count`` windows are processed; arguments as in ``windows_at_once``."""
-    process, each = _sizes(info, window, restoration)
-    return process + count * each
+    return _PROCESS_BYTES + queued + count * (_WINDOW_BYTES + pixels * pixel_bytes + queued)
 
 
 def windows_at_once(
@@ -80,16 +74,16 @@ def windows_at_once(
     Raises:
         ValueError: If a stated limit is too small for one window.
     """
-    process, each = _sizes(info, window, restoration)
+    process, one = (memory_needed(info, window, restoration, count) for count in (0, 1))
     free = available_memory()
     if memory is None and free is None:
         return most
     limit = memory if memory is not None else int(0.8 * (free or 0))
-    count = (limit - process) // each
+    count = (limit - process) // (one - process)
     if count < 1 and memory is not None:
         raise ValueError(
             f"memory of {memory / 1e9:.2g} GB is too little: a window of {min(window, info.shape[0])} frames of "
-            f"{info.shape[-2]} x {info.shape[-1]} px takes about {(process + each) / 1e9:.2g} GB; allow more, "
+            f"{info.shape[-2]} x {info.shape[-1]} px takes about {one / 1e9:.2g} GB; allow more, "
             "or smaller windows"
         )
     return int(max(1, min(most, count)))

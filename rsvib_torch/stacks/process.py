@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from rsvib_torch.io.atomic import whole_file
 from rsvib_torch.io.files import PathLike, check_info_target
@@ -15,14 +15,21 @@ from rsvib_torch.io.schema import DetectedVibration
 from rsvib_torch.io.stack_info import exposure_times
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
-from rsvib_torch.stacks.job import BadFrames, StoredWindow, WindowFrames, WindowResult, plan_job
+from rsvib_torch.stacks.job import (
+    BadFrames,
+    DetectOptions,
+    RestoreOptions,
+    StoredWindow,
+    WindowFrames,
+    WindowResult,
+    plan_job,
+)
 from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_manifest
 from rsvib_torch.stacks.output import Journal, Sink, describe_difference, disk_errors_named
-from rsvib_torch.stacks.windows import Window
+from rsvib_torch.stacks.windows import DEFAULT_WINDOW, Window
 
 __all__ = ["DEFAULT_WINDOW", "StackReport", "detect_stack", "iterate_stack", "process_stack"]
 
-DEFAULT_WINDOW = 8  # frames
 _MAX_INITIAL_FAILURES = 8  # windows; a run stops if all windows up to this number fail
 
 
@@ -53,19 +60,7 @@ class StackReport:
     manifest: Path
 
 
-def iterate_stack(
-    source: PathLike,
-    timing: SensorTiming,
-    *,
-    window: int = DEFAULT_WINDOW,
-    detection: Mapping[str, Any] | None = None,
-    restoration: Mapping[str, Any] | None = None,
-    full_scale: float | None = None,
-    force: bool = False,
-    memory: str | float | None = None,
-    workers: int | None = None,
-    device: str = "auto",
-) -> Iterator[WindowResult]:
+def iterate_stack(source: PathLike, timing: SensorTiming, **options: Unpack[RestoreOptions]) -> Iterator[WindowResult]:
     """Restore a stack of any length window by window; each is available as soon as it is complete.
 
     A stack is cut into windows of at most ``window`` frames that share one frame with their neighbours. Each window is
@@ -75,14 +70,17 @@ def iterate_stack(
     Args:
         source: The stack, as in ``read_stack``.
         timing: The sensor. If it has no frame start times and the file states them, those of the file are used.
-        window: Maximum number of frames of a window.
-        detection: Options of ``detect_vibration``.
-        restoration: Options of ``restore``, for frames whose full scale is 1.
-        full_scale: As in ``read_stack``.
-        force: Whether to return restored frames even if they are judged worse than the raw ones.
-        memory: Limit for the memory of the process, in bytes or like ``"2GB"``; by default 80 % of the free memory.
-        workers: Maximum number of windows to compute at once; by default the number of processors.
-        device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
+        **options: Options of the run.
+
+            - ``window``: Maximum number of frames of a window, by default 8.
+            - ``detection``: Options of ``detect_vibration``.
+            - ``restoration``: Options of ``restore``, for frames whose full scale is 1.
+            - ``full_scale``: As in ``read_stack``.
+            - ``force``: Whether to return restored frames even if they are judged worse than the raw ones.
+            - ``memory``: Limit for the memory of the process, in bytes or like ``"2GB"``; by default 80 % of the free
+              memory.
+            - ``workers``: Maximum number of windows to compute at once; by default the number of processors.
+            - ``device``: ``"auto"``, ``"cpu"`` or ``"cuda"``.
 
     Yields:
         One ``WindowResult`` per window, in order.
@@ -96,18 +94,7 @@ def iterate_stack(
         >>> for result in iterate_stack("frames.tif", timing):  # doctest: +SKIP
         ...     print(result.indices, result.restored)
     """
-    job, windows, at_once = plan_job(
-        source,
-        timing,
-        window=window,
-        detection=detection,
-        restoration=restoration or {},
-        full_scale=full_scale,
-        memory=memory,
-        workers=workers,
-        device=device,
-        force=force,
-    )
+    job, windows, at_once = plan_job(source, timing, options)
     yield from compute_here(job, windows, lambda result, _: result, at_once=at_once)
 
 
@@ -116,13 +103,8 @@ def detect_stack(
     manifest: PathLike,
     timing: SensorTiming,
     *,
-    window: int = DEFAULT_WINDOW,
-    detection: Mapping[str, Any] | None = None,
-    full_scale: float | None = None,
-    memory: str | float | None = None,
-    workers: int | None = None,
-    device: str = "auto",
     progress: Callable[[int, int], None] | None = None,
+    **options: Unpack[DetectOptions],
 ) -> None:
     """Detect the vibration in every window of a stack of any length.
 
@@ -130,13 +112,8 @@ def detect_stack(
         source: As in ``iterate_stack``.
         manifest: The ``manifest.json`` to write; ``read_manifest`` reads it, ``process_stack(given=...)`` uses it.
         timing: As in ``iterate_stack``.
-        window: As in ``iterate_stack``.
-        detection: As in ``iterate_stack``.
-        full_scale: As in ``iterate_stack``.
-        memory: As in ``iterate_stack``.
-        workers: As in ``iterate_stack``.
-        device: As in ``iterate_stack``.
         progress: As in ``process_stack``.
+        **options: As in ``iterate_stack``, without ``restoration`` and ``force``.
 
     Raises:
         OSError: If the stack cannot be read, or the manifest cannot be written.
@@ -146,17 +123,7 @@ def detect_stack(
     Example:
         >>> detect_stack("frames.tif", "manifest.json", timing)  # doctest: +SKIP
     """
-    job, windows, at_once = plan_job(
-        source,
-        timing,
-        window=window,
-        detection=detection,
-        restoration=None,
-        full_scale=full_scale,
-        memory=memory,
-        workers=workers,
-        device=device,
-    )
+    job, windows, at_once = plan_job(source, timing, options, restores=False)
 
     def records() -> Iterator[dict[str, Any]]:
         errors: list[str | None] = []
@@ -167,9 +134,8 @@ def detect_stack(
                 progress(record["last"] + 1, job.info.shape[0])
             yield record
 
-    header = manifest_header(job, window, None, None)
     with whole_file(manifest) as part:
-        write_manifest(part, header, records())
+        write_manifest(part, manifest_header(job, None, None), records())
 
 
 def process_stack(
@@ -177,21 +143,14 @@ def process_stack(
     sink: PathLike,
     timing: SensorTiming,
     *,
-    window: int = DEFAULT_WINDOW,
-    detection: Mapping[str, Any] | None = None,
-    restoration: Mapping[str, Any] | None = None,
     given: Sequence[DetectedVibration | None] | None = None,
-    full_scale: float | None = None,
     bad_frames: BadFrames = "pass",
-    force: bool = False,
-    memory: str | float | None = None,
-    workers: int | None = None,
-    device: str = "auto",
     scheduler: str | None = None,
     compression: str | None = None,
     resume: bool = False,
     manifest: PathLike | None = None,
     progress: Callable[[int, int], None] | None = None,
+    **options: Unpack[RestoreOptions],
 ) -> StackReport:
     """Restore a stack of any length from file to file.
 
@@ -207,23 +166,17 @@ def process_stack(
         source: The stack, as in ``read_stack``.
         sink: The stack to write, as in ``write_stack``; data type, full scale, resolution and frame times are kept.
         timing: As in ``iterate_stack``.
-        window: As in ``iterate_stack``.
-        detection: As in ``iterate_stack``.
-        restoration: As in ``iterate_stack``; with ``joint=True`` every window becomes one image.
         given: Detections to use instead, one for each window (see ``read_manifest``).
-        full_scale: As in ``read_stack``.
         bad_frames: Whether frames that cannot be used are written unchanged (``"pass"``; a frame that cannot be read is
             written as NaN, or 0 for integers), or omitted (``"skip"``).
-        force: As in ``iterate_stack``.
-        memory: As in ``iterate_stack``. Dask workers have their own limits.
-        workers: As in ``iterate_stack``; with ``scheduler="local"``, the number of processes.
-        device: As in ``iterate_stack``.
         scheduler: Address of a Dask scheduler whose workers can read ``source`` under the same path; ``"local"`` starts
             workers on this machine; None computes in this process.
         compression: As in ``write_stack``.
         resume: Whether to continue an interrupted run; a complete output is not changed.
         manifest: Path of the manifest; by default ``sink`` with ``.manifest.json`` appended.
         progress: Called with the number of complete frames and of all frames.
+        **options: As in ``iterate_stack``. With ``joint=True`` in ``restoration``, every window becomes one image.
+            ``memory`` does not limit Dask workers; with ``scheduler="local"``, ``workers`` is the number of processes.
 
     Returns:
         Summary of the run.
@@ -240,23 +193,10 @@ def process_stack(
         >>> report = process_stack("frames.tif", "restored.tif", timing, memory="2GB")  # doctest: +SKIP
     """
     start, sink = time.perf_counter(), Path(sink)
-    job, windows, at_once = plan_job(
-        source,
-        timing,
-        window=window,
-        detection=detection,
-        restoration=restoration or {},
-        full_scale=full_scale,
-        memory=memory,
-        workers=workers,
-        device=device,
-        given=given,
-        bad_frames=bad_frames,
-        force=force,
-    )
+    job, windows, at_once = plan_job(source, timing, options, given=given, bad_frames=bad_frames)
     if given is not None and len(given) != len(windows):
         raise ValueError(
-            f"given has {len(given)} detections for {len(windows)} windows of at most {window} frames; "
+            f"given has {len(given)} detections for {len(windows)} windows of at most {job.window} frames; "
             "pass one for each window"
         )
     out = job.info.with_frames(len(windows) if job.joined else job.info.shape[0])
@@ -266,7 +206,7 @@ def process_stack(
     target = sink.with_name(sink.name + ".manifest.json") if manifest is None else Path(manifest)
     if sink.exists() and os.path.samefile(source, sink):
         raise ValueError(f"{sink}: a stack cannot be written over itself; choose another name")
-    header = manifest_header(job, window, sink.name, compression)
+    header = manifest_header(job, sink.name, compression)
     first: WindowResult | None = None
 
     def finish(result: WindowResult, pixels: WindowFrames) -> StoredWindow:

@@ -11,8 +11,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.detection import detect_vibration
+from rsvib_torch.detection.start import constant_frame
 from rsvib_torch.frames.prepare import prepare_frames
-from rsvib_torch.io.full_scale import check_dtype, counts_to_frames, frames_to_counts, known_full_scale
+from rsvib_torch.io.full_scale import (
+    beyond_full_scale,
+    check_dtype,
+    counts_to_frames,
+    frames_to_counts,
+    known_full_scale,
+)
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError, trusted_vibration
 from rsvib_torch.restoration.restore import restore_prepared
@@ -96,10 +103,7 @@ def frame_fault(
     low, high = frame.min(), frame.max()
     if frame.dtype.kind != "f":
         if full_scale is not None and high > full_scale:
-            return (
-                f"counts reach {high}, beyond full_scale={full_scale:g}; pass a full_scale of at least the largest "
-                f"count (frame {index})"
-            )
+            return f"{beyond_full_scale(high, full_scale)} (frame {index})"
     elif not np.isfinite(low) or not np.isfinite(high):
         infinite = np.argwhere(np.isinf(frame))
         if len(infinite):
@@ -111,7 +115,7 @@ def frame_fault(
         low, high = np.nanmin(frame), np.nanmax(frame)
     rounding = 1e-7  # of float32, relative
     if float(high) - float(low) <= rounding * max(abs(float(high)), abs(float(low))):
-        return f"frame {index} is constant: without detail there is nothing to register"
+        return constant_frame(index)
     return None
 
 

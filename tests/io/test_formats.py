@@ -16,6 +16,7 @@ from rsvib_torch.io import (
     FrameError,
     StackFormat,
     StackInfo,
+    check_stack_target,
     formats,
     open_stack,
     read_stack,
@@ -191,6 +192,20 @@ def test_format_can_be_added_and_removed(tmp_path, monkeypatch, writing):
     del formats.FORMATS[".toy"]
     with pytest.raises(ValueError, match=r"unknown file ending '\.toy'"):
         open_stack(tmp_path / "a.toy")
+
+
+def test_format_checks_the_full_scale_before_frames_are_computed(tmp_path):
+    def refuse(path, info):
+        if info.full_scale != 255:
+            raise ValueError(f"{path}: full scale {info.full_scale}")
+
+    register_format(StackFormat("toy", (".toy",), ToyReader, create=lambda *_: None, check=refuse))
+    try:
+        assert check_stack_target(tmp_path / "a.toy", (2, 5, 4), dtype="uint8") == 255
+        with pytest.raises(ValueError, match=r"a\.toy: full scale 4095"):
+            check_stack_target(tmp_path / "a.toy", (2, 5, 4), dtype="uint16", full_scale=4095)
+    finally:
+        del formats.FORMATS[".toy"]
 
 
 @pytest.mark.parametrize(("ending", "message"), [(".TOY", "endings must be like '.tif'"), (None, "has no file ending")])
