@@ -1,8 +1,12 @@
-"""Kornia augmentation: still images as a vibrating rolling-shutter camera records them."""
+"""Kornia augmentation: still images as a vibrating rolling-shutter camera records them.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NoReturn
 
 import torch
 from kornia.augmentation import GeometricAugmentationBase2D
@@ -10,11 +14,14 @@ from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 
-from rsvib_torch.augmentation.moving import ImageMotion, move_boxes, move_images, move_masks
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.core.precision import full_precision
+from rsvib_torch.core.splines import gauss_legendre, mirrored
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
+from rsvib_torch.imaging import blur_rows, gauss_node_count, rows_showing, trajectory_psf
 from rsvib_torch.imaging.psf import Interpolation
-from rsvib_torch.motion.timing import SensorTiming, check_timing
+from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
 
 __all__ = ["RollingShutterVibration"]
@@ -22,7 +29,93 @@ __all__ = ["RollingShutterVibration"]
 Range = float | Sequence[float] | Sequence[Sequence[float]]
 Parameters = dict[str, Tensor]
 _DRAWN = ("amplitude", "frequency", "phase", "image_motion", "exposure_rows")
-_NO_INVERSE = "RollingShutterVibration has no inverse; restore(frames, timing, vibration) removes a known vibration"
+
+
+@dataclass(frozen=True, eq=False)
+class ImageMotion:
+    """Motion of B images in row order, each with its own vibration, start and exposure.
+
+    Attributes:
+        vibration: Motion of batch shape (B,).
+        starts: (B,) exposure start of the first row of each image, seconds.
+        exposure_time: (B,) seconds.
+        timing: The sensor; its exposure is not used.
+    """
+
+    vibration: Motion
+    starts: Tensor
+    exposure_time: Tensor
+    timing: RowTiming
+
+    def trajectory(self, num_rows: int) -> tuple[Tensor, Tensor]:
+        """Displacement (B, R, N, 2) in px at the Gauss-Legendre nodes of the exposures of rows, and weights (N,)."""
+        rows = torch.arange(num_rows, dtype=torch.float64, device=self.starts.device)
+        starts = self.starts[:, None] + rows * self.timing.row_time
+        count = gauss_node_count(self.vibration, float(self.exposure_time.amax()))
+        nodes, weights = (tensor.to(starts.device) for tensor in gauss_legendre(count))
+        times = starts[..., None] + nodes * self.exposure_time[:, None, None]
+        return self.vibration.displacement(times), weights
+
+    def mean_displacement(self, rows: Tensor) -> Tensor:
+        """Mean displacement (B, S, 2) in px over the exposures of frame rows (B, S) (Eq. 2)."""
+        starts = self.starts[:, None] + rows * self.timing.row_time
+        return self.vibration.mean_displacement(starts, self.exposure_time[:, None])
+
+    def move(self, points: Tensor) -> Tensor:
+        """Positions (B, S, 2) in the frame of scene points (B, S, 2) in px, both (x, y)."""
+        rows = rows_showing(
+            points[..., 1],
+            self.starts[:, None],
+            self.timing,
+            self.vibration,
+            exposure_time=self.exposure_time[:, None],
+        )
+        return torch.stack([points[..., 0] + self.mean_displacement(rows)[..., 0], rows], dim=-1)
+
+    @full_precision
+    def move_images(self, images: Tensor, interpolation: Interpolation) -> Tensor:
+        """Form frames (B, C, R, W) from still images of the same shape, in row order, with mirrored boundaries.
+
+        Half-precision images are formed in float32.
+        """
+        dtype = images.dtype if images.dtype in (torch.float32, torch.float64) else torch.float32
+        psf = trajectory_psf(*self.trajectory(images.shape[-2]), interpolation=interpolation)
+        psf = type(psf)(psf.first_tap[:, None], psf.weights[:, None], psf.degree)  # the same for all channels
+        return blur_rows(images.to(dtype), psf).to(images.dtype)
+
+    def move_masks(self, masks: Tensor) -> Tensor:
+        """Labels (B, C, R, W) moved by the mean displacement of their rows, to the nearest pixel."""
+        B, _, R, W = masks.shape
+        rows = torch.arange(R, dtype=torch.float64, device=masks.device)
+        displacement = self.mean_displacement(rows.expand(B, -1))
+        source_rows = mirrored((rows - displacement[..., 1]).round().to(torch.int64), R)
+        columns = torch.arange(W, dtype=torch.float64, device=masks.device)
+        source_columns = mirrored((columns - displacement[..., :1]).round().to(torch.int64), W)
+        index = source_rows[..., None] * W + source_columns
+        index = index.flatten(1)[:, None].expand(-1, masks.shape[1], -1)
+        return masks.flatten(-2).gather(-1, index).reshape(masks.shape)
+
+    def move_boxes(self, boxes: Tensor) -> Tensor:
+        """Boxes (B, N, 4, 2) of corner pixels, in row order, that contain the moved content of the given boxes.
+
+        Rows move by different amounts, so the content of an upright box becomes curved: the result is the smallest
+        upright box around it. Boxes that are not upright are moved corner by corner.
+        """
+        low, high = boxes.amin(-2), boxes.amax(-2)
+        steps = torch.linspace(
+            0.0, 1.0, int((high - low)[..., 1].amax().ceil()) + 2, dtype=boxes.dtype, device=boxes.device
+        )
+        side_rows = low[..., 1, None] + (high - low)[..., 1, None] * steps  # (B, N, S), at most one row apart
+        sides = torch.stack(
+            [torch.stack([x[..., None].expand_as(side_rows), side_rows], -1) for x in (low[..., 0], high[..., 0])], -3
+        )
+        moved = self.move(sides.flatten(1, -2)).reshape(sides.shape).flatten(2, 3)
+        lowest, highest = moved.amin(-2)[..., None, :], moved.amax(-2)[..., None, :]
+        is_high = boxes == high[..., None, :]  # per corner and coordinate
+        around = torch.where(is_high, highest, lowest)
+        upright = (is_high | (boxes == low[..., None, :])).flatten(-2).all(-1)
+        corners = self.move(boxes.flatten(1, -2)).reshape(boxes.shape)
+        return torch.where(upright[..., None, None], around, corners)
 
 
 def _axis_ranges(
@@ -184,7 +277,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         if input.numel() == 0:
             return input
         images = frames_to_row_order(input, self.timing)
-        moved = move_images(images, self._motion(params, images), flags["interpolation"])
+        moved = self._motion(params, images).move_images(images, flags["interpolation"])
         return frames_from_row_order(moved, self.timing)
 
     def apply_transform_mask(
@@ -194,19 +287,14 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         if input.numel() == 0:
             return input
         masks = frames_to_row_order(input, self.timing)
-        return frames_from_row_order(move_masks(masks, self._motion(params, masks)), self.timing)
+        return frames_from_row_order(self._motion(params, masks).move_masks(masks), self.timing)
 
     def apply_transform_keypoint(
         self, input: Keypoints, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
     ) -> Keypoints:
         """Move keypoints to their positions in the frame."""
         output = input.clone()
-        points = input.data.to(torch.float64)
-        if points.numel():
-            motion = self._motion(params, points)
-            rowwise = self._points(points.reshape(len(motion.starts), -1, 2), params)
-            moved = self._points_back(motion.move(rowwise), params)
-            output._data = moved.reshape(points.shape).to(input.data.dtype)
+        output._data = self._moved(input.data, params, (2,), ImageMotion.move)
         return output
 
     def apply_transform_box(
@@ -214,34 +302,43 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
     ) -> Boxes:
         """Return the smallest upright boxes around the moved content of the boxes."""
         output = input.clone()
-        corners = input.data.to(torch.float64)
-        if corners.numel():
-            motion = self._motion(params, corners)
-            rowwise = self._points(corners.reshape(len(motion.starts), -1, 4, 2), params)
-            moved = self._points_back(move_boxes(rowwise, motion), params)
-            output._data = moved.reshape(corners.shape).to(input.data.dtype)
+        output._data = self._moved(input.data, params, (4, 2), ImageMotion.move_boxes)
         return output
+
+    def _moved(
+        self,
+        points: Tensor,
+        params: Parameters,
+        shape: tuple[int, ...],
+        move: Callable[[ImageMotion, Tensor], Tensor],
+    ) -> Tensor:
+        """Points (..., x and y), moved by ``move`` as (B, N, *shape) in row order."""
+        if points.numel() == 0:
+            return points
+        motion = self._motion(params, points)
+        by_columns, reverse = self.timing.scan_axis == -1, self.timing.readout_direction == "reverse"
+        last = points.new_tensor([0, self._num_rows(params) - 1], dtype=torch.float64)
+        sign = points.new_tensor([1, -1], dtype=torch.float64)
+        rowwise = points.to(torch.float64).reshape(len(motion.starts), -1, *shape)
+        rowwise = rowwise.flip(-1) if by_columns else rowwise
+        moved = move(motion, last + sign * rowwise if reverse else rowwise)
+        moved = last + sign * moved if reverse else moved
+        return (moved.flip(-1) if by_columns else moved).reshape(points.shape).to(points.dtype)
 
     def _motion(self, params: Parameters, like: Tensor) -> ImageMotion:
         """The drawn motion of a batch in row order."""
         drawn = {name: params[name].to(dtype=torch.float64, device=like.device) for name in _DRAWN}
         exposure_rows = drawn.pop("exposure_rows")
-        count = len(exposure_rows)
         vibration = Vibration(**drawn).to_row_order(self.timing)
         self.timing.check_rows(self._num_rows(params))
+        length = self._recording_length(params)
+        starts = self.timing.frame_starts(length) if length > 1 else torch.zeros(1, dtype=torch.float64)
         return ImageMotion(
             vibration=vibration,
-            starts=self._frame_starts(params, count).to(like.device),
+            starts=starts.repeat(len(exposure_rows) // length).to(like.device),
             exposure_time=exposure_rows * self.timing.row_time,
             timing=self.timing.in_row_order(),
         )
-
-    def _frame_starts(self, params: Parameters, count: int) -> Tensor:
-        """Exposure start of each image: 0, or that of the frame in its recording."""
-        length = self._recording_length(params)
-        if length == 1:
-            return torch.zeros(count, dtype=torch.float64)
-        return self.timing.frame_starts(length).repeat(count // length)
 
     def _recording_length(self, params: Parameters) -> int:
         """Number of frames of video clips that share one draw; 1 for images and for frames with individual draws."""
@@ -252,34 +349,14 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         drawn = (params[name].unflatten(0, (int(clips), -1)) for name in (*_DRAWN, "batch_prob"))
         return count // int(clips) if all(bool((clip == clip[:, :1]).all()) for clip in drawn) else 1
 
-    def _points(self, points: Tensor, params: Parameters) -> Tensor:
-        """Points (..., 2) of images as points of images in row order."""
-        points = points.flip(-1) if self.timing.scan_axis == -1 else points
-        return self._mirrored(points, params)
-
-    def _points_back(self, points: Tensor, params: Parameters) -> Tensor:
-        points = self._mirrored(points, params)
-        return points.flip(-1) if self.timing.scan_axis == -1 else points
-
-    def _mirrored(self, points: Tensor, params: Parameters) -> Tensor:
-        if self.timing.readout_direction == "forward":
-            return points
-        return torch.stack([points[..., 0], self._num_rows(params) - 1 - points[..., 1]], dim=-1)
-
     def _num_rows(self, params: Parameters) -> int:
         height, width = params["forward_input_shape"].tolist()[-2:]
         return int(height if self.timing.scan_axis == -2 else width)
 
-    def inverse_transform(
-        self, input: Tensor, flags: dict[str, Any], transform: Tensor | None = None, size: tuple[int, int] | None = None
-    ) -> Tensor:
+    def inverse_transform(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Raise an error: the blur is inverted by restoration only."""
-        raise NotImplementedError(_NO_INVERSE)
+        raise NotImplementedError(
+            "RollingShutterVibration has no inverse; restore(frames, timing, vibration) removes a known vibration"
+        )
 
-    def inverse_boxes(self, input: Boxes, *args: Any, **kwargs: Any) -> Boxes:
-        """Raise an error, as ``inverse_transform`` does."""
-        raise NotImplementedError(_NO_INVERSE)
-
-    def inverse_keypoints(self, input: Keypoints, *args: Any, **kwargs: Any) -> Keypoints:
-        """Raise an error, as ``inverse_transform`` does."""
-        raise NotImplementedError(_NO_INVERSE)
+    inverse_boxes = inverse_keypoints = inverse_transform

@@ -11,16 +11,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.frames.prepare import as_float_frames
 
 __all__ = ["BandFit", "Profiles", "SceneModel", "find_bands", "row_profiles"]
 
 SceneModel = Literal["smooth", "fixed"]
-_DARK = 0.02  # of the mean brightness: lower bound of the brightness of the scene
-_MIN_PERIODS = 1.5  # in a frame
-_MIN_PERIOD = 4.0  # rows; finer bands may be aliases of coarser ones
-_PADDING = 4  # of the transform, for the height of its peaks
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,24 +34,25 @@ class Profiles:
     clipped: float
 
 
-def row_profiles(frames: Tensor, scan_axis: int, full_scale: float | None, gamma: float) -> Profiles:
+def row_profiles(frames: Tensor, scan_axis: int | str, full_scale: float | None, gamma: float) -> Profiles:
     """Mean brightness of the rows of a stack (T, H, W) or (T, C, H, W).
 
     Args:
         frames: The stack; floats of full scale 1, or integers.
-        scan_axis: -2 or -1, the axis along which rows follow each other.
+        scan_axis: The axis along which rows follow each other, as in ``SensorTiming``.
         full_scale: Count that means 1.0, for integers.
         gamma: Pixels are raised to this power to make them proportional to light.
 
     Raises:
         ValueError: If the frames are black, saturated or too small.
     """
+    check_choice("scan_axis", scan_axis, (-2, "y", -1, "x"))
     check_number("gamma", gamma, above=0.0, at_most=4.0)
     images = as_float_frames(frames, full_scale)
     if images.ndim == 5:
         raise ValueError(f"calibration takes one stack, got a batch of shape {tuple(images.shape)}")
     images = images.mean(1) if images.ndim == 4 else images
-    images = images.transpose(-2, -1) if scan_axis == -1 else images
+    images = images.transpose(-2, -1) if scan_axis in (-1, "x") else images
     if images.shape[-2] < 32:
         raise ValueError(f"frames have {images.shape[-2]} rows along the scan; at least 32 are needed")
     clipped = images >= 1.0 - 1e-6
@@ -148,13 +145,16 @@ def fit_period(brightness: Tensor, start: float, scene: SceneModel) -> BandFit |
     return best
 
 
-def _fit(brightness: Tensor, period: float, scene: SceneModel, count: int) -> BandFit | None:
-    """Gauss-Newton on period, waveforms and smooth scene together, and on the texture in turn."""
+def _fit(brightness: Tensor, period: float, scene: SceneModel, count: int, dark: float = 0.02) -> BandFit | None:
+    """Gauss-Newton on period, waveforms and smooth scene together, and on the texture in turn.
+
+    The brightness of the scene is at least ``dark`` times its mean.
+    """
     frames, height = brightness.shape
     centre = 0.5 * (height - 1)
     rows = torch.arange(height, dtype=torch.float64) - centre
     smooth = _polynomials(height, period)
-    floor = _DARK * brightness.mean(1, keepdim=True)
+    floor = dark * brightness.mean(1, keepdim=True)
     texture = torch.ones(height, dtype=torch.float64)
     level = torch.maximum(_solve(smooth.expand(frames, -1, -1), brightness) @ smooth.T, floor)
     waves = torch.zeros(frames, 2 * count, dtype=torch.float64)
@@ -163,7 +163,7 @@ def _fit(brightness: Tensor, period: float, scene: SceneModel, count: int) -> Ba
         pattern = 1 + waves @ basis.T
         if scene == "fixed" and turn > 2:
             shape = level * pattern
-            texture = ((shape * brightness).sum(0) / shape.square().sum(0).clamp(min=1e-300)).clamp(min=_DARK)
+            texture = ((shape * brightness).sum(0) / shape.square().sum(0).clamp(min=1e-300)).clamp(min=dark)
         even = brightness / texture
         fixed = torch.cat([level[..., None] * basis, pattern[..., None] * smooth], -1)
         shift = level * (waves @ slope.T)
@@ -258,39 +258,47 @@ def _certainty(coefficients: Tensor, residual: Tensor, period: float) -> float:
     return float((coefficients[:, 0].abs().square() / noise.clamp(min=1e-300)).sum())
 
 
-def _spectrum(brightness: Tensor) -> tuple[Tensor, Tensor]:
-    """Power spectrum (N,) of the brightness of rows less a parabola, and its frequencies in cycles per row."""
-    height = brightness.shape[1]
-    place = torch.linspace(-1, 1, height, dtype=torch.float64)
+def _less_parabola(curves: Tensor) -> Tensor:
+    """Curves (N, H) less the parabola that fits each of them."""
+    place = torch.linspace(-1, 1, curves.shape[-1], dtype=torch.float64)
     smooth = torch.stack([torch.ones_like(place), place, place.square()], 1)
-    weight = torch.linalg.lstsq(smooth, brightness.T).solution
-    flat = (brightness - (smooth @ weight).T) / brightness.mean(1, keepdim=True)
-    length = _PADDING * height
-    window = torch.hann_window(height, dtype=torch.float64)
-    return torch.fft.rfft(flat * window, n=length).abs().square().sum(0), torch.fft.rfftfreq(length).double()
+    weight: Tensor = torch.linalg.lstsq(smooth, curves.mT).solution
+    return curves - (smooth @ weight).mT
 
 
-def _starts(brightness: Tensor) -> list[float]:
-    """Periods in rows at the peaks of the spectrum, the six highest and the six highest above the background."""
-    power, frequencies = _spectrum(brightness)
+def _starts(brightness: Tensor, min_periods: float, padding: int = 4) -> list[float]:
+    """Periods in rows at the peaks of the spectrum, the six highest and the six highest above the background.
+
+    The transform is ``padding`` times as long as a frame, for the height of its peaks.
+    """
     height = brightness.shape[1]
-    usable = (frequencies >= 0.8 * _MIN_PERIODS / height) & (frequencies <= 0.45)
-    reach = 8 * _PADDING
+    flat = _less_parabola(brightness) / brightness.mean(1, keepdim=True)
+    window = torch.hann_window(height, dtype=torch.float64)
+    power = torch.fft.rfft(flat * window, n=padding * height).abs().square().sum(0)
+    frequencies = torch.fft.rfftfreq(padding * height).double()
+    usable = (frequencies >= 0.8 * min_periods / height) & (frequencies <= 0.45)
+    usable[1:-1] &= (power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])
+    reach = 8 * padding
     around = torch.nn.functional.pad(power[None, None], (reach, reach), mode="reflect")[0, 0]
     background = around.unfold(0, 2 * reach + 1, 1).median(-1).values
-    peak = torch.zeros_like(usable)
-    peak[1:-1] = (power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])
-    starts: list[float] = []
+    places = usable.nonzero()[:, 0]
+    starts: set[float] = set()
+    # without the peaks above the background, texture alone is found as flicker in some pairs of frames
     for score in (power, power / background.clamp(min=1e-300)):
-        ranked = torch.where(usable & peak, score, 0.0).argsort(descending=True)[:6]
-        starts += [float(1 / frequencies[place]) for place in ranked if bool(usable[place] & peak[place])]
-    return sorted(set(starts))
+        highest = places[score[places].argsort(descending=True)[:6]]
+        starts |= set((1 / frequencies[highest]).tolist())
+    return sorted(starts)
 
 
-def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
+def find_bands(profiles: Profiles, *, min_periods: float = 1.5, min_period: float = 4.0) -> tuple[BandFit, SceneModel]:
     """The bands whose period has the smallest relative standard deviation.
 
     Several frames of a still scene are fitted together if their bands move, which eliminates the texture of the scene.
+
+    Args:
+        profiles: Brightness of the rows.
+        min_periods: Fewest periods in a frame.
+        min_period: Smallest period in rows: finer bands may be aliases of coarser ones.
 
     Returns:
         The fit and its model of the scene.
@@ -305,7 +313,7 @@ def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
         even = brightness / brightness.mean(1, keepdim=True)
         scenes.append(("fixed", even - even.mean(0) + 1.0))
     for scene, curve in scenes:
-        fits = [fit_period(brightness, start, scene) for start in _starts(curve)]
+        fits = [fit_period(brightness, start, scene) for start in _starts(curve, min_periods)]
         usable = [fit for fit in fits if fit is not None and fit.period <= brightness.shape[1]]
         if scene == "fixed":  # a pattern at the same rows in all frames is texture
             usable = [fit for fit in usable if moves(fit)]
@@ -321,19 +329,19 @@ def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
     if not trusted:
         raise ValueError(
             "no flicker found: no bands of the same period across all columns exceed the texture of the scene; at "
-            f"least {_MIN_PERIODS:g} periods of the flicker must fit into a frame with visible contrast; two or more "
+            f"least {min_periods:g} periods of the flicker must fit into a frame with visible contrast; two or more "
             "frames of a still scene eliminate its texture"
         )
     best, model = min(trusted, key=lambda item: item[0].period_std / item[0].period)
-    if best.period < _MIN_PERIOD:
+    if best.period < min_period:
         raise ValueError(
             f"the bands repeat every {best.period:.2f} rows: flicker this fast is ambiguous; "
-            f"use a flicker with bands of at least {_MIN_PERIOD:g} rows"
+            f"use a flicker with bands of at least {min_period:g} rows"
         )
-    if brightness.shape[1] / best.period < _MIN_PERIODS:
+    if brightness.shape[1] / best.period < min_periods:
         raise ValueError(
             f"flicker is slower than a frame: {brightness.shape[1] / best.period:.2f} periods in its rows, at least "
-            f"{_MIN_PERIODS:g} are needed; use a faster flicker"
+            f"{min_periods:g} are needed; use a faster flicker"
         )
     return best, model
 
@@ -347,7 +355,6 @@ def moves(fit: BandFit) -> bool:
 
 def same_everywhere(profiles: Profiles, fit: BandFit, scene: SceneModel) -> bool:
     """Whether the bands lie at the same rows in all parts of the columns, as those of light do."""
-    rows = torch.arange(profiles.rows.shape[1], dtype=torch.float64)
     parts = profiles.parts
     height = parts.shape[-1]
     periods = int(height / fit.period)
@@ -355,11 +362,9 @@ def same_everywhere(profiles: Profiles, fit: BandFit, scene: SceneModel) -> bool
     if scene == "fixed":
         parts = parts - parts.mean(0) * (parts.mean(-1) / parts.mean((0, -1)))[..., None]
     else:
-        place = torch.linspace(-1, 1, height, dtype=torch.float64)
-        smooth = torch.stack([torch.ones_like(place), place, place.square()], 1)
-        weight = torch.linalg.lstsq(smooth, parts.flatten(0, 1).T).solution
-        parts = parts - (smooth @ weight).T.unflatten(0, parts.shape[:2])
-    wave = torch.polar(torch.hann_window(kept, dtype=torch.float64), -2 * torch.pi * rows[:kept] / fit.period)
+        parts = _less_parabola(parts.flatten(0, 1)).view_as(parts)
+    angle = -2 * torch.pi * torch.arange(kept, dtype=torch.float64) / fit.period
+    wave = torch.polar(torch.hann_window(kept, dtype=torch.float64), angle)
     amplitude = parts[..., :kept].to(wave.dtype) @ wave
     together, each = amplitude.sum(1).abs().sum(), amplitude.abs().sum()
     return bool(together > 0.7 * each)

@@ -44,14 +44,12 @@ class StrobeFit:
         on_rows: Rows read while the light is on.
         exposure_rows: (T,) rows read during the exposure of one row.
         std: Standard deviations of the free parameters, by name.
-        misfit: Root mean square of the residuals over the brightness.
     """
 
     period: float
     on_rows: float
     exposure_rows: Array
     std: dict[str, float]
-    misfit: float
 
 
 def _residuals(brightness: Array, smooth: Array, shape: Array) -> Array:
@@ -71,6 +69,7 @@ def fit_strobe(
     *,
     on_fraction: float | None = None,
     exposures: Sequence[float] | None = None,
+    max_misfit: float = 0.3,
 ) -> StrobeFit:
     """Fit the bands of an on-off light: the overlap of its pulses with the exposure of each row.
 
@@ -83,9 +82,13 @@ def fit_strobe(
         phases: Phase of the fundamental in each frame, ``cos(2 pi i / P - phase)``, to start with.
         on_fraction: Fraction of the period that the light is on.
         exposures: Exposures in seconds, one a frame; ``std["row_time"]`` then holds that of the row time.
+        max_misfit: Largest root mean square of the residuals over the brightness.
 
     Returns:
         The best fit from several starts.
+
+    Raises:
+        ValueError: If the bands do not have the shape of an on-off light.
     """
     values = (brightness / brightness.mean(1, keepdim=True)).numpy()
     height = values.shape[1]
@@ -132,6 +135,8 @@ def fit_strobe(
             best = trial
     assert best is not None
     misfit = math.sqrt(2 * best.cost / values.size)
+    if misfit > max_misfit:
+        raise ValueError(f"the bands do not have the shape of an on-off light (misfit {misfit:.0%} of the mean)")
     names = ["period", "exposure_rows"] if exposures is None else ["period", "row_time", "on_rows"]
     std = _deviations(best.jac, best.fun.reshape(count, height), period)
     return StrobeFit(
@@ -139,7 +144,6 @@ def fit_strobe(
         on_rows=on_rows(best.x),
         exposure_rows=exposure_rows(best.x),
         std=dict(zip(names, std, strict=False)),
-        misfit=misfit,
     )
 
 
@@ -177,6 +181,4 @@ def exposure_from_contrast(contrast: float, light_contrast: float, period: float
         raise ValueError(
             f"the bands have a contrast of {contrast:.3f}, more than the light's own light_contrast={light_contrast:g}"
         )
-    if ratio == 1.0:
-        return 0.0
     return float(period * brentq(lambda turns: np.sinc(turns) - ratio, 0.0, 1.0))

@@ -1,6 +1,5 @@
 """Quality of restored images and of measured offset curves."""
 
-from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -11,8 +10,6 @@ from rsvib_torch.core.checks import check_choice, check_number, check_whole_numb
 from rsvib_torch.frames.arrays import ArrayLike, as_tensor
 
 __all__ = ["offset_endpoint_error", "psnr", "ssim"]
-
-_SSIM_WINDOW = 11  # px, of a Gaussian of 1.5 px cut at 3.5 standard deviations, as in scikit-image
 
 
 def _compared(image: ArrayLike, reference: ArrayLike, rim: int) -> tuple[Tensor, Tensor]:
@@ -109,26 +106,15 @@ def ssim(image: ArrayLike, reference: ArrayLike, data_range: float, *, rim: int 
     """
     data_range = check_number("data_range", data_range, above=0.0)
     first, second = _compared(image, reference, rim)
-    if min(first.shape[-2:]) < _SSIM_WINDOW:
+    window = 11  # px, of a Gaussian of 1.5 px cut at 3.5 standard deviations, as in scikit-image
+    if min(first.shape[-2:]) < window:
         raise ValueError(
-            f"ssim needs at least {_SSIM_WINDOW} x {_SSIM_WINDOW} px within the rim, "
-            f"got {first.shape[-2]} x {first.shape[-1]}"
+            f"ssim needs at least {window} x {window} px within the rim, got {first.shape[-2]} x {first.shape[-1]}"
         )
     # the separable filters are several times faster along the channel axis than along the batch axis
     folded = [value.flatten(0, 1)[None] for value in (first, second)]
-    similarity = kornia_ssim(folded[0], folded[1], _SSIM_WINDOW, max_val=data_range, eps=0.0, padding="valid")
+    similarity = kornia_ssim(folded[0], folded[1], window, max_val=data_range, eps=0.0, padding="valid")
     return _per_image(similarity[0].unflatten(0, first.shape[:2]).flatten(1).mean(1, dtype=torch.float64), image)
-
-
-def _root_mean_square(distance: Tensor) -> Tensor:
-    return distance.square().nanmean(-1).sqrt()
-
-
-_REDUCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    "mean": lambda distance: distance.nanmean(-1),
-    "rms": _root_mean_square,
-    "none": lambda distance: distance,
-}
 
 
 def offset_endpoint_error(
@@ -154,7 +140,7 @@ def offset_endpoint_error(
         >>> offset_endpoint_error(torch.tensor([[3.0, 4.0], [0.0, 0.0]]), torch.zeros(2, 2))
         tensor(2.5000, dtype=torch.float64)
     """
-    check_choice("reduction", reduction, tuple(_REDUCTIONS))
+    check_choice("reduction", reduction, ("mean", "rms", "none"))
     for name, value in (("measured", measured), ("truth", truth)):
         if value.ndim < 2 or value.shape[-1] != 2:
             raise ValueError(f"{name} must have shape (..., N, 2), got {tuple(value.shape)}")
@@ -162,4 +148,7 @@ def offset_endpoint_error(
         difference = measured.to(torch.float64) - truth.to(torch.float64)
     except RuntimeError as error:
         raise ValueError(f"truth of shape {tuple(truth.shape)} does not fit {tuple(measured.shape)}") from error
-    return _REDUCTIONS[reduction](torch.linalg.vector_norm(difference, dim=-1))
+    distance: Tensor = torch.linalg.vector_norm(difference, dim=-1)
+    if reduction == "none":
+        return distance
+    return distance.nanmean(-1) if reduction == "mean" else distance.square().nanmean(-1).sqrt()

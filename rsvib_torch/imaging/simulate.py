@@ -125,10 +125,6 @@ def _form_rows(
         transfer = taps.transpose(-2, -1).to(spectra.dtype) @ ramps  # (T, rows, taps, frequencies)
         tap = torch.arange(taps.shape[-1], device=scene.device) - _DEGREE // 2
         source = mirrored(top + chunk[:, None] - first[..., None] - tap, height)  # (T, rows, taps)
-        if scene.ndim == 3:
-            picked = spectra[:, source].movedim(0, 1)
-            row_spectra = (picked * transfer[:, None]).sum(-2)
-        else:
-            row_spectra = (spectra[source] * transfer).sum(-2)
+        row_spectra = (spectra[..., source, :] * transfer).sum(-2)
         formed.append(torch.fft.irfft(row_spectra, n=length)[..., left : left + width])
-    return torch.cat(formed, dim=-2).contiguous()
+    return torch.cat(formed, dim=-2).movedim(-3, 0).contiguous()  # frames before channels

@@ -118,9 +118,8 @@ def rows_showing(
     for iteration in range(8):
         starts = frame_start + rows * timing.row_time
         residual = scene_rows + vibration.mean_displacement(starts, exposure_time)[..., 1] - rows
-        last_of_three = (
-            iteration == 2
-        )  # three steps are enough for most motions; the third keeps the slope of the second
+        # three steps are enough for most motions; the third keeps the slope of the second
+        last_of_three = iteration == 2
         if not last_of_three:
             # derivative of the mean displacement, which differs from the velocity for periods as short as exposures
             ends = vibration.displacement(starts + exposure_time) - vibration.displacement(starts)

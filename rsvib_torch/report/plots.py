@@ -34,6 +34,7 @@ __all__ = [
     "motion_blur",
     "mtf_figure",
     "offset_figure",
+    "picture",
     "plain_axes",
     "psf_figure",
     "rows_figure",
@@ -356,7 +357,7 @@ def comparison_figure(
         size: Side of the crops in px.
         names: Titles of the two rows of panels.
     """
-    raw, restored = (_picture(frame) for frame in (raw, restored))
+    raw, restored = (picture(frame) for frame in (raw, restored))
     size = min(size, *raw.shape[:2])
     places = detailed_places(restored.mean(-1), size, count, rim=16)  # boundary extension changes the border
     figure = Figure(figsize=(4.0 * len(places) + 0.4, 8.6), layout="constrained")
@@ -378,8 +379,8 @@ def comparison_figure(
     return figure
 
 
-def _picture(frame: Tensor) -> Tensor:
-    """Frame (H, W, 1) or (H, W, 3) on the CPU."""
+def picture(frame: Tensor) -> Tensor:
+    """Frame (H, W) or (C, H, W) as (H, W, 1) or, from three channels on, as (H, W, 3), float32 on the CPU."""
     frame = frame.detach().float().cpu()
     frame = frame[None] if frame.ndim == 2 else frame
     frame = frame[:3] if frame.shape[0] >= 3 else frame.mean(0, keepdim=True)

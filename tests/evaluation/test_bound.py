@@ -4,9 +4,8 @@ import torch
 from scipy.interpolate import BSpline
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation.bound import information
-from rsvib_torch.evaluation.bound.cramer_rao import _parameters, _sensitivity, cramer_rao_bound
-from rsvib_torch.evaluation.bound.information import Recording
+from rsvib_torch.evaluation import bound as bound_module
+from rsvib_torch.evaluation.bound import Recording, _parameters, _sensitivity, cramer_rao_bound
 
 TIMING = rsv.SensorTiming(row_time=160e-6, exposure_rows=3, frame_rows=300)
 FIELDS = ("amplitude", "frequency", "period", "phase", "image_motion")
@@ -80,22 +79,22 @@ def dense_information(coefficients, num_frames, explain):
 
 def ridge(operator, derivatives):
     normal = operator.T @ operator
-    small = information._RIDGE * normal.diagonal().max()
+    small = bound_module._RIDGE * normal.diagonal().max()
     return np.linalg.solve(normal + small * np.eye(len(normal)), operator.T @ derivatives)
 
 
 def least_squares(operator, derivatives):
-    return np.linalg.lstsq(operator, derivatives, rcond=information._RIDGE**0.5)[0]
+    return np.linalg.lstsq(operator, derivatives, rcond=bound_module._RIDGE**0.5)[0]
 
 
 @pytest.mark.parametrize(
     ("num_frames", "explain", "tolerance"), [(2, ridge, 5e-4), (2, least_squares, 1e-2), (3, ridge, 5e-4)]
 )
 def test_projection_equals_dense_algebra(monkeypatch, num_frames, explain, tolerance):
-    monkeypatch.setattr(information, "_MARGIN", 0)  # the scene is periodic
-    monkeypatch.setattr(information, "fast_length", lambda minimum: minimum)
-    monkeypatch.setattr(information, "_within_band", lambda scene: scene)
-    monkeypatch.setattr(information, "bspline_coefficients", lambda scene, degree, dim: scene)
+    monkeypatch.setattr(bound_module, "_MARGIN", 0)  # the scene is periodic
+    monkeypatch.setattr(bound_module, "fast_length", lambda minimum: minimum)
+    monkeypatch.setattr(bound_module, "_within_band", lambda scene: scene)
+    monkeypatch.setattr(bound_module, "bspline_coefficients", lambda scene, degree, dim: scene)
     coefficients = torch.from_numpy(smooth_scene(HEIGHT + 2 * EDGE, WIDTH, seed=3))
     motion = rsv.Vibration(*([TRUTH[name + axis] for axis in "xy"] for name in "afpv"))
     parameters = _parameters(motion, acceleration=False)
@@ -108,7 +107,7 @@ def test_projection_equals_dense_algebra(monkeypatch, num_frames, explain, toler
         tuple(axis for axis, _, _ in parameters),
         lambda times: torch.stack([_sensitivity(motion, p, times) for p in parameters]),
     )
-    found = information.projected_information(recording).numpy()
+    found = bound_module.projected_information(recording).numpy()
     expected = dense_information(coefficients.numpy().ravel(), num_frames, explain)
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     assert np.abs((found - expected) / scale).max() <= tolerance

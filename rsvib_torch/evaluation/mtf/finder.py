@@ -1,5 +1,6 @@
 """Search for ROIs of slanted edges in the image of a chart."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,9 +24,6 @@ from rsvib_torch.frames.arrays import ArrayLike, as_tensor
 
 __all__ = ["SlantedEdge", "find_slanted_edges"]
 
-_BLUR, _TAPS = 1.2, 5  # px, of the Gaussian before the gradient, and its half length
-_ANGLES = (2.0, 30.0)  # degrees from an image axis
-_ENDS = 5  # px removed at the ends of an edge, because of corners
 _Side = Literal["left", "right", "top", "bottom"]
 
 
@@ -92,8 +90,6 @@ def find_slanted_edges(
     max_length = check_whole_number("max_length", max_length, at_least=min_length)
     check_number("min_contrast", min_contrast, above=0.0, at_most=1.0)
     values = grey.detach().to(torch.float64)
-    if min(values.shape) < 2 * _TAPS + 1:
-        return []
     low, high = (values.flatten().kthvalue(max(1, int(q * (values.numel() - 1)) + 1)).values for q in (0.01, 0.99))
     least = min_contrast * float(high - low)
     if least == 0.0:
@@ -113,14 +109,15 @@ def find_slanted_edges(
     return kept
 
 
-def _gradients(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives (right, down) of the image after a Gaussian filter."""
-    offset = torch.arange(-_TAPS, _TAPS + 1, dtype=values.dtype, device=values.device)
-    smooth = torch.exp(-0.5 * (offset / _BLUR).square())
+def _gradients(values: Tensor, blur: float) -> tuple[Tensor, Tensor]:
+    """Derivatives (right, down) of the image after a Gaussian filter of ``blur`` px."""
+    reach = math.ceil(4 * blur)
+    offset = torch.arange(-reach, reach + 1, dtype=values.dtype, device=values.device)
+    smooth = torch.exp(-0.5 * (offset / blur).square())
     smooth = smooth / smooth.sum()
     slope = offset * smooth
     slope = slope / (slope * offset).sum()
-    padded = torch.nn.functional.pad(values[None, None], (_TAPS,) * 4, mode="replicate")
+    padded = torch.nn.functional.pad(values[None, None], (reach,) * 4, mode="replicate")
     right, down = (
         torch.nn.functional.conv2d(torch.nn.functional.conv2d(padded, x[None, None, None]), y[None, None, :, None])[
             0, 0
@@ -130,15 +127,17 @@ def _gradients(values: Tensor) -> tuple[Tensor, Tensor]:
     return right, down
 
 
-def _lines(values: Tensor, least: float, min_length: int, max_length: int) -> list[tuple[tuple[float, float], range]]:
+def _lines(
+    values: Tensor, least: float, min_length: int, max_length: int, blur: float = 1.2
+) -> list[tuple[tuple[float, float], range]]:
     """Near-vertical lines, ``column = a + b row``, along ridges of the gradient, with the rows that they span."""
-    right, down = _gradients(values)
+    right, down = _gradients(values, blur)
     slope = (down.abs() / right.abs().clamp(min=1e-300)).atan().rad2deg()
     size = right.abs()
     ridge = torch.zeros_like(size, dtype=torch.bool)
     ridge[:, 1:-1] = (size[:, 1:-1] > size[:, :-2]) & (size[:, 1:-1] >= size[:, 2:])
     # a step as blurred as its gradient's peak allows: half of it still counts, for noise and blur
-    ridge &= (size > 0.3 * least / (_BLUR * 2.5)) & (slope < _ANGLES[1] + 10)
+    ridge &= (size > 0.3 * least / (blur * 2.5)) & (slope < 40)
     lines = []
     for sign in (1, -1):
         labels, count = ndimage.label((ridge & (sign * right > 0)).cpu().numpy(), structure=[[1, 1, 1]] * 3)
@@ -152,9 +151,12 @@ def _lines(values: Tensor, least: float, min_length: int, max_length: int) -> li
 
 
 def _split(
-    right: Tensor, rows: Tensor, columns: Tensor, min_length: int, max_length: int
+    right: Tensor, rows: Tensor, columns: Tensor, min_length: int, max_length: int, ends: int = 5
 ) -> list[tuple[tuple[float, float], range]]:
-    """Fit a line to the pixels of a ridge; bent ridges are split at their farthest point."""
+    """Fit a line to the pixels of a ridge; bent ridges are split at their farthest point.
+
+    ``ends`` px are removed at either end, because of corners.
+    """
     if len(rows) < 0.8 * min_length or int(rows[-1] - rows[0]) + 1 < min_length:
         return []
     rows, columns = rows.to(right.device), columns.to(right.device)
@@ -171,10 +173,10 @@ def _split(
         parts = [slice(None, max(cut - 2, 0)), slice(cut + 3, None)]
         return [piece for part in parts for piece in _split(right, rows[part], columns[part], min_length, max_length)]
     angle = abs(float(line[1].atan().rad2deg()))
-    begin, end = int(rows[0]) + _ENDS, int(rows[-1]) + 1 - _ENDS
+    begin, end = int(rows[0]) + ends, int(rows[-1]) + 1 - ends
     surplus = max(end - begin - max_length, 0) // 2
     begin, end = begin + surplus, end - surplus
-    if end - begin < min_length - 2 * _ENDS or end - begin < 16 or not _ANGLES[0] <= angle <= _ANGLES[1]:
+    if end - begin < max(min_length - 2 * ends, 16) or not 2.0 <= angle <= 30.0:
         return []
     return [((float(line[0]), float(line[1])), range(begin, end))]
 

@@ -20,8 +20,7 @@ from rsvib_torch.evaluation.scenes.drawing import (
 
 __all__ = ["resolution_chart"]
 
-_INK, _PAPER = 0.07, 0.86
-_SLANT = math.radians(5.0)
+_INK, _PAPER = 0.07, 0.86  # of full scale; a printed chart: grain and texture of either stay within 0 ... 1
 _Centre = tuple[float, float]
 
 
@@ -72,10 +71,12 @@ def resolution_chart(height: int, width: int, *, sigma: float = 0.6, seed: int =
             centre = (2 * rim + (j + 0.5) * pitch[0] - 0.5, 2 * rim + (i + 0.5) * pitch[1] - 0.5)
             _draw_field(canvas, relief, centre, size, (down, right))
     middle = (0.5 * (width - 1), 0.5 * (height - 1))
-    for axis, (pitch_along, count) in enumerate(((pitch[0], columns), (pitch[1], rows))):
-        reach = min(2, count // 2)
+    for board, centre, step, count in (
+        (canvas, middle, pitch[0], columns),
+        (canvas.transposed(), middle[::-1], pitch[1], rows),
+    ):
         for side in (-1, 1):
-            _draw_wedge(canvas, middle, side, axis, begin=0.55 * pitch_along, length=(reach - 0.1) * pitch_along)
+            _draw_wedge(board, centre, side, begin=0.55 * step, length=(min(2, count // 2) - 0.1) * step)
     _draw_border(canvas, rim)
     # grain and texture are proportional to the tone
     image = canvas.image * (1.0 + relief[0] * grain + relief[1] * texture)
@@ -93,7 +94,8 @@ def _draw_field(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, st
     ring = max(abs(down), abs(right))
     if abs(down) == abs(right):
         dark = (ring + (down > 0) + (right > 0)) % 2 == 0
-        _draw_slanted_square(canvas, relief, centre, size, dark=dark, turn=_SLANT if down * right > 0 else -_SLANT)
+        turn = math.copysign(math.radians(5.0), down * right)
+        _draw_slanted_square(canvas, relief, centre, size, dark=dark, turn=turn)
         return
     kind = (3 * abs(down) + 2 * abs(right) + (down > 0) + 2 * (right > 0)) % len(_FIELDS)
     _FIELDS[kind](canvas, relief, centre, size, ring)
@@ -102,12 +104,7 @@ def _draw_field(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, st
 def _draw_star(canvas: Canvas, centre: _Centre, radius: float, count: int) -> None:
     sigma = canvas.sigma
     count = max(8, min(count, int(radius)))
-    canvas.paint(
-        centre,
-        radius,
-        _INK,
-        lambda x, y: sectors(x, y, count, sigma) * disc(x, y, radius, sigma),
-    )
+    canvas.paint(centre, radius, _INK, lambda x, y: sectors(x, y, count, sigma) * disc(x, y, radius, sigma))
     canvas.paint(centre, radius, _INK, lambda x, y: disc(x, y, count / math.pi + 1.0, sigma))
     width = 0.02 * radius + 0.8
     for outline in (1.0, 1.1):
@@ -119,22 +116,22 @@ def _draw_star(canvas: Canvas, centre: _Centre, radius: float, count: int) -> No
         )
 
 
-def _draw_wedge(canvas: Canvas, middle: _Centre, side: int, axis: int, *, begin: float, length: float) -> None:
-    """Draw seven bars along x (axis 0) or y (1) whose frequency rises towards the middle of the chart."""
+def _draw_wedge(canvas: Canvas, middle: _Centre, side: int, *, begin: float, length: float) -> None:
+    """Draw seven bars along x whose frequency rises towards the middle of the chart."""
     sigma, count = canvas.sigma, 7
     coarse, fine = max(0.025, 2.0 * count / length), 0.5
-    centre = list(middle)
-    centre[axis] += side * (begin + 0.5 * length)
-    reach = [0.0, 0.0]
-    reach[axis], reach[1 - axis] = 0.5 * length, 0.5 * count / coarse
 
     def coverage(x: Tensor, y: Tensor) -> Tensor:
-        along, across = (side * x, y) if axis == 0 else (side * y, x)
-        frequency = (fine + (coarse - fine) * (along / length + 0.5)).clamp(coarse, fine)
-        ends = edge(along + 0.5 * length, sigma) * edge(0.5 * length - along, sigma)
-        return bars(across * frequency + 0.5 * (count - 0.5), frequency, count, sigma) * ends
+        frequency = (fine + (coarse - fine) * (side * x / length + 0.5)).clamp(coarse, fine)
+        return bars(y * frequency + 0.5 * (count - 0.5), frequency, count, sigma) * _between(x, 0.5 * length, sigma)
 
-    canvas.paint((centre[0], centre[1]), (reach[0], reach[1]), _INK, coverage)
+    centre = (middle[0] + side * (begin + 0.5 * length), middle[1])
+    canvas.paint(centre, (0.5 * length, 0.5 * count / coarse), _INK, coverage)
+
+
+def _between(x: Tensor, half: float, sigma: float) -> Tensor:
+    """Coverage of the strip ``|x| <= half``, much wider than the blur."""
+    return edge(x + half, sigma) * edge(half - x, sigma)
 
 
 def _draw_slanted_square(
@@ -156,19 +153,17 @@ def _draw_bar_groups(canvas: Canvas, relief: Tensor, centre: _Centre, size: floa
     """Groups of five bars, vertical and horizontal, of four frequencies."""
     sigma, count, length = canvas.sigma, 5, 0.085 * size
     for place, share in enumerate((1.0, 0.7, 0.48, 0.32)):
-        half = 0.18 * size * share
-        frequency = 0.5 * (count - 0.5) / half
-        for lying in (False, True):
-            middle = (centre[0] + (0.23 if lying else -0.23) * size, centre[1] + (0.345 - 0.23 * place) * size)
-            if lying:  # as tall as the vertical bars are long
-                frequency = 0.5 * (count - 0.5) / (length * share)
+        reach, down = 0.18 * size * share, centre[1] + (0.345 - 0.23 * place) * size
+        for board, middle, half in (
+            (canvas, (centre[0] - 0.23 * size, down), reach),
+            (canvas.transposed(), (down, centre[0] + 0.23 * size), length * share),
+        ):
+            frequency = 0.5 * (count - 0.5) / half
 
-            def coverage(x: Tensor, y: Tensor, f: float = frequency, turned: bool = lying) -> Tensor:
-                across, along = (y, x) if turned else (x, y)
-                ends = edge(along + length, sigma) * edge(length - along, sigma)
-                return bars(across * f + 0.5 * (count - 0.5), f, count, sigma) * ends
+            def coverage(x: Tensor, y: Tensor, f: float = frequency) -> Tensor:
+                return bars(x * f + 0.5 * (count - 0.5), f, count, sigma) * _between(y, length, sigma)
 
-            canvas.paint(middle, (length, half) if lying else (half, length), _INK, coverage)
+            board.paint(middle, (reach, length), _INK, coverage)
 
 
 def _draw_rings(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ring: int) -> None:
@@ -233,20 +228,14 @@ _FIELDS: tuple[Callable[[Canvas, Tensor, _Centre, float, int], None], ...] = (
 
 def _draw_border(canvas: Canvas, depth: float) -> None:
     """Draw black teeth that point inwards along all four borders, wider towards one end."""
-    height, width = canvas.image.shape
-    for along_size, across_size, flip in ((width, height, False), (height, width, True)):
-        for far in (False, True):
-            reach = (0.5 * along_size, depth)
-            centre = (0.5 * (along_size - 1), across_size - 1.0 if far else 0.0)
+    for board in (canvas, canvas.transposed()):
+        height, width = board.image.shape
+        for row, inwards in ((0.0, 1), (height - 1.0, -1)):
 
-            def coverage(x: Tensor, y: Tensor, far: bool = far, turned: bool = flip, n: int = along_size) -> Tensor:
-                along, across = (y, x) if turned else (x, y)
-                across = -across if far else across
-                place = (along / n + 0.5).clamp(0.0, 1.0)
-                cycles = (n / (2.4 * depth)) * (place - 0.15 * place * (1 - place))
+            def coverage(x: Tensor, y: Tensor, inwards: int = inwards, width: int = width) -> Tensor:
+                place = (x / width + 0.5).clamp(0.0, 1.0)
+                cycles = (width / (2.4 * depth)) * (place - 0.15 * place * (1 - place))
                 tooth = depth * (1.0 - 2.0 * (torch.remainder(cycles, 1.0) - 0.5).abs())
-                return edge((tooth - across) / math.sqrt(2.0), canvas.sigma)
+                return edge((tooth - inwards * y) / math.sqrt(2.0), canvas.sigma)
 
-            canvas.paint(
-                (centre[1], centre[0]) if flip else centre, (reach[1], reach[0]) if flip else reach, _INK, coverage
-            )
+            board.paint((0.5 * (width - 1), row), (0.5 * width, depth), _INK, coverage)

@@ -107,11 +107,15 @@ class Canvas:
         self.image = image
         self.sigma = sigma
 
+    def transposed(self) -> "Canvas":
+        """The same image with x and y exchanged."""
+        return Canvas(self.image.T, self.sigma)
+
     def paint(
         self,
         centre: tuple[float, float],
         reach: float | tuple[float, float],
-        tone: float | Callable[[Tensor], Tensor],
+        tone: float,
         coverage: Callable[[Tensor, Tensor], Tensor],
     ) -> None:
         """Paint a tone over the image.
@@ -119,22 +123,15 @@ class Canvas:
         Args:
             centre: Column and row of the origin of the shape's coordinates.
             reach: Half size (x, y) of the window in px, or one number for both.
-            tone: Value to paint, or a function of the values of the image.
+            tone: Value to paint.
             coverage: Function of the coordinates x (1, w) and y (h, 1) in px from the centre.
         """
-        half = reach if isinstance(reach, tuple) else (reach, reach)
-        pad = 5 * self.sigma
-        begin, end = (
-            [int(min(max(limit, 0), size)) for limit, size in zip(limits, reversed(self.image.shape), strict=True)]
-            for limits in (
-                [math.floor(c - h - pad) for c, h in zip(centre, half, strict=True)],
-                [math.ceil(c + h + pad) + 1 for c, h in zip(centre, half, strict=True)],
-            )
-        )
-        if begin[0] >= end[0] or begin[1] >= end[1]:
-            return
-        x = torch.arange(begin[0], end[0], dtype=torch.float32)[None] - centre[0]
-        y = torch.arange(begin[1], end[1], dtype=torch.float32)[:, None] - centre[1]
-        window = self.image[begin[1] : end[1], begin[0] : end[0]]
-        painted = tone(window) if callable(tone) else tone
-        window += coverage(x, y) * (painted - window)
+        places = []
+        for middle, half, size in zip(
+            centre, reach if isinstance(reach, tuple) else (reach, reach), reversed(self.image.shape), strict=True
+        ):
+            pad = half + 5 * self.sigma
+            places.append(torch.arange(max(math.floor(middle - pad), 0), min(math.ceil(middle + pad) + 1, size)))
+        columns, rows = places
+        window = self.image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        window += coverage(columns[None] - centre[0], rows[:, None] - centre[1]) * (tone - window)

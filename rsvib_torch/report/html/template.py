@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from rsvib_torch.io import whole_file
+from rsvib_torch.report.plots import picture
 
 __all__ = ["BeforeAfter", "Drawing", "before_after", "data_uri", "drawing", "write_page"]
 
@@ -90,7 +91,7 @@ def before_after(
         longest: Largest side in px; larger images are reduced by averaging.
         exact: Encode without loss (PNG) instead of as JPEG.
     """
-    images = [_opencv_image(image) for image in (before, after)]
+    images = [picture(image).flip(-1).numpy() for image in (before, after)]  # OpenCV: blue, green, red
     height, width = images[0].shape[:2]
     scale = longest / max(height, width)
     if scale < 1:
@@ -107,14 +108,6 @@ def before_after(
             raise ValueError(f"OpenCV cannot encode an image of shape {image.shape}")
         uris.append(data_uri(content.tobytes(), "image/png" if exact else "image/jpeg"))
     return BeforeAfter(uris[0], uris[1], names, caption, images[0].shape[1], images[0].shape[0])
-
-
-def _opencv_image(frame: Tensor) -> np.ndarray:
-    """Frame (H, W) or (C, H, W) as (H, W) or, from three channels on, as (H, W, 3) in blue, green, red."""
-    frame = frame.detach().float().cpu()
-    if frame.ndim == 3:
-        frame = frame[:3].flip(0).movedim(0, -1) if frame.shape[0] >= 3 else frame.mean(0)
-    return frame.numpy()
 
 
 def write_page(

@@ -1,4 +1,4 @@
-"""Fisher information about the parameters of a motion in frames of one unknown scene.
+"""Cramér-Rao bound of the parameters of a vibration: the smallest standard deviation of an unbiased estimate.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -6,31 +6,34 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.banded_solver import solve_banded
+from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
-from rsvib_torch.imaging import exposure_nodes, exposure_trajectory, rows_showing
+from rsvib_torch.frames.orientation import frames_to_row_order
+from rsvib_torch.imaging import exposure_nodes, exposure_trajectory, rows_showing, simulate_frames
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import RowTiming
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
-__all__ = [
-    "Recording",
-    "gradient_information",
-    "projected_information",
-    "random_information",
-    "scale_of_information",
-]
+__all__ = ["cramer_rao_bound"]
 
-_DEGREE = 13  # of the spline across rows
-_BAND = (0.35, 0.45)  # cycles per row, transition of the low-pass of the scene: the spline has aliases above
-_MARGIN = 16  # columns over which the scene closes to a period
-_RIDGE = 1e-10  # of the largest element, for scene rows outside all frames
-_CHUNK = 1 << 17  # rows of all frames times frequencies worked on at a time
+_DEGREE = 13  # of the spline across rows; degree 9 changes bounds of a drawn scene by 0.2 %, 15 by 0.05 %
+_MARGIN = 16  # px over which the scene closes to a period; 8 and 32 px change these bounds by less than 3e-5
+_RIDGE = 1e-10  # of the largest element, for scene rows outside all frames; 1e-9, 1e-11: bounds change by 0.8 %
+
+BoundMethod = Literal["projection", "gradients", "random"]
+# axis, name of the field, tone
+_Parameter = tuple[int, str, int]
+
+
+# --- Information ---
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,29 +68,6 @@ class Recording:
         """(T, R) s, exposure start of every row of every frame."""
         return self.timing.row_starts(self.num_frames, self.size[0], self.scene.device)
 
-    def mean_sensitivity(self, starts: Tensor) -> Tensor:
-        """Derivatives (P, ..., 2) of the mean displacement over exposures from ``starts`` (...) on."""
-        times, weights = (value.to(starts.device) for value in exposure_nodes(self.timing, "gauss", 8))
-        values = self.sensitivity(starts[..., None] + times) @ weights
-        along = torch.tensor(self.axes, device=starts.device)[:, None] == torch.arange(2, device=starts.device)
-        return values[..., None] * along.reshape(-1, *(1,) * starts.ndim, 2)
-
-    def others_showing(self) -> tuple[Tensor, Tensor]:
-        """Position of the content of each frame row in each frame q.
-
-        Returns:
-            Rows (T, R, q) and displacement along them (T, R, q) px.
-        """
-        starts, count = self.starts, self.num_frames
-        rows = torch.arange(self.size[0], dtype=torch.float64, device=starts.device)
-        content = rows - self.motion.mean_displacement(starts, self.timing.exposure_time)[..., 1]
-        begin = self.timing.frame_starts(count, starts.device)
-        found = rows_showing(content[..., None].expand(-1, -1, count), begin, self.timing, self.motion)
-        own = torch.eye(count, dtype=torch.bool, device=starts.device)[:, None]
-        found = torch.where(own, rows[:, None], found)  # exactly, so that the first and last rows stay inside
-        moments = begin + found * self.timing.row_time
-        return found, self.motion.mean_displacement(moments, self.timing.exposure_time)[..., 0]
-
 
 def scale_of_information(recording: Recording) -> Tensor:
     """Approximate information (P,) of each parameter for a known scene and unit noise."""
@@ -95,14 +75,14 @@ def scale_of_information(recording: Recording) -> Tensor:
     return recording.sensitivity(recording.starts).square().sum((1, 2)) * slope * recording.size[1]
 
 
-def projected_information(recording: Recording) -> Tensor:
+def projected_information(recording: Recording, *, chunk: int = 1 << 17) -> Tensor:
     """Information of the parameters when the scene is unknown, for unit noise.
 
     ``J = D' (1 - A (A' A)^-1 A') D``: D are the derivatives of the frames, A takes a scene to its frames, and the
     part of D that a scene could explain contains no information. The displacement along a row is a phase ramp, so that
     A is a banded matrix for each frequency along the row and the projection needs no iterations.
     The scene is taken as periodic along rows, and without detail above 0.4 cycles per row; only pixels count whose
-    content is visible in another frame.
+    content is visible in another frame. ``chunk`` rows of all frames times frequencies are worked on at a time.
 
     Returns:
         Matrix (P, P).
@@ -112,7 +92,7 @@ def projected_information(recording: Recording) -> Tensor:
     coefficients = bspline_coefficients(_within_band(recording.scene), _DEGREE, -2)
     spectra = torch.fft.rfft(extend_rows(coefficients, length, hold=0.0))
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=spectra.device)
-    step = max(1, _CHUNK // place.first.numel())
+    step = max(1, chunk // place.first.numel())
     residuals = []
     for begin in range(0, len(u), step):
         part = slice(begin, begin + step)
@@ -124,12 +104,11 @@ def projected_information(recording: Recording) -> Tensor:
     return information
 
 
-def _within_band(scene: Tensor) -> Tensor:
-    """The scene without its finest detail across rows."""
+def _within_band(scene: Tensor, low: float = 0.35, high: float = 0.45) -> Tensor:
+    """The scene without its detail above ``high`` cycles per row, where the spline across rows has aliases."""
     length = fast_length(len(scene) + 2 * _MARGIN)
     spectra = torch.fft.rfft(extend_rows(scene.T, length, hold=0.0))
     v = torch.fft.rfftfreq(length, dtype=scene.dtype, device=scene.device)
-    low, high = _BAND
     share = 0.5 + 0.5 * torch.cos(math.pi * ((v - low) / (high - low)).clamp(0.0, 1.0))
     smooth: Tensor = torch.fft.irfft(spectra * share, n=length)[:, : len(scene)].T
     return smooth
@@ -165,21 +144,11 @@ class _Places:
         rows = torch.arange(recording.size[0], dtype=torch.float64, device=starts.device)
         place = recording.origin[0] + rows[:, None] - displacement[..., 1]
         cell = place.floor()
-        taps = bspline_weights(place - cell, _DEGREE)
         lower = bspline_weights(place - cell, _DEGREE - 1)
-        slopes = functional.pad(lower, (1, 0)) - functional.pad(lower, (0, 1))
-        first, taps = spread_taps(cell, taps)
-        _, slopes = spread_taps(cell, slopes)
+        first, taps = spread_taps(cell, bspline_weights(place - cell, _DEGREE))
+        _, slopes = spread_taps(cell, functional.pad(lower, (1, 0)) - functional.pad(lower, (0, 1)))
         sensitivity = recording.sensitivity(starts[..., None] + times.to(starts.device))
-        return cls(
-            first - _DEGREE // 2,
-            taps,
-            slopes,
-            displacement[..., 0],
-            weights,
-            sensitivity,
-            recording.axes,
-        )
+        return cls(first - _DEGREE // 2, taps, slopes, displacement[..., 0], weights, sensitivity, recording.axes)
 
 
 def _unexplained(place: _Places, spectra: Tensor, u: Tensor) -> Tensor:
@@ -219,35 +188,36 @@ def _unexplained(place: _Places, spectra: Tensor, u: Tensor) -> Tensor:
 
 def _shown_twice(recording: Recording) -> Tensor:
     """(T, R, W) float64, 1 for pixels whose content is visible in another frame."""
-    rows, shift = recording.others_showing()
-    own = shift.diagonal(dim1=0, dim2=2).T  # (T, R)
-    columns = torch.arange(recording.size[1], dtype=torch.float64, device=rows.device)
-    place = columns - own[..., None, None] + shift[..., None]  # (T, R, q, W)
-    inside = (place >= 0) & (place <= recording.size[1] - 1)
-    inside &= ((rows >= 0) & (rows <= recording.size[0] - 1))[..., None]
+    (height, width), timing, motion = recording.size, recording.timing, recording.motion
+    starts, count = recording.starts, recording.num_frames
+    own_rows = torch.arange(height, dtype=torch.float64, device=starts.device)
+    content = own_rows - motion.mean_displacement(starts, timing.exposure_time)[..., 1]
+    begin = timing.frame_starts(count, starts.device)
+    # rows (T, R, q) of frame q that show the content of each frame row, and the displacement along them
+    rows = rows_showing(content[..., None].expand(-1, -1, count), begin, timing, motion)
+    own = torch.eye(count, dtype=torch.bool, device=starts.device)[:, None]
+    rows = torch.where(own, own_rows[:, None], rows)  # exactly, so that the first and last rows stay inside
+    shift = motion.mean_displacement(begin + rows * timing.row_time, timing.exposure_time)[..., 0]
+    columns = torch.arange(width, dtype=torch.float64, device=starts.device)
+    place = columns - shift.diagonal(dim1=0, dim2=2).T[..., None, None] + shift[..., None]  # (T, R, q, W)
+    inside = (place >= 0) & (place <= width - 1)
+    inside &= ((rows >= 0) & (rows <= height - 1))[..., None]
     return (inside.sum(2) >= 2).double()
 
 
-def gradient_information(recording: Recording) -> Tensor:
+def gradient_information(recording: Recording, noise: float | None = None) -> Tensor:
     """The information in closed form, row by row, for unit noise.
 
     ``J = sum_s sum_p (d_p - d)' M(s) (d_p - d)``: M(s) sums the gradient products of scene row s, d_p are the
     derivatives of its displacement in frame p and d their mean. For two frames this is half of what the derivatives
     of the offset give. Blur within the exposure and the extent of interpolation kernels are neglected.
+
+    Args:
+        recording: The frames and parameters.
+        noise: Standard deviation of the noise, for a random Gaussian scene with the power spectrum S of this one and
+            noise of power N: gradients are weighted by ``T S / (T S + N)``, which is small for frequencies below the
+            noise. None for an unknown deterministic scene.
     """
-    return _row_information(recording, None)
-
-
-def random_information(recording: Recording, noise: float) -> Tensor:
-    """The information for a random Gaussian scene with the power spectrum S of this one, for noise of power N.
-
-    Gradients are weighted by ``T S / (T S + N)``, which is small for frequencies below the noise. Otherwise as
-    ``gradient_information``, in the same units.
-    """
-    return _row_information(recording, noise)
-
-
-def _row_information(recording: Recording, noise: float | None) -> Tensor:
     timing, count = recording.timing, recording.num_frames
     (top, left), (height, width) = recording.origin, recording.size
     begin = timing.frame_starts(count, recording.scene.device)
@@ -263,7 +233,9 @@ def _row_information(recording: Recording, noise: float | None) -> Tensor:
     columns = torch.arange(recording.scene.shape[1], dtype=torch.float64, device=begin.device) - left
     window = (columns >= -low.amin(1, keepdim=True)) & (columns <= width - 1 - high.amax(1, keepdim=True))
     products = _gradient_products(recording.scene, window.double(), noise, count)  # (S, 2, 2)
-    sensitivity = recording.mean_sensitivity(moments)  # (P, S, T, 2)
+    times, weights = (value.to(begin.device) for value in exposure_nodes(timing, "gauss", 8))
+    means = recording.sensitivity(moments[..., None] + times) @ weights  # over the exposures, (P, S, T)
+    sensitivity = means[..., None] * functional.one_hot(torch.tensor(recording.axes), 2).to(means)[:, None, None]
     mean = (seen[..., None] * sensitivity).sum(2, keepdim=True) / seen.sum(1).clamp(min=1e-300)[:, None, None]
     shared = seen * ((seen > 0).sum(1, keepdim=True) > 1)
     relative = sensitivity - mean
@@ -293,3 +265,136 @@ def _gradient_products(scene: Tensor, window: Tensor, noise: float | None, num_f
     products = torch.einsum("asx,sx,bsx->sab", gradients, window, weighted)
     symmetric: Tensor = 0.5 * (products + products.transpose(-2, -1))
     return symmetric
+
+
+# --- Bound ---
+
+
+def _parameters(motion: Vibration, acceleration: bool) -> list[_Parameter]:
+    """Unknown parameters: those of all tones of non-zero amplitude, and the image motion of both axes."""
+    parameters: list[_Parameter] = []
+    for axis in range(2):
+        for tone in range(motion.amplitude.shape[-1]):
+            if float(motion.amplitude[axis, tone]) > 0:
+                parameters += [(axis, name, tone) for name in ("amplitude", "frequency", "phase")]
+        parameters += [(axis, "image_motion", 0)]
+        parameters += [(axis, "image_acceleration", 0)] if acceleration else []
+    return parameters
+
+
+def _sensitivity(motion: Vibration, parameter: _Parameter, times: Tensor) -> Tensor:
+    """Derivative of the displacement at ``times`` by a parameter."""
+    axis, name, tone = parameter
+    if name == "image_motion":
+        return times
+    if name == "image_acceleration":
+        return 0.5 * times.square()
+    amplitude, frequency, phase = (value[axis, tone] for value in (motion.amplitude, motion.frequency, motion.phase))
+    angle = 2 * math.pi * frequency * times + phase
+    if name == "amplitude":
+        return angle.sin()
+    return amplitude * angle.cos() * (2 * math.pi * times if name == "frequency" else 1.0)
+
+
+def _deviations(information: Tensor, typical: Tensor) -> Tensor:
+    """Square roots of the diagonal of the inverse; infinite where there is no information.
+
+    Args:
+        information: (P, P).
+        typical: (P,), information for a known scene; eigenvalues below 1e-8 of it count as zero.
+    """
+    scale = typical.clamp(min=1e-300).rsqrt()
+    values, vectors = torch.linalg.eigh(information * scale[:, None] * scale)
+    least = 1e-8
+    blind = values < least
+    shares = vectors.square()
+    variance = shares @ torch.where(blind, 0.0, 1 / values.clamp(min=least))
+    variance = torch.where(shares @ blind.double() > least, math.inf, variance)
+    deviations: Tensor = variance.sqrt() * scale
+    return deviations
+
+
+def cramer_rao_bound(
+    scene: Tensor,
+    timing: SensorTiming,
+    vibration: Vibration,
+    num_frames: int = 2,
+    *,
+    noise: float,
+    frame_size: tuple[int, int] | None = None,
+    method: BoundMethod = "projection",
+    acceleration: bool = False,
+) -> VibrationStd:
+    """Cramér-Rao bound of the parameters of a vibration, for white Gaussian noise and an unknown scene.
+
+    No unbiased estimate has a smaller standard deviation. With D the derivatives of the frames by the parameters and
+    A the operator that forms the frames, ``J = D' (1 - A (A' A)^-1 A') D / noise^2`` is the information if the scene is
+    unknown too, and the bound is the root of the diagonal of its inverse.
+    All parameters are unknown together: amplitude, frequency and phase (at the time origin) of all tones, and the
+    image motion. ``docs/bound.md`` has the derivation.
+
+    Args:
+        scene: (H, W) noise-free still scene, floating point, full scale 1, larger than the frames.
+        timing: The sensor.
+        vibration: The true motion, in image axes (not a batch).
+        num_frames: Frames taken of the scene.
+        noise: Standard deviation of the noise of a pixel as a fraction of full scale.
+        frame_size: (height, width) of the frames, as in ``simulate_frames``.
+        method: ``"projection"``, exact for an unknown deterministic scene; ``"gradients"``, its closed approximation
+            row by row, several times faster; or ``"random"``, the same for a random Gaussian scene with the power
+            spectrum of this one: larger if part of the spectrum is below the noise, since the scene is estimated
+            from the same frames.
+        acceleration: Whether the image acceleration is unknown as well (else it is known).
+
+    Returns:
+        Standard deviations in the layout of ``detection.std``: infinite without information (amplitude and phase
+        at a blind frequency), 0 for tones of amplitude 0 and for a known acceleration.
+
+    Raises:
+        TypeError: If the scene is not a floating-point tensor.
+        ValueError: If the scene does not fit the frames and motion, there are fewer than two frames, or an option is
+            out of range.
+
+    Example:
+        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
+        >>> scene = torch.rand(128, 96, generator=torch.Generator().manual_seed(0))
+        >>> bound = cramer_rao_bound(scene, timing, Vibration(0.5, 700.0), noise=0.01, frame_size=(90, 60))
+        >>> bool((bound.amplitude < 0.05).all())
+        True
+    """
+    check_choice("method", method, ("projection", "gradients", "random"))
+    noise = check_number("noise", noise, above=0.0)
+    if not isinstance(scene, Tensor) or not scene.dtype.is_floating_point:
+        raise TypeError("scene must be a floating-point tensor whose full scale is 1")
+    if scene.ndim != 2:
+        raise ValueError(f"scene must have shape (H, W), got {tuple(scene.shape)}")
+    if num_frames < 2:
+        raise ValueError(f"num_frames must be at least 2, got {num_frames}")
+    # the simulation checks the sizes and the motion
+    frames = simulate_frames(scene.double(), timing, vibration, num_frames, frame_size=frame_size)
+    motion = vibration.to_row_order(timing).to(scene.device)
+    parameters = _parameters(motion, acceleration)
+    frames = frames_to_row_order(frames, timing)
+    recording = Recording(
+        scene=frames_to_row_order(scene.double(), timing),
+        timing=timing.in_row_order(),
+        motion=motion,
+        num_frames=num_frames,
+        size=(frames.shape[-2], frames.shape[-1]),
+        axes=tuple(axis for axis, _, _ in parameters),
+        sensitivity=lambda times: torch.stack([_sensitivity(motion, p, times) for p in parameters]),
+    )
+    if method == "projection":
+        information = projected_information(recording)
+    else:
+        information = gradient_information(recording, noise if method == "random" else None)
+    deviations = noise * _deviations(information, scale_of_information(recording))
+
+    std = {name: torch.zeros_like(motion.amplitude) for name in ("amplitude", "frequency", "phase")}
+    std |= {name: torch.zeros_like(motion.image_motion) for name in ("image_motion", "image_acceleration")}
+    for (axis, name, tone), deviation in zip(parameters, deviations, strict=True):
+        std[name][(axis, tone) if std[name].ndim == 2 else axis] = deviation
+    std["period"] = std["frequency"] / torch.where(motion.frequency > 0, motion.frequency, 1.0).square()
+    if timing.scan_axis == -1:
+        std = {name: value.flip(0) for name, value in std.items()}
+    return VibrationStd(**std)

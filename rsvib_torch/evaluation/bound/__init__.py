@@ -1,1 +1,0 @@
-"""Cramér-Rao bound of the parameters of a vibration."""
