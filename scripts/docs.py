@@ -49,7 +49,7 @@ SECTIONS = {
         "measuring.md",
         "gallery.md",
     ),
-    "Method": ("method.md", "conventions.md", "bound.md", "accuracy.md", "benchmarks.md"),
+    "Method": ("method.md", "conventions.md", "verdicts.md", "bound.md", "accuracy.md", "benchmarks.md"),
     "Development": ("architecture.md", "ablation.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"),
 }
 STYLE = "site.css"  # wide pages, and tables that wrap

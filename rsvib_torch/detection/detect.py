@@ -1,4 +1,7 @@
-"""``detect_vibration``: entry point of detection, with the tables of models and methods."""
+"""``detect_vibration``: entry point of detection, with the tables of models and methods.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 import math
 from collections.abc import Callable

@@ -182,11 +182,10 @@ class Measurements:
         """(B, 2) px, root of the weighted mean product of the residuals of neighbouring rows.
 
         Noise is independent from row to row and does not contribute; an unmodelled motion, and a wrong timing, displace
-        neighbouring rows alike. Outliers (clouds) are left out. 0 if the mean is below ``significance`` of its standard
-        deviations (1.645: 95 %).
+        neighbouring rows alike. Rows with clouds have a small weight. 0 if the mean is below ``significance`` of its
+        standard deviations (1.645: 95 %).
         """
-        counted = self.weights.sqrt() * (self._biweight_argument(residual) < 1)
-        weight = counted[:, 1:] * counted[:, :-1]
+        weight = self.weights[:, 1:] * self.weights[:, :-1]
         product = (residual[:, 1:] * residual[:, :-1]).sum(2) / self.num_differences[:, 1:, None].clamp(min=1.0)
         total, deviation = (weight * product).sum(1), (weight * product).square().sum(1).sqrt()
         return torch.where(total > significance * deviation, total / weight.sum(1).clamp(min=1e-300), 0.0).sqrt()

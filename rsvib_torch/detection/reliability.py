@@ -161,12 +161,12 @@ def _against_fit(offsets: Tensor, fitted: Tensor, *, counted: float = 0.75) -> l
 def _against_other_motion(other: OtherMotion, axis: int, offset_amplitudes: Tensor) -> list[str]:
     """Reasons from motion that no vibration explains, given the offset amplitudes (K,) of the tones in px.
 
-    Limits: docs/reliability.md. Errors of interpolation and of the correction for unequal blur are below them.
+    Limits: docs/verdicts.md. Errors of interpolation and of the correction for unequal blur are below them.
     """
     size = float(offset_amplitudes.square().sum().sqrt()) / 2**0.5
     limits = (
         ("rows", float(other.unexplained[axis]), max(0.03, 0.01 * size)),
-        ("neighbouring rows", float(other.correlated[axis]), max(0.01, 0.005 * size)),
+        ("neighbouring rows", float(other.correlated[axis]), max(0.01, 0.003 * size)),
     )
     for rows, unexplained, allowed in limits:
         if unexplained > allowed:
@@ -192,13 +192,13 @@ def _against_rotation(other: OtherMotion, offset_amplitudes: Tensor) -> list[str
 def _against_exposure(other: OtherMotion, timing: RowTiming) -> list[str]:
     """Reasons against both axes from the blur of the frames, whose ratio is the square of that of the exposure times.
 
-    With correct exposure times the ratio was 0.7 to 2.3 (docs/reliability.md). It increases where little blur is
+    With correct exposure times the ratio was 0.7 to 2.3 (docs/verdicts.md). It increases where little blur is
     expected, because differences of interpolation add about 0.01 of the detail.
     """
     ratio, std, size = other.blur.tolist()
     low = ratio < 0.6 and 1 - ratio > 3 * std
     high = ratio > 2.5 and ratio - 1 > 5 * std and (ratio - 1) * size > 0.01
-    if not (low or high):
+    if size < 0.002 or not (low or high):
         return []
     return [
         f"the blur of the frames is {ratio:.2g} times that of an exposure of {timing.exposure_rows:g} rows: about "

@@ -15,7 +15,7 @@ from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
-from rsvib_torch.registration.register import register_rows
+from rsvib_torch.registration.register import check_frame_size, register_rows
 
 __all__ = ["GreyFrames", "band_curve", "constant_frame", "grey_frames", "measurements_of_curve"]
 
@@ -125,6 +125,7 @@ def band_curve(
             ``start_columns`` are used then, unless a fifth of their bands cannot be registered.
         start_columns: Columns that give a start of sufficient accuracy.
     """
+    check_frame_size(frames.shape[-2], frames.shape[-1], options)  # of the user's frames, not of the columns in use
     first = (frames.shape[-1] - start_columns) // 2
     curve = None
     if mere_start and first > 0:

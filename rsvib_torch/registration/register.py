@@ -21,7 +21,7 @@ from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.registration.bands import BandTask
 from rsvib_torch.registration.methods import BAND_METHODS, Registration, RegistrationOptions
 
-__all__ = ["OffsetCurve", "register_bands", "register_rows"]
+__all__ = ["OffsetCurve", "check_frame_size", "register_bands", "register_rows"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +109,22 @@ def register_bands(
     return replace(curve, offsets=offsets_from_row_order(curve.offsets, timing), heights=heights)
 
 
+def check_frame_size(num_rows: int, width: int, options: RegistrationOptions) -> None:
+    """Refuse frames that are smaller than a band and its search range.
+
+    Raises:
+        ValueError: If there are too few rows in readout order, or too few px in a row.
+    """
+    band_rows, search = options.band_rows, options.search
+    needed = (band_rows + 2 * search, 4 * (search + 8))
+    if num_rows < needed[0] or width < needed[1]:
+        raise ValueError(
+            f"frames of {num_rows} x {width} px (rows in readout order x px per row) are too small for bands of "
+            f"{band_rows} rows searched over {search} px: at least {needed[0]} x {needed[1]} are needed; reduce "
+            "band_rows or search"
+        )
+
+
 def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions) -> OffsetCurve:
     """``register_bands`` of prepared frames.
 
@@ -123,12 +139,7 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     band_rows, search = options.band_rows, options.search
     batch, num_frames, num_rows, width = grey.shape
     timing.check_rows(num_rows)
-    needed = (band_rows + 2 * search, 4 * (search + 8))
-    if num_rows < needed[0] or width < needed[1]:
-        raise ValueError(
-            f"frames of {num_rows} x {width} px (rows in read order x px a row) are too small for bands of "
-            f"{band_rows} rows searched over {search} px: at least {needed[0]} x {needed[1]} are needed"
-        )
+    check_frame_size(num_rows, width, options)
     # a Gaussian of 1 px band-limits the correlation, so that whole-pixel lags determine its peak, and damps noise;
     # contiguous images are filtered 14 times faster
     grey = _without_row_means(gaussian_blur2d(grey.contiguous(), (7, 7), (1.0, 1.0)))

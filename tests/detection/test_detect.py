@@ -435,3 +435,10 @@ def test_too_few_start_times():
     timing = SensorTiming(ROW_TIME, 20, 2048, frame_start_times=[0.0, 0.05])
     with pytest.raises(ValueError, match="frame_start_times has 2 entries for 3 frames"):
         detect_bands(detail(3, 256, 128), timing)
+
+
+@pytest.mark.parametrize("size", [(24, 640), (64, 90), (40, 2048)])
+def test_too_small_frames_are_named_with_their_own_size(paper_camera, size):
+    frames = torch.rand(2, *size, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match=rf"frames of {size[0]} x {size[1]} px .* at least 64 x 96 are needed"):
+        detect_vibration(frames, paper_camera)

@@ -168,7 +168,7 @@ def test_bad_values(values, message):
 @pytest.mark.parametrize(("scan_axis", "order"), [(-2, [0, 1]), (-1, [1, 0])])
 def test_standard_deviations_in_image_axes(scan_axis, order):
     tones = [torch.arange(4.0).reshape(2, 2) + offset for offset in (0, 4, 8, 12)]
-    axes = [torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0])]
+    axes = [torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0]), torch.tensor([5.0, 6.0])]
     camera = replace(TIMING, scan_axis=scan_axis, readout_direction="reverse")
     std = VibrationStd(*tones, *axes).from_row_order(camera)
     for name, values in zip(VibrationStd.__dataclass_fields__, (*tones, *axes), strict=True):
