@@ -2,11 +2,13 @@
 
 import re
 import runpy
+import sys
 from pathlib import Path
 
 import pytest
 
-EXAMPLES = Path(__file__).parents[1] / "scripts" / "examples"
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "scripts" / "examples"
 
 
 def run(name, arguments, capsys):
@@ -59,3 +61,10 @@ def test_help_is_the_docstring(script, capsys):
     with pytest.raises(SystemExit, match="0"):
         run(script, ["--help"], capsys)
     assert "Printed:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "scripts" / "trials").glob("*.py")), ids=lambda path: path.stem)
+def test_trials_can_be_imported(path, monkeypatch):
+    """Trials need recordings that are not part of the project; here only their imports are executed."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert callable(runpy.run_path(str(path), run_name="trial")["main"])

@@ -23,7 +23,7 @@ import torch
 from motion_truth import common_warp, rms
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
-from test_calibrate import HEIGHT, WIDTH, blink, film, shaded, sine
+from test_calibrate import HEIGHT, WIDTH, blink, record_frames, shaded, sine
 from truth import Motion, draw_scene, take_frames
 
 import rsvib_torch as rsv
@@ -103,7 +103,7 @@ def calibration(kind: str, count: int) -> str:
         ) -> Array:
             return np.asarray(blink(time, frequency) if square else sine(time, frequency, contrast))
 
-        frames = film(
+        frames = record_frames(
             light,
             frames=4 if "four" in kind else 1,
             row_time=row_time,
