@@ -44,7 +44,7 @@ class BandedFactor:
     """``A = U^H D U`` of a batch of banded matrices.
 
     The views of every step are kept with the memory of the solution, because creating them takes as long as a solution
-    of few systems. One factor must not solve in two threads at a time.
+    of few systems. A factor must not be used by two threads at the same time.
 
     Attributes:
         upper: (K, b, S), ``[j, i - 1]`` is ``U[j, j + i]``; values beyond the last column have no meaning.

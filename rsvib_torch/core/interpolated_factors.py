@@ -14,7 +14,7 @@ def node_frequencies(count: int, step: float, device: torch.device) -> Tensor:
     """Indices (N,) of the frequencies whose systems are factored, of ``count`` from 0 on.
 
     Steps increase with the frequency up to ``step``, because priors change most at low frequencies: with steps of a
-    sixth of the frequency, solutions change by 2e-6 of full scale.
+    sixth of the frequency, a restored frame of 2048 x 2048 px changes by 2e-5 of full scale (rms).
 
     Example:
         >>> node_frequencies(28, 3.0, torch.device("cpu")).tolist()

@@ -54,18 +54,21 @@ def judge(
     tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
     within_row, max_within_row = tones.displacement_within(timing.row_time).tolist(), 0.1  # px
     gain = offset_gain(vibration.frequency, intervals)
-    of_all = _against_measurements(good, visible, other_motion, min_bands)
+    of_both = _against_measurements(good, visible, other_motion, min_bands)
     if other_motion is not None:
-        of_all += _against_rotation(other_motion, vibration.amplitude * gain) + _against_exposure(other_motion, timing)
+        of_both += _against_rotation(other_motion, vibration.amplitude * gain) + _against_exposure(other_motion, timing)
     for axis, against in enumerate(reasons):
         amplitude = vibration.amplitude[axis]
-        against.extend(of_all)
+        against.extend(of_both)
         if not bool((amplitude > 0).any()):
-            against.append("no significant tone: the offsets are those of a uniform motion, or below their noise")
+            against.append(
+                "no significant tone: the offsets are those of a uniform motion, or below their noise; "
+                "use more frames if a vibration is expected"
+            )
         if int(amplitude.count_nonzero()) >= max_tones:
             against.append(
-                f"{max_tones} tones do not explain the motion: it is no sum of few tones, or the timing is wrong; try "
-                "model='free'"
+                f"{max_tones} tones do not explain the motion: it is not a sum of few tones, or the timing is wrong; "
+                "try model='free'"
             )
         for tone in amplitude.nonzero()[:, 0].tolist():
             against.extend(_against_tone(vibration, std, axis, tone, float(gain[axis, tone]), timing))
@@ -79,7 +82,7 @@ def judge(
         if within_row[axis] > max_within_row:
             against.append(
                 f"the image moves {within_row[axis]:.2g} px within a row time, condition (24) allows "
-                f"{max_within_row} px: this is no vibration of the whole camera, or row_time is wrong"
+                f"{max_within_row} px: the camera does not move as a whole, or row_time is wrong; check row_time"
             )
     reliable = torch.tensor([not against for against in reasons], device=vibration.device)
     return reliable, (tuple(reasons[0]), tuple(reasons[1]))
@@ -139,8 +142,8 @@ def _against_displacement(size: float, std: float, *, max_ratio: float = 0.5) ->
     if size == 0 or std <= max_ratio * size:
         return []
     return [
-        f"the displacement of the rows is uncertain: {size:.2g} ± {std:.2g} px, and {max_ratio:.0%} are allowed; use "
-        "more frames"
+        f"the displacement of the rows is uncertain: {size:.2g} ± {std:.2g} px; the standard deviation must be at "
+        f"most {max_ratio:.0%} of the displacement; use more frames"
     ]
 
 
@@ -161,7 +164,7 @@ def _against_fit(offsets: Tensor, fitted: Tensor, *, counted: float = 0.75) -> l
 def _against_other_motion(other: OtherMotion, axis: int, offset_amplitudes: Tensor) -> list[str]:
     """Reasons from motion that no vibration explains, given the offset amplitudes (K,) of the tones in px.
 
-    Limits: docs/verdicts.md. Errors of interpolation and of the correction for unequal blur are below them.
+    docs/verdicts.md lists the limits; they exceed the errors of interpolation and of the correction for unequal blur.
     """
     size = float(offset_amplitudes.square().sum().sqrt()) / 2**0.5
     limits = (
@@ -185,22 +188,25 @@ def _against_rotation(other: OtherMotion, offset_amplitudes: Tensor) -> list[str
         return []
     return [
         f"left and right halves of the rows move apart by {differential:.3g} px, {allowed:.2g} px are allowed: the "
-        "camera rotates, or the scene has parallax"
+        "camera rolls or zooms, or the scene has parallax; select a part of the frame with one distance"
     ]
 
 
 def _against_exposure(other: OtherMotion, timing: RowTiming) -> list[str]:
-    """Reasons against both axes from the blur of the frames, whose ratio is the square of that of the exposure times.
+    """Reasons against both axes from the difference of the blur between frames.
 
-    With correct exposure times the ratio was 0.7 to 2.3 (docs/verdicts.md). It increases where little blur is
-    expected, because differences of interpolation add about 0.01 of the detail.
+    Its ratio to the expected one is the square of the ratio of the exposure times (docs/verdicts.md). Interpolation
+    errors increase it by about 0.005 / size, so that high ratios count only if the excess is 0.01 of the detail, and
+    sizes below 0.002 do not count.
     """
     ratio, std, size = other.blur.tolist()
     low = ratio < 0.6 and 1 - ratio > 3 * std
     high = ratio > 2.5 and ratio - 1 > 5 * std and (ratio - 1) * size > 0.01
     if size < 0.002 or not (low or high):
         return []
+    rows = timing.exposure_rows
+    likely = f" (about {rows * math.sqrt(ratio):.2g} rows agree with the blur)" if ratio > 0 else ""
     return [
-        f"the blur of the frames is {ratio:.2g} times that of an exposure of {timing.exposure_rows:g} rows: about "
-        f"{timing.exposure_rows * math.sqrt(max(ratio, 0.0)):.2g} rows are likely; correct exposure_rows"
+        f"the difference of the blur between frames is {ratio:.2g} times the value expected for an exposure of "
+        f"{rows:g} rows; check exposure_rows{likely}"
     ]

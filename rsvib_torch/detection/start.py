@@ -96,7 +96,7 @@ def grey_frames(
 
 def constant_frame(index: int) -> str:
     """Message for a frame whose pixels are equal."""
-    return f"frame {index} is constant: without detail there is nothing to register"
+    return f"frame {index} is constant and cannot be registered; remove this frame"
 
 
 def _constant(frames: Tensor) -> Tensor:

@@ -130,7 +130,7 @@ class StdRecord(Section):
 
     @model_serializer(mode="wrap")
     def _without_unknown(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Files of version 0.1.0 have no ``displacement``, and keep their hash."""
+        """Omit an unknown ``displacement``: files written before this field was added keep their hash."""
         values: dict[str, Any] = handler(self)
         return {name: value for name, value in values.items() if name != "displacement" or value is not None}
 

@@ -205,7 +205,8 @@ def restore(
         ValueError: If a value is out of range, or frames, timing and vibration do not fit together.
 
     Warns:
-        RestorationWarning: If an axis is not restored, or the restored frames are no better than the raw ones.
+        RestorationWarning: If an axis is not restored, or the restored frames are no better than the raw ones. If both
+            axes of a detection are refused, the frames are returned unchanged.
 
     Example:
         >>> import torch

@@ -221,14 +221,16 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
     """Counts of each class and in all, and the coverage of intervals."""
     names = dict.fromkeys(case["class"] for case in results)
     text = [
-        "Axes that are correct, wrong (by their parameters, by the displacement of the rows), refused, and refused",
-        "although the displacement is known; recordings whose restoration is worse than the frames, without a warning",
-        "and with a warning only that an axis is not restored; largest error of a tone of axes called reliable, in",
-        "standard deviations; share of 95 % intervals of amplitude and frequency that contain the truth. The true row",
-        "time cannot be found from frames without start times: its error changes all frequencies alike.",
+        f"Frames of {options.honesty_size} x {options.honesty_size} px; exposures are given for frames of 2048 rows.",
+        "An axis is correct, wrong or refused. The columns 'parameters' and 'displacement' state why it is",
+        "wrong: a parameter differs by more than 5 standard deviations and 2 %, or the displacement by more",
+        "than 5 % and 0.01 px. 'Although known': refused, but the displacement is within 2 %. 'Worse': the",
+        "PSNR after restoration is more than 0.1 dB lower. 'Largest error': of a tone of a reliable axis, in",
+        "standard deviations. 'Within': share of the 95 % intervals that contain the truth. A wrong row time",
+        "without start times changes all frequencies alike and cannot be found.",
         "",
         "| class | cases | correct | wrong | parameters | displacement | refused | although known | worse, no warning "
-        "| worse, only an axis named | largest error | amplitude within | frequency within | tones |",
+        "| worse, warning about an axis only | largest error | amplitude within | frequency within | tones |",
         "|---" * 14 + "|",
         *(counts(name, [case for case in results if case["class"] == name]) for name in names),
         counts("all, timing correct", [case for case in results if case["class"] in TIMING_CORRECT]),

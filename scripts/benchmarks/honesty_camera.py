@@ -20,7 +20,9 @@ Array = NDArray[np.float64]
 Motion = Callable[[Array], Array]  # times (...) in s -> (4, ...): x and y in px, roll in rad, zoom
 
 FINER = 4  # points of the scene per px and axis
-MARGIN = 44  # px of the scene beyond the frame on each side; the largest displacement is 25 px
+# px of the scene beyond the frame on each side; the camera moves by at most 25 px, and layers that move further
+# continue with mirrored content
+MARGIN = 44
 OPTICS = 0.4  # px, standard deviation of the optics; the MTF of optics and pixel at the Nyquist frequency is 0.29
 # nodes of an exposure: minimum, per px of its path, maximum; the rms error of a chart is below 2e-5 up to 74 px
 NODES = (5, 2.0, 160)

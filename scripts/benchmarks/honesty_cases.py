@@ -14,7 +14,9 @@ import rsvib_torch as rsv
 
 FRAME_PERIOD = 1 / 24  # s
 BLANKING = 1.15  # row times of a frame period per row of a frame; a frame period stated 10 % too short is still valid
-FULL_ROWS = 2048  # rows to which the numbers of exposure rows refer; smaller frames have fewer and slower rows
+FULL_ROWS = (
+    2048  # rows to which the numbers of exposure rows refer; in smaller frames it is scaled, and the row time is longer
+)
 SCENES = ("city", "chart", "texture", "text")
 SCENE_SEEDS = 2  # drawings of each scene; they are kept in memory
 
@@ -24,7 +26,7 @@ Tones = Array  # (K, 3): amplitude in px, frequency in Hz, phase in rad
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A recording and the timing that detection is told.
+    """A recording and the timing that is passed to detection.
 
     Attributes:
         motion: The true motion.
@@ -169,7 +171,7 @@ def random(generator: Generator) -> Case:
 
 
 def harmonics(generator: Generator) -> Case:
-    """Five harmonics along x in two frames."""
+    """Five harmonics along x and one tone along y, in two frames."""
     base, order = generator.uniform(15.0, 40.0), np.arange(1, 6)
     amplitude = generator.uniform(0.5, 2.0) / order
     return of_tones(tones_of(generator, amplitude.tolist(), (base * order).tolist()), one_tone(generator), num_frames=2)
@@ -197,7 +199,7 @@ def random_walk(generator: Generator) -> Callable[[Array], Array]:
 
 
 def ringdown(generator: Generator, tau: float = 0.03) -> Callable[[Array], Array]:
-    """A tone of 2 to 4 px that decays within ``tau`` s."""
+    """A tone of 2 to 4 px that decays exponentially with the time constant ``tau`` in s."""
     tone = tones_of(generator, [generator.uniform(2.0, 4.0)], [generator.uniform(30.0, 90.0)])
     return lambda times: np.exp(-times / tau) * wave(tone, times)
 
@@ -224,7 +226,7 @@ def close_pair(generator: Generator) -> Case:
 
 
 def close_slow_pair(generator: Generator) -> Case:
-    """11.6 and 15.8 Hz in three frames, which last 1.5 periods of the first."""
+    """11.6 and 15.8 Hz in three frames, which last 1.4 periods of the first tone."""
     axes = [tones_of(generator, generator.uniform(1.0, 3.0, 2).tolist(), [11.6, 15.8]) for _ in range(2)]
     return of_tones(*axes, num_frames=3)
 

@@ -61,7 +61,7 @@ SECTIONS: dict[str, Section] = {
     "difficulty": Section("Scenes of equal difficulty", difficulty.rows, difficulty.lines),
     "slanted_edge": Section("Slanted-edge MTF", slanted_edge.rows, slanted_edge.lines),
     "verdict": Section("Verdict on restorations", verdict_roc.rows, verdict_roc.lines, by_default=False),
-    "honesty": Section("Confident wrong answers", honesty.rows, honesty.lines, by_default=False),
+    "honesty": Section("Reliable results that are wrong", honesty.rows, honesty.lines, by_default=False),
 }
 
 

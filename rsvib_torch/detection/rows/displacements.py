@@ -332,15 +332,15 @@ def blur_ratio(
 
     An exposure blurs a row to second order by ``1 + M : grad grad / 2`` with the second moments M of the path. The
     difference of two warped frames is fitted by ``ratio (M_2 - M_1) : grad grad m / 2 + gain m``, m their mean. The
-    offsets determine the motion, so that ``ratio = (T_e / stated T_e)^2`` for slow tones. Differences of interpolation
-    raise the ratio by about 0.005 / size; finite differences by 0.2.
+    offsets determine the motion, so that ``ratio = (T_e / stated T_e)^2`` for slow tones. Interpolation
+    errors increase the ratio by about 0.005 / size, and the finite differences increase it by about 0.2.
 
     Args:
         groups: The frames.
         timing: The sensor, in row order.
         motion: Motion of each stack (B).
         block: Rows that are averaged.
-        highest: Cycles/px along rows, below which the expansion is used.
+        highest: Cycles/px along rows, below which the expansion is used; a blur of 2 px is then expanded to 20 %.
 
     Returns:
         (B,) each: ratio, its standard deviation, and the size of the expected difference relative to m.
@@ -349,7 +349,7 @@ def blur_ratio(
     for group in groups:
         positions = _Positions.of(group, timing, motion)
         u = group.spectra.frequencies
-        low = (u > 1 / 64) & (u < highest)  # without shading
+        low = (u > 1 / 64) & (u < highest)  # shading affects frequencies below 1/64 cycles/px
 
         def averaged(values: Tensor) -> Tensor:
             rows = values.shape[2] // block

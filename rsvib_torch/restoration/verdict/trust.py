@@ -38,7 +38,7 @@ def displacement_uncertainty(
 ) -> tuple[Tensor, Tensor]:
     """Root-mean-square error of the displacement of the rows by standard deviations, and the displacement itself.
 
-    A ``std.displacement`` that is known is used; it contains all correlations. Otherwise, for
+    If ``std.displacement`` is given, it is the error; it contains the image motion and all correlations. Otherwise, for
     ``A sinc(f T_e) sin(2 pi f t + phi)``, the variance of a tone averaged over its period is
     ``sinc^2 (std_A^2 + A^2 std_angle^2) / 2``. The phase at the time origin and the frequency are correlated: the angle
     is most accurate in the middle of the record. Its variance there, plus the variance by the frequency with the mean
