@@ -27,7 +27,7 @@ INNER_LAYERS = {
     "detection": (
         {"measurements", "result"},
         {"start", "tones"},
-        {"rows", "reliability"},
+        {"rows", "reliability", "sensitivity"},
         {"shapes"},
         {"recorded"},
         {"detect"},

@@ -13,10 +13,12 @@ from torch import Tensor, nn
 
 from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.reliability import judge
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, stacked
 from rsvib_torch.detection.rows.direct import refine_directly
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals, stack_spectra
+from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
 from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
 from rsvib_torch.detection.start import band_curve, grey_frames, measurements_of_curve
@@ -25,8 +27,10 @@ from rsvib_torch.detection.tones.fit import (
     ToneFit,
     displacement_std,
     model_displacements,
+    residual_of,
     vibration_of_fit,
 )
+from rsvib_torch.detection.tones.further import with_further_tones
 from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import offsets_from_row_order
@@ -81,17 +85,19 @@ class _FitOptions:
     bands: RegistrationOptions
 
 
-_Fit = Callable[[OffsetCurve, Tensor, Tensor | None, RowTiming, _FitOptions], tuple[ToneFit, OtherMotion | None]]
+_Found = tuple[ToneFit, Measurements, OtherMotion | None]
+_Fit = Callable[[OffsetCurve, Tensor, Tensor | None, RowTiming, _FitOptions], _Found]
 
 
 @dataclass(frozen=True)
 class _Method:
-    """A method of detection: ``fit(curve, frames, valid, timing, options)`` -> fit, other motion.
+    """A method of detection: ``fit(curve, frames, valid, timing, options)`` -> fit, measurements, other motion.
 
     The arguments of ``fit`` are the offset curve (B, P, N) in px with NaN where a band could not be registered, the
     grey frames (B, T, H, W) in row order, their valid pixels (bool of that shape, or None for all), the sensor in row
-    order, and the options. It returns the fit of all B stacks, with the covariance of its parameters, and the motion
-    that it does not explain, or None if the method does not measure it. Stacks of a batch must not affect each other.
+    order, and the options. It returns the fit of all B stacks, with the covariance of its parameters, the measurements
+    with the weights of the fit, and the motion that it does not explain, or None if the method does not measure it.
+    Stacks of a batch must not affect each other.
 
     Attributes:
         fit: The function.
@@ -111,22 +117,23 @@ def _fit_bands(
     timing: RowTiming,
     options: _FitOptions,
     accuracy: float = 0.0,
-) -> tuple[ToneFit, None]:
+) -> _Found:
     """The paper's method: tones are fitted to the offsets of row bands."""
     measurements = measurements_of_curve(curve, timing, options.bands.band_step)
     interval = options.bands.band_step * timing.row_time
     blind = blind_frequencies(timing, 0.5 / interval).to(curve.offsets.device)
-    return find_tones(measurements, interval, options.tones, options.model, blind=blind, accuracy=accuracy), None
+    fit = find_tones(measurements, interval, options.tones, options.model, blind=blind, accuracy=accuracy)
+    return fit, measurements.reweighted(residual_of(measurements, fit)), None
 
 
 def _fit_direct(
     curve: OffsetCurve, frames: Tensor, valid: Tensor | None, timing: RowTiming, options: _FitOptions
-) -> tuple[ToneFit, OtherMotion]:
+) -> _Found:
     """The fit to bands, refined on the images."""
     # px; the gradients of rows reach a few tenths of a pixel, so that a start with this error converges
-    start, _ = _fit_bands(curve, frames, valid, timing, options, accuracy=0.15)
+    start, *_ = _fit_bands(curve, frames, valid, timing, options, accuracy=0.15)
     found = refine_directly(stack_spectra(frames, valid), timing, start, options.tones)
-    return found.fit, found.other_motion
+    return found.fit, found.measurements, found.other_motion
 
 
 _METHODS: dict[DetectionMethod, _Method] = {
@@ -197,7 +204,8 @@ def detect_vibration(
             have further ones.
         method: ``"direct"``, or ``"bands"`` (the paper's method), in half the time with ten times larger errors.
         registration: Method of the band registration, as in ``register_bands``.
-        tones: Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance.
+        tones: Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance; the standard deviations
+            then allow for a further tone.
         harmonics: Number of multiples of every tone, with one common base frequency; 1 for independent tones.
         image_acceleration: Whether the image motion has a constant acceleration.
         window: Number of frames of one result: the vibration is followed through the stack, and the result is a batch
@@ -311,11 +319,13 @@ def _detect(
     """``detect_vibration`` of grey frames (B, T, H, W) in row order; the result is a batch in image axes."""
     row_timing, bands = timing.in_row_order(), options.bands
     curve = band_curve(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve)
-    fit, other_motion = method.fit(curve, frames, valid, row_timing, options)
-    vibration, std = vibration_of_fit(fit)
+    fit, measurements, other_motion = method.fit(curve, frames, valid, row_timing, options)
     starts = row_timing.frame_starts(frames.shape[1], frames.device)[:, None]
     starts = (starts + torch.arange(frames.shape[-2], device=frames.device)[::8] * row_timing.row_time).flatten()
-    std = replace(std, displacement=displacement_std(fit, starts, row_timing.exposure_time))
+    own_std = displacement_std(fit, starts, row_timing.exposure_time)
+    fit, total_std = with_further_tones(measurements, fit, starts, number_is_known=options.tones is not None)
+    vibration, std = vibration_of_fit(fit)
+    std = replace(std, displacement=total_std)
     tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
     moved = tones.mean_displacement(starts.expand(len(frames), -1), row_timing.exposure_time)
     predicted = model_displacements(measurements_of_curve(curve, row_timing, bands.band_step), fit)
@@ -335,6 +345,7 @@ def _detect(
             visible=visible[index].flatten(),
             intervals=intervals,
             displacement=moved[index].std(0, correction=0),
+            own_std=own_std[index],
             timing=row_timing,
             other_motion=None if other_motion is None else other_motion[index],
             max_tones=MAX_TONES if options.tones is None and options.model.harmonics == 1 else math.inf,
@@ -344,6 +355,8 @@ def _detect(
     reliable = torch.stack([verdict[0] for verdict in verdicts])
     swap = timing.scan_axis == -1
     in_image = vibration.from_row_order(timing)
+    sensitivity = timing_sensitivity(fit, row_timing, frames.shape[1], frames.shape[-2])
+    sensitivity = sensitivity.flip(-2) if swap else sensitivity
     return DetectionResult(
         vibration=in_image,
         std=std.from_row_order(timing),
@@ -357,6 +370,11 @@ def _detect(
         residual=residual.flip(-1) if swap else residual,
         reliable=reliable.flip(-1) if swap else reliable,
         reasons=tuple((reasons[1], reasons[0]) if swap else reasons for _, reasons in verdicts),
+        sensitivity=sensitivity,
+        assumptions=tuple(
+            assumptions(in_image[index], sensitivity[index], row_timing, frames.shape[1])
+            for index in range(len(frames))
+        ),
     )
 
 

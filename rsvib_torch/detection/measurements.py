@@ -99,6 +99,14 @@ class Measurements:
         return self.information.diagonal(dim1=-2, dim2=-1)
 
     @property
+    def inverse_variances(self) -> Tensor:
+        """(B, N, 2) inverse variance ``1 / (W^-1)_aa`` of the displacement of each axis, W the information."""
+        first, both, second = (self.information[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        conditional = torch.stack([first, second], -1)
+        explained = torch.where(conditional > 0, both[..., None].square() / conditional.clamp(min=1e-300), 0.0)
+        return (conditional - explained.flip(-1)).clamp(min=0.0)
+
+    @property
     def num_differences(self) -> Tensor:
         """(B, N) independent differences within each group: one less than the frames that contain the row."""
         return (self.visible.sum(-1) - 1).clamp(min=0.0)
@@ -151,15 +159,11 @@ class Measurements:
     # Residuals of a fit, (B, N, G, 2) px
 
     def square(self, residual: Tensor) -> Tensor:
-        """(B, 2) sum of the squared residuals of each axis over their variance ``(W^-1)_aa``, W the information.
+        """(B, 2) sum of the squared residuals of each axis over their variance.
 
         The residuals of one axis do not affect the sum of the other.
         """
-        first, both, second = (self.information[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-        conditional = torch.stack([first, second], -1)
-        explained = torch.where(conditional > 0, both[..., None].square() / conditional.clamp(min=1e-300), 0.0)
-        inverse_variance = (conditional - explained.flip(-1)).clamp(min=0.0)
-        return torch.einsum("bnga,bna->ba", residual.square(), inverse_variance)
+        return torch.einsum("bnga,bna->ba", residual.square(), self.inverse_variances)
 
     def sizes(self, residual: Tensor) -> Tensor:
         """(B, N, 2) rms residual of each row in standard deviations; NaN where nothing was measured."""

@@ -23,6 +23,7 @@ def judge(
     visible: Tensor,
     intervals: Tensor,
     displacement: Tensor,
+    own_std: Tensor,
     timing: RowTiming,
     other_motion: OtherMotion | None = None,
     max_tones: float = math.inf,
@@ -40,6 +41,7 @@ def judge(
         visible: (M,) bool, bands that both frames contain.
         intervals: Times between the frames that were compared, s.
         displacement: (2,) px, displacement of the rows by the tones without its mean, rms over the rows.
+        own_std: (2,) px, standard deviation of the displacement if the number of tones is right.
         timing: The sensor, in row order.
         other_motion: Motion of the rows that the vibration does not explain; None if it was fitted to bands.
         max_tones: Largest number of tones that was tried on an axis; an axis with so many may have more.
@@ -56,7 +58,7 @@ def judge(
     gain = offset_gain(vibration.frequency, intervals)
     of_both = _against_measurements(good, visible, other_motion, min_bands)
     if other_motion is not None:
-        of_both += _against_rotation(other_motion, vibration.amplitude * gain) + _against_exposure(other_motion, timing)
+        of_both += _against_exposure(other_motion, timing)
     for axis, against in enumerate(reasons):
         amplitude = vibration.amplitude[axis]
         against.extend(of_both)
@@ -73,9 +75,11 @@ def judge(
         for tone in amplitude.nonzero()[:, 0].tolist():
             against.extend(_against_tone(vibration, std, axis, tone, float(gain[axis, tone]), timing))
         if std.displacement is not None:
-            against.extend(_against_displacement(float(displacement[axis]), float(std.displacement[axis])))
+            against.extend(
+                _against_displacement(*(float(value[axis]) for value in (displacement, std.displacement, own_std)))
+            )
         if other_motion is not None:
-            against.extend(_against_other_motion(other_motion, axis, amplitude * gain[axis]))
+            against.extend(_against_rotation(other_motion, axis) + _against_other_motion(other_motion, axis))
             continue
         if bool(good.any()):
             against.extend(_against_fit(offsets[good, axis], fitted[good, axis]))
@@ -110,6 +114,7 @@ def _against_tone(
     """Reasons against one tone."""
     size, hertz = float(vibration.amplitude[axis, tone]), float(vibration.frequency[axis, tone])
     size_std, hertz_std = float(std.amplitude[axis, tone]), float(std.frequency[axis, tone])
+    offset = size * gain * abs(_sinc(hertz * timing.exposure_time))
     name = f"tone of {hertz:.4g} Hz"
     against = []
     if not (0 < size_std < math.inf and 0 < hertz_std < math.inf):
@@ -119,9 +124,9 @@ def _against_tone(
             f"{name} is not significant: its amplitude is {size:.3g} ± {size_std:.2g} px, and {MIN_SIGNIFICANCE:g} "
             "standard deviations are needed; use more frames"
         )
-    elif size * gain < MIN_OFFSET:
+    elif offset < MIN_OFFSET:
         against.append(
-            f"{name} is too small: its offsets of {size * gain:.2g} px are below {MIN_OFFSET} px, where errors of "
+            f"{name} is too small: its offsets of {offset:.2g} px are below {MIN_OFFSET} px, where errors of "
             "interpolation may cause them"
         )
     if gain < MIN_GAIN:
@@ -137,14 +142,22 @@ def _against_tone(
     return against
 
 
-def _against_displacement(size: float, std: float, *, max_ratio: float = 0.5) -> list[str]:
-    """Reasons from the displacement of the rows in px and its standard deviation, rms over the rows."""
-    if size == 0 or std <= max_ratio * size:
-        return []
-    return [
-        f"the displacement of the rows is uncertain: {size:.2g} ± {std:.2g} px; the standard deviation must be at "
-        f"most {max_ratio:.0%} of the displacement; use more frames"
-    ]
+def _sinc(x: float) -> float:
+    return math.sin(math.pi * x) / (math.pi * x) if x else 1.0
+
+
+def _against_displacement(size: float, std: float, own_std: float) -> list[str]:
+    """Reasons from the displacement of the rows in px and its standard deviations, rms over the rows.
+
+    ``own_std`` holds if the number of tones is right, ``std`` allows for a further tone. The limits and their effect
+    are listed in docs/verdicts.md.
+    """
+    uncertain = f"the displacement of the rows is uncertain: {size:.2g} ± {std:.2g} px"
+    if std > max(0.04 * size, 0.01) and std > 1.5 * own_std:
+        return [f"{uncertain}, because the frames also agree with a further tone; use more frames"]
+    if std > 0.25 * size:
+        return [f"{uncertain}; the standard deviation must be at most 25 % of the displacement; use more frames"]
+    return []
 
 
 def _against_fit(offsets: Tensor, fitted: Tensor, *, counted: float = 0.75) -> list[str]:
@@ -161,15 +174,15 @@ def _against_fit(offsets: Tensor, fitted: Tensor, *, counted: float = 0.75) -> l
     ]
 
 
-def _against_other_motion(other: OtherMotion, axis: int, offset_amplitudes: Tensor) -> list[str]:
-    """Reasons from motion that no vibration explains, given the offset amplitudes (K,) of the tones in px.
+def _against_other_motion(other: OtherMotion, axis: int) -> list[str]:
+    """Reasons from motion that no vibration explains.
 
     docs/verdicts.md lists the limits; they exceed the errors of interpolation and of the correction for unequal blur.
     """
-    size = float(offset_amplitudes.square().sum().sqrt()) / 2**0.5
+    size = float(other.size[axis])
     limits = (
-        ("rows", float(other.unexplained[axis]), max(0.03, 0.01 * size)),
-        ("neighbouring rows", float(other.correlated[axis]), max(0.01, 0.003 * size)),
+        ("rows", float(other.unexplained[axis]), max(0.05, 0.006 * size)),
+        ("neighbouring rows", float(other.correlated[axis]), max(0.01, 0.006 * size)),
     )
     for rows, unexplained, allowed in limits:
         if unexplained > allowed:
@@ -180,15 +193,19 @@ def _against_other_motion(other: OtherMotion, axis: int, offset_amplitudes: Tens
     return []
 
 
-def _against_rotation(other: OtherMotion, offset_amplitudes: Tensor) -> list[str]:
-    """Reasons against both axes: rotation and zoom move the halves of a row along one axis, and rows along both."""
-    size = float(offset_amplitudes.square().sum(-1).amin().sqrt()) / 2**0.5
-    differential, allowed = float(other.differential.amax()), max(0.03, 0.02 * size)
-    if differential <= allowed:
+def _against_rotation(other: OtherMotion, axis: int) -> list[str]:
+    """Reasons from rotation and zoom, which move the halves of a row apart along the other axis.
+
+    A roll by theta moves the halves of a row by ``theta W / 4`` along y in opposite directions, and rows by up to
+    ``theta H / 2`` along x. A zoom does the same with the axes exchanged. Rows of both axes are concerned by parallax.
+    """
+    apart = float(other.differential[1 - axis])
+    allowed = max(0.035, 0.009 * float(other.size[axis]))
+    if apart <= allowed:
         return []
     return [
-        f"left and right halves of the rows move apart by {differential:.3g} px, {allowed:.2g} px are allowed: the "
-        "camera rolls or zooms, or the scene has parallax; select a part of the frame with one distance"
+        f"left and right halves of the rows move apart by {apart:.3g} px along {'yx'[axis]}, {allowed:.2g} px are "
+        "allowed: the camera rolls or zooms, or the scene has parallax; select a part of the frame with one distance"
     ]
 
 
@@ -196,13 +213,14 @@ def _against_exposure(other: OtherMotion, timing: RowTiming) -> list[str]:
     """Reasons against both axes from the difference of the blur between frames.
 
     Its ratio to the expected one is the square of the ratio of the exposure times (docs/verdicts.md). Interpolation
-    errors increase it by about 0.005 / size, so that high ratios count only if the excess is 0.01 of the detail, and
-    sizes below 0.002 do not count.
+    errors increase it by about 0.005 / size, so that high ratios count only if the excess is 0.02 of the detail, and
+    sizes below 0.002 do not count; above 0.25 the second order is not enough. Negative ratios are caused by another
+    error, because no exposure time gives them.
     """
     ratio, std, size = other.blur.tolist()
-    low = ratio < 0.6 and 1 - ratio > 3 * std
-    high = ratio > 2.5 and ratio - 1 > 5 * std and (ratio - 1) * size > 0.01
-    if size < 0.002 or not (low or high):
+    low = -0.3 < ratio < 0.6 and 1 - ratio > 3 * std
+    high = ratio > 2.5 and ratio - 1 > 5 * std and (ratio - 1) * size > 0.02
+    if not 0.002 < size < 0.25 or not (low or high):
         return []
     rows = timing.exposure_rows
     likely = f" (about {rows * math.sqrt(ratio):.2g} rows agree with the blur)" if ratio > 0 else ""

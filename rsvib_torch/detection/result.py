@@ -10,7 +10,7 @@ from torch.nn import functional
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
 
-__all__ = ["DetectionResult", "OtherMotion", "stacked"]
+__all__ = ["DetectionResult", "OtherMotion", "TimingSensitivity", "stacked"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,6 +18,7 @@ class OtherMotion:
     """Motion of the rows that no vibration explains, for each axis in px, without the part that noise explains.
 
     Attributes:
+        size: (..., 2) rms offset of the rows by the tones, for comparison.
         unexplained: (..., 2) rms residual displacement of the fit.
         correlated: (..., 2) the part of it that neighbouring rows have in common.
         differential: (..., 2) rms difference of the residual displacements of the left and right halves of the rows.
@@ -26,6 +27,7 @@ class OtherMotion:
             deviation, and the size of the expected difference relative to the detail of the scene.
     """
 
+    size: Tensor
     unexplained: Tensor
     correlated: Tensor
     differential: Tensor
@@ -35,6 +37,40 @@ class OtherMotion:
     def __getitem__(self, index: int) -> "OtherMotion":
         """The part of one stack out of a batch."""
         return OtherMotion(*(getattr(self, field.name)[index] for field in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class TimingSensitivity:
+    """Relative change of amplitudes and frequencies over the relative change of a stated time.
+
+    ``d ln A / d ln frame_rows = 3`` means that an amplitude becomes 3 % larger if ``frame_rows`` is stated 1 % larger
+    and the frames are the same. All values have the shape (..., 2, K), axes (x, y), 0 where there is no tone. A change
+    of ``row_time`` changes exposure time and frame period alike; with ``frame_start_times``, ``frame_rows`` has no
+    effect.
+
+    Attributes:
+        amplitude_by_row_time: d ln A / d ln row_time.
+        amplitude_by_frame_rows: d ln A / d ln frame_rows.
+        amplitude_by_exposure_rows: d ln A / d ln exposure_rows.
+        frequency_by_row_time: d ln f / d ln row_time.
+        frequency_by_frame_rows: d ln f / d ln frame_rows.
+        frequency_by_exposure_rows: d ln f / d ln exposure_rows.
+    """
+
+    amplitude_by_row_time: Tensor
+    amplitude_by_frame_rows: Tensor
+    amplitude_by_exposure_rows: Tensor
+    frequency_by_row_time: Tensor
+    frequency_by_frame_rows: Tensor
+    frequency_by_exposure_rows: Tensor
+
+    def __getitem__(self, index: int) -> "TimingSensitivity":
+        """The part of one stack out of a batch."""
+        return TimingSensitivity(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def flip(self, axis: int) -> "TimingSensitivity":
+        """With the entries along an axis in the opposite order."""
+        return TimingSensitivity(*(getattr(self, field.name).flip(axis) for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +86,8 @@ class DetectionResult:
         residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
         reliable: (..., 2) bool, verdict for each axis.
         reasons: Reasons against each axis (x, y) that is not reliable; a tuple of those for a batch.
+        sensitivity: Effect of the stated timing on amplitudes and frequencies.
+        assumptions: What the frames cannot contradict, one sentence for each; a tuple of those for a batch.
     """
 
     vibration: Vibration
@@ -60,6 +98,8 @@ class DetectionResult:
     residual: Tensor
     reliable: Tensor
     reasons: tuple[Any, ...]
+    sensitivity: TimingSensitivity
+    assumptions: tuple[Any, ...]
 
     def __getitem__(self, index: int) -> "DetectionResult":
         """The result of one stack out of a batch."""
@@ -72,6 +112,8 @@ class DetectionResult:
             self.residual[index],
             self.reliable[index],
             self.reasons[index],
+            self.sensitivity[index],
+            self.assumptions[index],
         )
 
 
@@ -112,4 +154,6 @@ def stacked(results: list[DetectionResult]) -> DetectionResult:
         residual=joined([result.residual for result in results]),
         reliable=joined([result.reliable for result in results]),
         reasons=tuple(tuple(result.reasons[index] for result in results) for index in range(batch)),
+        sensitivity=TimingSensitivity(**parameters([result.sensitivity for result in results], TimingSensitivity)),
+        assumptions=tuple(tuple(result.assumptions[index] for result in results) for index in range(batch)),
     )

@@ -157,6 +157,8 @@ class Detection(Protocol):
     def reliable(self) -> Tensor: ...
     @property
     def reasons(self) -> tuple[Any, ...]: ...
+    @property
+    def assumptions(self) -> tuple[Any, ...]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +172,7 @@ class DetectedVibration:
         residual: (2,) px, mean absolute difference of measured and fitted offsets.
         reliable: (2,) bool, verdict for each axis (x, y).
         reasons: Why an axis is not reliable, for each axis.
+        assumptions: What the frames cannot contradict, one sentence for each.
     """
 
     vibration: Vibration
@@ -178,6 +181,7 @@ class DetectedVibration:
     residual: Tensor
     reliable: Tensor
     reasons: tuple[Any, ...]
+    assumptions: tuple[Any, ...] = ()
 
 
 class DetectionRecord(Section):
@@ -189,6 +193,7 @@ class DetectionRecord(Section):
     residual: Numbers
     reliable: list[bool] = Field(min_length=2, max_length=2)
     reasons: list[list[str]] = Field(min_length=2, max_length=2)
+    assumptions: list[str] = Field(default_factory=list[str])
 
     @classmethod
     def from_detection(cls, detection: Detection, **fields: Any) -> Self:
@@ -200,8 +205,15 @@ class DetectionRecord(Section):
             residual=to_json(detection.residual),
             reliable=detection.reliable.tolist(),
             reasons=[list(axis) for axis in detection.reasons],
+            assumptions=list(detection.assumptions),
             **fields,
         )
+
+    @model_serializer(mode="wrap")
+    def _without_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Omit empty ``assumptions``: files written before this field was added keep their hash."""
+        values: dict[str, Any] = handler(self)
+        return {name: value for name, value in values.items() if name != "assumptions" or value}
 
     def to_detection(self) -> DetectedVibration:
         """The detection.
@@ -219,6 +231,7 @@ class DetectionRecord(Section):
             _to_tensor(self.residual, math.nan),
             torch.tensor(self.reliable),
             tuple(tuple(axis) for axis in self.reasons),
+            tuple(self.assumptions),
         )
 
 

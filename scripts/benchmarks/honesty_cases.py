@@ -54,6 +54,11 @@ class Case:
     stated: dict[str, float] = field(default_factory=dict)
     time_stamps: bool = False
 
+    @property
+    def timing_is_wrong(self) -> bool:
+        """Whether the stated timing differs from the true one."""
+        return bool(self.stated) or self.taken is not None or self.reverse
+
 
 @dataclass(frozen=True, eq=False)
 class Recording:
@@ -78,6 +83,11 @@ class Recording:
     def displacement(self) -> Array:
         """True displacement of the rows, (2, T, H) in px."""
         return row_displacement(self.case.motion, self.starts, self.exposure, self.frames.shape[-1])
+
+    def displacement_by(self, tones: Tones) -> Array:
+        """Displacement of the rows by tones (K, 3) along an axis, (T, H) in px."""
+        of_tones = moving(partial(wave, tones), partial(wave, np.zeros((0, 3))))
+        return np.asarray(row_displacement(of_tones, self.starts, self.exposure, self.frames.shape[-1])[0])
 
     def still(self, frame: int, x: float = 0.0, y: float = 0.0) -> Array:
         """A frame of a camera at rest that is displaced by a constant, without noise."""
@@ -180,7 +190,8 @@ def harmonics(generator: Generator) -> Case:
 def turning(generator: Generator, what: str) -> Case:
     """A plain vibration with a sinusoidal roll or zoom of 0.1 to 1 px at the border of 384 px."""
     amplitude = float(log_uniform(generator, 0.1, 1.0)[0]) / (0.5 * 384)
-    turn = tones_of(generator, [amplitude], [generator.uniform(20.0, 90.0)])
+    turn = one_tone(generator)  # like all tones, not at a frequency at which all frames move alike
+    turn[0, 0] = amplitude
     x, y = partial(wave, one_tone(generator)), partial(wave, one_tone(generator))
     return Case(moving(x, y, **{what: turn}), None)
 

@@ -291,7 +291,10 @@ def test_standard_deviations_agree_with_scatter():
 
 
 def test_standard_deviations_from_frames_agree_with_errors(paper_camera):
-    """Errors divided by their standard deviations are of order one for all noise seeds, scenes and phases."""
+    """Errors divided by their standard deviations are of order one for all noise seeds, scenes and phases.
+
+    The standard deviations allow for a further tone, so that errors are smaller for one tone.
+    """
     ratios = []
     for seed in range(20, 26):
         motion = Motion(phase=random_phase(seed))
@@ -301,7 +304,7 @@ def test_standard_deviations_from_frames_agree_with_errors(paper_camera):
             error = getattr(found, name)[:, 0].numpy() - np.array(getattr(motion, name))
             ratios.append(error / getattr(std, name)[:, 0].numpy())
     spread = np.sqrt(np.mean(np.square(ratios)))
-    assert 0.25 < spread < 2
+    assert 0.1 < spread < 2
 
 
 def test_dropped_frame_times(paper_camera):

@@ -19,6 +19,7 @@ def verdict(
     *,
     std=(0.01, 0.01),
     displacement_std=0.01,
+    own_std=None,
     offsets=None,
     fitted=None,
     visible=None,
@@ -34,6 +35,7 @@ def verdict(
         "fitted": curve.double() if fitted is None else fitted(curve.double()),
         "intervals": torch.tensor([0.04096], dtype=torch.float64),
         "displacement": torch.tensor([amplitude, 2.0]) / 2**0.5,
+        "own_std": torch.tensor([displacement_std if own_std is None else own_std, 0.01]),
         "timing": TIMING,
     }
     std_of_tones = VibrationStd(
@@ -68,8 +70,13 @@ def missing(count):
         ({"std": (2.0, 0.01)}, "not significant"),
         ({"std": (0.0, 0.01)}, "uncertainty of the tone of 30 Hz is unknown"),
         ({"std": (0.01, math.inf)}, "uncertainty of the tone of 30 Hz is unknown"),
-        ({"displacement_std": 1.05}, None),
-        ({"displacement_std": 1.07}, "displacement of the rows is uncertain: 2.1 ± 1.1 px"),
+        ({"displacement_std": 0.52}, None),
+        ({"displacement_std": 0.54}, "must be at most 25 % of the displacement"),
+        ({"displacement_std": 0.084, "own_std": 0.02}, None),  # 4 % of the displacement
+        ({"displacement_std": 0.086, "own_std": 0.02}, "uncertain: 2.1 ± 0.086 px, because the frames also agree"),
+        ({"displacement_std": 0.09, "own_std": 0.061}, None),
+        ({"displacement_std": 0.09, "own_std": 0.059}, "agree with a further tone"),
+        ({"amplitude": 0.05, "std": (0.001, 0.01), "displacement_std": 0.0075, "own_std": 0.001}, None),
         ({"max_tones": 1}, "1 tones do not explain the motion"),
         ({"amplitude": 0.002, "std": (1e-5, 0.01)}, "too small"),
         ({"frequency": 1 / 0.04096, "std": (1e-3, 1e-3)}, "nearly blind"),
@@ -87,10 +94,10 @@ def test_reasons_for_an_unreliable_tone(options, reason):
         assert any(reason in text for text in reasons[0]), reasons
 
 
-def other_motion(unexplained=0.0, correlated=0.0, differential=0.0, measured=1.0, blur=(1.2, 0.1, 0.05)):
-    """Residual motion along x only."""
+def other_motion(unexplained=0.0, correlated=0.0, differential=0.0, measured=1.0, blur=(1.2, 0.1, 0.05), size=1.0):
+    """Residual motion along x only, beside tones with offsets of ``size`` px along both axes."""
     axes = (torch.tensor([value, 0.0]) for value in (unexplained, correlated, differential))
-    return OtherMotion(*axes, torch.tensor(measured), torch.tensor(blur))
+    return OtherMotion(torch.full((2,), size), *axes, torch.tensor(measured), torch.tensor(blur))
 
 
 @pytest.mark.parametrize(
@@ -99,37 +106,36 @@ def other_motion(unexplained=0.0, correlated=0.0, differential=0.0, measured=1.0
         ({"unexplained": 0.02, "correlated": 0.005, "differential": 0.02}, (0, 0)),
         ({"unexplained": 0.3}, (1, 0)),
         ({"correlated": 0.1}, (1, 0)),
-        ({"differential": 0.3}, (1, 1)),
-        ({"unexplained": 0.3, "differential": 0.3}, (2, 1)),
+        ({"differential": 0.3}, (0, 1)),  # along x: a zoom, which displaces rows along y
+        ({"unexplained": 0.3, "differential": 0.3}, (1, 1)),
         ({"measured": 0.4}, (1, 1)),
         ({"blur": (0.5, 0.1, 0.05)}, (1, 1)),
         ({"blur": (0.5, 0.2, 0.05)}, (0, 0)),
         ({"blur": (4.0, 0.5, 0.05)}, (1, 1)),
         ({"blur": (4.0, 0.7, 0.05)}, (0, 0)),
         ({"blur": (4.0, 0.5, 0.003)}, (0, 0)),
+        ({"blur": (-0.2, 0.1, 0.05)}, (1, 1)),
+        ({"blur": (-0.4, 0.1, 0.05)}, (0, 0)),  # no exposure time has a negative ratio
+        ({"blur": (0.3, 0.01, 0.3)}, (0, 0)),  # the second order does not describe so much blur
     ],
 )
 def test_residual_motion_makes_axes_unreliable(residual, against):
-    """Differential motion affects the verdict of both axes."""
+    """Differential motion along one axis affects the verdict of the other."""
     reliable, reasons = verdict(other_motion=other_motion(**residual))
     assert tuple(len(axis) for axis in reasons) == against
     assert reliable.tolist() == [count == 0 for count in against]
 
 
 @pytest.mark.parametrize(
-    ("residual", "accepted"),
-    [
-        ({"unexplained": 0.029}, True),
-        ({"unexplained": 0.031}, False),
-        ({"correlated": 0.009}, True),
-        ({"correlated": 0.011}, False),
-        ({"differential": 0.029}, True),
-        ({"differential": 0.031}, False),
-    ],
+    ("residual", "axis", "allowed"),
+    [("unexplained", 0, (0.05, 0.12)), ("correlated", 0, (0.01, 0.12)), ("differential", 1, (0.035, 0.18))],
 )
-def test_residual_motion_of_a_small_tone_is_compared_with_errors_of_interpolation(residual, accepted):
-    reliable, _ = verdict(0.3, displacement_std=0.001, other_motion=other_motion(**residual))
-    assert bool(reliable[0]) == accepted
+@pytest.mark.parametrize("factor", [0.97, 1.03])
+def test_residual_motion_is_compared_with_errors_of_interpolation_and_the_offsets(residual, axis, allowed, factor):
+    for size, limit in zip((0.3, 20.0), allowed, strict=True):
+        reliable, _ = verdict(other_motion=other_motion(**{residual: factor * limit, "size": size}))
+        assert bool(reliable[axis]) == (factor < 1)
+        assert bool(reliable[1 - axis])
 
 
 def test_bands_are_not_judged_where_rows_were_measured():

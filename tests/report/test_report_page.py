@@ -14,6 +14,7 @@ from edge_truth import draw_edge, gaussian, mtf50_of, through_pixels
 
 from rsvib_torch.commands.main import run_command
 from rsvib_torch.detection import DetectionResult
+from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.evaluation import resolution_chart
 from rsvib_torch.imaging import SensorNoise, simulate_frames
 from rsvib_torch.io import write_stack
@@ -41,7 +42,16 @@ def result_of(vibration=SHAKE, reliable=(True, True), reasons=((), ())):
     std = VibrationStd(small, small, 1e-3 * small, small, small[:, 0], small[:, 0])
     gain = vibration.gain(TIMING.frame_period)
     return DetectionResult(
-        vibration, std, curve, offsets, gain, torch.zeros(2).double(), torch.tensor(reliable), reasons
+        vibration,
+        std,
+        curve,
+        offsets,
+        gain,
+        torch.zeros(2).double(),
+        torch.tensor(reliable),
+        reasons,
+        TimingSensitivity(*[gain] * 6),
+        (),
     )
 
 

@@ -12,6 +12,7 @@ import torch
 
 from rsvib_torch.commands.terminal import print_detection
 from rsvib_torch.detection import DetectionResult
+from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
@@ -47,7 +48,18 @@ def draw_result() -> DetectionResult:
     residual = (offsets - fitted).abs().nanmean((0, 1))
     gain = vibration.gain(TIMING.frame_period)
     reasons = ((), ("only one period is seen",))
-    return DetectionResult(vibration, std, curve, fitted, gain, residual, torch.tensor([True, False]), reasons)
+    return DetectionResult(
+        vibration,
+        std,
+        curve,
+        fitted,
+        gain,
+        residual,
+        torch.tensor([True, False]),
+        reasons,
+        TimingSensitivity(*[gain] * 6),
+        ("row_time=2e-05 s: assumed",),
+    )
 
 
 def test_vibration_is_read_back_exactly(tmp_path, result):
@@ -61,6 +73,7 @@ def test_vibration_is_read_back_exactly(tmp_path, result):
     torch.testing.assert_close(back.gain, result.gain, rtol=0, atol=0)
     torch.testing.assert_close(back.residual, result.residual, rtol=0, atol=0)
     assert back.reasons == ((), ("only one period is seen",))
+    assert back.assumptions == ("row_time=2e-05 s: assumed",)
 
 
 def test_vibration_file_is_plain_json(tmp_path, result):

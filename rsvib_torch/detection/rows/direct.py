@@ -34,7 +34,14 @@ from rsvib_torch.detection.rows.displacements import (
     measure_groups,
     remove_column_pattern,
 )
-from rsvib_torch.detection.tones.fit import ToneFit, fit_tones, residual_of, select_stacks, shrunk_motion
+from rsvib_torch.detection.tones.fit import (
+    ToneFit,
+    fit_tones,
+    model_displacements,
+    residual_of,
+    select_stacks,
+    shrunk_motion,
+)
 from rsvib_torch.detection.tones.selection import (
     find_tones,
     robust_fit,
@@ -98,11 +105,10 @@ def refine_directly(
             tried = tried | mirrored
             other, _ = robust_fit(found.measurements, frequencies, strongest_only(found.fit).active, start.model)
             found = _better_of_each(found, _refine(groups, timing, intervals, other, tones, max_rounds))
+    if tones is None:
+        found = replace(found, fit=significant_only(found.measurements, found.fit, intervals))
     blur = torch.stack(blur_ratio(groups, timing, shrunk_motion(found.fit, intervals)), -1)
-    found = replace(found, other_motion=replace(found.other_motion, blur=blur))
-    if tones is not None:
-        return found
-    return replace(found, fit=significant_only(found.measurements, found.fit, intervals))
+    return replace(found, other_motion=replace(found.other_motion, blur=blur))
 
 
 def _refine(
@@ -298,7 +304,9 @@ def _conclude(measurements: Measurements, fit: ToneFit, gradients: list[RowGradi
     fit = fit_tones(weighted, fit.frequencies, fit.active, fit.model)
     shown = measurements.num_differences > 0
     measured = (shown & (measurements.weights > 0).any(-1)).double().sum(1) / shown.double().sum(1).clamp(min=1.0)
+    tones = measurements.relative(model_displacements(measurements, replace(fit, drift=torch.zeros_like(fit.drift))))
     other = OtherMotion(
+        size=math.sqrt(2) * measurements.distances(tones).square().nanmean(1).sqrt(),
         unexplained=measurements.unexplained(residual),
         correlated=measurements.correlated(residual),
         differential=differential_motion(gradients),

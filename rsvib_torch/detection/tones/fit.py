@@ -24,6 +24,8 @@ __all__ = [
     "MotionModel",
     "ToneFit",
     "amplitude_std",
+    "axis_jacobian",
+    "displacement_jacobian",
     "displacement_std",
     "drift_response",
     "fit_roughly",
@@ -431,15 +433,30 @@ def displacement_std(fit: ToneFit, exposure_starts: Tensor, exposure_time: float
         exposure_starts: (N,) s, exposure starts of the rows.
         exposure_time: T_e in seconds.
     """
+    jacobian = displacement_jacobian(fit, exposure_starts.expand(len(fit.centre), -1), exposure_time)
+    jacobian = jacobian - jacobian.mean(1, keepdim=True)
+    covariance = _covariance_of_axes(fit)
+    return torch.einsum("bnap,bapq,bnaq->bna", jacobian, covariance, jacobian).clamp(min=0.0).mean(1).sqrt()
+
+
+def displacement_jacobian(fit: ToneFit, exposure_starts: Tensor, exposure_time: float) -> Tensor:
+    """Derivatives (B, N, 2, P) of the mean displacements of exposures from starts (B, N) by the parameters."""
     time = (exposure_starts + 0.5 * exposure_time - fit.centre[:, None])[..., None, None, None]
     smearing = torch.tensor([exposure_time, 0.0], dtype=time.dtype, device=time.device)[:, None, None, None]
     tones = _jacobian_of_tones(smearing.expand(2, 1, 2, 1), time, fit.coefficients, fit.frequencies)
     powers = [time, 0.5 * time.square()][: fit.drift.shape[-1]]
     drift = torch.cat(powers, -1).expand(*tones.shape[:-1], -1)
-    jacobian = torch.cat([tones, drift], -1)[:, :, 0]  # (B, N, 2, P)
-    jacobian = jacobian - jacobian.mean(1, keepdim=True)
-    covariance = _covariance_of_axes(fit)
-    return torch.einsum("bnap,bapq,bnaq->bna", jacobian, covariance, jacobian).clamp(min=0.0).mean(1).sqrt()
+    return torch.cat([tones, drift], -1)[:, :, 0]
+
+
+def axis_jacobian(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Tensor, Tensor]:
+    """Derivatives (B, N, G, M) of the displacements of an axis by its free parameters, and the matrix (P, M) to all."""
+    problem = _Problem(measurements, fit.active, fit.model)
+    tones = torch.stack([fit.coefficients.real, fit.coefficients.imag, fit.frequencies], -1)
+    jacobian = problem.jacobian(torch.cat([tones.flatten(-2), fit.drift], -1))[..., axis, :]
+    free = problem.free.unflatten(1, (2, -1))[:, axis]
+    to_all = _constraints(fit.model, fit.active.shape[-1], fit.active.device)
+    return (jacobian @ to_all) * free[:, None, None], to_all
 
 
 def amplitude_std(fit: ToneFit) -> Tensor:

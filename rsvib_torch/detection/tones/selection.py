@@ -215,26 +215,44 @@ def _with_blind_tones(measurements: Measurements, weighed: Measurements, fit: To
 def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor) -> ToneFit:
     """The fit without the tones, other than the strongest of an axis, that are not significant or too small.
 
-    Tones of large gain whose offsets are below ``MIN_OFFSET`` may be residuals of interpolation and blur. Where the
-    gain is small, small offsets do not mean a small amplitude, and the tone stays for the verdict. A family of
-    harmonics is kept or dropped as a whole.
+    A tone is significant if its amplitude is, or if the fit without it fails the F-test: the amplitudes of two tones
+    that the record hardly resolves are uncertain, although both are needed. Tones of large gain whose offsets are below
+    ``MIN_OFFSET`` may be residuals of interpolation and blur. Where the gain is small, small offsets do not mean a
+    small amplitude, and the tone stays for the verdict. A family of harmonics is kept or dropped as a whole.
 
     Args:
         measurements: The measurements of the fit.
         fit: With its covariance.
         intervals: (M,) s, times between the frames compared.
     """
+    harmonics = fit.model.harmonics
+    needed = torch.zeros_like(fit.active)
     while True:
-        size = fit.amplitude
+        size, std = fit.amplitude, amplitude_std(fit)
         gain = offset_gain(fit.frequencies, intervals)
-        small = (size * gain < MIN_OFFSET) & (gain >= MIN_GAIN)
-        significant = (size > MIN_SIGNIFICANCE * amplitude_std(fit)) & ~small & fit.active
-        strongest = size == size.amax(-1, keepdim=True)
-        families = ((significant | strongest) & fit.active).unflatten(-1, (-1, fit.model.harmonics)).any(-1)
-        keep = families.repeat_interleave(fit.model.harmonics, -1) & fit.active
-        if bool((keep == fit.active).all()):
+        attenuation = torch.sinc(fit.frequencies * measurements.exposure_time).abs()
+        small = (size * attenuation * gain < MIN_OFFSET) & (gain >= MIN_GAIN)
+        kept = ((size > MIN_SIGNIFICANCE * std) & ~small) | (size == size.amax(-1, keepdim=True)) | needed
+        kept = (kept & fit.active).unflatten(-1, (-1, harmonics)).any(-1)
+        families = fit.active.unflatten(-1, (-1, harmonics)).any(-1)
+        ratio = (size / std.clamp(min=1e-300)).unflatten(-1, (-1, harmonics)).amax(-1)
+        least = torch.where(families & ~kept, ratio, torch.inf)
+        dropped = (least == least.amin(-1, keepdim=True)) & families & ~kept
+        if not bool(dropped.any()):
             return fit
-        fit = fit_tones(measurements, fit.frequencies, keep, fit.model)
+        dropped = dropped.repeat_interleave(harmonics, -1) & fit.active
+        other = fit_tones(measurements, fit.frequencies, fit.active & ~dropped, fit.model)
+        after = measurements.square(residual_of(measurements, fit))
+        before = measurements.square(residual_of(measurements, other))
+        spare = measurements.num_measurements - 3 * fit.active.sum(-1)
+        worse = before - after > _F_THRESHOLD * 3 * harmonics * after / spare.clamp(min=1.0)
+        keep = dropped & worse[..., None] & ~small
+        needed = needed | keep
+        fit = (
+            other
+            if not bool(keep.any())
+            else fit_tones(measurements, fit.frequencies, fit.active & ~dropped | keep, fit.model)
+        )
 
 
 def strongest_only(fit: ToneFit) -> ToneFit:

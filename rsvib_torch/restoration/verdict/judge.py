@@ -62,7 +62,8 @@ class RestorationVerdict:
         noise: (P,) standard deviation of the noise of the raw frames.
         chi_square: (P,) mean square of that frame's difference from its prediction, over the variance of the noise:
             1 ... 2 where motion, blur and noise explain the frame.
-        predicted_gain: (P,) dB, estimated PSNR of the restored frames minus that of the raw ones.
+        predicted_gain: (P,) dB, estimated PSNR of the restored frames minus that of the raw ones. It is valid where the
+            motion is right and complete, and NaN where it is not and has the opposite sign of the outcome.
         outcome: For each pair: ``"helps"``; ``"partly"``: the vibration explains only a part of the displacement;
             ``"worse"``; ``"unknown"``: cannot be determined from this pair (vibration too small, or at a blind
             frequency; frames without contrast; too many missing pixels).
@@ -97,7 +98,7 @@ class RestorationVerdict:
         gain = float(self.predicted_gain.nanmean())
         counted = f" ({self.outcome.count(self.overall)} of {len(self.outcome)} pairs)" if len(self.outcome) > 1 else ""
         sentences = {
-            "helps": f"restored frames agree; estimated gain {gain:+.1f} dB",
+            "helps": "restored frames agree" + ("" if math.isnan(gain) else f"; estimated gain {gain:+.1f} dB"),
             "unknown": f"cannot determine whether restoration helps{counted}: {self.reasons[worst]}",
             "partly": f"restoration helps in part only{counted}: {self.reasons[worst]}",
             "worse": f"restored is no better than raw{counted}: {self.reasons[worst]}",
@@ -167,9 +168,12 @@ def _outcome(
     if not found:
         return "unknown", "no vibration was undone"
     outcome = max((outcome for outcome, _ in found), key=_OUTCOMES.index)
-    if outcome in ("helps", "unknown") and motion_is_complete and gain < -_GAIN_ERROR:
+    reason = "; ".join(why for kind, why in found if kind == outcome and why)
+    if outcome in ("partly", "worse") or gain >= 0 or not motion_is_complete:
+        return outcome, reason
+    if gain < -_GAIN_ERROR:
         return "worse", f"noise and artefacts outweigh the restored sharpness (estimated gain {gain:.1f} dB)"
-    return outcome, "; ".join(why for kind, why in found if kind == outcome and why)
+    return "unknown", reason or f"the estimated gain of {gain:.1f} dB is within its error of {_GAIN_ERROR:g} dB"
 
 
 def _mean_square(difference: Tensor) -> Tensor:
@@ -198,6 +202,8 @@ def _judge_pair(pair: FramePair, moves: list[bool], shared: int, *, max_missing:
     misfits = (misfit_before.tolist(), misfit_after.tolist(), resolution.tolist())
     one_image = pair.restored_later is None
     outcome, why = _outcome(*misfits, moves, pair.offset.tolist(), float(gain), one_image=one_image)
+    if (outcome == "worse" and gain > 0) or (outcome in ("helps", "partly") and gain < 0):
+        gain = torch.full_like(gain, math.nan)
     missing = 0.0 if pair.missing is None else float(pair.missing.any(0).double().mean())
     if missing > max_missing:
         outcome, why = "unknown", f"{100 * missing:.0f} % of the pixels are missing"

@@ -1,0 +1,172 @@
+"""Standard deviations that allow for a further tone, and sensitivities to the timing, on simulated displacements."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
+from rsvib_torch.detection.tones.fit import displacement_std, fit_tones, vibration_of_fit
+from rsvib_torch.detection.tones.further import with_further_tones
+from rsvib_torch.motion.timing import RowTiming
+
+TIMING = RowTiming(row_time=1 / 24 / 110, exposure_rows=20, frame_rows=110)
+ROWS, NOISE = 100, 0.003  # px
+
+
+def starts_of(timing, num_frames):
+    return np.arange(num_frames) * timing.frame_rows * timing.row_time + np.arange(ROWS)[:, None] * timing.row_time
+
+
+def mean_sine(amplitude, frequency, phase, starts, exposure):
+    """Mean of A sin(2 pi f t + phi) over [start, start + exposure], from its integral."""
+    w = 2 * np.pi * np.asarray(frequency)[..., None, None]
+    phase, amplitude = (np.asarray(values)[..., None, None] for values in (phase, amplitude))
+    return amplitude * (np.cos(w * starts + phase) - np.cos(w * (starts + exposure) + phase)) / (w * exposure)
+
+
+def measured(displacement, timing, generator=None, noise=NOISE):
+    """Measurements of displacements (B, N, G) along x, none along y."""
+    batch, rows, frames = displacement.shape
+    values = displacement + (0.0 if generator is None else noise * generator.standard_normal(displacement.shape))
+    both = torch.from_numpy(np.stack([values, np.zeros_like(values)], -1))
+    result = Measurements(
+        torch.from_numpy(starts_of(timing, frames)).expand(batch, -1, -1).clone(),
+        both,
+        torch.ones(batch, rows, frames, dtype=torch.float64),
+        torch.eye(2, dtype=torch.float64).expand(batch, rows, 2, 2) / noise**2,
+        timing.exposure_time,
+    )
+    return replace(result, displacements=result.relative(both))
+
+
+def fitted(measurements, frequency):
+    active = torch.zeros(len(measurements.exposure_starts), 2, 1, dtype=torch.bool)
+    active[:, 0] = True
+    return fit_tones(measurements, torch.as_tensor(frequency)[:, None, None].expand(-1, 2, 1), active)
+
+
+def row_starts(num_frames):
+    return torch.from_numpy(starts_of(TIMING, num_frames).T.ravel())
+
+
+@pytest.mark.parametrize("num_frames", [2, 3])
+def test_intervals_contain_the_truth_where_a_second_tone_is_not_resolved(num_frames):
+    """Half of 300 records have a second tone of random size whose frequency differs by less than 1 / duration."""
+    generator, batch = np.random.default_rng(num_frames), 300
+    duration = num_frames / 24
+    first = generator.uniform(30.0, 44.0, batch)
+    truth = mean_sine(1.0, first, generator.uniform(-3, 3, batch), starts_of(TIMING, num_frames), TIMING.exposure_time)
+    size = 0.3 * np.abs(generator.standard_normal(batch)) * (generator.random(batch) < 0.5)
+    beside = first + generator.uniform(-1, 1, batch) / duration
+    phase = generator.uniform(-3, 3, batch)
+    truth = truth + mean_sine(size, beside, phase, starts_of(TIMING, num_frames), TIMING.exposure_time)
+    measurements = measured(truth, TIMING, generator)
+    fit = fitted(measurements, first)
+
+    def share_within(found):
+        vibration, std = vibration_of_fit(found)
+        error = (vibration.amplitude[:, 0, 0] - 1.0).abs() / std.amplitude[:, 0, 0]
+        return float((error < 1.96).double().mean())
+
+    allowing, displacement = with_further_tones(measurements, fit, row_starts(num_frames))
+    assert share_within(fit) < 0.75
+    assert share_within(allowing) > 0.88
+    own = displacement_std(fit, row_starts(num_frames), TIMING.exposure_time)
+    assert bool((displacement[:, 0] >= own[:, 0]).all())
+    assert float((displacement / own)[:, 0].median()) > 1.1
+    torch.testing.assert_close(allowing.coefficients, fit.coefficients)
+
+
+def test_a_known_number_of_tones_leaves_smooth_errors_only():
+    generator = np.random.default_rng(5)
+    truth = mean_sine([2.0], [37.0], [0.4], starts_of(TIMING, 3), TIMING.exposure_time)
+    measurements = measured(truth, TIMING, generator)
+    fit = fitted(measurements, [37.0])
+    known, _ = with_further_tones(measurements, fit, row_starts(3), number_is_known=True)
+    free, _ = with_further_tones(measurements, fit, row_starts(3))
+    std = [float(vibration_of_fit(found)[1].amplitude[0, 0, 0]) for found in (fit, known, free)]
+    assert std[0] < std[1] < 2 * std[0]
+    assert std[2] > 3 * std[1]
+
+
+def test_stacks_of_a_batch_do_not_affect_each_other():
+    generator = np.random.default_rng(6)
+    frequency = np.array([33.0, 150.0])
+    truth = mean_sine([1.0, 0.2], frequency, [0.3, 2.0], starts_of(TIMING, 3), TIMING.exposure_time)
+    measurements = measured(truth, TIMING, generator)
+    fit = fitted(measurements, frequency)
+    together, displacement = with_further_tones(measurements, fit, row_starts(3))
+    for index in range(2):
+        own = measured(np.zeros((1, ROWS, 3)), TIMING)
+        own = replace(own, displacements=measurements.displacements[index : index + 1])
+        alone, own_displacement = with_further_tones(own, fitted(own, frequency[index : index + 1]), row_starts(3))
+        torch.testing.assert_close(alone.covariance[0], together.covariance[index], rtol=1e-6, atol=1e-12)
+        torch.testing.assert_close(own_displacement[0], displacement[index], rtol=1e-6, atol=0)
+
+
+def test_exact_displacements_have_finite_standard_deviations():
+    truth = mean_sine([2.0], [37.0], [0.4], starts_of(TIMING, 2), TIMING.exposure_time)
+    measurements = measured(truth, TIMING)
+    allowing, displacement = with_further_tones(measurements, fitted(measurements, [37.0]), row_starts(2))
+    assert bool(torch.isfinite(allowing.covariance).all())
+    assert 0 < float(displacement[0, 0]) < 0.01
+
+
+@pytest.mark.parametrize("frequency", [17.0, 31.0, 55.0])
+def test_sensitivity_of_one_tone_in_two_frames(frequency):
+    """A sin(pi f T) is what two frames determine, so that d ln A / d ln T = -pi f T cot(pi f T)."""
+    truth = mean_sine([2.0], [frequency], [0.4], starts_of(TIMING, 2), TIMING.exposure_time)
+    fit = fitted(measured(truth, TIMING), [frequency])
+    found = timing_sensitivity(fit, TIMING, 2, ROWS)
+    angle = math.pi * frequency * TIMING.frame_period
+    assert float(found.amplitude_by_frame_rows[0, 0, 0]) == pytest.approx(-angle / math.tan(angle), rel=1e-3)
+    assert float(found.frequency_by_frame_rows[0, 0, 0]) == pytest.approx(0.0, abs=1e-6)
+    assert float(found.frequency_by_row_time[0, 0, 0]) == pytest.approx(-1.0, rel=1e-5)
+    assert float(found.amplitude_by_row_time[0, 0, 0]) == pytest.approx(0.0, abs=1e-5)
+    x = math.pi * frequency * TIMING.exposure_time  # A sinc(f T_e) is what the rows determine
+    assert float(found.amplitude_by_exposure_rows[0, 0, 0]) == pytest.approx(1 - x / math.tan(x), rel=1e-3)
+    for values in vars(found).values():
+        assert values.shape == (1, 2, 1)
+        assert float(values[0, 1, 0]) == 0.0  # no tone along y
+
+
+@pytest.mark.parametrize("name", ["row_time", "frame_rows", "exposure_rows"])
+@pytest.mark.parametrize("times", [None, (0.0, 1 / 24, 3 / 24, 4 / 24)])
+def test_sensitivity_agrees_with_fits_of_other_timings(name, times):
+    """The same displacements are fitted with a timing that is 0.05 % larger or smaller."""
+    timing = replace(TIMING, frame_start_times=times)
+    starts = timing.row_starts(4, ROWS).numpy().T
+    truth = mean_sine([2.0], [37.0], [0.4], starts, timing.exposure_time)
+    logs = []
+    for factor in (0.9995, 1.0005):
+        other = replace(timing, **{name: factor * getattr(timing, name)})
+        measurements = measured(truth, other)
+        own_starts = torch.from_numpy(other.row_starts(4, ROWS).numpy().T[None].copy())
+        fit = fitted(replace(measurements, exposure_starts=own_starts), [37.0])
+        logs.append([math.log(float(fit.amplitude[0, 0, 0])), math.log(float(fit.frequencies[0, 0, 0]))])
+    change = (np.array(logs[1]) - np.array(logs[0])) / 0.001
+    exact = measured(truth, timing)
+    fit = fitted(replace(exact, exposure_starts=torch.from_numpy(starts[None].copy())), [37.0])
+    found = timing_sensitivity(fit, timing, 4, ROWS)
+    for of, expected in zip(("amplitude", "frequency"), change, strict=True):
+        assert float(getattr(found, f"{of}_by_{name}")[0, 0, 0]) == pytest.approx(expected, rel=0.03, abs=2e-3)
+
+
+def test_assumptions_state_what_the_frames_cannot_contradict():
+    truth = mean_sine([2.0], [55.0], [0.4], starts_of(TIMING, 2), TIMING.exposure_time)
+    fit = fitted(measured(truth, TIMING), [55.0])
+    vibration = vibration_of_fit(fit)[0][0]
+    sensitivity = timing_sensitivity(fit, TIMING, 2, ROWS)[0]
+    two = assumptions(vibration, sensitivity, TIMING, 2)
+    assert any("row_time" in text and "inversely proportional" in text for text in two)
+    assert any("two frames cannot contradict" in text for text in two)
+    effect = next(text for text in two if text.startswith("frame_rows=110:"))
+    assert "x amplitude -5.5 %, frequency +0.0 %" in effect.replace("-0.0", "+0.0")
+    four = assumptions(vibration, sensitivity, replace(TIMING, frame_start_times=(0.0, 0.05, 0.1, 0.15)), 4)
+    assert not any("row_time" in text or "two frames" in text for text in four)
+    still = vibration_of_fit(fitted(measured(0 * truth, TIMING, np.random.default_rng(0)), [55.0]))[0][0]
+    assert assumptions(replace(still, amplitude=0 * still.amplitude), sensitivity, TIMING, 2) == ()
