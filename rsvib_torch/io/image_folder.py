@@ -58,11 +58,6 @@ def _read_frame(file: Path) -> NDArray[Any]:
         reader.close()
 
 
-def _describe(info: StackInfo) -> str:
-    scale = "" if info.full_scale is None else f" with full scale {info.full_scale:g}"
-    return f"{info.shape[1:]} {info.dtype}{scale}"
-
-
 class _ImagesReader(FrameReader):
     """Frames of files that are decoded on access."""
 
@@ -79,8 +74,7 @@ class _ImagesReader(FrameReader):
             first = first or (info, file)
             if replace(info, resolution=None) != replace(first[0], resolution=None):
                 raise ValueError(
-                    f"frames of different size or kind: {first[1].name} is {_describe(first[0])}, "
-                    f"{file.name} is {_describe(info)}"
+                    f"frames of different size or kind: {first[1].name} is {first[0].kind}, {file.name} is {info.kind}"
                 )
         if first is None or len(self._damaged) > len(self._files) // 2:
             raise next(iter(self._damaged.values()))

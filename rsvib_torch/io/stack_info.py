@@ -69,6 +69,12 @@ class StackInfo:
         return tuple(self.shape[self.axes.index(axis)] for axis in self.stored_axes)
 
     @property
+    def kind(self) -> str:
+        """Shape of a frame, data type and full scale, for messages."""
+        scale = "" if self.full_scale is None else f" with full scale {self.full_scale:g}"
+        return f"{self.shape[1:]} {self.dtype}{scale}"
+
+    @property
     def is_integer(self) -> bool:
         """Whether the pixels are counts."""
         return "int" in self.dtype
