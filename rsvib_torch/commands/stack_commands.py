@@ -54,6 +54,7 @@ from rsvib_torch.io import (
 )
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.schema import TimingRecord, check_same_timing
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.report.html import Box, Report, write_report_page
 from rsvib_torch.report.plots import comparison_figure, offset_figure, save_figure
@@ -78,7 +79,7 @@ from rsvib_torch.stacks import (
 )
 from rsvib_torch.stacks.job import RestoreOptions
 
-__all__ = ["Stack", "detect", "load", "report", "restore_frames", "run", "save", "simulate"]
+__all__ = ["Stack", "detect", "load", "report", "restore_and_save", "restore_frames", "run", "simulate"]
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def load(path: Path, config: Config, full_scale: float | None, device: DeviceNam
     return Stack(frames.to(target), info, scale, timing)
 
 
-def save(path: Path, frames: Tensor, stack: Stack) -> None:
+def _save(path: Path, frames: Tensor, stack: Stack) -> None:
     """Write frames with the data type, full scale and metadata of a stack."""
     with working(f"writing {path.name}"):
         write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
@@ -122,11 +123,22 @@ def _detect(stack: Stack, config: Config) -> DetectionResult:
     return result
 
 
-def _restore(stack: Stack, detected: Detected, options: dict[str, Any], force: bool) -> RestoredFrames:
+def _restore(stack: Stack, motion: Motion | Detected, options: dict[str, Any], force: bool) -> RestoredFrames:
     """Restore frames, judge the result on eight pairs of frames, and print the verdict."""
     with working("restoring the frames and judging the result"):
-        result = restore_trusted(stack.frames, stack.timing, detected, options, force=force, most_pairs=8)
+        result = restore_trusted(stack.frames, stack.timing, motion, options, force=force, most_pairs=8)
     print_restoration(result)
+    return result
+
+
+def restore_and_save(
+    path: Path, stack: Stack, motion: Motion | Detected, options: dict[str, Any], force: bool
+) -> RestoredFrames:
+    """Restore frames, print the verdict, and write them; the input unchanged if it is no worse, unless ``force``."""
+    result = _restore(stack, motion, options, force)
+    _save(path, result.frames, stack)
+    state = "restored" if result.restored else "unchanged"
+    print_line(f"{path}: {len(result.frames)} frames {state}, {stack.info.dtype}")
     return result
 
 
@@ -273,17 +285,14 @@ def restore_frames(
         return
     detected = read_vibration(vibration, timing_from_first_frame(settings.timing, read_stack_info(frames)))
     stack = load(frames, settings, full_scale, device)
-    shape = (1, *stack.info.shape[1:]) if joint == "all" else stack.info.shape
+    options = restoration_options(stack.info, stack.full_scale, settings, overrides)
+    shape = (1, *stack.info.shape[1:]) if options.get("joint") is True else stack.info.shape
     check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale)
     if report is not None:
         check_writable(report)
-    options = restoration_options(stack.info, stack.full_scale, settings, overrides)
-    result = _restore(stack, detected, options, force)
-    save(restored, result.frames, stack)
+    result = restore_and_save(restored, stack, detected, options, force)
     if report is not None:
         write_restoration(report, result, options)
-    state = "restored" if result.restored else "unchanged"
-    print_line(f"{restored}: {len(result.frames)} frames {state}, {stack.info.dtype}")
 
 
 def _restore_windows(

@@ -24,7 +24,15 @@ from rsvib_torch.restoration.verdict.judge import RestorationWarning, judge_fram
 from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError, pairs_to_judge
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
-__all__ = ["METHODS", "RestorationMethod", "VibrationRestorer", "method_options", "restore", "restore_prepared"]
+__all__ = [
+    "METHODS",
+    "RestorationMethod",
+    "VibrationRestorer",
+    "method_options",
+    "restore",
+    "restore_prepared",
+    "unchanged_frames",
+]
 
 
 class CommonOptions(TypedDict, total=False):
@@ -231,7 +239,7 @@ def restore(
     for note in left_alone:
         warnings.warn(note, RestorationWarning, stacklevel=4)  # the caller, above two decorators
     if left_alone and not bool(vibration.moving_axes().any()):
-        return prepared.from_row_order(_unchanged(prepared, options.get("joint", False)))
+        return unchanged_frames(prepared, options.get("joint", False))
     restored = restore_prepared(prepared, vibration, method, options)
     if check:
         _warn_if_worse(prepared, restored.detach(), vibration, options.get("joint", False))
@@ -264,13 +272,18 @@ def restore_prepared(
     return chosen.function(images, frame_motion(motion, frames.timing, images.shape[1], images.shape[-2]), **options)
 
 
-def _unchanged(frames: PreparedFrames, joint: bool | int) -> Tensor:
-    """The frames as taken (B, T, C, H, W), NaN at missing pixels; with ``joint=True`` the middle one."""
+def unchanged_frames(frames: PreparedFrames, joint: bool | int) -> Tensor:
+    """The frames as taken, instead of the result of ``restore``: NaN at missing pixels; with ``joint=True`` one frame.
+
+    Args:
+        frames: The frames.
+        joint: As in ``restore_exact``; the middle frame replaces the image of all frames.
+    """
     images = frames.images
     if frames.missing is not None:
         images = images.masked_fill(frames.missing, math.nan)
     middle = images.shape[1] // 2
-    return images[:, middle : middle + 1] if joint is True else images
+    return frames.from_row_order(images[:, middle : middle + 1] if joint is True else images)
 
 
 def _motion_in_row_order(frames: PreparedFrames, vibration: Motion) -> Motion:

@@ -20,11 +20,12 @@ from rsvib_torch.io.full_scale import (
     frames_to_counts,
     known_full_scale,
 )
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError, trusted_vibration
-from rsvib_torch.restoration.restore import restore_prepared
+from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
+from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
 from rsvib_torch.restoration.verdict.judge import judge_prepared
-from rsvib_torch.restoration.verdict.trust import Detected
+from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
 __all__ = ["RestoredFrames", "frame_fault", "restore_block", "restore_trusted"]
 
@@ -51,19 +52,19 @@ class RestoredFrames:
 def restore_trusted(
     frames: Tensor,
     timing: SensorTiming,
-    detected: Detected,
+    motion: Motion | Detected,
     options: Mapping[str, Any],
     *,
     force: bool = False,
     first_frames: int | None = None,
     most_pairs: int | None = None,
 ) -> RestoredFrames:
-    """Restore frames with the reliable part of a detection, and judge whether that helps.
+    """Restore frames with a motion, or the reliable part of a detection, and judge whether that helps.
 
     Args:
         frames: Stack (T, H, W) or (T, C, H, W) whose full scale is 1.
         timing: The sensor.
-        detected: Detection in these frames.
+        motion: The motion in image axes, or a detection in these frames.
         options: Options of ``restore``.
         force: Whether to return restored frames even if they are judged worse than the raw ones.
         first_frames: Number of frames to restore; None for all.
@@ -73,20 +74,21 @@ def restore_trusted(
         Restored frames; the frames as taken if nothing moves, or if restoration makes them worse.
     """
     rows = frames.shape[-1 if timing.scan_axis == -1 else -2]
-    vibration, left_alone = trusted_vibration(detected, timing, len(frames), rows)
+    vibration, left_alone = vibration_to_undo(motion, timing, len(frames), rows)
     frames = frames if first_frames is None else frames[:first_frames]
-    if not bool(vibration.moving_axes().any()):
-        return RestoredFrames(frames, False, left_alone, None, False)
-    chosen = {name: value for name, value in options.items() if name not in ("method", "saturation")}
+    joint = options.get("joint", False)
     prepared = prepare_frames(frames, timing, saturation=options.get("saturation", "auto"))
+    if not bool(vibration.moving_axes().any()):
+        return RestoredFrames(unchanged_frames(prepared, joint), False, left_alone, None, False)
+    chosen = {name: value for name, value in options.items() if name not in ("method", "saturation")}
     restored = restore_prepared(prepared, vibration, options.get("method", "exact"), chosen)
     verdict = None
     with suppress(TooLittleInCommonError):
         if len(frames) > 1:
-            joint = options.get("joint", False)
             verdict = judge_prepared(prepared, restored, vibration, joint=joint, most_pairs=most_pairs)
     keep = verdict is None or verdict.overall != "worse" or force
-    return RestoredFrames(prepared.from_row_order(restored) if keep else frames, keep, left_alone, verdict, True)
+    result = prepared.from_row_order(restored) if keep else unchanged_frames(prepared, joint)
+    return RestoredFrames(result, keep, left_alone, verdict, True)
 
 
 def frame_fault(
