@@ -33,6 +33,7 @@ from rsvib_torch.commands.terminal import (
     error_line,
     print_detection,
     print_line,
+    print_not_kept,
     print_restoration,
     working,
 )
@@ -45,6 +46,7 @@ from rsvib_torch.io import (
     check_stack_target,
     check_writable,
     exposure_times,
+    metadata_not_kept,
     open_stack,
     read_stack,
     read_stack_info,
@@ -111,10 +113,13 @@ def load(path: Path, config: Config, full_scale: float | None, device: DeviceNam
     return Stack(frames.to(target), info, scale, timing)
 
 
-def _save(path: Path, frames: Tensor, stack: Stack) -> None:
-    """Write frames with the data type, full scale and metadata of a stack."""
+def _save(path: Path, frames: Tensor, stack: Stack) -> tuple[str, ...]:
+    """Write frames with the data type, full scale and metadata of a stack; print and return what is not kept."""
     with working(f"writing {path.name}"):
         write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
+    names = metadata_not_kept(stack.info, path, tuple(frames.shape))
+    print_not_kept(path, names)
+    return names
 
 
 def _detect(stack: Stack, config: Config) -> DetectionResult:
@@ -132,14 +137,20 @@ def _restore(stack: Stack, motion: Motion | Detected, options: dict[str, Any], f
 
 
 def restore_and_save(
-    path: Path, stack: Stack, motion: Motion | Detected, options: dict[str, Any], force: bool
-) -> RestoredFrames:
+    path: Path,
+    stack: Stack,
+    motion: Motion | Detected,
+    options: dict[str, Any],
+    force: bool,
+    report: Path | None = None,
+) -> None:
     """Restore frames, print the verdict, and write them; the input unchanged if it is no worse, unless ``force``."""
     result = _restore(stack, motion, options, force)
-    _save(path, result.frames, stack)
+    not_kept = _save(path, result.frames, stack)
+    if report is not None:
+        write_restoration(report, result, options, not_kept)
     state = "restored" if result.restored else "unchanged"
     print_line(f"{path}: {len(result.frames)} frames {state}, {stack.info.dtype}")
-    return result
 
 
 def _write_detection(folder: Path, result: DetectionResult, timing: SensorTiming) -> list[str]:
@@ -290,9 +301,7 @@ def restore_frames(
     check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale)
     if report is not None:
         check_writable(report)
-    result = restore_and_save(restored, stack, detected, options, force)
-    if report is not None:
-        write_restoration(report, result, options)
+    restore_and_save(restored, stack, detected, options, force, report)
 
 
 def _restore_windows(
@@ -330,6 +339,7 @@ def _restore_windows(
             device=str(torch_device(device)),
             progress=progress,
         )
+    print_not_kept(restored, result.not_kept)
     print_line(f"{restored}: {result.frames} frames in {result.windows} windows, {result.restored} windows restored")
 
 
@@ -418,7 +428,7 @@ def run(
         if result.windows == 1:
             assert isinstance(first.detection, DetectionResult)
             assert first.restoration is not None
-            write_restoration(folder / "restoration.json", first.restoration, options)
+            write_restoration(folder / "restoration.json", first.restoration, options, result.not_kept)
             timing = timing_from_first_frame(settings.timing, info)
             names += ["restoration.json", *_write_detection(folder, first.detection, timing)]
         else:
@@ -441,6 +451,7 @@ def run(
         _warn_of_failures(result.failed)
     if result.bad_frames:
         error_line(f"{result.bad_frames} frames could not be used: see manifest.json", "warning")
+    print_not_kept(out / output, result.not_kept)
     print_line(f"{out}: {', '.join(names)}")
 
 

@@ -30,6 +30,7 @@ __all__ = [
     "check_info_target",
     "check_stack_target",
     "load_frames",
+    "metadata_not_kept",
     "open_stack",
     "read_stack",
     "read_stack_info",
@@ -238,6 +239,37 @@ def check_stack_target(
     return None if kind.kind == "f" else required_full_scale(full_scale, kind, path)
 
 
+def metadata_not_kept(
+    like: StackInfo, path: PathLike, shape: tuple[int, ...], *, dtype: str | None = None
+) -> tuple[str, ...]:
+    """What a file states about its frames and the file with the restored frames will not state.
+
+    Args:
+        like: The stack that is restored.
+        path: The stack to write.
+        shape: Its shape, (T, H, W) or (T, C, H, W).
+        dtype: Its data type; None for the same.
+
+    Returns:
+        Names of tags, ``"full scale"``, ``"resolution"`` and ``"frame times"``.
+
+    Example:
+        >>> info = StackInfo((8, 1024, 1024), "uint16", 4095.0, resolution=(300.0, 300.0, "inch"))
+        >>> metadata_not_kept(info, "restored.npy", (8, 1024, 1024))
+        ('full scale', 'resolution')
+        >>> metadata_not_kept(info, "restored.tif", (8, 1024, 1024))
+        ()
+    """
+    keeps = target_format(Path(path)).keeps
+    stated = like.full_scale not in (None, known_full_scale(np.dtype(like.dtype)))
+    timed = like.frame_times is not None and not like.times_of_playback
+    lost = [name for name, tag in like.metadata_for(shape, dtype).items() if tag is None or "metadata" not in keeps]
+    lost += ["full scale"] * (stated and "full_scale" not in keeps)
+    lost += ["resolution"] * (like.resolution is not None and "resolution" not in keeps)
+    lost += ["frame times"] * (timed and not ("frame_times" in keeps and shape[0] == like.shape[0]))
+    return tuple(lost)
+
+
 def write_frames(
     form: StackFormat, path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None
 ) -> None:
@@ -289,8 +321,9 @@ def write_stack(
         full_scale: Count that corresponds to 1.0; 255 for ``"uint8"`` if not given, required for other integers. Floats
             keep their values.
         compression: ``"zlib"`` or ``"lzma"`` for TIFF files; None for no compression.
-        like: The stack from which the frames were computed: its resolution, channel order and, if the number of frames
-            is the same, frame times are stored if the format supports them.
+        like: The stack from which the frames were computed: its resolution, channel order, metadata and, if the number
+            of frames is the same, frame times are stored if the format supports them; ``metadata_not_kept`` lists those
+            that are not.
 
     Raises:
         OSError: If the file cannot be written.
@@ -311,7 +344,14 @@ def write_stack(
     info = StackInfo(tuple(pixels.shape), pixels.dtype.name, full_scale)
     if like is not None:
         times = None if like.times_of_playback else like.with_frames(len(pixels)).frame_times
-        info = replace(info, frame_times=times, resolution=like.resolution, channels_last=like.channels_last)
+        metadata = like.metadata_for(info.shape, info.dtype)
+        info = replace(
+            info,
+            frame_times=times,
+            resolution=like.resolution,
+            channels_last=like.channels_last,
+            metadata=metadata,
+        )
     form = check_info_target(path, info, compression)
     with temporary_folder(path) as folder:
         part = folder / path.name

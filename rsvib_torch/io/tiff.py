@@ -1,10 +1,9 @@
 """Stacks in TIFF and BigTIFF files, also compressed."""
 
-import json
 import math
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
 from rsvib_torch.io.formats import FrameReader, StackFormat
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_frame, readable_stack
+from rsvib_torch.io.tiff_metadata import json_description, read_metadata, writer_options
 
 __all__ = ["FORMAT", "open_tiff", "write_tiff"]
 
@@ -137,15 +137,6 @@ def _resolution(tif: Any) -> tuple[float, float, str] | None:
     return (x / per_x, y / per_y, unit) if min(x, per_x, y, per_y) > 0 else None
 
 
-def _json_description(tif: Any) -> dict[str, Any]:
-    """The JSON description that tifffile writes into the first page; empty if there is none."""
-    try:
-        metadata = json.loads(tif.pages.first.shaped_description or "{}")
-    except ValueError:
-        return {}
-    return metadata if isinstance(metadata, dict) else {}
-
-
 def _info(
     tif: Any, shape: tuple[int, ...], dtype: np.dtype[Any], photometric: Any, *, channels_last: bool
 ) -> StackInfo:
@@ -157,7 +148,7 @@ def _info(
     if photometric not in _PHOTOMETRIC:
         raise ValueError(f"pixels are {_name(photometric)}; expected grey (black is 0) or RGB")
     check_dtype(dtype)
-    metadata = _json_description(tif)
+    metadata = json_description(tif)
     bits = tif.pages.first.bitspersample
     full_scale = None
     if "full_scale" in metadata:
@@ -167,7 +158,7 @@ def _info(
     frame_times = metadata.get("frame_times")
     if frame_times is not None and len(frame_times) != shape[0]:
         frame_times = None  # those of the first of several arrays
-    return StackInfo(
+    info = StackInfo(
         shape,
         dtype.name,
         known_full_scale(dtype, full_scale),
@@ -175,6 +166,7 @@ def _info(
         _resolution(tif),
         channels_last=channels_last,
     )
+    return replace(info, metadata=read_metadata(tif, info))
 
 
 def _series_info(tif: Any, series: Any) -> tuple[StackInfo, tuple[int, ...]]:
@@ -258,7 +250,9 @@ class _PageReader:
         self._path, self._tif, self._numbers = path, tif, [page.number for page in pages]
         self._complete = _complete_pages([page.extent for page in pages], size)
         last = tif.pages[first.number].axes == "YXS"
-        self.info = _info(tif, (len(pages), *first.shape), first.dtype, first.photometric, channels_last=last)
+        info = _info(tif, (len(pages), *first.shape), first.dtype, first.photometric, channels_last=last)
+        lost = {"thumbnails and masks": None} if len(pages) < len(tif.pages) else {}
+        self.info = replace(info, metadata={**info.metadata, **lost})
 
     def frame(self, index: int) -> NDArray[Any]:
         """Pixels of a frame as stored."""
@@ -288,7 +282,7 @@ def _series_of_all_frames(tif: Any) -> Any | None:
     Raises:
         ValueError: If there are several series of another arrangement.
     """
-    metadata = _json_description(tif)
+    metadata = json_description(tif)
     if "shape" in metadata:  # series of pages that were written one by one would take quadratic time
         shape = tuple(metadata["shape"])
         pages = math.prod(shape) // math.prod(tif.pages.first.shape)
@@ -344,14 +338,14 @@ def open_tiff(path: Path) -> FrameReader:
 def _layout(info: StackInfo) -> tuple[StackInfo, dict[str, Any]]:
     """The stack as it is stored, and options of ``tifffile.imwrite``: three or four channels are stored last (RGB)."""
     colour = info.axes == "TCHW" and info.shape[1] in (3, 4)
-    stored = StackInfo(info.shape, info.dtype, info.full_scale, info.frame_times, info.resolution, colour)
+    stored = replace(info, channels_last=colour)
     axes = "TYX" if info.axes == "THW" else "TYXS" if colour else "TSYX" if info.shape[1] > 1 else "TCYX"
-    metadata: dict[str, object] = {"axes": axes}
+    description: dict[str, object] = {"axes": axes}
     if info.full_scale is not None:
-        metadata["full_scale"] = info.full_scale
+        description["full_scale"] = info.full_scale
     if info.frame_times is not None:
-        metadata["frame_times"] = list(info.frame_times)
-    options: dict[str, Any] = {"photometric": "rgb" if colour else "minisblack", "metadata": metadata}
+        description["frame_times"] = list(info.frame_times)
+    options = {"photometric": "rgb" if colour else "minisblack", **writer_options(info, description)}
     if axes == "TSYX":
         options["planarconfig"] = "separate"
     if info.resolution is not None:
@@ -365,7 +359,7 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
     if fresh:
         tifffile.imwrite(path, data=None, **options)
     with tifffile.TiffFile(path) as tif:
-        offset = int(tif.series[0].dataoffset or 0)
+        offset = int(tif.pages.first.dataoffsets[0])
     return ContiguousWriter(path, stored, offset, reserve=fresh)
 
 
@@ -378,4 +372,12 @@ def write_tiff(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], comp
     tifffile.imwrite(path, data=pages, compression=compression, maxworkers=1, **options)
 
 
-FORMAT = StackFormat("tiff", (".tif", ".tiff"), open_tiff, _create, write_tiff, compressions=("zlib", "lzma"))
+FORMAT = StackFormat(
+    "tiff",
+    (".tif", ".tiff"),
+    open_tiff,
+    _create,
+    write_tiff,
+    compressions=("zlib", "lzma"),
+    keeps=("full_scale", "frame_times", "resolution", "metadata"),
+)
