@@ -82,6 +82,20 @@ def test_channels_last_in_calibration_and_files(colour, tmp_path):
     assert torch.equal(rsv.read_stack(tmp_path / "frames.tif"), colour)
 
 
+def test_channels_last_in_blocks_scenes_and_quality(grey, colour):
+    last = colour.permute(0, 2, 3, 1).numpy()
+    with pytest.raises(ValueError, match="appear to have their channels last"):
+        rsv.restore_block(last, TIMING)
+    restored = rsv.restore_block(last, TIMING, channels="last")
+    np.testing.assert_array_equal(np.moveaxis(restored, -1, 1), rsv.restore_block(colour.numpy(), TIMING))
+    assert np.abs(restored - last).max() > 0.1
+    restored = rsv.restore_block(grey.numpy(), TIMING, channels="last")
+    np.testing.assert_array_equal(restored, rsv.restore_block(grey.numpy(), TIMING))
+    with pytest.raises(ValueError, match=r"appears to have its channels last: pass scene.permute\(2, 0, 1\)"):
+        rsv.simulate_frames(torch.rand(320, 240, 3), TIMING, VIBRATION)
+    assert rsv.psnr(list(grey), list(0.9 * grey), 1.0).shape == (3,)
+
+
 @pytest.mark.parametrize("scan_axis", [-2, -1])
 @pytest.mark.parametrize("batch", [False, True])
 def test_channels_last_keeps_masks_and_comes_back(scan_axis, batch):

@@ -55,7 +55,7 @@ def row_profiles(
     images = as_float_frames(frames, full_scale, channels=channels)
     if images.ndim == 5:
         raise ValueError(f"calibration takes one stack, got a batch of shape {tuple(images.shape)}")
-    images = images.mean(channel_axis("frames", images, channels)) if images.ndim == 4 else images
+    images = images.mean(channel_axis("frames", images.shape, channels)) if images.ndim == 4 else images
     images = images.transpose(-2, -1) if scan_axis in (-1, "x") else images
     if images.shape[-2] < 32:
         raise ValueError(f"frames have {images.shape[-2]} rows along the scan; at least 32 are needed")

@@ -400,6 +400,6 @@ class VibrationDetector(nn.Module):
         self.timing = timing
         self.options = options
 
-    def forward(self, frames: Tensor) -> DetectionResult:
+    def forward(self, frames: FramesOrFiles) -> DetectionResult:
         """Detect the vibration in a stack of frames."""
         return detect_vibration(frames, self.timing, **self.options)

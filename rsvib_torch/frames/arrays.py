@@ -81,13 +81,13 @@ def _stacked(name: str, items: Sequence[Tensor]) -> Tensor:
     return torch.stack(list(items))
 
 
-def channel_axis(name: str, frames: Tensor, channels: Channels) -> int:
-    """The axis of the channels, -3 or -1, of frames that have more than three axes.
+def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
+    """The axis of the channels: -1 if they are last, -3 if they come before the image axes or do not exist.
 
     Args:
         name: Name of the argument in error messages.
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W); with ``channels="last"`` (T, H, W),
-            (T, H, W, C) or (B, T, H, W, C).
+        shape: (T, H, W), (T, C, H, W) or (B, T, C, H, W); with ``channels="last"`` (T, H, W), (T, H, W, C) or
+            (B, T, H, W, C).
         channels: Position of the channels; None for ``"first"``, with a check of the shape.
 
     Raises:
@@ -95,15 +95,15 @@ def channel_axis(name: str, frames: Tensor, channels: Channels) -> int:
             more than four pixels along each axis.
 
     Example:
-        >>> channel_axis("frames", torch.zeros(2, 48, 64, 3), "last")
+        >>> channel_axis("frames", (2, 48, 64, 3), "last")
         -1
-        >>> channel_axis("frames", torch.zeros(2, 48, 64, 3), None)
+        >>> channel_axis("frames", (2, 48, 64, 3), None)
         Traceback (most recent call last):
         ...
         ValueError: frames of shape (2, 48, 64, 3) appear to have their channels last: pass channels="last" or...
     """
     check_choice("channels", channels, (None, "first", "last"))
-    shape, most = tuple(frames.shape), 4
+    shape, most = tuple(shape), 4
     appears_last = len(shape) >= 3 and shape[-1] <= most < min(shape[-3:-1])
     appears_first = len(shape) >= 4 and shape[-3] <= most < min(shape[-2:])
     if len(shape) == 3 and appears_last and channels != "first":
@@ -121,4 +121,4 @@ def channel_axis(name: str, frames: Tensor, channels: Channels) -> int:
         raise ValueError(
             f'{name} of shape {shape} appear to have their channels before the image axes: omit channels="last"'
         )
-    return -1 if channels == "last" else -3
+    return -1 if channels == "last" and len(shape) > 3 else -3

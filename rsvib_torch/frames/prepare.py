@@ -115,7 +115,7 @@ def prepare_frames(
     """
     check_timing(timing)
     given = as_tensor(name, frames)
-    axis = channel_axis(name, given, channels)
+    axis = channel_axis(name, given.shape, channels)
     missing = _missing_pixels(given, ignore, allow_missing, axis)
     if missing is not None:
         if bool(missing.all()):
@@ -173,7 +173,7 @@ def as_float_frames(
         raise ValueError(
             f"{name} must have shape (T, H, W), (T, C, H, W) or (B, T, C, H, W), got {tuple(frames.shape)}"
         )
-    channel_axis(name, frames, channels)
+    channel_axis(name, frames.shape, channels)
     count = frames.shape[1 if frames.ndim == 5 else 0]
     if count < minimum_frames:
         raise ValueError(f"at least {minimum_frames} frames are needed, got {count}")

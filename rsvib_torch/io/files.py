@@ -337,7 +337,7 @@ def write_stack(
     frames = as_tensor("frames", frames)
     if not frames.dtype.is_floating_point:
         raise TypeError(f"frames must be a floating-point tensor whose full scale is 1, got {frames.dtype}")
-    axis = channel_axis("frames", frames, channels)
+    axis = channel_axis("frames", frames.shape, channels)
     frames = frames.movedim(axis, -3) if frames.ndim > 3 else frames
     full_scale = check_stack_target(path, tuple(frames.shape), dtype=dtype, full_scale=full_scale)
     pixels = frames_to_counts(frames, np.dtype(dtype or np.float32), full_scale)

@@ -376,6 +376,6 @@ class VibrationRestorer(nn.Module):
         common = {"full_scale": full_scale, "channels": channels, "saturation": saturation, "check": check}
         self.options = {"method": method, **common, **options}
 
-    def forward(self, frames: Tensor, vibration: Motion | Detected, ignore: Tensor | None = None) -> Tensor:
+    def forward(self, frames: FramesOrFiles, vibration: Motion | Detected, ignore: Tensor | None = None) -> Tensor:
         """Restore a stack of frames."""
         return restore(frames, self.timing, vibration, ignore=ignore, **self.options)

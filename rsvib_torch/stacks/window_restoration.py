@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rsvib_torch.detection import detect_vibration
 from rsvib_torch.detection.start import constant_frame
+from rsvib_torch.frames.arrays import Channels, channel_axis
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import (
     beyond_full_scale,
@@ -128,6 +129,7 @@ def restore_block(
     detection: Mapping[str, Any] | None = None,
     restoration: Mapping[str, Any] | None = None,
     full_scale: float | None = None,
+    channels: Channels = None,
     force: bool = False,
     device: str = "cpu",
 ) -> NDArray[Any]:
@@ -142,6 +144,7 @@ def restore_block(
         detection: Options of ``detect_vibration``.
         restoration: Options of ``restore``, for frames whose full scale is 1; not ``joint=True``.
         full_scale: Count that corresponds to 1.0; 255 for ``uint8`` if not given, required for other integers.
+        channels: ``"last"`` for frames (T, H, W, C), as in ``detect_vibration``.
         force: Whether to return restored frames even if they are judged worse than the raw ones.
         device: Device for the computation.
 
@@ -149,7 +152,8 @@ def restore_block(
         Restored frames.
 
     Raises:
-        ValueError: If the timing has frame start times, ``joint=True``, or the full scale is unknown.
+        ValueError: If the timing has frame start times, ``joint=True``, the full scale is unknown, or the frames appear
+            to have their channels last.
 
     Example:
         >>> restored = array.map_overlap(  # doctest: +SKIP
@@ -166,7 +170,8 @@ def restore_block(
         raise ValueError("joint=True makes one image of a block; restore_block keeps its shape")
     check_dtype(frames.dtype)
     scale = known_full_scale(frames.dtype, full_scale)
-    stored = frames.astype(frames.dtype.newbyteorder("="), copy=False)
+    axis = channel_axis("frames", frames.shape, channels)
+    stored = np.moveaxis(frames.astype(frames.dtype.newbyteorder("="), copy=False), axis, -3)
     if len(stored) < 2 or any(frame_fault(frame, index, scale) for index, frame in enumerate(stored)):
         return frames
     floats = counts_to_frames(stored, scale, "frames").to(device)
@@ -175,4 +180,6 @@ def restore_block(
         restored = restore_trusted(floats, timing, detected, options, force=force, most_pairs=2)
     except (ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
         return frames
-    return frames_to_counts(restored.frames, np.dtype(frames.dtype), scale) if restored.restored else frames
+    if not restored.restored:
+        return frames
+    return np.moveaxis(frames_to_counts(restored.frames, np.dtype(frames.dtype), scale), -3, axis)
