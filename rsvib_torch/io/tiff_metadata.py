@@ -94,9 +94,10 @@ def read_metadata(tif: Any, info: StackInfo) -> dict[str, Tag | None]:
             once = None in values[1:]
             found[name] = Tag(tag.code, int(tag.dtype), tag.count, values[0], once, _COPIED[tag.code])
     tags = tif.pages.first.tags
-    scales = [_value(tags.get(code)) for code in (282, 283, 296)]
-    if None not in scales and scales[2] == 1 and scales[:2] != [(1, 1), (1, 1)]:
-        found[_RESOLUTION] = Tag(282, 5, 2, (scales[0], scales[1]), False, "image")
+    x, y, unit = (_value(tags.get(code)) for code in (282, 283, 296))
+    rational = all(isinstance(scale, tuple) and len(scale) == 2 and min(scale) > 0 for scale in (x, y))
+    if rational and unit == 1 and (x, y) != ((1, 1), (1, 1)):
+        found[_RESOLUTION] = Tag(282, 5, 2, (x, y), False, "image")
     same_pages = info.axes == "THW" or (info.channels_last and info.shape[1] in (3, 4))
     return found | _descriptions(tif, others, info.shape[0] if same_pages else -1)
 

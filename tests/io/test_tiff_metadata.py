@@ -244,3 +244,43 @@ def test_omitted_frames_invalidate_descriptions_of_all_frames(tmp_path):
     assert report.not_kept == ("ImageJ metadata",)
     assert read_stack_info(tmp_path / "out.tif").shape[0] == FRAMES - 1
     assert not header(tmp_path / "out.tif", "is_imagej")
+
+
+def test_damaged_metadata_do_not_prevent_reading(tmp_path):
+    """Random bytes in the header and the values of tags: frames are read and written, or refused."""
+    own = {"axes": "TYX", "Labels": [f"frame {i}" for i in range(5)], "Info": "some text"}
+    tifffile.imwrite(tmp_path / "imagej.tif", GREY, imagej=True, resolution=(0.4, 0.2), metadata=own)
+    options = {"photometric": "minisblack", "metadata": None, "description": "orbit 7"}
+    tifffile.imwrite(tmp_path / "tags.tif", GREY, extratags=tags_of(GEOREFERENCE | OTHERS), **options)
+    draw = np.random.default_rng(5)
+    written = 0
+    for name in ("imagej.tif", "tags.tif"):
+        data = (tmp_path / name).read_bytes()
+        for _ in range(60):
+            damaged = bytearray(data)
+            damaged[draw.integers(2000)] = draw.choice([0, 1, 255, draw.integers(256)])
+            (tmp_path / "bad.tif").write_bytes(damaged)
+            try:
+                info = read_stack_info(tmp_path / "bad.tif")
+                frames = read_stack(tmp_path / "bad.tif", full_scale=65535)
+            except ValueError:
+                continue
+            write_stack(tmp_path / "out.tif", frames, like=info)
+            assert read_stack_info(tmp_path / "out.tif").shape == info.shape
+            written += 1
+    assert written > 60
+
+
+def test_resolution_of_zero_denominators_is_ignored(tmp_path):
+    tifffile.imwrite(
+        tmp_path / "a.tif", GREY, photometric="minisblack", resolution=(3, 2), resolutionunit="NONE", metadata=None
+    )
+    assert "resolution" in read_stack_info(tmp_path / "a.tif").metadata
+    with tifffile.TiffFile(tmp_path / "a.tif") as tif:
+        place = tif.pages.first.tags["XResolution"].valueoffset
+    data = bytearray((tmp_path / "a.tif").read_bytes())
+    data[place + 4 : place + 8] = bytes(4)
+    (tmp_path / "a.tif").write_bytes(data)
+    info = read_stack_info(tmp_path / "a.tif")
+    assert "resolution" not in info.metadata
+    write_stack(tmp_path / "b.tif", read_stack(tmp_path / "a.tif", full_scale=4095), like=info)
