@@ -113,7 +113,7 @@ class _SimulationSection(Section):
 
 
 _DetectionSection = options_section(
-    "_DetectionSection", ToneOptions, skip=("full_scale", "ignore", "window", "window_step")
+    "_DetectionSection", ToneOptions, skip=("full_scale", "ignore", "channels", "window", "window_step")
 )
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from rsvib_torch.calibration.flicker import BandFit, Profiles, find_bands, row_profiles
 from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
 from rsvib_torch.core.checks import check_number
+from rsvib_torch.frames.arrays import Channels, FramesLike
 
 __all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_exposure"]
 
@@ -47,7 +48,7 @@ class RowTimeCalibration:
 
 
 def calibrate_row_time(
-    frames: Tensor,
+    frames: FramesLike,
     flicker_frequency: float,
     *,
     frame_rate: float | None = None,
@@ -56,6 +57,7 @@ def calibrate_row_time(
     scan_axis: ScanAxis = -2,
     gamma: float = 1.0,
     full_scale: float | None = None,
+    channels: Channels = None,
 ) -> RowTimeCalibration:
     """Row time from frames of a light that flickers at a known frequency: ``T_row = 1 / (f P)``, bands of P rows.
 
@@ -78,6 +80,7 @@ def calibrate_row_time(
         gamma: Pixels are raised to this power to make them proportional to light (about 2.2 for photographs). The
             row time does not depend on it, the exposure does.
         full_scale: Count that means 1.0, for integers other than 8 bit.
+        channels: As in ``detect_vibration``.
 
     Returns:
         Row time with its standard deviation, and the other values that the arguments determine.
@@ -108,7 +111,7 @@ def calibrate_row_time(
         check_number("light_contrast", light_contrast, above=0.0, at_most=2.0)
     if on_fraction is not None and light_contrast is not None:
         raise ValueError("pass on_fraction for an on-off light, or light_contrast for a sinusoidal one, not both")
-    profiles = row_profiles(frames, scan_axis, full_scale, gamma)
+    profiles = row_profiles(frames, scan_axis, full_scale, gamma, channels)
     bands, scene = find_bands(profiles)
     height = profiles.rows.shape[1]
     row_time = 1 / (frequency * bands.period)
@@ -136,12 +139,13 @@ def calibrate_row_time(
 
 
 def calibrate_row_time_by_exposure(
-    frames: Tensor,
+    frames: FramesLike,
     exposure_times: Sequence[float],
     *,
     scan_axis: ScanAxis = -2,
     gamma: float = 1.0,
     full_scale: float | None = None,
+    channels: Channels = None,
 ) -> RowTimeCalibration:
     """Row time from frames of a strobe of unknown frequency taken with different known exposures.
 
@@ -155,6 +159,7 @@ def calibrate_row_time_by_exposure(
         scan_axis: As in ``calibrate_row_time``.
         gamma: As in ``calibrate_row_time``; it matters here.
         full_scale: Count that means 1.0, for integers other than 8 bit.
+        channels: As in ``detect_vibration``.
 
     Returns:
         Row time with its standard deviation, and the frequency of the strobe.
@@ -164,7 +169,7 @@ def calibrate_row_time_by_exposure(
         ValueError: If there are no bands, exposures do not fit the frames or are all the same.
     """
     exposures = [check_number("exposure_times", value, above=0.0, at_most=10.0) for value in exposure_times]
-    profiles = row_profiles(frames, scan_axis, full_scale, gamma)
+    profiles = row_profiles(frames, scan_axis, full_scale, gamma, channels)
     if len(exposures) != len(profiles.rows):
         raise ValueError(f"{len(exposures)} exposure times do not fit {len(profiles.rows)} frames; one a frame")
     if max(exposures) < 1.05 * min(exposures):

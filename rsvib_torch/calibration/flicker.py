@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice, check_number
+from rsvib_torch.frames.arrays import Channels, FramesLike, channel_axis
 from rsvib_torch.frames.prepare import as_float_frames
 
 __all__ = ["BandFit", "Profiles", "SceneModel", "find_bands", "row_profiles"]
@@ -34,7 +35,9 @@ class Profiles:
     clipped: float
 
 
-def row_profiles(frames: Tensor, scan_axis: int | str, full_scale: float | None, gamma: float) -> Profiles:
+def row_profiles(
+    frames: FramesLike, scan_axis: int | str, full_scale: float | None, gamma: float, channels: Channels = None
+) -> Profiles:
     """Mean brightness of the rows of a stack (T, H, W) or (T, C, H, W).
 
     Args:
@@ -42,16 +45,17 @@ def row_profiles(frames: Tensor, scan_axis: int | str, full_scale: float | None,
         scan_axis: The axis along which rows follow each other, as in ``SensorTiming``.
         full_scale: Count that means 1.0, for integers.
         gamma: Pixels are raised to this power to make them proportional to light.
+        channels: As in ``prepare_frames``.
 
     Raises:
         ValueError: If the frames are black, saturated or too small.
     """
     check_choice("scan_axis", scan_axis, (-2, "y", -1, "x"))
     check_number("gamma", gamma, above=0.0, at_most=4.0)
-    images = as_float_frames(frames, full_scale)
+    images = as_float_frames(frames, full_scale, channels=channels)
     if images.ndim == 5:
         raise ValueError(f"calibration takes one stack, got a batch of shape {tuple(images.shape)}")
-    images = images.mean(1) if images.ndim == 4 else images
+    images = images.mean(channel_axis("frames", images.shape, channels)) if images.ndim == 4 else images
     images = images.transpose(-2, -1) if scan_axis in (-1, "x") else images
     if images.shape[-2] < 32:
         raise ValueError(f"frames have {images.shape[-2]} rows along the scan; at least 32 are needed")

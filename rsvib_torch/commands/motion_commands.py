@@ -19,8 +19,9 @@ from rsvib_torch.commands.options import (
     RestoredArgument,
     ScaleOption,
     full_scale_of,
+    restoration_options,
 )
-from rsvib_torch.commands.stack_commands import load, save
+from rsvib_torch.commands.stack_commands import load, restore_and_save
 from rsvib_torch.commands.terminal import error_line, print_line, working
 from rsvib_torch.config import read_config
 from rsvib_torch.detection import align_motion, check_motion, detect_motion, detect_swept_tone
@@ -29,7 +30,6 @@ from rsvib_torch.motion.recorded import MotionUnit, TimeUnit, read_motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.report.plots import measured_text
-from rsvib_torch.restoration import restore
 
 __all__ = ["calibrate", "known", "motion"]
 
@@ -143,14 +143,20 @@ def known(
         bool, typer.Option("--fit-gain", help="Estimate the focal length from the frames as well.")
     ] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Restore even if the recording does not explain the motion of the frames.")
+        bool,
+        typer.Option(
+            "--force",
+            help="Restore even if the recording does not explain the motion of the frames, or the restored frames are "
+            "judged no better than the input.",
+        ),
     ] = False,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
 ) -> None:
     """Restore frames with a motion that was recorded by a gyroscope or attitude sensor.
 
-    The recording is compared with the offsets of rows between the frames, and refused if it does not explain them.
+    The recording is compared with the offsets of rows between the frames, and refused if it does not explain them. If
+    the restored frames are judged no better than the input, the input is written unchanged, unless --force is given.
     """
     settings = read_config(config)
     recorded = read_motion(
@@ -162,7 +168,9 @@ def known(
     )
     info = read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
-    check_stack_target(restored, info.shape, dtype=info.dtype, full_scale=scale)
+    options = restoration_options(info, scale, settings)
+    shape = (1, *info.shape[1:]) if options.get("joint") is True else info.shape
+    check_stack_target(restored, shape, dtype=info.dtype, full_scale=scale)
     stack = load(frames, settings, full_scale, device)
     if offset is None:
         with working("aligning the recording with the frames"):
@@ -184,10 +192,7 @@ def known(
                 f"{offset + first:.6g} to {offset + last:.6g} s"
             )
     _check_motion(motion, stack.frames, stack.timing, placed, force, required=offset is None)
-    with working("restoring the frames"):
-        result = restore(stack.frames, stack.timing, placed, **settings.restoration)
-    save(restored, result, stack)
-    print_line(f"{restored}: {len(result)} frames restored, {info.dtype}")
+    restore_and_save(restored, stack, placed, options, force)
 
 
 def _refuse(path: Path, reasons: tuple[str, ...], force: bool) -> None:

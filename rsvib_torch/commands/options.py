@@ -103,6 +103,9 @@ class Overrides:
     saturation: float | None
 
 
+NO_OVERRIDES = Overrides(None, None, None, None)
+
+
 def torch_device(name: DeviceName) -> torch.device:
     """Device of that name.
 
@@ -133,7 +136,7 @@ def full_scale_of(path: Path, info: StackInfo, config: Config, option: float | N
 
 
 def restoration_options(
-    info: StackInfo, full_scale: float | None, config: Config, overrides: Overrides
+    info: StackInfo, full_scale: float | None, config: Config, overrides: Overrides = NO_OVERRIDES
 ) -> dict[str, Any]:
     """Options of ``restore``: those of the configuration file, overridden by those of the command line.
 

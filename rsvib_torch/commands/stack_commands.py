@@ -33,6 +33,7 @@ from rsvib_torch.commands.terminal import (
     error_line,
     print_detection,
     print_line,
+    print_not_kept,
     print_restoration,
     working,
 )
@@ -45,6 +46,7 @@ from rsvib_torch.io import (
     check_stack_target,
     check_writable,
     exposure_times,
+    metadata_not_kept,
     open_stack,
     read_stack,
     read_stack_info,
@@ -54,6 +56,7 @@ from rsvib_torch.io import (
 )
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.schema import TimingRecord, check_same_timing
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.report.html import Box, Report, write_report_page
 from rsvib_torch.report.plots import comparison_figure, offset_figure, save_figure
@@ -78,7 +81,7 @@ from rsvib_torch.stacks import (
 )
 from rsvib_torch.stacks.job import RestoreOptions
 
-__all__ = ["Stack", "detect", "load", "report", "restore_frames", "run", "save", "simulate"]
+__all__ = ["Stack", "detect", "load", "report", "restore_and_save", "restore_frames", "run", "simulate"]
 
 
 @dataclass(frozen=True)
@@ -110,10 +113,13 @@ def load(path: Path, config: Config, full_scale: float | None, device: DeviceNam
     return Stack(frames.to(target), info, scale, timing)
 
 
-def save(path: Path, frames: Tensor, stack: Stack) -> None:
-    """Write frames with the data type, full scale and metadata of a stack."""
+def _save(path: Path, frames: Tensor, stack: Stack) -> tuple[str, ...]:
+    """Write frames with the data type, full scale and metadata of a stack; print and return what is not kept."""
     with working(f"writing {path.name}"):
         write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
+    names = metadata_not_kept(stack.info, path, tuple(frames.shape))
+    print_not_kept(path, names)
+    return names
 
 
 def _detect(stack: Stack, config: Config) -> DetectionResult:
@@ -122,12 +128,29 @@ def _detect(stack: Stack, config: Config) -> DetectionResult:
     return result
 
 
-def _restore(stack: Stack, detected: Detected, options: dict[str, Any], force: bool) -> RestoredFrames:
+def _restore(stack: Stack, motion: Motion | Detected, options: dict[str, Any], force: bool) -> RestoredFrames:
     """Restore frames, judge the result on eight pairs of frames, and print the verdict."""
     with working("restoring the frames and judging the result"):
-        result = restore_trusted(stack.frames, stack.timing, detected, options, force=force, most_pairs=8)
+        result = restore_trusted(stack.frames, stack.timing, motion, options, force=force, most_pairs=8)
     print_restoration(result)
     return result
+
+
+def restore_and_save(
+    path: Path,
+    stack: Stack,
+    motion: Motion | Detected,
+    options: dict[str, Any],
+    force: bool,
+    report: Path | None = None,
+) -> None:
+    """Restore frames, print the verdict, and write them; the input unchanged if it is no worse, unless ``force``."""
+    result = _restore(stack, motion, options, force)
+    not_kept = _save(path, result.frames, stack)
+    if report is not None:
+        write_restoration(report, result, options, not_kept)
+    state = "restored" if result.restored else "unchanged"
+    print_line(f"{path}: {len(result.frames)} frames {state}, {stack.info.dtype}")
 
 
 def _write_detection(folder: Path, result: DetectionResult, timing: SensorTiming) -> list[str]:
@@ -273,17 +296,12 @@ def restore_frames(
         return
     detected = read_vibration(vibration, timing_from_first_frame(settings.timing, read_stack_info(frames)))
     stack = load(frames, settings, full_scale, device)
-    shape = (1, *stack.info.shape[1:]) if joint == "all" else stack.info.shape
+    options = restoration_options(stack.info, stack.full_scale, settings, overrides)
+    shape = (1, *stack.info.shape[1:]) if options.get("joint") is True else stack.info.shape
     check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale)
     if report is not None:
         check_writable(report)
-    options = restoration_options(stack.info, stack.full_scale, settings, overrides)
-    result = _restore(stack, detected, options, force)
-    save(restored, result.frames, stack)
-    if report is not None:
-        write_restoration(report, result, options)
-    state = "restored" if result.restored else "unchanged"
-    print_line(f"{restored}: {len(result.frames)} frames {state}, {stack.info.dtype}")
+    restore_and_save(restored, stack, detected, options, force, report)
 
 
 def _restore_windows(
@@ -321,6 +339,7 @@ def _restore_windows(
             device=str(torch_device(device)),
             progress=progress,
         )
+    print_not_kept(restored, result.not_kept)
     print_line(f"{restored}: {result.frames} frames in {result.windows} windows, {result.restored} windows restored")
 
 
@@ -409,7 +428,7 @@ def run(
         if result.windows == 1:
             assert isinstance(first.detection, DetectionResult)
             assert first.restoration is not None
-            write_restoration(folder / "restoration.json", first.restoration, options)
+            write_restoration(folder / "restoration.json", first.restoration, options, result.not_kept)
             timing = timing_from_first_frame(settings.timing, info)
             names += ["restoration.json", *_write_detection(folder, first.detection, timing)]
         else:
@@ -432,6 +451,7 @@ def run(
         _warn_of_failures(result.failed)
     if result.bad_frames:
         error_line(f"{result.bad_frames} frames could not be used: see manifest.json", "warning")
+    print_not_kept(out / output, result.not_kept)
     print_line(f"{out}: {', '.join(names)}")
 
 

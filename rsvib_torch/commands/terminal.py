@@ -2,8 +2,9 @@
 
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich import box
@@ -31,6 +32,7 @@ __all__ = [
     "error_line",
     "print_detection",
     "print_line",
+    "print_not_kept",
     "print_restoration",
     "warnings_in_one_line",
     "working",
@@ -40,6 +42,12 @@ __all__ = [
 def print_line(message: str) -> None:
     """Print one line to standard output; long lines are not wrapped, and brackets are not markup."""
     Console(highlight=False).print(Text(message), soft_wrap=True)
+
+
+def print_not_kept(path: Path, names: Sequence[str]) -> None:
+    """Print which metadata of the input a file does not contain."""
+    if names:
+        print_line(f"{path}: not kept from the input: {', '.join(names)}")
 
 
 def error_line(message: str, kind: str = "error") -> None:

@@ -32,8 +32,9 @@ from rsvib_torch.detection.tones.fit import (
 )
 from rsvib_torch.detection.tones.further import with_further_tones
 from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
-from rsvib_torch.frames.arrays import ArrayLike
+from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
+from rsvib_torch.io.files import FramesOrFiles
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOptions
@@ -53,6 +54,7 @@ class BandOptions(TypedDict, total=False):
     search: int
     ignore: ArrayLike | None
     full_scale: float | None
+    channels: Channels
 
 
 class ToneOptions(BandOptions, total=False):
@@ -155,21 +157,21 @@ _OTHER_MODELS: dict[str, Callable[..., MotionDetection | SweptTone]] = {
 
 @overload
 def detect_vibration(
-    frames: ArrayLike, timing: SensorTiming, *, model: Literal["tones"] = "tones", **options: Unpack[ToneOptions]
+    frames: FramesOrFiles, timing: SensorTiming, *, model: Literal["tones"] = "tones", **options: Unpack[ToneOptions]
 ) -> DetectionResult: ...
 @overload
 def detect_vibration(
-    frames: ArrayLike, timing: SensorTiming, *, model: Literal["free"], **options: Unpack[BandOptions]
+    frames: FramesOrFiles, timing: SensorTiming, *, model: Literal["free"], **options: Unpack[BandOptions]
 ) -> MotionDetection: ...
 @overload
 def detect_vibration(
-    frames: ArrayLike, timing: SensorTiming, *, model: Literal["swept"], **options: Unpack[BandOptions]
+    frames: FramesOrFiles, timing: SensorTiming, *, model: Literal["swept"], **options: Unpack[BandOptions]
 ) -> SweptTone: ...
 @outside_graphs
 @full_precision
 @torch.no_grad()
 def detect_vibration(
-    frames: ArrayLike,
+    frames: FramesOrFiles,
     timing: SensorTiming,
     *,
     model: VibrationModel = "tones",
@@ -186,6 +188,7 @@ def detect_vibration(
     columns: int | None = None,
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
+    channels: Channels = None,
 ) -> DetectionResult | MotionDetection | SweptTone:
     """Detect the vibration of the camera from consecutive frames (Sec. 2 of Liu et al. 2023).
 
@@ -195,13 +198,14 @@ def detect_vibration(
     every row, and fits again: all frames of a stack together, down to the noise. No gradient flows through the result.
 
     Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, tensor or NumPy array;
-            floating point, or integers of known full scale. NaN marks missing pixels.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, floating point, or
+            integers of known full scale: a tensor, an array, a list of these, or a path or list of paths of files,
+            which are read as by ``read_stack``. NaN marks missing pixels.
         timing: The sensor. Frame start times at unequal intervals (dropped frames) remove blind frequencies.
         model: ``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape; ``"swept"``: one tone per
             axis whose amplitude decays or grows and whose frequency sweeps. The last two take the options from
-            ``registration`` to ``search``, ``ignore`` and ``full_scale``; ``detect_motion`` and ``detect_swept_tone``
-            have further ones.
+            ``registration`` to ``search``, ``ignore``, ``full_scale`` and ``channels``; ``detect_motion`` and
+            ``detect_swept_tone`` have further ones.
         method: ``"direct"``, or ``"bands"`` (the paper's method), in half the time with ten times larger errors.
         registration: Method of the band registration, as in ``register_bands``.
         tones: Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance; the standard deviations
@@ -218,6 +222,8 @@ def detect_vibration(
             vibration, and a quarter of them takes two thirds of the time for half the accuracy. None for all.
         ignore: Bool, broadcastable to (..., H, W) of the frames: True for missing pixels (dead, saturated).
         full_scale: Count that means 1.0, for integer frames.
+        channels: ``"last"`` for frames (T, H, W, C) or (B, T, H, W, C). By default channels come before the image axes,
+            and frames that appear to have them last are refused; ``"first"`` omits this check.
 
     Returns:
         The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve: a
@@ -261,6 +267,7 @@ def detect_vibration(
             search=search,
             ignore=ignore,
             full_scale=full_scale,
+            channels=channels,
         )
     check_choice("method", method, tuple(_METHODS))
     if tones != "auto":
@@ -274,7 +281,7 @@ def detect_vibration(
     options = _FitOptions(
         None if tones == "auto" else tones, MotionModel(harmonics, 2 if image_acceleration else 1), bands
     )
-    stacks = grey_frames(frames, timing, full_scale, ignore)
+    stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     if columns is not None:
         stacks = stacks.narrowed(columns)
     grey, valid_pixels = stacks.images, stacks.valid
@@ -411,6 +418,6 @@ class VibrationDetector(nn.Module):
         self.timing = timing
         self.options = options
 
-    def forward(self, frames: Tensor) -> DetectionResult:
+    def forward(self, frames: FramesOrFiles) -> DetectionResult:
         """Detect the vibration in a stack of frames."""
         return detect_vibration(frames, self.timing, **self.options)

@@ -10,9 +10,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.frames.arrays import ArrayLike
+from rsvib_torch.frames.arrays import Channels
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.io.files import FramesOrFiles, load_frames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
 from rsvib_torch.registration.register import check_frame_size, register_rows
@@ -55,20 +56,23 @@ class GreyFrames:
 
 
 def grey_frames(
-    frames: ArrayLike,
+    frames: FramesOrFiles,
     timing: SensorTiming,
     full_scale: float | None,
     ignore: object,
+    channels: Channels,
     *,
     min_valid_fraction: float = 0.1,
 ) -> GreyFrames:
     """Check stacks of frames and convert them to grey frames in row order.
 
     Args:
-        frames: (T, H, W), (T, C, H, W) or (B, T, C, H, W), tensor or array; NaN marks missing pixels.
+        frames: (T, H, W), (T, C, H, W) or (B, T, C, H, W); tensor, array, list of these, or files; NaN marks missing
+            pixels.
         timing: The sensor.
         full_scale: Count that means 1.0, for integer frames.
         ignore: Bool tensor or array, broadcastable to (..., H, W) of the frames: True for missing pixels.
+        channels: As in ``prepare_frames``.
         min_valid_fraction: Fraction of the pixels of each frame that must not be missing.
 
     Raises:
@@ -76,7 +80,8 @@ def grey_frames(
         ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or
             ``ignore`` does not fit.
     """
-    prepared = prepare_frames(frames, timing, full_scale=full_scale, ignore=ignore, minimum_frames=2)
+    frames, full_scale = load_frames(frames, full_scale)
+    prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, minimum_frames=2)
     images, valid = prepared.filled, None
     if prepared.missing is not None:
         valid = ~prepared.missing.any(2)

@@ -7,12 +7,12 @@ from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
-from rsvib_torch.frames.arrays import ArrayLike, as_tensor
+from rsvib_torch.frames.arrays import FramesLike, as_tensor
 
 __all__ = ["offset_endpoint_error", "psnr", "ssim"]
 
 
-def _compared(image: ArrayLike, reference: ArrayLike, rim: int) -> tuple[Tensor, Tensor]:
+def _compared(image: FramesLike, reference: FramesLike, rim: int) -> tuple[Tensor, Tensor]:
     """Both images without their rim in float32 or float64, as (N, C, H, W), one entry of N an image."""
     image, reference = as_tensor("image", image), as_tensor("reference", reference)
     for name, value in (("image", image), ("reference", reference)):
@@ -44,12 +44,13 @@ def _compared(image: ArrayLike, reference: ArrayLike, rim: int) -> tuple[Tensor,
     return first.reshape(size), second.reshape(size)
 
 
-def _per_image(values: Tensor, image: ArrayLike) -> Tensor:
+def _per_image(values: Tensor, image: FramesLike) -> Tensor:
     """Values (N,) in the leading shape of the images: (), (T,) or (B, T)."""
-    return values.reshape(image.shape[: -3 if image.ndim >= 4 else -2])
+    shape = as_tensor("image", image).shape
+    return values.reshape(shape[: -3 if len(shape) >= 4 else -2])
 
 
-def psnr(image: ArrayLike, reference: ArrayLike, data_range: float, *, rim: int = 0) -> Tensor:
+def psnr(image: FramesLike, reference: FramesLike, data_range: float, *, rim: int = 0) -> Tensor:
     """Peak signal-to-noise ratio of each image.
 
     ``10 log10(data_range^2 / mean (image - reference)^2)`` in dB, the mean over the pixels and channels of one image;
@@ -78,7 +79,7 @@ def psnr(image: ArrayLike, reference: ArrayLike, data_range: float, *, rim: int 
     return _per_image(10.0 * torch.log10(data_range**2 / error), image)
 
 
-def ssim(image: ArrayLike, reference: ArrayLike, data_range: float, *, rim: int = 0) -> Tensor:
+def ssim(image: FramesLike, reference: FramesLike, data_range: float, *, rim: int = 0) -> Tensor:
     """Structural similarity of each image (Wang et al. 2004).
 
     Equal to scikit-image's with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False``: Gaussian window of

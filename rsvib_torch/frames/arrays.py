@@ -1,19 +1,25 @@
-"""Conversion of NumPy arrays of any memory layout and byte order to tensors."""
+"""Conversion of arrays and lists of arrays to tensors, and the axis on which frames have their channels."""
 
-from typing import Any
+import os
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-__all__ = ["ArrayLike", "as_tensor"]
+from rsvib_torch.core.checks import check_choice
+
+__all__ = ["ArrayLike", "Channels", "FramesLike", "as_tensor", "channel_axis"]
 
 ArrayLike = Tensor | NDArray[Any]
+FramesLike = ArrayLike | Sequence[ArrayLike]
+Channels = Literal["first", "last"] | None
 
 
 def as_tensor(name: str, value: object) -> Tensor:
-    """Return a tensor, array or nested list of numbers as a tensor of the same values and dtype.
+    """Return a tensor, array or nested list of numbers as a tensor of the same values and dtype; lists are stacked.
 
     The tensor shares the memory of an array if PyTorch supports its layout. Read-only arrays and arrays with negative
     strides or foreign byte order (FITS and TIFF files) are copied.
@@ -24,21 +30,95 @@ def as_tensor(name: str, value: object) -> Tensor:
 
     Raises:
         TypeError: If the value is a masked array or does not consist of numbers.
+        ValueError: If the tensors or arrays of a list differ in shape, dtype or device.
 
     Example:
         >>> as_tensor("frames", np.arange(3, dtype=">u2")[::-1]).tolist()
         [2, 1, 0]
+        >>> as_tensor("frames", [torch.zeros(4, 5), torch.ones(4, 5)]).shape
+        torch.Size([2, 4, 5])
     """
     if isinstance(value, Tensor):
         return value
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError(f"{name} must not be a masked array; pass its data, and the mask as ignore=")
+    if isinstance(value, (list, tuple)) and any(isinstance(item, (list, tuple)) or _is_array(item) for item in value):
+        return _stacked(name, [as_tensor(f"{name}[{index}]", item) for index, item in enumerate(value)])
     try:
-        if isinstance(value, np.ndarray):
-            native = value if value.dtype.isnative else value.astype(value.dtype.newbyteorder("="))
+        if _is_array(value):
+            array = np.asarray(value)
+            native = array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
             unsupported = any(stride < 0 or stride % native.itemsize for stride in native.strides)
             return torch.from_numpy(native.copy() if unsupported or not native.flags.writeable else native)
         return torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError) as error:
         kind = f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
-        raise TypeError(f"{name} must be a tensor or array of numbers, got {type(value).__name__}{kind}") from error
+        files = isinstance(value, (str, os.PathLike)) or (
+            isinstance(value, (list, tuple)) and any(isinstance(item, (str, os.PathLike)) for item in value)
+        )
+        remedy = "; read files with read_stack" if files else ""
+        raise TypeError(
+            f"{name} must be a tensor or array of numbers, got {type(value).__name__}{kind}{remedy}"
+        ) from error
+
+
+def _is_array(value: object) -> bool:
+    """Whether NumPy can convert the value without interpreting its elements: arrays, data sets of files, images."""
+    return hasattr(value, "__array__") or hasattr(value, "__array_interface__")
+
+
+def _stacked(name: str, items: Sequence[Tensor]) -> Tensor:
+    """The tensors of a list in one tensor."""
+
+    def described(item: Tensor) -> str:
+        return f"{tuple(item.shape)} {str(item.dtype).removeprefix('torch.')} on {item.device}"
+
+    for index, item in enumerate(items):
+        if described(item) != described(items[0]):
+            raise ValueError(
+                f"{name} must be alike, but {name}[{index}] is {described(item)} and {name}[0] is {described(items[0])}"
+            )
+    return torch.stack(list(items))
+
+
+def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
+    """The axis of the channels: -1 if they are last, -3 if they come before the image axes or do not exist.
+
+    Args:
+        name: Name of the argument in error messages.
+        shape: (T, H, W), (T, C, H, W) or (B, T, C, H, W); with ``channels="last"`` (T, H, W), (T, H, W, C) or
+            (B, T, H, W, C).
+        channels: Position of the channels; None for ``"first"``, with a check of the shape.
+
+    Raises:
+        ValueError: If the shape appears to have another position of the channels: up to four of them, in an image of
+            more than four pixels along each axis.
+
+    Example:
+        >>> channel_axis("frames", (2, 48, 64, 3), "last")
+        -1
+        >>> channel_axis("frames", (2, 48, 64, 3), None)
+        Traceback (most recent call last):
+        ...
+        ValueError: frames of shape (2, 48, 64, 3) appear to have their channels last: pass channels="last" or...
+    """
+    check_choice("channels", channels, (None, "first", "last"))
+    shape, most = tuple(shape), 4
+    appears_last = len(shape) >= 3 and shape[-1] <= most < min(shape[-3:-1])
+    appears_first = len(shape) >= 4 and shape[-3] <= most < min(shape[-2:])
+    if len(shape) == 3 and appears_last and channels != "first":
+        raise ValueError(
+            f'{name} of shape {shape} appear to be one image (H, W, C): pass {name}[None] with channels="last", or '
+            f'channels="first" if these are {shape[0]} frames of {shape[1]} x {shape[2]} px'
+        )
+    if appears_last and channels is None:
+        order = (0, 3, 1, 2) if len(shape) == 4 else (0, 1, 4, 2, 3)
+        raise ValueError(
+            f'{name} of shape {shape} appear to have their channels last: pass channels="last" or '
+            f'{name}.permute{order}, or channels="first" if they have {shape[-3]} channels'
+        )
+    if appears_first and channels == "last":
+        raise ValueError(
+            f'{name} of shape {shape} appear to have their channels before the image axes: omit channels="last"'
+        )
+    return -1 if channels == "last" and len(shape) > 3 else -3

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.frames.arrays import ArrayLike, as_tensor
+from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
@@ -35,6 +35,7 @@ class PreparedFrames:
         timing: The sensor in row order.
         image_timing: The sensor as given by the user, in image orientation.
         shape: Shape of the user's frames.
+        channel_axis: Their axis of the channels, -3 or -1, if they have one.
         dtype: Floating-point dtype of results for the user.
     """
 
@@ -44,11 +45,12 @@ class PreparedFrames:
     timing: RowTiming
     image_timing: SensorTiming
     shape: tuple[int, ...]
+    channel_axis: int
     dtype: torch.dtype
 
     @property
     def batched(self) -> bool:
-        """Whether the user gave a batch of stacks (B, T, C, H, W)."""
+        """Whether the user gave a batch of stacks, with five axes."""
         return len(self.shape) == 5
 
     @cached_property
@@ -64,14 +66,15 @@ class PreparedFrames:
         """Images (B, T', C, H', W') in row order with the axes, orientation and dtype of the user's frames."""
         turned = frames_from_row_order(images, self.image_timing)
         turned = turned if self.batched else turned[0]
-        return (turned[:, 0] if len(self.shape) == 3 else turned).to(self.dtype)
+        return (turned[:, 0] if len(self.shape) == 3 else turned.movedim(-3, self.channel_axis)).to(self.dtype)
 
 
 def prepare_frames(
-    frames: ArrayLike,
+    frames: FramesLike,
     timing: SensorTiming,
     *,
     full_scale: float | None = None,
+    channels: Channels = None,
     ignore: object = None,
     saturation: Saturation = None,
     minimum_frames: int = 1,
@@ -81,9 +84,11 @@ def prepare_frames(
     """Check frames and turn them into floating-point images (B, T, C, H, W) in row order, with their masks.
 
     Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation; tensor or array.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation; tensor, array or list of these.
         timing: The sensor.
         full_scale: Count that means 1.0, for integer frames other than uint8.
+        channels: ``"last"`` for frames (T, H, W, C) or (B, T, H, W, C); None for channels before the image axes, with a
+            check of the shape; ``"first"`` without this check.
         ignore: Boolean mask of the frames' shape, or one that broadcasts to that shape without the channel axis: True
             at pixels without data, which may hold any value. None for no mask; NaN marks missing pixels as well.
         saturation: Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for
@@ -110,43 +115,49 @@ def prepare_frames(
     """
     check_timing(timing)
     given = as_tensor(name, frames)
-    missing = _missing_pixels(given, ignore, allow_missing)
+    axis = channel_axis(name, given.shape, channels)
+    missing = _missing_pixels(given, ignore, allow_missing, axis)
     if missing is not None:
         if bool(missing.all()):
             raise ValueError("ignore leaves no pixel: frame 0 has only 0.0% of pixels with data")
         given = given.masked_fill(missing, 0)
-    images = as_float_frames(given, full_scale, minimum_frames=minimum_frames, name=name)
+    images = as_float_frames(given, full_scale, channels=channels, minimum_frames=minimum_frames, name=name)
     saturated = _saturated_pixels(given, saturation, full_scale)
-    dtype = images.dtype
-    images = images if dtype in (torch.float32, torch.float64) else images.to(torch.float32)
+    dtype = given.dtype if given.dtype.is_floating_point else images.dtype
 
     def in_row_order(values: Tensor) -> Tensor:
-        values = values if values.ndim == 5 else values[None]
-        return frames_to_row_order(values if values.ndim == 5 else values[:, :, None], timing)
+        values = values[:, None] if values.ndim == 3 else values.movedim(axis, -3)
+        return frames_to_row_order(values if values.ndim == 5 else values[None], timing)
 
     images = in_row_order(images)
     row_timing = timing.in_row_order()
     row_timing.check_rows(images.shape[-2])
     missing, saturated = (None if mask is None else in_row_order(mask) for mask in (missing, saturated))
-    return PreparedFrames(images, missing, saturated, row_timing, timing, tuple(given.shape), dtype)
+    return PreparedFrames(images, missing, saturated, row_timing, timing, tuple(given.shape), axis, dtype)
 
 
 def as_float_frames(
-    frames: ArrayLike, full_scale: float | None = None, *, minimum_frames: int = 1, name: str = "frames"
+    frames: FramesLike,
+    full_scale: float | None = None,
+    *,
+    channels: Channels = None,
+    minimum_frames: int = 1,
+    name: str = "frames",
 ) -> Tensor:
-    """Check a stack of frames and convert integers to floating point with full scale 1.
+    """Check a stack of frames and convert it to float32 with full scale 1; float64 is kept.
 
-    Floating-point frames keep their values and dtype. 8-bit integers have full scale 255; the full scale of other
-    integers must be given, because a 16-bit file may hold 12-bit counts.
+    Floating-point frames keep their values. 8-bit integers have full scale 255; the full scale of other integers must
+    be given, because a 16-bit file may hold 12-bit counts.
 
     Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W); tensor or array.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W); tensor, array or list of these.
         full_scale: Count that means 1.0, for integer frames.
+        channels: As in ``prepare_frames``.
         minimum_frames: Number of frames that the stack must have.
         name: Name of the argument in error messages.
 
     Returns:
-        Floating-point tensor of the same shape.
+        Tensor of the same shape.
 
     Raises:
         TypeError: If the frames are not a tensor or array of real numbers.
@@ -162,6 +173,7 @@ def as_float_frames(
         raise ValueError(
             f"{name} must have shape (T, H, W), (T, C, H, W) or (B, T, C, H, W), got {tuple(frames.shape)}"
         )
+    channel_axis(name, frames.shape, channels)
     count = frames.shape[1 if frames.ndim == 5 else 0]
     if count < minimum_frames:
         raise ValueError(f"at least {minimum_frames} frames are needed, got {count}")
@@ -173,7 +185,7 @@ def as_float_frames(
         if not bool(torch.isfinite(torch.stack(frames.aminmax())).all()):  # one pass; propagates NaN and infinity
             pixel = tuple((~torch.isfinite(frames)).nonzero()[0].tolist())
             raise ValueError(f"{name} must be finite, but pixel {pixel} is {frames[pixel].item()}")
-        return frames
+        return frames if frames.dtype == torch.float64 else frames.to(torch.float32)
     if full_scale is None:
         if frames.dtype != torch.uint8:
             raise ValueError(
@@ -184,8 +196,8 @@ def as_float_frames(
     return frames.to(torch.float32) / check_number("full_scale", full_scale, above=0.0)
 
 
-def _missing_pixels(frames: Tensor, ignore: object, allow_missing: bool) -> Tensor | None:
-    """Mask of the frames' shape of ignored and NaN pixels; None if there are none."""
+def _missing_pixels(frames: Tensor, ignore: object, allow_missing: bool, axis: int) -> Tensor | None:
+    """Mask of the frames' shape, with channels on ``axis``, of ignored and NaN pixels; None if there are none."""
     missing = None
     if allow_missing and frames.dtype.is_floating_point and bool(torch.isnan(frames.sum())):
         missing = torch.isnan(frames)
@@ -194,7 +206,7 @@ def _missing_pixels(frames: Tensor, ignore: object, allow_missing: bool) -> Tens
         return missing
     mask = as_tensor("ignore", ignore).to(frames.device)
     shape, target = tuple(mask.shape), tuple(frames.shape)
-    planes = target if frames.ndim < 4 else (*target[:-3], *target[-2:])
+    planes = target if frames.ndim < 4 else (*target[:axis], *target[axis:][1:])
     if shape != target:
         try:
             mask = mask.expand(planes)
@@ -203,7 +215,7 @@ def _missing_pixels(frames: Tensor, ignore: object, allow_missing: bool) -> Tens
                 f"ignore {shape} does not fit the frames: ignore must be a boolean mask of shape {target}, or one "
                 f"that broadcasts to {planes}"
             ) from error
-        mask = mask if frames.ndim < 4 else mask.unsqueeze(-3).expand(target)
+        mask = mask if frames.ndim < 4 else mask.unsqueeze(axis).expand(target)
     if mask.dtype != torch.bool:
         raise TypeError(f"ignore must be a bool tensor, got {mask.dtype}")
     return mask if missing is None else mask | missing

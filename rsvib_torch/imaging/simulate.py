@@ -69,6 +69,10 @@ def simulate_frames(
         raise TypeError("scene must be a floating-point tensor whose full scale is 1")
     if scene.ndim not in (2, 3) or not bool(torch.isfinite(scene).all()):
         raise ValueError(f"scene must be a finite (H, W) or (C, H, W) tensor, got shape {tuple(scene.shape)}")
+    if scene.ndim == 3 and scene.shape[-1] <= 4 < min(scene.shape[:2]):
+        raise ValueError(
+            f"scene of shape {tuple(scene.shape)} appears to have its channels last: pass scene.permute(2, 0, 1)"
+        )
     if noise is not None and not isinstance(noise, SensorNoise):
         raise TypeError(f"noise must be a SensorNoise, got {type(noise).__name__}")
     if num_frames < 1:

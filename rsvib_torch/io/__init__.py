@@ -1,7 +1,14 @@
 """Stacks of frames in files: the registry of formats, one module per format, and atomic writes."""
 
 from rsvib_torch.io.atomic import check_writable, whole_file, whole_folder
-from rsvib_torch.io.files import check_stack_target, open_stack, read_stack, read_stack_info, write_stack
+from rsvib_torch.io.files import (
+    check_stack_target,
+    metadata_not_kept,
+    open_stack,
+    read_stack,
+    read_stack_info,
+    write_stack,
+)
 from rsvib_torch.io.formats import FrameReader, FrameWriter, StackFormat, register_format
 from rsvib_torch.io.stack_info import FrameError, StackInfo, exposure_times, timing_from_first_frame
 
@@ -14,6 +21,7 @@ __all__ = [
     "check_stack_target",
     "check_writable",
     "exposure_times",
+    "metadata_not_kept",
     "open_stack",
     "read_stack",
     "read_stack_info",

@@ -1,27 +1,36 @@
 """Reading and writing whole stacks: the file ending selects the format."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice
-from rsvib_torch.frames.arrays import ArrayLike, as_tensor
+from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.io import hdf5, image_folder, npy, raw, tiff, video, zarr_store
 from rsvib_torch.io.atomic import check_writable, move_into_place, temporary_folder
 from rsvib_torch.io.formats import FrameReader, StackFormat, find_format, register_format, target_format
-from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts, known_full_scale, required_full_scale
+from rsvib_torch.io.full_scale import (
+    counts_to_frames,
+    frames_to_counts,
+    full_scale_of_counts,
+    known_full_scale,
+    required_full_scale,
+)
 from rsvib_torch.io.stack_info import StackInfo
 
 __all__ = [
+    "FramesOrFiles",
     "PathLike",
     "check_info_target",
     "check_stack_target",
+    "load_frames",
+    "metadata_not_kept",
     "open_stack",
     "read_stack",
     "read_stack_info",
@@ -30,6 +39,7 @@ __all__ = [
 ]
 
 PathLike = str | os.PathLike[str]
+FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]
 
 for _form in (
     npy.FORMAT,
@@ -92,8 +102,8 @@ def read_stack_info(path: PathLike) -> StackInfo:
     return reader.info
 
 
-def read_stack(path: PathLike, *, full_scale: float | None = None) -> Tensor:
-    """Read a stack of frames from a file.
+def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None = None) -> Tensor:
+    """Read a stack of frames from a file, or from several files one after another.
 
     The ending selects the format: TIFF (``.tif``, ``.tiff``; also BigTIFF and compressed), ``.npy`` with (H, W),
     (T, H, W) or (T, C, H, W), HDF5 (``.h5``, ``.hdf5``), Zarr v3 (``.zarr``), raw frames with a sidecar (``.raw``),
@@ -105,7 +115,7 @@ def read_stack(path: PathLike, *, full_scale: float | None = None) -> Tensor:
     and may be NaN or infinite here.
 
     Args:
-        path: The file or folder.
+        path: The file or folder, or a list of them whose frames have the same shape, data type and full scale.
         full_scale: Count that corresponds to 1.0.
 
     Returns:
@@ -119,15 +129,58 @@ def read_stack(path: PathLike, *, full_scale: float | None = None) -> Tensor:
     Example:
         >>> frames = read_stack("frames.tif", full_scale=4095)  # doctest: +SKIP
     """
-    reader = open_stack(path)
-    try:
-        info = reader.info
-        pixels = np.empty(info.shape, dtype=info.dtype)
-        for index in range(len(pixels)):
-            pixels[index] = reader.frame(index)
-    finally:
-        reader.close()
-    return counts_to_frames(pixels, info.full_scale if full_scale is None else full_scale, str(path))
+    paths = [path] if isinstance(path, (str, os.PathLike)) else list(path)
+    pixels, stated = _read_pixels(paths)
+    return counts_to_frames(pixels, stated if full_scale is None else full_scale, str(paths[0]))
+
+
+def _read_pixels(paths: Sequence[PathLike]) -> tuple[NDArray[Any], float | None]:
+    """Pixels as stored of the frames of all files, (T, H, W) or (T, C, H, W), and the full scale that they state."""
+    if not paths:
+        raise ValueError("path must contain at least one file, got an empty list")
+    parts: list[NDArray[Any]] = []
+    infos: list[StackInfo] = []
+    for path in paths:
+        reader = open_stack(path)
+        try:
+            infos.append(reader.info)
+            first, info = infos[0], infos[-1]
+            if info.kind != first.kind:
+                raise ValueError(f"frames of different size or kind: {paths[0]} is {first.kind}, {path} is {info.kind}")
+            pixels = np.empty(info.shape, dtype=info.dtype)
+            for index in range(len(pixels)):
+                pixels[index] = reader.frame(index)
+        finally:
+            reader.close()
+        parts.append(pixels)
+    return parts[0] if len(parts) == 1 else np.concatenate(parts), infos[0].full_scale
+
+
+def load_frames(frames: FramesOrFiles, full_scale: float | None) -> tuple[FramesLike, float | None]:
+    """Read frames that are given by the paths of their files; other frames are returned unchanged.
+
+    Args:
+        frames: Frames in memory, a path, or a list of paths.
+        full_scale: Count that corresponds to 1.0, as in ``read_stack``.
+
+    Returns:
+        The frames, integers as stored, and their full scale.
+
+    Example:
+        >>> load_frames([[[0.5]]], None)
+        ([[[0.5]]], None)
+    """
+    if isinstance(frames, (str, os.PathLike)):
+        paths: list[PathLike] = [frames]
+    elif isinstance(frames, (list, tuple)) and frames and all(isinstance(item, (str, os.PathLike)) for item in frames):
+        paths = list(frames)
+    else:
+        return cast(FramesLike, frames), full_scale
+    pixels, stated = _read_pixels(paths)
+    full_scale = stated if full_scale is None else full_scale
+    if pixels.dtype.kind == "f":
+        return counts_to_frames(pixels, full_scale, str(paths[0])), None
+    return pixels, full_scale_of_counts(pixels, full_scale, str(paths[0]))
 
 
 def check_info_target(
@@ -186,6 +239,37 @@ def check_stack_target(
     return None if kind.kind == "f" else required_full_scale(full_scale, kind, path)
 
 
+def metadata_not_kept(
+    like: StackInfo, path: PathLike, shape: tuple[int, ...], *, dtype: str | None = None
+) -> tuple[str, ...]:
+    """What a file states about its frames and the file with the restored frames will not state.
+
+    Args:
+        like: The stack that is restored.
+        path: The stack to write.
+        shape: Its shape, (T, H, W) or (T, C, H, W).
+        dtype: Its data type; None for the same.
+
+    Returns:
+        Names of tags, ``"full scale"``, ``"resolution"`` and ``"frame times"``.
+
+    Example:
+        >>> info = StackInfo((8, 1024, 1024), "uint16", 4095.0, resolution=(300.0, 300.0, "inch"))
+        >>> metadata_not_kept(info, "restored.npy", (8, 1024, 1024))
+        ('full scale', 'resolution')
+        >>> metadata_not_kept(info, "restored.tif", (8, 1024, 1024))
+        ()
+    """
+    keeps = target_format(Path(path)).keeps
+    stated = like.full_scale not in (None, known_full_scale(np.dtype(like.dtype)))
+    timed = like.frame_times is not None and not like.times_of_playback
+    lost = [name for name, tag in like.metadata_for(shape, dtype).items() if tag is None or "metadata" not in keeps]
+    lost += ["full scale"] * (stated and "full_scale" not in keeps)
+    lost += ["resolution"] * (like.resolution is not None and "resolution" not in keeps)
+    lost += ["frame times"] * (timed and not ("frame_times" in keeps and shape[0] == like.shape[0]))
+    return tuple(lost)
+
+
 def write_frames(
     form: StackFormat, path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None
 ) -> None:
@@ -213,8 +297,9 @@ def write_frames(
 
 def write_stack(
     path: PathLike,
-    frames: ArrayLike,
+    frames: FramesLike,
     *,
+    channels: Channels = None,
     dtype: str | None = None,
     full_scale: float | None = None,
     compression: str | None = None,
@@ -229,13 +314,16 @@ def write_stack(
 
     Args:
         path: The file or folder to write.
-        frames: (T, H, W) or (T, C, H, W), floating point.
+        frames: (T, H, W) or (T, C, H, W), floating point: a tensor, an array or a list of these.
+        channels: ``"last"`` for frames (T, H, W, C). By default channels come before the image axes, and frames that
+            appear to have them last are refused; ``"first"`` omits this check.
         dtype: NumPy name of the data type in the file, by default ``"float32"``.
         full_scale: Count that corresponds to 1.0; 255 for ``"uint8"`` if not given, required for other integers. Floats
             keep their values.
         compression: ``"zlib"`` or ``"lzma"`` for TIFF files; None for no compression.
-        like: The stack from which the frames were computed: its resolution, channel order and, if the number of frames
-            is the same, frame times are stored if the format supports them.
+        like: The stack from which the frames were computed: its resolution, channel order, metadata and, if the number
+            of frames is the same, frame times are stored if the format supports them; ``metadata_not_kept`` lists those
+            that are not.
 
     Raises:
         OSError: If the file cannot be written.
@@ -249,12 +337,21 @@ def write_stack(
     frames = as_tensor("frames", frames)
     if not frames.dtype.is_floating_point:
         raise TypeError(f"frames must be a floating-point tensor whose full scale is 1, got {frames.dtype}")
+    axis = channel_axis("frames", frames.shape, channels)
+    frames = frames.movedim(axis, -3) if frames.ndim > 3 else frames
     full_scale = check_stack_target(path, tuple(frames.shape), dtype=dtype, full_scale=full_scale)
     pixels = frames_to_counts(frames, np.dtype(dtype or np.float32), full_scale)
     info = StackInfo(tuple(pixels.shape), pixels.dtype.name, full_scale)
     if like is not None:
         times = None if like.times_of_playback else like.with_frames(len(pixels)).frame_times
-        info = replace(info, frame_times=times, resolution=like.resolution, channels_last=like.channels_last)
+        metadata = like.metadata_for(info.shape, info.dtype)
+        info = replace(
+            info,
+            frame_times=times,
+            resolution=like.resolution,
+            channels_last=like.channels_last,
+            metadata=metadata,
+        )
     form = check_info_target(path, info, compression)
     with temporary_folder(path) as folder:
         part = folder / path.name

@@ -79,6 +79,7 @@ class FrameWriter(Protocol):
 # Full scale:  ``info.full_scale`` is the count that corresponds to 1.0, or None if the file does not state it; formats
 #              that have room for it store it (``known_full_scale`` supplies 255 for uint8).
 # Frame times: exposure starts in seconds, or None; presentation times need ``times_of_playback=True``.
+# Metadata:    ``keeps`` states what the format stores besides pixels; users are told what their file loses.
 # Reading:     ``open`` must not allocate memory by sizes in a header before it has compared them with the size of the
 #              file, must not execute code or follow links to other files, and raises an ``OSError`` if the file cannot
 #              be opened, a one-line ``ValueError`` that names the file if it is not a stack (``readable_stack``), and
@@ -105,6 +106,8 @@ class StackFormat:
         marker: File that identifies a folder of any name as a stack of this format.
         companions: Endings of additional files, which are appended to the file name.
         compressions: Values of ``compression`` besides None.
+        keeps: What is stored besides pixels: ``"full_scale"``, ``"frame_times"``, ``"resolution"`` and ``"metadata"``,
+            attributes of ``StackInfo``.
     """
 
     name: str
@@ -120,6 +123,7 @@ class StackFormat:
     marker: str = ""
     companions: tuple[str, ...] = ()
     compressions: tuple[str, ...] = ()
+    keeps: tuple[str, ...] = ()
 
     @property
     def writable(self) -> bool:

@@ -68,6 +68,15 @@ def beyond_full_scale(largest: int, full_scale: float) -> str:
     return f"counts reach {largest}, beyond full_scale={full_scale:g}; pass a full_scale of at least the largest count"
 
 
+def full_scale_of_counts(counts: NDArray[Any], full_scale: float | None, name: str) -> float:
+    """As ``required_full_scale``; a ``ValueError`` as well if counts exceed the full scale."""
+    full_scale = required_full_scale(full_scale, counts.dtype, name)
+    largest = int(counts.max())
+    if largest > full_scale:
+        raise ValueError(f"{name}: {beyond_full_scale(largest, full_scale)}")
+    return full_scale
+
+
 def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str) -> Tensor:
     """Convert pixels as stored to float32 frames; floats keep their values.
 
@@ -81,10 +90,7 @@ def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str) 
     """
     if counts.dtype.kind == "f":
         return torch.from_numpy(np.ascontiguousarray(counts, dtype=np.float32))
-    full_scale = required_full_scale(full_scale, counts.dtype, name)
-    largest = int(counts.max())
-    if largest > full_scale:
-        raise ValueError(f"{name}: {beyond_full_scale(largest, full_scale)}")
+    full_scale = full_scale_of_counts(counts, full_scale, name)
     narrow = counts.dtype.itemsize <= 2  # float32 holds 16-bit counts exactly
     signed = counts.astype(np.int32 if narrow else np.int64)  # torch does not compute with all unsigned types
     return (torch.from_numpy(signed).to(torch.float32 if narrow else torch.float64) / full_scale).to(torch.float32)

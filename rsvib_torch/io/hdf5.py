@@ -99,4 +99,6 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
     return ContiguousWriter(path, info, offset, reserve=fresh)
 
 
-FORMAT = StackFormat("hdf5", (".h5", ".hdf5", ".hdf"), _open, _create)
+FORMAT = StackFormat(
+    "hdf5", (".h5", ".hdf5", ".hdf"), _open, _create, keeps=("full_scale", "frame_times", "resolution")
+)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.io.formats import FrameReader, FrameWriter, StackFormat
 from rsvib_torch.io.png import decode_png, encode_png, png_info
-from rsvib_torch.io.stack_info import FrameError, StackInfo
+from rsvib_torch.io.stack_info import FrameError, StackInfo, Tag
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 
 __all__ = ["FOLDER_FORMAT", "PNG_FORMAT"]
@@ -58,11 +58,6 @@ def _read_frame(file: Path) -> NDArray[Any]:
         reader.close()
 
 
-def _describe(info: StackInfo) -> str:
-    scale = "" if info.full_scale is None else f" with full scale {info.full_scale:g}"
-    return f"{info.shape[1:]} {info.dtype}{scale}"
-
-
 class _ImagesReader(FrameReader):
     """Frames of files that are decoded on access."""
 
@@ -70,21 +65,25 @@ class _ImagesReader(FrameReader):
         self._files = _frame_files(path)
         self._damaged: dict[int, ValueError] = {}
         first: tuple[StackInfo, Path] | None = None
+        metadata: dict[str, Tag | None] = {}
         for index, file in enumerate(self._files):
             try:
                 info = _read_info(file)
             except ValueError as error:
                 self._damaged[index] = error
                 continue
-            first = first or (info, file)
+            if first is None:
+                first, metadata = (info, file), dict(info.metadata)
+            for name in metadata.keys() | info.metadata.keys():
+                if info.metadata.get(name) != metadata.get(name):
+                    metadata[name] = None  # differs between the files
             if replace(info, resolution=None) != replace(first[0], resolution=None):
                 raise ValueError(
-                    f"frames of different size or kind: {first[1].name} is {_describe(first[0])}, "
-                    f"{file.name} is {_describe(info)}"
+                    f"frames of different size or kind: {first[1].name} is {first[0].kind}, {file.name} is {info.kind}"
                 )
         if first is None or len(self._damaged) > len(self._files) // 2:
             raise next(iter(self._damaged.values()))
-        self.info = first[0].with_frames(len(self._files))
+        self.info = replace(first[0], metadata=metadata).with_frames(len(self._files))
 
     def frame(self, index: int) -> NDArray[Any]:
         """Pixels of a frame as stored."""
@@ -115,7 +114,7 @@ class _ImagesWriter(FrameWriter):
 
     def write(self, index: int, frame: NDArray[Any]) -> None:
         """Write the file of a frame."""
-        file, one = self._files[index], replace(self._info, shape=(1, *self._info.shape[1:]), frame_times=None)
+        file, one = self._files[index], replace(self._info.with_frames(1), frame_times=None, metadata={})
         part = file.with_name(f".{file.name}.part{file.suffix}")
         if file.suffix.lower() in _PNG:
             encode_png(part, np.asarray(frame, dtype=self._info.dtype), one)
@@ -153,6 +152,20 @@ def _check_folder(path: Path, info: StackInfo) -> None:
 
 
 PNG_FORMAT = StackFormat(
-    "png", _PNG, _ImagesReader, lambda path, info, _: _ImagesWriter([path], info), dtypes=_PNG_TYPES, check=_check_image
+    "png",
+    _PNG,
+    _ImagesReader,
+    lambda path, info, _: _ImagesWriter([path], info),
+    dtypes=_PNG_TYPES,
+    check=_check_image,
+    keeps=("full_scale", "resolution"),
 )
-FOLDER_FORMAT = StackFormat("image folder", ("",), _ImagesReader, _create_folder, check=_check_folder, kind="folder")
+FOLDER_FORMAT = StackFormat(
+    "image folder",
+    ("",),
+    _ImagesReader,
+    _create_folder,
+    check=_check_folder,
+    kind="folder",
+    keeps=("full_scale", "resolution"),
+)

@@ -67,4 +67,6 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
     return ContiguousWriter(path, info, 0, reserve=fresh)
 
 
-FORMAT = StackFormat("raw", (".raw",), _open, _create, companions=(".json",))
+FORMAT = StackFormat(
+    "raw", (".raw",), _open, _create, companions=(".json",), keeps=("full_scale", "frame_times", "resolution")
+)

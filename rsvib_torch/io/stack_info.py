@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,9 @@ from rsvib_torch.motion.timing import SensorTiming
 
 __all__ = [
     "FrameError",
+    "Scope",
     "StackInfo",
+    "Tag",
     "attributes_of",
     "exposure_times",
     "info_from_attributes",
@@ -27,6 +29,31 @@ __all__ = [
 
 class FrameError(ValueError):
     """One frame of a stack cannot be read; the other frames may be readable."""
+
+
+Scope = Literal["file", "image", "stack"]
+
+
+@dataclass(frozen=True)
+class Tag:
+    """An entry in the header of a TIFF file.
+
+    Attributes:
+        code: Number of the tag.
+        dtype: Number of its data type in TIFF.
+        count: Number of values.
+        value: A number, text, bytes, or a tuple of numbers.
+        first_page: Whether only the first page has it.
+        scope: What it describes: ``"image"``: valid for frames of the same size only (georeferencing); ``"stack"``:
+            for the same number of them in the same data type only; ``"file"``: for any frames.
+    """
+
+    code: int
+    dtype: int
+    count: int
+    value: Any
+    first_page: bool
+    scope: Scope
 
 
 @dataclass(frozen=True)
@@ -43,6 +70,8 @@ class StackInfo:
         channels_last: Whether the file stores the channels of a pixel next to each other.
         times_of_playback: Whether ``frame_times`` are presentation times of a video: rounded, and possibly at another
             rate than the exposures.
+        metadata: Further metadata of a TIFF file by name, which are kept when it is restored to TIFF; None for those
+            that cannot be kept.
     """
 
     shape: tuple[int, ...]
@@ -52,6 +81,7 @@ class StackInfo:
     resolution: tuple[float, float, str] | None = None
     channels_last: bool = field(default=False, compare=False)
     times_of_playback: bool = field(default=False, compare=False)
+    metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def axes(self) -> str:
@@ -69,6 +99,12 @@ class StackInfo:
         return tuple(self.shape[self.axes.index(axis)] for axis in self.stored_axes)
 
     @property
+    def kind(self) -> str:
+        """Shape of a frame, data type and full scale, for messages."""
+        scale = "" if self.full_scale is None else f" with full scale {self.full_scale:g}"
+        return f"{self.shape[1:]} {self.dtype}{scale}"
+
+    @property
     def is_integer(self) -> bool:
         """Whether the pixels are counts."""
         return "int" in self.dtype
@@ -81,7 +117,17 @@ class StackInfo:
     def with_frames(self, count: int) -> "StackInfo":
         """The same kind of stack with ``count`` frames; frame times are kept only if their number is unchanged."""
         times = self.frame_times if count == self.shape[0] else None
-        return replace(self, shape=(count, *self.shape[1:]), frame_times=times)
+        shape = (count, *self.shape[1:])
+        return replace(self, shape=shape, frame_times=times, metadata=self.metadata_for(shape))
+
+    def metadata_for(self, shape: tuple[int, ...], dtype: str | None = None) -> dict[str, Tag | None]:
+        """The metadata of a stack of another shape or data type: None for those that are not valid for it."""
+        invalid: set[Scope] = set()
+        if shape != self.shape or dtype not in (None, self.dtype):
+            invalid.add("stack")
+        if shape[-2:] != self.shape[-2:]:
+            invalid.add("image")
+        return {name: None if tag is None or tag.scope in invalid else tag for name, tag in self.metadata.items()}
 
     def from_stored(self, frame: NDArray[Any]) -> NDArray[Any]:
         """Convert a frame from the axis order and byte order of the file to (H, W) or (C, H, W) in native order."""

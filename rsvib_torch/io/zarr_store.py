@@ -108,4 +108,12 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> _ZarrWriter:
     return _ZarrWriter(array, info)
 
 
-FORMAT = StackFormat("zarr", (".zarr",), _open, _create, kind="tree", marker=_HEADER)
+FORMAT = StackFormat(
+    "zarr",
+    (".zarr",),
+    _open,
+    _create,
+    kind="tree",
+    marker=_HEADER,
+    keeps=("full_scale", "frame_times", "resolution"),
+)

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.chunking import runs
-from rsvib_torch.frames.arrays import ArrayLike
+from rsvib_torch.frames.arrays import Channels, FramesLike
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
@@ -64,7 +64,7 @@ class OffsetCurve:
 
 
 def register_bands(
-    frames: ArrayLike,
+    frames: FramesLike,
     timing: SensorTiming,
     *,
     method: Registration = "ncc",
@@ -72,19 +72,21 @@ def register_bands(
     band_step: int = 16,
     search: int = 16,
     full_scale: float | None = None,
+    channels: Channels = None,
 ) -> OffsetCurve:
     """Measure the offset of every row band between consecutive frames (Sec. 2.2 of Liu et al. 2023).
 
     The whole-frame offset is found first and may be hundreds of px (image motion); the search range counts from it.
 
     Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) with T >= 2, tensor or array.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) with T >= 2; tensor, array or list of these.
         timing: The sensor.
         method: ``"projection"`` (gray projection, the paper), ``"ncc"`` or ``"phase"``.
         band_rows: Rows of a band (the paper's window size).
         band_step: Rows from one band to the next (the paper's window interval).
         search: Search range in px; a peak at its edge counts as failed.
         full_scale: Count that means 1.0, for integer frames.
+        channels: As in ``detect_vibration``.
 
     Returns:
         The offset curve, axes (x, y) of the image, rows in readout order.
@@ -102,7 +104,9 @@ def register_bands(
         [4.0, 0.0]
     """
     options = RegistrationOptions(method, band_rows, band_step, search)
-    prepared = prepare_frames(frames, timing, full_scale=full_scale, minimum_frames=2, allow_missing=False)
+    prepared = prepare_frames(
+        frames, timing, full_scale=full_scale, channels=channels, minimum_frames=2, allow_missing=False
+    )
     batch = register_rows(prepared.images.mean(2), prepared.timing, options)
     curve = batch if prepared.batched else batch[0]
     heights = (curve.heights[1], curve.heights[0]) if timing.scan_axis == -1 else curve.heights

@@ -3,7 +3,7 @@
 import csv
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -157,13 +157,16 @@ def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None
     _write_csv(path, [*head, "frames", "outcome", "bad_frames", "note"], lines)
 
 
-def write_restoration(path: str | os.PathLike[str], result: RestoredFrames, options: dict[str, Any]) -> None:
+def write_restoration(
+    path: str | os.PathLike[str], result: RestoredFrames, options: dict[str, Any], not_kept: Sequence[str] = ()
+) -> None:
     """Write whether frames were restored, with which options, and whether that helped, as JSON.
 
     Args:
         path: The file to write.
         result: Restored frames with their verdict.
         options: Options of ``restore``.
+        not_kept: Metadata of the input that the output does not contain.
 
     Raises:
         OSError: If the file cannot be written.
@@ -177,6 +180,7 @@ def write_restoration(path: str | os.PathLike[str], result: RestoredFrames, opti
         "left_alone": list(result.left_alone),
         "outcome": None if verdict is None else verdict.overall,
         "summary": None if verdict is None else verdict.summary,
+        "not_kept": list(not_kept),
     }
     if verdict is not None:
         pairs = {name: to_json(value) for name, value in vars(verdict).items() if isinstance(value, Tensor)}

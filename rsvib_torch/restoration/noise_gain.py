@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.frames.arrays import Channels
 from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.io.files import FramesOrFiles, load_frames
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.noise.high_pass import estimate_noise
@@ -17,13 +19,14 @@ __all__ = ["predict_noise_gain"]
 
 
 def predict_noise_gain(
-    frames: Tensor,
+    frames: FramesOrFiles,
     timing: SensorTiming,
     vibration: Motion | Detected,
     *,
     method: str = "exact",
     columns: int = 256,
     full_scale: float | None = None,
+    channels: Channels = None,
     **options: Any,
 ) -> Tensor:
     """Ratio of the standard deviation of noise after restoration to that before it.
@@ -39,6 +42,7 @@ def predict_noise_gain(
         method: As in ``restore``.
         columns: Width of the strip across the scan, from the middle of the frames.
         full_scale: As in ``restore``.
+        channels: As in ``restore``.
         **options: Options of the method.
 
     Returns:
@@ -53,7 +57,8 @@ def predict_noise_gain(
     """
     rim = 16  # px at the borders that are excluded
     count = check_whole_number("columns", columns, at_least=4 * rim)
-    prepared = prepare_frames(frames, timing, full_scale=full_scale, allow_missing=False)
+    frames, full_scale = load_frames(frames, full_scale)
+    prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, allow_missing=False)
     first = max(0, (prepared.images.shape[-1] - count) // 2)
     strip = prepared.images[..., first : first + count].to(torch.float64)
     vibration, _ = vibration_to_undo(vibration, timing, strip.shape[1], strip.shape[-2])

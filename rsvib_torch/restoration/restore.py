@@ -10,8 +10,9 @@ from torch import Tensor, nn
 
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.frames.arrays import ArrayLike
+from rsvib_torch.frames.arrays import Channels
 from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
+from rsvib_torch.io.files import FramesOrFiles, load_frames
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.banded import restore_banded
@@ -23,13 +24,22 @@ from rsvib_torch.restoration.verdict.judge import RestorationWarning, judge_fram
 from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError, pairs_to_judge
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
-__all__ = ["METHODS", "RestorationMethod", "VibrationRestorer", "method_options", "restore", "restore_prepared"]
+__all__ = [
+    "METHODS",
+    "RestorationMethod",
+    "VibrationRestorer",
+    "method_options",
+    "restore",
+    "restore_prepared",
+    "unchanged_frames",
+]
 
 
 class CommonOptions(TypedDict, total=False):
     """Options of ``restore`` and ``VibrationRestorer`` for all methods; ``ignore`` is one of ``restore`` only."""
 
     full_scale: float | None
+    channels: Channels
     ignore: Tensor | None
     saturation: Saturation
     check: bool
@@ -135,33 +145,34 @@ def _check_options(method: str, options: Mapping[str, Any]) -> None:
 
 @overload
 def restore(
-    frames: ArrayLike, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[ExactOptions]
+    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[ExactOptions]
 ) -> Tensor: ...
 @overload
 def restore(
-    frames: ArrayLike, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[BandedOptions]
+    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[BandedOptions]
 ) -> Tensor: ...
 @overload
 def restore(
-    frames: ArrayLike, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[DewarpOptions]
+    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[DewarpOptions]
 ) -> Tensor: ...
 @overload
 def restore(
-    frames: ArrayLike, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[RichardsonLucyOptions]
+    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[RichardsonLucyOptions]
 ) -> Tensor: ...
 @overload
 def restore(
-    frames: ArrayLike, timing: SensorTiming, vibration: Motion | Detected, *, method: str, **options: Any
+    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | Detected, *, method: str, **options: Any
 ) -> Tensor: ...
 @outside_graphs
 @full_precision
 def restore(
-    frames: ArrayLike,
+    frames: FramesOrFiles,
     timing: SensorTiming,
     vibration: Motion | Detected,
     *,
     method: str = "exact",
     full_scale: float | None = None,
+    channels: Channels = None,
     ignore: Tensor | None = None,
     saturation: Saturation = "auto",
     check: bool = True,
@@ -178,7 +189,8 @@ def restore(
     and ``"dewarp"`` replace them by local means. These three methods treat saturated pixels as measured.
 
     Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation; tensor or NumPy array.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation: a tensor, an array, a list of
+            these, or a path or list of paths of files, which are read as by ``read_stack``.
         timing: The sensor.
         vibration: The motion in image axes: one for all, or a batch (B,) for a batch of stacks. Or a
             ``DetectionResult``: axes without a reliable vibration are then not corrected, see ``trusted_vibration``.
@@ -187,6 +199,8 @@ def restore(
             slabs (Sec. 3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest; ``"richardson-lucy"``: iterative,
             non-negative, several frames jointly if requested.
         full_scale: Count that means 1.0, for integer frames other than uint8.
+        channels: ``"last"`` for frames (T, H, W, C) or (B, T, H, W, C). By default channels come before the image axes,
+            and frames that appear to have them last are refused; ``"first"`` omits this check.
         ignore: Boolean mask shaped like the frames of pixels that do not count; they may hold any value. Mask stuck
             columns and a dark rim here: they do not move with the scene, and bias the noise level.
         saturation: Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for
@@ -216,13 +230,16 @@ def restore(
         0.5
     """
     _check_options(method, options)
-    prepared = prepare_frames(frames, timing, full_scale=full_scale, ignore=ignore, saturation=saturation)
+    frames, full_scale = load_frames(frames, full_scale)
+    prepared = prepare_frames(
+        frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, saturation=saturation
+    )
     _, count, _, height, _ = prepared.images.shape
     vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
     for note in left_alone:
         warnings.warn(note, RestorationWarning, stacklevel=4)  # the caller, above two decorators
     if left_alone and not bool(vibration.moving_axes().any()):
-        return prepared.from_row_order(_unchanged(prepared, options.get("joint", False)))
+        return unchanged_frames(prepared, options.get("joint", False))
     restored = restore_prepared(prepared, vibration, method, options)
     if check:
         _warn_if_worse(prepared, restored.detach(), vibration, options.get("joint", False))
@@ -255,13 +272,18 @@ def restore_prepared(
     return chosen.function(images, frame_motion(motion, frames.timing, images.shape[1], images.shape[-2]), **options)
 
 
-def _unchanged(frames: PreparedFrames, joint: bool | int) -> Tensor:
-    """The frames as taken (B, T, C, H, W), NaN at missing pixels; with ``joint=True`` the middle one."""
+def unchanged_frames(frames: PreparedFrames, joint: bool | int) -> Tensor:
+    """The frames as taken, instead of the result of ``restore``: NaN at missing pixels; with ``joint=True`` one frame.
+
+    Args:
+        frames: The frames.
+        joint: As in ``restore_exact``; the middle frame replaces the image of all frames.
+    """
     images = frames.images
     if frames.missing is not None:
         images = images.masked_fill(frames.missing, math.nan)
     middle = images.shape[1] // 2
-    return images[:, middle : middle + 1] if joint is True else images
+    return frames.from_row_order(images[:, middle : middle + 1] if joint is True else images)
 
 
 def _motion_in_row_order(frames: PreparedFrames, vibration: Motion) -> Motion:
@@ -321,6 +343,7 @@ class VibrationRestorer(nn.Module):
         timing: The sensor.
         method: As in ``restore``.
         full_scale: As in ``restore``.
+        channels: As in ``restore``.
         saturation: As in ``restore``.
         check: As in ``restore``.
         **options: As in ``restore``.
@@ -342,6 +365,7 @@ class VibrationRestorer(nn.Module):
         *,
         method: str = "exact",
         full_scale: float | None = None,
+        channels: Channels = None,
         saturation: Saturation = "auto",
         check: bool = True,
         **options: Any,
@@ -349,8 +373,9 @@ class VibrationRestorer(nn.Module):
         super().__init__()
         _check_options(method, options)
         self.timing = timing
-        self.options = {"method": method, "full_scale": full_scale, "saturation": saturation, "check": check, **options}
+        common = {"full_scale": full_scale, "channels": channels, "saturation": saturation, "check": check}
+        self.options = {"method": method, **common, **options}
 
-    def forward(self, frames: Tensor, vibration: Motion | Detected, ignore: Tensor | None = None) -> Tensor:
+    def forward(self, frames: FramesOrFiles, vibration: Motion | Detected, ignore: Tensor | None = None) -> Tensor:
         """Restore a stack of frames."""
         return restore(frames, self.timing, vibration, ignore=ignore, **self.options)

@@ -167,10 +167,11 @@ class StackJob:
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             return replace(as_taken, detection=detection, error=" ".join(str(error).split()))
         one_image = self.joined and restoration.restored
+        restored = restoration.frames if one_image else restoration.frames[: len(kept)]
         return replace(
             as_taken,
             indices=() if one_image else kept,
-            frames=restoration.frames if one_image else restoration.frames[: len(kept)],
+            frames=restored if restoration.restored else as_taken.frames,
             restored=restoration.restored,
             detection=detection,
             restoration=restoration,

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -61,6 +61,7 @@ class StackManifest(Section):
         output: Name of the output; None for detection only.
         units: Units of the numbers.
         bad_frames: Index of each frame that could not be used, with the reason.
+        not_kept: Metadata of the input that the output does not contain.
         windows: Result of every window.
     """
 
@@ -72,6 +73,7 @@ class StackManifest(Section):
     output: dict[str, Any] | None
     units: dict[str, str]
     bad_frames: dict[str, str]
+    not_kept: list[str] = Field(default_factory=list)
     windows: list[WindowRecord]
 
     def header(self) -> dict[str, Any]:
@@ -146,13 +148,16 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
     return copy
 
 
-def write_manifest(path: Path, header: dict[str, Any], records: Iterable[dict[str, Any]]) -> None:
+def write_manifest(
+    path: Path, header: dict[str, Any], records: Iterable[dict[str, Any]], not_kept: Sequence[str] = ()
+) -> None:
     """Write a manifest with one line per key and window; records are not kept in memory.
 
     Args:
         path: Temporary name of the file.
         header: As made by ``manifest_header``.
         records: Contents of ``WindowRecord``.
+        not_kept: Metadata of the input that the output does not contain.
     """
     units = {
         "start_time": "s, of the first row of the first frame of a window, the time origin of its detection",
@@ -174,7 +179,7 @@ def write_manifest(path: Path, header: dict[str, Any], records: Iterable[dict[st
             bad.update(record["bad_frames"])
             file.write(",\n    " if number else "\n    ")
             file.write(json.dumps(record, allow_nan=False))
-        file.write(f'\n  ],\n  "bad_frames": {json.dumps(bad)}\n}}\n')
+        file.write(f'\n  ],\n  "bad_frames": {json.dumps(bad)},\n  "not_kept": {json.dumps(list(not_kept))}\n}}\n')
         file.flush()
         os.fsync(file.fileno())
 

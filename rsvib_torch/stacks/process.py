@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from rsvib_torch.io.atomic import whole_file
-from rsvib_torch.io.files import PathLike, check_info_target
+from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept
 from rsvib_torch.io.schema import DetectedVibration
 from rsvib_torch.io.stack_info import exposure_times
 from rsvib_torch.motion.timing import SensorTiming
@@ -47,6 +47,7 @@ class StackReport:
         seconds: Duration of the run.
         first: Result of the first window, if it was computed in this process.
         manifest: Path of the manifest.
+        not_kept: Metadata of the input that the output does not contain.
     """
 
     frames: int
@@ -58,6 +59,7 @@ class StackReport:
     seconds: float
     first: WindowResult | None
     manifest: Path
+    not_kept: tuple[str, ...]
 
 
 def iterate_stack(source: PathLike, timing: SensorTiming, **options: Unpack[RestoreOptions]) -> Iterator[WindowResult]:
@@ -164,7 +166,8 @@ def process_stack(
 
     Args:
         source: The stack, as in ``read_stack``.
-        sink: The stack to write, as in ``write_stack``; data type, full scale, resolution and frame times are kept.
+        sink: The stack to write, as in ``write_stack``; data type, full scale, resolution, frame times and metadata are
+            kept as far as the format supports them.
         timing: As in ``iterate_stack``.
         given: Detections to use instead, one for each window (see ``read_manifest``).
         bad_frames: Whether frames that cannot be used are written unchanged (``"pass"``; a frame that cannot be read is
@@ -215,7 +218,7 @@ def process_stack(
             first = result
         return job.stored(result, pixels)
 
-    def report(records: Iterable[Mapping[str, Any]], resumed: int) -> StackReport:
+    def report(records: Iterable[Mapping[str, Any]], resumed: int, not_kept: Sequence[str]) -> StackReport:
         return StackReport(
             **_totals(records),
             windows=len(windows),
@@ -223,6 +226,7 @@ def process_stack(
             seconds=time.perf_counter() - start,
             first=first,
             manifest=target,
+            not_kept=tuple(not_kept),
         )
 
     journal = Journal(sink)
@@ -232,7 +236,7 @@ def process_stack(
             difference = describe_difference(complete.header(), header)
             if difference:
                 raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
-            return report((record.model_dump() for record in complete.windows), len(windows))
+            return report((record.model_dump() for record in complete.windows), len(windows), complete.not_kept)
         fresh = not journal.open(header, resume=resume)
         resumed = journal.count
         with disk_errors_named(journal):
@@ -245,14 +249,15 @@ def process_stack(
             else:
                 results = compute_with_dask(job, windows[resumed:], scheduler=scheduler, workers=at_once)
             _store_windows(windows, results, writer, journal, progress)
+            not_kept = metadata_not_kept(job.info, sink, (journal.written, *out.shape[1:]))
             with disk_errors_named(journal):
-                write_manifest(journal.folder / "manifest.json", header, journal.records())
+                write_manifest(journal.folder / "manifest.json", header, journal.records(), not_kept)
                 writer.finish(journal.written)
         finally:
             writer.close()
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(journal.folder / "manifest.json", target)
-        summary = report(journal.records(), resumed)
+        summary = report(journal.records(), resumed, not_kept)
         journal.remove()
         return summary
     finally:

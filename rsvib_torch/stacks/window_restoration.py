@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rsvib_torch.detection import detect_vibration
 from rsvib_torch.detection.start import constant_frame
+from rsvib_torch.frames.arrays import Channels, channel_axis
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import (
     beyond_full_scale,
@@ -20,11 +21,12 @@ from rsvib_torch.io.full_scale import (
     frames_to_counts,
     known_full_scale,
 )
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError, trusted_vibration
-from rsvib_torch.restoration.restore import restore_prepared
+from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
+from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
 from rsvib_torch.restoration.verdict.judge import judge_prepared
-from rsvib_torch.restoration.verdict.trust import Detected
+from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
 __all__ = ["RestoredFrames", "frame_fault", "restore_block", "restore_trusted"]
 
@@ -51,19 +53,19 @@ class RestoredFrames:
 def restore_trusted(
     frames: Tensor,
     timing: SensorTiming,
-    detected: Detected,
+    motion: Motion | Detected,
     options: Mapping[str, Any],
     *,
     force: bool = False,
     first_frames: int | None = None,
     most_pairs: int | None = None,
 ) -> RestoredFrames:
-    """Restore frames with the reliable part of a detection, and judge whether that helps.
+    """Restore frames with a motion, or the reliable part of a detection, and judge whether that helps.
 
     Args:
         frames: Stack (T, H, W) or (T, C, H, W) whose full scale is 1.
         timing: The sensor.
-        detected: Detection in these frames.
+        motion: The motion in image axes, or a detection in these frames.
         options: Options of ``restore``.
         force: Whether to return restored frames even if they are judged worse than the raw ones.
         first_frames: Number of frames to restore; None for all.
@@ -73,20 +75,21 @@ def restore_trusted(
         Restored frames; the frames as taken if nothing moves, or if restoration makes them worse.
     """
     rows = frames.shape[-1 if timing.scan_axis == -1 else -2]
-    vibration, left_alone = trusted_vibration(detected, timing, len(frames), rows)
+    vibration, left_alone = vibration_to_undo(motion, timing, len(frames), rows)
     frames = frames if first_frames is None else frames[:first_frames]
-    if not bool(vibration.moving_axes().any()):
-        return RestoredFrames(frames, False, left_alone, None, False)
-    chosen = {name: value for name, value in options.items() if name not in ("method", "saturation")}
+    joint = options.get("joint", False)
     prepared = prepare_frames(frames, timing, saturation=options.get("saturation", "auto"))
+    if not bool(vibration.moving_axes().any()):
+        return RestoredFrames(unchanged_frames(prepared, joint), False, left_alone, None, False)
+    chosen = {name: value for name, value in options.items() if name not in ("method", "saturation")}
     restored = restore_prepared(prepared, vibration, options.get("method", "exact"), chosen)
     verdict = None
     with suppress(TooLittleInCommonError):
         if len(frames) > 1:
-            joint = options.get("joint", False)
             verdict = judge_prepared(prepared, restored, vibration, joint=joint, most_pairs=most_pairs)
     keep = verdict is None or verdict.overall != "worse" or force
-    return RestoredFrames(prepared.from_row_order(restored) if keep else frames, keep, left_alone, verdict, True)
+    result = prepared.from_row_order(restored) if keep else unchanged_frames(prepared, joint)
+    return RestoredFrames(result, keep, left_alone, verdict, True)
 
 
 def frame_fault(
@@ -126,6 +129,7 @@ def restore_block(
     detection: Mapping[str, Any] | None = None,
     restoration: Mapping[str, Any] | None = None,
     full_scale: float | None = None,
+    channels: Channels = None,
     force: bool = False,
     device: str = "cpu",
 ) -> NDArray[Any]:
@@ -140,6 +144,7 @@ def restore_block(
         detection: Options of ``detect_vibration``.
         restoration: Options of ``restore``, for frames whose full scale is 1; not ``joint=True``.
         full_scale: Count that corresponds to 1.0; 255 for ``uint8`` if not given, required for other integers.
+        channels: ``"last"`` for frames (T, H, W, C), as in ``detect_vibration``.
         force: Whether to return restored frames even if they are judged worse than the raw ones.
         device: Device for the computation.
 
@@ -147,7 +152,8 @@ def restore_block(
         Restored frames.
 
     Raises:
-        ValueError: If the timing has frame start times, ``joint=True``, or the full scale is unknown.
+        ValueError: If the timing has frame start times, ``joint=True``, the full scale is unknown, or the frames appear
+            to have their channels last.
 
     Example:
         >>> restored = array.map_overlap(  # doctest: +SKIP
@@ -164,7 +170,8 @@ def restore_block(
         raise ValueError("joint=True makes one image of a block; restore_block keeps its shape")
     check_dtype(frames.dtype)
     scale = known_full_scale(frames.dtype, full_scale)
-    stored = frames.astype(frames.dtype.newbyteorder("="), copy=False)
+    axis = channel_axis("frames", frames.shape, channels)
+    stored = np.moveaxis(frames.astype(frames.dtype.newbyteorder("="), copy=False), axis, -3)
     if len(stored) < 2 or any(frame_fault(frame, index, scale) for index, frame in enumerate(stored)):
         return frames
     floats = counts_to_frames(stored, scale, "frames").to(device)
@@ -173,4 +180,6 @@ def restore_block(
         restored = restore_trusted(floats, timing, detected, options, force=force, most_pairs=2)
     except (ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
         return frames
-    return frames_to_counts(restored.frames, np.dtype(frames.dtype), scale) if restored.restored else frames
+    if not restored.restored:
+        return frames
+    return np.moveaxis(frames_to_counts(restored.frames, np.dtype(frames.dtype), scale), -3, axis)

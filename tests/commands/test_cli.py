@@ -169,6 +169,28 @@ def test_an_unreliable_axis_is_not_restored(place, tmp_path, capsys):
     assert difference.abs().mean() < 0.01
 
 
+def test_metadata_are_kept_or_listed(place, tmp_path, capsys):
+    tags = [(33550, "d", 3, (0.5, 0.5, 0.0), False), (42113, "s", 0, "0", False)]
+    counts = tifffile.imread(place / "frames.tif")
+    tifffile.imwrite(tmp_path / "geo.tif", counts, photometric="minisblack", extratags=tags, metadata=None)
+    config = ("--config", place / "camera.toml")
+    assert run("run", tmp_path / "geo.tif", tmp_path / "out", *config) == 0
+    assert "not kept" not in capsys.readouterr().out
+    with tifffile.TiffFile(tmp_path / "out" / "restored.tif") as tif:
+        assert [tif.pages[1].tags[code].value for code in (33550, 42113)] == [(0.5, 0.5, 0.0), "0"]
+    assert json.loads((tmp_path / "out" / "restoration.json").read_text())["not_kept"] == []
+    names = ["ModelPixelScaleTag", "GDAL_NODATA"]
+    assert run("run", tmp_path / "geo.tif", tmp_path / "out", *config, "--output", "restored.npy") == 0
+    assert f"restored.npy: not kept from the input: {', '.join(names)}\n" in capsys.readouterr().out
+    for file in ("restoration.json", "manifest.json"):
+        assert json.loads((tmp_path / "out" / file).read_text())["not_kept"] == names
+    for name, lost in (("r.tif", []), ("r.h5", names)):
+        found = ("--vibration", tmp_path / "out" / "vibration.json", "--report", tmp_path / "report.json")
+        assert run("restore", tmp_path / "geo.tif", tmp_path / name, *config, *found) == 0
+        assert ("not kept from the input: ModelPixelScaleTag, GDAL_NODATA" in capsys.readouterr().out) == bool(lost)
+        assert json.loads((tmp_path / "report.json").read_text())["not_kept"] == lost
+
+
 def change_vibration(place, folder, change):
     """A vibration.json that differs from the detection."""
     assert run("detect", place / "frames.tif", "--config", place / "camera.toml", "--out", folder / "detected") == 0

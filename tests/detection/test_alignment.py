@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 
@@ -171,6 +172,29 @@ def test_command(frames, gyroscope, tmp_path, capsys):
     assert run_command([*arguments, *forced]) == 0
     assert "further apart along y" in capsys.readouterr().err
     assert (tmp_path / "out.tif").exists()
+
+
+def test_known_writes_the_input_where_the_restored_frames_are_worse(frames, tmp_path, capsys):
+    """A wrong sign along y passes the check of the offsets, because x is right; the verdict on the frames decides."""
+    (tmp_path / "camera.toml").write_text(CONFIG + "[restoration]\nsaturation = 4095\n")
+    rsv.write_stack(tmp_path / "frames.tif", frames, dtype="uint16", full_scale=4095)
+    times = np.arange(-0.02, 0.1, 5e-4)
+    files = [str(tmp_path / "frames.tif"), str(tmp_path / "out.tif"), "--config", str(tmp_path / "camera.toml")]
+    common = ["known", *files, "--unit", "px", "--offset", "0", "--motion", str(tmp_path / "motion.csv")]
+    given = tifffile.imread(tmp_path / "frames.tif")
+    for factor, more, state, message in (
+        ([1, 1], [], "restored", "restored frames agree"),
+        ([1, -0.9], [], "unchanged", "restored is no better than raw"),
+        ([1, -0.9], ["--force"], "restored", "restored is no better than raw"),
+        ([0, 0], ["--force"], "unchanged", "no vibration to remove: the frames are written unchanged"),
+    ):
+        log(tmp_path / "motion.csv", times, factor * HandShake().displacement(times))
+        assert run_command([*common, *more]) == 0
+        shown = capsys.readouterr()
+        assert message in shown.out + shown.err
+        assert f"out.tif: 4 frames {state}, uint16" in shown.out
+        assert ("--force writes the restored ones" in shown.err) == (factor == [1, -0.9] and not more)
+        assert (tifffile.imread(tmp_path / "out.tif") == given).all() == (state == "unchanged")
 
 
 @pytest.mark.parametrize(

@@ -430,7 +430,7 @@ def test_bad_input(paper_camera, frames, options, error, message):
 
 
 def test_frames_of_different_size(paper_camera):
-    with pytest.raises(TypeError, match="frames must be a tensor or array of numbers, got list"):
+    with pytest.raises(ValueError, match=r"frames\[1\] is \(256, 130\) float32 on cpu and frames\[0\] is \(256, 128\)"):
         detect_bands([detail(256, 128), detail(256, 130)], paper_camera)
 
 

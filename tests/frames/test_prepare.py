@@ -20,7 +20,7 @@ def sensor(scan_axis=-2, direction="forward"):
 
 @pytest.mark.parametrize(("scan_axis", "direction"), ORIENTATIONS)
 @pytest.mark.parametrize("shape", LAYOUTS)
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
 def test_round_trip(shape, scan_axis, direction, dtype):
     frames = torch.rand(shape, dtype=torch.float64).to(dtype)
     prepared = prepare_frames(frames, sensor(scan_axis, direction))
@@ -100,9 +100,12 @@ def test_bad_input(options, error, message):
 
 
 def test_float_frames_are_not_scaled():
-    for dtype in (torch.float16, torch.float32, torch.float64):
+    for dtype in (torch.float32, torch.float64):
         frames = torch.rand(2, 4, 5, dtype=torch.float64).to(dtype) * 300 - 7
         assert as_float_frames(frames) is frames
+    for dtype in (torch.float16, torch.bfloat16):
+        frames = (torch.rand(2, 4, 5) * 300 - 7).to(dtype)
+        assert torch.equal(as_float_frames(frames), frames.to(torch.float32))
 
 
 def test_integer_frames_are_scaled():

@@ -73,7 +73,7 @@ def test_tiff_files_that_are_not_stacks_are_refused(tmp_path):
         tmp_path / "axes.tif", np.zeros((2, 5, 9, 7), "uint8"), photometric="minisblack", metadata={"axes": "TZYX"}
     )
     for name, message in {
-        "sizes": r"frames of different size or kind: \(9, 7\) uint8, \(5, 7\) uint8",
+        "sizes": r"different size or kind: page 1 is 5 x 7 px uint8, page 0 is 9 x 7 px uint8",
         "white": "MINISWHITE",
         "bits": "pixels are bool",
         "axes": "one axis of frames",

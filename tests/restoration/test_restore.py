@@ -298,7 +298,7 @@ def test_methods_without_saturation_use_the_saturated_values(lamps, method):
         ({"frames": torch.full((2, 16, 16), math.nan)}, ValueError, "ignore leaves no pixel"),
         ({"frames": torch.full((2, 16, 16), math.inf)}, ValueError, "frames must be finite"),
         ({"ignore": torch.zeros(2, 16, 8, dtype=torch.bool)}, ValueError, "ignore must be a boolean mask of shape"),
-        ({"frames": "frames.tif"}, TypeError, "frames must be a tensor or array of numbers, got str"),
+        ({"frames": {"a": 1}}, TypeError, "frames must be a tensor or array of numbers, got dict"),
         ({"clipped": True}, TypeError, "method='exact' has no option 'clipped'"),
         ({"timing": None}, TypeError, "timing must be a SensorTiming, got NoneType"),
         ({"frames": torch.ones(2, 16, 16).short(), "full_scale": -1}, ValueError, "full_scale must be larger than 0"),

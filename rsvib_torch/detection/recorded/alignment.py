@@ -15,7 +15,8 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
 from rsvib_torch.detection.start import grey_frames, measurements_of_curve
-from rsvib_torch.frames.arrays import ArrayLike
+from rsvib_torch.frames.arrays import ArrayLike, Channels
+from rsvib_torch.io.files import FramesOrFiles
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
@@ -78,7 +79,7 @@ class _Clock:
 @full_precision
 @torch.no_grad()
 def align_motion(
-    frames: ArrayLike,
+    frames: FramesOrFiles,
     timing: SensorTiming,
     recorded: FreeMotion,
     *,
@@ -91,6 +92,7 @@ def align_motion(
     search: int = 16,
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
+    channels: Channels = None,
 ) -> ClockAlignment:
     """Find offset and scale between the clock of a recorded motion and that of the frames.
 
@@ -99,8 +101,8 @@ def align_motion(
     uniform drift of each axis is fitted as well.
 
     Args:
-        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames, tensor or NumPy array; NaN marks missing
-            pixels.
+        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames; tensor, array, list of these, or files; NaN
+            marks missing pixels.
         timing: The sensor.
         recorded: The motion on its own clock, in image axes.
         offsets: Smallest and largest offset in seconds; by default all for which the recording covers the frames.
@@ -112,6 +114,7 @@ def align_motion(
         search: Search range of the start in px around the whole-frame offset.
         ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out.
         full_scale: Count that means 1.0, for integer frames.
+        channels: As in ``detect_vibration``.
 
     Returns:
         The motion on the clock of the frames, offset and scale with standard deviations, and a verdict.
@@ -131,7 +134,7 @@ def align_motion(
     """
     if recorded.batch_shape:
         raise ValueError("align_motion takes one motion, not a batch")
-    stack = grey_frames(frames, timing, full_scale, ignore)
+    stack = grey_frames(frames, timing, full_scale, ignore, channels)
     if stack.batched:
         raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")
     grey = stack.images

@@ -14,8 +14,9 @@ from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.shapes.free import start_curve
 from rsvib_torch.detection.start import grey_frames, measurements_of_curve
-from rsvib_torch.frames.arrays import ArrayLike
+from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
+from rsvib_torch.io.files import FramesOrFiles
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
@@ -47,7 +48,7 @@ class MotionCheck:
 @full_precision
 @torch.no_grad()
 def check_motion(
-    frames: ArrayLike,
+    frames: FramesOrFiles,
     timing: SensorTiming,
     motion: Motion,
     *,
@@ -57,14 +58,15 @@ def check_motion(
     search: int = 16,
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
+    channels: Channels = None,
 ) -> MotionCheck:
     """Compare a given motion with the offsets of row bands between frames.
 
     A motion with the wrong sign, clock or focal length makes frames worse: its subtraction increases the offsets.
 
     Args:
-        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames, tensor or NumPy array; NaN marks missing
-            pixels.
+        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames; tensor, array, list of these, or files; NaN
+            marks missing pixels.
         timing: The sensor.
         motion: A vibration or free motion in image axes, on the clock of the frames.
         registration: Method of the band registration, as in ``register_bands``.
@@ -73,6 +75,7 @@ def check_motion(
         search: Search range in px around the whole-frame offset.
         ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out.
         full_scale: Count that means 1.0, for integer frames.
+        channels: As in ``detect_vibration``.
 
     Returns:
         Rms offsets with and without the motion, and a verdict.
@@ -89,7 +92,7 @@ def check_motion(
         ...
         ValueError: at least 2 frames are needed, got 1
     """
-    stack = grey_frames(frames, timing, full_scale, ignore)
+    stack = grey_frames(frames, timing, full_scale, ignore, channels)
     if stack.batched or motion.batch_shape:
         raise ValueError("check_motion takes one stack and one motion, not a batch")
     bands = RegistrationOptions(registration, band_rows, band_step, search)

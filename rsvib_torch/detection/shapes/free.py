@@ -21,8 +21,9 @@ from rsvib_torch.core.splines import bspline_weights, gauss_legendre
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.start import GreyFrames, band_curve, grey_frames, measurements_of_curve
-from rsvib_torch.frames.arrays import ArrayLike
+from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
+from rsvib_torch.io.files import FramesOrFiles
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
@@ -82,7 +83,7 @@ class MotionDetection:
 @full_precision
 @torch.no_grad()
 def detect_motion(
-    frames: ArrayLike,
+    frames: FramesOrFiles,
     timing: SensorTiming,
     *,
     registration: Registration = "ncc",
@@ -93,6 +94,7 @@ def detect_motion(
     search: int = 16,
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
+    channels: Channels = None,
 ) -> MotionDetection:
     """Detect a motion of any shape from consecutive frames: the free model.
 
@@ -102,8 +104,8 @@ def detect_motion(
     motion is estimated as well.
 
     Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, tensor or NumPy array;
-            floats, or integers of known full scale. NaN marks missing pixels.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames; tensor, array, list of
+            these, or files; floats, or integers of known full scale. NaN marks missing pixels.
         timing: The sensor.
         registration: Method of the band registration, as in ``register_bands``; for the initial value.
         knot_rows: Row times from one knot of the spline to the next, which then resolves frequencies up to
@@ -114,6 +116,7 @@ def detect_motion(
         search: Search range of the start in px around the whole-frame offset.
         ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out (dead, saturated).
         full_scale: Count that means 1.0, for integer frames.
+        channels: As in ``detect_vibration``.
 
     Returns:
         The motion in image axes with its uncertainty over time.
@@ -132,7 +135,7 @@ def detect_motion(
     """
     check_whole_number("knot_rows", knot_rows, at_least=4)
     check_whole_number("iterations", iterations, at_least=1)
-    stacks = grey_frames(frames, timing, full_scale, ignore)
+    stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     results = [_detect(stacks.one(i), timing, bands, knot_rows, iterations) for i in range(len(stacks.images))]
     if not stacks.batched:

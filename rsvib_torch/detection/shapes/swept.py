@@ -21,7 +21,8 @@ from rsvib_torch.detection.shapes.free import (
     unexplained_reason,
 )
 from rsvib_torch.detection.start import GreyFrames, grey_frames, measurements_of_curve
-from rsvib_torch.frames.arrays import ArrayLike
+from rsvib_torch.frames.arrays import ArrayLike, Channels
+from rsvib_torch.io.files import FramesOrFiles
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
@@ -74,7 +75,7 @@ class SweptTone:
 @full_precision
 @torch.no_grad()
 def detect_swept_tone(
-    frames: ArrayLike,
+    frames: FramesOrFiles,
     timing: SensorTiming,
     *,
     registration: Registration = "ncc",
@@ -84,6 +85,7 @@ def detect_swept_tone(
     search: int = 16,
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
+    channels: Channels = None,
 ) -> SweptTone:
     """Detect one tone an axis whose amplitude decays or grows exponentially and whose frequency changes linearly.
 
@@ -91,8 +93,8 @@ def detect_swept_tone(
     repeated with displacements measured on the images around it, row by row.
 
     Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, tensor or NumPy array. NaN
-            marks missing pixels.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames; tensor, array, list of
+            these, or files. NaN marks missing pixels.
         timing: The sensor.
         registration: Method of the band registration, as in ``register_bands``; for the initial value.
         iterations: Rounds of measuring and fitting.
@@ -101,6 +103,7 @@ def detect_swept_tone(
         search: Search range of the start in px around the whole-frame offset.
         ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out (dead, saturated).
         full_scale: Count that means 1.0, for integer frames.
+        channels: As in ``detect_vibration``.
 
     Returns:
         Parameters of both axes at the time origin, with standard deviations and verdict.
@@ -117,7 +120,7 @@ def detect_swept_tone(
         ValueError: at least 2 frames are needed, got 1
     """
     check_whole_number("iterations", iterations, at_least=1)
-    stacks = grey_frames(frames, timing, full_scale, ignore)
+    stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     fitted = [_detect(stacks.one(index), timing, bands, iterations) for index in range(len(stacks.images))]
     step = min(_step(one.fits, one.record, timing) for one in fitted)  # motions of a batch have common knots

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.frames.arrays import as_tensor
+from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
+from rsvib_torch.io.files import FramesOrFiles, load_frames
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, joint_groups
@@ -260,13 +261,14 @@ def judge_frames(
 
 
 def judge_restoration(
-    frames: Tensor,
-    restored: Tensor,
+    frames: FramesOrFiles,
+    restored: FramesLike,
     timing: SensorTiming,
     vibration: Motion | Detected,
     *,
     joint: bool | int = False,
     full_scale: float | None = None,
+    channels: Channels = None,
     ignore: Tensor | None = None,
     most_pairs: int | None = None,
 ) -> RestorationVerdict:
@@ -287,6 +289,7 @@ def judge_restoration(
         vibration: The vibration that was undone, in image axes, or the detection that ``restore`` was given.
         joint: As in ``restore``.
         full_scale: As in ``restore``.
+        channels: As in ``restore``, for both stacks.
         ignore: As in ``restore``; ignored pixels and NaN are not judged.
         most_pairs: Compare no more pairs than these, evenly spread over the stack; None for all.
 
@@ -298,7 +301,8 @@ def judge_restoration(
         TypeError: If an argument has the wrong type.
         ValueError: If there is one frame only, shapes differ, or two frames have too little in common.
     """
-    prepared = prepare_frames(frames, timing, full_scale=full_scale, ignore=ignore, minimum_frames=2)
+    frames, full_scale = load_frames(frames, full_scale)
+    prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, minimum_frames=2)
     if prepared.batched:
         raise ValueError(f"frames must be one stack (T, H, W) or (T, C, H, W), got shape {prepared.shape}")
     restored = as_tensor("restored", restored)
@@ -307,7 +311,9 @@ def judge_restoration(
         raise ValueError(f"restored must have the shape {expected}, got {tuple(restored.shape)}")
     count, height = prepared.images.shape[1], prepared.images.shape[-2]
     vibration, _ = vibration_to_undo(vibration, timing, count, height)
-    images = prepare_frames(restored, timing, full_scale=full_scale, allow_missing=False, name="restored").images
+    images = prepare_frames(
+        restored, timing, full_scale=full_scale, channels=channels, allow_missing=False, name="restored"
+    ).images
     return judge_prepared(prepared, images, vibration, joint=joint, most_pairs=most_pairs)
 
 

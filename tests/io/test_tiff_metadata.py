@@ -1,0 +1,286 @@
+"""Metadata of TIFF files: copied to TIFF files, and listed where they cannot be."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+from small_stack import FRAMES, draw_counts, process_small
+
+from rsvib_torch.io import metadata_not_kept, read_stack, read_stack_info, write_stack
+from rsvib_torch.stacks import read_manifest
+
+GREY = np.random.default_rng(8).integers(0, 4096, (5, 40, 30)).astype(np.uint16)
+COLOUR = np.random.default_rng(9).integers(0, 256, (5, 40, 30, 3)).astype(np.uint8)
+GREY.flat[0] = 4095
+GEOREFERENCE = {
+    "ModelPixelScaleTag": (33550, "d", 3, (0.5, 0.25, 0.0)),
+    "ModelTiepointTag": (33922, "d", 6, (0.0, 0.0, 0.0, 440720.0, 3751320.0, 0.0)),
+    "ModelTransformationTag": (34264, "d", 16, tuple(float(i) / 7 for i in range(16))),
+    "GeoKeyDirectoryTag": (34735, "H", 16, (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, 32611)),
+    "GeoDoubleParamsTag": (34736, "d", 2, (298.25, 6378137.0)),
+    "GeoAsciiParamsTag": (34737, "s", 0, "WGS 84 / UTM zone 11N|WGS 84|"),
+    "RPCCoefficientTag": (50844, "d", 92, tuple(float(i) / 3 for i in range(92))),
+}
+OTHERS = {
+    "GDAL_METADATA": (42112, "s", 0, '<GDALMetadata>\n  <Item name="GAIN">2.5</Item>\n</GDALMetadata>'),
+    "GDAL_NODATA": (42113, "s", 0, "-9999"),
+    "InterColorProfile": (34675, 7, None, b"a profile \0\1\2"),
+    "DateTime": (306, "s", 0, "2024:05:01 10:00:00"),
+    "Artist": (315, "s", 0, "Zo\u00eb".encode()),
+    "Model": (272, "s", 0, "camera 7"),
+    "Orientation": (274, "H", 1, 6),
+    "65001": (65001, "d", 1, 0.25),
+}
+
+
+def tags_of(entries, *, first_page=False):
+    return [(*entry, first_page) for entry in entries.values()]
+
+
+def write_pages(path, options, pages=GREY, **file_options):
+    with tifffile.TiffWriter(path, **file_options) as tif:
+        for number, page in enumerate(pages):
+            tif.write(page, **options(number))
+
+
+def copied(folder, *, output="out.tif", compression=None, change=lambda frames: frames):
+    """Write the frames of in.tif like the input, and return what is not kept."""
+    info = read_stack_info(folder / "in.tif")
+    scale = info.full_scale or (4095 if info.is_integer else None)
+    frames = change(read_stack(folder / "in.tif", full_scale=scale))
+    options = {"dtype": info.dtype, "full_scale": scale, "compression": compression, "like": info}
+    write_stack(folder / output, frames, **options)
+    assert torch.equal(read_stack(folder / output, full_scale=scale), frames)
+    again = read_stack_info(folder / output)
+    assert output.endswith("npy") or again.full_scale == scale
+    if output.endswith("tif"):  # a copy of the copy is the same
+        assert again.metadata == {name: tag for name, tag in again.metadata.items() if tag is not None}
+        write_stack(folder / f"again_{output}", frames, **{**options, "like": again})
+        assert read_stack_info(folder / f"again_{output}").metadata == again.metadata
+    return metadata_not_kept(info, folder / output, tuple(frames.shape))
+
+
+def header(path, name):
+    """An attribute of ``tifffile.TiffFile``."""
+    with tifffile.TiffFile(path) as tif:
+        return getattr(tif, name)
+
+
+def values(path, page=0):
+    with tifffile.TiffFile(path) as tif:
+        return {tag.code: tag.value for tag in tif.pages.get(page).tags}
+
+
+@pytest.mark.parametrize("compression", [None, "zlib"])
+@pytest.mark.parametrize("file_options", [{}, {"byteorder": ">", "bigtiff": True}])
+@pytest.mark.parametrize("first_page", [False, True])
+def test_georeference_and_other_tags_are_kept(tmp_path, compression, file_options, first_page):
+    entries = GEOREFERENCE | OTHERS
+    tags = tags_of(entries, first_page=first_page)
+    options = {"photometric": "minisblack", "metadata": None, "resolution": (300, 200, "INCH")}
+    tifffile.imwrite(tmp_path / "in.tif", GREY, extratags=tags, **options, **file_options)
+    assert copied(tmp_path, compression=compression) == ()
+    for page in (0, 3):
+        given, found = values(tmp_path / "in.tif", page), values(tmp_path / "out.tif", page)
+        for code, *_ in entries.values():
+            assert found.get(code) == given.get(code)
+            assert (code in found) == (page == 0 or not first_page)
+    assert found[282] == (300, 1)
+    assert read_stack_info(tmp_path / "out.tif").resolution == (300.0, 200.0, "inch")
+
+
+def test_tags_of_pages_written_one_by_one(tmp_path):
+    def options(number):
+        own = {"65001": (65001, "I", 1, number), "40000": (40000, "I", 1, 9)}
+        return {
+            "extratags": tags_of(GEOREFERENCE | own),
+            "datetime": f"2024:01:01 00:00:0{number}",
+            "description": f"frame {number}",
+            "metadata": {"temperature": number},
+        }
+
+    write_pages(tmp_path / "in.tif", options)
+    lost = {
+        "DateTime (differs between pages)",
+        "tag 65001 (differs between pages)",
+        "ImageDescription (differs between pages)",
+        "JSON metadata (differs between pages)",
+        "XPos",
+    }
+    assert set(copied(tmp_path)) == lost
+    given, found = values(tmp_path / "in.tif"), values(tmp_path / "out.tif", 4)
+    assert all(found[code] == given[code] for code, *_ in GEOREFERENCE.values())
+    write_pages(
+        tmp_path / "in.tif",
+        lambda i: {"description": "orbit 7", "metadata": {"camera": "K1"}, "contiguous": False},
+    )
+    assert copied(tmp_path) == ()
+    with tifffile.TiffFile(tmp_path / "out.tif") as tif:
+        assert tif.pages.first.description == "orbit 7"
+        assert tif.shaped_metadata[0]["camera"] == "K1"
+
+
+def test_descriptions_are_kept(tmp_path):
+    metadata = {"axes": "TYX", "full_scale": 4095, "frame_times": [0.0, 1.0, 2.0, 3.0, 4.5], "camera": "K1"}
+    text = "orbit 7, \u00b5m"
+    options = {"photometric": "minisblack", "description": text.encode(), "metadata": metadata}
+    tifffile.imwrite(tmp_path / "in.tif", GREY, **options)
+    assert copied(tmp_path) == ()
+    with tifffile.TiffFile(tmp_path / "out.tif") as tif:
+        assert tif.pages.first.description == text
+        assert json.loads(tif.pages.first.description1) == {"shape": [5, 40, 30], **metadata}
+    assert read_stack_info(tmp_path / "out.tif").frame_times == (0.0, 1.0, 2.0, 3.0, 4.5)
+    assert copied(tmp_path, change=lambda frames: frames[:2]) == ("frame times",)
+    assert header(tmp_path / "out.tif", "shaped_metadata")[0]["camera"] == "K1"
+
+
+@pytest.mark.parametrize("compression", [None, "zlib"])
+@pytest.mark.parametrize("byteorder", ["<", ">"])
+def test_imagej_metadata_are_kept(tmp_path, byteorder, compression):
+    own = {"Labels": [f"frame {i}" for i in range(5)], "Info": "some text", "Overlays": [b"overlay"]}
+    metadata = {"axes": "TYX", "unit": "um", "finterval": 0.1, "spacing": 3.9, "loop": False, **own}
+    tifffile.imwrite(
+        tmp_path / "in.tif", GREY, imagej=True, byteorder=byteorder, resolution=(1 / 2.5, 1 / 5), metadata=metadata
+    )
+    assert copied(tmp_path, compression=compression) == ()
+    with tifffile.TiffFile(tmp_path / "in.tif") as given, tifffile.TiffFile(tmp_path / "out.tif") as found:
+        assert found.is_imagej
+        assert found.series[0].axes == "TYX"
+        rest = dict(found.imagej_metadata)
+        assert json.loads(rest.pop("rsvib")) == {"full_scale": 4095.0}
+        assert rest == given.imagej_metadata
+        assert (rest["Labels"], rest["Info"]) == (own["Labels"], own["Info"])
+        assert all(found.pages[0].tags[name].value == given.pages[0].tags[name].value for name in ("XResolution", 296))
+    lost = ("ImageJ metadata", "ImageJ overlays and labels")
+    assert copied(tmp_path, change=lambda frames: frames[:2]) == lost
+    assert not header(tmp_path / "out.tif", "is_imagej")
+    assert copied(tmp_path, output="out.npy") == ("resolution", *lost)
+
+
+def test_ome_xml_is_kept(tmp_path):
+    metadata = {"axes": "TYX", "PhysicalSizeX": 0.1, "PhysicalSizeXUnit": "um", "Plane": {"ExposureTime": [0.1] * 5}}
+    tifffile.imwrite(tmp_path / "in.tif", GREY, ome=True, photometric="minisblack", metadata=metadata)
+    assert copied(tmp_path) == ()
+    with tifffile.TiffFile(tmp_path / "in.tif") as given, tifffile.TiffFile(tmp_path / "out.tif") as found:
+        assert found.is_ome
+        assert found.ome_metadata == given.ome_metadata
+        assert found.asarray().shape == GREY.shape
+    assert copied(tmp_path, change=lambda frames: frames[:2]) == ("OME-XML",)
+    info = read_stack_info(tmp_path / "in.tif")
+    assert metadata_not_kept(info, "out.tif", info.shape, dtype="float32") == ("OME-XML",)
+    tifffile.imwrite(tmp_path / "in.tif", COLOUR, ome=True, photometric="rgb", metadata={"axes": "TYXS"})
+    assert copied(tmp_path) == ()
+    tifffile.imwrite(  # the output has the three channels of a pixel in one page
+        tmp_path / "in.tif", np.moveaxis(COLOUR, -1, 1), ome=True, photometric="minisblack", metadata={"axes": "TCYX"}
+    )
+    assert copied(tmp_path) == ("OME-XML",)
+    write_pages(tmp_path / "in.tif", lambda i: {}, ome=True)
+    assert copied(tmp_path) == ()
+
+
+def test_other_formats_and_sizes_lose_metadata(tmp_path):
+    options = {"photometric": "minisblack", "resolution": (300, 200, "INCH"), "metadata": {"full_scale": 4095}}
+    entries = {name: entry for name, entry in (GEOREFERENCE | OTHERS).items() if name != "65001"}
+    tifffile.imwrite(tmp_path / "in.tif", GREY, extratags=tags_of(entries), **options)
+    assert set(copied(tmp_path, output="out.npy")) == {*entries, "full scale", "resolution"}
+    assert set(copied(tmp_path, output="out.h5")) == {*entries}
+    assert set(copied(tmp_path, output="folder")) == {*entries}
+    assert set(copied(tmp_path, output="out.raw")) == {*entries}
+    assert set(copied(tmp_path, change=lambda frames: frames[:, :32])) == {*GEOREFERENCE}
+    assert copied(tmp_path, change=lambda frames: frames[:2]) == ()
+
+
+def test_folders_keep_what_all_files_have(tmp_path):
+    for index, frame in enumerate(GREY):
+        entries = GEOREFERENCE | {"DateTime": (306, "s", 0, f"2024:01:01 00:00:0{index}")}
+        (tmp_path / "in").mkdir(exist_ok=True)
+        tifffile.imwrite(tmp_path / "in" / f"{index}.tif", frame, extratags=tags_of(entries), metadata=None)
+    info = read_stack_info(tmp_path / "in")
+    frames = read_stack(tmp_path / "in", full_scale=4095)
+    assert metadata_not_kept(info, "out.tif", info.shape) == ("DateTime",)
+    write_stack(tmp_path / "out.tif", frames, dtype="uint16", full_scale=4095, like=info)
+    found = values(tmp_path / "out.tif")
+    assert all(found[code] == value for code, _, _, value in GEOREFERENCE.values())
+    assert 306 not in found
+    write_stack(tmp_path / "out", frames, like=replace(info, dtype="float32"))
+    assert read_stack_info(tmp_path / "out").metadata == {}
+
+
+def test_thumbnails_and_other_images_are_listed(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "in.tif") as tif:
+        for frame in GREY:
+            tif.write(frame, metadata=None, subifds=1)
+            tif.write(frame[::2, ::2], subfiletype=1, metadata=None)
+        tif.write(GREY[0, ::4, ::4], subfiletype=1, metadata=None)
+    assert copied(tmp_path) == ("SubIFDs", "thumbnails and masks")
+
+
+def test_runs_keep_metadata_and_list_what_is_lost(tmp_path):
+    source = tmp_path / "in.tif"
+    tifffile.imwrite(source, draw_counts(), photometric="minisblack", imagej=False, extratags=tags_of(GEOREFERENCE))
+    report = process_small(source, tmp_path / "out.tif")
+    assert (report.not_kept, report.frames) == ((), FRAMES)
+    found = values(tmp_path / "out.tif", FRAMES - 1)
+    assert all(found[code] == value for code, _, _, value in GEOREFERENCE.values())
+    report = process_small(source, tmp_path / "out.npy")
+    assert report.not_kept == tuple(GEOREFERENCE)
+    assert read_manifest(report.manifest).not_kept == list(GEOREFERENCE)
+    again = process_small(source, tmp_path / "out.npy", resume=True)
+    assert (again.not_kept, again.resumed) == (report.not_kept, report.windows)
+    manifest = json.loads(report.manifest.read_text())
+    del manifest["not_kept"]  # as written by earlier versions
+    report.manifest.write_text(json.dumps(manifest))
+    assert read_manifest(report.manifest).not_kept == []
+
+
+def test_omitted_frames_invalidate_descriptions_of_all_frames(tmp_path):
+    counts = draw_counts()
+    counts[5] = 77
+    tifffile.imwrite(tmp_path / "in.tif", counts, imagej=True, metadata={"axes": "TYX"})
+    report = process_small(tmp_path / "in.tif", tmp_path / "out.tif", bad_frames="skip")
+    assert report.not_kept == ("ImageJ metadata",)
+    assert read_stack_info(tmp_path / "out.tif").shape[0] == FRAMES - 1
+    assert not header(tmp_path / "out.tif", "is_imagej")
+
+
+def test_damaged_metadata_do_not_prevent_reading(tmp_path):
+    """Random bytes in the header and the values of tags: frames are read and written, or refused."""
+    own = {"axes": "TYX", "Labels": [f"frame {i}" for i in range(5)], "Info": "some text"}
+    tifffile.imwrite(tmp_path / "imagej.tif", GREY, imagej=True, resolution=(0.4, 0.2), metadata=own)
+    options = {"photometric": "minisblack", "metadata": None, "description": "orbit 7"}
+    tifffile.imwrite(tmp_path / "tags.tif", GREY, extratags=tags_of(GEOREFERENCE | OTHERS), **options)
+    draw = np.random.default_rng(5)
+    written = 0
+    for name in ("imagej.tif", "tags.tif"):
+        data = (tmp_path / name).read_bytes()
+        for _ in range(60):
+            damaged = bytearray(data)
+            damaged[draw.integers(2000)] = draw.choice([0, 1, 255, draw.integers(256)])
+            (tmp_path / "bad.tif").write_bytes(damaged)
+            try:
+                info = read_stack_info(tmp_path / "bad.tif")
+                frames = read_stack(tmp_path / "bad.tif", full_scale=65535)
+            except ValueError:
+                continue
+            write_stack(tmp_path / "out.tif", frames, like=info)
+            assert read_stack_info(tmp_path / "out.tif").shape == info.shape
+            written += 1
+    assert written > 60
+
+
+def test_resolution_of_zero_denominators_is_ignored(tmp_path):
+    tifffile.imwrite(
+        tmp_path / "a.tif", GREY, photometric="minisblack", resolution=(3, 2), resolutionunit="NONE", metadata=None
+    )
+    assert "resolution" in read_stack_info(tmp_path / "a.tif").metadata
+    with tifffile.TiffFile(tmp_path / "a.tif") as tif:
+        place = tif.pages.first.tags["XResolution"].valueoffset
+    data = bytearray((tmp_path / "a.tif").read_bytes())
+    data[place + 4 : place + 8] = bytes(4)
+    (tmp_path / "a.tif").write_bytes(data)
+    info = read_stack_info(tmp_path / "a.tif")
+    assert "resolution" not in info.metadata
+    write_stack(tmp_path / "b.tif", read_stack(tmp_path / "a.tif", full_scale=4095), like=info)

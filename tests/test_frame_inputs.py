@@ -1,0 +1,257 @@
+"""Forms in which users give frames: channels last, lists, files and half precision, for all public functions."""
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import rsvib_torch as rsv
+from rsvib_torch.evaluation.scenes import city_and_fields
+from rsvib_torch.frames.arrays import as_tensor
+from rsvib_torch.frames.prepare import prepare_frames
+
+TIMING = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+VIBRATION = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+
+
+@pytest.fixture(scope="module", name="grey")
+def simulate_grey():
+    """Three frames of 284 x 202 px."""
+    return rsv.simulate_frames(city_and_fields(320, 240, seed=3), TIMING, VIBRATION, num_frames=3)
+
+
+@pytest.fixture(scope="module", name="colour")
+def tint(grey):
+    return torch.stack([grey, 0.5 * grey, 0.8 * grey], 1)
+
+
+def rms(values):
+    return float(values.double().square().mean().sqrt())
+
+
+# Every public function of frames: the call, and the axes of the frames in its result, if it returns frames.
+FUNCTIONS = {
+    "detect_vibration": lambda frames, **options: rsv.detect_vibration(frames, TIMING, tones=1, **options),
+    "model free": lambda frames, **options: rsv.detect_vibration(frames, TIMING, model="free", **options),
+    "detect_motion": lambda frames, **options: rsv.detect_motion(frames, TIMING, **options),
+    "detect_swept_tone": lambda frames, **options: rsv.detect_swept_tone(frames, TIMING, **options),
+    "check_motion": lambda frames, **options: rsv.check_motion(frames, TIMING, VIBRATION, **options),
+    "VibrationDetector": lambda frames, **options: rsv.VibrationDetector(TIMING, tones=1, **options)(frames),
+    "register_bands": lambda frames, **options: rsv.register_bands(frames, TIMING, **options),
+    "judge_restoration": lambda frames, **options: rsv.judge_restoration(frames, frames, TIMING, VIBRATION, **options),
+    "predict_noise_gain": lambda frames, **options: rsv.predict_noise_gain(frames, TIMING, VIBRATION, **options),
+    "restore": lambda frames, **options: rsv.restore(frames, TIMING, VIBRATION, **options),
+    "VibrationRestorer": lambda frames, **options: rsv.VibrationRestorer(TIMING, **options)(frames, VIBRATION),
+}
+
+
+@pytest.mark.filterwarnings("ignore::rsvib_torch.RestorationWarning")
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_channels_last_is_an_option_and_refused_without_it(colour, name):
+    function, last = FUNCTIONS[name], colour.permute(0, 2, 3, 1)
+    message = 'frames of shape (3, 284, 202, 3) appear to have their channels last: pass channels="last" or frames.perm'
+    with pytest.raises(ValueError, match=re.escape(message)):
+        function(last)
+    with pytest.raises(ValueError, match=r"appear to be one image \(H, W, C\): pass frames\[None\]"):
+        function(last[0].numpy())
+    found, expected = function(last, channels="last"), function(colour)
+    for attribute in ("vibration.amplitude", "motion.coefficients", "after", "offsets", "predicted_gain"):
+        values = [found, expected]
+        for part in attribute.split("."):
+            values = [getattr(value, part, None) for value in values]
+        if isinstance(values[0], torch.Tensor):
+            torch.testing.assert_close(*values, equal_nan=True)
+    if isinstance(found, torch.Tensor):
+        torch.testing.assert_close(found.movedim(-1, -3) if found.ndim == 4 else found, expected)
+
+
+def test_channels_last_in_calibration_and_files(colour, tmp_path):
+    rows = torch.arange(512)
+    light = (0.4 + 0.2 * torch.cos(2 * torch.pi * rows / 64))[None, :, None, None].expand(1, 512, 16, 3)
+    with pytest.raises(ValueError, match="appear to have their channels last"):
+        rsv.calibrate_row_time(light, 1000.0)
+    found = rsv.calibrate_row_time(light, 1000.0, channels="last")
+    assert found.row_time == pytest.approx(1 / 64e3, rel=1e-6)
+    last = colour.permute(0, 2, 3, 1)
+    with pytest.raises(ValueError, match="appear to have their channels last"):
+        rsv.write_stack(tmp_path / "frames.tif", last)
+    assert not list(tmp_path.iterdir())
+    rsv.write_stack(tmp_path / "frames.tif", last, channels="last")
+    assert torch.equal(rsv.read_stack(tmp_path / "frames.tif"), colour)
+
+
+def test_channels_last_in_blocks_scenes_and_quality(grey, colour):
+    last = colour.permute(0, 2, 3, 1).numpy()
+    with pytest.raises(ValueError, match="appear to have their channels last"):
+        rsv.restore_block(last, TIMING)
+    restored = rsv.restore_block(last, TIMING, channels="last")
+    np.testing.assert_array_equal(np.moveaxis(restored, -1, 1), rsv.restore_block(colour.numpy(), TIMING))
+    assert np.abs(restored - last).max() > 0.1
+    restored = rsv.restore_block(grey.numpy(), TIMING, channels="last")
+    np.testing.assert_array_equal(restored, rsv.restore_block(grey.numpy(), TIMING))
+    with pytest.raises(ValueError, match=r"appears to have its channels last: pass scene.permute\(2, 0, 1\)"):
+        rsv.simulate_frames(torch.rand(320, 240, 3), TIMING, VIBRATION)
+    assert rsv.psnr(list(grey), list(0.9 * grey), 1.0).shape == (3,)
+
+
+@pytest.mark.parametrize("scan_axis", [-2, -1])
+@pytest.mark.parametrize("batch", [False, True])
+def test_channels_last_keeps_masks_and_comes_back(scan_axis, batch):
+    timing = rsv.SensorTiming(20e-6, 20, 2048, scan_axis=scan_axis, readout_direction="reverse")
+    frames = torch.rand(*((4,) if batch else ()), 2, 5, 7, 3)
+    frames[..., 0, 1, 2] = torch.nan
+    for ignore in (torch.rand(2, 5, 7) > 0.8, torch.rand(5, 7) > 0.8, torch.rand(frames.shape) > 0.8):
+        prepared = prepare_frames(frames, timing, channels="last", ignore=ignore, saturation=0.9)
+        first = ignore.movedim(-1, -3) if ignore.shape == frames.shape else ignore
+        expected = prepare_frames(frames.movedim(-1, -3), timing, ignore=first, saturation=0.9)
+        for attribute in ("images", "missing", "saturated"):
+            assert torch.equal(getattr(prepared, attribute), getattr(expected, attribute))
+        back = prepared.from_row_order(prepared.images)
+        assert torch.equal(back, torch.where(prepared.from_row_order(prepared.missing) > 0, 0.0, frames))
+
+
+@pytest.mark.parametrize(
+    ("shape", "channels"),
+    [
+        ((2, 3, 48, 64), None),
+        ((2, 1, 48, 64), "first"),
+        ((2, 8, 48, 64), None),  # eight bands
+        ((2, 48, 64, 8), "last"),
+        ((2, 3, 48, 4), None),  # few columns
+        ((2, 3, 4, 5), "last"),  # few rows
+        ((2, 8, 64, 4), "first"),  # appears to be channels last
+        ((2, 48, 64), "last"),  # no channels
+        ((9, 64, 3), "first"),
+        ((4, 64, 3), None),
+        ((3, 2, 3, 48, 64), None),
+    ],
+)
+def test_valid_shapes_are_accepted(shape, channels):
+    frames = torch.rand(shape)
+    prepared = prepare_frames(frames, TIMING, channels=channels)
+    assert prepared.images.ndim == 5
+    assert torch.equal(prepared.from_row_order(prepared.images), frames)
+
+
+@pytest.mark.parametrize(
+    ("shape", "channels", "message"),
+    [
+        (
+            (2, 48, 64, 1),
+            None,
+            r"pass channels=\"last\" or frames.permute\(0, 3, 1, 2\), or channels=\"first\" if they",
+        ),
+        ((3, 2, 48, 64, 4), None, r"frames.permute\(0, 1, 4, 2, 3\)"),
+        ((48, 64, 3), "last", r"one image \(H, W, C\): pass frames\[None\] with channels=\"last\""),
+        ((48, 64, 1), None, r"or channels=\"first\" if these are 48 frames of 64 x 1 px"),
+        ((2, 3, 48, 64), "last", r"appear to have their channels before the image axes: omit channels=\"last\""),
+        ((2, 48, 64, 3), "Last", "channels must be one of None, 'first', 'last'; got 'Last'"),
+        ((64, 3), "last", r"frames must have shape \(T, H, W\)"),
+    ],
+)
+def test_shapes_that_are_refused(shape, channels, message):
+    with pytest.raises(ValueError, match=message):
+        prepare_frames(torch.rand(shape), TIMING, channels=channels)
+
+
+def test_lists_are_stacked(grey, colour):
+    expected = rsv.restore(grey, TIMING, VIBRATION)
+    amplitude = rsv.detect_vibration(grey, TIMING).vibration.amplitude
+    lists = {
+        "tensors": list(grey),
+        "arrays": [frame.numpy() for frame in grey],
+        "tuple": tuple(grey),
+        "reversed": [np.ascontiguousarray(frame.numpy()[::-1])[::-1] for frame in grey],
+        "big endian": [frame.numpy().astype(">f4") for frame in grey],
+        "mixed": [grey[0], grey[1].numpy(), grey[2]],
+    }
+    for frames in lists.values():
+        assert torch.equal(rsv.restore(frames, TIMING, VIBRATION), expected)
+        assert torch.equal(rsv.detect_vibration(frames, TIMING).vibration.amplitude, amplitude)
+    counts = [(4095 * frame.numpy()).round().astype(np.uint16) for frame in grey]
+    restored = rsv.restore(counts, TIMING, VIBRATION, full_scale=4095)
+    assert rms(restored - expected) < 2e-3
+    last = [frame.permute(1, 2, 0).numpy() for frame in colour]
+    assert rsv.restore(last, TIMING, VIBRATION, channels="last").shape == (3, 284, 202, 3)
+    assert as_tensor("frames", [list(grey), list(grey)]).shape == (2, 3, 284, 202)
+    assert as_tensor("numbers", [[1, 2], [3, 4]]).tolist() == [[1, 2], [3, 4]]
+
+
+@pytest.mark.parametrize(
+    ("frames", "error", "message"),
+    [
+        (
+            [torch.zeros(5, 7), torch.zeros(5, 6)],
+            ValueError,
+            r"frames\[1\] is \(5, 6\) float32 on cpu and frames\[0\] is \(5, 7\) float32 on cpu",
+        ),
+        ([np.zeros((5, 7)), np.zeros((5, 7), np.uint8)], ValueError, r"frames\[1\] is \(5, 7\) uint8 on cpu and"),
+        (
+            [torch.zeros(5, 7), "b.png"],
+            TypeError,
+            r"frames\[1\] must be a tensor or array of numbers, got str; read fil",
+        ),
+        ([np.ma.masked_array(np.zeros((5, 7)))], TypeError, r"frames\[0\] must not be a masked array"),
+        ([], ValueError, r"frames must have shape .* got \(0,\)"),
+        ((frame for frame in torch.zeros(2, 5, 7)), TypeError, "got generator"),
+        (None, TypeError, "got NoneType"),
+    ],
+)
+def test_lists_that_are_refused(frames, error, message):
+    with pytest.raises(error, match=message):
+        rsv.restore(frames, TIMING, VIBRATION)
+
+
+def test_files_are_read(grey, tmp_path):
+    counts = (65535 * grey.numpy()).round().astype(np.uint16)
+    counts[:, 60:62, 60:62] = 65535  # saturated
+    for index, frame in enumerate(counts):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), frame)
+    np.save(tmp_path / "stack.npy", counts)
+    paths = sorted(tmp_path.glob("*.png"))
+    expected = rsv.restore(counts, TIMING, VIBRATION, full_scale=65535)
+    for frames in (paths, [str(path) for path in paths], [tmp_path / "stack.npy"], str(tmp_path / "stack.npy")):
+        assert torch.equal(rsv.restore(frames, TIMING, VIBRATION, full_scale=65535), expected)
+        found = rsv.detect_vibration(frames, TIMING, tones=1, full_scale=65535)
+        torch.testing.assert_close(found.vibration.amplitude[:, 0], VIBRATION.amplitude[:, 0], rtol=0.02, atol=0)
+        assert torch.equal(
+            rsv.read_stack(frames, full_scale=65535), torch.from_numpy(counts.astype(np.float32)) / 65535
+        )
+    rsv.write_stack(tmp_path / "floats.tif", grey)
+    assert torch.equal(rsv.restore([tmp_path / "floats.tif"], TIMING, VIBRATION), rsv.restore(grey, TIMING, VIBRATION))
+    for frames, error, message in (
+        (paths, ValueError, "0.png: full scale of uint16 frames unknown: pass full_scale"),
+        (
+            [paths[0], tmp_path / "floats.tif"],
+            ValueError,
+            r"different size or kind: .*0.png is \(284, 202\) uint16, .*fl",
+        ),
+        ([tmp_path / "none.png"], FileNotFoundError, "none.png does not exist"),
+    ):
+        with pytest.raises(error, match=message):
+            rsv.restore(frames, TIMING, VIBRATION)
+    with pytest.raises(ValueError, match=r"counts reach 65535, beyond full_scale=4095"):
+        rsv.restore(paths, TIMING, VIBRATION, full_scale=4095)
+    with pytest.raises(TypeError, match="got list; read files with read_stack"):
+        rsv.register_bands(paths, TIMING)
+    with pytest.raises(ValueError, match="path must contain at least one file"):
+        rsv.read_stack([])
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("scale", [1.0, 4095.0])
+def test_half_precision_is_accurate_to_its_quantisation(grey, dtype, scale):
+    """Differences from float32 are those that noise of the size of the quantisation causes."""
+    half = (scale * grey).to(dtype)
+    quantisation = rms(half.float() / scale - grey)
+    restored, expected = rsv.restore(half, TIMING, VIBRATION), rsv.restore(grey, TIMING, VIBRATION)
+    assert restored.dtype == dtype
+    assert 0 < rms(restored.float() / scale - expected) < 2.5 * quantisation
+    found, truth = (rsv.detect_vibration(frames, TIMING, tones=1) for frames in (half, grey))
+    assert found.reliable.all()
+    for name in ("amplitude", "frequency", "phase"):
+        difference = getattr(found.vibration, name) - getattr(truth.vibration, name)
+        assert bool((difference.abs() < 3 * getattr(found.std, name)).all()), name
+    assert found.vibration.amplitude.dtype == torch.float64
