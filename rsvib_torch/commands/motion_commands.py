@@ -162,7 +162,7 @@ def known(
     )
     info = read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
-    check_stack_target(restored, info.shape, dtype=info.dtype, full_scale=scale)
+    check_stack_target(restored, info.shape, dtype=info.dtype, full_scale=scale, like=info)
     stack = load(frames, settings, full_scale, device)
     if offset is None:
         with working("aligning the recording with the frames"):

@@ -44,6 +44,7 @@ from rsvib_torch.io import (
     StackInfo,
     check_stack_target,
     check_writable,
+    describe_stack,
     exposure_times,
     open_stack,
     read_stack,
@@ -106,8 +107,16 @@ def load(path: Path, config: Config, full_scale: float | None, device: DeviceNam
     with working(f"reading {path}"):
         frames = read_stack(path, full_scale=scale)
     timing = timing_from_first_frame(config.timing, info)
-    info = replace(info, frame_times=exposure_times(info, config.timing), times_of_playback=False)
+    print_notes(info, config)
+    times = exposure_times(info, config.timing)
+    info = replace(info, frame_times=times, time_error=0.0, frame_rate=info.frame_rate or config.timing.frame_rate)
     return Stack(frames.to(target), info, scale, timing)
+
+
+def print_notes(info: StackInfo, config: Config) -> None:
+    """Print what the file states about orientation, dropped frames and unequal intervals."""
+    for note in describe_stack(info, config.timing):
+        print_line(note)
 
 
 def save(path: Path, frames: Tensor, stack: Stack) -> None:
@@ -213,7 +222,9 @@ def detect(
         print_detection(result)
         print_line(f"{out}: {', '.join(names)}")
         return
-    scale = full_scale_of(frames, read_stack_info(frames), settings, full_scale)
+    info = read_stack_info(frames)
+    print_notes(info, settings)
+    scale = full_scale_of(frames, info, settings, full_scale)
     with whole_folder(out) as folder:
         with counting(f"detecting in {frames.name}") as progress:
             detect_stack(
@@ -274,7 +285,7 @@ def restore_frames(
     detected = read_vibration(vibration, timing_from_first_frame(settings.timing, read_stack_info(frames)))
     stack = load(frames, settings, full_scale, device)
     shape = (1, *stack.info.shape[1:]) if joint == "all" else stack.info.shape
-    check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale)
+    check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
     if report is not None:
         check_writable(report)
     options = restoration_options(stack.info, stack.full_scale, settings, overrides)
@@ -307,6 +318,7 @@ def _restore_windows(
     if not isinstance(window, int):
         raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")
     info = read_stack_info(frames)
+    print_notes(info, config)
     scale = full_scale_of(frames, info, config, full_scale)
     with counting(f"restoring {frames.name}") as progress:
         result = process_stack(
@@ -376,6 +388,7 @@ def run(
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
     check_writable(out, folder=True)
     info = read_stack_info(frames)
+    print_notes(info, settings)
     scale = full_scale_of(frames, info, settings, full_scale)
     options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation))
     common: RestoreOptions = {

@@ -3,7 +3,8 @@
 from rsvib_torch.io.atomic import check_writable, whole_file, whole_folder
 from rsvib_torch.io.files import check_stack_target, open_stack, read_stack, read_stack_info, write_stack
 from rsvib_torch.io.formats import FrameReader, FrameWriter, StackFormat, register_format
-from rsvib_torch.io.stack_info import FrameError, StackInfo, exposure_times, timing_from_first_frame
+from rsvib_torch.io.frame_times import TimingWarning, describe_stack, exposure_times, timing_from_first_frame
+from rsvib_torch.io.stack_info import FrameError, StackInfo
 
 __all__ = [
     "FrameError",
@@ -11,8 +12,10 @@ __all__ = [
     "FrameWriter",
     "StackFormat",
     "StackInfo",
+    "TimingWarning",
     "check_stack_target",
     "check_writable",
+    "describe_stack",
     "exposure_times",
     "open_stack",
     "read_stack",

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
 from rsvib_torch.io.formats import FrameReader, StackFormat
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_frame, readable_stack
+from rsvib_torch.io.time_metadata import tiff_times
 
 __all__ = ["FORMAT", "open_tiff", "write_tiff"]
 
@@ -103,14 +105,15 @@ def _read_info(tif: Any) -> tuple[StackInfo, tuple[int, ...]]:
         full_scale = float(metadata["full_scale"])
     elif isinstance(bits, int) and bits not in (8, 16, 32, 64) and tif.pages[0].dtype.kind == "u":
         full_scale = float(2**bits - 1)  # packed pixels, e.g. 4095 for 12 bits
-    frame_times = metadata.get("frame_times")
+    orientation = tif.pages[0].tags.valueof("Orientation", 1)
     info = StackInfo(
         stack if times else (1, *stack),
         series.dtype.name,
         known_full_scale(series.dtype, full_scale),
-        None if frame_times is None else tuple(float(time) for time in frame_times),
-        _resolution(tif),
+        resolution=_resolution(tif),
         channels_last=bool(channels) and channels[0] > columns,
+        orientation=int(orientation) if orientation in range(1, 9) else 1,
+        **tiff_times(tif, stack[0] if times else 1, metadata),
     )
     return info, (*ones, *kept)
 
@@ -192,16 +195,20 @@ def open_tiff(path: Path) -> FrameReader:
 def _layout(info: StackInfo) -> tuple[StackInfo, dict[str, Any]]:
     """The stack as it is stored, and options of ``tifffile.imwrite``: three or four channels are stored last (RGB)."""
     colour = info.axes == "TCHW" and info.shape[1] in (3, 4)
-    stored = StackInfo(info.shape, info.dtype, info.full_scale, info.frame_times, info.resolution, colour)
+    stored = replace(info, channels_last=colour)
     axes = "TYX" if info.axes == "THW" else "TYXS" if colour else "TSYX" if info.shape[1] > 1 else "TCYX"
     metadata: dict[str, object] = {"axes": axes}
     if info.full_scale is not None:
         metadata["full_scale"] = info.full_scale
     if info.frame_times is not None:
         metadata["frame_times"] = list(info.frame_times)
+    elif info.frame_rate is not None:
+        metadata["frame_rate"] = info.frame_rate
     options: dict[str, Any] = {"photometric": "rgb" if colour else "minisblack", "metadata": metadata}
     if axes == "TSYX":
         options["planarconfig"] = "separate"
+    if info.orientation != 1:
+        options["extratags"] = [("Orientation", "H", 1, info.orientation, True)]
     if info.resolution is not None:
         options["resolution"] = info.resolution[:2]
         options["resolutionunit"] = info.resolution[2].upper()
