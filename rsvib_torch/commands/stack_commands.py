@@ -186,7 +186,8 @@ def simulate(
             generator=torch.Generator(target).manual_seed(simulation.seed if seed is None else seed),
         )
     with working(f"writing {frames}"):
-        write_stack(frames, simulated, dtype=dtype, full_scale=scale)
+        stated = StackInfo(tuple(simulated.shape), dtype, scale, frame_rate=settings.timing.frame_rate)
+        write_stack(frames, simulated, dtype=dtype, full_scale=scale, like=stated)
     print_line(f"{frames}: {len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}")
 
 

@@ -34,7 +34,7 @@ def jpeg_info(path: Path) -> StackInfo:
         colour = image.mode == "RGB"
         shape = (1, 3, image.height, image.width) if colour else (1, image.height, image.width)
         info = StackInfo(shape, "uint8", 255.0, channels_last=colour)
-        return replace(info, **exif_fields(image.getexif()))
+        return replace(info, **exif_fields(image.info.get("exif", b"")))
 
 
 def decode_jpeg(path: Path) -> NDArray[Any]:

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import StackInfo
@@ -83,9 +83,7 @@ def png_info(path: Path) -> StackInfo:
             chunks = _chunks(head, path, b"IDAT")
         except ValueError:
             chunks = _chunks(head + file.read(), path, b"IDAT")
-    exif = Image.Exif()
-    exif.load(chunks.get(b"eXIf", b""))
-    return replace(_info(chunks, path.stat().st_size, path), **exif_fields(exif))
+    return replace(_info(chunks, path.stat().st_size, path), **exif_fields(chunks.get(b"eXIf", b"")))
 
 
 def decode_png(path: Path) -> NDArray[Any]:
@@ -123,7 +121,7 @@ def encode_png(path: Path, frame: NDArray[Any], info: StackInfo) -> None:
         added += _chunk(b"pHYs", struct.pack(">IIB", x, y, 1))
     if info.orientation != 1:
         exif = Image.Exif()
-        exif[0x0112] = info.orientation
+        exif[ExifTags.Base.Orientation] = info.orientation
         added += _chunk(b"eXIf", exif.tobytes().removeprefix(b"Exif\0\0"))
     start = 8 + 25  # after signature and header
     path.write_bytes(data[:start] + added + data[start:])

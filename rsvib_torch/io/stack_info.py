@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.io.full_scale import known_full_scale
-from rsvib_torch.io.time_metadata import times_of_attributes
+from rsvib_torch.io.time_metadata import orientation_of, times_of_attributes
 
 __all__ = [
     "FrameError",
@@ -176,9 +176,6 @@ def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], 
         stated["frame_times"] = tuple(float(time) for time in times)
     else:
         stated = times_of_attributes(attributes, shape[0])
-    orientation = int(attributes.get("orientation") or 1)
-    if orientation not in range(1, 9):
-        raise ValueError(f"orientation={orientation}; expected 1 to 8, as in the tag of TIFF")
     resolution = attributes.get("resolution")
     if resolution is not None:
         x, y = (float(value) for value in resolution)
@@ -191,6 +188,6 @@ def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], 
         full_scale,
         resolution=resolution,
         channels_last=axes == "THWC",
-        orientation=orientation,
+        orientation=orientation_of(attributes.get("orientation")),
         **stated,
     )

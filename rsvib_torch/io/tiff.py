@@ -14,7 +14,7 @@ from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
 from rsvib_torch.io.formats import FrameReader, StackFormat
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_frame, readable_stack
-from rsvib_torch.io.time_metadata import tiff_times
+from rsvib_torch.io.time_metadata import orientation_of, tiff_times
 
 __all__ = ["FORMAT", "open_tiff", "write_tiff"]
 
@@ -105,14 +105,13 @@ def _read_info(tif: Any) -> tuple[StackInfo, tuple[int, ...]]:
         full_scale = float(metadata["full_scale"])
     elif isinstance(bits, int) and bits not in (8, 16, 32, 64) and tif.pages[0].dtype.kind == "u":
         full_scale = float(2**bits - 1)  # packed pixels, e.g. 4095 for 12 bits
-    orientation = tif.pages[0].tags.valueof("Orientation", 1)
     info = StackInfo(
         stack if times else (1, *stack),
         series.dtype.name,
         known_full_scale(series.dtype, full_scale),
         resolution=_resolution(tif),
         channels_last=bool(channels) and channels[0] > columns,
-        orientation=int(orientation) if orientation in range(1, 9) else 1,
+        orientation=orientation_of(tif.pages[0].tags.valueof("Orientation")),
         **tiff_times(tif, stack[0] if times else 1, metadata),
     )
     return info, (*ones, *kept)

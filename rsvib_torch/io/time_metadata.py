@@ -1,6 +1,7 @@
-"""Times and frame rate in the metadata of other programs: HDF5 and Zarr attributes, TIFF, EXIF.
+"""Times, frame rate and orientation in the metadata of other programs: HDF5 and Zarr attributes, TIFF, EXIF.
 
-Each function returns the fields of ``StackInfo`` that the metadata state, and none if they are ambiguous.
+Functions return the fields of ``StackInfo`` that the metadata state, and none if they are ambiguous or damaged, since
+frames can be read without them.
 """
 
 import re
@@ -11,8 +12,9 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+from PIL import ExifTags, Image
 
-__all__ = ["exif_fields", "merged_times", "tiff_times", "time_attributes", "times_of_attributes"]
+__all__ = ["exif_fields", "merged_times", "orientation_of", "tiff_times", "time_attributes", "times_of_attributes"]
 
 _SOFTWARE_CLOCK_ERROR = 5e-3  # s; times that acquisition software writes have jitter of milliseconds
 
@@ -37,6 +39,11 @@ def _time_fields(times: Iterable[float | None], count: int, error: float, source
     if len(known) != count or any(later <= earlier for earlier, later in pairwise(known)):
         return {}
     return {"frame_times": tuple(known), "time_error": error, "time_source": source}
+
+
+def orientation_of(value: object) -> int:
+    """The value of an orientation tag, 1 to 8; 1 (as stored) if it is anything else."""
+    return int(value) if isinstance(value, int | np.integer) and value in range(1, 9) else 1
 
 
 def time_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
@@ -98,14 +105,23 @@ def _seconds_of_date(text: object, fraction: object = "") -> float | None:
     return None
 
 
-def exif_fields(exif: Any) -> dict[str, Any]:
-    """Orientation and time of one image from its EXIF metadata, as read by Pillow."""
-    details = exif.get_ifd(0x8769)
-    original = _seconds_of_date(details.get(0x9003), details.get(0x9291, ""))
-    time = original if original is not None else _seconds_of_date(exif.get(0x0132), details.get(0x9290, ""))
-    orientation = exif.get(0x0112)
-    fields: dict[str, Any] = {"orientation": orientation} if orientation in range(1, 9) else {}
-    return fields | _time_fields([time], 1, _SOFTWARE_CLOCK_ERROR, "EXIF times")
+def exif_fields(data: bytes) -> dict[str, Any]:
+    """Orientation and time of one image from its EXIF metadata."""
+    exif = Image.Exif()
+    try:
+        exif.load(data)
+        details = exif.get_ifd(ExifTags.IFD.Exif)
+    except Exception:  # damaged metadata raise errors of many types
+        return {}
+    taken, changed = (
+        _seconds_of_date(date, details.get(fraction, ""))
+        for date, fraction in (
+            (details.get(ExifTags.Base.DateTimeOriginal), ExifTags.Base.SubsecTimeOriginal),
+            (exif.get(ExifTags.Base.DateTime), ExifTags.Base.SubsecTime),
+        )
+    )
+    fields = {"orientation": orientation_of(exif.get(ExifTags.Base.Orientation))}
+    return fields | _time_fields([changed if taken is None else taken], 1, _SOFTWARE_CLOCK_ERROR, "EXIF times")
 
 
 def merged_times(infos: Iterable[Any]) -> dict[str, Any]:
@@ -158,6 +174,13 @@ def tiff_times(tif: Any, count: int, metadata: Mapping[str, Any]) -> dict[str, A
         return {"frame_times": tuple(float(time) for time in metadata["frame_times"])}
     if "frame_rate" in metadata:
         return {"frame_rate": float(metadata["frame_rate"]), "time_source": "frame_rate"}
+    try:
+        return _times_of_other_programs(tif, count)
+    except Exception:  # damaged metadata raise errors of many types
+        return {}
+
+
+def _times_of_other_programs(tif: Any, count: int) -> dict[str, Any]:
     if tif.ome_metadata:
         return _ome_fields(tif.ome_metadata, count)
     interval = (tif.imagej_metadata or {}).get("finterval")
@@ -175,10 +198,10 @@ def tiff_times(tif: Any, count: int, metadata: Mapping[str, Any]) -> dict[str, A
 def _page_times(page: Any) -> dict[str, float]:
     """The time of a page by each source that states it."""
     tags = page.tags
-    exif = tags["ExifTag"].value if "ExifTag" in tags else {}
-    date = tags["DateTime"].value if "DateTime" in tags else ""
+    exif = tags.valueof("ExifTag", {})
     times = {
         "times in descriptions": _described_time(page.description),
-        "DateTime tags": _seconds_of_date(date, exif.get("SubsecTime", "") if isinstance(exif, dict) else ""),
+        "EXIF times": _seconds_of_date(exif.get("DateTimeOriginal"), exif.get("SubsecTimeOriginal", "")),
+        "DateTime tags": _seconds_of_date(tags.valueof("DateTime"), exif.get("SubsecTime", "")),
     }
     return {source: time for source, time in times.items() if time is not None}

@@ -26,6 +26,7 @@ _LOSSLESS, _H264 = (".mkv", ".avi"), (".mp4", ".mov", ".m4v")
 _CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}
 _READ_ONLY = (".webm", ".3gp", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv")
 _H264_OPTIONS = {"crf": "12"}  # constant rate factor, 0 (no loss) to 51; differences of less than 18 are hardly visible
+_FFV1_OPTIONS = {"level": "3", "g": "1"}  # each frame can be decoded alone: damage does not affect other frames
 _BT709, _LIMITED_RANGE = 1, 1  # codes of ITU-T H.273 and FFmpeg
 _DEFAULT_RATE = 25.0  # frames per second, if neither file nor sensor state them
 
@@ -175,8 +176,10 @@ def _source(info: StackInfo) -> Path | None:
     return info.path if info.path is not None and info.path.suffix.lower() in endings else None
 
 
-def _presentation_times(path: Path, info: StackInfo) -> tuple[Fraction, list[int]]:
-    """Time unit in s of the video to write, and the presentation time of each frame in this unit.
+def _presentation_times(path: Path, info: StackInfo) -> tuple[Fraction, list[int], Fraction | None]:
+    """Time unit in s of the video to write, presentation time of each frame in this unit, and their time origin in s.
+
+    The time origin is None if it is that of the source.
 
     Times are those of the source if it is a video, else the frame times of the stack, else equal intervals.
     """
@@ -188,15 +191,18 @@ def _presentation_times(path: Path, info: StackInfo) -> tuple[Fraction, list[int
     if not times:
         rate = Fraction(info.frame_rate or _DEFAULT_RATE).limit_denominator(1001)
         times = [index / rate for index in range(info.shape[0])]
-    if path.suffix.lower() == ".avi" and len(times) > 1:  # its unit is the frame period
+    start = None
+    if path.suffix.lower() == ".avi" and len(times) > 1:  # it begins at 0, and its unit is the frame period
+        start, times = times[0], [time - times[0] for time in times]
         intervals = np.diff([float(time) for time in times])
         periods = round(float(np.sum(np.round(intervals / np.median(intervals)))))
-        unit = 1 / (periods / (times[-1] - times[0])).limit_denominator(1001)
-        if max(abs(time / unit - round(time / unit)) for time in times) > 0.25:
+        unit = 1 / (periods / times[-1]).limit_denominator(1001)
+        rounding = 0.0011  # s; .mkv has units of 1 ms
+        if max(abs(float(time - unit * round(time / unit))) for time in times) > rounding:
             raise ValueError(f"{path}: .avi cannot hold a variable frame rate; write .mkv")
     else:
         unit = Fraction(1, math.lcm(*(time.denominator for time in times)))
-    return unit, [round(time / unit) for time in times]
+    return unit, [round(time / unit) for time in times], start
 
 
 def _encoded_as(path: Path, info: StackInfo) -> tuple[str, str, float]:
@@ -217,9 +223,9 @@ def _add_streams(output: Any, path: Path, info: StackInfo, source: Any) -> tuple
         The video stream, and the audio stream of the output for each of ``source``.
     """
     lossy = path.suffix.lower() in _H264
-    unit, ticks = _presentation_times(path, info)
+    unit, ticks, _ = _presentation_times(path, info)
     rate = 1 / (unit * int(np.median(np.diff(ticks)))) if len(ticks) > 1 else Fraction(_DEFAULT_RATE)
-    codec, options = ("libx264", _H264_OPTIONS) if lossy else ("ffv1", {})
+    codec, options = ("libx264", _H264_OPTIONS) if lossy else ("ffv1", _FFV1_OPTIONS)
     video = output.add_stream(codec, rate=rate, options=options)
     video.height, video.width = info.shape[-2:]
     video.pix_fmt = _encoded_as(path, info)[1]
@@ -233,8 +239,10 @@ def _add_streams(output: Any, path: Path, info: StackInfo, source: Any) -> tuple
     if source is None:
         return video, {}
     output.metadata.update(source.metadata)
-    taken = source.streams.best("video").codec_context
-    video.codec_context.color_primaries, video.codec_context.color_trc = taken.color_primaries, taken.color_trc
+    taken, encoder = source.streams.best("video").codec_context, video.codec_context
+    encoder.color_primaries, encoder.color_trc = taken.color_primaries, taken.color_trc
+    if taken.sample_aspect_ratio:
+        encoder.sample_aspect_ratio = taken.sample_aspect_ratio
     return video, {stream: output.add_stream_from_template(stream) for stream in source.streams.audio}
 
 
@@ -267,14 +275,14 @@ def _check(path: Path, info: StackInfo) -> None:
 
 def _write(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
     av, (layout, encoded, full_scale) = _av(), _encoded_as(path, info)
-    unit, ticks = _presentation_times(path, info)
+    unit, ticks, start = _presentation_times(path, info)
     with ExitStack() as opened:
         source = _open_source(info, opened)
         output = opened.enter_context(
             av.open(str(path), "w", format=_CONTAINERS[path.suffix.lower()], options={"fflags": "+bitexact"})
         )
         video, audio = _add_streams(output, path, info, source)
-        sound = _packets(source, audio)
+        sound = _packets(source, audio, start)
         packet = next(sound, None)
         for tick, pixels in zip(ticks, frames, strict=True):
             while packet is not None and packet.pts * packet.time_base <= tick * unit:  # players read both together
@@ -295,14 +303,21 @@ def _write(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compress
             packet = next(sound, None)
 
 
-def _packets(source: Any, streams: dict[Any, Any]) -> Iterator[Any]:
-    """Packets of the streams of ``source``, for the streams of the output that belong to them."""
+def _packets(source: Any, streams: dict[Any, Any], start: Fraction | None) -> Iterator[Any]:
+    """Packets of the streams of ``source``, for the streams of the output that belong to them.
+
+    Packets before the time origin ``start`` (s) of the output are omitted; None if it is that of the source.
+    """
     if not streams:
         return
     for packet in source.demux(*streams):
         if packet.dts is not None and packet.pts is not None:  # the last packet of a stream is empty
+            if start is not None:
+                ticks = round(start / packet.time_base)
+                packet.pts, packet.dts = packet.pts - ticks, packet.dts - ticks
             packet.stream = streams[packet.stream]
-            yield packet
+            if start is None or packet.pts >= 0:
+                yield packet
 
 
 FORMAT = StackFormat(
