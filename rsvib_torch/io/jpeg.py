@@ -18,7 +18,7 @@ def _open(path: Path) -> Image.Image:
     with path.open("rb"):
         pass  # a file that cannot be opened is an OSError
     try:
-        image = Image.open(path, formats=("JPEG", "MPO"))
+        image = Image.open(path, formats=("JPEG",))
     except (OSError, ValueError, Image.DecompressionBombError) as error:
         raise ValueError(f"{path}: not a JPEG file") from error
     if image.mode not in ("L", "RGB"):

@@ -27,7 +27,7 @@ _SECONDS = {
 _TIME_NAME = re.compile(r"(?:frame_?)?(?:time_?stamps?|times?)(?:_(s|sec|ms|us|ns))?", re.IGNORECASE)
 _RATE_NAME = re.compile(r"(?:acquisition_?)?frame_?rate(?:_hz)?|fps", re.IGNORECASE)
 _DESCRIBED_TIME = re.compile(
-    r"\b(?:frame_?|elapsed_?)?(?:time_?stamps?|times?)(?:[-_ ](?P<suffix>s|sec|ms|us|ns))?\"?\s*[=:]\s*"
+    r"(?<!exposure )\b(?:frame_?|elapsed_?)?(?:time_?stamps?|times?)(?:[-_ ](?P<suffix>s|sec|ms|us|ns))?\"?\s*[=:]\s*"
     r"(?P<value>[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?)(?:\s*(?P<unit>s|sec|ms|us|µs|ns)\b)?",
     re.IGNORECASE,
 )
