@@ -344,7 +344,10 @@ def run(
     config: ConfigOption,
     output: Annotated[
         str,
-        typer.Option(help="Name of the restored stack in that folder; its extension selects the format."),
+        typer.Option(
+            help="Name of the restored stack in that folder; its extension selects the format, e.g. "
+            ".mp4 or .mkv for a video with the time stamps and the sound of the input."
+        ),
     ] = "restored.tif",
     compression: Annotated[str | None, typer.Option(help="Compression of a TIFF stack: zlib or lzma.")] = None,
     method: MethodOption = None,
