@@ -39,7 +39,8 @@ for _form in (
     image_folder.FOLDER_FORMAT,
     raw.FORMAT,
     tiff.FORMAT,
-    video.FORMAT,
+    video.FFV1_FORMAT,
+    video.H264_FORMAT,
     video.READ_ONLY_FORMAT,
     zarr_store.FORMAT,
 ):
@@ -248,7 +249,7 @@ def write_stack(
     """Write a stack of frames whose full scale is 1.
 
     The ending selects the format as in ``read_stack``; videos are written as FFV1 (``.mkv``, ``.avi``; without loss) or
-    H.264 (``.mp4``, ``.mov``; 8 bits, with loss). A path without an ending is a folder of PNG files
+    H.264 (``.mp4``, ``.mov``; 8 bits, with loss; also of floats). A path without an ending is a folder of PNG files
     (frame_0000.png ...), or of TIFF files if PNG does not support the data type. Integers are multiplied by the full
     scale, rounded and clipped to 0 ... full scale; all formats except ``.npy`` store the full scale. The file replaces
     an existing one when it is complete; after an error nothing has changed.

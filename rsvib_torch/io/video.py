@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rsvib_torch.io.formats import StackFormat, needed_package
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 
-__all__ = ["FORMAT", "READ_ONLY_FORMAT"]
+__all__ = ["FFV1_FORMAT", "H264_FORMAT", "READ_ONLY_FORMAT"]
 
 _LOSSLESS, _H264 = (".mkv", ".avi"), (".mp4", ".mov", ".m4v")
 _CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}
@@ -94,8 +94,7 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
 
     Containers state the number of frames only roughly. ``size`` and ``changed`` (ns) identify the state of the file.
     """
-    av = _av()
-    with readable_stack(path, "video"), av.open(str(path), metadata_errors="replace") as container:
+    with _av().open(str(path), metadata_errors="replace") as container:
         stream = container.streams.best("video")
         if stream is None:
             raise ValueError("it contains no video stream")
@@ -127,8 +126,12 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
 
 
 def _scanned(path: Path) -> tuple[StackInfo, tuple[Fraction, ...]]:
-    state = path.stat()
-    return _scan(path.absolute(), state.st_size, state.st_mtime_ns)
+    av, state = _av(), path.stat()
+    with readable_stack(path, "video"):
+        try:
+            return _scan(path.absolute(), state.st_size, state.st_mtime_ns)
+        except av.error.FFmpegError as error:
+            raise ValueError(error.strerror) from error
 
 
 class _VideoReader:
@@ -290,7 +293,8 @@ def _write(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compress
                 packet = next(sound, None)
             counts = np.moveaxis(pixels, 0, -1) if pixels.shape[:-2] == (3,) else pixels.reshape(pixels.shape[-2:])
             if full_scale != info.full_scale:
-                counts = np.rint(counts * (full_scale / (info.full_scale or full_scale)))
+                relative = counts / (info.full_scale or 1.0)  # the full scale of floats is 1
+                counts = np.rint(full_scale * np.clip(np.nan_to_num(relative), 0.0, 1.0))
             counts = np.ascontiguousarray(counts, dtype=np.uint8 if full_scale <= 255 else np.uint16)
             frame = av.VideoFrame.from_ndarray(counts, format=layout)
             if encoded != layout:
@@ -320,7 +324,8 @@ def _packets(source: Any, streams: dict[Any, Any], start: Fraction | None) -> It
                 yield packet
 
 
-FORMAT = StackFormat(
-    "video", (*_LOSSLESS, *_H264), _VideoReader, write_all=_write, dtypes=("uint8", "uint16"), check=_check
+FFV1_FORMAT = StackFormat(
+    "FFV1 video", _LOSSLESS, _VideoReader, write_all=_write, dtypes=("uint8", "uint16"), check=_check
 )
-READ_ONLY_FORMAT = StackFormat("video", _READ_ONLY, _VideoReader)
+H264_FORMAT = StackFormat("H.264 video", _H264, _VideoReader, write_all=_write, check=_check)
+READ_ONLY_FORMAT = StackFormat("webm, mpeg, 3gp and wmv", _READ_ONLY, _VideoReader)

@@ -172,7 +172,7 @@ def test_names_that_are_not_stacks_are_refused(tmp_path):
         read_stack(tmp_path / "frames.xyz")
     with pytest.raises(ValueError, match="jpeg files can only be read"):
         write_stack(tmp_path / "frames.jpg", FRAMES)
-    with pytest.raises(ValueError, match=r"video files can only be read; write .*mkv"):
+    with pytest.raises(ValueError, match=r"wmv files can only be read; write .*mkv"):
         write_stack(tmp_path / "frames.webm", FRAMES, dtype="uint8")
 
 

@@ -84,6 +84,13 @@ def test_other_full_scales_are_scaled_to_the_depth_of_the_video(tmp_path, full_s
     np.testing.assert_allclose(read_stack(tmp_path / "a.mkv"), frames, atol=1.01 / full_scale)
 
 
+def test_floats_are_written_for_viewing(tmp_path):
+    frames = torch.tensor([-0.5, 0.0, 0.3, 1.0, 1.5, float("nan")])[:, None, None].expand(6, 48, 64)
+    write_stack(tmp_path / "a.mp4", frames)
+    means = read_stack(tmp_path / "a.mp4").mean((1, 2, 3))
+    np.testing.assert_allclose(means, [0.0, 0.0, 0.3, 1.0, 1.0, 0.0], atol=0.012)
+
+
 def test_colours_are_those_of_the_input(tmp_path):
     colours = torch.tensor([[0.8, 0.2, 0.1], [0.1, 0.7, 0.3], [0.2, 0.3, 0.9]])
     for height in (64, 640):  # players assume other colours for tall videos without a tag
@@ -218,8 +225,8 @@ def test_a_frame_of_another_size_is_reported(tmp_path):
     [
         ("a.mp4", (2, 47, 64), "uint8", r"H\.264 needs an even height and width, got \(47, 64\); write \.mkv"),
         ("a.mkv", (2, 4, 48, 64), "uint8", r"videos hold 1 or 3 channels, got 4; write \.tif"),
-        ("a.mkv", (2, 48, 64), "float32", "video files hold uint8, uint16; got dtype float32"),
-        ("a.webm", (2, 48, 64), "uint8", "video files can only be read"),
+        ("a.mkv", (2, 48, 64), "float32", "FFV1 video files hold uint8, uint16; got dtype float32"),
+        ("a.webm", (2, 48, 64), "uint8", "wmv files can only be read"),
     ],
 )
 def test_what_a_video_cannot_hold_is_refused(tmp_path, name, shape, dtype, message):
@@ -257,6 +264,21 @@ def test_what_a_container_cannot_hold_is_refused_before_the_computation(
     assert rsvib("run", place / name, place / "out", *arguments) == 2
     assert message in capsys.readouterr().err
     assert not (place / "out").exists()
+
+
+def test_files_that_are_not_videos_are_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with av.open("sound.mp4", "w") as output:
+        audio = output.add_stream("aac", rate=48000)
+        audio.layout = "mono"
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.int16), format="s16", layout="mono")
+        frame.sample_rate = 48000
+        output.mux(audio.encode(frame))
+        output.mux(audio.encode())
+    (tmp_path / "text.mov").write_text("no video")
+    for name, reason in (("sound.mp4", "it contains no video stream"), ("text.mov", "Invalid data found when")):
+        with pytest.raises(ValueError, match=rf"^{name}: not a readable video stack: {reason}"):
+            read_stack(name)
 
 
 def test_missing_package_names_the_extra(tmp_path, monkeypatch):
