@@ -57,6 +57,12 @@ def _orientation(frame: Any) -> int:
     return 1
 
 
+def _conversion() -> Any:
+    """Options for the conversion of colours; without them the mean of a frame changes by more than one count of 255."""
+    flags = _av().video.reformatter.Interpolation
+    return flags.BILINEAR | flags.FULL_CHR_H_INT | flags.ACCURATE_RND
+
+
 def _decoded_as(layout: Any) -> tuple[str, float]:
     """Pixel format to which frames are converted, and its full scale; grey and RGB keep their depth."""
     bits = max(component.bits for component in layout.components)
@@ -69,7 +75,8 @@ def _pixels(frame: Any) -> NDArray[Any]:
     """Pixels (H, W) or (3, H, W) of a decoded frame."""
     unspecified, untagged_height = 2, 576  # players assume the colours of HDTV for taller videos without a tag
     matrix = "ITU709" if frame.colorspace == unspecified and frame.height > untagged_height else None
-    pixels = frame.to_ndarray(format=_decoded_as(frame.format)[0], src_colorspace=matrix)
+    layout = _decoded_as(frame.format)[0]
+    pixels = frame.to_ndarray(format=layout, src_colorspace=matrix, interpolation=_conversion())
     return np.ascontiguousarray(pixels if pixels.ndim == 2 else np.moveaxis(pixels, -1, 0))
 
 
@@ -298,7 +305,7 @@ def _write(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compress
             counts = np.ascontiguousarray(counts, dtype=np.uint8 if full_scale <= 255 else np.uint16)
             frame = av.VideoFrame.from_ndarray(counts, format=layout)
             if encoded != layout:
-                frame = frame.reformat(format=encoded, dst_colorspace="ITU709")
+                frame = frame.reformat(format=encoded, dst_colorspace="ITU709", interpolation=_conversion())
             frame.pts, frame.time_base = tick, unit
             output.mux(video.encode(frame))
         output.mux(video.encode())
