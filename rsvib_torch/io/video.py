@@ -47,6 +47,12 @@ def _av() -> Any:
     return needed_package("av", "reading and writing video", "video")
 
 
+def _open_container(path: Path) -> Any:
+    """Open a video for decoding; formats that refer to other files (playlists) are refused."""
+    formats = "matroska,webm,avi,mov,mp4,mpegts,mpeg,mpegvideo,asf"
+    return _av().open(str(path), metadata_errors="replace", options={"format_whitelist": formats})
+
+
 def _orientation(frame: Any) -> int:
     """Value of the orientation tag that corresponds to the display matrix of a frame."""
     for data in frame.side_data:
@@ -101,7 +107,7 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
 
     Containers state the number of frames only roughly. ``size`` and ``changed`` (ns) identify the state of the file.
     """
-    with _av().open(str(path), metadata_errors="replace") as container:
+    with _open_container(path) as container:
         stream = container.streams.best("video")
         if stream is None:
             raise ValueError("it contains no video stream")
@@ -152,7 +158,7 @@ class _VideoReader:
 
     def _restart(self) -> None:
         self.close()
-        self._container, self._next = _av().open(str(self._path), metadata_errors="replace"), 0
+        self._container, self._next = _open_container(self._path), 0
         self._decoding = _frames(self._container)
 
     def frame(self, index: int) -> NDArray[Any]:
@@ -189,9 +195,8 @@ def _source(info: StackInfo) -> Path | None:
 def _presentation_times(path: Path, info: StackInfo) -> tuple[Fraction, list[int], Fraction | None]:
     """Time unit in s of the video to write, presentation time of each frame in this unit, and their time origin in s.
 
-    The time origin is None if it is that of the source.
-
-    Times are those of the source if it is a video, else the frame times of the stack, else equal intervals.
+    Times are those of the source if it is a video, else the frame times of the stack, else equal intervals. The time
+    origin is None if it is that of the source.
     """
     source = _source(info)
     times: Sequence[Fraction] = _scanned(source)[1] if source is not None else ()
@@ -258,7 +263,7 @@ def _add_streams(output: Any, path: Path, info: StackInfo, source: Any) -> tuple
 
 def _open_source(info: StackInfo, opened: ExitStack) -> Any:
     path = _source(info)
-    return None if path is None else opened.enter_context(_av().open(str(path), metadata_errors="replace"))
+    return None if path is None else opened.enter_context(_open_container(path))
 
 
 def _check(path: Path, info: StackInfo) -> None:

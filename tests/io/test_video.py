@@ -209,6 +209,29 @@ def test_damage_does_not_affect_other_frames(tmp_path, ending):
     assert sum(taken) >= 4
 
 
+@pytest.mark.parametrize(
+    ("name", "codec"),
+    [
+        ("a.webm", "libvpx"),
+        ("a.3gp", "libx264"),
+        ("a.mts", "libx264"),
+        ("a.m2ts", "mpeg2video"),
+        ("a.mpg", "mpeg2video"),
+        ("a.wmv", "wmv2"),
+        ("a.m4v", "mpeg4"),
+        ("a.avi", "mjpeg"),
+    ],
+)
+def test_other_kinds_of_video_are_read(tmp_path, name, codec):
+    levels = np.broadcast_to(np.arange(6, dtype=np.uint8)[:, None, None, None] * 40, (6, 48, 64, 3))
+    encoded = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+    options = {"layout": "rgb24", "encoded": encoded, "rate": 25, "unit": Fraction(1, 25)}
+    write_video(tmp_path / name, levels, np.arange(6) / 25, codec=codec, **options)
+    np.testing.assert_allclose(read_stack(tmp_path / name).mean((1, 2, 3)) * 255, levels[:, 0, 0, 0], atol=4)
+    times = read_stack_info(tmp_path / name).frame_times
+    assert np.diff(times) == pytest.approx(np.full(5, 1 / 25), abs=1.1e-3)
+
+
 def test_a_frame_of_another_size_is_reported(tmp_path):
     """Two videos without a header, one after the other, as from a camera that was set to another resolution."""
     options = {"layout": "rgb24", "codec": "mpeg2video", "encoded": "yuv420p", "rate": 25, "unit": Fraction(1, 25)}
@@ -278,7 +301,15 @@ def test_files_that_are_not_videos_are_refused(tmp_path, monkeypatch):
         output.mux(audio.encode(frame))
         output.mux(audio.encode())
     (tmp_path / "text.mov").write_text("no video")
-    for name, reason in (("sound.mp4", "it contains no video stream"), ("text.mov", "Invalid data found when")):
+    write_video(tmp_path / "secret.mkv", noise(8), TIMES)
+    (tmp_path / "list.mp4").write_text("ffconcat version 1.0\nfile secret.mkv\n")
+    (tmp_path / "list.mkv").write_text("#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nsecret.mkv\n#EXT-X-ENDLIST\n")
+    for name, reason in (
+        ("sound.mp4", "it contains no video stream"),
+        ("text.mov", "Invalid data found when"),
+        ("list.mp4", "Invalid"),
+        ("list.mkv", "Invalid"),
+    ):
         with pytest.raises(ValueError, match=rf"^{name}: not a readable video stack: {reason}"):
             read_stack(name)
 
