@@ -24,7 +24,14 @@ from rsvib_torch.commands.stack_commands import load, save
 from rsvib_torch.commands.terminal import error_line, print_line, working
 from rsvib_torch.config import read_config
 from rsvib_torch.detection import align_motion, check_motion, detect_motion, detect_swept_tone
-from rsvib_torch.io import check_stack_target, check_writable, read_stack, read_stack_info, whole_file
+from rsvib_torch.io import (
+    check_stack_target,
+    check_writable,
+    describe_stack,
+    read_stack,
+    read_stack_info,
+    whole_file,
+)
 from rsvib_torch.motion.recorded import MotionUnit, TimeUnit, read_motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -262,6 +269,8 @@ def calibrate(
     with working("reading the frames"):
         stacks = [read_stack(path, full_scale=full_scale) for path in frames]
     for path, stack in zip(frames, stacks, strict=True):
+        for note in describe_stack(read_stack_info(path), None):
+            print_line(note)
         if stack.shape[1:] != stacks[0].shape[1:]:
             raise ValueError(
                 f"{path}: frames of shape {tuple(stack.shape[1:])}, expected {tuple(stacks[0].shape[1:])} as in "

@@ -175,20 +175,22 @@ def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTimi
     return replace(of_stack, frame_start_times=tuple(time - times[0] for time in times))
 
 
-def describe_stack(info: StackInfo, timing: SensorTiming) -> list[str]:
+def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:
     """Sentences about an orientation, dropped frames and unequal intervals that a file states.
 
     Args:
         info: What the file states.
-        timing: The sensor, without the times of the file.
+        timing: The sensor, without the times of the file; None if it is not known.
     """
     name, notes = info.path or "the file", []
     if info.orientation in _ORIENTATIONS:
         notes.append(
             f"{name}: displayed {_ORIENTATIONS[info.orientation]}; rows, x and y are those of the stored frames"
         )
+    if timing is None or timing.frame_start_times is not None:
+        return notes
     times, spacing = exposure_times(info, timing), _spacing(info)
-    if times is not None and spacing is not None and len(spacing.numbers) and timing.frame_start_times is None:
+    if times is not None and spacing is not None and len(spacing.numbers):
         missing = round(float(spacing.numbers[-1])) + 1 - len(times)
         if not spacing.equal:
             low, high = (1e3 * float(interval) for interval in (np.diff(times).min(), np.diff(times).max()))
