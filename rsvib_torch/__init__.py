@@ -26,7 +26,15 @@ from rsvib_torch.evaluation import (
     ssim,
 )
 from rsvib_torch.imaging import Optics, RowVaryingBlur, SensorNoise, row_psf, simulate_frames
-from rsvib_torch.io import StackInfo, open_stack, read_stack, read_stack_info, write_stack
+from rsvib_torch.io import (
+    StackInfo,
+    TimingWarning,
+    open_stack,
+    read_stack,
+    read_stack_info,
+    timing_from_first_frame,
+    write_stack,
+)
 from rsvib_torch.motion.recorded import read_motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -64,6 +72,7 @@ __all__ = [
     "StackInfo",
     "StackReport",
     "SweptTone",
+    "TimingWarning",
     "Vibration",
     "VibrationDetector",
     "VibrationRestorer",
@@ -94,6 +103,7 @@ __all__ = [
     "simulate_frames",
     "slanted_edge_mtf",
     "ssim",
+    "timing_from_first_frame",
     "trusted_vibration",
     "visible_pixels",
     "write_stack",

@@ -25,7 +25,14 @@ from rsvib_torch.commands.stack_commands import load, restore_and_save
 from rsvib_torch.commands.terminal import error_line, print_line, working
 from rsvib_torch.config import read_config
 from rsvib_torch.detection import align_motion, check_motion, detect_motion, detect_swept_tone
-from rsvib_torch.io import check_stack_target, check_writable, read_stack, read_stack_info, whole_file
+from rsvib_torch.io import (
+    check_stack_target,
+    check_writable,
+    describe_stack,
+    read_stack,
+    read_stack_info,
+    whole_file,
+)
 from rsvib_torch.motion.recorded import MotionUnit, TimeUnit, read_motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -170,7 +177,7 @@ def known(
     scale = full_scale_of(frames, info, settings, full_scale)
     options = restoration_options(info, scale, settings)
     shape = (1, *info.shape[1:]) if options.get("joint") is True else info.shape
-    check_stack_target(restored, shape, dtype=info.dtype, full_scale=scale)
+    check_stack_target(restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     stack = load(frames, settings, full_scale, device)
     if offset is None:
         with working("aligning the recording with the frames"):
@@ -267,6 +274,8 @@ def calibrate(
     with working("reading the frames"):
         stacks = [read_stack(path, full_scale=full_scale) for path in frames]
     for path, stack in zip(frames, stacks, strict=True):
+        for note in describe_stack(read_stack_info(path), None):
+            print_line(note)
         if stack.shape[1:] != stacks[0].shape[1:]:
             raise ValueError(
                 f"{path}: frames of shape {tuple(stack.shape[1:])}, expected {tuple(stacks[0].shape[1:])} as in "

@@ -37,10 +37,14 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 
 FramesArgument = Annotated[
     Path,
-    typer.Argument(help="Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG or TIFF files."),
+    typer.Argument(help="Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files."),
 ]
 RestoredArgument = Annotated[
-    Path, typer.Argument(help="Stack to write, with the data type and full scale of the input.")
+    Path,
+    typer.Argument(
+        help="Stack to write, with the data type and full scale of the input. The extension selects the format; .mp4 "
+        "and .mkv are videos with the time stamps and the sound of the input.",
+    ),
 ]
 ConfigOption = Annotated[Path, typer.Option(help="TOML configuration file that describes the camera.")]
 DeviceOption = Annotated[DeviceName, typer.Option(help="Device for the computation; auto uses a GPU if there is one.")]

@@ -45,6 +45,7 @@ from rsvib_torch.io import (
     StackInfo,
     check_stack_target,
     check_writable,
+    describe_stack,
     exposure_times,
     metadata_not_kept,
     open_stack,
@@ -109,8 +110,16 @@ def load(path: Path, config: Config, full_scale: float | None, device: DeviceNam
     with working(f"reading {path}"):
         frames = read_stack(path, full_scale=scale)
     timing = timing_from_first_frame(config.timing, info)
-    info = replace(info, frame_times=exposure_times(info, config.timing), times_of_playback=False)
+    print_notes(info, config)
+    times = exposure_times(info, config.timing)
+    info = replace(info, frame_times=times, time_error=0.0, frame_rate=info.frame_rate or config.timing.frame_rate)
     return Stack(frames.to(target), info, scale, timing)
+
+
+def print_notes(info: StackInfo, config: Config) -> None:
+    """Print what the file states about orientation, dropped frames and unequal intervals."""
+    for note in describe_stack(info, config.timing):
+        print_line(note)
 
 
 def _save(path: Path, frames: Tensor, stack: Stack) -> tuple[str, ...]:
@@ -200,7 +209,8 @@ def simulate(
             generator=torch.Generator(target).manual_seed(simulation.seed if seed is None else seed),
         )
     with working(f"writing {frames}"):
-        write_stack(frames, simulated, dtype=dtype, full_scale=scale)
+        stated = StackInfo(tuple(simulated.shape), dtype, scale, frame_rate=settings.timing.frame_rate)
+        write_stack(frames, simulated, dtype=dtype, full_scale=scale, like=stated)
     print_line(f"{frames}: {len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}")
 
 
@@ -236,7 +246,9 @@ def detect(
         print_detection(result)
         print_line(f"{out}: {', '.join(names)}")
         return
-    scale = full_scale_of(frames, read_stack_info(frames), settings, full_scale)
+    info = read_stack_info(frames)
+    print_notes(info, settings)
+    scale = full_scale_of(frames, info, settings, full_scale)
     with whole_folder(out) as folder:
         with counting(f"detecting in {frames.name}") as progress:
             detect_stack(
@@ -298,7 +310,7 @@ def restore_frames(
     stack = load(frames, settings, full_scale, device)
     options = restoration_options(stack.info, stack.full_scale, settings, overrides)
     shape = (1, *stack.info.shape[1:]) if options.get("joint") is True else stack.info.shape
-    check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale)
+    check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
     if report is not None:
         check_writable(report)
     restore_and_save(restored, stack, detected, options, force, report)
@@ -325,6 +337,7 @@ def _restore_windows(
     if not isinstance(window, int):
         raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")
     info = read_stack_info(frames)
+    print_notes(info, config)
     scale = full_scale_of(frames, info, config, full_scale)
     with counting(f"restoring {frames.name}") as progress:
         result = process_stack(
@@ -350,7 +363,10 @@ def run(
     config: ConfigOption,
     output: Annotated[
         str,
-        typer.Option(help="Name of the restored stack in that folder; its extension selects the format."),
+        typer.Option(
+            help="Name of the restored stack in that folder; its extension selects the format, e.g. "
+            ".mp4 or .mkv for a video with the time stamps and the sound of the input."
+        ),
     ] = "restored.tif",
     compression: Annotated[str | None, typer.Option(help="Compression of a TIFF stack: zlib or lzma.")] = None,
     method: MethodOption = None,
@@ -395,6 +411,7 @@ def run(
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
     check_writable(out, folder=True)
     info = read_stack_info(frames)
+    print_notes(info, settings)
     scale = full_scale_of(frames, info, settings, full_scale)
     options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation))
     common: RestoreOptions = {

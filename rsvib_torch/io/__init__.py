@@ -10,7 +10,8 @@ from rsvib_torch.io.files import (
     write_stack,
 )
 from rsvib_torch.io.formats import FrameReader, FrameWriter, StackFormat, register_format
-from rsvib_torch.io.stack_info import FrameError, StackInfo, exposure_times, timing_from_first_frame
+from rsvib_torch.io.frame_times import TimingWarning, describe_stack, exposure_times, timing_from_first_frame
+from rsvib_torch.io.stack_info import FrameError, StackInfo
 
 __all__ = [
     "FrameError",
@@ -18,8 +19,10 @@ __all__ = [
     "FrameWriter",
     "StackFormat",
     "StackInfo",
+    "TimingWarning",
     "check_stack_target",
     "check_writable",
+    "describe_stack",
     "exposure_times",
     "metadata_not_kept",
     "open_stack",

@@ -44,11 +44,14 @@ FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]
 for _form in (
     npy.FORMAT,
     hdf5.FORMAT,
+    image_folder.JPEG_FORMAT,
     image_folder.PNG_FORMAT,
     image_folder.FOLDER_FORMAT,
     raw.FORMAT,
     tiff.FORMAT,
-    video.FORMAT,
+    video.FFV1_FORMAT,
+    video.H264_FORMAT,
+    video.READ_ONLY_FORMAT,
     zarr_store.FORMAT,
 ):
     register_format(_form)
@@ -76,7 +79,9 @@ def open_stack(path: PathLike) -> FrameReader:
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
-    return find_format(path).open(path)
+    reader = find_format(path).open(path)
+    reader.info = replace(reader.info, path=path)
+    return reader
 
 
 def read_stack_info(path: PathLike) -> StackInfo:
@@ -107,8 +112,10 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
 
     The ending selects the format: TIFF (``.tif``, ``.tiff``; also BigTIFF and compressed), ``.npy`` with (H, W),
     (T, H, W) or (T, C, H, W), HDF5 (``.h5``, ``.hdf5``), Zarr v3 (``.zarr``), raw frames with a sidecar (``.raw``),
-    videos (always three channels, RGB), a single ``.png``, or a folder of PNG or TIFF files in natural order (frame9
-    before frame10). Channels keep the order of the file, RGB or RGBA.
+    video (``.mp4``, ``.mov``, ``.mkv``, ``.avi`` and others; grey or RGB, with 8 to 16 bits), a single ``.png`` or
+    ``.jpg``, or a folder of PNG, TIFF or JPEG files in natural order (frame9 before frame10). Channels keep the order
+    of the file, RGB or RGBA. Frames have the stored rows and columns: an orientation that the file states for display
+    (``read_stack_info(path).orientation``) is not applied.
 
     Integers are divided by the full scale: ``full_scale`` if given, else the value stated in the file, else 255 for
     ``uint8``. The full scale of other integers is unknown (16 bits may hold 12-bit counts). Floats keep their values
@@ -196,7 +203,9 @@ def check_info_target(
     """
     form = target_format(path)
     if not form.writable:
-        raise ValueError(f"{path}: {form.name} files can only be read; write .tif, .png, .npy or a folder of PNG files")
+        raise ValueError(
+            f"{path}: {form.name} files can only be read; write .tif, .png, .npy, .mkv or a folder of PNG files"
+        )
     if info.dtype not in form.dtypes:
         raise ValueError(f"{path}: {form.name} files hold {', '.join(form.dtypes)}; got dtype {info.dtype}")
     if len(info.shape) not in (3, 4) or min(info.shape) < 1:
@@ -216,8 +225,29 @@ def check_info_target(
     return form
 
 
+def _info_to_write(info: StackInfo, like: StackInfo | None) -> StackInfo:
+    """A stack with what is stated about the stack from which it was computed, except times that are not exact."""
+    if like is None:
+        return info
+    kept = like.with_frames(info.shape[0])
+    return replace(
+        kept,
+        shape=info.shape,
+        dtype=info.dtype,
+        full_scale=info.full_scale,
+        frame_times=None if kept.time_error else kept.frame_times,
+        time_error=0.0,
+        metadata=like.metadata_for(info.shape, info.dtype),
+    )
+
+
 def check_stack_target(
-    path: PathLike, shape: tuple[int, ...], *, dtype: str | None = None, full_scale: float | None = None
+    path: PathLike,
+    shape: tuple[int, ...],
+    *,
+    dtype: str | None = None,
+    full_scale: float | None = None,
+    like: StackInfo | None = None,
 ) -> float | None:
     """Raise the error that ``write_stack`` would raise for frames of this shape, before they are computed.
 
@@ -226,6 +256,7 @@ def check_stack_target(
         shape: (T, H, W) or (T, C, H, W).
         dtype: As in ``write_stack``.
         full_scale: As in ``write_stack``.
+        like: As in ``write_stack``.
 
     Returns:
         The full scale that would be used; None for floats.
@@ -235,7 +266,7 @@ def check_stack_target(
         full_scale = None
     elif full_scale is None:
         full_scale = known_full_scale(kind)
-    check_info_target(Path(path), StackInfo(tuple(shape), kind.name, full_scale))
+    check_info_target(Path(path), _info_to_write(StackInfo(tuple(shape), kind.name, full_scale), like))
     return None if kind.kind == "f" else required_full_scale(full_scale, kind, path)
 
 
@@ -251,7 +282,7 @@ def metadata_not_kept(
         dtype: Its data type; None for the same.
 
     Returns:
-        Names of tags, ``"full scale"``, ``"resolution"`` and ``"frame times"``.
+        Names of tags, ``"full scale"``, ``"resolution"``, ``"orientation"`` and ``"frame times"``.
 
     Example:
         >>> info = StackInfo((8, 1024, 1024), "uint16", 4095.0, resolution=(300.0, 300.0, "inch"))
@@ -262,10 +293,11 @@ def metadata_not_kept(
     """
     keeps = target_format(Path(path)).keeps
     stated = like.full_scale not in (None, known_full_scale(np.dtype(like.dtype)))
-    timed = like.frame_times is not None and not like.times_of_playback
+    timed = like.frame_times is not None and not like.time_error
     lost = [name for name, tag in like.metadata_for(shape, dtype).items() if tag is None or "metadata" not in keeps]
     lost += ["full scale"] * (stated and "full_scale" not in keeps)
     lost += ["resolution"] * (like.resolution is not None and "resolution" not in keeps)
+    lost += ["orientation"] * (like.orientation != 1 and "orientation" not in keeps)
     lost += ["frame times"] * (timed and not ("frame_times" in keeps and shape[0] == like.shape[0]))
     return tuple(lost)
 
@@ -307,7 +339,8 @@ def write_stack(
 ) -> None:
     """Write a stack of frames whose full scale is 1.
 
-    The ending selects the format as in ``read_stack``; a path without an ending is a folder of PNG files
+    The ending selects the format as in ``read_stack``; videos are written as FFV1 (``.mkv``, ``.avi``; without loss) or
+    H.264 (``.mp4``, ``.mov``; 8 bits, with loss; also of floats). A path without an ending is a folder of PNG files
     (frame_0000.png ...), or of TIFF files if PNG does not support the data type. Integers are multiplied by the full
     scale, rounded and clipped to 0 ... full scale; all formats except ``.npy`` store the full scale. The file replaces
     an existing one when it is complete; after an error nothing has changed.
@@ -321,9 +354,10 @@ def write_stack(
         full_scale: Count that corresponds to 1.0; 255 for ``"uint8"`` if not given, required for other integers. Floats
             keep their values.
         compression: ``"zlib"`` or ``"lzma"`` for TIFF files; None for no compression.
-        like: The stack from which the frames were computed: its resolution, channel order, metadata and, if the number
-            of frames is the same, frame times are stored if the format supports them; ``metadata_not_kept`` lists those
-            that are not.
+        like: The stack from which the frames were computed: its resolution, orientation, frame rate, channel order,
+            metadata and, if the number of frames is the same, frame times are stored if the format supports them;
+            ``metadata_not_kept`` lists those that are not. If both files are videos, the presentation times of the
+            frames and the audio are copied.
 
     Raises:
         OSError: If the file cannot be written.
@@ -341,17 +375,7 @@ def write_stack(
     frames = frames.movedim(axis, -3) if frames.ndim > 3 else frames
     full_scale = check_stack_target(path, tuple(frames.shape), dtype=dtype, full_scale=full_scale)
     pixels = frames_to_counts(frames, np.dtype(dtype or np.float32), full_scale)
-    info = StackInfo(tuple(pixels.shape), pixels.dtype.name, full_scale)
-    if like is not None:
-        times = None if like.times_of_playback else like.with_frames(len(pixels)).frame_times
-        metadata = like.metadata_for(info.shape, info.dtype)
-        info = replace(
-            info,
-            frame_times=times,
-            resolution=like.resolution,
-            channels_last=like.channels_last,
-            metadata=metadata,
-        )
+    info = _info_to_write(StackInfo(tuple(pixels.shape), pixels.dtype.name, full_scale), like)
     form = check_info_target(path, info, compression)
     with temporary_folder(path) as folder:
         part = folder / path.name

@@ -78,7 +78,8 @@ class FrameWriter(Protocol):
 # Data types:  one of ``dtypes`` in native byte order; pixels are returned as stored, without scaling.
 # Full scale:  ``info.full_scale`` is the count that corresponds to 1.0, or None if the file does not state it; formats
 #              that have room for it store it (``known_full_scale`` supplies 255 for uint8).
-# Frame times: exposure starts in seconds, or None; presentation times need ``times_of_playback=True``.
+# Frame times: exposure starts in seconds, or None; times that are not exact need ``time_error`` and ``time_source``.
+# Orientation: frames have the rows and columns of the file; ``info.orientation`` states how they are displayed.
 # Metadata:    ``keeps`` states what the format stores besides pixels; users are told what their file loses.
 # Reading:     ``open`` must not allocate memory by sizes in a header before it has compared them with the size of the
 #              file, must not execute code or follow links to other files, and raises an ``OSError`` if the file cannot
@@ -106,8 +107,8 @@ class StackFormat:
         marker: File that identifies a folder of any name as a stack of this format.
         companions: Endings of additional files, which are appended to the file name.
         compressions: Values of ``compression`` besides None.
-        keeps: What is stored besides pixels: ``"full_scale"``, ``"frame_times"``, ``"resolution"`` and ``"metadata"``,
-            attributes of ``StackInfo``.
+        keeps: What is stored besides pixels: ``"full_scale"``, ``"frame_times"``, ``"orientation"``, ``"resolution"``
+            and ``"metadata"``, attributes of ``StackInfo``.
     """
 
     name: str
@@ -202,5 +203,5 @@ def needed_package(name: str, purpose: str, extra: str) -> Any:
         if error.name is not None and error.name.partition(".")[0] != name.partition(".")[0]:
             raise
         raise ModuleNotFoundError(
-            f"{purpose} needs the package {name.partition('.')[0]}; install rsvib_torch[{extra}]", name=error.name
+            f"{purpose} needs the package {name.partition('.')[0]}: pip install rsvib_torch[{extra}]", name=error.name
         ) from error

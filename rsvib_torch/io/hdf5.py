@@ -1,5 +1,6 @@
 """Stacks in HDF5 files: one dataset of frames with attributes."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
 from rsvib_torch.io.formats import ArrayReader, StackFormat, needed_package
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_from_attributes, readable_stack
+from rsvib_torch.io.time_metadata import time_attributes, times_of_attributes
 
 __all__ = ["FORMAT"]
 
@@ -60,6 +62,24 @@ def _check_sizes(dataset: Any, file_size: int) -> None:
         raise ValueError(f"its chunks of {chunk} bytes are larger than the stack of {needed}")
 
 
+def _times_beside(file: Any, dataset: Any, count: int) -> dict[str, Any]:
+    """Times and frame rate in datasets beside the frames, or in attributes of their group or of the file."""
+    h5py = _h5py()
+    found: dict[str, Any] = {}
+    for group in (file, dataset.parent):
+        members = {
+            name: group[name]
+            for name in time_attributes(dict.fromkeys(group))
+            if isinstance(group.get(name, getlink=True), h5py.HardLink) and isinstance(group[name], h5py.Dataset)
+        }
+        found |= time_attributes(group.attrs)
+        for name, member in members.items():
+            if member.shape in ((), (1,), (count,)) and member.dtype.kind in "iuf" and not member.external:
+                found[name] = member[...]
+                found |= {f"{name}_units": member.attrs[key] for key in ("unit", "units") if key in member.attrs}
+    return times_of_attributes(found, count)
+
+
 def _open(path: Path) -> ArrayReader | ContiguousReader:
     h5py = _h5py()
     with readable_stack(path, "HDF5"):
@@ -70,6 +90,8 @@ def _open(path: Path) -> ArrayReader | ContiguousReader:
             check_dtype(dataset.dtype)
             info = info_from_attributes(dict(dataset.attrs), tuple(dataset.shape), dataset.dtype)
             _check_sizes(dataset, path.stat().st_size)
+            if info.frame_times is None and info.frame_rate is None:
+                info = replace(info, **_times_beside(file, dataset, info.shape[0]))
             offset = dataset.id.get_offset()
             if dataset.chunks is None and offset is not None:
                 return ContiguousReader(path, info, int(offset), dataset.dtype)
@@ -100,5 +122,5 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
 
 
 FORMAT = StackFormat(
-    "hdf5", (".h5", ".hdf5", ".hdf"), _open, _create, keeps=("full_scale", "frame_times", "resolution")
+    "hdf5", (".h5", ".hdf5", ".hdf"), _open, _create, keeps=("full_scale", "frame_times", "orientation", "resolution")
 )

@@ -1,4 +1,4 @@
-"""Stacks with one file per frame: folders of PNG or TIFF files in natural order, or a single PNG file."""
+"""Stacks with one file per frame: folders of PNG, TIFF or JPEG files in natural order, or one PNG or JPEG file."""
 
 import os
 import re
@@ -10,13 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.io.formats import FrameReader, FrameWriter, StackFormat
+from rsvib_torch.io.jpeg import decode_jpeg, jpeg_info
 from rsvib_torch.io.png import decode_png, encode_png, png_info
 from rsvib_torch.io.stack_info import FrameError, StackInfo, Tag
 from rsvib_torch.io.tiff import open_tiff, write_tiff
+from rsvib_torch.io.time_metadata import merged_times
 
-__all__ = ["FOLDER_FORMAT", "PNG_FORMAT"]
+__all__ = ["FOLDER_FORMAT", "JPEG_FORMAT", "PNG_FORMAT"]
 
-_PNG, _TIFF = (".png",), (".tif", ".tiff")
+_PNG, _TIFF, _JPEG = (".png",), (".tif", ".tiff"), (".jpg", ".jpeg")
+_KINDS = {"PNG": _PNG, "TIFF": _TIFF, "JPEG": _JPEG}
+_ENDINGS = (*_PNG, *_TIFF, *_JPEG)
 _PNG_TYPES = ("uint8", "uint16")
 
 
@@ -30,17 +34,20 @@ def _frame_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     visible = [file for file in path.iterdir() if not file.name.startswith(".") and file.is_file()]
-    png, tiff = ([file for file in visible if file.suffix.lower() in endings] for endings in (_PNG, _TIFF))
-    if png and tiff:
-        raise ValueError(f"{path}: the folder contains both PNG and TIFF files; expected one kind")
-    if not png and not tiff:
-        raise ValueError(f"{path}: the folder contains no PNG files and no TIFF files")
-    return sorted(png or tiff, key=_natural_key)
+    files = {kind: [f for f in visible if f.suffix.lower() in endings] for kind, endings in _KINDS.items()}
+    found = [kind for kind in files if files[kind]]
+    if len(found) > 1:
+        raise ValueError(f"{path}: the folder contains both {' and '.join(found)} files; expected one kind")
+    if not found:
+        raise ValueError(f"{path}: the folder contains no PNG, TIFF or JPEG files")
+    return sorted(files[found[0]], key=_natural_key)
 
 
 def _read_info(file: Path) -> StackInfo:
     if file.suffix.lower() in _PNG:
         return png_info(file)
+    if file.suffix.lower() in _JPEG:
+        return jpeg_info(file)
     reader = open_tiff(file)
     reader.close()
     if reader.info.shape[0] != 1:
@@ -51,11 +58,18 @@ def _read_info(file: Path) -> StackInfo:
 def _read_frame(file: Path) -> NDArray[Any]:
     if file.suffix.lower() in _PNG:
         return decode_png(file)
+    if file.suffix.lower() in _JPEG:
+        return decode_jpeg(file)
     reader = open_tiff(file)
     try:
         return reader.frame(0)
     finally:
         reader.close()
+
+
+def _without_position(info: StackInfo) -> StackInfo:
+    """What must be the same in all files of a folder."""
+    return replace(info, resolution=None, frame_times=None)
 
 
 class _ImagesReader(FrameReader):
@@ -66,24 +80,27 @@ class _ImagesReader(FrameReader):
         self._damaged: dict[int, ValueError] = {}
         first: tuple[StackInfo, Path] | None = None
         metadata: dict[str, Tag | None] = {}
+        infos: list[StackInfo | None] = [None] * len(self._files)
         for index, file in enumerate(self._files):
             try:
                 info = _read_info(file)
             except ValueError as error:
                 self._damaged[index] = error
                 continue
+            infos[index] = info
             if first is None:
                 first, metadata = (info, file), dict(info.metadata)
             for name in metadata.keys() | info.metadata.keys():
                 if info.metadata.get(name) != metadata.get(name):
                     metadata[name] = None  # differs between the files
-            if replace(info, resolution=None) != replace(first[0], resolution=None):
+            if _without_position(info) != _without_position(first[0]):
                 raise ValueError(
                     f"frames of different size or kind: {first[1].name} is {first[0].kind}, {file.name} is {info.kind}"
                 )
         if first is None or len(self._damaged) > len(self._files) // 2:
             raise next(iter(self._damaged.values()))
-        self.info = replace(first[0], metadata=metadata).with_frames(len(self._files))
+        stack = replace(first[0], frame_times=None, metadata=metadata).with_frames(len(self._files))
+        self.info = replace(stack, **merged_times(infos))
 
     def frame(self, index: int) -> NDArray[Any]:
         """Pixels of a frame as stored."""
@@ -114,7 +131,8 @@ class _ImagesWriter(FrameWriter):
 
     def write(self, index: int, frame: NDArray[Any]) -> None:
         """Write the file of a frame."""
-        file, one = self._files[index], replace(self._info.with_frames(1), frame_times=None, metadata={})
+        file = self._files[index]
+        one = replace(self._info.with_frames(1), frame_times=None, frame_rate=None, metadata={})
         part = file.with_name(f".{file.name}.part{file.suffix}")
         if file.suffix.lower() in _PNG:
             encode_png(part, np.asarray(frame, dtype=self._info.dtype), one)
@@ -142,10 +160,10 @@ def _check_image(path: Path, info: StackInfo) -> None:
 def _check_folder(path: Path, info: StackInfo) -> None:
     _check_channels(path, info)
     if path.is_dir():
-        images = {f.name for f in path.iterdir() if f.suffix.lower() in (*_PNG, *_TIFF) and not f.name.startswith(".")}
+        images = {f.name for f in path.iterdir() if f.suffix.lower() in _ENDINGS and not f.name.startswith(".")}
         others = images - set(_frame_names(info))
         if others:
-            kind = "TIFF" if Path(min(others)).suffix.lower() in _TIFF else "PNG"
+            kind = next(kind for kind, endings in _KINDS.items() if Path(min(others)).suffix.lower() in endings)
             raise ValueError(
                 f"{path}: the folder contains other {kind} files, e.g. {min(others)}; choose another folder"
             )
@@ -158,7 +176,7 @@ PNG_FORMAT = StackFormat(
     lambda path, info, _: _ImagesWriter([path], info),
     dtypes=_PNG_TYPES,
     check=_check_image,
-    keeps=("full_scale", "resolution"),
+    keeps=("full_scale", "orientation", "resolution"),
 )
 FOLDER_FORMAT = StackFormat(
     "image folder",
@@ -167,5 +185,6 @@ FOLDER_FORMAT = StackFormat(
     _create_folder,
     check=_check_folder,
     kind="folder",
-    keeps=("full_scale", "resolution"),
+    keeps=("full_scale", "orientation", "resolution"),
 )
+JPEG_FORMAT = StackFormat("jpeg", _JPEG, _ImagesReader)

@@ -2,15 +2,18 @@
 
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import ExifTags, Image
 
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.time_metadata import exif_fields
 
 __all__ = ["decode_png", "encode_png", "png_info"]
 
@@ -80,7 +83,7 @@ def png_info(path: Path) -> StackInfo:
             chunks = _chunks(head, path, b"IDAT")
         except ValueError:
             chunks = _chunks(head + file.read(), path, b"IDAT")
-    return _info(chunks, path.stat().st_size, path)
+    return replace(_info(chunks, path.stat().st_size, path), **exif_fields(chunks.get(b"eXIf", b"")))
 
 
 def decode_png(path: Path) -> NDArray[Any]:
@@ -100,7 +103,10 @@ def decode_png(path: Path) -> NDArray[Any]:
 
 
 def encode_png(path: Path, frame: NDArray[Any], info: StackInfo) -> None:
-    """Write one frame (H, W) or (C, H, W); full scale and resolution are stored as ``tEXt`` and ``pHYs`` chunks."""
+    """Write one frame (H, W) or (C, H, W).
+
+    Full scale, resolution and orientation are stored as chunks ``tEXt``, ``pHYs`` and ``eXIf``.
+    """
     if frame.ndim == 3:
         frame = np.moveaxis(frame, 0, -1)[..., (2, 1, 0, 3)[: frame.shape[0]] if frame.shape[0] > 1 else (0,)]
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(frame))
@@ -113,6 +119,10 @@ def encode_png(path: Path, frame: NDArray[Any], info: StackInfo) -> None:
         per_metre = 100.0 if info.resolution[2] == "centimeter" else 100.0 / 2.54
         x, y = (round(value * per_metre) for value in info.resolution[:2])
         added += _chunk(b"pHYs", struct.pack(">IIB", x, y, 1))
+    if info.orientation != 1:
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = info.orientation
+        added += _chunk(b"eXIf", exif.tobytes().removeprefix(b"Exif\0\0"))
     start = 8 + 25  # after signature and header
     path.write_bytes(data[:start] + added + data[start:])
 

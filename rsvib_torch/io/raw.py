@@ -27,6 +27,8 @@ class _Sidecar(Section):
     offset: int = Field(default=0, ge=0)
     full_scale: float | None = None
     frame_times: list[float] | None = None
+    frame_rate: float | None = Field(default=None, gt=0.0)
+    orientation: int = Field(default=1, ge=1, le=8)
     resolution: tuple[float, float, str] | None = Field(default=None, strict=False)
 
 
@@ -39,7 +41,7 @@ def _open(path: Path) -> ContiguousReader:
     if not beside.exists():
         raise FileNotFoundError(f"{path}: raw frames need the sidecar {beside.name}, which does not exist")
     sidecar = validate(_Sidecar, read_json(beside, "sidecar of raw frames"), str(beside))
-    attributes = sidecar.model_dump(include={"axes", "full_scale", "frame_times"})
+    attributes = sidecar.model_dump(include={"axes", "full_scale", "frame_times", "frame_rate", "orientation"})
     if sidecar.resolution is not None:
         attributes |= {"resolution": sidecar.resolution[:2], "resolution_unit": sidecar.resolution[2]}
     dtype = np.dtype(sidecar.dtype)
@@ -60,6 +62,8 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
             "offset": 0,
             "full_scale": info.full_scale,
             "frame_times": info.frame_times,
+            "frame_rate": info.frame_rate,
+            "orientation": info.orientation,
             "resolution": info.resolution,
         }
         _sidecar_path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -68,5 +72,10 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
 
 
 FORMAT = StackFormat(
-    "raw", (".raw",), _open, _create, companions=(".json",), keeps=("full_scale", "frame_times", "resolution")
+    "raw",
+    (".raw",),
+    _open,
+    _create,
+    companions=(".json",),
+    keeps=("full_scale", "frame_times", "orientation", "resolution"),
 )

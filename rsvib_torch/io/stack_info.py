@@ -1,4 +1,4 @@
-"""What a file states about a stack: shape, data type, full scale, frame times; errors of unreadable files."""
+"""What a file states about a stack: shape, data type, full scale, times, orientation; errors of unreadable files."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.io.full_scale import known_full_scale
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.io.time_metadata import orientation_of, times_of_attributes
 
 __all__ = [
     "FrameError",
@@ -18,12 +18,9 @@ __all__ = [
     "StackInfo",
     "Tag",
     "attributes_of",
-    "exposure_times",
     "info_from_attributes",
     "readable_frame",
     "readable_stack",
-    "timing_from_first_frame",
-    "timing_of_stack",
 ]
 
 
@@ -66,10 +63,15 @@ class StackInfo:
         full_scale: Count that corresponds to 1.0: stated in the file, or 255 for ``uint8``; None if unknown, and for
             floats, whose values are not scaled.
         frame_times: Exposure start of the first row of every frame in seconds, if the file states it.
+        frame_rate: Frames per second, if the file states it instead of the times.
         resolution: Pixels per unit along x and y, and the unit (``"inch"``, ``"centimeter"``), if the file states it.
         channels_last: Whether the file stores the channels of a pixel next to each other.
-        times_of_playback: Whether ``frame_times`` are presentation times of a video: rounded, and possibly at another
-            rate than the exposures.
+        orientation: How the stored image is to be turned for display: 1 (as stored) to 8, the values of the tag of TIFF
+            and EXIF, e.g. 6 for 90 degrees clockwise. Frames always have the stored rows and columns.
+        time_error: Largest error of ``frame_times`` in seconds, e.g. rounding in a video; 0 if they are exact exposure
+            starts. Times with an error may run at another rate than the exposures (``exposure_times``).
+        time_source: Where the file states times or frame rate, for messages.
+        path: The file; None if the stack is not in a file, or has another number of frames than the file.
         metadata: Further metadata of a TIFF file by name, which are kept when it is restored to TIFF; None for those
             that cannot be kept.
     """
@@ -80,7 +82,11 @@ class StackInfo:
     frame_times: tuple[float, ...] | None = None
     resolution: tuple[float, float, str] | None = None
     channels_last: bool = field(default=False, compare=False)
-    times_of_playback: bool = field(default=False, compare=False)
+    frame_rate: float | None = None
+    orientation: int = 1
+    time_error: float = field(default=0.0, compare=False)
+    time_source: str = field(default="frame_times", compare=False)
+    path: Path | None = field(default=None, compare=False)
     metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
 
     @property
@@ -100,9 +106,10 @@ class StackInfo:
 
     @property
     def kind(self) -> str:
-        """Shape of a frame, data type and full scale, for messages."""
+        """Shape of a frame, data type, full scale and orientation, for messages."""
         scale = "" if self.full_scale is None else f" with full scale {self.full_scale:g}"
-        return f"{self.shape[1:]} {self.dtype}{scale}"
+        orientation = "" if self.orientation == 1 else f" with orientation {self.orientation}"
+        return f"{self.shape[1:]} {self.dtype}{scale}{orientation}"
 
     @property
     def is_integer(self) -> bool:
@@ -115,10 +122,11 @@ class StackInfo:
         return int(np.prod(self.shape[1:], dtype=object)) * np.dtype(self.dtype).itemsize
 
     def with_frames(self, count: int) -> "StackInfo":
-        """The same kind of stack with ``count`` frames; frame times are kept only if their number is unchanged."""
-        times = self.frame_times if count == self.shape[0] else None
+        """The same kind of stack with ``count`` frames; times and path are kept only if their number is unchanged."""
+        if count == self.shape[0]:
+            return self
         shape = (count, *self.shape[1:])
-        return replace(self, shape=shape, frame_times=times, metadata=self.metadata_for(shape))
+        return replace(self, shape=shape, frame_times=None, path=None, metadata=self.metadata_for(shape))
 
     def metadata_for(self, shape: tuple[int, ...], dtype: str | None = None) -> dict[str, Tag | None]:
         """The metadata of a stack of another shape or data type: None for those that are not valid for it."""
@@ -179,6 +187,10 @@ def attributes_of(info: StackInfo) -> dict[str, Any]:
         attributes["full_scale"] = float(info.full_scale)
     if info.frame_times is not None:
         attributes["frame_times"] = [float(time) for time in info.frame_times]
+    elif info.frame_rate is not None:
+        attributes["frame_rate"] = float(info.frame_rate)
+    if info.orientation != 1:
+        attributes["orientation"] = info.orientation
     if info.resolution is not None:
         attributes["resolution"] = [float(value) for value in info.resolution[:2]]
         attributes["resolution_unit"] = info.resolution[2]
@@ -189,7 +201,7 @@ def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], 
     """Interpret a stored array as a stack.
 
     Args:
-        attributes: As made by ``attributes_of``; all may be missing.
+        attributes: As made by ``attributes_of``, or times of other programs; all may be missing.
         shape: Shape of the array in the file: (H, W), (T, H, W), (T, C, H, W), or (T, H, W, C) if ``axes`` states it.
         dtype: Data type in the file.
 
@@ -205,53 +217,24 @@ def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], 
         shape = (shape[0], shape[3], shape[1], shape[2])
     elif axes == "TCHW" and "axes" not in attributes and shape[-1] <= 4 < shape[1]:
         raise ValueError(f"array has shape {shape}; expected (T, C, H, W), or the attribute axes='THWC'")
-    times = attributes.get("frame_times")
-    if times is not None:
-        times = tuple(float(time) for time in np.asarray(times, dtype=np.float64).ravel())
+    stated: dict[str, Any] = {}
+    if attributes.get("frame_times") is not None:
+        times = np.asarray(attributes["frame_times"], dtype=np.float64).ravel()
+        stated["frame_times"] = tuple(float(time) for time in times)
+    else:
+        stated = times_of_attributes(attributes, shape[0])
     resolution = attributes.get("resolution")
     if resolution is not None:
         x, y = (float(value) for value in resolution)
         resolution = (x, y, str(attributes.get("resolution_unit", "centimeter")))
     full_scale = attributes.get("full_scale")
     full_scale = known_full_scale(dtype, None if full_scale is None else float(full_scale))
-    return StackInfo(shape, dtype.name, full_scale, times, resolution, axes == "THWC")
-
-
-def exposure_times(info: StackInfo, timing: SensorTiming, *, tolerance: float = 0.25) -> tuple[float, ...] | None:
-    """Exposure start of every frame as stated by its file, in seconds; None if it is not stated.
-
-    Presentation times of a video are rounded and may run at another rate than the exposures. They are used only if
-    they are whole frame periods apart and most of them one period: gaps are then dropped frames, and the result
-    consists of multiples of the camera's frame period.
-
-    Args:
-        info: What the file states.
-        timing: The sensor.
-        tolerance: Largest deviation of the interval between two presentation times from a whole number of frame
-            periods, in periods; below 0.5, where rounding is ambiguous.
-    """
-    if info.frame_times is None or not info.times_of_playback:
-        return info.frame_times
-    periods = np.diff(np.array(info.frame_times)) / timing.frame_period
-    whole = np.round(periods)
-    if not len(whole) or whole.min() < 1 or np.abs(periods - whole).max() > tolerance or np.median(whole) != 1:
-        return None
-    return tuple(float(count) * timing.frame_period for count in (0.0, *np.cumsum(whole)))
-
-
-def timing_of_stack(timing: SensorTiming, info: StackInfo) -> SensorTiming:
-    """The sensor with the frame times of a file, unless it has its own or these are evenly spaced playback times."""
-    if timing.frame_start_times is not None or (times := exposure_times(info, timing)) is None:
-        return timing
-    if info.times_of_playback and np.ptp(np.diff(times)) < 1e-9 * timing.frame_period:
-        return timing
-    return replace(timing, frame_start_times=times)
-
-
-def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTiming:
-    """As ``timing_of_stack``, with the frame times of the file relative to the first frame."""
-    of_stack = timing_of_stack(timing, info)
-    if timing.frame_start_times is not None or of_stack.frame_start_times is None:
-        return of_stack
-    times = [float(time) for time in of_stack.frame_start_times]
-    return replace(of_stack, frame_start_times=tuple(time - times[0] for time in times))
+    return StackInfo(
+        shape,
+        dtype.name,
+        full_scale,
+        resolution=resolution,
+        channels_last=axes == "THWC",
+        orientation=orientation_of(attributes.get("orientation")),
+        **stated,
+    )

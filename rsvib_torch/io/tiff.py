@@ -16,6 +16,7 @@ from rsvib_torch.io.formats import FrameReader, StackFormat
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_frame, readable_stack
 from rsvib_torch.io.tiff_metadata import json_description, read_metadata, writer_options
+from rsvib_torch.io.time_metadata import orientation_of, tiff_times
 
 __all__ = ["FORMAT", "open_tiff", "write_tiff"]
 
@@ -155,16 +156,14 @@ def _info(
         full_scale = float(metadata["full_scale"])
     elif isinstance(bits, int) and bits not in (8, 16, 32, 64) and dtype.kind == "u":
         full_scale = float(2**bits - 1)  # packed pixels, e.g. 4095 for 12 bits
-    frame_times = metadata.get("frame_times")
-    if frame_times is not None and len(frame_times) != shape[0]:
-        frame_times = None  # those of the first of several arrays
     info = StackInfo(
         shape,
         dtype.name,
         known_full_scale(dtype, full_scale),
-        None if frame_times is None else tuple(float(time) for time in frame_times),
-        _resolution(tif),
+        resolution=_resolution(tif),
         channels_last=channels_last,
+        orientation=orientation_of(tif.pages.first.tags.valueof("Orientation")),
+        **tiff_times(tif, shape[0], metadata),
     )
     return replace(info, metadata=read_metadata(tif, info))
 
@@ -345,9 +344,13 @@ def _layout(info: StackInfo) -> tuple[StackInfo, dict[str, Any]]:
         description["full_scale"] = info.full_scale
     if info.frame_times is not None:
         description["frame_times"] = list(info.frame_times)
+    elif info.frame_rate is not None:
+        description["frame_rate"] = info.frame_rate
     options = {"photometric": "rgb" if colour else "minisblack", **writer_options(info, description)}
     if axes == "TSYX":
         options["planarconfig"] = "separate"
+    if info.orientation != 1:
+        options["extratags"].append(("Orientation", "H", 1, info.orientation, False))
     if info.resolution is not None:
         options["resolution"] = info.resolution[:2]
         options["resolutionunit"] = info.resolution[2].upper()
@@ -379,5 +382,5 @@ FORMAT = StackFormat(
     _create,
     write_tiff,
     compressions=("zlib", "lzma"),
-    keeps=("full_scale", "frame_times", "resolution", "metadata"),
+    keeps=("full_scale", "frame_times", "orientation", "resolution", "metadata"),
 )

@@ -18,14 +18,14 @@ __all__ = ["json_description", "read_metadata", "writer_options"]
 _DESCRIPTION, _IMAGEJ_COUNTS, _IMAGEJ = 270, 50838, 50839  # codes of tags
 _JSON = "JSON metadata"  # keys of the description that tifffile writes
 _RESOLUTION = "resolution"  # without a unit of length, which ImageJ states in the description
-_LAYOUT_KEYS = ("shape", "axes", "truncated", "full_scale", "frame_times")  # of that description, for the reader only
+# keys of that description for the reader only
+_LAYOUT_KEYS = ("shape", "axes", "truncated", "full_scale", "frame_times", "frame_rate")
 _IMAGEJ_KEY = "rsvib="  # line of an ImageJ description: ImageJ uses the last description, so that there is no other one
 
 _COPIED: dict[int, Scope] = {
     269: "file",  # DocumentName
     271: "file",  # Make
     272: "file",  # Model
-    274: "file",  # Orientation
     306: "file",  # DateTime
     315: "file",  # Artist
     316: "file",  # HostComputer
@@ -155,7 +155,7 @@ def writer_options(info: StackInfo, description: Mapping[str, Any]) -> dict[str,
 
     Args:
         info: The stack.
-        description: Axes, full scale and frame times, to be stored as JSON.
+        description: Axes, full scale, frame times and frame rate, to be stored as JSON.
     """
     extratags: list[tuple[Any, ...]] = []
     options: dict[str, Any] = {"metadata": dict(description), "extratags": extratags}

@@ -1,101 +1,344 @@
-"""Stacks in video files, read through OpenCV."""
+"""Stacks in video files, read and written with PyAV.
 
-import itertools
+Frames are returned as stored, because these are the rows that the sensor has read. A rotation for display is not
+applied; the videos that are written state it.
+"""
+
 import math
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack
+from fractions import Fraction
+from functools import lru_cache
+from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.formats import StackFormat
-from rsvib_torch.io.stack_info import FrameError, StackInfo
+from rsvib_torch.io.formats import StackFormat, needed_package
+from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 
-__all__ = ["FORMAT"]
+__all__ = ["FFV1_FORMAT", "H264_FORMAT", "READ_ONLY_FORMAT"]
 
+_LOSSLESS, _H264 = (".mkv", ".avi"), (".mp4", ".mov", ".m4v")
+_CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}
+_READ_ONLY = (".webm", ".3gp", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv")
+_H264_OPTIONS = {"crf": "12"}  # constant rate factor, 0 (no loss) to 51; differences of less than 18 are hardly visible
+_FFV1_OPTIONS = {"level": "3", "g": "1"}  # each frame can be decoded alone: damage does not affect other frames
+_BT709, _LIMITED_RANGE = 1, 1  # codes of ITU-T H.273 and FFmpeg
+_DEFAULT_RATE = 25.0  # frames per second, if neither file nor sensor state them
 
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Suppress messages that the decoder writes to the terminal."""
-    level = cv2.utils.logging.getLogLevel()
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        yield
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-
-
-def _open_decoder(path: Path) -> Any:
-    with path.open("rb"):
-        pass  # a file that cannot be opened is an OSError
-    with _silent():
-        video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        if not video.isOpened():
-            video.release()
-            raise ValueError(f"{path}: not a readable video")
-    return video
+# display matrix (a, b, c, d) of each value of the orientation tag: displayed x = a x + c y, displayed y = b x + d y
+_MATRICES = {
+    1: (1, 0, 0, 1),
+    2: (-1, 0, 0, 1),
+    3: (-1, 0, 0, -1),
+    4: (1, 0, 0, -1),
+    5: (0, 1, 1, 0),
+    6: (0, 1, -1, 0),
+    7: (0, -1, -1, 0),
+    8: (0, -1, 1, 0),
+}
 
 
-def _playback_times(path: Path) -> list[float]:
-    """Presentation time in seconds of every frame that can be decoded; containers state their number only roughly."""
-    video = _open_decoder(path)
-    times = []
-    with _silent():
-        stated = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-        while video.grab():
-            times.append(1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC)))
-        video.release()
-    if not times:
-        raise ValueError(f"{path}: no frame of the video can be decoded")
-    if len(times) < stated - max(1, stated // 10):
-        raise ValueError(f"{path}: truncated: {len(times)} of {stated} frames can be decoded")
-    return times
+def _av() -> Any:
+    return needed_package("av", "reading and writing video", "video")
+
+
+def _open_container(path: Path) -> Any:
+    """Open a video for decoding; formats that refer to other files (playlists) are refused."""
+    formats = "matroska,webm,avi,mov,mp4,mpegts,mpeg,mpegvideo,asf"
+    return _av().open(str(path), metadata_errors="replace", options={"format_whitelist": formats})
+
+
+def _orientation(frame: Any) -> int:
+    """Value of the orientation tag that corresponds to the display matrix of a frame."""
+    for data in frame.side_data:
+        if data.type.name == "DISPLAYMATRIX":
+            a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
+            signs = tuple(round(value / max(map(abs, (a, b, c, d, 1)))) for value in (a, b, c, d))
+            return next((tag for tag, matrix in _MATRICES.items() if matrix == signs), 1)
+    return 1
+
+
+def _conversion() -> Any:
+    """Options for the conversion of colours; without them the mean of a frame changes by more than one count of 255."""
+    flags = _av().video.reformatter.Interpolation
+    return flags.BILINEAR | flags.FULL_CHR_H_INT | flags.ACCURATE_RND
+
+
+def _decoded_as(layout: Any) -> tuple[str, float]:
+    """Pixel format to which frames are converted, and its full scale; grey and RGB keep their depth."""
+    bits = max(component.bits for component in layout.components)
+    if layout.name.startswith(("gray", "gbrp")) and "f" not in layout.name:
+        return layout.name, float(2**bits - 1)
+    return ("rgb24", 255.0) if bits <= 8 else ("rgb48le", 65535.0)
+
+
+def _pixels(frame: Any) -> NDArray[Any]:
+    """Pixels (H, W) or (3, H, W) of a decoded frame."""
+    unspecified, untagged_height = 2, 576  # players assume the colours of HDTV for taller videos without a tag
+    matrix = "ITU709" if frame.colorspace == unspecified and frame.height > untagged_height else None
+    layout = _decoded_as(frame.format)[0]
+    pixels = frame.to_ndarray(format=layout, src_colorspace=matrix, interpolation=_conversion())
+    return np.ascontiguousarray(pixels if pixels.ndim == 2 else np.moveaxis(pixels, -1, 0))
+
+
+def _frames(container: Any) -> Generator[Any, None, None]:
+    """Decode the frames of the main video stream in the order of presentation; damaged packets are skipped."""
+    av, stream = _av(), container.streams.best("video")
+    stream.thread_type = "AUTO"
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets, None)
+            if packet is None:
+                return
+            yield from packet.decode()
+        except av.error.InvalidDataError:
+            continue
+
+
+@lru_cache(maxsize=8)
+def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fraction, ...]]:
+    """Decode a video once: what it states, and the presentation times in s of the frames that can be decoded.
+
+    Containers state the number of frames only roughly. ``size`` and ``changed`` (ns) identify the state of the file.
+    """
+    with _open_container(path) as container:
+        stream = container.streams.best("video")
+        if stream is None:
+            raise ValueError("it contains no video stream")
+        times, first = [], None
+        for frame in _frames(container):
+            first = first or frame
+            times.append(Fraction(frame.pts or 0) * stream.time_base if frame.pts is not None else None)
+        if first is None:
+            raise ValueError("no frame can be decoded")
+        known = [time for time in times if time is not None]
+        rising = len(known) == len(times) > 1 and all(a < b for a, b in pairwise(known))
+        pixels, rate = _pixels(first), stream.average_rate
+        duration = float(stream.frames / rate if rate else 0)  # stated by .avi, .mp4 and .mov
+        decoded = float(known[-1] - known[0]) if rising else duration
+        if len(times) < 0.9 * stream.frames - 1 and decoded < 0.9 * duration:  # .avi also counts empty frames
+            raise ValueError(f"truncated: {len(times)} frames, {decoded:.3g} of {duration:.3g} s, can be decoded")
+        info = StackInfo(
+            (len(times), *pixels.shape),
+            pixels.dtype.name,
+            _decoded_as(first.format)[1],
+            tuple(float(time) for time in known) if rising else None,
+            channels_last=pixels.ndim == 3,
+            frame_rate=None if rising or not rate else float(rate),
+            orientation=_orientation(first),
+            time_error=float(stream.time_base),
+            time_source="time stamps",
+        )
+        return info, tuple(known) if rising else ()
+
+
+def _scanned(path: Path) -> tuple[StackInfo, tuple[Fraction, ...]]:
+    av, state = _av(), path.stat()
+    with readable_stack(path, "video"):
+        try:
+            return _scan(path.absolute(), state.st_size, state.st_mtime_ns)
+        except av.error.FFmpegError as error:
+            raise ValueError(error.strerror) from error
 
 
 class _VideoReader:
-    """Frames (3, H, W), uint8 RGB, of a video, also of grey ones.
-
-    Frames are decoded in sequence; reading an earlier frame starts again at the beginning.
-    """
+    """Frames of a video, decoded in sequence; reading an earlier frame starts again at the beginning."""
 
     def __init__(self, path: Path) -> None:
-        self._path, times = path, _playback_times(path)
-        self._video, self._next = _open_decoder(path), 0
-        height, width = (int(self._video.get(key)) for key in (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH))
-        rising = len(times) > 1 and all(0.0 <= a < b < math.inf for a, b in itertools.pairwise(times))
-        self.info = StackInfo(
-            (len(times), 3, height, width),
-            "uint8",
-            255.0,
-            tuple(times) if rising else None,
-            channels_last=True,
-            times_of_playback=True,
-        )
+        self._path = path
+        self.info = _scanned(path)[0]
+        self._container: Any = None
+        self._restart()
+
+    def _restart(self) -> None:
+        self.close()
+        self._container, self._next = _open_container(self._path), 0
+        self._decoding = _frames(self._container)
 
     def frame(self, index: int) -> NDArray[Any]:
-        """Pixels of a frame."""
-        with _silent():
-            if index < self._next:
-                self._video.release()
-                self._video, self._next = _open_decoder(self._path), 0
-            while self._next < index and self._video.grab():
-                self._next += 1
-            pixels = self._video.read()[1] if self._next == index else None
-        if pixels is None:
+        """Pixels of a frame as stored."""
+        if index < self._next:
+            self._restart()
+        frame = None
+        while self._next <= index:
+            frame = next(self._decoding, None)
+            self._next += 1
+        if frame is None:
             raise FrameError(f"{self._path}: frame {index} cannot be decoded")
-        self._next += 1
-        if pixels.shape != (*self.info.shape[2:], 3):
-            raise FrameError(f"{self._path}: frames of different size: frame {index} is {pixels.shape[:2]}")
-        return np.ascontiguousarray(np.moveaxis(pixels[..., ::-1], -1, 0))  # OpenCV decodes to BGR
+        if frame.is_corrupt:
+            raise FrameError(f"{self._path}: frame {index} is damaged")
+        pixels = _pixels(frame)
+        if pixels.shape != self.info.shape[1:]:
+            raise FrameError(f"{self._path}: frames of different size: frame {index} is {pixels.shape[-2:]}")
+        return pixels
 
     def close(self) -> None:
         """Close the file."""
-        self._video.release()
+        if self._container is not None:
+            self._decoding.close()
+            self._container.close()
+            self._container = None
 
 
-FORMAT = StackFormat("video", (".avi", ".mp4", ".m4v", ".mov", ".mkv", ".webm"), _VideoReader)
+def _source(info: StackInfo) -> Path | None:
+    """The video from which the frames to write were computed, one for each of its frames."""
+    endings = (*_LOSSLESS, *_H264, *_READ_ONLY)
+    return info.path if info.path is not None and info.path.suffix.lower() in endings else None
+
+
+def _presentation_times(path: Path, info: StackInfo) -> tuple[Fraction, list[int], Fraction | None]:
+    """Time unit in s of the video to write, presentation time of each frame in this unit, and their time origin in s.
+
+    Times are those of the source if it is a video, else the frame times of the stack, else equal intervals. The time
+    origin is None if it is that of the source.
+    """
+    source = _source(info)
+    times: Sequence[Fraction] = _scanned(source)[1] if source is not None else ()
+    if not times and info.frame_times is not None:
+        fine = 90000  # Hz; usual unit of .mp4
+        times = [Fraction(round(fine * (time - info.frame_times[0])), fine) for time in info.frame_times]
+    if not times:
+        rate = Fraction(info.frame_rate or _DEFAULT_RATE).limit_denominator(1001)
+        times = [index / rate for index in range(info.shape[0])]
+    start = None
+    if path.suffix.lower() == ".avi" and len(times) > 1:  # it begins at 0, and its unit is the frame period
+        start, times = times[0], [time - times[0] for time in times]
+        intervals = np.diff([float(time) for time in times])
+        periods = round(float(np.sum(np.round(intervals / np.median(intervals)))))
+        unit = 1 / (periods / times[-1]).limit_denominator(1001)
+        rounding = 0.0011  # s; .mkv has units of 1 ms
+        if max(abs(float(time - unit * round(time / unit))) for time in times) > rounding:
+            raise ValueError(f"{path}: .avi cannot hold a variable frame rate; write .mkv")
+    else:
+        unit = Fraction(1, math.lcm(*(time.denominator for time in times)))
+    return unit, [round(time / unit) for time in times], start
+
+
+def _encoded_as(path: Path, info: StackInfo) -> tuple[str, str, float]:
+    """Pixel formats of the array of a frame and of the encoder, and their full scale."""
+    grey, lossy = info.axes == "THW" or info.shape[1] == 1, path.suffix.lower() in _H264
+    bits = next(bits for bits in (8, 10, 12, 14, 16) if lossy or 2**bits - 1 >= (info.full_scale or 0.0))
+    if bits > 8:
+        layout = f"gray{bits}le" if grey else f"gbrp{bits}le"
+        return layout, layout, 2.0**bits - 1.0
+    layout = "gray" if grey else "rgb24"
+    return layout, "yuv420p" if lossy else "gray" if grey else "bgr0", 255.0
+
+
+def _add_streams(output: Any, path: Path, info: StackInfo, source: Any) -> tuple[Any, dict[Any, Any]]:
+    """Add a video stream to an open container; also the audio of ``source``, a container or None, without encoding it.
+
+    Returns:
+        The video stream, and the audio stream of the output for each of ``source``.
+    """
+    lossy = path.suffix.lower() in _H264
+    unit, ticks, _ = _presentation_times(path, info)
+    rate = 1 / (unit * int(np.median(np.diff(ticks)))) if len(ticks) > 1 else Fraction(_DEFAULT_RATE)
+    codec, options = ("libx264", _H264_OPTIONS) if lossy else ("ffv1", _FFV1_OPTIONS)
+    video = output.add_stream(codec, rate=rate, options=options)
+    video.height, video.width = info.shape[-2:]
+    video.pix_fmt = _encoded_as(path, info)[1]
+    video.codec_context.time_base = video.time_base = unit
+    if info.orientation != 1:
+        a, b, c, d = _MATRICES[info.orientation]
+        one = 1 << 16  # fixed-point numbers
+        video.set_display_matrix([a * one, b * one, 0, c * one, d * one, 0, 0, 0, 1 << 30])
+    if lossy:
+        video.codec_context.colorspace, video.codec_context.color_range = _BT709, _LIMITED_RANGE
+    if source is None:
+        return video, {}
+    output.metadata.update(source.metadata)
+    taken, encoder = source.streams.best("video").codec_context, video.codec_context
+    encoder.color_primaries, encoder.color_trc = taken.color_primaries, taken.color_trc
+    if taken.sample_aspect_ratio:
+        encoder.sample_aspect_ratio = taken.sample_aspect_ratio
+    return video, {stream: output.add_stream_from_template(stream) for stream in source.streams.audio}
+
+
+def _open_source(info: StackInfo, opened: ExitStack) -> Any:
+    path = _source(info)
+    return None if path is None else opened.enter_context(_open_container(path))
+
+
+def _check(path: Path, info: StackInfo) -> None:
+    av, ending = _av(), path.suffix.lower()
+    if info.axes == "TCHW" and info.shape[1] not in (1, 3):
+        raise ValueError(f"{path}: videos hold 1 or 3 channels, got {info.shape[1]}; write .tif")
+    if ending in _H264 and (info.shape[-2] % 2 or info.shape[-1] % 2):
+        raise ValueError(f"{path}: H.264 needs an even height and width, got {info.shape[-2:]}; write .mkv")
+    held = {".avi": (1,), ".mkv": (1, 3, 6, 8)}.get(ending, tuple(_MATRICES))
+    if info.orientation not in held:
+        better = ".mkv or .mp4" if ending == ".avi" and info.orientation in (3, 6, 8) else ".mp4"
+        raise ValueError(
+            f"{path}: {ending} cannot hold the orientation {info.orientation} of the input; write {better}"
+        )
+    _presentation_times(path, info)
+    with ExitStack() as opened:
+        source = _open_source(info, opened)
+        output = opened.enter_context(av.open(BytesIO(), "w", format=_CONTAINERS[ending]))
+        for stream in source.streams.audio if source is not None else ():
+            name = stream.codec_context.name
+            if name not in output.supported_codecs:
+                raise ValueError(f"{path}: {ending} cannot hold the audio ({name}) of {info.path}; write .mkv")
+
+
+def _write(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+    av, (layout, encoded, full_scale) = _av(), _encoded_as(path, info)
+    unit, ticks, start = _presentation_times(path, info)
+    with ExitStack() as opened:
+        source = _open_source(info, opened)
+        output = opened.enter_context(
+            av.open(str(path), "w", format=_CONTAINERS[path.suffix.lower()], options={"fflags": "+bitexact"})
+        )
+        video, audio = _add_streams(output, path, info, source)
+        sound = _packets(source, audio, start)
+        packet = next(sound, None)
+        for tick, pixels in zip(ticks, frames, strict=True):
+            while packet is not None and packet.pts * packet.time_base <= tick * unit:  # players read both together
+                output.mux(packet)
+                packet = next(sound, None)
+            counts = np.moveaxis(pixels, 0, -1) if pixels.shape[:-2] == (3,) else pixels.reshape(pixels.shape[-2:])
+            if full_scale != info.full_scale:
+                relative = counts / (info.full_scale or 1.0)  # the full scale of floats is 1
+                counts = np.rint(full_scale * np.clip(np.nan_to_num(relative), 0.0, 1.0))
+            counts = np.ascontiguousarray(counts, dtype=np.uint8 if full_scale <= 255 else np.uint16)
+            frame = av.VideoFrame.from_ndarray(counts, format=layout)
+            if encoded != layout:
+                frame = frame.reformat(format=encoded, dst_colorspace="ITU709", interpolation=_conversion())
+            frame.pts, frame.time_base = tick, unit
+            output.mux(video.encode(frame))
+        output.mux(video.encode())
+        while packet is not None:
+            output.mux(packet)
+            packet = next(sound, None)
+
+
+def _packets(source: Any, streams: dict[Any, Any], start: Fraction | None) -> Iterator[Any]:
+    """Packets of the streams of ``source``, for the streams of the output that belong to them.
+
+    Packets before the time origin ``start`` (s) of the output are omitted; None if it is that of the source.
+    """
+    if not streams:
+        return
+    for packet in source.demux(*streams):
+        if packet.dts is not None and packet.pts is not None:  # the last packet of a stream is empty
+            if start is not None:
+                ticks = round(start / packet.time_base)
+                packet.pts, packet.dts = packet.pts - ticks, packet.dts - ticks
+            packet.stream = streams[packet.stream]
+            if start is None or packet.pts >= 0:
+                yield packet
+
+
+_KEEPS = ("full_scale", "frame_times", "orientation")
+FFV1_FORMAT = StackFormat(
+    "FFV1 video", _LOSSLESS, _VideoReader, write_all=_write, dtypes=("uint8", "uint16"), check=_check, keeps=_KEEPS
+)
+H264_FORMAT = StackFormat("H.264 video", _H264, _VideoReader, write_all=_write, check=_check, keeps=_KEEPS)
+READ_ONLY_FORMAT = StackFormat("webm, mpeg, 3gp and wmv", _READ_ONLY, _VideoReader)

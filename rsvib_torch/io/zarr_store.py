@@ -115,5 +115,5 @@ FORMAT = StackFormat(
     _create,
     kind="tree",
     marker=_HEADER,
-    keeps=("full_scale", "frame_times", "resolution"),
+    keeps=("full_scale", "frame_times", "orientation", "resolution"),
 )

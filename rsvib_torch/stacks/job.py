@@ -15,9 +15,10 @@ from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.io.files import PathLike, open_stack, read_stack_info
 from rsvib_torch.io.formats import FrameReader
+from rsvib_torch.io.frame_times import timing_of_stack
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts, required_full_scale
 from rsvib_torch.io.schema import DetectedVibration, detection_to_json
-from rsvib_torch.io.stack_info import FrameError, StackInfo, timing_of_stack
+from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.memory import parse_memory, windows_at_once
 from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted

@@ -251,7 +251,7 @@ class Sink:
         elif frames:
             part = self._stage / f"{window:06d}.part"
             with part.open("wb") as file:
-                stack = np.stack(frames)
+                stack = np.ascontiguousarray(np.stack(frames))  # channels may be stored last
                 np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(stack))
                 file.write(stack.data)  # errors of np.save do not contain the reason
                 file.flush()

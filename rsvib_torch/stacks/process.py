@@ -11,8 +11,8 @@ from typing import Any, Unpack
 
 from rsvib_torch.io.atomic import whole_file
 from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept
+from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.schema import DetectedVibration
-from rsvib_torch.io.stack_info import exposure_times
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import (
@@ -203,8 +203,13 @@ def process_stack(
             "pass one for each window"
         )
     out = job.info.with_frames(len(windows) if job.joined else job.info.shape[0])
-    times = None if out.frame_times is None else exposure_times(job.info, timing)
-    out = replace(out, full_scale=job.full_scale, frame_times=times)
+    out = replace(
+        out,
+        full_scale=job.full_scale,
+        frame_times=None if out.frame_times is None else exposure_times(job.info, timing),
+        time_error=0.0,
+        frame_rate=out.frame_rate or timing.frame_rate,
+    )
     form = check_info_target(sink, out, compression, check_folder=False)
     target = sink.with_name(sink.name + ".manifest.json") if manifest is None else Path(manifest)
     if sink.exists() and os.path.samefile(source, sink):

@@ -473,7 +473,7 @@ def test_outputs_that_cannot_be_written(place, vibration_text, tmp_path, capsys,
         (restore_arguments(place, tmp_path, out=tmp_path / "r.png"), "a PNG file holds one frame, got 2"),
         (("detect", frames, *config, "--out", tmp_path / "file"), "a file of that name exists"),
         (("run", frames, tmp_path / "file" / "out", *config), "file is not writable"),
-        (("simulate", place / "scene.png", tmp_path / "f.mp4", *config), "video files can only be read"),
+        (("simulate", place / "scene.png", tmp_path / "f.webm", *config), "wmv files can only be read"),
     ]
 
     def refuse(*args, **kwargs):

@@ -97,7 +97,7 @@ def test_png_damage_is_refused(tmp_path):
 
 
 def test_png_folders_that_are_not_stacks_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="contains no PNG files"):
+    with pytest.raises(ValueError, match="contains no PNG, TIFF or JPEG files"):
         read_stack(tmp_path)
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 5), np.uint8))
     cv2.imwrite(str(tmp_path / "b.png"), np.zeros((4, 6), np.uint8))
@@ -138,7 +138,9 @@ def test_videos_that_cannot_be_read(tmp_path, capfd):
     writer.release()
     data = (tmp_path / "cut.avi").read_bytes()
     (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
-    with pytest.raises(ValueError, match=r"cut\.avi: truncated: \d+ of 20 frames"):
+    with pytest.raises(
+        ValueError, match=r"cut\.avi: not a readable video stack: truncated: \d+ frames, 0\.\d+ of 0\.833 s"
+    ):
         read_stack(tmp_path / "cut.avi")
     assert capfd.readouterr().err == ""
 
@@ -168,10 +170,10 @@ def test_names_that_are_not_stacks_are_refused(tmp_path):
     (tmp_path / "frames.xyz").write_text("")
     with pytest.raises(ValueError, match=r"unknown file ending '\.xyz'; expected .*\.tif"):
         read_stack(tmp_path / "frames.xyz")
-    with pytest.raises(ValueError, match=r"unknown file ending '\.jpg'"):
+    with pytest.raises(ValueError, match="jpeg files can only be read"):
         write_stack(tmp_path / "frames.jpg", FRAMES)
-    with pytest.raises(ValueError, match="video files can only be read"):
-        write_stack(tmp_path / "frames.mp4", FRAMES, dtype="uint8")
+    with pytest.raises(ValueError, match=r"wmv files can only be read; write .*mkv"):
+        write_stack(tmp_path / "frames.webm", FRAMES, dtype="uint8")
 
 
 @pytest.mark.parametrize(

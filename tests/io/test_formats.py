@@ -225,7 +225,7 @@ def test_missing_package_names_the_extra(tmp_path, monkeypatch, ending, package)
     monkeypatch.setitem(sys.modules, package, None)
     (tmp_path / "a.h5").write_bytes(b"")
     (tmp_path / "a.zarr").mkdir()
-    message = rf"needs the package {package}; install rsvib_torch\[formats\]"
+    message = rf"needs the package {package}: pip install rsvib_torch\[formats\]"
     with pytest.raises(ModuleNotFoundError, match=message):
         read_stack(tmp_path / f"a{ending}")
     with pytest.raises(ModuleNotFoundError, match=message):

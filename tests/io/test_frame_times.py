@@ -1,6 +1,7 @@
-"""Frame times stated by files: used and kept by every command; playback times of videos only if they are plausible."""
+"""Frame times and rates stated by files: used and kept by every command, and compared with the sensor."""
 
 import json
+import re
 from dataclasses import replace
 
 import cv2
@@ -14,7 +15,7 @@ from truth import decibel
 import rsvib_torch as rsv
 from rsvib_torch import StackInfo, read_stack_info
 from rsvib_torch.commands.main import run_command
-from rsvib_torch.io import exposure_times, timing_from_first_frame, write_stack
+from rsvib_torch.io import TimingWarning, describe_stack, exposure_times, timing_from_first_frame, write_stack
 
 KEPT = [0, 1, 2, 4, 5, 9, 10]  # the other frames were dropped
 START = 100.25  # s
@@ -85,26 +86,82 @@ def test_without_its_times_the_stack_is_not_restored(place):
     assert min(decibel(frame, STILL, 12) for frame in restored) < 30
 
 
-def info_with(times):
-    return StackInfo((len(times), 8, 8), "uint8", 255.0, tuple(times), times_of_playback=True)
+def info_with(times, error=1e-3):
+    times = tuple(float(time) for time in times)
+    return StackInfo((len(times), 8, 8), "uint8", 255.0, times, time_error=error, time_source="time stamps")
 
 
-def test_playback_times_are_only_used_to_find_dropped_frames():
+def test_rounded_times_are_used_to_find_dropped_frames():
     period = TIMING.frame_period
     gaps = info_with([round(index * period, 3) for index in KEPT])
     assert exposure_times(gaps, TIMING) == pytest.approx([index * period for index in KEPT], rel=1e-12)
     assert timing_from_first_frame(TIMING, gaps).frame_start_times == exposure_times(gaps, TIMING)
-    even = info_with([1.0 + 0.99 * index * period for index in range(9)])
+    assert describe_stack(gaps, TIMING) == [
+        "the file: 4 frames are missing according to its time stamps, which are used"
+    ]
+    even = info_with([1.0 + 0.993 * index * period for index in range(9)])
     assert exposure_times(even, TIMING) == pytest.approx([index * period for index in range(9)], rel=1e-12)
     assert timing_from_first_frame(TIMING, even) is TIMING
-    for times in ([index / 30 for index in range(9)], [0.0, period / 2, period], [0.0, 4 * period, 8 * period]):
-        assert exposure_times(info_with(times), TIMING) is None  # playback at another rate
-        assert timing_from_first_frame(TIMING, info_with(times)) is TIMING
+    assert describe_stack(even, TIMING) == []
     own = replace(TIMING, frame_start_times=tuple(index * period for index in range(9)))
     assert timing_from_first_frame(own, gaps) is own
+    assert describe_stack(gaps, own) == []
 
 
-def test_video_with_another_playback_rate_has_evenly_spaced_frames(tmp_path):
+def test_a_long_stack_of_rounded_times_has_the_rate_of_the_sensor():
+    """Rounded to 1 ms, 10.4 ms are intervals of 10 and 11 ms; a gap of 30 frames is still counted correctly."""
+    kept = [*range(40), *range(70, 90)]
+    rounded = info_with([round(index * TIMING.frame_period, 3) for index in kept])
+    assert exposure_times(rounded, TIMING) == pytest.approx([index * TIMING.frame_period for index in kept], rel=1e-12)
+
+
+@pytest.mark.parametrize("error", [1e-5, 1e-3])
+def test_times_of_a_variable_frame_rate_are_used_as_they_are(error):
+    times = np.cumsum([0, 1, 1, 1.3, 1, 1.15, 1, 1, 1.22, 1]) * TIMING.frame_period
+    info = info_with(np.round(times / error) * error, error)
+    assert exposure_times(info, TIMING) == info.frame_times
+    timing = timing_from_first_frame(TIMING, info)
+    assert timing.frame_start_times == pytest.approx(times, abs=error)
+    (note,) = describe_stack(info, TIMING)
+    assert "frame intervals of 10" in note
+    assert "its time stamps are used, whose error is up to" in note
+
+
+def test_a_slow_change_of_the_frame_rate_is_not_mistaken_for_equal_intervals():
+    times = np.cumsum(np.linspace(1.0, 1.08, 60)) * TIMING.frame_period
+    info = info_with(times - times[0], 1e-5)
+    assert exposure_times(info, replace(TIMING, frame_rows=108)) == info.frame_times
+
+
+def test_irregular_times_that_are_too_rough_are_reported():
+    info = info_with(np.cumsum([0, *[1] * 7, *[1.48] * 6]) * TIMING.frame_period, 5e-3)
+    with pytest.warns(TimingWarning, match=r"time stamps are irregular and have errors of up to 5 ms; equal intervals"):
+        assert timing_from_first_frame(TIMING, info) is TIMING
+
+
+@pytest.mark.parametrize("interval", [1 / 30, 0.5 * TIMING.frame_period, 4 * TIMING.frame_period])
+def test_a_frame_rate_that_contradicts_the_sensor_is_reported_with_the_remedy(interval):
+    rate = re.escape(f"{1 / interval:.5g} frames per second according to its time stamps, but 96.154 according to")
+    remedy = re.escape(f"set frame_rows={interval / 1e-4:.6g}")
+    for info in (
+        info_with(interval * np.arange(9)),
+        replace(info_with(interval * np.arange(9)), frame_times=None, frame_rate=1 / interval),
+    ):
+        assert exposure_times(info, TIMING) is None
+        with pytest.warns(TimingWarning, match=f"{rate}.*{remedy}"):
+            assert timing_from_first_frame(TIMING, info) is TIMING
+
+
+def test_exact_times_may_be_those_of_every_nth_frame():
+    fourth = info_with(4 * TIMING.frame_period * np.arange(9), 0.0)
+    assert timing_from_first_frame(TIMING, fourth).frame_start_times == fourth.frame_times
+    with pytest.warns(TimingWarning, match=r"128\.21 frames per second .* the times of the file are used"):
+        used = timing_from_first_frame(TIMING, info_with(0.75 * TIMING.frame_period * np.arange(9), 0.0))
+    assert used.frame_start_times[1] == pytest.approx(0.75 * TIMING.frame_period)
+
+
+@pytest.mark.filterwarnings("default::rsvib_torch.io.TimingWarning")
+def test_video_with_another_playback_rate_has_evenly_spaced_frames(tmp_path, capsys):
     kind = cv2.VideoWriter.fourcc(*"MJPG")
     # FFmpeg would write messages to the terminal
     writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.CAP_OPENCV_MJPEG, kind, 24, (WIDTH, HEIGHT))
@@ -114,6 +171,8 @@ def test_video_with_another_playback_rate_has_evenly_spaced_frames(tmp_path):
     (tmp_path / "camera.toml").write_text(CAMERA.replace("full_scale = 4095\n", ""))
     arguments = ("run", tmp_path / "clip.avi", tmp_path / "out", "--config", tmp_path / "camera.toml")
     assert rsvib(*arguments, "--output", "restored.h5") == 0
+    warning = capsys.readouterr().err
+    assert warning.count("24 frames per second according to its time stamps, but 96.154 according to the sensor") == 1
     found = json.loads((tmp_path / "out" / "vibration.json").read_text())
     assert found["timing"]["frame_start_times"] is None
     assert found["vibration"]["frequency"][0][0] == pytest.approx(MOTION.frequency[0], rel=0.02)

@@ -124,7 +124,7 @@ def test_video_is_read_as_rgb(tmp_path):
     writer.release()
     info = read_stack_info(path)
     assert replace(info, frame_times=None) == StackInfo((4, 3, 48, 64), "uint8", 255.0)
-    assert info.times_of_playback
+    assert info.time_error == pytest.approx(1 / 24)
     assert info.frame_times == pytest.approx([0, 1 / 24, 2 / 24, 3 / 24], abs=1e-6)
     means = (read_stack(path) * 255).mean((-2, -1))
     np.testing.assert_allclose(means, [[30, 60, level] for level in (40, 90, 140, 190)], atol=4)

@@ -31,7 +31,6 @@ OTHERS = {
     "DateTime": (306, "s", 0, "2024:05:01 10:00:00"),
     "Artist": (315, "s", 0, "Zo\u00eb".encode()),
     "Model": (272, "s", 0, "camera 7"),
-    "Orientation": (274, "H", 1, 6),
     "65001": (65001, "d", 1, 0.25),
 }
 
@@ -150,7 +149,7 @@ def test_imagej_metadata_are_kept(tmp_path, byteorder, compression):
         assert found.is_imagej
         assert found.series[0].axes == "TYX"
         rest = dict(found.imagej_metadata)
-        assert json.loads(rest.pop("rsvib")) == {"full_scale": 4095.0}
+        assert json.loads(rest.pop("rsvib")) == {"full_scale": 4095.0, "frame_rate": 10.0}
         assert rest == given.imagej_metadata
         assert (rest["Labels"], rest["Info"]) == (own["Labels"], own["Info"])
         assert all(found.pages[0].tags[name].value == given.pages[0].tags[name].value for name in ("XResolution", 296))
@@ -184,8 +183,9 @@ def test_ome_xml_is_kept(tmp_path):
 def test_other_formats_and_sizes_lose_metadata(tmp_path):
     options = {"photometric": "minisblack", "resolution": (300, 200, "INCH"), "metadata": {"full_scale": 4095}}
     entries = {name: entry for name, entry in (GEOREFERENCE | OTHERS).items() if name != "65001"}
-    tifffile.imwrite(tmp_path / "in.tif", GREY, extratags=tags_of(entries), **options)
-    assert set(copied(tmp_path, output="out.npy")) == {*entries, "full scale", "resolution"}
+    tags = [*tags_of(entries), (274, "H", 1, 6, False)]
+    tifffile.imwrite(tmp_path / "in.tif", GREY, extratags=tags, **options)
+    assert set(copied(tmp_path, output="out.npy")) == {*entries, "full scale", "resolution", "orientation"}
     assert set(copied(tmp_path, output="out.h5")) == {*entries}
     assert set(copied(tmp_path, output="folder")) == {*entries}
     assert set(copied(tmp_path, output="out.raw")) == {*entries}

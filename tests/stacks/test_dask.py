@@ -86,7 +86,9 @@ def test_missing_scheduler_and_missing_package(place, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="no Dask scheduler answers at nonsense://x"):
         process_small(place / "frames.tif", tmp_path / "out.tif", scheduler="nonsense://x")
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ModuleNotFoundError, match=r"needs the package distributed; install rsvib_torch\[distributed\]"):
+    with pytest.raises(
+        ModuleNotFoundError, match=r"needs the package distributed: pip install rsvib_torch\[distributed\]"
+    ):
         process_small(place / "frames.tif", tmp_path / "out.tif", scheduler="local")
     assert list(tmp_path.iterdir()) == []
 

@@ -1,0 +1,203 @@
+"""Times and frame rate that a file states, compared with the sensor and used as exposure starts of the frames."""
+
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.motion.timing import SensorTiming
+
+__all__ = [
+    "TimingWarning",
+    "describe_stack",
+    "exposure_times",
+    "timing_from_first_frame",
+    "timing_of_stack",
+]
+
+_RATE_TOLERANCE = 0.01  # relative; files state 30 for 29.97 frames per second (0.1 %)
+
+_ORIENTATIONS = {
+    2: "mirrored left to right",
+    3: "rotated by 180 degrees",
+    4: "mirrored top to bottom",
+    5: "rotated by 90 degrees clockwise and mirrored left to right",
+    6: "rotated by 90 degrees clockwise",
+    7: "rotated by 90 degrees anticlockwise and mirrored left to right",
+    8: "rotated by 90 degrees anticlockwise",
+}
+
+
+class TimingWarning(UserWarning):
+    """The frame rate or the times in a file contradict the timing of the sensor."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Spacing:
+    """Spacing of the frames of a file.
+
+    Attributes:
+        numbers: Number of intervals from the first frame to each frame, more than one where frames were dropped, (T,).
+        interval: Interval without dropped frames in s: of a straight line, or the median if the rate is variable.
+        error: Error of ``interval`` in s due to the error of the times.
+        equal: Whether the times are whole numbers of intervals apart, to within their error, 2 % of an interval (clock
+            of a telephone or camera), and a quarter of an interval.
+    """
+
+    numbers: NDArray[np.float64]
+    interval: float
+    error: float
+    equal: bool
+
+
+def _spacing(info: StackInfo) -> _Spacing | None:
+    """Spacing according to the times or the frame rate of a file; None if it states neither."""
+    if info.frame_times is None or len(info.frame_times) < 2:
+        return None if info.frame_rate is None else _Spacing(np.zeros(0), 1.0 / info.frame_rate, 0.0, equal=True)
+    times = np.array(info.frame_times)
+    intervals = np.diff(times)
+    median = float(np.median(intervals))
+    single = float(intervals[np.round(intervals / median) == 1].mean())  # more accurate if times are rounded
+    whole = np.round(intervals / single)
+    numbers = np.concatenate([[0.0], np.cumsum(whole)])
+    line = np.polynomial.Polynomial.fit(numbers, times, 1)
+    jitter = float(np.abs(times - line(numbers)).max())
+    if whole.min() >= 1 and jitter <= min(max(info.time_error, 0.02 * single), 0.25 * single):
+        return _Spacing(numbers, float(line.convert().coef[1]), info.time_error / float(numbers[-1]), equal=True)
+    return _Spacing(numbers, median, info.time_error, equal=False)
+
+
+def _same_rate(info: StackInfo, timing: SensorTiming) -> bool:
+    """Whether the frame rate of a file, if it states one, is that of the sensor.
+
+    Frames with exact times may be every n-th frame of the sensor.
+    """
+    spacing = _spacing(info)
+    if spacing is None:
+        return True
+    period = timing.frame_period
+    if info.frame_times is not None and info.time_error == 0.0:
+        period *= max(1, round(spacing.interval / period))
+    return abs(spacing.interval - period) <= _RATE_TOLERANCE * period + spacing.error
+
+
+def _warn_of_rate(info: StackInfo, timing: SensorTiming) -> None:
+    """Warn if the frame rate of a file is not that of the sensor, with both values and the remedy."""
+    spacing = _spacing(info)
+    if spacing is None or _same_rate(info, timing):
+        return
+    exact = info.frame_times is not None and info.time_error == 0.0
+    used = "the times of the file are used" if exact else f"{timing.frame_rate:.5g} is used, with equal intervals"
+    warnings.warn(
+        f"{info.path or 'the file'}: {1.0 / spacing.interval:.5g} frames per second according to its "
+        f"{info.time_source}, but {timing.frame_rate:.5g} according to the sensor (frame_rows={timing.frame_rows:g}, "
+        f"row_time={timing.row_time:g} s); {used}. If the file is right, set frame_rows="
+        f"{spacing.interval / timing.row_time:.6g} or correct row_time; if the sensor is right (slow motion), nothing "
+        "needs to be changed",
+        TimingWarning,
+        stacklevel=2,
+    )
+
+
+def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] | None:
+    """Exposure start of every frame according to its file, in seconds; None if it is not stated, or at another rate.
+
+    Exact times are returned as they are. Times with an error, e.g. the presentation times of a video, are used only if
+    their interval is the frame period of the sensor to 1 %. If they are whole numbers of intervals apart to within
+    their error or 2 % of a period, the result consists of multiples of the sensor's frame period, with gaps where
+    frames were dropped. Otherwise the frame rate is variable: the times are returned as they are if their error is less
+    than a tenth of a period.
+
+    Args:
+        info: What the file states.
+        timing: The sensor.
+
+    Example:
+        >>> info = StackInfo((4, 8, 8), "uint8", 255.0, (0.0, 0.033, 0.067, 0.2), time_error=0.001)
+        >>> timing = SensorTiming(row_time=1 / 30000, exposure_rows=100, frame_rows=1000)
+        >>> [round(30 * time) for time in exposure_times(info, timing)]
+        [0, 1, 2, 6]
+    """
+    if info.frame_times is None or info.time_error == 0.0:
+        return info.frame_times
+    spacing = _spacing(info)
+    if spacing is None or not _same_rate(info, timing):
+        return None
+    if spacing.equal:
+        return tuple(float(number) * timing.frame_period for number in spacing.numbers)
+    return info.frame_times if info.time_error <= 0.1 * timing.frame_period else None
+
+
+def timing_of_stack(timing: SensorTiming, info: StackInfo) -> SensorTiming:
+    """The sensor with the frame times of a file, unless it has its own or the frames are evenly spaced.
+
+    Warns:
+        TimingWarning: If the file states another frame rate than the sensor has, or irregular times that are too rough.
+    """
+    if timing.frame_start_times is not None:
+        return timing
+    _warn_of_rate(info, timing)
+    times = exposure_times(info, timing)
+    if times is None:
+        if info.frame_times is not None and len(info.frame_times) > 1 and _same_rate(info, timing):
+            warnings.warn(
+                f"{info.path or 'the file'}: the {info.time_source} are irregular and have errors of up to "
+                f"{1e3 * info.time_error:.3g} ms; equal intervals are assumed, set frame_start_times if they are not",
+                TimingWarning,
+                stacklevel=2,
+            )
+        return timing
+    if info.time_error and np.ptp(np.diff(times)) < 1e-9 * timing.frame_period:
+        return timing
+    return replace(timing, frame_start_times=times)
+
+
+def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTiming:
+    """The timing of a stack: the sensor, with the frame times of the file relative to the first frame.
+
+    Args:
+        timing: The sensor. Its own ``frame_start_times``, if it has any, are kept.
+        info: What the file states, from ``read_stack_info``.
+
+    Warns:
+        TimingWarning: If the file states another frame rate than the sensor has, or irregular times that are too rough.
+
+    Example:
+        >>> timing = timing_from_first_frame(timing, read_stack_info("clip.mp4"))  # doctest: +SKIP
+        >>> detection = detect_vibration(read_stack("clip.mp4"), timing)  # doctest: +SKIP
+    """
+    of_stack = timing_of_stack(timing, info)
+    if timing.frame_start_times is not None or of_stack.frame_start_times is None:
+        return of_stack
+    times = [float(time) for time in of_stack.frame_start_times]
+    return replace(of_stack, frame_start_times=tuple(time - times[0] for time in times))
+
+
+def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:
+    """Sentences about an orientation, dropped frames and unequal intervals that a file states.
+
+    Args:
+        info: What the file states.
+        timing: The sensor, without the times of the file; None if it is not known.
+    """
+    name, notes = info.path or "the file", []
+    if info.orientation in _ORIENTATIONS:
+        notes.append(
+            f"{name}: displayed {_ORIENTATIONS[info.orientation]}; rows, x and y are those of the stored frames"
+        )
+    if timing is None or timing.frame_start_times is not None:
+        return notes
+    times, spacing = exposure_times(info, timing), _spacing(info)
+    if times is not None and spacing is not None and len(spacing.numbers):
+        missing = round(float(spacing.numbers[-1])) + 1 - len(times)
+        if not spacing.equal:
+            low, high = (1e3 * float(interval) for interval in (np.diff(times).min(), np.diff(times).max()))
+            notes.append(
+                f"{name}: frame intervals of {low:.4g} to {high:.4g} ms; its {info.time_source} are used, whose error "
+                f"is up to {1e3 * info.time_error:.2g} ms"
+            )
+        elif missing:
+            notes.append(f"{name}: {missing} frames are missing according to its {info.time_source}, which are used")
+    return notes

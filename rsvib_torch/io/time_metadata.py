@@ -1,0 +1,207 @@
+"""Times, frame rate and orientation in the metadata of other programs: HDF5 and Zarr attributes, TIFF, EXIF.
+
+Functions return the fields of ``StackInfo`` that the metadata state, and none if they are ambiguous or damaged, since
+frames can be read without them.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from itertools import pairwise
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from PIL import ExifTags, Image
+
+__all__ = ["exif_fields", "merged_times", "orientation_of", "tiff_times", "time_attributes", "times_of_attributes"]
+
+_SOFTWARE_CLOCK_ERROR = 5e-3  # s; times that acquisition software writes have jitter of milliseconds
+
+_SECONDS = {
+    **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
+    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "usec", "µs", "μs", "microsecond", "microseconds"), 1e-6),
+    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e-9),
+}
+_TIME_NAME = re.compile(r"(?:frame_?)?(?:time_?stamps?|times?)(?:_(s|sec|ms|us|ns))?", re.IGNORECASE)
+_RATE_NAME = re.compile(r"(?:acquisition_?)?frame_?rate(?:_hz)?|fps", re.IGNORECASE)
+_DESCRIBED_TIME = re.compile(
+    r"(?<!exposure )\b(?:frame_?|elapsed_?)?(?:time_?stamps?|times?)(?:[-_ ](?P<suffix>s|sec|ms|us|ns))?\"?\s*[=:]\s*"
+    r"(?P<value>[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?)(?:\s*(?P<unit>s|sec|ms|us|µs|ns)\b)?",
+    re.IGNORECASE,
+)
+
+
+def _time_fields(times: Iterable[float | None], count: int, error: float, source: str) -> dict[str, Any]:
+    """Fields of ``count`` times in seconds; none unless all are known and strictly increasing."""
+    known = [time for time in times if time is not None and np.isfinite(time)]
+    if len(known) != count or any(later <= earlier for earlier, later in pairwise(known)):
+        return {}
+    return {"frame_times": tuple(known), "time_error": error, "time_source": source}
+
+
+def orientation_of(value: object) -> int:
+    """The value of an orientation tag, 1 to 8; 1 (as stored) if it is anything else."""
+    return int(value) if isinstance(value, int | np.integer) and value in range(1, 9) else 1
+
+
+def time_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Those attributes whose names are used for times, their unit, and the frame rate."""
+    return {
+        name: value
+        for name, value in attributes.items()
+        if _TIME_NAME.fullmatch(re.sub("_units?$", "", name)) or _RATE_NAME.fullmatch(name)
+    }
+
+
+def times_of_attributes(attributes: Mapping[str, Any], count: int) -> dict[str, Any]:
+    """Times and frame rate of HDF5 and Zarr attributes such as ``timestamps``, ``timestamps_ms``, ``frame_rate``.
+
+    The unit of times is that of the attribute with ``_unit`` or ``_units`` appended, or the ending of the name;
+    otherwise the one of s, ms, us and ns that gives 1 to 1000 frames per second.
+
+    Args:
+        attributes: All attributes; others are ignored.
+        count: Number of frames.
+    """
+    fields: dict[str, Any] = {}
+    for name, value in attributes.items():
+        if _RATE_NAME.fullmatch(name) and np.size(value) == 1 and np.asarray(value).dtype.kind in "iuf":
+            rate = float(np.asarray(value).item())
+            if np.isfinite(rate) and rate > 0.0:
+                fields |= {"frame_rate": rate, "time_source": f"attribute {name}"}
+    for name, value in attributes.items():
+        match = _TIME_NAME.fullmatch(name)
+        stored = np.asarray(value).ravel()
+        if match is None or stored.dtype.kind not in "iuf" or len(stored) != count or count < 2:
+            continue
+        # integers of 64 bits, e.g. nanoseconds since 1970, are subtracted before they are rounded to floats
+        relative = (stored - stored[0]).astype(np.float64) if stored[0] <= stored.min() else np.zeros(count)
+        unit = attributes.get(f"{name}_units", attributes.get(f"{name}_unit", match[1]))
+        if unit is None:
+            interval = float(np.median(np.diff(relative)))
+            factors = [factor for factor in (1.0, 1e-3, 1e-6, 1e-9) if 1e-3 <= factor * interval < 1.0]
+        else:
+            text = unit.decode() if isinstance(unit, bytes) else str(unit)
+            factors = [_SECONDS[text.lower()]] if text.lower() in _SECONDS else []
+        if len(factors) == 1:
+            error = max(factors[0] if stored.dtype.kind in "iu" else 0.0, 1e-9)
+            fields |= _time_fields((factors[0] * relative).tolist(), count, error, f"attribute {name}")
+    return fields
+
+
+def _seconds_of_date(text: object, fraction: object = "") -> float | None:
+    """Seconds since 1970 of a date of TIFF and EXIF with a fraction of a second; None without a fraction."""
+    digits = str(fraction).strip("\0 ")
+    date = str(text).strip("\0 ").replace("T", " ")
+    if "." not in date and digits.isdecimal():
+        date = f"{date}.{digits}"
+    for layout in ("%Y:%m:%d %H:%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f"):
+        try:
+            return datetime.strptime(date[:26], layout).replace(tzinfo=UTC).timestamp()
+        except ValueError:
+            continue
+    return None
+
+
+def exif_fields(data: bytes) -> dict[str, Any]:
+    """Orientation and time of one image from its EXIF metadata."""
+    exif = Image.Exif()
+    try:
+        exif.load(data)
+        details = exif.get_ifd(ExifTags.IFD.Exif)
+    except Exception:  # damaged metadata raise errors of many types
+        return {}
+    taken, changed = (
+        _seconds_of_date(date, details.get(fraction, ""))
+        for date, fraction in (
+            (details.get(ExifTags.Base.DateTimeOriginal), ExifTags.Base.SubsecTimeOriginal),
+            (exif.get(ExifTags.Base.DateTime), ExifTags.Base.SubsecTime),
+        )
+    )
+    fields = {"orientation": orientation_of(exif.get(ExifTags.Base.Orientation))}
+    return fields | _time_fields([changed if taken is None else taken], 1, _SOFTWARE_CLOCK_ERROR, "EXIF times")
+
+
+def merged_times(infos: Iterable[Any]) -> dict[str, Any]:
+    """Times of a folder from the times of its files: the ``StackInfo`` of each, None for those that are damaged."""
+    infos = list(infos)
+    times = [info.frame_times[0] if info is not None and info.frame_times else None for info in infos]
+    return _time_fields(times, len(infos), _SOFTWARE_CLOCK_ERROR, infos[0].time_source if infos[0] else "")
+
+
+def _described_time(text: str) -> float | None:
+    """Time in seconds in the description of a page, e.g. ``frame_time_ms = 33.3`` or ``"ElapsedTime-ms": 33.3``."""
+    found = {
+        float(match["value"]) * _SECONDS[unit.lower()]
+        for match in _DESCRIBED_TIME.finditer(text)
+        if (unit := match["suffix"] or match["unit"])
+    }
+    return found.pop() if len(found) == 1 else None
+
+
+def _ome_fields(text: str, count: int) -> dict[str, Any]:
+    """Times of the planes (``DeltaT``) or their interval (``TimeIncrement``) in the OME-XML of an image."""
+    pixels = ElementTree.fromstring(text).find(".//{*}Pixels")
+    if pixels is None:
+        return {}
+    times: dict[int, float] = {}
+    for plane in pixels.iterfind("{*}Plane"):
+        unit = _SECONDS.get(plane.get("DeltaTUnit", "s").lower())
+        if plane.get("TheC", "0") == "0" and plane.get("DeltaT") is not None and unit is not None:
+            number = int(plane.get("TheT", "0")) + int(plane.get("TheZ", "0"))  # only one of them varies
+            times[number] = unit * float(plane.get("DeltaT", ""))
+    fields = _time_fields((times.get(i) for i in range(count)), count, _SOFTWARE_CLOCK_ERROR, "OME DeltaT")
+    interval = float(pixels.get("TimeIncrement", "0")) * _SECONDS.get(pixels.get("TimeIncrementUnit", "s").lower(), 0.0)
+    if not fields and interval > 0.0:
+        fields = {"frame_rate": 1.0 / interval, "time_source": "OME TimeIncrement"}
+    return fields
+
+
+def tiff_times(tif: Any, count: int, metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Times or frame rate of a TIFF file.
+
+    They are stated by the metadata that this package writes, OME-XML, ImageJ (``finterval``), or on every page by a
+    description with a time and its unit, or by the tag DateTime with a fraction of a second.
+
+    Args:
+        tif: The open ``tifffile.TiffFile``.
+        count: Number of frames.
+        metadata: Metadata that this package has written.
+    """
+    if len(metadata.get("frame_times", ())) == count:  # otherwise those of the first of several arrays
+        return {"frame_times": tuple(float(time) for time in metadata["frame_times"])}
+    if "frame_rate" in metadata:
+        return {"frame_rate": float(metadata["frame_rate"]), "time_source": "frame_rate"}
+    try:
+        return _times_of_other_programs(tif, count)
+    except Exception:  # damaged metadata raise errors of many types
+        return {}
+
+
+def _times_of_other_programs(tif: Any, count: int) -> dict[str, Any]:
+    if tif.ome_metadata:
+        return _ome_fields(tif.ome_metadata, count)
+    interval = (tif.imagej_metadata or {}).get("finterval")
+    if isinstance(interval, int | float) and interval > 0:
+        unit = _SECONDS.get(str(tif.imagej_metadata.get("tunit", "s")).lower())
+        return {"frame_rate": 1.0 / (unit * interval), "time_source": "ImageJ finterval"} if unit else {}
+    first = _page_times(tif.pages[0])
+    if len(tif.pages) != count or not first:
+        return {}
+    pages = (_page_times(tif.pages.get(number, aspage=True)) for number in range(count))
+    source = next(iter(first))
+    return _time_fields((page.get(source) for page in pages), count, _SOFTWARE_CLOCK_ERROR, source)
+
+
+def _page_times(page: Any) -> dict[str, float]:
+    """The time of a page by each source that states it."""
+    tags = page.tags
+    exif = tags.valueof("ExifTag", {})
+    times = {
+        "times in descriptions": _described_time(page.description),
+        "EXIF times": _seconds_of_date(exif.get("DateTimeOriginal"), exif.get("SubsecTimeOriginal", "")),
+        "DateTime tags": _seconds_of_date(tags.valueof("DateTime"), exif.get("SubsecTime", "")),
+    }
+    return {source: time for source, time in times.items() if time is not None}

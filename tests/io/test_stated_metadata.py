@@ -1,0 +1,271 @@
+"""Times, frame rate and orientation that other programs store in HDF5, Zarr, TIFF, PNG and JPEG files."""
+
+import warnings
+from datetime import datetime, timedelta
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+import torch
+import zarr
+from PIL import ExifTags, Image
+from small_config import CAMERA
+from small_stack import OPTIONS, STILL, TIMING
+from small_video import PERIOD, draw_frames
+from truth import decibel
+
+import rsvib_torch as rsv
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.io import TimingWarning, read_stack, read_stack_info, timing_from_first_frame, write_stack
+
+KEPT = np.array([0, 1, 2, 4, 5, 9])  # the other frames were dropped
+TIMES = KEPT * PERIOD
+FRAMES = np.random.default_rng(1).integers(0, 255, (6, 20, 30), dtype=np.uint8)
+
+
+def rsvib(*arguments):
+    return run_command([str(argument) for argument in arguments])
+
+
+def check_dropped_frames(path):
+    used = timing_from_first_frame(TIMING, read_stack_info(path)).frame_start_times
+    assert used == pytest.approx(TIMES, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "units"),
+    [
+        ("timestamps", TIMES + 1.7e9, None),
+        ("timestamps", (TIMES * 1e9).round().astype(np.int64) + 1_700_000_000_000_000_000, None),
+        ("timestamps_us", (TIMES * 1e6).round().astype(np.uint32), None),
+        ("time", TIMES * 1e3, "ms"),
+        ("Frame_Times", TIMES, b"s"),
+    ],
+)
+@pytest.mark.parametrize("place", ["/", "/camera"])
+def test_times_in_hdf5_datasets(tmp_path, name, values, units, place):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        group = file.require_group(place)
+        group["frames" if place == "/" else "images"] = FRAMES
+        group[name] = values
+        if units is not None:
+            group[name].attrs["units"] = units
+    check_dropped_frames(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "units"),
+    [
+        ("timestamps", np.arange(9) * PERIOD, "s"),  # of nine frames
+        ("timestamps", -TIMES, None),
+        ("timestamps", TIMES, "fortnights"),
+        ("timestamps", TIMES * np.nan, "s"),
+        ("timestamps", [b"early", b"noon", b"noon", b"late", b"late", b"night"], None),
+        ("timestamps", TIMES * 1e-4, None),  # 1e6 frames per second, or 1000 ns
+        ("exposure_times", TIMES, "s"),
+    ],
+)
+def test_ambiguous_times_in_hdf5_are_not_used(tmp_path, name, values, units):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["frames"] = FRAMES
+        file[name] = values
+        if units is not None:
+            file[name].attrs["units"] = units
+    assert timing_from_first_frame(TIMING, read_stack_info(tmp_path / "a.h5")) is TIMING
+
+
+@pytest.mark.parametrize("place", ["frames", "/", "dataset"])
+@pytest.mark.parametrize("name", ["frame_rate", "fps", "FrameRate", "AcquisitionFrameRate"])
+def test_frame_rate_in_hdf5_is_compared(tmp_path, name, place):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["frames"] = FRAMES
+        if place == "dataset":
+            file[name] = 30.0
+        else:
+            file[place].attrs[name] = 30.0
+    message = rf"a\.h5: 30 frames per second according to its attribute {name}, but 96\.154 .* set frame_rows=333\.333"
+    with pytest.warns(TimingWarning, match=message):
+        timing_from_first_frame(TIMING, read_stack_info(tmp_path / "a.h5"))
+
+
+def test_times_in_zarr_attributes(tmp_path):
+    attributes = {"timestamps_ms": (1e3 * TIMES).tolist(), "orientation": "portrait"}
+    zarr.create_array(store=str(tmp_path / "a.zarr"), data=FRAMES, attributes=attributes)
+    check_dropped_frames(tmp_path / "a.zarr")
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        {"imagej": True, "metadata": {"axes": "TYX", "finterval": 1 / 30, "fps": 96.154}},
+        {"imagej": True, "metadata": {"axes": "TYX", "finterval": 100 / 3, "tunit": "ms"}},
+        {"ome": True, "metadata": {"axes": "TYX", "TimeIncrement": 1 / 30, "TimeIncrementUnit": "s"}},
+    ],
+)
+def test_frame_rate_in_tiff_is_compared(tmp_path, metadata):
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack", **metadata)
+    with pytest.warns(TimingWarning, match=r"a\.tif: 30 frames per second according to its (ImageJ|OME)"):
+        timing_from_first_frame(TIMING, read_stack_info(tmp_path / "a.tif"))
+
+
+def test_times_in_ome_tiff(tmp_path):
+    plane = {"DeltaT": (1e3 * TIMES).tolist(), "DeltaTUnit": ["ms"] * 6}
+    metadata = {"axes": "TYX", "Plane": plane}
+    tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES, photometric="minisblack", metadata=metadata)
+    check_dropped_frames(tmp_path / "a.ome.tif")
+
+
+def write_pages(path, tags):
+    with tifffile.TiffWriter(path) as file:
+        for page, time in zip(FRAMES, TIMES, strict=True):
+            file.write(page, photometric="minisblack", contiguous=False, metadata=None, **tags(time))
+
+
+def date_of(time, layout="%Y:%m:%d %H:%M:%S.%f"):
+    return (datetime(2026, 5, 6, 12, 0, 59, 990_000) + timedelta(seconds=float(time))).strftime(layout)
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        lambda time: {"description": f"gain = 3\nframe_time_ms = {1e3 * time:.3f}\n"},
+        lambda time: {"description": f'{{"ElapsedTime-ms": {1e3 * time:.3f}, "Gain": 3}}'},
+        lambda time: {"description": f"frameTimestamps_sec = {time:.6f}"},
+        lambda time: {"description": f"Time: {1e6 * time:.0f} us, exposure time: 500 us"},
+        lambda time: {"extratags": [(306, "s", 0, date_of(time), True)]},
+    ],
+)
+def test_times_on_the_pages_of_a_tiff(tmp_path, tags):
+    write_pages(tmp_path / "a.tif", tags)
+    check_dropped_frames(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        lambda time: {"description": f"time = {time:.6f}"},  # no unit
+        lambda time: {"description": f"exposure_time_ms = {1e3 * time:.3f}"},
+        lambda time: {"extratags": [(306, "s", 0, date_of(time, "%Y:%m:%d %H:%M:%S"), True)]},  # whole seconds
+        lambda _: {"description": "<OME><Image></OME>"},
+        lambda time: {"description": f"time_ms = {1e3 * time}, time_ms = 7"},
+    ],
+)
+def test_ambiguous_times_on_pages_are_not_used(tmp_path, tags):
+    write_pages(tmp_path / "a.tif", tags)
+    assert timing_from_first_frame(TIMING, read_stack_info(tmp_path / "a.tif")) is TIMING
+    assert read_stack(tmp_path / "a.tif").shape == FRAMES.shape
+
+
+def write_images(folder, ending, frames, orientation, times=None):
+    folder.mkdir()
+    for number, frame in enumerate(frames):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation if np.isscalar(orientation) else orientation[number]
+        if times is not None:
+            details = exif.get_ifd(ExifTags.IFD.Exif)
+            date, fraction = date_of(times[number]).split(".")
+            details[ExifTags.Base.DateTimeOriginal], details[ExifTags.Base.SubsecTimeOriginal] = date, fraction[:3]
+        options = {"quality": 98} if ending == "jpg" else {}
+        Image.fromarray(frame).save(folder / f"frame{number}.{ending}", exif=exif, **options)
+
+
+@pytest.mark.parametrize("ending", ["jpg", "png", "tif"])
+def test_images_are_read_as_stored_and_their_orientation_is_kept(tmp_path, capsys, ending):
+    frames = draw_frames(np.arange(6) * PERIOD)
+    write_images(tmp_path / "frames", ending, frames, 6)
+    assert read_stack_info(tmp_path / "frames").orientation == 6
+    np.testing.assert_allclose(read_stack(tmp_path / "frames") * 255, frames, atol=9)
+    (tmp_path / "camera.toml").write_text(CAMERA.replace("full_scale = 4095\n", ""))
+    config = ("--config", tmp_path / "camera.toml")
+    for output in ("images", "restored.tif", "restored.h5", "restored.zarr", "restored.raw", "restored.mp4"):
+        name = tmp_path / "out" / output
+        assert rsvib("run", tmp_path / "frames", tmp_path / "out", *config, "--output", output) == 0
+        assert "displayed rotated by 90 degrees clockwise" in capsys.readouterr().out
+        assert read_stack_info(name).orientation == 6
+        restored = read_stack(name)
+        restored = restored.mean(1) if restored.ndim == 4 else restored
+        assert min(decibel(frame, STILL, 12) for frame in restored.numpy()) > 34
+    with Image.open(tmp_path / "out" / "images" / "frame_0000.png") as image:
+        assert image.getexif()[ExifTags.Base.Orientation] == 6
+
+
+@pytest.mark.parametrize("ending", ["jpg", "png"])
+def test_exif_times_of_images_find_dropped_frames(tmp_path, ending):
+    write_images(tmp_path / "frames", ending, FRAMES, 1, TIMES)
+    check_dropped_frames(tmp_path / "frames")
+
+
+def test_images_of_different_orientation_are_refused(tmp_path):
+    write_images(tmp_path / "frames", "png", FRAMES, (6, 6, 8, 6, 6, 6))
+    with pytest.raises(ValueError, match=r"frame0\.png is .* with orientation 6, frame2\.png is .* with orientation 8"):
+        read_stack_info(tmp_path / "frames")
+
+
+def test_jpeg_files_are_read(tmp_path):
+    colours = np.broadcast_to(np.array([200, 60, 30], np.uint8), (20, 30, 3))
+    Image.fromarray(colours).save(tmp_path / "a.jpg", quality=98)
+    Image.fromarray(colours).convert("CMYK").save(tmp_path / "b.jpg")
+    frames = read_stack(tmp_path / "a.jpg")
+    assert frames.shape == (1, 3, 20, 30)
+    np.testing.assert_allclose(frames[0, :, 5, 5] * 255, [200, 60, 30], atol=3)
+    with pytest.raises(ValueError, match=r"b\.jpg: pixels are CMYK; expected grey or RGB"):
+        read_stack(tmp_path / "b.jpg")
+    data = (tmp_path / "a.jpg").read_bytes()
+    for name, content in (("cut.jpg", data[: len(data) // 2]), ("no.jpg", b"GIF89a"), ("empty.jpeg", b"")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=rf"{name}: (not a JPEG file|the JPEG file cannot be decoded)"):
+            read_stack(tmp_path / name)
+    (tmp_path / "c.png").write_bytes(b"")
+    with pytest.raises(ValueError, match="the folder contains both PNG and JPEG files"):
+        read_stack(tmp_path)
+
+
+def test_damaged_exif_metadata_do_not_prevent_reading(tmp_path):
+    Image.fromarray(FRAMES[0]).save(tmp_path / "a.png", exif=b"Exif\0\0II*\0\xff\xff\xff\xff")
+    Image.fromarray(FRAMES[0]).save(tmp_path / "b.png", exif=b"Exif\0\0nonsense")
+    for name in ("a.png", "b.png"):
+        assert read_stack_info(tmp_path / name).orientation == 1
+        assert read_stack(tmp_path / name).shape == (1, 20, 30)
+
+
+def test_a_frame_rate_is_kept_by_all_formats(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("frames", data=FRAMES).attrs["fps"] = 97.0
+    like = read_stack_info(tmp_path / "a.h5")
+    for name in ("b.h5", "b.tif", "b.zarr", "b.raw"):
+        write_stack(tmp_path / name, torch.rand(6, 20, 30), like=like)
+        assert read_stack_info(tmp_path / name).frame_rate == 97.0
+    write_stack(tmp_path / "b.mkv", torch.rand(6, 20, 30), dtype="uint8", like=like)
+    assert read_stack_info(tmp_path / "b.mkv").frame_times == pytest.approx(np.arange(6) / 97, abs=6e-4)
+
+
+def test_commands_and_functions_warn_once_of_another_frame_rate(tmp_path, capsys):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("frames", data=draw_frames(np.arange(6) * PERIOD)).attrs["frame_rate"] = 30
+    (tmp_path / "camera.toml").write_text(CAMERA.replace("full_scale = 4095\n", ""))
+    config = ("--config", tmp_path / "camera.toml")
+    text = "a.h5: 30 frames per second according to its attribute frame_rate, but 96.154 according to the sensor"
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        for arguments in (
+            ("run", tmp_path / "a.h5", tmp_path / "out", *config),
+            ("detect", tmp_path / "a.h5", *config, "--out", tmp_path / "found"),
+            ("detect", tmp_path / "a.h5", *config, "--out", tmp_path / "windows", "--window", 3),
+            ("report", tmp_path / "a.h5", tmp_path / "page", *config),
+            (
+                "restore",
+                tmp_path / "a.h5",
+                tmp_path / "r.tif",
+                *config,
+                "--vibration",
+                tmp_path / "found" / "vibration.json",
+            ),
+        ):
+            assert rsvib(*arguments) == 0
+            assert capsys.readouterr().err.count(text) == 1
+    options = {"detection": OPTIONS["detection"], "restoration": OPTIONS["restoration"]}
+    with pytest.warns(TimingWarning, match="30 frames per second"):
+        rsv.process_stack(tmp_path / "a.h5", tmp_path / "b.tif", TIMING, **options)
+    with pytest.warns(TimingWarning, match="30 frames per second"):
+        next(rsv.iterate_stack(tmp_path / "a.h5", TIMING, **options))

@@ -1,0 +1,338 @@
+"""Videos: depth, time stamps, orientation and sound, read and written."""
+
+import json
+import sys
+import tomllib
+from dataclasses import replace
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+import torch
+from small_config import CAMERA
+from small_stack import MOTION, STILL
+from small_video import PERIOD, draw_frames, sound_of, write_clip, write_video
+from truth import decibel
+
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.io import FrameError, StackInfo, open_stack, read_stack, read_stack_info, write_stack
+
+TIMES = np.arange(6) / 30
+VARIABLE = np.cumsum([0, 1, 1.31, 1, 1, 1.17, 1, 1]) * PERIOD
+DROPPED = np.array([0, 1, 2, 4, 5, 9, 10, 11]) * PERIOD
+
+
+def noise(bits, *shape):
+    dtype = np.uint8 if bits == 8 else np.uint16
+    return np.random.default_rng(bits).integers(0, 2**bits, (6, 48, 64, *shape), dtype=dtype)
+
+
+def rsvib(*arguments):
+    return run_command([str(argument) for argument in arguments])
+
+
+@pytest.fixture(name="place")
+def write_config(tmp_path):
+    (tmp_path / "camera.toml").write_text(CAMERA.replace("full_scale = 4095\n", ""))
+    return tmp_path
+
+
+@pytest.mark.parametrize(("bits", "layout"), [(8, "gray"), *((bits, f"gray{bits}le") for bits in (10, 12, 14, 16))])
+@pytest.mark.parametrize("ending", [".mkv", ".avi"])
+def test_grey_videos_keep_their_depth(tmp_path, bits, layout, ending):
+    counts = noise(bits)
+    write_video(tmp_path / f"a{ending}", counts, TIMES, layout=layout, unit=Fraction(1, 30))
+    info = read_stack_info(tmp_path / f"a{ending}")
+    assert (info.shape, info.full_scale) == ((6, 48, 64), 2**bits - 1)
+    frames = read_stack(tmp_path / f"a{ending}")
+    np.testing.assert_array_equal((frames.double() * info.full_scale).round(), counts)
+    write_stack(tmp_path / f"b{ending}", frames, dtype=info.dtype, full_scale=info.full_scale, like=info)
+    assert torch.equal(read_stack(tmp_path / f"b{ending}"), frames)
+    assert read_stack_info(tmp_path / f"b{ending}") == info
+
+
+@pytest.mark.parametrize(
+    ("bits", "layout", "encoded"), [(8, "rgb24", "bgr0"), *((bits, f"gbrp{bits}le", None) for bits in (10, 12, 16))]
+)
+def test_colour_videos_keep_their_depth(tmp_path, bits, layout, encoded):
+    counts = noise(bits, 3)
+    write_video(tmp_path / "a.mkv", counts, TIMES, layout=layout, encoded=encoded)
+    info = read_stack_info(tmp_path / "a.mkv")
+    assert (info.shape, info.full_scale) == ((6, 3, 48, 64), 2**bits - 1)
+    frames = read_stack(tmp_path / "a.mkv")
+    np.testing.assert_array_equal((frames.double() * info.full_scale).round(), np.moveaxis(counts, -1, 1))
+    write_stack(tmp_path / "b.mkv", frames, dtype=info.dtype, full_scale=info.full_scale, like=info)
+    assert torch.equal(read_stack(tmp_path / "b.mkv"), frames)
+
+
+def test_ten_bits_of_a_yuv_video_are_not_reduced_to_eight(tmp_path):
+    ramp = np.linspace(2000, 60000, 640).astype(np.uint16)
+    counts = np.broadcast_to(ramp[None, None, :, None], (3, 48, 640, 3))
+    lossless = {"x265-params": "lossless=1:log-level=none"}
+    options = {"codec": "libx265", "encoded": "yuv420p10le", "options": lossless}
+    write_video(tmp_path / "a.mp4", counts, TIMES[:3], layout="rgb48le", **options)
+    frames = read_stack(tmp_path / "a.mp4")
+    assert len(torch.unique((frames[0, 0, 0] * 65535).round())) > 500
+    np.testing.assert_allclose(frames[1, 1, 20], ramp / 65535, atol=1.2e-3)  # one step of 10 bits
+
+
+@pytest.mark.parametrize("full_scale", [200, 4000, 40000])
+def test_other_full_scales_are_scaled_to_the_depth_of_the_video(tmp_path, full_scale):
+    frames = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(1))
+    dtype = "uint8" if full_scale < 256 else "uint16"
+    write_stack(tmp_path / "a.mkv", frames, dtype=dtype, full_scale=full_scale)
+    np.testing.assert_allclose(read_stack(tmp_path / "a.mkv"), frames, atol=1.01 / full_scale)
+
+
+def test_floats_are_written_for_viewing(tmp_path):
+    frames = torch.tensor([-0.5, 0.0, 0.3, 1.0, 1.5, float("nan")])[:, None, None].expand(6, 48, 64)
+    write_stack(tmp_path / "a.mp4", frames)
+    means = read_stack(tmp_path / "a.mp4").mean((1, 2, 3))
+    np.testing.assert_allclose(means, [0.0, 0.0, 0.3, 1.0, 1.0, 0.0], atol=0.012)
+
+
+def test_colours_are_those_of_the_input(tmp_path):
+    colours = torch.tensor([[0.8, 0.2, 0.1], [0.1, 0.7, 0.3], [0.2, 0.3, 0.9]])
+    for height in (64, 640):  # players assume other colours for tall videos without a tag
+        frames = colours[..., None, None].expand(3, 3, height, 64)
+        for name in ("a.mp4", "a.mkv"):
+            write_stack(tmp_path / name, frames, dtype="uint8")
+            restored = read_stack(tmp_path / name)
+            np.testing.assert_allclose(restored, frames, atol=0.012)
+            assert float((restored - frames).mean().abs()) < 0.002
+
+
+def test_all_orientations_are_kept(tmp_path):
+    frames = torch.rand(2, 48, 64, generator=torch.Generator().manual_seed(1))
+    for orientation in range(1, 9):
+        like = StackInfo((2, 48, 64), "uint8", 255.0, orientation=orientation)
+        for ending in (".mp4", ".mov", ".mkv") if orientation in (1, 3, 6, 8) else (".mp4", ".mov"):
+            write_stack(tmp_path / f"a{ending}", frames, dtype="uint8", like=like)
+            assert read_stack_info(tmp_path / f"a{ending}").orientation == orientation
+    with av.open(str(tmp_path / "a.mp4")) as video:
+        assert next(video.decode(video=0)).rotation == 90  # orientation 8: anticlockwise
+    for ending, tag, better in ((".avi", 6, r"\.mkv or \.mp4"), (".mkv", 2, r"\.mp4")):
+        message = rf"{ending} cannot hold the orientation {tag} of the input; write {better}"
+        with pytest.raises(ValueError, match=message):
+            write_stack(tmp_path / f"b{ending}", frames, dtype="uint8", like=replace(like, orientation=tag))
+
+
+def test_a_rotated_video_is_read_as_stored_and_restored_in_the_same_orientation(place, capsys):
+    """The rows of the file are the rows of the sensor; with the rotation applied, nothing could be restored."""
+    times = np.arange(8) * PERIOD
+    write_clip(place / "portrait.mp4", times, rotation=-90)
+    assert read_stack_info(place / "portrait.mp4").shape == (8, 3, 96, 64)
+    config = ("--config", place / "camera.toml")
+    assert rsvib("run", place / "portrait.mp4", place / "out", *config, "--output", "restored.mp4") == 0
+    assert "displayed rotated by 90 degrees clockwise; rows, x and y are those of the stored" in capsys.readouterr().out
+    assert read_stack_info(place / "out" / "restored.mp4").orientation == 6
+    frames = read_stack(place / "out" / "restored.mp4").mean(1).numpy()
+    assert min(decibel(frame, STILL, 12) for frame in frames) > 34
+
+
+def test_the_bands_of_a_rotated_video_give_the_row_time_of_the_stored_rows(place, capsys):
+    times = np.arange(2) / 30
+    light = 0.5 + 0.4 * np.sin(2 * np.pi * 1000 * (times[:, None] + 3e-5 * np.arange(480)))
+    frames = np.broadcast_to((255 * light).astype(np.uint8)[:, :, None, None], (2, 480, 320, 3))
+    options = {"layout": "rgb24", "codec": "libx264", "encoded": "yuv420p", "rate": 30, "rotation": -90}
+    write_video(place / "led.mov", frames, times, **options)
+    assert rsvib("calibrate", place / "led.mov", "--frequency", 1000, "--out", place / "sensor.toml") == 0
+    assert "displayed rotated by 90 degrees clockwise" in capsys.readouterr().out
+    sensor = tomllib.loads((place / "sensor.toml").read_text())["sensor"]
+    assert sensor["scan_axis"] == "y"
+    assert sensor["row_time"] == pytest.approx(3e-5, rel=2e-3)
+
+
+@pytest.mark.parametrize("times", [VARIABLE, DROPPED], ids=["variable", "dropped"])
+@pytest.mark.parametrize("command", ["run", "restore"])
+def test_time_stamps_are_used_and_kept_with_the_sound(place, times, command):
+    write_clip(place / "clip.mp4", times)
+    config = ("--config", place / "camera.toml")
+    if command == "run":
+        assert rsvib("run", place / "clip.mp4", place / "out", *config, "--output", "restored.mp4") == 0
+        restored = place / "out" / "restored.mp4"
+    else:
+        restored = place / "restored.mp4"
+        assert rsvib("detect", place / "clip.mp4", *config, "--out", place / "found") == 0
+        found = json.loads((place / "found" / "vibration.json").read_text())
+        assert found["timing"]["frame_start_times"] == pytest.approx(times, abs=2e-5)
+        vibration = ("--vibration", place / "found" / "vibration.json")
+        assert rsvib("restore", place / "clip.mp4", restored, *config, *vibration) == 0
+    frames = read_stack(restored).mean(1).numpy()
+    assert min(decibel(frame, STILL, 12) for frame in frames) > 34
+    assert read_stack_info(restored).frame_times == read_stack_info(place / "clip.mp4").frame_times
+    assert len(sound_of(restored)) > 3
+    assert sound_of(restored) == sound_of(place / "clip.mp4")
+
+
+def test_known_motion_writes_a_video_with_sound(place):
+    times = np.arange(0.0, 9 * PERIOD, 2e-4)
+    x, y = MOTION.displacement(times).T
+    rows = [f"{t:.6f},{a:.6f},{b:.6f}" for t, a, b in zip(times, x, y, strict=True)]
+    (place / "motion.csv").write_text("\n".join(["time,x,y", *rows]))
+    write_clip(place / "clip.mp4", np.arange(8) * PERIOD)
+    arguments = ("--config", place / "camera.toml", "--motion", place / "motion.csv", "--unit", "px", "--offset", 0)
+    assert rsvib("known", place / "clip.mp4", place / "restored.mkv", *arguments) == 0
+    assert min(decibel(frame, STILL, 12) for frame in read_stack(place / "restored.mkv").mean(1).numpy()) > 34
+    assert [data for _, data in sound_of(place / "restored.mkv")] == [data for _, data in sound_of(place / "clip.mp4")]
+
+
+@pytest.mark.filterwarnings("default::rsvib_torch.io.TimingWarning")
+def test_slow_motion_keeps_the_times_of_playback_and_warns(place, capsys):
+    times = np.arange(8) * PERIOD
+    write_clip(place / "slow.mp4", times, shown_at=np.arange(8) / 25)
+    arguments = ("--config", place / "camera.toml", "--output", "restored.mp4")
+    assert rsvib("run", place / "slow.mp4", place / "out", *arguments) == 0
+    assert capsys.readouterr().err.count("25 frames per second according to its time stamps, but 96.154") == 1
+    assert read_stack_info(place / "out" / "restored.mp4").frame_times == pytest.approx(np.arange(8) / 25)
+
+
+def test_a_stack_without_times_is_written_with_the_frame_rate_of_the_sensor(place):
+    counts = draw_frames(np.arange(4) * PERIOD)
+    np.save(place / "frames.npy", counts)
+    arguments = ("--config", place / "camera.toml", "--output", "restored.mp4")
+    assert rsvib("run", place / "frames.npy", place / "out", *arguments) == 0
+    assert read_stack_info(place / "out" / "restored.mp4").frame_times == pytest.approx(np.arange(4) * PERIOD, abs=2e-5)
+
+
+def test_frames_can_be_read_in_any_order(tmp_path):
+    """H.264 stores frames in another order than it presents them."""
+    times = np.arange(12) / 30
+    levels = np.broadcast_to(np.arange(12, dtype=np.uint8)[:, None, None, None] * 20, (12, 48, 64, 3))
+    write_video(tmp_path / "a.mp4", levels, times, layout="rgb24", codec="libx264", encoded="yuv420p")
+    reader = open_stack(tmp_path / "a.mp4")
+    for index in (7, 3, 11, 0, 0, 5):
+        assert reader.frame(index).mean() == pytest.approx(20 * index, abs=3)
+    reader.close()
+
+
+@pytest.mark.parametrize("ending", [".avi", ".mkv"])
+def test_damage_does_not_affect_other_frames(tmp_path, ending):
+    path = tmp_path / f"a{ending}"
+    frames = torch.from_numpy(noise(8) / np.float32(255))
+    write_stack(path, frames, dtype="uint8", like=StackInfo((6, 48, 64), "uint8", 255.0, frame_rate=25.0))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 600] = bytes(600)
+    path.write_bytes(data)
+    reader = open_stack(path)
+    start, taken = reader.info.frame_times[0], []
+    for index, time in enumerate(reader.info.frame_times):
+        taken.append(np.array_equal(reader.frame(index), noise(8)[round((time - start) * 25)]))
+    reader.close()
+    assert sum(taken) >= 4
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"),
+    [
+        ("a.webm", "libvpx"),
+        ("a.3gp", "libx264"),
+        ("a.mts", "libx264"),
+        ("a.m2ts", "mpeg2video"),
+        ("a.mpg", "mpeg2video"),
+        ("a.wmv", "wmv2"),
+        ("a.m4v", "mpeg4"),
+        ("a.avi", "mjpeg"),
+    ],
+)
+def test_other_kinds_of_video_are_read(tmp_path, name, codec):
+    levels = np.broadcast_to(np.arange(6, dtype=np.uint8)[:, None, None, None] * 40, (6, 48, 64, 3))
+    encoded = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+    options = {"layout": "rgb24", "encoded": encoded, "rate": 25, "unit": Fraction(1, 25)}
+    write_video(tmp_path / name, levels, np.arange(6) / 25, codec=codec, **options)
+    np.testing.assert_allclose(read_stack(tmp_path / name).mean((1, 2, 3)) * 255, levels[:, 0, 0, 0], atol=4)
+    times = read_stack_info(tmp_path / name).frame_times
+    assert np.diff(times) == pytest.approx(np.full(5, 1 / 25), abs=1.1e-3)
+
+
+def test_a_frame_of_another_size_is_reported(tmp_path):
+    """Two videos without a header, one after the other, as from a camera that was set to another resolution."""
+    options = {"layout": "rgb24", "codec": "mpeg2video", "encoded": "yuv420p", "rate": 25, "unit": Fraction(1, 25)}
+    for name, size in (("a.mpg", 48), ("b.mpg", 64)):
+        write_video(tmp_path / name, np.broadcast_to(np.uint8(90), (6, size, 64, 3)), np.arange(6) / 25, **options)
+    (tmp_path / "b.mpg").write_bytes((tmp_path / "b.mpg").read_bytes() + (tmp_path / "a.mpg").read_bytes())
+    reader = open_stack(tmp_path / "b.mpg")
+    assert reader.frame(0).shape == (3, 64, 64)
+    with pytest.raises(FrameError, match=r"b\.mpg: frames of different size: frame \d+ is \(48, 64\)"):
+        reader.frame(reader.info.shape[0] - 1)
+    reader.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "dtype", "message"),
+    [
+        ("a.mp4", (2, 47, 64), "uint8", r"H\.264 needs an even height and width, got \(47, 64\); write \.mkv"),
+        ("a.mkv", (2, 4, 48, 64), "uint8", r"videos hold 1 or 3 channels, got 4; write \.tif"),
+        ("a.mkv", (2, 48, 64), "float32", "FFV1 video files hold uint8, uint16; got dtype float32"),
+        ("a.webm", (2, 48, 64), "uint8", "wmv files can only be read"),
+    ],
+)
+def test_what_a_video_cannot_hold_is_refused(tmp_path, name, shape, dtype, message):
+    with pytest.raises(ValueError, match=message):
+        write_stack(tmp_path / name, torch.rand(shape), dtype=dtype)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "times", "unit", "sound", "output", "message"),
+    [
+        (
+            "clip.mkv",
+            VARIABLE,
+            Fraction(1, 1000),
+            "aac",
+            "a.avi",
+            "a.avi: .avi cannot hold a variable frame rate; write .mkv",
+        ),
+        (
+            "clip.avi",
+            np.arange(8) * PERIOD,
+            Fraction(13, 1250),
+            "pcm_u8",
+            "a.mp4",
+            "a.mp4: .mp4 cannot hold the audio (pcm_u8) of",
+        ),
+    ],
+)
+def test_what_a_container_cannot_hold_is_refused_before_the_computation(
+    place, capsys, name, times, unit, sound, output, message
+):
+    write_clip(place / name, times, sound=sound, unit=unit)
+    arguments = ("--config", place / "camera.toml", "--output", output)
+    assert rsvib("run", place / name, place / "out", *arguments) == 2
+    assert message in capsys.readouterr().err
+    assert not (place / "out").exists()
+
+
+def test_files_that_are_not_videos_are_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with av.open("sound.mp4", "w") as output:
+        audio = output.add_stream("aac", rate=48000)
+        audio.layout = "mono"
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.int16), format="s16", layout="mono")
+        frame.sample_rate = 48000
+        output.mux(audio.encode(frame))
+        output.mux(audio.encode())
+    (tmp_path / "text.mov").write_text("no video")
+    write_video(tmp_path / "secret.mkv", noise(8), TIMES)
+    (tmp_path / "list.mp4").write_text("ffconcat version 1.0\nfile secret.mkv\n")
+    (tmp_path / "list.mkv").write_text("#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nsecret.mkv\n#EXT-X-ENDLIST\n")
+    for name, reason in (
+        ("sound.mp4", "it contains no video stream"),
+        ("text.mov", "Invalid data found when"),
+        ("list.mp4", "Invalid"),
+        ("list.mkv", "Invalid"),
+    ):
+        with pytest.raises(ValueError, match=rf"^{name}: not a readable video stack: {reason}"):
+            read_stack(name)
+
+
+def test_missing_package_names_the_extra(tmp_path, monkeypatch):
+    (tmp_path / "a.mp4").write_bytes(b"")
+    monkeypatch.setitem(sys.modules, "av", None)
+    message = r"reading and writing video needs the package av: pip install rsvib_torch\[video\]"
+    with pytest.raises(ModuleNotFoundError, match=message):
+        read_stack(tmp_path / "a.mp4")
+    with pytest.raises(ModuleNotFoundError, match=message):
+        write_stack(tmp_path / "b.mp4", torch.rand(2, 48, 64), dtype="uint8")
