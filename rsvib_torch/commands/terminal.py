@@ -59,10 +59,14 @@ def error_line(message: str, kind: str = "error") -> None:
 
 @contextmanager
 def warnings_in_one_line() -> Iterator[None]:
-    """Show Python's warnings without file name and source line."""
+    """Show Python's warnings without file name and source line, each once."""
+    shown: set[str] = set()
 
     def show(message: Any, *_: Any, **__: Any) -> None:
-        error_line(" ".join(str(message).split()), "warning")
+        line = " ".join(str(message).split())
+        if line not in shown:
+            shown.add(line)
+            error_line(line, "warning")
 
     with warnings.catch_warnings():
         warnings.showwarning = show

@@ -41,6 +41,8 @@ class _Spacing:
     Attributes:
         numbers: Number of intervals from the first frame to each frame, more than one where frames were dropped, (T,).
         interval: Interval without dropped frames in s: of a straight line, or the median if the rate is variable.
+        shortest: Shortest interval in s if the rate is variable, otherwise ``interval``.
+        longest: Longest interval in s if the rate is variable, otherwise ``interval``.
         error: Error of ``interval`` in s due to the error of the times.
         equal: Whether the times are whole numbers of intervals apart, to within their error, 2 % of an interval (clock
             of a telephone or camera), and a quarter of an interval.
@@ -48,6 +50,8 @@ class _Spacing:
 
     numbers: NDArray[np.float64]
     interval: float
+    shortest: float
+    longest: float
     error: float
     equal: bool
 
@@ -55,7 +59,8 @@ class _Spacing:
 def _spacing(info: StackInfo) -> _Spacing | None:
     """Spacing according to the times or the frame rate of a file; None if it states neither."""
     if info.frame_times is None or len(info.frame_times) < 2:
-        return None if info.frame_rate is None else _Spacing(np.zeros(0), 1.0 / info.frame_rate, 0.0, equal=True)
+        period = None if info.frame_rate is None else 1.0 / info.frame_rate
+        return None if period is None else _Spacing(np.zeros(0), period, period, period, 0.0, equal=True)
     times = np.array(info.frame_times)
     intervals = np.diff(times)
     median = float(np.median(intervals))
@@ -65,14 +70,16 @@ def _spacing(info: StackInfo) -> _Spacing | None:
     line = np.polynomial.Polynomial.fit(numbers, times, 1)
     jitter = float(np.abs(times - line(numbers)).max())
     if whole.min() >= 1 and jitter <= min(max(info.time_error, 0.02 * single), 0.25 * single):
-        return _Spacing(numbers, float(line.convert().coef[1]), info.time_error / float(numbers[-1]), equal=True)
-    return _Spacing(numbers, median, info.time_error, equal=False)
+        interval = float(line.convert().coef[1])
+        return _Spacing(numbers, interval, interval, interval, info.time_error / float(numbers[-1]), equal=True)
+    return _Spacing(numbers, median, float(intervals.min()), float(intervals.max()), info.time_error, equal=False)
 
 
 def _same_rate(info: StackInfo, timing: SensorTiming) -> bool:
     """Whether the frame rate of a file, if it states one, is that of the sensor.
 
-    Frames with exact times may be every n-th frame of the sensor.
+    If it is variable, the period of the sensor must lie between the shortest and the longest interval. Frames with
+    exact times may be every n-th frame of the sensor.
     """
     spacing = _spacing(info)
     if spacing is None:
@@ -80,7 +87,8 @@ def _same_rate(info: StackInfo, timing: SensorTiming) -> bool:
     period = timing.frame_period
     if info.frame_times is not None and info.time_error == 0.0:
         period *= max(1, round(spacing.interval / period))
-    return abs(spacing.interval - period) <= _RATE_TOLERANCE * period + spacing.error
+    tolerance = _RATE_TOLERANCE * period + spacing.error
+    return spacing.shortest - tolerance <= period <= spacing.longest + tolerance
 
 
 def _warn_of_rate(info: StackInfo, timing: SensorTiming) -> None:
@@ -105,10 +113,10 @@ def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] |
     """Exposure start of every frame according to its file, in seconds; None if it is not stated, or at another rate.
 
     Exact times are returned as they are. Times with an error, e.g. the presentation times of a video, are used only if
-    their interval is the frame period of the sensor to 1 %. If they are whole numbers of intervals apart to within
-    their error or 2 % of a period, the result consists of multiples of the sensor's frame period, with gaps where
-    frames were dropped. Otherwise the frame rate is variable: the times are returned as they are if their error is less
-    than a tenth of a period.
+    their interval is the frame period of the sensor to 1 %, or their intervals include it. If they are whole numbers of
+    intervals apart to within their error or 2 % of a period, the result consists of multiples of the sensor's frame
+    period, with gaps where frames were dropped. Otherwise the frame rate is variable: the times are returned as they
+    are if their error is less than a tenth of a period.
 
     Args:
         info: What the file states.

@@ -115,6 +115,16 @@ def test_a_long_stack_of_rounded_times_has_the_rate_of_the_sensor():
     assert exposure_times(rounded, TIMING) == pytest.approx([index * TIMING.frame_period for index in kept], rel=1e-12)
 
 
+def test_the_median_of_a_variable_frame_rate_need_not_be_that_of_the_sensor():
+    """A telephone with a nominal rate takes more than half of its frames later, because the scene is dark."""
+    times = np.cumsum([0, 1.4, 1.4, 1, 1, 1.03, 1.19, 1.3]) * TIMING.frame_period
+    info = info_with(times, 1e-5)
+    assert timing_from_first_frame(TIMING, info).frame_start_times == pytest.approx(times)
+    with pytest.warns(TimingWarning, match=r"per second according to its time stamps, but 240\.38"):
+        fast = timing_from_first_frame(replace(TIMING, frame_rows=41.6), info)  # slow motion
+    assert fast.frame_start_times is None
+
+
 @pytest.mark.parametrize("error", [1e-5, 1e-3])
 def test_times_of_a_variable_frame_rate_are_used_as_they_are(error):
     times = np.cumsum([0, 1, 1, 1.3, 1, 1.15, 1, 1, 1.22, 1]) * TIMING.frame_period
