@@ -23,12 +23,12 @@ from rsvib_torch.commands.options import (
 from rsvib_torch.commands.stack_commands import load, save
 from rsvib_torch.commands.terminal import error_line, print_line, working
 from rsvib_torch.config import read_config
+from rsvib_torch.core.presentation import measured_text
 from rsvib_torch.detection import align_motion, check_motion, detect_motion, detect_swept_tone
 from rsvib_torch.io import check_stack_target, check_writable, read_stack, read_stack_info, whole_file
 from rsvib_torch.motion.recorded import MotionUnit, TimeUnit, read_motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.report.plots import measured_text
 from rsvib_torch.restoration import restore
 
 __all__ = ["calibrate", "known", "motion"]

@@ -22,8 +22,8 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
+from rsvib_torch.core.presentation import measured_text
 from rsvib_torch.detection import DetectionResult
-from rsvib_torch.report.plots import measured_text
 from rsvib_torch.stacks import RestoredFrames
 
 __all__ = [
@@ -145,6 +145,6 @@ def print_restoration(result: RestoredFrames) -> None:
         print_line("cannot determine whether restoration helps: no two frames show the same scene")
     elif result.verdict.overall in ("partly", "worse"):
         unchanged = "" if result.restored else "; the frames are written unchanged, --force writes the restored ones"
-        error_line(result.verdict.summary + unchanged, "warning")
+        error_line(result.verdict.sentence + unchanged, "warning")
     else:
-        print_line(result.verdict.summary)
+        print_line(result.verdict.sentence)

@@ -7,6 +7,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.presentation import Result, plain_values
+from rsvib_torch.io.schema import TimingRecord, detection_summary
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
 
@@ -37,8 +40,12 @@ class OtherMotion:
         return OtherMotion(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
-@dataclass(frozen=True, eq=False)
-class DetectionResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class DetectionResult(
+    Result,
+    units={**Vibration.units, "residual": "px", "gain": "px of offset per px of displacement", "offsets": "s and px"},
+    file_format="rsvib vibration",
+):
     """A detected vibration with its uncertainty and verdict. Batches of stacks or windows lead all tensors.
 
     Attributes:
@@ -50,6 +57,9 @@ class DetectionResult:
         residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
         reliable: (..., 2) bool, verdict for each axis.
         reasons: Reasons against each axis (x, y) that is not reliable; a tuple of those for a batch.
+        timing: The sensor of the frames.
+
+    ``save`` writes a ``vibration.json`` as the program does, which ``rsvib restore`` and ``read_vibration`` read.
     """
 
     vibration: Vibration
@@ -60,6 +70,21 @@ class DetectionResult:
     residual: Tensor
     reliable: Tensor
     reasons: tuple[Any, ...]
+    timing: SensorTiming | None = None
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading dimensions: empty for one result, (B,) for a batch of stacks or windows."""
+        return self.vibration.batch_shape
+
+    def summary(self) -> str:
+        """Tones of each axis with standard deviations, then the verdict; of a batch, a table with one row per axis."""
+        return detection_summary(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All values as nested lists, numbers and texts, as in a ``vibration.json``; None for unknown numbers."""
+        timing = None if self.timing is None else TimingRecord.from_timing(self.timing).model_dump()
+        return {**super().to_dict(), "timing": timing, "period": plain_values(self.vibration.period)}
 
     def __getitem__(self, index: int) -> "DetectionResult":
         """The result of one stack out of a batch."""
@@ -72,6 +97,7 @@ class DetectionResult:
             self.residual[index],
             self.reliable[index],
             self.reasons[index],
+            self.timing,
         )
 
 
@@ -106,10 +132,12 @@ def stacked(results: list[DetectionResult]) -> DetectionResult:
             joined([curve.offsets for curve in curves]),
             joined([curve.quality for curve in curves]),
             curves[0].heights,
+            joined([curve.std for curve in curves if curve.std is not None]) if curves[0].std is not None else None,
         ),
         fitted=joined([result.fitted for result in results]),
         gain=padded([result.gain for result in results]),
         residual=joined([result.residual for result in results]),
         reliable=joined([result.reliable for result in results]),
         reasons=tuple(tuple(result.reasons[index] for result in results) for index in range(batch)),
+        timing=results[0].timing,
     )

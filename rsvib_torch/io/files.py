@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rsvib_torch.core.atomic import check_writable, move_into_place, temporary_folder
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.frames.arrays import ArrayLike, as_tensor
 from rsvib_torch.io import hdf5, image_folder, npy, raw, tiff, video, zarr_store
-from rsvib_torch.io.atomic import check_writable, move_into_place, temporary_folder
 from rsvib_torch.io.formats import FrameReader, StackFormat, find_format, register_format, target_format
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.stack_info import StackInfo

@@ -30,7 +30,7 @@ class WindowRecord(Section):
         detection: The detection; None if it failed.
         left_alone: A sentence for each axis that was not restored.
         outcome: ``RestorationVerdict.overall``; None if the frames could not be compared.
-        summary: ``RestorationVerdict.summary``.
+        summary: ``RestorationVerdict.sentence``.
         error: Why detection or restoration failed.
         bad_frames: Index of each frame that could not be used, with the reason.
     """

@@ -4,10 +4,11 @@ import math
 from collections.abc import Sequence
 from typing import Literal
 
+from rsvib_torch.core.presentation import measured_text
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
-from rsvib_torch.report.plots import measured_text, motion_blur, tones_text
+from rsvib_torch.report.plots import motion_blur, tones_text
 from rsvib_torch.restoration import RestorationVerdict
 
 __all__ = ["TONE_HEAD", "Mark", "camera_rows", "mark_of", "tone_rows", "verdict_sentences"]
@@ -109,7 +110,7 @@ def verdict_sentences(
     if bool(result.reliable.all()):  # otherwise the reasons are given above
         sentences += [_sentence(note) for note in left_alone]
     if verdict is not None:
-        sentences.append(_sentence(verdict.summary))
+        sentences.append(_sentence(verdict.sentence))
     elif restored:
         sentences.append("No two frames have enough of the scene in common to judge the restoration.")
     return sentences
