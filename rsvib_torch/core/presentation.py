@@ -35,6 +35,7 @@ __all__ = [
     "Summarised",
     "axis_head",
     "axis_rows",
+    "json_text",
     "measured_text",
     "plain_values",
     "text_table",
@@ -189,8 +190,13 @@ def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None
         OSError: If the file cannot be written.
     """
     with whole_file(path) as part:
-        lines = (f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
-        part.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+        part.write_text(json_text(content) + "\n", encoding="utf-8")
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """A table as JSON with one key per line."""
+    lines = (f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
+    return "{\n" + ",\n".join(lines) + "\n}"
 
 
 def _restored(kind: Any, value: Any, path: str, missing: float) -> Any:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rsvib_torch.core.atomic import check_writable, move_into_place, temporary_folder
 from rsvib_torch.core.checks import check_choice
+from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import ArrayLike, as_tensor
 from rsvib_torch.io import hdf5, image_folder, npy, raw, tiff, video, zarr_store
 from rsvib_torch.io.formats import FrameReader, StackFormat, find_format, register_format, target_format
@@ -123,8 +124,10 @@ def read_stack(path: PathLike, *, full_scale: float | None = None) -> Tensor:
     try:
         info = reader.info
         pixels = np.empty(info.shape, dtype=info.dtype)
+        advance = steps(len(pixels), "frames")
         for index in range(len(pixels)):
             pixels[index] = reader.frame(index)
+            advance()
     finally:
         reader.close()
     return counts_to_frames(pixels, info.full_scale if full_scale is None else full_scale, str(path))
@@ -211,6 +214,14 @@ def write_frames(
         writer.close()
 
 
+def _counted(pixels: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    """The frames of a stack, with a report of the progress."""
+    advance = steps(len(pixels), "frames")
+    for frame in pixels:
+        yield frame
+        advance()
+
+
 def write_stack(
     path: PathLike,
     frames: ArrayLike,
@@ -258,7 +269,7 @@ def write_stack(
     form = check_info_target(path, info, compression)
     with temporary_folder(path) as folder:
         part = folder / path.name
-        write_frames(form, part, info, iter(pixels), compression)
+        write_frames(form, part, info, _counted(pixels), compression)
         if form.kind == "folder":
             path.parent.mkdir(parents=True, exist_ok=True)
         move_into_place(part, path, form.kind, form.companions)

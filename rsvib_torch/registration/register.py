@@ -15,6 +15,7 @@ from torch.nn import functional
 
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.presentation import Result
+from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import ArrayLike
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.prepare import prepare_frames
@@ -173,7 +174,9 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     first, second = grey[:, :-1].flatten(0, 1), grey[:, 1:].flatten(0, 1)
     bytes_of_pair = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4
     offsets, quality = [], []
-    for pair in runs(len(first), max(1, 2**28 // bytes_of_pair)):  # 256 MiB of windows at a time
+    parts = runs(len(first), max(1, 2**28 // bytes_of_pair))  # 256 MiB of windows at a time
+    advance = steps(len(parts), "groups of pairs")
+    for pair in parts:
         task = BandTask(first[pair], second[pair], coarse_offset(first[pair], second[pair]), tops, band_rows, search)
         if task.width < search:
             raise ValueError(f"frames {width} px wide overlap too little after their whole-frame offset")
@@ -181,6 +184,7 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
         failed = ~(correlation > 0.1)  # chance reaches correlations of 0.1
         offsets.append(torch.where(failed[..., None], torch.nan, measured))
         quality.append(torch.where(failed, 0.0, correlation))
+        advance()
     rows = tops.to(torch.float64) + 0.5 * (band_rows - 1)
     starts = timing.frame_starts(num_frames, grey.device)[:, None] + rows * timing.row_time
     index = torch.arange(num_frames, device=grey.device)

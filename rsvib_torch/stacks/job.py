@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice, check_whole_number
-from rsvib_torch.core.presentation import Summarised
+from rsvib_torch.core.presentation import Summarised, plain_values
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.io.files import PathLike, open_stack, read_stack_info
 from rsvib_torch.io.formats import FrameReader
@@ -226,6 +226,7 @@ class StackJob:
             "left_alone": [] if restoration is None else list(restoration.left_alone),
             "outcome": None if verdict is None else verdict.overall,
             "summary": None if verdict is None else verdict.sentence,
+            "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
             "error": result.error,
             "bad_frames": {str(index): reason for index, reason in result.bad_frames.items()},
         }

@@ -31,6 +31,7 @@ class WindowRecord(Section):
         left_alone: A sentence for each axis that was not restored.
         outcome: ``RestorationVerdict.overall``; None if the frames could not be compared.
         summary: ``RestorationVerdict.sentence``.
+        predicted_gain: Mean of ``RestorationVerdict.predicted_gain`` in dB; None if unknown.
         error: Why detection or restoration failed.
         bad_frames: Index of each frame that could not be used, with the reason.
     """
@@ -45,6 +46,7 @@ class WindowRecord(Section):
     left_alone: list[str]
     outcome: str | None
     summary: str | None
+    predicted_gain: float | None = None
     error: str | None
     bad_frames: dict[str, str]
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from rsvib_torch.commands.terminal import print_detection
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
@@ -247,15 +246,3 @@ def test_comparison_draws_the_same_crop_of_both_frames(tmp_path, shape):
         assert after.get_array().mean() < before.get_array().mean()  # the grey scale is common to both
     save_figure(figure, tmp_path / "before_after.png", dpi=40)
     assert (tmp_path / "before_after.png").stat().st_size > 1000
-
-
-def test_printed_detection(capsys, result):
-    print_detection(result)
-    out = capsys.readouterr().out
-    assert "2.000 ± 0.010" in out  # two significant digits of the standard deviation
-    assert "60.000 ± 0.010" in out
-    assert out.count("∞") == 0
-    words = " ".join(out.split())
-    assert "image motion 20.00 ± 0.10 px/s; reliable" in words
-    assert "y: residual" in words
-    assert words.endswith("not reliable: only one period is seen")

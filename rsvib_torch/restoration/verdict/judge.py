@@ -14,6 +14,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import Result, measured_text, text_table, wrapped
+from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import as_tensor
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.motion.motion import Motion
@@ -253,9 +254,10 @@ def judge_frames(
         TooLittleInCommonError: If two frames have too little in common.
     """
     moves = motion.vibration.moving_axes()[0].tolist()
-    verdicts = [
-        _judge_pair(shared_part(raw, restored, motion, frames, columns, hidden), moves, shared) for frames in pairs
-    ]
+    verdicts, advance = [], steps(len(pairs), "pairs of frames")
+    for frames in pairs:
+        verdicts.append(_judge_pair(shared_part(raw, restored, motion, frames, columns, hidden), moves, shared))
+        advance()
     joined = {
         field.name: torch.stack([getattr(verdict, field.name) for verdict in verdicts])
         for field in fields(RestorationVerdict)

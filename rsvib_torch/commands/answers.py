@@ -1,0 +1,160 @@
+"""Answers of the commands: what was detected and restored, what was left unchanged and why, and what to do next."""
+
+import shlex
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rsvib_torch.core.presentation import measured_text, plain_values, text_table, wrapped
+from rsvib_torch.detection import DetectionResult
+from rsvib_torch.io.schema import DetectedVibration
+from rsvib_torch.stacks import RestoredFrames, StackManifest
+
+__all__ = [
+    "command_text",
+    "detection_data",
+    "restoration_data",
+    "restoration_lines",
+    "steps_after_detection",
+    "windows_data",
+    "windows_lines",
+]
+
+
+def command_text(*parts: str | Path) -> str:
+    """A command line of the program that can be copied into a shell."""
+    return shlex.join(["rsvib", *map(str, parts)])
+
+
+def detection_data(result: DetectionResult) -> dict[str, Any]:
+    """A detection without its offset curve."""
+    return {name: value for name, value in result.to_dict().items() if name not in ("offsets", "fitted")}
+
+
+def restored_axes(left_alone: Iterable[str]) -> str:
+    """The axes that were restored, from the sentences about the others."""
+    unchanged = {note[0] for note in left_alone}
+    return " and ".join(name for name in "xy" if name not in unchanged)
+
+
+def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
+    """What was restored and its gain, and which axes were left unchanged and why.
+
+    Args:
+        result: Restored frames with their verdict.
+        count: Number of frames of the stack.
+    """
+    frames = f"{count} frames" if len(result.frames) == count else f"1 image of {count} frames"
+    if not result.restored:
+        lines = [f"{count} frames unchanged"]
+    else:
+        lines = [f"{frames} restored along {restored_axes(result.left_alone)}"]
+    if result.verdict is not None:
+        lines.append(result.verdict.sentence)
+    elif result.restored:
+        lines.append("cannot determine whether restoration helps: no two frames show the same scene")
+    elif not result.moves:
+        lines.append("there is no vibration to remove")
+    return [wrapped(line) for line in [*lines, *result.left_alone]]
+
+
+def restoration_data(result: RestoredFrames) -> dict[str, Any]:
+    """The same as ``restoration_lines`` for JSON."""
+    verdict = result.verdict
+    return {
+        "frames": "restored" if result.restored else "as taken",
+        "axes": restored_axes(result.left_alone).split(" and ") if result.restored else [],
+        "left_alone": list(result.left_alone),
+        "outcome": None if verdict is None else verdict.overall,
+        "predicted_gain_db": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
+        "summary": None if verdict is None else verdict.sentence,
+    }
+
+
+def windows_data(manifest: StackManifest) -> dict[str, Any]:
+    """Summary of the windows of a stack: numbers of windows, gain, tones of each axis, and axes left unchanged.
+
+    Tones are medians over the reliable windows of the strongest tone, with the standard deviation over the windows.
+    """
+    windows, found = manifest.windows, manifest.detections()
+    gains = [record.predicted_gain for record in windows if record.predicted_gain is not None]
+    unchanged = {
+        name: {str(record.window): note for record in windows for note in record.left_alone if note.startswith(name)}
+        for name in "xy"
+    }
+    return {
+        "windows": len(windows),
+        "restored": sum(record.frames == "restored" for record in windows),
+        "outcomes": dict(Counter(record.outcome for record in windows if record.outcome is not None)),
+        "predicted_gain_db": {"lowest": min(gains), "highest": max(gains)} if gains else None,
+        "tones": {name: _tone_over_windows(found, axis) for axis, name in enumerate("xy")},
+        "left_alone": unchanged,
+        "errors": {str(record.window): record.error for record in windows if record.error is not None},
+        "bad_frames": manifest.bad_frames,
+    }
+
+
+def _tone_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> dict[str, Any]:
+    """Number of windows in which an axis is reliable, and median and spread of its strongest tone over them."""
+    reliable = [one.vibration for one in found if one is not None and bool(one.reliable[axis])]
+    data: dict[str, Any] = {"reliable_windows": len(reliable)}
+    for name in ("amplitude", "frequency"):
+        values = torch.tensor([float(getattr(one, name)[axis, 0]) for one in reliable], dtype=torch.float64)
+        data[name] = float(values.median()) if len(values) else None
+        data[f"{name}_spread"] = float(values.std()) if len(values) > 1 else None
+    return data
+
+
+def windows_lines(data: dict[str, Any]) -> tuple[list[str], list[str]]:
+    """Lines about the vibration and about the restoration, from ``windows_data``."""
+    rows, count = [], data["windows"]
+    for name, tone in data["tones"].items():
+        texts = [
+            "" if tone[quantity] is None else measured_text(tone[quantity], tone[f"{quantity}_spread"])
+            for quantity in ("amplitude", "frequency")
+        ]
+        rows.append([name, f"{tone['reliable_windows']} of {count}", *texts])
+    table = text_table(("axis", "reliable windows", "amplitude (px)", "frequency (Hz)"), rows)
+    vibration = [table, "strongest tone: median ± standard deviation over the windows"]
+    restoration = [f"{data['restored']} of {count} windows restored"]
+    if data["predicted_gain_db"] is not None:
+        low, high = data["predicted_gain_db"].values()
+        restoration.append(f"estimated gain {low:+.1f} … {high:+.1f} dB")
+    for name, notes in data["left_alone"].items():
+        if notes:
+            window, note = next(iter(notes.items()))
+            restoration.append(wrapped(f"{name} unchanged in {len(notes)} windows; in window {window}: {note}"))
+    if data["errors"]:
+        window, error = next(iter(data["errors"].items()))
+        vibration.append(
+            wrapped(f"detection or restoration failed in {len(data['errors'])} windows; in window {window}: {error}")
+        )
+    return vibration, restoration
+
+
+def steps_after_detection(
+    result: DetectionResult | None, frames: Path, config: Path, vibration: Path | None = None
+) -> list[str]:
+    """What to do after a detection: restore, or try another model.
+
+    Args:
+        result: The detection; None for windows.
+        frames: The stack.
+        config: The configuration file.
+        vibration: The file of the detection, if the frames were not restored by the same command.
+    """
+    lines = []
+    if vibration is not None and (result is None or bool(result.reliable.any())):
+        target = frames.with_name("restored.tif")
+        restore = command_text("restore", frames, target, "--config", config, "--vibration", vibration)
+        lines.append(f"restore the frames:\n  {restore}")
+    reasons = [] if result is None else [reason for axis in result.reasons for reason in axis]
+    if any("model='free'" in reason for reason in reasons):
+        motion = command_text("motion", frames, "--config", config, "--out", "motion.csv")
+        lines.append(f"detect a motion that is not a steady vibration (model='free'):\n  {motion}")
+    if reasons:
+        lines.append("remove the causes named in the reasons above, which also name the remedy")
+    return lines
