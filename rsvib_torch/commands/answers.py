@@ -11,6 +11,7 @@ import torch
 from rsvib_torch.core.presentation import measured_text, plain_values, text_table, wrapped
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.io.schema import DetectedVibration
+from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.stacks import RestoredFrames, StackManifest
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "restoration_data",
     "restoration_lines",
     "steps_after_detection",
+    "verdict_data",
     "windows_data",
     "windows_lines",
 ]
@@ -58,20 +60,30 @@ def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
         lines.append("cannot determine whether restoration helps: no two frames show the same scene")
     elif not result.moves:
         lines.append("there is no vibration to remove")
-    return [wrapped(line) for line in [*lines, *result.left_alone]]
+    for note in result.left_alone:
+        refused = (
+            "its vibration is not reliable" in note
+        )  # the reasons are those of the verdict, which is printed before
+        lines.append(f"{note[0]} unchanged: its vibration is not reliable, see the reasons above" if refused else note)
+    return [wrapped(line) for line in lines]
 
 
 def restoration_data(result: RestoredFrames) -> dict[str, Any]:
     """The same as ``restoration_lines`` for JSON."""
-    verdict = result.verdict
     return {
         "frames": "restored" if result.restored else "as taken",
         "axes": restored_axes(result.left_alone).split(" and ") if result.restored else [],
         "left_alone": list(result.left_alone),
-        "outcome": None if verdict is None else verdict.overall,
-        "predicted_gain_db": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
-        "summary": None if verdict is None else verdict.sentence,
+        **verdict_data(result.verdict),
     }
+
+
+def verdict_data(verdict: RestorationVerdict | None) -> dict[str, Any]:
+    """A verdict on restored frames for JSON."""
+    if verdict is None:
+        return {"outcome": None, "predicted_gain_db": None, "summary": None}
+    gain = plain_values(verdict.predicted_gain.nanmean())
+    return {"outcome": verdict.overall, "predicted_gain_db": gain, "summary": verdict.sentence}
 
 
 def windows_data(manifest: StackManifest) -> dict[str, Any]:
@@ -156,5 +168,5 @@ def steps_after_detection(
         motion = command_text("motion", frames, "--config", config, "--out", "motion.csv")
         lines.append(f"detect a motion that is not a steady vibration (model='free'):\n  {motion}")
     if reasons:
-        lines.append("remove the causes named in the reasons above, which also name the remedy")
+        lines.append("follow the remedies that the reasons above name")
     return lines

@@ -2,6 +2,7 @@
 
 import csv
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
-from rsvib_torch.commands.answers import command_text
+from rsvib_torch.commands.answers import command_text, verdict_data
 from rsvib_torch.commands.options import (
     ConfigOption,
     DeviceOption,
@@ -23,7 +24,7 @@ from rsvib_torch.commands.options import (
     check_new,
     full_scale_of,
 )
-from rsvib_torch.commands.stack_commands import load, save
+from rsvib_torch.commands.stack_commands import Stack, load, save
 from rsvib_torch.commands.terminal import Answer, error_line, working
 from rsvib_torch.config import read_config
 from rsvib_torch.core.presentation import measured_text
@@ -40,7 +41,7 @@ from rsvib_torch.io import check_stack_target, check_writable, read_stack, read_
 from rsvib_torch.motion.recorded import MotionUnit, TimeUnit, read_motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration import restore
+from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError, judge_restoration, restore
 
 __all__ = ["calibrate", "known", "motion"]
 
@@ -179,7 +180,7 @@ def known(
     data: dict[str, Any] = {"alignment": None, "check": None}
     stack = load(frames, settings, full_scale, device)
     if offset is None:
-        with working("aligning the recording with the frames"):
+        with working("aligning the recording"):
             found = align_motion(stack.frames, stack.timing, recorded, fit_gain=fit_gain)
         results["Recording on the clock of the frames"] = [found.summary()]
         data["alignment"] = found.to_dict()
@@ -198,11 +199,25 @@ def known(
     if check is not None:
         results["Motion of the frames"] = [check.summary()]
         data["check"] = check.to_dict()
-    with working("restoring the frames"):
-        result = restore(stack.frames, stack.timing, placed, **settings.restoration)
+    with working("restoring and judging"):
+        result = restore(stack.frames, stack.timing, placed, check=False, **settings.restoration)
+        verdict = _judge(stack, result, placed, settings.restoration.get("joint", False))
     save(restored, result, stack)
-    results["Restoration"] = [f"{len(result)} frames restored along x and y with the recorded motion"]
+    results["Restoration"] = [f"{len(stack.frames)} frames restored along x and y with the recorded motion"]
+    if verdict is not None:
+        results["Restoration"].append(verdict.sentence)
+        if verdict.overall in ("partly", "worse"):
+            error_line(verdict.sentence, "warning")
+    data["restoration"] = {"frames": "restored", **verdict_data(verdict)}
     return Answer(results, data, [restored])
+
+
+def _judge(stack: Stack, restored: Tensor, motion: FreeMotion, joint: bool | int) -> RestorationVerdict | None:
+    """Verdict on restored frames; None if no two frames show the same scene."""
+    with suppress(TooLittleInCommonError):
+        if len(stack.frames) > 1:
+            return judge_restoration(stack.frames, restored, stack.timing, motion, joint=joint, most_pairs=8)
+    return None
 
 
 def _refuse(path: Path, reasons: tuple[str, ...], force: bool) -> None:
@@ -224,7 +239,7 @@ def _check_motion(
         error_line("cannot determine whether the motion fits: the comparison needs two frames", "warning")
         return None
     try:
-        with working("comparing the motion with the frames"):
+        with working("comparing the motion"):
             check = check_motion(frames, timing, motion)
     except ValueError as error:
         if required:

@@ -130,7 +130,7 @@ def _detect(stack: Stack, config: Config) -> DetectionResult:
 
 def _restore(stack: Stack, detected: Detected, options: dict[str, Any], force: bool) -> RestoredFrames:
     """Restore frames, and judge the result on eight pairs of frames."""
-    with working("restoring the frames and judging the result"):
+    with working("restoring and judging"):
         result = restore_trusted(stack.frames, stack.timing, detected, options, force=force, most_pairs=8)
     _warn_of_restoration(result)
     return result
@@ -489,7 +489,7 @@ def run(
     names = []
     with whole_folder(out) as folder:
         if len(first.frames):
-            with working("drawing input and restored frame"):
+            with working("drawing the frames"):
                 _draw_comparison(folder / "before_after.png", frames, scale, first)
             names.append("before_after.png")
         names += [output, "manifest.json"]

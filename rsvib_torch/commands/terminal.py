@@ -5,21 +5,12 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    SpinnerColumn,
-    Task,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
 from rich.text import Text
 
 from rsvib_torch.core.presentation import json_text, wrapped
@@ -100,10 +91,11 @@ def show_answer(command: str, answer: Answer) -> None:
     for title, lines in answer.results.items():
         print_line("\n".join([title, *(f"  {line}" for text in lines for line in text.splitlines())]) + "\n")
     if answer.files:
-        print_line(f"Files (open {answer.files[0].name} first)")
+        print_line(f"Files (open {answer.files[0].name} first)" if len(answer.files) > 1 else "File")
         for folder in dict.fromkeys(path.parent for path in answer.files):
-            names = ", ".join(path.name for path in answer.files if path.parent == folder)
-            print_line(textwrap.indent(wrapped(f"{folder}: {names}"), "  "))
+            names = [path.name for path in answer.files if path.parent == folder]
+            text = str(folder / names[0]) if len(names) == 1 else f"{folder}: {', '.join(names)}"
+            print_line(textwrap.indent(wrapped(text), "  "))
     if answer.next_steps:
         print_line("\n".join(["", "Next", *(textwrap.indent(step, "  ") for step in answer.next_steps)]))
 
@@ -129,21 +121,19 @@ def warnings_in_one_line() -> Iterator[None]:
         yield
 
 
-class _RateColumn(ProgressColumn):
-    """Steps per second."""
+class _StateColumn(ProgressColumn):
+    """Complete steps, rate and remaining time; the elapsed time while the number of steps is unknown."""
 
     def render(self, task: Task) -> Text:
-        """The rate, empty until it has been measured."""
-        rate = task.finished_speed or task.speed
-        return Text("" if rate is None else f"{rate:.2f} {task.fields.get('unit', 'frames')}/s")
-
-
-class _CountColumn(MofNCompleteColumn):
-    """Number of complete steps, empty until it is known."""
-
-    def render(self, task: Task) -> Text:
-        """The number of complete steps and of all steps."""
-        return Text("") if task.total is None else super().render(task)
+        """The state of a loop, in at most 40 characters."""
+        if task.total is None:
+            return Text(str(timedelta(seconds=int(task.elapsed or 0))))
+        state = f"{task.completed:.0f} of {task.total:.0f} {task.fields['unit']}"
+        done, seconds = task.completed - task.fields["first"], task.elapsed or 0.0
+        if done <= 0 or seconds <= 0:
+            return Text(state)
+        left = timedelta(seconds=round((task.total - task.completed) * seconds / done))
+        return Text(f"{state}  {done / seconds:.3g}/s  {left} left")
 
 
 def _progress() -> Progress:
@@ -152,16 +142,11 @@ def _progress() -> Progress:
     return Progress(
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=20),
-        _CountColumn(),
-        _RateColumn(),
-        TimeElapsedColumn(),
-        TextColumn("remaining"),
-        TimeRemainingColumn(),
+        BarColumn(bar_width=10),
+        _StateColumn(),
         console=console,
         transient=True,
         disable=_outputs[-1].quiet or not console.is_terminal,
-        speed_estimate_period=300.0,  # s; windows of a stack may take minutes each
     )
 
 
@@ -170,13 +155,10 @@ def working(description: str) -> Iterator[None]:
     """Show the elapsed time, and progress, rate and remaining time of the loops in the block that report them."""
     with _progress() as progress:
         task = progress.add_task(description, total=None)
-        loop: tuple[int, str] | None = None
 
         def show(done: int, total: int, unit: str) -> None:
-            nonlocal loop
-            if loop != (total, unit) or done <= progress.tasks[0].completed:
-                progress.reset(task, total=total, completed=0, description=f"{description}: {unit}", unit=unit)
-            loop = (total, unit)
+            if done == 0:  # another loop begins
+                progress.reset(task, total=total, unit=unit, first=0)
             progress.update(task, completed=done)
 
         with listening(show):
@@ -196,7 +178,7 @@ def counting(description: str) -> Iterator[Callable[[int, int], None]]:
         def show(done: int, total: int) -> None:
             nonlocal task
             if task is None:  # frames of a resumed run do not count for the rate
-                task = progress.add_task(description, total=total, completed=done)
+                task = progress.add_task(description, total=total, completed=done, unit="frames", first=done)
             else:
                 progress.update(task, completed=done)
 

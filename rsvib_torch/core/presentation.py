@@ -146,17 +146,18 @@ def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
 
     Example:
         >>> verdict_lines([True, False], [(), ("too short", "noisy")])
-        ['x: reliable', 'y: not reliable: too short; noisy']
+        ['x: reliable', 'y: not reliable:', ' - too short', ' - noisy']
     """
-    return [
-        f"{name}: reliable" if bool(good) else wrapped(f"{name}: not reliable: {'; '.join(map(str, why))}")
-        for name, good, why in zip("xy", reliable, reasons, strict=True)
-    ]
+    lines = []
+    for name, good, why in zip("xy", reliable, reasons, strict=True):
+        lines.append(f"{name}: reliable" if bool(good) else f"{name}: not reliable:")
+        lines += [wrapped(f" - {reason}") for reason in why]
+    return lines
 
 
 def wrapped(text: str) -> str:
     """Text in lines of the width of the terminal, at most 100 characters; all but the first are indented."""
-    width = min(100, shutil.get_terminal_size((100, 24)).columns)
+    width = min(100, shutil.get_terminal_size((100, 24)).columns) - 2  # an answer of the program is indented by 2
     return textwrap.fill(text, width, subsequent_indent="   ", break_long_words=False, break_on_hyphens=False)
 
 

@@ -25,7 +25,7 @@ def listening(listener: Listener) -> Iterator[None]:
         _listeners.remove(listener)
 
 
-def steps(total: int, unit: str) -> Callable[[], None]:
+def steps(total: int, unit: str) -> Callable[..., None]:
     """Begin a loop.
 
     Args:
@@ -33,23 +33,25 @@ def steps(total: int, unit: str) -> Callable[[], None]:
         unit: What a step is, in the plural, e.g. ``"frames"``.
 
     Returns:
-        A function to be called after each step, from any thread.
+        A function to be called after each step, or with the number of steps after several, from any thread.
 
     Example:
         >>> with listening(lambda done, total, unit: print(f"{done} of {total} {unit}")):
-        ...     advance = steps(2, "frames")
+        ...     advance = steps(3, "frames")
         ...     advance()
-        ...     advance()
-        1 of 2 frames
-        2 of 2 frames
+        ...     advance(2)
+        0 of 3 frames
+        1 of 3 frames
+        3 of 3 frames
     """
     done = 0
 
-    def advance() -> None:
+    def advance(count: int = 1) -> None:
         nonlocal done
         with _lock:
-            done += 1
+            done += count
             for listener in _listeners[-1:]:
                 listener(done, total, unit)
 
+    advance(0)
     return advance

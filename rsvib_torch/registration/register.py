@@ -175,7 +175,7 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     bytes_of_pair = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4
     offsets, quality = [], []
     parts = runs(len(first), max(1, 2**28 // bytes_of_pair))  # 256 MiB of windows at a time
-    advance = steps(len(parts), "groups of pairs")
+    advance = steps(len(first), "pairs")
     for pair in parts:
         task = BandTask(first[pair], second[pair], coarse_offset(first[pair], second[pair]), tops, band_rows, search)
         if task.width < search:
@@ -184,7 +184,7 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
         failed = ~(correlation > 0.1)  # chance reaches correlations of 0.1
         offsets.append(torch.where(failed[..., None], torch.nan, measured))
         quality.append(torch.where(failed, 0.0, correlation))
-        advance()
+        advance(len(correlation))
     rows = tops.to(torch.float64) + 0.5 * (band_rows - 1)
     starts = timing.frame_starts(num_frames, grey.device)[:, None] + rows * timing.row_time
     index = torch.arange(num_frames, device=grey.device)

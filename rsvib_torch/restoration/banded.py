@@ -177,7 +177,7 @@ def restore_banded(
     spectra = torch.view_as_real(_aligned_spectra(frames, motion, u, length)).movedim(-1, 0).contiguous()
     restored = frames.new_empty(B * T * len(centres), stride, C, W)
     chunks = runs(len(slab_rows), chunk_rows)
-    advance = steps(len(chunks), "chunks of rows")
+    advance = steps(len(chunks), "chunks")
     for chunk in chunks:
         bank = _filters(displacement[chunk], node_weights, grid, weight[chunk], interpolation)
         source = mirrored(slab_rows[chunk, None, None] + kept[:, None] - lags, H)  # (n, stride, V)

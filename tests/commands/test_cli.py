@@ -161,8 +161,8 @@ def test_an_unreliable_axis_is_not_restored(place, tmp_path, capsys):
     capsys.readouterr()
     assert run("restore", frames, tmp_path / "restored.tif", "--config", config, "--vibration", path) == 0
     shown = capsys.readouterr().out
-    assert "  x is not restored: its vibration is not reliable (blind)\n" in shown
-    assert "  y is not restored: its vibration is not reliable (too short; noisy)\n" in shown
+    assert "  x: not reliable:\n   - blind\n  y: not reliable:\n   - too short\n   - noisy\n" in shown
+    assert "  y unchanged: its vibration is not reliable, see the reasons above\n" in shown
     assert "  2 frames unchanged\n" in shown
     difference = read_stack(tmp_path / "restored.tif") - read_stack(frames)
     assert difference.abs().mean() < 0.01
@@ -249,7 +249,7 @@ def test_frames_without_vibration_are_unchanged(place, tmp_path, capsys):
     assert run("run", tmp_path / "still.tif", tmp_path / "out", "--config", place / "camera.toml") == 0
     shown = capsys.readouterr()
     assert "no vibration to remove: the frames are written unchanged" in shown.err
-    assert "x is not restored: its vibration is not reliable" in shown.out
+    assert "x unchanged: its vibration is not reliable, see the reasons above" in shown.out
     assert (tifffile.imread(tmp_path / "out" / "restored.tif") == tifffile.imread(tmp_path / "still.tif")).all()
     assert json.loads((tmp_path / "out" / "restoration.json").read_text())["frames"] == "as taken"
 

@@ -112,9 +112,10 @@ def test_reasons_tones_and_image_motion_are_printed(detection):
     assert lines[3] == "y     no tone"
     assert lines[4] == "image motion 20.00 ± 0.10 px/s along x, 0.00 ± 0.10 px/s along y"
     assert lines[5] == "x: reliable"
-    assert lines[6].startswith("y: not reliable: no significant tone")
-    assert lines[-1].startswith("   ")
-    assert lines[-1].endswith("; blind")
+    assert lines[6] == "y: not reliable:"
+    assert lines[7].startswith(" - no significant tone")
+    assert lines[8].startswith("   ")
+    assert lines[-1] == " - blind"
     assert max(map(len, lines)) <= 100
 
 

@@ -228,7 +228,7 @@ def measure_groups(
 ) -> tuple[Measurements, list[RowGradients]]:
     """``measure_group`` of all groups, the measurements as one record."""
     each = [None] * len(groups) if gradients is None else gradients
-    measured, advance = [], steps(len(groups), "groups of frames")
+    measured, advance = [], steps(len(groups), "groups")
     for group, own in zip(groups, each, strict=True):
         measured.append(measure_group(group, timing, motion, own))
         advance()

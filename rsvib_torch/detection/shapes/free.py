@@ -88,7 +88,7 @@ class MotionDetection(
             [*labels, *(measured_text(value[at], digits=2) for value in (size, self.std_seen, self.unseen))]
             for at, labels in axis_rows(self.batch_shape)
         ]
-        head = ("displacement (px rms)", "± between frames (px)", "± common to all frames (px)")
+        head = ("displacement (px rms)", "± between frames (px)", "± common to all (px)")
         return "\n".join(verdict_table(head, rows, self.batch_shape, self.reliable, self.reasons))
 
     def __getitem__(self, index: int) -> "MotionDetection":

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.core.presentation import Result, axis_rows, measured_text, verdict_table
+from rsvib_torch.core.presentation import Result, axis_rows, measured_text, text_table, verdict_lines, verdict_table
 from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
@@ -82,12 +82,16 @@ class SweptTone(
         return self.amplitude.shape[:-1]
 
     def summary(self) -> str:
-        """The tone of each axis with standard deviations, and the verdict."""
-        rows = [
-            [*labels, *(measured_text(getattr(self, name)[at], self.std[name][at]) for name in self.std)]
-            for at, labels in axis_rows(self.batch_shape)
-        ]
-        head = [f"{name} ({self.units[name]})" for name in self.std]
+        """The tone of each axis with standard deviations, and the verdict; of a batch, amplitudes and frequencies."""
+
+        def text(name: str, at: tuple[int, ...]) -> str:
+            return measured_text(getattr(self, name)[at], self.std[name][at])
+
+        if not self.batch_shape:
+            table = [[f"{name} ({self.units[name]})", text(name, (0,)), text(name, (1,))] for name in self.std]
+            return "\n".join([text_table(("axis", "x", "y"), table), *verdict_lines(self.reliable, self.reasons)])
+        rows = [[*labels, text("amplitude", at), text("frequency", at)] for at, labels in axis_rows(self.batch_shape)]
+        head = ("amplitude (px)", "frequency (Hz)")
         return "\n".join(verdict_table(head, rows, self.batch_shape, self.reliable, self.reasons))
 
     def __getitem__(self, index: int) -> "SweptTone":

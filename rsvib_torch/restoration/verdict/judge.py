@@ -254,7 +254,7 @@ def judge_frames(
         TooLittleInCommonError: If two frames have too little in common.
     """
     moves = motion.vibration.moving_axes()[0].tolist()
-    verdicts, advance = [], steps(len(pairs), "pairs of frames")
+    verdicts, advance = [], steps(len(pairs), "pairs")
     for frames in pairs:
         verdicts.append(_judge_pair(shared_part(raw, restored, motion, frames, columns, hidden), moves, shared))
         advance()
