@@ -43,7 +43,7 @@ from rsvib_torch.report.plots import (
     save_figure,
     windows_figure,
 )
-from rsvib_torch.report.results import read_vibration, write_offsets, write_vibration
+from rsvib_torch.report.results import read_vibration, write_offsets, write_vibration, write_windows
 from rsvib_torch.restoration import (
     RestorationVerdict,
     RestorationWarning,
@@ -122,5 +122,6 @@ __all__ = [
     "write_offsets",
     "write_stack",
     "write_vibration",
+    "write_windows",
 ]
 __version__ = "0.1.0"

@@ -1,18 +1,14 @@
 """Answers of the commands: what was detected and restored, what was left unchanged and why, and what to do next."""
 
 import shlex
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from rsvib_torch.core.presentation import measured_text, plain_values, text_table, wrapped
+from rsvib_torch.core.presentation import plain_values, wrapped
 from rsvib_torch.detection import DetectionResult
-from rsvib_torch.io.schema import DetectedVibration
 from rsvib_torch.restoration import RestorationVerdict
-from rsvib_torch.stacks import RestoredFrames, StackManifest
+from rsvib_torch.stacks import RestoredFrames
 
 __all__ = [
     "command_text",
@@ -21,8 +17,6 @@ __all__ = [
     "restoration_lines",
     "steps_after_detection",
     "verdict_data",
-    "windows_data",
-    "windows_lines",
 ]
 
 
@@ -84,67 +78,6 @@ def verdict_data(verdict: RestorationVerdict | None) -> dict[str, Any]:
         return {"outcome": None, "predicted_gain_db": None, "summary": None}
     gain = plain_values(verdict.predicted_gain.nanmean())
     return {"outcome": verdict.overall, "predicted_gain_db": gain, "summary": verdict.sentence}
-
-
-def windows_data(manifest: StackManifest) -> dict[str, Any]:
-    """Summary of the windows of a stack: numbers of windows, gain, tones of each axis, and axes left unchanged.
-
-    Tones are medians over the reliable windows of the strongest tone, with the standard deviation over the windows.
-    """
-    windows, found = manifest.windows, manifest.detections()
-    gains = [record.predicted_gain for record in windows if record.predicted_gain is not None]
-    unchanged = {
-        name: {str(record.window): note for record in windows for note in record.left_alone if note.startswith(name)}
-        for name in "xy"
-    }
-    return {
-        "windows": len(windows),
-        "restored": sum(record.frames == "restored" for record in windows),
-        "outcomes": dict(Counter(record.outcome for record in windows if record.outcome is not None)),
-        "predicted_gain_db": {"lowest": min(gains), "highest": max(gains)} if gains else None,
-        "tones": {name: _tone_over_windows(found, axis) for axis, name in enumerate("xy")},
-        "left_alone": unchanged,
-        "errors": {str(record.window): record.error for record in windows if record.error is not None},
-        "bad_frames": manifest.bad_frames,
-    }
-
-
-def _tone_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> dict[str, Any]:
-    """Number of windows in which an axis is reliable, and median and spread of its strongest tone over them."""
-    reliable = [one.vibration for one in found if one is not None and bool(one.reliable[axis])]
-    data: dict[str, Any] = {"reliable_windows": len(reliable)}
-    for name in ("amplitude", "frequency"):
-        values = torch.tensor([float(getattr(one, name)[axis, 0]) for one in reliable], dtype=torch.float64)
-        data[name] = float(values.median()) if len(values) else None
-        data[f"{name}_spread"] = float(values.std()) if len(values) > 1 else None
-    return data
-
-
-def windows_lines(data: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """Lines about the vibration and about the restoration, from ``windows_data``."""
-    rows, count = [], data["windows"]
-    for name, tone in data["tones"].items():
-        texts = [
-            "" if tone[quantity] is None else measured_text(tone[quantity], tone[f"{quantity}_spread"])
-            for quantity in ("amplitude", "frequency")
-        ]
-        rows.append([name, f"{tone['reliable_windows']} of {count}", *texts])
-    table = text_table(("axis", "reliable windows", "amplitude (px)", "frequency (Hz)"), rows)
-    vibration = [table, "strongest tone: median ± standard deviation over the windows"]
-    restoration = [f"{data['restored']} of {count} windows restored"]
-    if data["predicted_gain_db"] is not None:
-        low, high = data["predicted_gain_db"].values()
-        restoration.append(f"estimated gain {low:+.1f} … {high:+.1f} dB")
-    for name, notes in data["left_alone"].items():
-        if notes:
-            window, note = next(iter(notes.items()))
-            restoration.append(wrapped(f"{name} unchanged in {len(notes)} windows; in window {window}: {note}"))
-    if data["errors"]:
-        window, error = next(iter(data["errors"].items()))
-        vibration.append(
-            wrapped(f"detection or restoration failed in {len(data['errors'])} windows; in window {window}: {error}")
-        )
-    return vibration, restoration
 
 
 def steps_after_detection(

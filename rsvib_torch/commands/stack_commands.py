@@ -16,8 +16,6 @@ from rsvib_torch.commands.answers import (
     restoration_data,
     restoration_lines,
     steps_after_detection,
-    windows_data,
-    windows_lines,
 )
 from rsvib_torch.commands.options import (
     ConfigOption,
@@ -158,7 +156,7 @@ def _write_windows(folder: Path, path: Path) -> list[str]:
     """Write summary, table and figure of the windows of a manifest, and return the names of the files."""
     manifest = read_manifest(path)
     with working("drawing the windows"):
-        write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **windows_data(manifest)})
+        write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **manifest.totals()})
         write_windows(folder / "windows.csv", manifest)
         starts = [record.start_time for record in manifest.windows]
         save_figure(windows_figure(starts, manifest.detections()), folder / "windows.png")
@@ -286,11 +284,11 @@ def detect(
             )
         names = [*_write_windows(folder, folder / "manifest.json"), "manifest.json"]
     _remove_old(out, _OF_DETECTION, names)
-    data = windows_data(read_manifest(out / "manifest.json"))
-    _warn_of_failures(len(data["errors"]))
+    manifest = read_manifest(out / "manifest.json")
+    _warn_of_failures(sum(record.error is not None for record in manifest.windows))
     return Answer(
-        {f"Vibration in {data['windows']} windows of {frames.name}": windows_lines(data)[0]},
-        {"windows": data},
+        {f"Vibration in {len(manifest.windows)} windows of {frames.name}": manifest.lines()[0]},
+        {"windows": manifest.totals()},
         [out / name for name in names],
         steps_after_detection(None, frames, config, out / "manifest.json"),
     )
@@ -333,6 +331,7 @@ def restore_frames(
     if is_manifest:
         if report is not None:
             raise ValueError("--report needs a vibration.json; the verdict on each window is in its manifest.json")
+        check_new([restored.with_name(f"{restored.name}.manifest.json")], overwrite)
         return _restore_windows(frames, restored, settings, vibration, overrides, force, device, full_scale)
     detected = read_vibration(vibration, timing_from_first_frame(settings.timing, read_stack_info(frames)))
     stack = load(frames, settings, full_scale, device)
@@ -393,11 +392,11 @@ def _restore_windows(
             device=str(torch_device(device)),
             progress=progress,
         )
-    data = windows_data(read_manifest(result.manifest))
-    vibration_lines, lines = windows_lines(data)
+    manifest = read_manifest(result.manifest)
+    vibration_lines, lines = manifest.lines()
     return Answer(
         {"Vibration": vibration_lines, "Restoration": [result.summary(), *lines[1:]]},
-        {"windows": data},
+        {"windows": manifest.totals()},
         [restored, result.manifest],
     )
 
@@ -520,12 +519,12 @@ def run(
             files,
             steps + steps_after_detection(first.detection, frames, config),
         )
-    data = windows_data(read_manifest(out / "manifest.json"))
+    stored = read_manifest(out / "manifest.json")
     _warn_of_failures(result.failed)
-    vibration_lines, lines = windows_lines(data)
+    vibration_lines, lines = stored.lines()
     return Answer(
         {f"Vibration in {frames.name}": vibration_lines, "Restoration": [result.summary(), *lines[1:]]},
-        {"windows": data},
+        {"windows": stored.totals()},
         files,
         steps,
     )

@@ -88,11 +88,14 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
     """Write the measured and the fitted offset curve as CSV; offsets that were not measured are empty.
 
     Args:
-        path: The file to write.
+        path: The file to write; an existing file is replaced.
         result: A detection (not a batch).
 
     Raises:
         OSError: If the file cannot be written.
+
+    Example:
+        >>> write_offsets("offsets.csv", detection)  # doctest: +SKIP
     """
     curve = result.offsets
     count = curve.times.shape[-1]
@@ -126,10 +129,13 @@ def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None
 
     Args:
         path: The file to write.
-        manifest: The manifest of the stack.
+        manifest: The manifest of the stack, from ``read_manifest``.
 
     Raises:
         OSError: If the file cannot be written.
+
+    Example:
+        >>> write_windows("windows.csv", read_manifest("manifest.json"))  # doctest: +SKIP
     """
     quantities = ("amplitude", "frequency", "phase")
     head = ["window", "first_frame", "last_frame", "start_s"]
