@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.motion.timing import SensorTiming
 
@@ -29,8 +30,8 @@ class FrameError(ValueError):
     """One frame of a stack cannot be read; the other frames may be readable."""
 
 
-@dataclass(frozen=True)
-class StackInfo:
+@dataclass(frozen=True, repr=False)
+class StackInfo(Summarised):
     """Shape, data type and full scale of a stack in a file.
 
     Attributes:
@@ -52,6 +53,16 @@ class StackInfo:
     resolution: tuple[float, float, str] | None = None
     channels_last: bool = field(default=False, compare=False)
     times_of_playback: bool = field(default=False, compare=False)
+
+    def summary(self) -> str:
+        """The stack in one line."""
+        parts = [f"{self.shape[0]} frames of {self.shape[-2]} x {self.shape[-1]} px", self.dtype]
+        parts += [f"{self.shape[1]} channels"] if self.axes == "TCHW" else []
+        parts += [] if self.full_scale is None else [f"full scale {self.full_scale:g}"]
+        if self.frame_times:
+            parts.append(f"frame times {self.frame_times[0]:.6g} … {self.frame_times[-1]:.6g} s")
+        parts += [] if self.resolution is None else ["{:g} x {:g} px per {}".format(*self.resolution)]
+        return ", ".join(parts)
 
     @property
     def axes(self) -> str:

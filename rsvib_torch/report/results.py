@@ -73,6 +73,11 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
     """
     path = Path(path)
     data = read_json(path, "vibration.json")
+    if data.get("format") not in (None, DetectionResult.file_format):
+        raise ValueError(
+            f"{path}: not a vibration.json, but a file of the format {data['format']!r}; give the vibration.json, or "
+            "the manifest.json of windows, that rsvib detect or run wrote"
+        )
     if isinstance(data.get("reliable"), list) and any(isinstance(entry, list) for entry in data["reliable"]):
         raise ValueError(f"{path}: a batch of detections; read it with DetectionResult.load, and pass one of them")
     record = validate(VibrationFile, data, str(path))

@@ -249,6 +249,16 @@ def test_a_failed_save_leaves_no_file(detection, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["v.json"]
 
 
+def test_the_description_of_a_stack_is_one_line():
+    info = rsv.StackInfo(
+        (900, 3, 448, 256), "uint16", 4095.0, tuple(0.1 * i for i in range(900)), (300.0, 300.0, "inch")
+    )
+    assert repr(info) == (
+        "900 frames of 448 x 256 px, uint16, 3 channels, full scale 4095, frame times 0 … 89.9 s, 300 x 300 px per inch"
+    )
+    assert str(rsv.StackInfo((2, 8, 9), "float32", None)) == "2 frames of 8 x 9 px, float32"
+
+
 def test_other_result_types_print_their_shapes():
     @dataclass(frozen=True, eq=False, repr=False)
     class Other(Result):

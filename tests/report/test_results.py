@@ -118,6 +118,7 @@ def put(data, value, *keys):
         (lambda d: put(d, -3.0, "vibration", "amplitude", 0, 0), "vibration: amplitude must not be negative"),
         (lambda d: put(d, [True], "reliable"), "reliable: expected 2 entries, got [True]"),
         (lambda d: put(d, 2, "version"), "version: expected 1, got 2"),
+        (lambda d: put(d, "rsvib windows", "format"), "not a vibration.json, but a file of the format 'rsvib windows'"),
         (lambda d: put(d, 0.0, "timing", "row_time"), "timing: row_time must be larger than 0"),
         (lambda d: put(d, 1, "colour"), "colour: unknown key"),
     ],
