@@ -247,7 +247,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         "details": _details(before, after, names),
         "offsets": offsets,
         "tones_head": words.TONE_HEAD,
-        "tones": words.tone_rows(result),
+        "tones": words.detected_tones(result),
         "tone_figures": tone_figures,
         "mtf_head": ("edge", "direction", "angle", "MTF50 of the input (cycles/px)", f"MTF50 {names[1]} (cycles/px)"),
         "mtf_rows": [_edge_row(edge) for edge in measured],
