@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.presentation import FIGURES, measured_text
+from rsvib_torch.core.presentation import FIGURES, Result, measured_text
 from rsvib_torch.detection import DetectionResult, MotionDetection, SweptTone
 from rsvib_torch.evaluation import MtfCurve
 from rsvib_torch.imaging import row_psf
@@ -65,6 +65,12 @@ class _Drawing(Figure):
         return picture.getvalue()
 
 
+def _check_one(result: Result) -> None:
+    """Raise a ``ValueError`` for a batch."""
+    if result.batch_shape:
+        raise ValueError(f"a batch of shape {tuple(result.batch_shape)} cannot be drawn: select one, result[0]")
+
+
 def tones_text(result: DetectionResult, axis: int) -> list[str]:
     """Amplitude and frequency of every tone of an axis, one text each."""
     vibration, std = result.vibration, result.std
@@ -77,7 +83,19 @@ def tones_text(result: DetectionResult, axis: int) -> list[str]:
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150) -> None:
-    """Write a figure as an image file, atomically."""
+    """Write a figure as an image file, atomically.
+
+    Args:
+        figure: The figure.
+        path: The file to write; its ending selects the format (``.png``, ``.svg``, ``.pdf``).
+        dpi: Pixels per inch.
+
+    Raises:
+        OSError: If the file cannot be written.
+
+    Example:
+        >>> save_figure(offset_figure(detection), "offsets.png")  # doctest: +SKIP
+    """
     with whole_file(path) as part:
         FigureCanvasAgg(figure).print_figure(str(part), dpi=dpi, facecolor="white")
 
@@ -145,7 +163,11 @@ def offset_figure(result: DetectionResult) -> Figure:
 
     Args:
         result: A detection (not a batch).
+
+    Example:
+        >>> save_figure(offset_figure(detection), "offsets.png")  # doctest: +SKIP
     """
+    _check_one(result)
     figure = _Drawing(figsize=(13, 6.4), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, height_ratios=(3, 1), squeeze=False)
     points: Any = None
@@ -174,6 +196,11 @@ def windows_figure(
         times: Position of each window on the horizontal axis.
         detections: The detection of each window (not a batch); None where it failed.
         time_label: Label of the horizontal axis.
+
+    Example:
+        >>> manifest = read_manifest("manifest.json")  # doctest: +SKIP
+        >>> starts = [window.start_time for window in manifest.windows]  # doctest: +SKIP
+        >>> figure = windows_figure(starts, manifest.detections())  # doctest: +SKIP
     """
     figure = _Drawing(figsize=(11, 5.6), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, squeeze=False)
@@ -228,7 +255,13 @@ def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None)
         motion: The motion (not a batch).
         first: Start of the drawing in seconds.
         last: End of the drawing; by default that of a free motion, or four periods of the tone of lower frequency.
+
+    Example:
+        >>> figure = motion_figure(Vibration([3.1, 5.2], [50.0, 30.0]))
+        >>> figure.axes[0].get_xlabel()
+        'time (ms)'
     """
+    _check_one(motion)
     if isinstance(motion, FreeMotion):
         first, last = motion.start, motion.end if last is None else last
     if last is None:
@@ -308,6 +341,7 @@ def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
         result: A detection (not a batch).
         axis: 0 for x, 1 for y.
     """
+    _check_one(result)
     figure = _Drawing(figsize=(5.6, 4.4), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     _finish_offsets(figure, panels, _draw_offsets(panels[0], panels[1], result, axis))
@@ -323,7 +357,11 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     Args:
         result: A detection (not a batch).
         timing: The sensor.
+
+    Example:
+        >>> save_figure(gain_figure(detection, timing), "gain.png")  # doctest: +SKIP
     """
+    _check_one(result)
     vibration, std = result.vibration, result.std
     highest = max(1.35 * float((vibration.frequency * (vibration.amplitude > 0)).max()), 4.2 / timing.frame_period)
     frequency = np.linspace(0.0, highest, 2000)
@@ -379,10 +417,17 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figur
     """Draw mean displacement and motion blur of every row of frame 0.
 
     Args:
-        vibration: The motion.
+        vibration: The motion (not a batch).
         timing: The sensor.
         num_rows: Rows of a frame.
+
+    Example:
+        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+        >>> figure = rows_figure(Vibration([3.1, 5.2], [50.0, 30.0]), timing, num_rows=512)
+        >>> [panel.get_ylabel() for panel in figure.axes]
+        ['displacement (px)', 'motion blur (px)']
     """
+    _check_one(vibration)
     starts = timing.row_starts(1, num_rows)[0]
     figure = _Drawing(figsize=(5.6, 4.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
@@ -404,10 +449,14 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
     Each kernel is centred on the mean displacement of its row, rounded to whole px; all have the same grey scale.
 
     Args:
-        vibration: The motion.
+        vibration: The motion (not a batch).
         timing: The sensor.
         num_rows: Rows of a frame.
+
+    Example:
+        >>> save_figure(psf_figure(detection.vibration, timing, num_rows=2048), "psf.png")  # doctest: +SKIP
     """
+    _check_one(vibration)
     down, across = 3, 8
     rows = torch.linspace(0, num_rows - 1, down * across).round()
     starts = timing.row_starts(1, num_rows)[0][rows.long()]
@@ -441,6 +490,9 @@ def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]]) -> Figure:
 
     Args:
         curves: Measured edges of the input and of the restored frame, or of one image, by the name in the legend.
+
+    Example:
+        >>> figure = mtf_figure({"raw": [raw_curve], "restored": [restored_curve]})  # doctest: +SKIP
     """
     figure = _Drawing(figsize=(5.6, 3.9), layout="constrained")
     panel = figure.subplots()
@@ -498,6 +550,11 @@ def comparison_figure(
         count: Number of crops.
         size: Side of the crops in px.
         names: Titles of the two rows of panels.
+
+    Example:
+        >>> frame = torch.rand(96, 128, generator=torch.Generator().manual_seed(0))
+        >>> len(comparison_figure(frame, frame, count=2, size=32).axes)
+        4
     """
     raw, restored = (picture(frame) for frame in (raw, restored))
     size = min(size, *raw.shape[:2])

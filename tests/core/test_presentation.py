@@ -200,6 +200,12 @@ def test_results_are_drawn(results, tmp_path):
     assert "<svg" in (tmp_path / "offsets.svg").read_text()
 
 
+def test_figures_of_batches_are_refused(windows):
+    for draw in (rsv.offset_figure, lambda w: rsv.gain_figure(w, TIMING), lambda w: rsv.motion_figure(w.vibration)):
+        with pytest.raises(ValueError, match=r"a batch of shape \(3,\) cannot be drawn: select one, result\[0\]"):
+            draw(windows)
+
+
 def test_a_saved_detection_is_a_vibration_json(detection, windows, frames, tmp_path):
     path = tmp_path / "vibration.json"
     detection.save(path)
