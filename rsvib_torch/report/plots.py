@@ -242,8 +242,8 @@ def windows_figure(
 def _batch_figure(results: DetectionResult) -> Figure:
     """Figure of a batch of detections: windows over time, stacks over their number."""
     parts = [results[index] for index in range(results.batch_shape[0])]
-    starts = [float(part.offsets.times.min()) for part in parts]
-    if len(set(starts)) == len(starts):
+    starts = [float(part.offsets.times.min()) for part in parts]  # to a fraction of a row
+    if results.timing is not None and (np.diff(starts) > 0.5 * results.timing.frame_period).all():
         return windows_figure(starts, parts)
     return windows_figure(range(len(parts)), parts, time_label="number of the stack")
 

@@ -200,6 +200,18 @@ def test_results_are_drawn(results, tmp_path):
     assert "<svg" in (tmp_path / "offsets.svg").read_text()
 
 
+def test_batches_are_drawn_over_windows_or_stacks(frames, windows):
+    stacks = rsv.detect_vibration(torch.stack([frames[:2], frames[2:]])[:, :, None], TIMING)
+    for results, label, places in (
+        (windows, "start of the window (s)", (0.0, 0.024)),
+        (stacks, "number of the stack", (0, 1)),
+    ):
+        panel = results.plot().axes[2]
+        assert panel.get_xlabel() == label
+        assert panel.lines[0].get_xdata()[0] == pytest.approx(places[0], abs=1e-3)
+        assert panel.get_xlim()[1] > places[1]
+
+
 def test_figures_of_batches_are_refused(windows):
     for draw in (rsv.offset_figure, lambda w: rsv.gain_figure(w, TIMING), lambda w: rsv.motion_figure(w.vibration)):
         with pytest.raises(ValueError, match=r"a batch of shape \(3,\) cannot be drawn: select one, result\[0\]"):
