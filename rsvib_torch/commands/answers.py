@@ -54,11 +54,11 @@ def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
         lines.append("cannot determine whether restoration helps: no two frames show the same scene")
     elif not result.moves:
         lines.append("there is no vibration to remove")
-    for note in result.left_alone:
-        refused = (
-            "its vibration is not reliable" in note
-        )  # the reasons are those of the verdict, which is printed before
-        lines.append(f"{note[0]} unchanged: its vibration is not reliable, see the reasons above" if refused else note)
+    refused = "its vibration is not reliable"  # for the reasons of the detection, which are printed before
+    lines += [
+        f"{note[0]} unchanged: {refused}, see the reasons above" if refused in note else note
+        for note in result.left_alone
+    ]
     return [wrapped(line) for line in lines]
 
 

@@ -25,7 +25,7 @@ import rsvib_torch as rsv
 from rsvib_torch.commands import main
 from rsvib_torch.commands.main import run_command
 from rsvib_torch.commands.terminal import working
-from rsvib_torch.core.progress import steps
+from rsvib_torch.core.progress import listening, steps
 
 PROGRAM = Path(sys.executable).with_name("rsvib")
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=200)
@@ -350,7 +350,7 @@ def in_terminal(arguments, columns):
 LOOPS = """
 import time
 from rsvib_torch.commands.terminal import counting, output_of, working
-from rsvib_torch.core.progress import steps
+from rsvib_torch.core.progress import listening, steps
 
 with working("restoring"):
     advance = steps(4, "frames")
@@ -375,6 +375,33 @@ def test_progress_has_rate_and_remaining_time():
     assert re.search(r"restoring \S* 3 of 4 frames  \d[\d.]*/s  0:00:00 left", shown)
     assert re.search(r"restoring frames.tif \S* 20 of 100 frames  \d[\d.]*/s  0:00:0\d left", shown)
     assert "quietly" not in shown
+
+
+def test_long_operations_report_their_progress(place, tmp_path):
+    """Each loop begins at 0 and ends at its number of steps."""
+    reported = []
+
+    def units(work):
+        reported.clear()
+        with listening(lambda *state: reported.append(state)):
+            result = work()
+        begun = [unit for done, _, unit in reported if done == 0]
+        assert begun == [unit for done, total, unit in reported if done == total]
+        return result, set(begun)
+
+    frames, found = units(lambda: rsv.read_stack(place / "long.tif"))
+    assert found == {"frames"}
+    detection, found = units(lambda: rsv.detect_vibration(frames, TIMING))
+    assert found == {"pairs", "groups"}
+    for method, unit in (("exact", "frames"), ("banded", "chunks"), ("richardson-lucy", "iterations")):
+        restored, found = units(
+            lambda method=method: rsv.restore(frames, TIMING, detection, method=method, check=False)
+        )
+        assert unit in found
+    _, found = units(lambda: rsv.judge_restoration(frames, restored, TIMING, detection))
+    assert found == {"pairs"}
+    _, found = units(lambda: rsv.write_stack(tmp_path / "r.npy", restored))
+    assert found == {"frames"}
 
 
 def test_no_progress_without_a_terminal(capsys):
