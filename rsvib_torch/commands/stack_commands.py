@@ -500,7 +500,8 @@ def run(
             names += [*_write_detection(folder, first.detection, timing), "restoration.json"]
         else:
             names += _write_windows(folder, out / "manifest.json")
-    _remove_old(out, results, names)
+    if overwrite:
+        _remove_old(out, results, names)
     if result.bad_frames:
         error_line(f"{result.bad_frames} frames could not be used: see manifest.json", "warning")
     page = command_text("report", frames, out / "report", "--config", config)
