@@ -83,8 +83,11 @@ class DetectionResult(
 
     def to_dict(self) -> dict[str, Any]:
         """All values as nested lists, numbers and texts, as in a ``vibration.json``; None for unknown numbers."""
-        timing = None if self.timing is None else TimingRecord.from_timing(self.timing).model_dump()
-        return {**super().to_dict(), "timing": timing, "period": plain_values(self.vibration.period)}
+        values = super().to_dict()
+        values["timing"] = None if self.timing is None else TimingRecord.from_timing(self.timing).model_dump()
+        values["period"] = plain_values(self.vibration.period)
+        curve = {name: values.pop(name) for name in ("offsets", "fitted")}  # long, therefore last
+        return values | curve
 
     def __getitem__(self, index: int) -> "DetectionResult":
         """The result of one stack out of a batch."""
