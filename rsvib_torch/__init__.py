@@ -40,6 +40,18 @@ from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve, register_bands
+from rsvib_torch.report.plots import (
+    comparison_figure,
+    gain_figure,
+    motion_figure,
+    mtf_figure,
+    offset_figure,
+    psf_figure,
+    rows_figure,
+    save_figure,
+    windows_figure,
+)
+from rsvib_torch.report.results import read_vibration, write_offsets, write_vibration, write_windows
 from rsvib_torch.restoration import (
     RestorationVerdict,
     RestorationWarning,
@@ -50,7 +62,7 @@ from rsvib_torch.restoration import (
     trusted_vibration,
     visible_pixels,
 )
-from rsvib_torch.stacks import StackReport, iterate_stack, process_stack, restore_block
+from rsvib_torch.stacks import StackReport, iterate_stack, process_stack, read_manifest, restore_block
 
 __all__ = [
     "ClockAlignment",
@@ -82,30 +94,44 @@ __all__ = [
     "calibrate_row_time",
     "calibrate_row_time_by_exposure",
     "check_motion",
+    "comparison_figure",
     "detect_motion",
     "detect_swept_tone",
     "detect_vibration",
     "find_slanted_edges",
+    "gain_figure",
     "iterate_stack",
     "judge_restoration",
+    "motion_figure",
+    "mtf_figure",
     "offset_endpoint_error",
+    "offset_figure",
     "open_stack",
     "predict_noise_gain",
     "process_stack",
+    "psf_figure",
     "psnr",
+    "read_manifest",
     "read_motion",
     "read_stack",
     "read_stack_info",
+    "read_vibration",
     "register_bands",
     "restore",
     "restore_block",
     "row_psf",
+    "rows_figure",
+    "save_figure",
     "simulate_frames",
     "slanted_edge_mtf",
     "ssim",
     "timing_from_first_frame",
     "trusted_vibration",
     "visible_pixels",
+    "windows_figure",
+    "write_offsets",
     "write_stack",
+    "write_vibration",
+    "write_windows",
 ]
 __version__ = "0.1.0"

@@ -178,7 +178,7 @@ def run(trial: Trial, size: tuple[int, int], out: Path, console: Console) -> Non
             "noise_of_full_scale": NOISE,
             "vibration": lines,
             "reliable": detection.reliable.tolist(),
-            "failed_bands": round(1.0 - detection.offsets.good.double().mean().item(), 4),
+            "rows_not_measured": round(1.0 - detection.offsets.good.double().mean().item(), 4),
             "residual_px": [round(value, 4) for value in detection.residual.tolist()],
             **quality,
             "rim": RIM,

@@ -43,7 +43,7 @@ def taken(scene: Tensor, timing: rsv.SensorTiming, noise: float) -> Tensor:
 
 
 def offsets() -> Figure:
-    """Measured offsets of bands of rows between two frames, and the vibration fitted to them."""
+    """Measured offsets of rows between two frames, and the vibration fitted to them."""
     timing = camera(20)
     frames = taken(city_and_fields(FRAME_ROWS + 2 * MARGIN, 512 + 2 * MARGIN, SEED), timing, 0.005)
     return offset_figure(rsv.detect_vibration(frames, timing))

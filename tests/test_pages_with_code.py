@@ -60,7 +60,7 @@ def test_quick_start_page(tmp_path, monkeypatch, capsys):
     (tmp_path / "out" / "demo" / "chart").mkdir(parents=True)
     rsv.write_stack("out/demo/chart/frames.tif", frames, full_scale=4095, dtype="uint16")
     names = run_page("quickstart.md", 3)
-    assert re.search(r"^x: 3\.1.* px at (49\.99|50\.00)", capsys.readouterr().out, flags=re.MULTILINE)
+    assert re.search(r"^x     3\.1.* (49\.99|50\.00)", capsys.readouterr().out, flags=re.MULTILINE)
     assert rsv.read_stack("out/restored.tif").shape == frames.shape
     assert names["measured"].reliable.all()
     torch.testing.assert_close(names["measured"].vibration.amplitude, names["vibration"].amplitude, rtol=0, atol=0.02)

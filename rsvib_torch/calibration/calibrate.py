@@ -11,6 +11,7 @@ from torch import Tensor
 from rsvib_torch.calibration.flicker import BandFit, Profiles, find_bands, row_profiles
 from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
 from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.presentation import Result, measured_text, wrapped
 from rsvib_torch.frames.arrays import Channels, FramesLike
 
 __all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_exposure"]
@@ -18,8 +19,19 @@ __all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_ex
 ScanAxis = Literal[-2, -1, "y", "x"]
 
 
-@dataclass(frozen=True)
-class RowTimeCalibration:
+@dataclass(frozen=True, repr=False)
+class RowTimeCalibration(
+    Result,
+    units={
+        "row_time": "s",
+        "row_time_std": "s",
+        "period_rows": "rows",
+        "flicker_frequency": "Hz",
+        "frame_rows": "row times",
+        "exposure_time": "s",
+        "exposure_time_std": "s",
+    },
+):
     """Result of a calibration with flickering light; undetermined values are None, with the reason in ``notes``.
 
     Attributes:
@@ -45,6 +57,23 @@ class RowTimeCalibration:
     exposure_time: float | None
     exposure_time_std: float | None
     notes: tuple[str, ...]
+
+    def summary(self) -> str:
+        """The measured values of the sensor, and what is not determined."""
+        lines = [
+            f"row time {measured_text(1e6 * self.row_time, 1e6 * self.row_time_std)} us",
+            f"flicker {self.flicker_frequency:.6g} Hz",
+            f"bands of {self.period_rows:.3f} rows, contrast {self.contrast:.3g}",
+        ]
+        if self.exposure_time is not None:
+            std = None if self.exposure_time_std is None else 1e6 * self.exposure_time_std
+            rows = self.exposure_time / self.row_time
+            lines.append(f"exposure {measured_text(1e6 * self.exposure_time, std)} us, {rows:.2f} row times")
+        if self.frame_rows is not None:
+            lines.append(f"frame period {self.frame_rows:.2f} row times")
+        if self.readout_direction is not None:
+            lines.append(f"readout direction {self.readout_direction}")
+        return "\n".join([*lines, *map(wrapped, self.notes)])
 
 
 def calibrate_row_time(

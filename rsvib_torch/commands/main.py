@@ -1,27 +1,135 @@
 """The ``rsvib`` program: its commands, and one line for every error."""
 
+import inspect
 import logging
 import sys
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
 import rsvib_torch
 from rsvib_torch.commands import motion_commands, stack_commands
-from rsvib_torch.commands.terminal import error_line, print_line, warnings_in_one_line
+from rsvib_torch.commands.options import JsonOption, QuietOption
+from rsvib_torch.commands.terminal import (
+    Answer,
+    error_line,
+    output_of,
+    print_line,
+    show_answer,
+    warnings_in_one_line,
+)
 
 __all__ = ["main", "run_command"]
 
-app = typer.Typer(name="rsvib", add_completion=False, pretty_exceptions_enable=False)
-app.command()(stack_commands.run)
-app.command()(stack_commands.detect)
-app.command("restore")(stack_commands.restore_frames)
-app.command()(stack_commands.report)
-app.command()(motion_commands.motion)
-app.command()(motion_commands.known)
-app.command()(motion_commands.calibrate)
-app.command()(stack_commands.simulate)
+# Commands in the order of the help: name, function, line in the list of commands, and two examples.
+_COMMANDS: tuple[tuple[str, Callable[..., Answer], str, str], ...] = (
+    (
+        "run",
+        stack_commands.run,
+        "Detect the vibration, restore the frames, judge the result.",
+        """
+        rsvib run frames.tif results --config camera.toml
+        rsvib run long.tif results --config camera.toml --memory 2GB --resume
+        """,
+    ),
+    (
+        "detect",
+        stack_commands.detect,
+        "Detect the vibration in a stack of frames.",
+        """
+        rsvib detect frames.tif --config camera.toml --out found
+        rsvib detect frames.tif --config camera.toml --out found --overwrite --json
+        """,
+    ),
+    (
+        "restore",
+        stack_commands.restore_frames,
+        "Restore a stack of frames with a detected vibration.",
+        """
+        rsvib restore frames.tif restored.tif --config camera.toml \\
+              --vibration found/vibration.json
+        rsvib restore frames.tif still.tif --config camera.toml \\
+              --vibration found/vibration.json --joint all
+        """,
+    ),
+    (
+        "report",
+        stack_commands.report,
+        "Detect, restore, and write an HTML page with all figures.",
+        """
+        rsvib report frames.tif report --config camera.toml
+        rsvib report chart.tif report --config camera.toml --edge 200,340,60,40
+        """,
+    ),
+    (
+        "motion",
+        motion_commands.motion,
+        "Detect motion that is not a steady vibration.",
+        """
+        rsvib motion frames.tif --config camera.toml --out motion.csv
+        rsvib motion frames.tif --config camera.toml --out swept.csv --model swept
+        """,
+    ),
+    (
+        "known",
+        motion_commands.known,
+        "Restore frames with the recording of a gyroscope.",
+        """
+        rsvib known frames.tif restored.tif --config camera.toml \\
+              --motion gyroscope.csv --unit rad/s --focal-length 1800
+        rsvib known frames.tif restored.tif --config camera.toml \\
+              --motion motion.csv --unit px --offset 0
+        """,
+    ),
+    (
+        "calibrate",
+        motion_commands.calibrate,
+        "Measure row time and exposure with a flickering light.",
+        """
+        rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 --out camera.toml
+        rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025
+        """,
+    ),
+    (
+        "simulate",
+        stack_commands.simulate,
+        "Simulate frames of a vibrating camera.",
+        """
+        rsvib simulate scene.png frames.tif --config camera.toml
+        rsvib simulate scene.png frames.npy --config camera.toml --seed 2
+        """,
+    ),
+)
+_SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 120}  # characters
+
+
+def _with_output(name: str, function: Callable[..., Answer]) -> Callable[..., None]:
+    """A command that prints its answer, with the options ``--json`` and ``--quiet``."""
+
+    def command(*, as_json: bool = False, quiet: bool = False, **arguments: Any) -> None:
+        with output_of(as_json=as_json, quiet=quiet):
+            show_answer(name, function(**arguments))
+
+    parameters, hints = inspect.signature(function).parameters.values(), get_type_hints(function, include_extras=True)
+    own = inspect.signature(command).parameters
+    options = {"as_json": JsonOption, "quiet": QuietOption}
+    added = [own[option].replace(annotation=kind) for option, kind in options.items()]
+    command.__signature__ = inspect.Signature([*parameters, *added])  # type: ignore[attr-defined]
+    command.__annotations__ = hints | options
+    command.__doc__ = function.__doc__
+    return command
+
+
+# plain help texts: rich would read [sensor] as markup and join the lines of the examples
+app = typer.Typer(name="rsvib", rich_markup_mode=None, context_settings=_SETTINGS, pretty_exceptions_enable=False)
+for _name, _function, _help, _examples in _COMMANDS:
+    app.command(
+        _name,
+        short_help=_help,
+        epilog="\b\nExamples:" + _examples.replace("\n        ", "\n  ").rstrip(),  # \b keeps the lines
+        context_settings=_SETTINGS,
+    )(_with_output(_name, _function))
 
 _INTERRUPTED = 130  # exit code of typer after Ctrl-C; older versions raise Abort
 

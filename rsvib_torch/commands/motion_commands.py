@@ -3,7 +3,7 @@
 import csv
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -12,19 +12,31 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
+from rsvib_torch.commands.answers import command_text, restoration_data, restoration_lines
 from rsvib_torch.commands.options import (
     ConfigOption,
     DeviceOption,
     FramesArgument,
+    OverwriteOption,
     RestoredArgument,
     ScaleOption,
+    check_new,
     full_scale_of,
     restoration_options,
 )
 from rsvib_torch.commands.stack_commands import load, restore_and_save
-from rsvib_torch.commands.terminal import error_line, print_line, working
+from rsvib_torch.commands.terminal import Answer, error_line, note, working
 from rsvib_torch.config import read_config
-from rsvib_torch.detection import align_motion, check_motion, detect_motion, detect_swept_tone
+from rsvib_torch.core.presentation import measured_text
+from rsvib_torch.detection import (
+    MotionCheck,
+    MotionDetection,
+    SweptTone,
+    align_motion,
+    check_motion,
+    detect_motion,
+    detect_swept_tone,
+)
 from rsvib_torch.io import (
     check_stack_target,
     check_writable,
@@ -36,12 +48,10 @@ from rsvib_torch.io import (
 from rsvib_torch.motion.recorded import MotionUnit, TimeUnit, read_motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.report.plots import measured_text
 
 __all__ = ["calibrate", "known", "motion"]
 
 Array = NDArray[np.float64]
-MotionTable = tuple[tuple[str, ...], Array]  # names of the columns, and their values (N, columns); s and px
 
 
 def motion(
@@ -65,58 +75,58 @@ def motion(
     ] = 16,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
-) -> None:
+    overwrite: OverwriteOption = False,
+) -> Answer:
     """Detect motion that is not a steady vibration.
 
     To restore frames with the CSV file: rsvib known --motion FILE --unit px --offset 0.
     """
     settings = read_config(config)
     check_writable(out)
+    check_new([out], overwrite)
     stack = load(frames, settings, full_scale, device)
+    result: MotionDetection | SweptTone
     with working("detecting the motion"):
         if model == "free":
-            names, table = _detect_free_motion(stack.frames, stack.timing, knot_rows, search)
+            result, names, table = _detect_free_motion(stack.frames, stack.timing, knot_rows, search)
         else:
-            names, table = _detect_swept_tone(stack.frames, stack.timing, search)
+            result, names, table = _detect_swept_tone(stack.frames, stack.timing, search)
     with whole_file(out) as file, file.open("w", newline="", encoding="utf-8") as text:
         writer = csv.writer(text)
         writer.writerow(names)
         writer.writerows([f"{time:.9f}", *(f"{value:.5f}" for value in row)] for time, *row in table)
-    print_line(f"{out}: {', '.join(names)}")
+    target = frames.with_name("restored.tif")
+    restore_it = ("known", frames, target, "--config", config, "--motion", out, "--unit", "px", "--offset", "0")
+    return Answer(
+        {f"Motion in {frames.name}": [result.summary()]},
+        {"motion": _without_curve(result), "columns": list(names)},
+        [out],
+        [f"restore the frames:\n  {command_text(*restore_it)}"] * bool(result.reliable.any()),
+    )
 
 
-def _detect_free_motion(frames: Tensor, timing: SensorTiming, knot_rows: int, search: int) -> MotionTable:
-    """Detect a free motion, print its accuracy, and sample it twice per knot."""
+def _detect_free_motion(
+    frames: Tensor, timing: SensorTiming, knot_rows: int, search: int
+) -> tuple[MotionDetection, tuple[str, ...], Array]:
+    """Detect a free motion, and sample it twice per knot."""
     result = detect_motion(frames, timing, knot_rows=knot_rows, search=search)
-    for axis, name in enumerate("xy"):
-        size = float(result.displacement[..., axis].square().mean().sqrt())
-        print_line(
-            f"{name}: displacement {size:.3f} px rms; standard deviation {float(result.std_seen[axis]):.3f} px of the "
-            f"part that differs between frames, {float(result.unseen[axis]):.3f} px of the part common to all frames; "
-            + _verdict(result.reasons[axis])
-        )
     times, values = _sampled(result.motion, float(result.times.max()) + timing.exposure_time, 0.5)
     measured, stds = result.times.flatten().cpu().numpy(), result.std.flatten(0, 1).cpu().numpy()
     interpolated = [np.interp(times, measured, stds[:, axis]) for axis in range(2)]
-    return ("time", "x", "y", "std_x", "std_y"), np.column_stack([times, values, *interpolated])
+    return result, ("time", "x", "y", "std_x", "std_y"), np.column_stack([times, values, *interpolated])
 
 
-def _detect_swept_tone(frames: Tensor, timing: SensorTiming, search: int) -> MotionTable:
-    """Detect a swept tone per axis, print its parameters, and sample its motion once per knot."""
+def _detect_swept_tone(frames: Tensor, timing: SensorTiming, search: int) -> tuple[SweptTone, tuple[str, ...], Array]:
+    """Detect a swept tone per axis, and sample its motion once per knot."""
     result = detect_swept_tone(frames, timing, search=search)
-    units = {"amplitude": "px", "frequency": "Hz", "decay": "/s", "chirp": "Hz/s", "phase": "rad"}
-    for axis, name in enumerate("xy"):
-        values = [
-            f"{quantity} {float(getattr(result, quantity)[axis]):.4g} ± {float(result.std[quantity][axis]):.2g} {unit}"
-            for quantity, unit in units.items()
-        ]
-        print_line(f"{name}: {', '.join(values)}; {_verdict(result.reasons[axis])}")
     times, samples = _sampled(result.motion, result.motion.end, 1.0)
-    return ("time", "x", "y"), np.column_stack([times, samples])
+    return result, ("time", "x", "y"), np.column_stack([times, samples])
 
 
-def _verdict(reasons: tuple[str, ...]) -> str:
-    return f"not reliable: {'; '.join(reasons)}" if reasons else "reliable"
+def _without_curve(result: MotionDetection | SweptTone) -> dict[str, Any]:
+    """A detection without its displacements, which are in the CSV file."""
+    curve = ("motion", "times", "displacement") + ("std",) * isinstance(result, MotionDetection)
+    return {name: value for name, value in result.to_dict().items() if name not in curve}
 
 
 def _sampled(motion: FreeMotion, last: float, knots: float) -> tuple[Array, Array]:
@@ -159,7 +169,8 @@ def known(
     ] = False,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
-) -> None:
+    overwrite: OverwriteOption = False,
+) -> Answer:
     """Restore frames with a motion that was recorded by a gyroscope or attitude sensor.
 
     The recording is compared with the offsets of rows between the frames, and refused if it does not explain them. If
@@ -178,15 +189,15 @@ def known(
     options = restoration_options(info, scale, settings)
     shape = (1, *info.shape[1:]) if options.get("joint") is True else info.shape
     check_stack_target(restored, shape, dtype=info.dtype, full_scale=scale, like=info)
+    check_new([restored], overwrite)
+    results: dict[str, list[str]] = {}
+    data: dict[str, Any] = {"alignment": None, "check": None}
     stack = load(frames, settings, full_scale, device)
     if offset is None:
-        with working("aligning the recording with the frames"):
+        with working("aligning the recording"):
             found = align_motion(stack.frames, stack.timing, recorded, fit_gain=fit_gain)
-        print_line(
-            f"clock {found.offset:.6f} ± {found.offset_std:.6f} s at the first row of frame 0, rate {found.scale:.7f}; "
-            f"gain {found.gain[0]:.4f} and {found.gain[1]:.4f}, drift {found.drift[0]:.4g} and {found.drift[1]:.4g} "
-            "px/s along x and y"
-        )
+        results["Recording on the clock of the frames"] = [found.summary()]
+        data["alignment"] = found.to_dict()
         _refuse(motion, found.reasons, force)
         placed = found.motion
     else:
@@ -198,8 +209,14 @@ def known(
                 f"{motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, the frames need "
                 f"{offset + first:.6g} to {offset + last:.6g} s"
             )
-    _check_motion(motion, stack.frames, stack.timing, placed, force, required=offset is None)
-    restore_and_save(restored, stack, placed, options, force)
+    check = _check_motion(motion, stack.frames, stack.timing, placed, force, required=offset is None)
+    if check is not None:
+        results["Motion of the frames"] = [check.summary()]
+        data["check"] = check.to_dict()
+    result = restore_and_save(restored, stack, placed, options, force)
+    results["Restoration"] = restoration_lines(result, len(stack.frames))
+    data["restoration"] = restoration_data(result)
+    return Answer(results, data, [restored])
 
 
 def _refuse(path: Path, reasons: tuple[str, ...], force: bool) -> None:
@@ -212,29 +229,28 @@ def _refuse(path: Path, reasons: tuple[str, ...], force: bool) -> None:
 
 def _check_motion(
     path: Path, frames: Tensor, timing: SensorTiming, motion: FreeMotion, force: bool, *, required: bool
-) -> None:
-    """Print the offsets of rows before and after correction with a motion, and refuse a motion that enlarges them.
+) -> MotionCheck | None:
+    """Compare the offsets of rows before and after correction with a motion, and refuse a motion that enlarges them.
 
     With ``required``, an error of the comparison is an error of the command, otherwise a warning.
     """
     if len(frames) < 2:
         error_line("cannot determine whether the motion fits: the comparison needs two frames", "warning")
-        return
+        return None
     try:
-        with working("comparing the motion with the frames"):
+        with working("comparing the motion"):
             check = check_motion(frames, timing, motion)
     except ValueError as error:
         if required:
             raise
         error_line(f"cannot determine whether the motion fits: {error}", "warning")
-        return
-    before, after = (" and ".join(f"{value:.3f}" for value in sizes) for sizes in (check.before, check.after))
-    print_line(f"offset of rows between frames: {before} px rms along x and y, {after} px rms without the motion")
+        return None
     if check.helps:
         for reason in check.reasons:
             error_line(reason, "warning")
     else:
         _refuse(path, check.reasons or ("the motion does not reduce the offsets of rows between frames",), force)
+    return check
 
 
 def calibrate(
@@ -262,8 +278,9 @@ def calibrate(
     ] = "y",
     gamma: Annotated[float, typer.Option(help="Exponent that makes pixel values proportional to light.")] = 1.0,
     full_scale: Annotated[float | None, typer.Option(help="Count that corresponds to full scale.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Configuration file to write, with the table sensor.")] = None,
-) -> None:
+    out: Annotated[Path | None, typer.Option(help="Configuration file to write, with the table [sensor].")] = None,
+    overwrite: OverwriteOption = False,
+) -> Answer:
     """Measure row time, readout direction and exposure of a camera from frames of a flickering light."""
     if (frequency is None) == (not exposure):
         raise ValueError(
@@ -271,11 +288,12 @@ def calibrate(
         )
     if out is not None:
         check_writable(out)
+        check_new([out], overwrite)
     with working("reading the frames"):
         stacks = [read_stack(path, full_scale=full_scale) for path in frames]
     for path, stack in zip(frames, stacks, strict=True):
-        for note in describe_stack(read_stack_info(path), None):
-            print_line(note)
+        for sentence in describe_stack(read_stack_info(path), None):
+            note(sentence)
         if stack.shape[1:] != stacks[0].shape[1:]:
             raise ValueError(
                 f"{path}: frames of shape {tuple(stack.shape[1:])}, expected {tuple(stacks[0].shape[1:])} as in "
@@ -296,28 +314,22 @@ def calibrate(
                 scan_axis=axis,
                 gamma=gamma,
             )
-    _print_calibration(result, stack.shape[axis])
-    if out is not None:
+    table = _sensor_toml(result, scan_axis)
+    rows = stack.shape[axis]
+    readout = measured_text(1e3 * result.row_time * rows, 1e3 * result.row_time_std * rows)
+    steps = ["enter the values that are marked as unknown"] * (table.count("?") > 0)
+    if out is None:
+        steps = ["write these values into a configuration file with --out, or copy them", *steps]
+    else:
         with whole_file(out) as file:
-            file.write_text(_sensor_toml(result, scan_axis), encoding="utf-8")
-        print_line(f"{out}: [sensor]")
-
-
-def _print_calibration(result: RowTimeCalibration, num_rows: int) -> None:
-    row_time, std = result.row_time, result.row_time_std
-    readout = measured_text(1e3 * row_time * num_rows, 1e3 * std * num_rows)
-    print_line(f"row time {measured_text(1e6 * row_time, 1e6 * std)} us ({num_rows} rows in {readout} ms)")
-    print_line(f"flicker {result.flicker_frequency:.6g} Hz")
-    print_line(f"bands of {result.period_rows:.3f} rows, contrast {result.contrast:.3g}")
-    if result.frame_rows is not None:
-        print_line(f"frame rows {result.frame_rows:.2f}")
-    if result.readout_direction is not None:
-        print_line(f"readout direction {result.readout_direction}")
-    if result.exposure_time is not None and result.exposure_time_std:
-        exposure = measured_text(1e6 * result.exposure_time, 1e6 * result.exposure_time_std)
-        print_line(f"exposure {exposure} us, {result.exposure_time / row_time:.2f} rows")
-    for note in result.notes:
-        print_line(note)
+            file.write_text(table, encoding="utf-8")
+        steps.append(f"detect a vibration:\n  {command_text('detect', 'FRAMES', '--config', out, '--out', 'FOLDER')}")
+    return Answer(
+        {"Camera": [result.summary(), f"{rows} rows are read in {readout} ms"], "Configuration": [table]},
+        {"calibration": result.to_dict()},
+        [] if out is None else [out],
+        steps,
+    )
 
 
 def _sensor_toml(result: RowTimeCalibration, scan_axis: str) -> str:

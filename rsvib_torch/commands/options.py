@@ -1,5 +1,6 @@
 """Arguments and options that several commands share, and their combination with the configuration file."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,14 +21,18 @@ __all__ = [
     "ForceOption",
     "FramesArgument",
     "JointOption",
+    "JsonOption",
     "MemoryOption",
     "MethodOption",
     "Overrides",
+    "OverwriteOption",
     "PriorOption",
+    "QuietOption",
     "RestoredArgument",
     "SaturationOption",
     "ScaleOption",
     "WorkersOption",
+    "check_new",
     "full_scale_of",
     "restoration_options",
     "torch_device",
@@ -77,6 +82,13 @@ SaturationOption = Annotated[
 ForceOption = Annotated[
     bool, typer.Option("--force", help="Write the restored frames even if they are judged no better than the input.")
 ]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace results that exist already.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print the answer as JSON on standard output, and nothing else there.")
+]
+QuietOption = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors, and no progress.")
+]
 MemoryOption = Annotated[
     str | None,
     typer.Option(help="Memory limit of the process, e.g. 2GB.", show_default="four fifths of the free memory"),
@@ -108,6 +120,17 @@ class Overrides:
 
 
 NO_OVERRIDES = Overrides(None, None, None, None)
+
+
+def check_new(paths: Iterable[Path], overwrite: bool) -> None:
+    """Raise a ``FileExistsError`` if results exist and must not be replaced; an empty folder does not count."""
+    existing = [path for path in paths if path.exists() and not (path.is_dir() and not any(path.iterdir()))]
+    if existing and not overwrite:
+        names = ", ".join(path.name for path in existing)
+        raise FileExistsError(
+            f"results exist already in {existing[0].parent}: {names}; choose another name, or replace them with "
+            "--overwrite"
+        )
 
 
 def torch_device(name: DeviceName) -> torch.device:

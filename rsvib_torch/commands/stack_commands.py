@@ -1,5 +1,6 @@
 """Commands that detect and remove vibration: ``simulate``, ``detect``, ``restore``, ``run`` and ``report``."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,6 +10,13 @@ import typer
 from torch import Tensor
 
 import rsvib_torch
+from rsvib_torch.commands.answers import (
+    command_text,
+    detection_data,
+    restoration_data,
+    restoration_lines,
+    steps_after_detection,
+)
 from rsvib_torch.commands.options import (
     ConfigOption,
     DeviceName,
@@ -19,25 +27,20 @@ from rsvib_torch.commands.options import (
     MemoryOption,
     MethodOption,
     Overrides,
+    OverwriteOption,
     PriorOption,
     RestoredArgument,
     SaturationOption,
     ScaleOption,
     WorkersOption,
+    check_new,
     full_scale_of,
     restoration_options,
     torch_device,
 )
-from rsvib_torch.commands.terminal import (
-    counting,
-    error_line,
-    print_detection,
-    print_line,
-    print_not_kept,
-    print_restoration,
-    working,
-)
+from rsvib_torch.commands.terminal import Answer, counting, error_line, note, working
 from rsvib_torch.config import Config, read_config
+from rsvib_torch.core.presentation import write_json
 from rsvib_torch.core.validation import validate
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.imaging import simulate_frames
@@ -60,7 +63,7 @@ from rsvib_torch.io.schema import TimingRecord, check_same_timing
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.report.html import Box, Report, write_report_page
-from rsvib_torch.report.plots import comparison_figure, offset_figure, save_figure
+from rsvib_torch.report.plots import comparison_figure, offset_figure, save_figure, windows_figure
 from rsvib_torch.report.results import (
     read_vibration,
     write_offsets,
@@ -118,8 +121,14 @@ def load(path: Path, config: Config, full_scale: float | None, device: DeviceNam
 
 def print_notes(info: StackInfo, config: Config) -> None:
     """Print what the file states about orientation, dropped frames and unequal intervals."""
-    for note in describe_stack(info, config.timing):
-        print_line(note)
+    for sentence in describe_stack(info, config.timing):
+        note(sentence)
+
+
+def _note_lost(path: Path, names: Sequence[str]) -> None:
+    """Print which metadata of the input a file does not contain."""
+    if names:
+        note(f"{path}: not kept from the input: {', '.join(names)}")
 
 
 def _save(path: Path, frames: Tensor, stack: Stack) -> tuple[str, ...]:
@@ -127,7 +136,7 @@ def _save(path: Path, frames: Tensor, stack: Stack) -> tuple[str, ...]:
     with working(f"writing {path.name}"):
         write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
     names = metadata_not_kept(stack.info, path, tuple(frames.shape))
-    print_not_kept(path, names)
+    _note_lost(path, names)
     return names
 
 
@@ -138,10 +147,10 @@ def _detect(stack: Stack, config: Config) -> DetectionResult:
 
 
 def _restore(stack: Stack, motion: Motion | Detected, options: dict[str, Any], force: bool) -> RestoredFrames:
-    """Restore frames, judge the result on eight pairs of frames, and print the verdict."""
-    with working("restoring the frames and judging the result"):
+    """Restore frames, and judge the result on eight pairs of frames."""
+    with working("restoring and judging"):
         result = restore_trusted(stack.frames, stack.timing, motion, options, force=force, most_pairs=8)
-    print_restoration(result)
+    _warn_of_restoration(result)
     return result
 
 
@@ -152,14 +161,22 @@ def restore_and_save(
     options: dict[str, Any],
     force: bool,
     report: Path | None = None,
-) -> None:
-    """Restore frames, print the verdict, and write them; the input unchanged if it is no worse, unless ``force``."""
+) -> RestoredFrames:
+    """Restore frames, and write them; the input unchanged if it is no worse, unless ``force``."""
     result = _restore(stack, motion, options, force)
     not_kept = _save(path, result.frames, stack)
     if report is not None:
         write_restoration(report, result, options, not_kept)
-    state = "restored" if result.restored else "unchanged"
-    print_line(f"{path}: {len(result.frames)} frames {state}, {stack.info.dtype}")
+    return result
+
+
+def _warn_of_restoration(result: RestoredFrames) -> None:
+    """Print a warning if there is nothing to restore, or if restoration does not help or helps in part only."""
+    if not result.moves:
+        error_line("no vibration to remove: the frames are written unchanged", "warning")
+    elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
+        unchanged = "" if result.restored else "; the frames are written unchanged, --force writes the restored ones"
+        error_line(result.verdict.sentence + unchanged, "warning")
 
 
 def _write_detection(folder: Path, result: DetectionResult, timing: SensorTiming) -> list[str]:
@@ -168,7 +185,34 @@ def _write_detection(folder: Path, result: DetectionResult, timing: SensorTiming
         write_vibration(folder / "vibration.json", result, timing)
         write_offsets(folder / "offsets.csv", result)
         save_figure(offset_figure(result), folder / "offsets.png")
-    return ["vibration.json", "offsets.csv", "offsets.png"]
+    return ["offsets.png", "vibration.json", "offsets.csv"]
+
+
+def _write_windows(folder: Path, path: Path) -> list[str]:
+    """Write summary, table and figure of the windows of a manifest, and return the names of the files."""
+    manifest = read_manifest(path)
+    with working("drawing the windows"):
+        write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **manifest.totals()})
+        write_windows(folder / "windows.csv", manifest)
+        starts = [record.start_time for record in manifest.windows]
+        save_figure(windows_figure(starts, manifest.detections()), folder / "windows.png")
+    return ["windows.png", "windows.json", "windows.csv"]
+
+
+def _check_folder(folder: Path, names: Iterable[str], overwrite: bool) -> None:
+    """Raise an ``OSError`` if results cannot be written into a folder, or exist there and must not be replaced."""
+    check_writable(folder, folder=True)
+    check_new([folder / name for name in names], overwrite)
+
+
+def _remove_old(folder: Path, results: Iterable[str], names: Iterable[str]) -> None:
+    """Remove results of an earlier run from a folder that this run did not replace."""
+    for name in set(results) - set(names):
+        (folder / name).unlink(missing_ok=True)
+
+
+_OF_DETECTION = ("vibration.json", "offsets.csv", "offsets.png")
+_OF_WINDOWS = ("manifest.json", "windows.json", "windows.csv", "windows.png")
 
 
 def simulate(
@@ -183,12 +227,14 @@ def simulate(
     seed: Annotated[
         int | None, typer.Option(help="Seed of the noise.", min=0, show_default="from the configuration")
     ] = None,
-) -> None:
+    overwrite: OverwriteOption = False,
+) -> Answer:
     """Simulate frames of a vibrating camera.
 
     The camera, its vibration and its noise are described in the configuration file.
     """
     settings = read_config(config)
+    check_new([frames], overwrite)
     if settings.simulation is None:
         raise ValueError(f"{config}: simulation: missing key; expected a table with vibration, num_frames, ...")
     simulation, target = settings.simulation, torch_device(device)
@@ -211,7 +257,14 @@ def simulate(
     with working(f"writing {frames}"):
         stated = StackInfo(tuple(simulated.shape), dtype, scale, frame_rate=settings.timing.frame_rate)
         write_stack(frames, simulated, dtype=dtype, full_scale=scale, like=stated)
-    print_line(f"{frames}: {len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}")
+    line = f"{len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}"
+    run_it = command_text("run", frames, frames.with_name("results"), "--config", config)
+    return Answer(
+        {"Simulated frames": [line, f"vibration:\n{simulation.vibration}"]},
+        {"shape": list(simulated.shape), "dtype": dtype, "vibration": simulation.vibration.to_dict()},
+        [frames],
+        [f"detect the vibration and restore the frames:\n  {run_it}"],
+    )
 
 
 def detect(
@@ -230,22 +283,27 @@ def detect(
     workers: WorkersOption = None,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
-) -> None:
+    overwrite: OverwriteOption = False,
+) -> Answer:
     """Detect the vibration in a stack of frames.
 
     The vibration is modelled as sinusoids of constant amplitude and frequency. For other motion see rsvib motion.
     """
     settings = read_config(config)
-    check_writable(out, folder=True)
+    _check_folder(out, (*_OF_DETECTION, *_OF_WINDOWS), overwrite)
     window = settings.stack.get("window") if window is None else window
     if window is None:
         stack = load(frames, settings, full_scale, device)
         result = _detect(stack, settings)
         with whole_folder(out) as folder:
             names = _write_detection(folder, result, stack.timing)
-        print_detection(result)
-        print_line(f"{out}: {', '.join(names)}")
-        return
+        _remove_old(out, _OF_WINDOWS, names)
+        return Answer(
+            {f"Vibration in {frames.name}": [result.summary()]},
+            {"detection": detection_data(result)},
+            [out / name for name in names],
+            steps_after_detection(result, frames, config, out / "vibration.json"),
+        )
     info = read_stack_info(frames)
     print_notes(info, settings)
     scale = full_scale_of(frames, info, settings, full_scale)
@@ -263,10 +321,16 @@ def detect(
                 device=str(torch_device(device)),
                 progress=progress,
             )
-        manifest = read_manifest(folder / "manifest.json")
-        write_windows(folder / "windows.csv", manifest)
+        names = [*_write_windows(folder, folder / "manifest.json"), "manifest.json"]
+    _remove_old(out, _OF_DETECTION, names)
+    manifest = read_manifest(out / "manifest.json")
     _warn_of_failures(sum(record.error is not None for record in manifest.windows))
-    print_line(f"{out}: manifest.json, windows.csv, {len(manifest.windows)} windows")
+    return Answer(
+        {f"Vibration in {len(manifest.windows)} windows of {frames.name}": manifest.lines()[0]},
+        {"windows": manifest.totals()},
+        [out / name for name in names],
+        steps_after_detection(None, frames, config, out / "manifest.json"),
+    )
 
 
 def _warn_of_failures(windows: int) -> None:
@@ -292,20 +356,22 @@ def restore_frames(
     ] = None,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
-) -> None:
+    overwrite: OverwriteOption = False,
+) -> Answer:
     """Restore a stack of frames with a detected vibration, and judge the result.
 
     If the restored frames are judged no better than the input, the input is written unchanged, unless --force is given.
     """
     settings = read_config(config)
     overrides = Overrides(method, joint, prior, saturation)
+    check_new([restored, *([] if report is None else [report])], overwrite)
     with vibration.open("rb") as file:
         is_manifest = b'"rsvib stack"' in file.read(200)  # bytes; the format is the first key of either file
     if is_manifest:
         if report is not None:
             raise ValueError("--report needs a vibration.json; the verdict on each window is in its manifest.json")
-        _restore_windows(frames, restored, settings, vibration, overrides, force, device, full_scale)
-        return
+        check_new([restored.with_name(f"{restored.name}.manifest.json")], overwrite)
+        return _restore_windows(frames, restored, settings, vibration, overrides, force, device, full_scale)
     detected = read_vibration(vibration, timing_from_first_frame(settings.timing, read_stack_info(frames)))
     stack = load(frames, settings, full_scale, device)
     options = restoration_options(stack.info, stack.full_scale, settings, overrides)
@@ -313,7 +379,18 @@ def restore_frames(
     check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
     if report is not None:
         check_writable(report)
-    restore_and_save(restored, stack, detected, options, force, report)
+    result = restore_and_save(restored, stack, detected, options, force, report)
+    return Answer(
+        {"Vibration": [detected.summary()], "Restoration": restoration_lines(result, len(stack.frames))},
+        {"detection": detected.to_dict(), "restoration": restoration_data(result)},
+        [restored, *([] if report is None else [report])],
+        _steps_after_restoration(result, frames, config),
+    )
+
+
+def _steps_after_restoration(result: RestoredFrames, frames: Path, config: Path) -> list[str]:
+    page = command_text("report", frames, frames.with_name("report"), "--config", config)
+    return [f"write a page with all figures and the sharpness before and after:\n  {page}"] if result.restored else []
 
 
 def _restore_windows(
@@ -325,7 +402,7 @@ def _restore_windows(
     force: bool,
     device: DeviceName,
     full_scale: float | None,
-) -> None:
+) -> Answer:
     """Restore a stack with the detections of its windows."""
     manifest = read_manifest(vibration)
     stored = validate(TimingRecord, manifest.settings.get("sensor", {}), f"{vibration}: settings.sensor")
@@ -352,8 +429,14 @@ def _restore_windows(
             device=str(torch_device(device)),
             progress=progress,
         )
-    print_not_kept(restored, result.not_kept)
-    print_line(f"{restored}: {result.frames} frames in {result.windows} windows, {result.restored} windows restored")
+    _note_lost(restored, result.not_kept)
+    manifest = read_manifest(result.manifest)
+    vibration_lines, lines = manifest.lines()
+    return Answer(
+        {"Vibration": vibration_lines, "Restoration": [result.summary(), *lines[1:]]},
+        {"windows": manifest.totals()},
+        [restored, result.manifest],
+    )
 
 
 def run(
@@ -400,7 +483,8 @@ def run(
     ] = None,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
-) -> None:
+    overwrite: OverwriteOption = False,
+) -> Answer:
     """Detect the vibration, restore the frames, judge the result and draw figures.
 
     Stacks of any length are processed in windows. If the restored frames are judged no better than the input, the
@@ -409,7 +493,8 @@ def run(
     settings = read_config(config)
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
-    check_writable(out, folder=True)
+    results = (*_OF_DETECTION, *_OF_WINDOWS, "restoration.json", "before_after.png")
+    _check_folder(out, (output, *results), overwrite or resume)
     info = read_stack_info(frames)
     print_notes(info, settings)
     scale = full_scale_of(frames, info, settings, full_scale)
@@ -424,7 +509,9 @@ def run(
         "workers": workers,
         "device": str(torch_device(device)),
     }
-    with counting(f"restoring {frames.name}") as progress:
+    one_window = info.shape[0] <= common["window"]
+    description = f"restoring {frames.name}"
+    with working(description) if one_window else counting(description) as progress:
         result = process_stack(
             frames,
             out / output,
@@ -440,36 +527,51 @@ def run(
     first = result.first
     if first is None:  # the run was complete before, or its first window was
         first = next(iter(iterate_stack(frames, settings.timing, **common)))
-    names = [output, "manifest.json"]
+    names = []
     with whole_folder(out) as folder:
+        if len(first.frames):
+            with working("drawing the frames"):
+                _draw_comparison(folder / "before_after.png", frames, scale, first)
+            names.append("before_after.png")
+        names += [output, "manifest.json"]
         if result.windows == 1:
             assert isinstance(first.detection, DetectionResult)
             assert first.restoration is not None
             write_restoration(folder / "restoration.json", first.restoration, options, result.not_kept)
             timing = timing_from_first_frame(settings.timing, info)
-            names += ["restoration.json", *_write_detection(folder, first.detection, timing)]
+            names += [*_write_detection(folder, first.detection, timing), "restoration.json"]
         else:
-            write_windows(folder / "windows.csv", read_manifest(out / "manifest.json"))
-            names.append("windows.csv")
-        if len(first.frames):
-            with working("drawing input and restored frame"):
-                _draw_comparison(folder / "before_after.png", frames, scale, first)
-            names.append("before_after.png")
-    if result.windows == 1:
-        if isinstance(first.detection, DetectionResult):
-            print_detection(first.detection)
-        if first.restoration is not None:
-            print_restoration(first.restoration)
-    else:
-        rate = f", {result.seconds / result.frames:.2f} s per frame" if result.frames and not result.resumed else ""
-        print_line(f"{result.frames} frames in {result.windows} windows, {result.restored} windows restored{rate}")
-        if result.resumed:
-            print_line(f"{result.resumed} windows were complete before this run")
-        _warn_of_failures(result.failed)
+            names += _write_windows(folder, out / "manifest.json")
+    if overwrite:
+        _remove_old(out, results, names)
     if result.bad_frames:
         error_line(f"{result.bad_frames} frames could not be used: see manifest.json", "warning")
-    print_not_kept(out / output, result.not_kept)
-    print_line(f"{out}: {', '.join(names)}")
+    _note_lost(out / output, result.not_kept)
+    page = command_text("report", frames, out / "report", "--config", config)
+    steps = [f"write a page with all figures and the sharpness before and after:\n  {page}"] if result.restored else []
+    files = [out / name for name in names]
+    if result.windows == 1:
+        assert isinstance(first.detection, DetectionResult)
+        assert first.restoration is not None
+        _warn_of_restoration(first.restoration)
+        return Answer(
+            {
+                f"Vibration in {frames.name}": [first.detection.summary()],
+                "Restoration": restoration_lines(first.restoration, info.shape[0]),
+            },
+            {"detection": detection_data(first.detection), "restoration": restoration_data(first.restoration)},
+            files,
+            steps + steps_after_detection(first.detection, frames, config),
+        )
+    stored = read_manifest(out / "manifest.json")
+    _warn_of_failures(result.failed)
+    vibration_lines, lines = stored.lines()
+    return Answer(
+        {f"Vibration in {frames.name}": vibration_lines, "Restoration": [result.summary(), *lines[1:]]},
+        {"windows": stored.totals()},
+        files,
+        steps,
+    )
 
 
 def _draw_comparison(path: Path, frames: Path, full_scale: float | None, first: WindowResult) -> None:
@@ -501,18 +603,18 @@ def report(
     force: ForceOption = False,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
-) -> None:
+    overwrite: OverwriteOption = False,
+) -> Answer:
     """Detect, restore and judge as rsvib run does, and write a report as an HTML page with figures.
 
     The page is one file that needs no network. The figures are also written as PNG files.
     """
     boxes = [_edge_box(text) for text in edge or []]
     settings = read_config(config)
-    check_writable(out, folder=True)
+    _check_folder(out, ["report.html"], overwrite)
     stack = load(frames, settings, full_scale, device)
     options = restoration_options(stack.info, stack.full_scale, settings, Overrides(method, joint, prior, saturation))
     detection = _detect(stack, settings)
-    print_detection(detection)
     result = _restore(stack, detection, options, force)
     content = Report(
         title=f"Vibration in {frames.name}",
@@ -529,7 +631,17 @@ def report(
     )
     with whole_folder(out) as folder, working("writing the page"):
         files = write_report_page(folder, content, boxes or None)
-    print_line(f"{out}: {', '.join(files)}")
+    run_it = command_text("run", frames, out, "--config", config)
+    return Answer(
+        {
+            f"Vibration in {frames.name}": [detection.summary()],
+            "Restoration": restoration_lines(result, len(stack.frames)),
+        },
+        {"detection": detection_data(detection), "restoration": restoration_data(result)},
+        [out / name for name in files],
+        [f"write the restored frames:\n  {run_it}"] * result.restored
+        + steps_after_detection(detection, frames, config),
+    )
 
 
 def _edge_box(text: str) -> Box:

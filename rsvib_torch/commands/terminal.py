@@ -1,57 +1,117 @@
-"""Terminal output: progress, results as tables, and warnings and errors in one line each."""
+"""Terminal output: progress, the answer of a command as text or JSON, and warnings and errors in one line each."""
 
-import math
+import textwrap
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from rich import box
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    SpinnerColumn,
-    Task,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-from rich.table import Table
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
 from rich.text import Text
 
-from rsvib_torch.detection import DetectionResult
-from rsvib_torch.report.plots import measured_text
-from rsvib_torch.stacks import RestoredFrames
+from rsvib_torch.core.presentation import json_text, wrapped
+from rsvib_torch.core.progress import listening
 
 __all__ = [
+    "Answer",
     "counting",
     "error_line",
-    "print_detection",
+    "note",
+    "output_of",
     "print_line",
-    "print_not_kept",
-    "print_restoration",
+    "show_answer",
     "warnings_in_one_line",
     "working",
 ]
 
 
+@dataclass
+class Answer:
+    """What a command found and did: the last thing that it prints.
+
+    Attributes:
+        results: Titles of the results, and their lines.
+        data: The same for ``--json``, values that JSON can store.
+        files: Files that were written, the one to open first in front.
+        next_steps: What to do next: sentences and commands.
+    """
+
+    results: dict[str, list[str]]
+    data: dict[str, Any]
+    files: list[Path] = field(default_factory=list)
+    next_steps: list[str] = field(default_factory=list)
+
+
+@dataclass
+class _Output:
+    """Form of the output of a command, and its notes and warnings so far."""
+
+    as_json: bool = False
+    quiet: bool = False
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+_outputs: list[_Output] = [_Output()]  # of the running command, last
+
+
+@contextmanager
+def output_of(*, as_json: bool, quiet: bool) -> Iterator[None]:
+    """Form of the output of a command.
+
+    Args:
+        as_json: Whether its answer is printed as JSON.
+        quiet: Whether no text and no progress is printed.
+    """
+    _outputs.append(_Output(as_json, quiet))
+    try:
+        yield
+    finally:
+        _outputs.pop()
+
+
 def print_line(message: str) -> None:
-    """Print one line to standard output; long lines are not wrapped, and brackets are not markup."""
+    """Print a text to standard output; long lines are not wrapped, and brackets are not markup."""
     Console(highlight=False).print(Text(message), soft_wrap=True)
 
 
-def print_not_kept(path: Path, names: Sequence[str]) -> None:
-    """Print which metadata of the input a file does not contain."""
-    if names:
-        print_line(f"{path}: not kept from the input: {', '.join(names)}")
+def show_answer(command: str, answer: Answer) -> None:
+    """Print what a command found and did, as text or as JSON."""
+    output = _outputs[-1]
+    if output.as_json:
+        files = [str(path) for path in answer.files]
+        content = {"command": command, **answer.data, "files": files, "open_first": files[0] if files else None}
+        content |= {"next_steps": answer.next_steps, "notes": output.notes, "warnings": output.warnings}
+        print_line(json_text(content))
+        return
+    if output.quiet:
+        return
+    notes = {"Notes": output.notes} if output.notes else {}
+    for title, lines in {**answer.results, **notes}.items():
+        print_line("\n".join([title, *(f"  {line}" for text in lines for line in text.splitlines())]) + "\n")
+    if answer.files:
+        print_line(f"Files (open {answer.files[0].name} first)" if len(answer.files) > 1 else "File")
+        for folder in dict.fromkeys(path.parent for path in answer.files):
+            names = [path.name for path in answer.files if path.parent == folder]
+            text = str(folder / names[0]) if len(names) == 1 else f"{folder}: {', '.join(names)}"
+            print_line(textwrap.indent(wrapped(text), "  "))
+    if answer.next_steps:
+        print_line("\n".join(["", "Next", *(textwrap.indent(step, "  ") for step in answer.next_steps)]))
+
+
+def note(message: str) -> None:
+    """Print a sentence with the answer of the running command: what a file states, or what it does not contain."""
+    _outputs[-1].notes.append(message)
 
 
 def error_line(message: str, kind: str = "error") -> None:
     """Print a message to standard error, with the prefix ``rsvib: error:`` on each of its lines."""
+    if kind == "warning":
+        _outputs[-1].warnings.append(message)
     console = Console(stderr=True, highlight=False)
     for line in message.splitlines() or [""]:
         console.print(Text.assemble(("rsvib: ", "bold"), (f"{kind}: ", "bold red"), line), soft_wrap=True)
@@ -73,37 +133,48 @@ def warnings_in_one_line() -> Iterator[None]:
         yield
 
 
-def _progress(*columns: ProgressColumn) -> Progress:
+class _StateColumn(ProgressColumn):
+    """Complete steps, rate and remaining time; the elapsed time while the number of steps is unknown."""
+
+    def render(self, task: Task) -> Text:
+        """The state of a loop, in at most 40 characters."""
+        if task.total is None:
+            return Text(str(timedelta(seconds=int(task.elapsed or 0))))
+        state = f"{task.completed:.0f} of {task.total:.0f} {task.fields['unit']}"
+        done, seconds = task.completed - task.fields["first"], task.elapsed or 0.0
+        if done <= 0 or seconds <= 0:
+            return Text(state)
+        left = timedelta(seconds=round((task.total - task.completed) * seconds / done))
+        return Text(f"{state}  {done / seconds:.3g}/s  {left} left")
+
+
+def _progress() -> Progress:
     """A progress bar on standard error that is removed at the end; nothing is shown unless it is a terminal."""
     console = Console(stderr=True)
-    description = TextColumn("{task.description}", markup=False)
     return Progress(
         SpinnerColumn(),
-        description,
-        BarColumn(bar_width=30),
-        *columns,
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=10),
+        _StateColumn(),
         console=console,
         transient=True,
-        disable=not console.is_terminal,
-        speed_estimate_period=300.0,  # s; windows of a stack may take minutes each
+        disable=_outputs[-1].quiet or not console.is_terminal,
     )
 
 
 @contextmanager
 def working(description: str) -> Iterator[None]:
-    """Show a moving bar and the elapsed time."""
-    with _progress(TimeElapsedColumn()) as progress:
-        progress.add_task(description, total=None)
-        yield
+    """Show the elapsed time, and progress, rate and remaining time of the loops in the block that report them."""
+    with _progress() as progress:
+        task = progress.add_task(description, total=None)
 
+        def show(done: int, total: int, unit: str) -> None:
+            if done == 0:  # another loop begins
+                progress.reset(task, total=total, unit=unit, first=0)
+            progress.update(task, completed=done)
 
-class _RateColumn(ProgressColumn):
-    """Frames per second."""
-
-    def render(self, task: Task) -> Text:
-        """The rate, empty until it has been measured."""
-        rate = task.finished_speed or task.speed
-        return Text("" if rate is None else f"{rate:.2f} frames/s")
+        with listening(show):
+            yield
 
 
 @contextmanager
@@ -113,50 +184,14 @@ def counting(description: str) -> Iterator[Callable[[int, int], None]]:
     Yields:
         A function to call with the number of processed frames and the number of all frames.
     """
-    with _progress(MofNCompleteColumn(), _RateColumn(), TimeRemainingColumn()) as progress:
+    with _progress() as progress:
         task: Any = None
 
         def show(done: int, total: int) -> None:
             nonlocal task
             if task is None:  # frames of a resumed run do not count for the rate
-                task = progress.add_task(description, total=total, completed=done)
+                task = progress.add_task(description, total=total, completed=done, unit="frames", first=done)
             else:
                 progress.update(task, completed=done)
 
         yield show
-
-
-def print_detection(result: DetectionResult) -> None:
-    """Print a detection as a table with one line per tone, and the verdict on each axis."""
-    vibration, std = result.vibration, result.std
-    heads = ("axis", "amplitude (px)", "frequency (Hz)", "period (ms)", "phase (π)", "gain")
-    table = Table(*heads, title="Vibration", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    for axis, letter in enumerate("xy"):
-        for tone in range(vibration.amplitude.shape[-1]):
-            if tone > 0 and not float(vibration.amplitude[axis, tone]) > 0:
-                continue
-            cells = []
-            for name, scale in (("amplitude", 1), ("frequency", 1), ("period", 1e3), ("phase", 1 / math.pi)):
-                value, deviation = (scale * getattr(values, name)[axis, tone] for values in (vibration, std))
-                cells.append(measured_text(value, deviation))
-            table.add_row(letter, *cells, f"{float(result.gain[axis, tone]):.2f}")
-    Console(highlight=False, width=None if Console().is_terminal else 100).print(table)
-    for axis, name in enumerate("xy"):
-        motion = measured_text(vibration.image_motion[axis], std.image_motion[axis])
-        verdict = "reliable" if bool(result.reliable[axis]) else f"not reliable: {'; '.join(result.reasons[axis])}"
-        print_line(f"{name}: residual {float(result.residual[axis]):.4f} px, image motion {motion} px/s; {verdict}")
-
-
-def print_restoration(result: RestoredFrames) -> None:
-    """Print which axes were not restored, and whether restoration helped."""
-    for note in result.left_alone:
-        print_line(note)
-    if not result.moves:
-        error_line("no vibration to remove: the frames are written unchanged", "warning")
-    elif result.verdict is None:
-        print_line("cannot determine whether restoration helps: no two frames show the same scene")
-    elif result.verdict.overall in ("partly", "worse"):
-        unchanged = "" if result.restored else "; the frames are written unchanged, --force writes the restored ones"
-        error_line(result.verdict.summary + unchanged, "warning")
-    else:
-        print_line(result.verdict.summary)

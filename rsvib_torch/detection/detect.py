@@ -87,19 +87,35 @@ class _FitOptions:
     bands: RegistrationOptions
 
 
-_Found = tuple[ToneFit, Measurements, OtherMotion | None]
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Result of a method.
+
+    Attributes:
+        fit: The fit of all B stacks, with the covariance of its parameters.
+        measurements: The measurements with the weights of the fit.
+        offsets: The same as offsets between consecutive frames.
+        fitted: (B, P, N, 2) px, the offsets that it predicts for them.
+        other_motion: Motion that it does not explain; None if the method does not measure it.
+    """
+
+    fit: ToneFit
+    measurements: Measurements
+    offsets: OffsetCurve
+    fitted: Tensor
+    other_motion: OtherMotion | None = None
+
+
 _Fit = Callable[[OffsetCurve, Tensor, Tensor | None, RowTiming, _FitOptions], _Found]
 
 
 @dataclass(frozen=True)
 class _Method:
-    """A method of detection: ``fit(curve, frames, valid, timing, options)`` -> fit, measurements, other motion.
+    """A method of detection: ``fit(curve, frames, valid, timing, options)`` -> result.
 
     The arguments of ``fit`` are the offset curve (B, P, N) in px with NaN where a band could not be registered, the
     grey frames (B, T, H, W) in row order, their valid pixels (bool of that shape, or None for all), the sensor in row
-    order, and the options. It returns the fit of all B stacks, with the covariance of its parameters, the measurements
-    with the weights of the fit, and the motion that it does not explain, or None if the method does not measure it.
-    Stacks of a batch must not affect each other.
+    order, and the options. Stacks of a batch must not affect each other.
 
     Attributes:
         fit: The function.
@@ -125,7 +141,15 @@ def _fit_bands(
     interval = options.bands.band_step * timing.row_time
     blind = blind_frequencies(timing, 0.5 / interval).to(curve.offsets.device)
     fit = find_tones(measurements, interval, options.tones, options.model, blind=blind, accuracy=accuracy)
-    return fit, measurements.reweighted(residual_of(measurements, fit)), None
+    weighted = measurements.reweighted(residual_of(measurements, fit))
+    return _Found(fit, weighted, curve, _band_offsets(curve, fit, timing, options))
+
+
+def _band_offsets(curve: OffsetCurve, fit: ToneFit, timing: RowTiming, options: _FitOptions) -> Tensor:
+    """Offsets (B, P, N, 2) in px of row bands that a fit predicts."""
+    predicted = model_displacements(measurements_of_curve(curve, timing, options.bands.band_step), fit)
+    offsets: Tensor = (predicted[:, :, 1] - predicted[:, :, 0]).unflatten(1, curve.quality.shape[1:])
+    return offsets
 
 
 def _fit_direct(
@@ -133,9 +157,9 @@ def _fit_direct(
 ) -> _Found:
     """The fit to bands, refined on the images."""
     # px; the gradients of rows reach a few tenths of a pixel, so that a start with this error converges
-    start, *_ = _fit_bands(curve, frames, valid, timing, options, accuracy=0.15)
-    found = refine_directly(stack_spectra(frames, valid), timing, start, options.tones)
-    return found.fit, found.measurements, found.other_motion
+    start = _fit_bands(curve, frames, valid, timing, options, accuracy=0.15).fit
+    found, offsets, fitted = refine_directly(stack_spectra(frames, valid), timing, start, options.tones)
+    return _Found(found.fit, found.measurements, offsets, fitted, found.other_motion)
 
 
 _METHODS: dict[DetectionMethod, _Method] = {
@@ -300,6 +324,7 @@ def detect_vibration(
                 for part, window_timing in _windows(grey.shape[1], window, window_step, timing)
             ]
         )
+    found = replace(found, timing=timing)  # of the stack, not of a window
     return found if stacks.batched else found[0]
 
 
@@ -326,19 +351,19 @@ def _detect(
     """``detect_vibration`` of grey frames (B, T, H, W) in row order; the result is a batch in image axes."""
     row_timing, bands = timing.in_row_order(), options.bands
     curve = band_curve(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve)
-    fit, measurements, other_motion = method.fit(curve, frames, valid, row_timing, options)
+    found = method.fit(curve, frames, valid, row_timing, options)
+    fit, other_motion, measured = found.fit, found.other_motion, found.offsets
     starts = row_timing.frame_starts(frames.shape[1], frames.device)[:, None]
     starts = (starts + torch.arange(frames.shape[-2], device=frames.device)[::8] * row_timing.row_time).flatten()
     own_std = displacement_std(fit, starts, row_timing.exposure_time)
-    fit, total_std = with_further_tones(measurements, fit, starts, number_is_known=options.tones is not None)
+    fit, total_std = with_further_tones(found.measurements, fit, starts, number_is_known=options.tones is not None)
     vibration, std = vibration_of_fit(fit)
     std = replace(std, displacement=total_std)
     tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
     moved = tones.mean_displacement(starts.expand(len(frames), -1), row_timing.exposure_time)
-    predicted = model_displacements(measurements_of_curve(curve, row_timing, bands.band_step), fit)
-    fitted = (predicted[:, :, 1] - predicted[:, :, 0]).unflatten(1, curve.quality.shape[1:])
-    residual = (curve.offsets - fitted).abs().nanmean(dim=(1, 2))
+    residual = (measured.offsets - found.fitted).abs().nanmean(dim=(1, 2))
 
+    fitted = _band_offsets(curve, fit, row_timing, options)
     # an image motion may carry bands out of the later frame
     later = curve.rows + fitted[..., 1]
     visible = (later >= 0.5 * bands.band_rows) & (later <= frames.shape[-2] - 1 - 0.5 * bands.band_rows)
@@ -368,11 +393,12 @@ def _detect(
         vibration=in_image,
         std=std.from_row_order(timing),
         offsets=replace(
-            curve,
-            offsets=offsets_from_row_order(curve.offsets, timing),
-            heights=(curve.heights[1], curve.heights[0]) if swap else curve.heights,
+            measured,
+            offsets=offsets_from_row_order(measured.offsets, timing),
+            std=measured.std if measured.std is None or not swap else measured.std.flip(-1),
+            heights=(measured.heights[1], measured.heights[0]) if swap else measured.heights,
         ),
-        fitted=offsets_from_row_order(fitted, timing),
+        fitted=offsets_from_row_order(found.fitted, timing),
         gain=in_image.gain(float(intervals[0])),
         residual=residual.flip(-1) if swap else residual,
         reliable=reliable.flip(-1) if swap else reliable,
@@ -382,6 +408,7 @@ def _detect(
             assumptions(in_image[index], sensitivity[index], row_timing, frames.shape[1])
             for index in range(len(frames))
         ),
+        timing=timing,
     )
 
 

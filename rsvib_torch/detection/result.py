@@ -7,6 +7,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.presentation import Result, axis_head, axis_rows, plain_values, text_table
+from rsvib_torch.io.schema import TimingRecord, detection_summary
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
 
@@ -39,8 +42,11 @@ class OtherMotion:
         return OtherMotion(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
-@dataclass(frozen=True, eq=False)
-class TimingSensitivity:
+_TONE_VALUES = ("amplitude", "frequency")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TimingSensitivity(Result):
     """Relative change of amplitudes and frequencies over the relative change of a stated time.
 
     ``d ln A / d ln frame_rows = 3`` means that an amplitude becomes 3 % larger if ``frame_rows`` is stated 1 % larger
@@ -64,6 +70,20 @@ class TimingSensitivity:
     frequency_by_frame_rows: Tensor
     frequency_by_exposure_rows: Tensor
 
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading dimensions: empty for one result, (B,) for a batch of stacks or windows."""
+        return self.amplitude_by_row_time.shape[:-2]
+
+    def summary(self) -> str:
+        """Changes of the strongest tone of each axis if a time is stated 1 % larger."""
+        rows = [
+            [*labels, name, *(f"{float(getattr(self, f'{of}_by_{name}')[at][0]):+.2f}" for of in _TONE_VALUES)]
+            for at, labels in axis_rows(self.batch_shape)
+            for name in ("row_time", "frame_rows", "exposure_rows")
+        ]
+        return text_table([*axis_head(self.batch_shape), "1 % of", *(f"{of} (%)" for of in _TONE_VALUES)], rows)
+
     def __getitem__(self, index: int) -> "TimingSensitivity":
         """The part of one stack out of a batch."""
         return TimingSensitivity(*(getattr(self, field.name)[index] for field in fields(self)))
@@ -73,8 +93,12 @@ class TimingSensitivity:
         return TimingSensitivity(*(getattr(self, field.name).flip(axis) for field in fields(self)))
 
 
-@dataclass(frozen=True, eq=False)
-class DetectionResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class DetectionResult(
+    Result,
+    units={**Vibration.units, "residual": "px", "gain": "px of offset per px of displacement", "offsets": "s and px"},
+    file_format="rsvib vibration",
+):
     """A detected vibration with its uncertainty and verdict. Batches of stacks or windows lead all tensors.
 
     Attributes:
@@ -88,6 +112,9 @@ class DetectionResult:
         reasons: Reasons against each axis (x, y) that is not reliable; a tuple of those for a batch.
         sensitivity: Effect of the stated timing on amplitudes and frequencies.
         assumptions: What the frames cannot contradict, one sentence for each; a tuple of those for a batch.
+        timing: The sensor of the frames.
+
+    ``save`` writes a ``vibration.json`` as the program does, which ``rsvib restore`` and ``read_vibration`` read.
     """
 
     vibration: Vibration
@@ -100,6 +127,24 @@ class DetectionResult:
     reasons: tuple[Any, ...]
     sensitivity: TimingSensitivity
     assumptions: tuple[Any, ...]
+    timing: SensorTiming | None = None
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading dimensions: empty for one result, (B,) for a batch of stacks or windows."""
+        return self.vibration.batch_shape
+
+    def summary(self) -> str:
+        """Tones of each axis with standard deviations, then the verdict; of a batch, a table with one row per axis."""
+        return detection_summary(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All values as nested lists, numbers and texts, as in a ``vibration.json``; None for unknown numbers."""
+        values = super().to_dict()
+        values["timing"] = None if self.timing is None else TimingRecord.from_timing(self.timing).model_dump()
+        values["period"] = plain_values(self.vibration.period)
+        curve = {name: values.pop(name) for name in ("offsets", "fitted")}  # long, therefore last
+        return values | curve
 
     def __getitem__(self, index: int) -> "DetectionResult":
         """The result of one stack out of a batch."""
@@ -114,6 +159,7 @@ class DetectionResult:
             self.reasons[index],
             self.sensitivity[index],
             self.assumptions[index],
+            self.timing,
         )
 
 
@@ -148,6 +194,7 @@ def stacked(results: list[DetectionResult]) -> DetectionResult:
             joined([curve.offsets for curve in curves]),
             joined([curve.quality for curve in curves]),
             curves[0].heights,
+            joined([curve.std for curve in curves if curve.std is not None]) if curves[0].std is not None else None,
         ),
         fitted=joined([result.fitted for result in results]),
         gain=padded([result.gain for result in results]),
@@ -156,4 +203,5 @@ def stacked(results: list[DetectionResult]) -> DetectionResult:
         reasons=tuple(tuple(result.reasons[index] for result in results) for index in range(batch)),
         sensitivity=TimingSensitivity(**parameters([result.sensitivity for result in results], TimingSensitivity)),
         assumptions=tuple(tuple(result.assumptions[index] for result in results) for index in range(batch)),
+        timing=results[0].timing,
     )

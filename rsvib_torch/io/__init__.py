@@ -1,6 +1,6 @@
 """Stacks of frames in files: the registry of formats, one module per format, and atomic writes."""
 
-from rsvib_torch.io.atomic import check_writable, whole_file, whole_folder
+from rsvib_torch.core.atomic import check_writable, whole_file, whole_folder
 from rsvib_torch.io.files import (
     check_stack_target,
     metadata_not_kept,

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rsvib_torch.core.atomic import check_writable, move_into_place, temporary_folder
 from rsvib_torch.core.checks import check_choice
+from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.io import hdf5, image_folder, npy, raw, tiff, video, zarr_store
-from rsvib_torch.io.atomic import check_writable, move_into_place, temporary_folder
 from rsvib_torch.io.formats import FrameReader, StackFormat, find_format, register_format, target_format
 from rsvib_torch.io.full_scale import (
     counts_to_frames,
@@ -155,8 +156,10 @@ def _read_pixels(paths: Sequence[PathLike]) -> tuple[NDArray[Any], float | None]
             if info.kind != first.kind:
                 raise ValueError(f"frames of different size or kind: {paths[0]} is {first.kind}, {path} is {info.kind}")
             pixels = np.empty(info.shape, dtype=info.dtype)
+            advance = steps(len(pixels), "frames")
             for index in range(len(pixels)):
                 pixels[index] = reader.frame(index)
+                advance()
         finally:
             reader.close()
         parts.append(pixels)
@@ -327,6 +330,14 @@ def write_frames(
         writer.close()
 
 
+def _counted(pixels: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    """The frames of a stack, with a report of the progress."""
+    advance = steps(len(pixels), "frames")
+    for frame in pixels:
+        yield frame
+        advance()
+
+
 def write_stack(
     path: PathLike,
     frames: FramesLike,
@@ -379,7 +390,7 @@ def write_stack(
     form = check_info_target(path, info, compression)
     with temporary_folder(path) as folder:
         part = folder / path.name
-        write_frames(form, part, info, iter(pixels), compression)
+        write_frames(form, part, info, _counted(pixels), compression)
         if form.kind == "folder":
             path.parent.mkdir(parents=True, exist_ok=True)
         move_into_place(part, path, form.kind, form.companions)

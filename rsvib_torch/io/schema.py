@@ -5,7 +5,6 @@ are ordered (x, y), with one list of tones for each axis; null stands for a valu
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, Self
 
@@ -13,9 +12,10 @@ import torch
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from torch import Tensor
 
+from rsvib_torch.core.presentation import Result, plain_values, verdict_table, wrapped
 from rsvib_torch.core.validation import Section, checked
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.motion.vibration import Vibration, VibrationStd, image_motion_line, tone_head, tone_rows
 
 __all__ = [
     "DetectedVibration",
@@ -24,27 +24,21 @@ __all__ = [
     "TimingRecord",
     "VibrationRecord",
     "check_same_timing",
+    "detection_summary",
     "detection_to_json",
-    "to_json",
 ]
 
 Tones = list[float] | list[list[float]]
 Numbers = list[float | None]
 
 
-def _converted(values: Any, convert: Callable[[Any], Any]) -> Any:
-    """Nested lists with every value converted."""
-    return [_converted(value, convert) for value in values] if isinstance(values, list) else convert(values)
-
-
-def to_json(values: Tensor) -> Any:
-    """Nested lists of the values of a tensor, with None where a value is not finite."""
-    return _converted(values.detach().cpu().tolist(), lambda value: value if math.isfinite(value) else None)
-
-
 def _to_tensor(values: Any, missing: float) -> Tensor:
-    """Inverse of ``to_json``: a float64 tensor with ``missing`` in place of None."""
-    return torch.tensor(_converted(values, lambda value: missing if value is None else value), dtype=torch.float64)
+    """Nested lists as a float64 tensor with ``missing`` in place of None."""
+
+    def filled(value: Any) -> Any:
+        return [filled(part) for part in value] if isinstance(value, list) else missing if value is None else value
+
+    return torch.tensor(filled(values), dtype=torch.float64)
 
 
 class TimingRecord(Section):
@@ -104,7 +98,7 @@ class VibrationRecord(Section):
     @classmethod
     def from_vibration(cls, vibration: Vibration) -> Self:
         """The record of one vibration (not a batch)."""
-        return cls(**{name: to_json(getattr(vibration, name)) for name in VibrationRecord.model_fields})
+        return cls(**{name: plain_values(getattr(vibration, name)) for name in VibrationRecord.model_fields})
 
     def to_vibration(self) -> Vibration:
         """The vibration."""
@@ -126,7 +120,7 @@ class StdRecord(Section):
     def from_std(cls, std: VibrationStd) -> Self:
         """The record of the standard deviations of one vibration."""
         values = {name: getattr(std, name) for name in cls.model_fields}
-        return cls(**{name: to_json(value) for name, value in values.items() if value is not None})
+        return cls(**{name: plain_values(value) for name, value in values.items() if value is not None})
 
     @model_serializer(mode="wrap")
     def _without_unknown(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -161,8 +155,18 @@ class Detection(Protocol):
     def assumptions(self) -> tuple[Any, ...]: ...
 
 
-@dataclass(frozen=True, eq=False)
-class DetectedVibration:
+def detection_summary(detection: Detection) -> str:
+    """Tones of each axis with standard deviations, then the verdict; of a batch, a table with one row per axis."""
+    vibration, std = detection.vibration, detection.std
+    rows = [cells for _, cells in tone_rows(vibration, std)]
+    table, *verdict = verdict_table(tone_head(), rows, vibration.batch_shape, detection.reliable, detection.reasons)
+    if not vibration.batch_shape:  # those sentences that concern two frames
+        verdict += [wrapped(f"assumed: {text}") for text in detection.assumptions if text.startswith("frame_")]
+    return "\n".join([table, *image_motion_line(vibration, std), *verdict])
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DetectedVibration(Result):
     """A detection without its offset curve: everything that restoration needs.
 
     Attributes:
@@ -183,6 +187,10 @@ class DetectedVibration:
     reasons: tuple[Any, ...]
     assumptions: tuple[Any, ...] = ()
 
+    def summary(self) -> str:
+        """Tones of each axis with standard deviations, then the verdict."""
+        return detection_summary(self)
+
 
 class DetectionRecord(Section):
     """Fields of ``DetectedVibration``."""
@@ -201,8 +209,8 @@ class DetectionRecord(Section):
         return cls(
             vibration=VibrationRecord.from_vibration(detection.vibration),
             std=StdRecord.from_std(detection.std),
-            gain=to_json(detection.gain),
-            residual=to_json(detection.residual),
+            gain=plain_values(detection.gain),
+            residual=plain_values(detection.residual),
             reliable=detection.reliable.tolist(),
             reasons=[list(axis) for axis in detection.reasons],
             assumptions=list(detection.assumptions),

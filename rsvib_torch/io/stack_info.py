@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.time_metadata import orientation_of, times_of_attributes
 
@@ -53,8 +54,8 @@ class Tag:
     scope: Scope
 
 
-@dataclass(frozen=True)
-class StackInfo:
+@dataclass(frozen=True, repr=False)
+class StackInfo(Summarised):
     """Shape, data type and full scale of a stack in a file.
 
     Attributes:
@@ -88,6 +89,18 @@ class StackInfo:
     time_source: str = field(default="frame_times", compare=False)
     path: Path | None = field(default=None, compare=False)
     metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
+
+    def summary(self) -> str:
+        """The stack in one line."""
+        parts = [f"{self.shape[0]} frames of {self.shape[-2]} x {self.shape[-1]} px", self.dtype]
+        parts += [f"{self.shape[1]} channels"] if self.axes == "TCHW" else []
+        parts += [] if self.full_scale is None else [f"full scale {self.full_scale:g}"]
+        parts += [] if self.orientation == 1 else [f"orientation {self.orientation}"]
+        parts += [] if self.frame_rate is None else [f"{self.frame_rate:.6g} frames per second"]
+        if self.frame_times:
+            parts.append(f"frame times {self.frame_times[0]:.6g} … {self.frame_times[-1]:.6g} s")
+        parts += [] if self.resolution is None else ["{:g} x {:g} px per {}".format(*self.resolution)]
+        return ", ".join(parts)
 
     @property
     def axes(self) -> str:

@@ -1,30 +1,31 @@
 """The base class of motions: what code outside this package may use of a motion of any type."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from copy import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.presentation import Result
 from rsvib_torch.motion.timing import SensorTiming
 
 __all__ = ["Motion"]
 
 
-@dataclass(frozen=True, eq=False)
-class Motion(ABC):
+@dataclass(frozen=True, eq=False, repr=False)
+class Motion(Result, ABC):
     """Motion of the image on the sensor as a function of time: scene content at ``s`` appears at ``s + D(t)``.
 
-    Contract of a motion type. It is a frozen dataclass (``eq=False``) whose fields are float64 tensors that begin with
-    the batch dimensions, other motions of the same batch shape, and plain numbers that hold for the whole batch. It
-    implements the abstract members below; everything else follows from them. The last axis of every result counts the
-    components of the displacement, today (x, y) in px, positive to the right and down. Methods that take times accept
-    tensors of any shape S whose leading dimensions are the batch dimensions (or 1), in seconds since the exposure start
-    of row 0 of frame 0, return float64 tensors (S, axes), and are differentiable with respect to tensors that require
-    gradients. Bounds are not differentiable. A motion is an immutable value: methods that change it return another one.
+    Contract of a motion type. It is a frozen dataclass (``eq=False, repr=False``) whose fields are float64 tensors that
+    begin with the batch dimensions, other motions of the same batch shape, and plain numbers that hold for the whole
+    batch. It implements the abstract members below; everything else follows from them. The last axis of every result
+    counts the components of the displacement, today (x, y) in px, positive to the right and down. Methods that take
+    times accept tensors of any shape S whose leading dimensions are the batch dimensions (or 1), in seconds since the
+    exposure start of row 0 of frame 0, return float64 tensors (S, axes), and are differentiable with respect to tensors
+    that require gradients. Bounds are not differentiable. A motion is an immutable value: methods that change it return
+    another one.
     """
 
     @property
@@ -148,23 +149,6 @@ class Motion(ABC):
         if timing.readout_direction == "reverse":
             signs[1] = -1.0
         return order, signs
-
-    def mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
-        """The same motion with ``function``, which must preserve values, applied to every tensor.
-
-        Values are not checked again, so that no device is synchronised.
-        """
-        result = copy(self)
-        for name, value in vars(self).items():
-            if isinstance(value, Tensor):
-                object.__setattr__(result, name, function(value))
-            elif isinstance(value, Motion):
-                object.__setattr__(result, name, value.mapped(function))
-        return result
-
-    def to(self, device: torch.device | str) -> Self:
-        """The same motion on another device."""
-        return self.mapped(lambda values: values.to(device))
 
     def detached(self) -> Self:
         """The same motion without gradients."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.presentation import axis_head, axis_rows, measured_text, text_table
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, gauss_legendre
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.vibration import TensorLike, Vibration
@@ -17,8 +18,8 @@ from rsvib_torch.motion.vibration import TensorLike, Vibration
 __all__ = ["FreeMotion"]
 
 
-@dataclass(frozen=True, eq=False)
-class FreeMotion(Motion):
+@dataclass(frozen=True, eq=False, repr=False)
+class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "s"}):
     """A free spline with tones: ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t + a t^2 / 2 + R(t)``.
 
     ``R(t) = sum_n c_n B((t - start) / spacing - n + 1)`` is a cubic B-spline; before its first and after its last knot
@@ -124,6 +125,20 @@ class FreeMotion(Motion):
         fields = ([getattr(m.tones, name) for m in motions] for name in Vibration.__dataclass_fields__)
         tones = Vibration(*(torch.stack(values) for values in fields))
         return cls(torch.stack([m.coefficients for m in motions]), first.start, first.spacing, tones)
+
+    def summary(self) -> str:
+        """Duration and range of the motion; of a batch, those of each motion."""
+        count = self.coefficients.shape[-1] - 2
+        times = torch.linspace(self.start, self.end, 4 * count, dtype=torch.float64, device=self.device)
+        moved = self.displacement(times.expand(*self.batch_shape, -1)).detach()
+        low, high = moved.amin(-2), moved.amax(-2)
+        rows = [
+            [*labels, measured_text(low[at]), measured_text(high[at])] for at, labels in axis_rows(self.batch_shape)
+        ]
+        head = [*axis_head(self.batch_shape), "smallest displacement (px)", "largest (px)"]
+        first = f"{self.start:.6g} … {self.end:.6g} s, {count} knots {1e3 * self.spacing:.4g} ms apart"
+        tones = [self.tones.summary()] if bool(self.tones.moving_axes().any()) else []
+        return "\n".join([first, text_table(head, rows), *tones])
 
     @property
     def batch_shape(self) -> torch.Size:

@@ -8,10 +8,22 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.presentation import Result, axis_head, axis_rows, measured_text, text_table
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 
-__all__ = ["Vibration", "VibrationStd", "blind_frequencies"]
+__all__ = ["Vibration", "VibrationStd", "blind_frequencies", "image_motion_line", "tone_head", "tone_rows"]
+
+_UNITS = {
+    "amplitude": "px",
+    "frequency": "Hz",
+    "period": "s",
+    "phase": "rad at the first row of frame 0",
+    "image_motion": "px/s",
+    "image_acceleration": "px/s^2",
+}
+_COLUMNS = {"amplitude": ("px", 1.0), "frequency": ("Hz", 1.0), "period": ("ms", 1e3), "phase": ("rad", 1.0)}
+_QUANTITIES = ("amplitude", "frequency", "phase")
 
 TensorLike = Tensor | float | Sequence[float] | Sequence[Sequence[float]]
 
@@ -59,8 +71,8 @@ def _check_values(values: dict[str, Tensor]) -> None:
             raise ValueError(f"{name} must not be negative, got {values[name].min().item():g}")
 
 
-@dataclass(frozen=True, eq=False)
-class Vibration(Motion):
+@dataclass(frozen=True, eq=False, repr=False)
+class Vibration(Motion, units=_UNITS):
     """Sinusoidal displacement of the image on the sensor, with an image motion.
 
     ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t + a t^2 / 2`` per axis (Eq. 1 of Liu et al. 2023, several tones,
@@ -80,6 +92,10 @@ class Vibration(Motion):
 
     Example:
         >>> vibration = Vibration(amplitude=[3.1, 5.2], frequency=[50.0, 30.0], phase=[0.0, 1.0])
+        >>> vibration
+        axis  amplitude (px)  frequency (Hz)  phase (rad)
+        x     3.100           50.00           0.000
+        y     5.200           30.00           1.000
         >>> vibration.period[0].item()
         0.02
         >>> round(vibration.displacement(torch.tensor(0.005)).tolist()[0], 6)
@@ -127,6 +143,12 @@ class Vibration(Motion):
         """No vibration and no image motion: the camera stands still."""
         zeros = torch.zeros(*batch_shape, 2, 1, dtype=torch.float64, device=device)
         return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0])
+
+    def summary(self) -> str:
+        """The tones of each axis as a table; of a batch, the strongest tone of each axis."""
+        rows = [cells for _, cells in tone_rows(self)]
+        table = text_table([*axis_head(self.batch_shape), *tone_head()], rows)
+        return "\n".join([table, *image_motion_line(self)])
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -250,14 +272,16 @@ class Vibration(Motion):
         )
 
 
-@dataclass(frozen=True, eq=False)
-class VibrationStd:
+@dataclass(frozen=True, eq=False, repr=False)
+class VibrationStd(Result, units=_UNITS | {"displacement": "px"}):
     """Standard deviations in the layout of ``Vibration``: px, Hz, s, rad (..., 2, K), px/s and px/s^2 (..., 2).
 
     ``displacement`` (..., 2) in px is that of the displacement of the rows of the record, rms over the rows and without
     their mean. It contains the image motion and the correlations of all parameters: a record shorter than a period
     leaves amplitude and frequency uncertain, and may still determine the displacement. None: not known.
     """
+
+    _MISSING = math.inf  # None in a file: an unknown standard deviation
 
     amplitude: Tensor
     frequency: Tensor
@@ -266,6 +290,19 @@ class VibrationStd:
     image_motion: Tensor
     image_acceleration: Tensor
     displacement: Tensor | None = None
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading dimensions: empty for one vibration, (B,) for a batch of stacks."""
+        return self.amplitude.shape[:-2]
+
+    def summary(self) -> str:
+        """Standard deviations of the tones of each axis as a table; of a batch, those of the strongest tones."""
+        rows = [
+            [*labels, *(measured_text(getattr(self, name)[at], digits=2) for name in _QUANTITIES)]
+            for at, labels in _tones(self)
+        ]
+        return "standard deviations\n" + text_table([*axis_head(self.batch_shape), *tone_head()], rows)
 
     def __getitem__(self, index: int) -> "VibrationStd":
         """The standard deviations of one stack of a batch."""
@@ -281,6 +318,60 @@ class VibrationStd:
         motion, acceleration = self.image_motion.flip(-1), self.image_acceleration.flip(-1)
         displacement = None if self.displacement is None else self.displacement.flip(-1)
         return VibrationStd(amplitude, frequency, period, phase, motion, acceleration, displacement)
+
+
+# Text
+
+
+def _tones(values: Vibration | VibrationStd) -> list[tuple[tuple[int, ...], list[str]]]:
+    """Index (..., axis, tone) and first cells of the rows: all tones of one vibration, the strongest of a batch.
+
+    An axis without a tone has one row.
+    """
+    count = 1 if values.batch_shape else values.amplitude.shape[-1]
+    rows = [((*at, tone), labels) for at, labels in axis_rows(values.batch_shape) for tone in range(count)]
+    return [(at, labels) for at, labels in rows if at[-1] == 0 or float(values.amplitude[at]) > 0]
+
+
+def tone_head(quantities: Sequence[str] = _QUANTITIES) -> list[str]:
+    """Heads of the columns of ``tone_rows`` behind the axis."""
+    return [f"{name} ({_COLUMNS[name][0]})" for name in quantities]
+
+
+def tone_rows(
+    vibration: Vibration, std: VibrationStd | None = None, quantities: Sequence[str] = _QUANTITIES
+) -> list[tuple[tuple[int, ...], list[str]]]:
+    """Rows of a table of tones: the index (..., axis, tone) in the tensors, and the cells.
+
+    Args:
+        vibration: The tones; of a batch, the strongest of each axis is shown.
+        std: Their standard deviations.
+        quantities: Columns: ``"amplitude"``, ``"frequency"``, ``"period"``, ``"phase"``.
+    """
+    rows = []
+    for at, labels in _tones(vibration):
+        cells = ["no tone"] + [""] * (len(quantities) - 1)
+        if float(vibration.amplitude[at]) > 0:
+            cells = [
+                measured_text(
+                    scale * getattr(vibration, name)[at], None if std is None else scale * getattr(std, name)[at]
+                )
+                for name, scale in ((name, _COLUMNS[name][1]) for name in quantities)
+            ]
+        rows.append((at, labels + cells))
+    return rows
+
+
+def image_motion_line(vibration: Vibration, std: VibrationStd | None = None) -> list[str]:
+    """A line with the image motion of one vibration, if it exceeds 1 px/s and four standard deviations."""
+    if vibration.batch_shape:
+        return []
+    speeds = vibration.image_motion.tolist()
+    stds = [0.0, 0.0] if std is None else std.image_motion.tolist()
+    if not any(math.isfinite(e) and abs(v) > max(4 * e, 1.0 if e else 0.0) for v, e in zip(speeds, stds, strict=True)):
+        return []
+    texts = [measured_text(v, e or None) for v, e in zip(speeds, stds, strict=True)]
+    return [f"image motion {texts[0]} px/s along x, {texts[1]} px/s along y"]
 
 
 def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:

@@ -14,6 +14,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.presentation import Result
+from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import Channels, FramesLike
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.prepare import prepare_frames
@@ -24,8 +26,8 @@ from rsvib_torch.registration.methods import BAND_METHODS, Registration, Registr
 __all__ = ["OffsetCurve", "check_frame_size", "register_bands", "register_rows"]
 
 
-@dataclass(frozen=True, eq=False)
-class OffsetCurve:
+@dataclass(frozen=True, eq=False, repr=False)
+class OffsetCurve(Result, units={"times": "s", "later_times": "s", "offsets": "px", "std": "px"}):
     """Offsets of row bands between frames.
 
     The content of the band around row r of the earlier frame lies at r plus the offset in the later frame
@@ -34,12 +36,16 @@ class OffsetCurve:
 
     Attributes:
         pairs: (P, 2) int64, indices of the earlier and the later frame.
-        rows: (N,) float64, centre row of each band in the earlier frame, in readout order.
+        rows: (N,) float64, centre row of each band in the earlier frame, in readout order; in the still scene, if the
+            offsets are those of the direct method.
         times: (..., P, N) float64, exposure start of the centre row in the earlier frame, s.
-        later_times: (..., P, N) float64, exposure start of the same row in the later frame, s.
-        offsets: (..., P, N, 2) float64 px, axes (x, y); NaN where registration failed.
-        quality: (..., P, N) float64 in 0 ... 1; correlation of the matched bands, 0 where registration failed.
+        later_times: (..., P, N) float64, exposure start in the later frame, s: of the same row, or, in the direct
+            method, of the row with the same part of the scene.
+        offsets: (..., P, N, 2) float64 px, axes (x, y); NaN where nothing was measured.
+        quality: (..., P, N) float64 in 0 ... 1, 0 where nothing was measured: correlation of the matched bands, or, in
+            the direct method, weight in the fit (0 for outliers).
         heights: Rows averaged for the offset along x and y, (x, y).
+        std: (..., P, N, 2) px, standard deviations of the offsets; None if unknown.
     """
 
     pairs: Tensor
@@ -49,6 +55,26 @@ class OffsetCurve:
     offsets: Tensor
     quality: Tensor
     heights: tuple[int, int]
+    std: Tensor | None = None
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading dimensions: empty for one curve."""
+        return self.offsets.shape[:-3]
+
+    def summary(self) -> str:
+        """Number of offsets, and their range along each axis."""
+        pairs, rows = self.quality.shape[-2:]
+        lines = [
+            f"offsets of {pairs} pairs of frames, {rows} rows each, {float(self.good.double().mean()):.0%} measured"
+        ]
+        if self.batch_shape:
+            lines = [f"batch {tuple(self.batch_shape)}: {lines[0]}"]
+        values = self.offsets[self.good]
+        if len(values):
+            low, high = values.amin(0), values.amax(0)
+            lines += [f"{name}: {float(low[axis]):.3f} … {float(high[axis]):.3f} px" for axis, name in enumerate("xy")]
+        return "\n".join(lines)
 
     @property
     def good(self) -> Tensor:
@@ -59,7 +85,8 @@ class OffsetCurve:
         """The curve of one stack of a batch."""
         if self.offsets.ndim == 3:
             raise IndexError("this offset curve is not a batch")
-        names = ("offsets", "quality", *(("times", "later_times") if self.times.ndim > 2 else ()))
+        names = ["offsets", "quality"] + ["times", "later_times"] * (self.times.ndim > 2)
+        names += ["std"] * (self.std is not None)
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
 
@@ -151,7 +178,9 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     first, second = grey[:, :-1].flatten(0, 1), grey[:, 1:].flatten(0, 1)
     bytes_of_pair = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4
     offsets, quality = [], []
-    for pair in runs(len(first), max(1, 2**28 // bytes_of_pair)):  # 256 MiB of windows at a time
+    parts = runs(len(first), max(1, 2**28 // bytes_of_pair))  # 256 MiB of windows at a time
+    advance = steps(len(first), "pairs")
+    for pair in parts:
         task = BandTask(first[pair], second[pair], coarse_offset(first[pair], second[pair]), tops, band_rows, search)
         if task.width < search:
             raise ValueError(f"frames {width} px wide overlap too little after their whole-frame offset")
@@ -159,6 +188,7 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
         failed = ~(correlation > 0.1)  # chance reaches correlations of 0.1
         offsets.append(torch.where(failed[..., None], torch.nan, measured))
         quality.append(torch.where(failed, 0.0, correlation))
+        advance(len(correlation))
     rows = tops.to(torch.float64) + 0.5 * (band_rows - 1)
     starts = timing.frame_starts(num_frames, grey.device)[:, None] + rows * timing.row_time
     index = torch.arange(num_frames, device=grey.device)

@@ -1,5 +1,6 @@
 """Figures of detections and restorations, and values with their standard deviations as text."""
 
+import io
 import math
 import os
 import textwrap
@@ -16,22 +17,27 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.detection import DetectionResult
+from rsvib_torch.core.presentation import FIGURES, Result, measured_text
+from rsvib_torch.detection import DetectionResult, MotionDetection, SweptTone
 from rsvib_torch.evaluation import MtfCurve
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
 from rsvib_torch.io import whole_file
+from rsvib_torch.io.schema import Detection
 from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import blind_frequencies
+from rsvib_torch.motion.vibration import Vibration, blind_frequencies
+from rsvib_torch.restoration import RestorationVerdict
 
 __all__ = [
     "axis_offset_figure",
     "comparison_figure",
     "detailed_places",
+    "free_motion_figure",
     "gain_figure",
-    "measured_text",
     "motion_blur",
+    "motion_figure",
     "mtf_figure",
     "offset_figure",
     "picture",
@@ -40,6 +46,8 @@ __all__ = [
     "rows_figure",
     "save_figure",
     "tones_text",
+    "verdict_figure",
+    "windows_figure",
 ]
 
 _INK, _GREY, _GRID = "#222222", "#8a8a8a", "#d9d9d9"
@@ -48,22 +56,19 @@ _FIT_COLOUR = _AXIS_COLOURS["y"]
 _QUALITY_COLOURS = LinearSegmentedColormap.from_list("quality", ["#f0a030", "#9cc3e0", "#14487a"])  # poor ... good
 
 
-def measured_text(value: Tensor | float, std: Tensor | float, digits: int = 2) -> str:
-    """Format ``value ± std`` with two significant digits of the standard deviation.
+class _Drawing(Figure):
+    """A figure that notebooks show without pyplot."""
 
-    Args:
-        value: The value; an infinite one is written as ∞.
-        std: Its standard deviation.
-        digits: Decimals if the standard deviation is zero or unknown.
+    def _repr_png_(self) -> bytes:
+        picture = io.BytesIO()
+        FigureCanvasAgg(self).print_figure(picture, dpi=90, facecolor="white")
+        return picture.getvalue()
 
-    Example:
-        >>> measured_text(60.0, 0.012)
-        '60.000 ± 0.012'
-    """
-    value, std = float(value), float(std)
-    if math.isfinite(std) and std > 0:
-        digits = min(9, max(0, 1 - math.floor(math.log10(std))))
-    return " ± ".join(f"{number:.{digits}f}" if math.isfinite(number) else "∞" for number in (value, std))
+
+def _check_one(result: Result) -> None:
+    """Raise a ``ValueError`` for a batch."""
+    if result.batch_shape:
+        raise ValueError(f"a batch of shape {tuple(result.batch_shape)} cannot be drawn: select one, result[0]")
 
 
 def tones_text(result: DetectionResult, axis: int) -> list[str]:
@@ -78,7 +83,19 @@ def tones_text(result: DetectionResult, axis: int) -> list[str]:
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150) -> None:
-    """Write a figure as an image file, atomically."""
+    """Write a figure as an image file, atomically.
+
+    Args:
+        figure: The figure.
+        path: The file to write; its ending selects the format (``.png``, ``.svg``, ``.pdf``).
+        dpi: Pixels per inch.
+
+    Raises:
+        OSError: If the file cannot be written.
+
+    Example:
+        >>> save_figure(offset_figure(detection), "offsets.png")  # doctest: +SKIP
+    """
     with whole_file(path) as part:
         FigureCanvasAgg(figure).print_figure(str(part), dpi=dpi, facecolor="white")
 
@@ -109,11 +126,14 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
     edge = upper.get_xaxis_transform()
     upper.scatter(failed, np.full_like(failed, 0.02), s=18, marker="x", color=_GREY, transform=edge, zorder=4)
     lower.scatter(times[good], residual, s=0.6 * size, **style)
+    if curve.std is not None:
+        std = curve.std.detach().cpu().numpy()[..., axis][good]
+        lower.errorbar(times[good], residual, std, fmt="none", ecolor=_GRID, elinewidth=0.8, zorder=1)
     lower.axhline(0.0, color=_FIT_COLOUR, linewidth=1.0, zorder=3)
     spread = 1.15 * float(np.quantile(np.abs(residual), 0.99)) if residual.size else 1.0
     lower.set_ylim(-max(spread, 1e-3), max(spread, 1e-3))
     lower.set_title(f"mean |residual| {float(result.residual[axis]):.4f} px", loc="left", fontsize=9.5, color=_INK)
-    lower.set_xlabel("exposure start of the band in the earlier frame (ms)", color=_INK)
+    lower.set_xlabel("exposure start of the rows in the earlier frame (ms)", color=_INK)
     upper.set_ylabel("offset (px)", color=_INK)
     lower.set_ylabel("residual (px)", color=_INK)
     plain_axes(upper)
@@ -124,26 +144,31 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
 def _finish_offsets(figure: Figure, panels: Any, points: Any) -> None:
     """Add the legend and the colour bar."""
     handles = [
-        Line2D([], [], color=_QUALITY_COLOURS(1.0), marker="o", markersize=5, linewidth=0, label="measured band"),
+        Line2D([], [], color=_QUALITY_COLOURS(1.0), marker="o", markersize=5, linewidth=0, label="measured rows"),
         Line2D([], [], color=_FIT_COLOUR, linewidth=1.3, label="detected vibration"),
-        Line2D([], [], color=_GREY, marker="x", markersize=5, linewidth=0, label="failed band"),
+        Line2D([], [], color=_GREY, marker="x", markersize=5, linewidth=0, label="not measured"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=9.5, frameon=False)
     bar = figure.colorbar(points, ax=panels, fraction=0.025, pad=0.01)
-    bar.set_label("quality of the band (correlation)", color=_INK)
+    bar.set_label("quality (0: outlier)", color=_INK)
     bar.outline.set_visible(False)
 
 
 def offset_figure(result: DetectionResult) -> Figure:
     """Draw the offset curve of each axis with its fit, and the residuals (as Figure 6 of Liu et al. 2023).
 
-    Points are the measured bands, coloured by their quality; crosses on the lower edge are failed bands; the line is
-    the offset curve of the detected vibration.
+    Points are the measurements that the vibration was fitted to: rows of the images in the direct method, with error
+    bars of one standard deviation in the lower panels, row bands otherwise. Their colour is their quality; crosses on
+    the lower edge are rows that were not measured; the line is the offset curve of the detected vibration.
 
     Args:
         result: A detection (not a batch).
+
+    Example:
+        >>> save_figure(offset_figure(detection), "offsets.png")  # doctest: +SKIP
     """
-    figure = Figure(figsize=(13, 6.4), layout="constrained")
+    _check_one(result)
+    figure = _Drawing(figsize=(13, 6.4), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, height_ratios=(3, 1), squeeze=False)
     points: Any = None
     for axis, name in enumerate("xy"):
@@ -160,6 +185,155 @@ def offset_figure(result: DetectionResult) -> Figure:
     return figure
 
 
+def windows_figure(
+    times: Sequence[float], detections: Sequence[Detection | None], *, time_label: str = "start of the window (s)"
+) -> Figure:
+    """Draw amplitude and frequency of the detected tones over windows or stacks, with error bars of two stds.
+
+    Points of axes that are not reliable are hollow and do not determine the range of the axis.
+
+    Args:
+        times: Position of each window on the horizontal axis.
+        detections: The detection of each window (not a batch); None where it failed.
+        time_label: Label of the horizontal axis.
+
+    Example:
+        >>> manifest = read_manifest("manifest.json")  # doctest: +SKIP
+        >>> starts = [window.start_time for window in manifest.windows]  # doctest: +SKIP
+        >>> figure = windows_figure(starts, manifest.detections())  # doctest: +SKIP
+    """
+    figure = _Drawing(figsize=(11, 5.6), layout="constrained")
+    panels = figure.subplots(2, 2, sharex=True, squeeze=False)
+    for axis, name in enumerate("xy"):
+        for panel, (quantity, unit) in zip(panels[:, axis], (("amplitude", "px"), ("frequency", "Hz")), strict=True):
+            reliable_values: list[float] = []
+            for time, found in zip(times, detections, strict=True):
+                if found is None:
+                    panel.axvline(time, color=_GREY, linewidth=0.8, linestyle=":", zorder=0)
+                    continue
+                reliable = bool(found.reliable[axis])
+                for tone in found.vibration.amplitude[axis].nonzero()[:, 0].tolist():
+                    value = float(getattr(found.vibration, quantity)[axis, tone])
+                    std = 2 * float(getattr(found.std, quantity)[axis, tone])
+                    error = std if reliable and math.isfinite(std) else 0.0
+                    style: dict[str, Any] = {} if reliable else {"markerfacecolor": "white"}
+                    colour = _AXIS_COLOURS[name] if tone == 0 else _GREY
+                    panel.errorbar(time, value, error, fmt="o", markersize=5, capsize=2, color=colour, **style)
+                    reliable_values += [value - error, value + error] if reliable else []
+            if reliable_values:
+                low, high = min(reliable_values), max(reliable_values)
+                margin = max(0.15 * (high - low), 0.002 * abs(high))
+                panel.set_ylim(low - margin, high + margin)
+            panel.set_ylabel(f"{quantity} ({unit})", color=_INK)
+            panel.ticklabel_format(axis="y", useOffset=False)
+            plain_axes(panel)
+        panels[0, axis].set_title(f"Tones along {name}", loc="left", fontsize=12, fontweight="bold", color=_INK)
+        panels[1, axis].set_xlabel(time_label, color=_INK)
+    handles = [
+        Line2D([], [], color=_INK, marker="o", linewidth=0, label="strongest tone, reliable"),
+        Line2D([], [], color=_INK, marker="o", markerfacecolor="white", linewidth=0, label="not reliable"),
+        Line2D([], [], color=_GREY, marker="o", linewidth=0, label="weaker tone"),
+        Line2D([], [], color=_GREY, linestyle=":", label="detection failed"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9.5, frameon=False)
+    return figure
+
+
+def _batch_figure(results: DetectionResult) -> Figure:
+    """Figure of a batch of detections: windows over time, stacks over their number."""
+    parts = [results[index] for index in range(results.batch_shape[0])]
+    starts = [float(part.offsets.times.min()) for part in parts]  # to a fraction of a row
+    if results.timing is not None and (np.diff(starts) > 0.5 * results.timing.frame_period).all():
+        return windows_figure(starts, parts)
+    return windows_figure(range(len(parts)), parts, time_label="number of the stack")
+
+
+def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None) -> Figure:
+    """Draw the displacement of a motion along both axes over time.
+
+    Args:
+        motion: The motion (not a batch).
+        first: Start of the drawing in seconds.
+        last: End of the drawing; by default that of a free motion, or four periods of the tone of lower frequency.
+
+    Example:
+        >>> figure = motion_figure(Vibration([3.1, 5.2], [50.0, 30.0]))
+        >>> figure.axes[0].get_xlabel()
+        'time (ms)'
+    """
+    _check_one(motion)
+    if isinstance(motion, FreeMotion):
+        first, last = motion.start, motion.end if last is None else last
+    if last is None:
+        periods = motion.periods_within(1.0)
+        slowest = float(periods[periods > 0].min()) if bool((periods > 0).any()) else 10.0  # Hz
+        last = first + 4.0 / slowest
+    times = torch.linspace(first, last, 2000, dtype=torch.float64, device=motion.device)
+    displacement = motion.displacement(times).detach().cpu()
+    figure = _Drawing(figsize=(8, 3.6), layout="constrained")
+    _draw_displacement(figure.subplots(), times.cpu(), displacement)
+    return figure
+
+
+def _draw_displacement(panel: Axes, times: Tensor, displacement: Tensor, std: Tensor | None = None) -> None:
+    """Draw displacements (N, 2) in px at times (N,) in seconds, with a band of two standard deviations."""
+    for axis, name in enumerate("xy"):
+        values = displacement[:, axis]
+        panel.plot(1e3 * times, values, color=_AXIS_COLOURS[name], linewidth=1.3, label=name)
+        if std is not None:
+            low, high = values - 2 * std[:, axis], values + 2 * std[:, axis]
+            panel.fill_between(1e3 * times, low, high, color=_AXIS_COLOURS[name], alpha=0.2, linewidth=0)
+    panel.set_xlabel("time (ms)")
+    panel.set_ylabel("displacement (px)")
+    panel.legend(fontsize=9, frameon=False, ncols=2)
+    plain_axes(panel)
+
+
+def free_motion_figure(result: MotionDetection) -> Figure:
+    """Draw a detected motion at the rows of the frames, with a band of two standard deviations.
+
+    Args:
+        result: A detection of a free motion (not a batch).
+    """
+    figure = _Drawing(figsize=(8, 3.6), layout="constrained")
+    panel = figure.subplots()
+    for frame in range(len(result.times)):
+        parts = (values[frame].cpu() for values in (result.times, result.displacement, result.std))
+        _draw_displacement(panel, *parts)
+    panel.legend(panel.lines[:2], "xy", fontsize=9, frameon=False, ncols=2)
+    return figure
+
+
+def verdict_figure(verdict: RestorationVerdict) -> Figure:
+    """Draw the displacement between the frames of each pair before and after restoration, and the estimated gain.
+
+    Args:
+        verdict: The verdict on a restoration.
+    """
+    figure = _Drawing(figsize=(10, 3.4), layout="constrained")
+    panels = figure.subplots(1, 3)
+    pairs = np.arange(len(verdict.outcome))
+    for axis, name in enumerate("xy"):
+        for values, style, label in (
+            (verdict.misfit_before, "o-", "frames as taken"),
+            (verdict.misfit_after, "s-", "after restoration"),
+            (verdict.resolution, ":", "smallest visible"),
+        ):
+            colour = _GREY if style == ":" else _AXIS_COLOURS["y" if style == "s-" else "x"]
+            panels[axis].plot(pairs, values[:, axis].cpu(), style, color=colour, markersize=4, label=label)
+        panels[axis].set_title(f"displacement along {name} (px rms)", loc="left", fontsize=10, color=_INK)
+        panels[axis].set_ylim(bottom=0)
+    panels[0].legend(fontsize=9, frameon=False)
+    panels[2].plot(pairs, verdict.predicted_gain.cpu(), "o-", color=_AXIS_COLOURS["x"], markersize=4)
+    panels[2].axhline(0.0, color=_GREY, linewidth=0.8)
+    panels[2].set_title("estimated gain (dB)", loc="left", fontsize=10, color=_INK)
+    for panel in panels:
+        panel.set_xlabel("pair of frames")
+        panel.xaxis.get_major_locator().set_params(integer=True)
+        plain_axes(panel)
+    return figure
+
+
 def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
     """Draw the offset curve of one axis with its fit and residuals.
 
@@ -167,7 +341,8 @@ def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
         result: A detection (not a batch).
         axis: 0 for x, 1 for y.
     """
-    figure = Figure(figsize=(5.6, 4.4), layout="constrained")
+    _check_one(result)
+    figure = _Drawing(figsize=(5.6, 4.4), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     _finish_offsets(figure, panels, _draw_offsets(panels[0], panels[1], result, axis))
     return figure
@@ -182,12 +357,16 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     Args:
         result: A detection (not a batch).
         timing: The sensor.
+
+    Example:
+        >>> save_figure(gain_figure(detection, timing), "gain.png")  # doctest: +SKIP
     """
+    _check_one(result)
     vibration, std = result.vibration, result.std
     highest = max(1.35 * float((vibration.frequency * (vibration.amplitude > 0)).max()), 4.2 / timing.frame_period)
     frequency = np.linspace(0.0, highest, 2000)
     gain = np.abs(2 * np.sin(np.pi * frequency * timing.frame_period) * np.sinc(frequency * timing.exposure_time))
-    figure = Figure(figsize=(5.6, 4.6), layout="constrained")
+    figure = _Drawing(figsize=(5.6, 4.6), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1))
     upper.plot(frequency, gain, color="#555555", linewidth=1.2)
     for panel in (upper, lower):
@@ -238,12 +417,19 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figur
     """Draw mean displacement and motion blur of every row of frame 0.
 
     Args:
-        vibration: The motion.
+        vibration: The motion (not a batch).
         timing: The sensor.
         num_rows: Rows of a frame.
+
+    Example:
+        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+        >>> figure = rows_figure(Vibration([3.1, 5.2], [50.0, 30.0]), timing, num_rows=512)
+        >>> [panel.get_ylabel() for panel in figure.axes]
+        ['displacement (px)', 'motion blur (px)']
     """
+    _check_one(vibration)
     starts = timing.row_starts(1, num_rows)[0]
-    figure = Figure(figsize=(5.6, 4.6), layout="constrained")
+    figure = _Drawing(figsize=(5.6, 4.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     curves = (vibration.mean_displacement(starts, timing.exposure_time), motion_blur(vibration, starts, timing))
     for panel, values, label in zip(panels, curves, ("displacement (px)", "motion blur (px)"), strict=True):
@@ -263,10 +449,14 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
     Each kernel is centred on the mean displacement of its row, rounded to whole px; all have the same grey scale.
 
     Args:
-        vibration: The motion.
+        vibration: The motion (not a batch).
         timing: The sensor.
         num_rows: Rows of a frame.
+
+    Example:
+        >>> save_figure(psf_figure(detection.vibration, timing, num_rows=2048), "psf.png")  # doctest: +SKIP
     """
+    _check_one(vibration)
     down, across = 3, 8
     rows = torch.linspace(0, num_rows - 1, down * across).round()
     starts = timing.row_starts(1, num_rows)[0][rows.long()]
@@ -281,7 +471,7 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
     cells = np.zeros((len(rows), 2 * reach + 1, 2 * reach + 1))
     for index, (left, top) in enumerate((first.long() + reach).tolist()):
         cells[index, top : top + height, left : left + width] = psf.weights[index].numpy()
-    figure = Figure(figsize=(11.4, 4.9), layout="constrained")
+    figure = _Drawing(figsize=(11.4, 4.9), layout="constrained")
     panels = figure.subplots(down, across).flatten()
     extent = (-reach - 0.5, reach + 0.5, reach + 0.5, -reach - 0.5)
     for index, panel in enumerate(panels):
@@ -299,12 +489,16 @@ def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]]) -> Figure:
     """Draw modulation transfer functions of slanted edges: thin lines for the edges, a bold line for their mean.
 
     Args:
-        curves: Measured edges of the input and of the restored frame, by the name in the legend.
+        curves: Measured edges of the input and of the restored frame, or of one image, by the name in the legend.
+
+    Example:
+        >>> figure = mtf_figure({"raw": [raw_curve], "restored": [restored_curve]})  # doctest: +SKIP
     """
-    figure = Figure(figsize=(5.6, 3.9), layout="constrained")
+    figure = _Drawing(figsize=(5.6, 3.9), layout="constrained")
     panel = figure.subplots()
     frequency = torch.linspace(0, 0.5, 51, dtype=torch.float64)
-    for colour, (name, edges) in zip((_GREY, _AXIS_COLOURS["x"]), curves.items(), strict=True):
+    colours = (_GREY, _AXIS_COLOURS["x"])[-len(curves) :]
+    for colour, (name, edges) in zip(colours, curves.items(), strict=True):
         values = [edge.at(frequency.to(edge.lsf.device)).cpu() for edge in edges]
         for value in values:
             panel.plot(frequency, value, color=colour, linewidth=0.7, alpha=0.5)
@@ -356,11 +550,16 @@ def comparison_figure(
         count: Number of crops.
         size: Side of the crops in px.
         names: Titles of the two rows of panels.
+
+    Example:
+        >>> frame = torch.rand(96, 128, generator=torch.Generator().manual_seed(0))
+        >>> len(comparison_figure(frame, frame, count=2, size=32).axes)
+        4
     """
     raw, restored = (picture(frame) for frame in (raw, restored))
     size = min(size, *raw.shape[:2])
     places = detailed_places(restored.mean(-1), size, count, rim=16)  # boundary extension changes the border
-    figure = Figure(figsize=(4.0 * len(places) + 0.4, 8.6), layout="constrained")
+    figure = _Drawing(figsize=(4.0 * len(places) + 0.4, 8.6), layout="constrained")
     panels = figure.subplots(2, len(places), squeeze=False)
     for index, (row, column) in enumerate(places):
         crops = [frame[row : row + size, column : column + size] for frame in (raw, restored)]
@@ -385,3 +584,21 @@ def picture(frame: Tensor) -> Tensor:
     frame = frame[None] if frame.ndim == 2 else frame
     frame = frame[:3] if frame.shape[0] >= 3 else frame.mean(0, keepdim=True)
     return frame.movedim(0, -1)
+
+
+def _curve_figure(curve: MtfCurve) -> Figure:
+    return mtf_figure({f"MTF50 {measured_text(curve.mtf50, curve.mtf50_std)} cycles/px": [curve]})
+
+
+FIGURES.update(
+    {
+        (DetectionResult, 0): offset_figure,
+        (DetectionResult, 1): _batch_figure,
+        (MotionDetection, 0): free_motion_figure,
+        (SweptTone, 0): lambda result: motion_figure(result.motion),
+        (Vibration, 0): motion_figure,
+        (FreeMotion, 0): motion_figure,
+        (MtfCurve, 0): _curve_figure,
+        (RestorationVerdict, 0): verdict_figure,
+    }
+)

@@ -1,33 +1,23 @@
 """Result files: ``vibration.json``, ``offsets.csv``, ``restoration.json`` and ``windows.csv``."""
 
 import csv
-import json
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 from torch import Tensor
 
+from rsvib_torch.core.presentation import plain_values, write_json
 from rsvib_torch.core.validation import read_json, validate
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.io import whole_file
-from rsvib_torch.io.schema import DetectedVibration, DetectionRecord, TimingRecord, check_same_timing, to_json
+from rsvib_torch.io.schema import DetectedVibration, DetectionRecord, TimingRecord, check_same_timing
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks import RestoredFrames, StackManifest
 
 __all__ = ["VibrationFile", "read_vibration", "write_offsets", "write_restoration", "write_vibration", "write_windows"]
-
-_UNITS = {
-    "amplitude": "px",
-    "frequency": "Hz",
-    "period": "s",
-    "phase": "rad at the first row of frame 0",
-    "image_motion": "px/s",
-    "image_acceleration": "px/s^2",
-    "residual": "px",
-    "gain": "px of offset per px of displacement",
-}
 
 
 class VibrationFile(DetectionRecord):
@@ -38,52 +28,62 @@ class VibrationFile(DetectionRecord):
     timing: TimingRecord
     period: list[list[float | None]]
     units: dict[str, str]
+    offsets: Any = None  # the offset curve and its fit, which restoration does not need
+    fitted: Any = None
+    sensitivity: Any = None
 
 
-def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timing: SensorTiming) -> None:
-    """Write a vibration, its standard deviations and verdict as JSON, with the timing it was detected with.
+def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timing: SensorTiming | None = None) -> None:
+    """Write a detection as ``vibration.json``: vibration, standard deviations, verdict, offset curve and timing.
 
     Args:
-        path: The file to write.
+        path: The file to write; an existing file is replaced.
         result: A detection (not a batch).
-        timing: The sensor.
+        timing: The sensor; by default ``result.timing``.
 
     Raises:
         OSError: If the file cannot be written.
+        ValueError: If the result is a batch, or the timing is unknown.
+
+    Example:
+        >>> write_vibration("vibration.json", detection)  # doctest: +SKIP
     """
-    record = VibrationFile.from_detection(
-        result,
-        format="rsvib vibration",
-        version=1,
-        timing=TimingRecord.from_timing(timing),
-        period=to_json(result.vibration.period),
-        units=_UNITS,
-    ).model_dump()
-    names = ("format", "version", "timing", "vibration", "period")
-    _write_json(path, {**{name: record[name] for name in names}, **record})
+    if result.batch_shape:
+        raise ValueError(
+            f"result is a batch of shape {tuple(result.batch_shape)}; write one: write_vibration(path, result[0])"
+        )
+    timing = timing or result.timing
+    if timing is None:
+        raise ValueError("timing unknown: pass timing=SensorTiming(...) of the frames")
+    replace(result, timing=timing).save(path)
 
 
-def _write_json(path: str | os.PathLike[str], content: dict[str, Any]) -> None:
-    """Write a table with one key per line."""
-    with whole_file(path) as part:
-        lines = (f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
-        part.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
-
-
-def read_vibration(path: str | os.PathLike[str], timing: SensorTiming) -> DetectedVibration:
-    """Read a file that ``write_vibration`` wrote.
+def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = None) -> DetectedVibration:
+    """Read a ``vibration.json``, as ``restore`` needs it; ``DetectionResult.load`` also reads its offset curve.
 
     Args:
-        path: The file.
-        timing: The sensor of the frames to be restored.
+        path: A file written by ``write_vibration``, ``DetectionResult.save`` or the program.
+        timing: The sensor of the frames to be restored, which must be that of the file; None not to compare them.
 
     Raises:
         OSError: If the file cannot be opened.
         ValueError: If it is not a complete ``vibration.json``, or was detected with another timing.
+
+    Example:
+        >>> restored = restore(frames, timing, read_vibration("vibration.json", timing))  # doctest: +SKIP
     """
     path = Path(path)
-    record = validate(VibrationFile, read_json(path, "vibration.json"), str(path))
-    check_same_timing(str(path), record.timing, timing)
+    data = read_json(path, "vibration.json")
+    if data.get("format") not in (None, DetectionResult.file_format):
+        raise ValueError(
+            f"{path}: not a vibration.json, but a file of the format {data['format']!r}; give the vibration.json, or "
+            "the manifest.json of windows, that rsvib detect or run wrote"
+        )
+    if isinstance(data.get("reliable"), list) and any(isinstance(entry, list) for entry in data["reliable"]):
+        raise ValueError(f"{path}: a batch of detections; read it with DetectionResult.load, and pass one of them")
+    record = validate(VibrationFile, data, str(path))
+    if timing is not None:
+        check_same_timing(str(path), record.timing, timing)
     try:
         return record.to_detection()
     except ValueError as error:
@@ -91,14 +91,17 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming) -> Detect
 
 
 def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None:
-    """Write the measured and the fitted offset curve as CSV, one line per band; a failed band has empty offsets.
+    """Write the measured and the fitted offset curve as CSV; offsets that were not measured are empty.
 
     Args:
-        path: The file to write.
+        path: The file to write; an existing file is replaced.
         result: A detection (not a batch).
 
     Raises:
         OSError: If the file cannot be written.
+
+    Example:
+        >>> write_offsets("offsets.csv", detection)  # doctest: +SKIP
     """
     curve = result.offsets
     count = curve.times.shape[-1]
@@ -113,7 +116,9 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
         "fitted_y_px": result.fitted[..., 1],
         "quality": curve.quality,
     }
-    values = [to_json(column.flatten()) for column in columns.values()]
+    if curve.std is not None:
+        columns |= {"std_x_px": curve.std[..., 0], "std_y_px": curve.std[..., 1]}
+    values = [plain_values(column.flatten()) for column in columns.values()]
     _write_csv(path, columns, zip(*values, strict=True))
 
 
@@ -130,10 +135,13 @@ def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None
 
     Args:
         path: The file to write.
-        manifest: The manifest of the stack.
+        manifest: The manifest of the stack, from ``read_manifest``.
 
     Raises:
         OSError: If the file cannot be written.
+
+    Example:
+        >>> write_windows("windows.csv", read_manifest("manifest.json"))  # doctest: +SKIP
     """
     quantities = ("amplitude", "frequency", "phase")
     head = ["window", "first_frame", "last_frame", "start_s"]
@@ -179,11 +187,11 @@ def write_restoration(
         "options": options,
         "left_alone": list(result.left_alone),
         "outcome": None if verdict is None else verdict.overall,
-        "summary": None if verdict is None else verdict.summary,
+        "summary": None if verdict is None else verdict.sentence,
         "not_kept": list(not_kept),
     }
     if verdict is not None:
-        pairs = {name: to_json(value) for name, value in vars(verdict).items() if isinstance(value, Tensor)}
+        pairs = {name: plain_values(value) for name, value in vars(verdict).items() if isinstance(value, Tensor)}
         content["pairs"] = {**pairs, "outcome": list(verdict.outcome), "reasons": list(verdict.reasons)}
         content["units"] = {"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"}
-    _write_json(path, content)
+    write_json(path, content)

@@ -11,7 +11,9 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import extend_rows, extended_length
+from rsvib_torch.core.progress import steps
 from rsvib_torch.core.splines import bspline_weights, mirrored
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
@@ -174,8 +176,9 @@ def restore_banded(
     kept = torch.arange(stride, device=frames.device) - (stride - 1) // 2
     spectra = torch.view_as_real(_aligned_spectra(frames, motion, u, length)).movedim(-1, 0).contiguous()
     restored = frames.new_empty(B * T * len(centres), stride, C, W)
-    for begin in range(0, len(slab_rows), chunk_rows):
-        chunk = slice(begin, begin + chunk_rows)
+    chunks = runs(len(slab_rows), chunk_rows)
+    advance = steps(len(chunks), "chunks")
+    for chunk in chunks:
         bank = _filters(displacement[chunk], node_weights, grid, weight[chunk], interpolation)
         source = mirrored(slab_rows[chunk, None, None] + kept[:, None] - lags, H)  # (n, stride, V)
         a, b = bank[:, 0, None, :, None], bank[:, 1, None, :, None]
@@ -184,5 +187,6 @@ def restore_banded(
             torch.addcmul(real * a, imaginary, b, value=-1).sum(2), torch.addcmul(real * b, imaginary, a).sum(2)
         )
         restored[chunk] = torch.fft.irfft(rows_out, n=length)[..., :W]
+        advance()
     stacked: Tensor = restored.unflatten(0, (B, T, len(centres))).flatten(2, 3)[:, :, :H]
     return stacked.movedim(3, 2)

@@ -329,7 +329,7 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Motion, 
             continue  # frames that share no scene cannot be compared
         if verdict.overall in ("partly", "worse"):
             where = f"stack {stack}: " if len(raw) > 1 else ""
-            summary = verdict.in_image_axes(frames.image_timing).summary
+            summary = verdict.in_image_axes(frames.image_timing).sentence
             warnings.warn(f"{where}{summary}", RestorationWarning, stacklevel=5)  # the caller of ``restore``
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.imaging.blur import RowVaryingBlur
 from rsvib_torch.imaging.psf import RowPSF, row_psf
@@ -88,9 +89,11 @@ def _iterate(counts: Tensor, measured: Tensor, start: Tensor, kernels: RowPSF, i
     sensitivity = blur.adjoint(measured, size)
     visible = sensitivity > 0.1  # of one pixel; a coefficient that affects the pixels less keeps its initial value
     scene = torch.maximum(start, 1e-4 * mean)  # from a lower value, multiplicative updates need many iterations
+    advance = steps(iterations, "iterations")
     for _ in range(iterations):
         ratio = counts / blur(scene).clamp(min=tiny)
         scene = torch.where(visible, scene * blur.adjoint(ratio, size) / sensitivity.clamp(min=tiny), scene)
+        advance()
     return scene
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice, check_whole_number
+from rsvib_torch.core.presentation import Summarised, plain_values
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.io.files import PathLike, open_stack, read_stack_info
 from rsvib_torch.io.formats import FrameReader
@@ -48,8 +49,8 @@ class RestoreOptions(DetectOptions, total=False):
     force: bool
 
 
-@dataclass(frozen=True, eq=False)
-class WindowResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class WindowResult(Summarised):
     """One window of a stack, restored.
 
     Attributes:
@@ -71,6 +72,18 @@ class WindowResult:
     restoration: RestoredFrames | None
     error: str | None
     bad_frames: Mapping[int, str]
+
+    def summary(self) -> str:
+        """Frames of the window, its vibration, and what was restored."""
+        state = "restored" if self.restored else "unchanged"
+        lines = [f"window {self.window.index}, frames {self.window.first} … {self.window.last}: {state}"]
+        if self.detection is not None:
+            lines.append(self.detection.summary())
+        if self.restoration is not None:
+            lines += self.restoration.left_alone
+            lines += [] if self.restoration.verdict is None else [self.restoration.verdict.sentence]
+        lines += [] if self.error is None else [self.error]
+        return "\n".join([*lines, *(f"frame {index}: {fault}" for index, fault in self.bad_frames.items())])
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +227,8 @@ class StackJob:
             "detection": detection_to_json(result.detection),
             "left_alone": [] if restoration is None else list(restoration.left_alone),
             "outcome": None if verdict is None else verdict.overall,
-            "summary": None if verdict is None else verdict.summary,
+            "summary": None if verdict is None else verdict.sentence,
+            "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
             "error": result.error,
             "bad_frames": {str(index): reason for index, reason in result.bad_frames.items()},
         }

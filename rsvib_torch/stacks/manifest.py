@@ -3,13 +3,16 @@
 import hashlib
 import json
 import os
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
 from pydantic import Field
 
+from rsvib_torch.core.presentation import Summarised, measured_text, text_table, wrapped
 from rsvib_torch.core.validation import Section, read_json, validate
 from rsvib_torch.io.schema import DetectedVibration, DetectionRecord, TimingRecord, detection_to_json
 from rsvib_torch.stacks.job import StackJob
@@ -30,7 +33,8 @@ class WindowRecord(Section):
         detection: The detection; None if it failed.
         left_alone: A sentence for each axis that was not restored.
         outcome: ``RestorationVerdict.overall``; None if the frames could not be compared.
-        summary: ``RestorationVerdict.summary``.
+        summary: ``RestorationVerdict.sentence``.
+        predicted_gain: Mean of ``RestorationVerdict.predicted_gain`` in dB; None if unknown.
         error: Why detection or restoration failed.
         bad_frames: Index of each frame that could not be used, with the reason.
     """
@@ -45,11 +49,12 @@ class WindowRecord(Section):
     left_alone: list[str]
     outcome: str | None
     summary: str | None
+    predicted_gain: float | None = None
     error: str | None
     bad_frames: dict[str, str]
 
 
-class StackManifest(Section):
+class StackManifest(Summarised, Section):
     """Content of ``manifest.json``.
 
     Attributes:
@@ -80,9 +85,71 @@ class StackManifest(Section):
         """Everything that was determined before the first window, as made by ``manifest_header``."""
         return self.model_dump(include={"input", "settings", "versions", "output"})
 
+    def summary(self) -> str:
+        """Tones over the windows, what was restored, and what failed."""
+        vibration, restoration = self.lines()
+        return "\n".join([*vibration, *(restoration if self.output is not None else [])])
+
+    def totals(self) -> dict[str, Any]:
+        """Summary of the windows of a stack: numbers of windows, gain, tones of each axis, and axes left unchanged.
+
+        Tones are medians over the reliable windows of the strongest tone, with the standard deviation over the windows.
+        """
+        windows, found = self.windows, self.detections()
+        gains = [record.predicted_gain for record in windows if record.predicted_gain is not None]
+        notes = [(str(record.window), note) for record in windows for note in record.left_alone]
+        unchanged = {name: {window: note for window, note in notes if note.startswith(name)} for name in "xy"}
+        return {
+            "windows": len(windows),
+            "restored": sum(record.frames == "restored" for record in windows),
+            "outcomes": dict(Counter(record.outcome for record in windows if record.outcome is not None)),
+            "predicted_gain_db": {"lowest": min(gains), "highest": max(gains)} if gains else None,
+            "tones": {name: _tone_over_windows(found, axis) for axis, name in enumerate("xy")},
+            "left_alone": unchanged,
+            "errors": {str(record.window): record.error for record in windows if record.error is not None},
+            "bad_frames": self.bad_frames,
+        }
+
+    def lines(self) -> tuple[list[str], list[str]]:
+        """The totals as lines of text: about the vibration, and about the restoration."""
+        data = self.totals()
+        rows, count = [], data["windows"]
+        for name, tone in data["tones"].items():
+            texts = [
+                "" if tone[quantity] is None else measured_text(tone[quantity], tone[f"{quantity}_spread"])
+                for quantity in ("amplitude", "frequency")
+            ]
+            rows.append([name, f"{tone['reliable_windows']} of {count}", *texts])
+        table = text_table(("axis", "reliable windows", "amplitude (px)", "frequency (Hz)"), rows)
+        vibration = [table, "strongest tone: median ± standard deviation over the windows"]
+        restoration = [f"{data['restored']} of {count} windows restored"]
+        if data["predicted_gain_db"] is not None:
+            low, high = data["predicted_gain_db"].values()
+            restoration.append(f"estimated gain {low:+.1f} … {high:+.1f} dB")
+        for name, notes in data["left_alone"].items():
+            if notes:
+                window, note = next(iter(notes.items()))
+                restoration.append(wrapped(f"{name} unchanged in {len(notes)} windows; in window {window}: {note}"))
+        if data["errors"]:
+            window, error = next(iter(data["errors"].items()))
+            failed = f"detection or restoration failed in {len(data['errors'])} windows"
+            vibration.append(wrapped(f"{failed}; in window {window}: {error}"))
+        return vibration, restoration
+
     def detections(self) -> list[DetectedVibration | None]:
         """The detection of every window; None where it failed."""
         return [None if record.detection is None else record.detection.to_detection() for record in self.windows]
+
+
+def _tone_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> dict[str, Any]:
+    """Number of windows in which an axis is reliable, and median and spread of its strongest tone over them."""
+    reliable = [one.vibration for one in found if one is not None and bool(one.reliable[axis])]
+    data: dict[str, Any] = {"reliable_windows": len(reliable)}
+    for name in ("amplitude", "frequency"):
+        values = torch.tensor([float(getattr(one, name)[axis, 0]) for one in reliable], dtype=torch.float64)
+        data[name] = float(values.median()) if len(values) else None
+        data[f"{name}_spread"] = float(values.std()) if len(values) > 1 else None
+    return data
 
 
 def fingerprint(path: Path, *, block: int = 1 << 16, blocks: int = 32, files: int = 32) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.atomic import move_into_place, nearest_folder, whole_file
+from rsvib_torch.core.atomic import move_into_place, nearest_folder, whole_file
 from rsvib_torch.io.files import write_frames
 from rsvib_torch.io.formats import FrameWriter, StackFormat
 from rsvib_torch.io.stack_info import StackInfo

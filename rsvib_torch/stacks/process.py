@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Unpack
 
-from rsvib_torch.io.atomic import whole_file
+from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept
 from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.schema import DetectedVibration
@@ -33,8 +34,8 @@ __all__ = ["DEFAULT_WINDOW", "StackReport", "detect_stack", "iterate_stack", "pr
 _MAX_INITIAL_FAILURES = 8  # windows; a run stops if all windows up to this number fail
 
 
-@dataclass(frozen=True, eq=False)
-class StackReport:
+@dataclass(frozen=True, eq=False, repr=False)
+class StackReport(Summarised):
     """Summary of a run.
 
     Attributes:
@@ -60,6 +61,19 @@ class StackReport:
     first: WindowResult | None
     manifest: Path
     not_kept: tuple[str, ...]
+
+    def summary(self) -> str:
+        """Numbers of frames and windows, and the time."""
+        lines = [f"{self.frames} frames in {self.windows} windows, {self.restored} windows restored"]
+        if self.frames and not self.resumed:
+            lines[0] += f", {self.seconds / self.frames:.2g} s per frame"
+        if self.resumed:
+            lines.append(f"{self.resumed} windows were complete before this run")
+        if self.failed:
+            lines.append(f"detection or restoration failed in {self.failed} windows: see {self.manifest.name}")
+        if self.bad_frames:
+            lines.append(f"{self.bad_frames} frames could not be used: see {self.manifest.name}")
+        return "\n".join(lines)
 
 
 def iterate_stack(source: PathLike, timing: SensorTiming, **options: Unpack[RestoreOptions]) -> Iterator[WindowResult]:

@@ -107,7 +107,7 @@ def test_detect_then_restore(place, tmp_path, capsys):
     assert shown.err == ""
     assert "amplitude (px)" in shown.out
     assert re.search(r"\b7[01]\.\d", shown.out)
-    assert shown.out.count("reliable") == 2
+    assert shown.out.count(": reliable") == 2
     restored = tmp_path / "restored.tif"
     assert run("restore", frames, restored, "--config", config, "--vibration", out / "vibration.json") == 0
     info = read_stack_info(restored)
@@ -119,8 +119,8 @@ def test_detect_then_restore(place, tmp_path, capsys):
 
 def test_run_writes_all_results_and_can_be_repeated(place, tmp_path):
     out = tmp_path / "out"
-    for _ in range(2):
-        assert run("run", place / "frames.tif", out, "--config", place / "camera.toml") == 0
+    for more in ((), ("--overwrite",)):
+        assert run("run", place / "frames.tif", out, "--config", place / "camera.toml", *more) == 0
     names = [
         "before_after.png",
         "manifest.json",
@@ -160,11 +160,10 @@ def test_an_unreliable_axis_is_not_restored(place, tmp_path, capsys):
     path.write_text(json.dumps(data))
     capsys.readouterr()
     assert run("restore", frames, tmp_path / "restored.tif", "--config", config, "--vibration", path) == 0
-    shown = capsys.readouterr().out.splitlines()
-    assert shown[:2] == [
-        "x is not restored: its vibration is not reliable (blind)",
-        "y is not restored: its vibration is not reliable (too short; noisy)",
-    ]
+    shown = capsys.readouterr().out
+    assert "  x: not reliable:\n   - blind\n  y: not reliable:\n   - too short\n   - noisy\n" in shown
+    assert "  y unchanged: its vibration is not reliable, see the reasons above\n" in shown
+    assert "  2 frames unchanged\n" in shown
     difference = read_stack(tmp_path / "restored.tif") - read_stack(frames)
     assert difference.abs().mean() < 0.01
 
@@ -180,13 +179,13 @@ def test_metadata_are_kept_or_listed(place, tmp_path, capsys):
         assert [tif.pages[1].tags[code].value for code in (33550, 42113)] == [(0.5, 0.5, 0.0), "0"]
     assert json.loads((tmp_path / "out" / "restoration.json").read_text())["not_kept"] == []
     names = ["ModelPixelScaleTag", "GDAL_NODATA"]
-    assert run("run", tmp_path / "geo.tif", tmp_path / "out", *config, "--output", "restored.npy") == 0
+    assert run("run", tmp_path / "geo.tif", tmp_path / "out", *config, "--output", "restored.npy", "--overwrite") == 0
     assert f"restored.npy: not kept from the input: {', '.join(names)}\n" in capsys.readouterr().out
     for file in ("restoration.json", "manifest.json"):
         assert json.loads((tmp_path / "out" / file).read_text())["not_kept"] == names
     for name, lost in (("r.tif", []), ("r.h5", names)):
         found = ("--vibration", tmp_path / "out" / "vibration.json", "--report", tmp_path / "report.json")
-        assert run("restore", tmp_path / "geo.tif", tmp_path / name, *config, *found) == 0
+        assert run("restore", tmp_path / "geo.tif", tmp_path / name, *config, *found, "--overwrite") == 0
         assert ("not kept from the input: ModelPixelScaleTag, GDAL_NODATA" in capsys.readouterr().out) == bool(lost)
         assert json.loads((tmp_path / "report.json").read_text())["not_kept"] == lost
 
@@ -215,7 +214,7 @@ def test_a_wrong_vibration_leaves_the_frames_unchanged_unless_forced(place, tmp_
     assert (tifffile.imread(tmp_path / "r.tif") == tifffile.imread(place / "frames.tif")).all()
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["frames"], report["outcome"], report["pairs"]["outcome"]) == ("as taken", "worse", ["worse"])
-    assert run(*arguments, "--force", "--report", tmp_path / "report.json") == 0
+    assert run(*arguments, "--force", "--report", tmp_path / "report.json", "--overwrite") == 0
     assert "restored is no better than raw" in capsys.readouterr().err
     assert (tifffile.imread(tmp_path / "r.tif") != tifffile.imread(place / "frames.tif")).any()
     assert json.loads((tmp_path / "report.json").read_text())["frames"] == "restored"
@@ -237,7 +236,7 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     out = tmp_path / "out"
     config = tmp_path / "dewarp.toml"
     config.write_text(CONFIG + "[restoration]\nmethod = 'banded'\nhalf_rows = 8\nsaturation = 4000\n")
-    common = ("run", place / "frames.tif", out, "--config", config)
+    common = ("run", place / "frames.tif", out, "--config", config, "--overwrite")
     assert run(*common) == 0
     report = json.loads((out / "restoration.json").read_text())
     assert report["options"] == {"method": "banded", "half_rows": 8, "saturation": 4000 / 4095}
@@ -272,7 +271,7 @@ def test_frames_without_vibration_are_unchanged(place, tmp_path, capsys):
     assert run("run", tmp_path / "still.tif", tmp_path / "out", "--config", place / "camera.toml") == 0
     shown = capsys.readouterr()
     assert "no vibration to remove: the frames are written unchanged" in shown.err
-    assert "x is not restored: its vibration is not reliable" in shown.out
+    assert "x unchanged: its vibration is not reliable, see the reasons above" in shown.out
     assert (tifffile.imread(tmp_path / "out" / "restored.tif") == tifffile.imread(tmp_path / "still.tif")).all()
     assert json.loads((tmp_path / "out" / "restoration.json").read_text())["frames"] == "as taken"
 
@@ -296,11 +295,11 @@ def test_saturated_and_missing_pixels(place, tmp_path):
 def test_full_scale_comes_from_option_file_or_config(place, tmp_path, capsys):
     counts = tifffile.imread(place / "frames.tif")
     tifffile.imwrite(tmp_path / "plain.tif", counts, photometric="minisblack")
-    arguments = (tmp_path / "plain.tif", "--config", place / "camera.toml", "--out", tmp_path / "out")
+    arguments = (tmp_path / "plain.tif", "--config", place / "camera.toml", "--out", tmp_path / "out", "--overwrite")
     assert run("detect", *arguments) == 0  # the full scale is in the configuration
     silent = tmp_path / "silent.toml"
     silent.write_text(CONFIG.replace("full_scale = 4095", ""))
-    assert run("detect", arguments[0], "--config", silent, "--out", tmp_path / "out", "--full-scale", 4095) == 0
+    assert run("detect", arguments[0], "--config", silent, "--out", tmp_path / "o", "--full-scale", 4095) == 0
     capsys.readouterr()
     assert run("detect", arguments[0], "--config", silent, "--out", tmp_path / "out2") == 2
     assert "full scale of uint16 frames unknown: pass full_scale, e.g. full_scale=4095" in capsys.readouterr().err

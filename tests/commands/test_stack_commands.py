@@ -54,7 +54,7 @@ def test_run_of_a_long_stack(place, tmp_path, capsys):
     shown = capsys.readouterr()
     assert shown.err == ""
     assert "13 frames in 4 windows, 4 windows restored, " in shown.out
-    names = ["before_after.png", "clear.zarr", "manifest.json", "windows.csv"]
+    names = ["before_after.png", "clear.zarr", "manifest.json", "windows.csv", "windows.json", "windows.png"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
     assert read_stack_info(tmp_path / "out" / "clear.zarr").full_scale == 4095
     with (tmp_path / "out" / "windows.csv").open() as file:
@@ -69,7 +69,8 @@ def test_run_of_a_long_stack(place, tmp_path, capsys):
 def test_detect_in_windows_then_restore(place, tmp_path, capsys):
     options = ("--config", place / "camera.toml")
     assert run("detect", place / "frames.tif", *options, "--out", tmp_path / "found", "--memory", "1GB") == 0
-    assert sorted(path.name for path in (tmp_path / "found").iterdir()) == ["manifest.json", "windows.csv"]
+    names = ["manifest.json", "windows.csv", "windows.json", "windows.png"]
+    assert sorted(path.name for path in (tmp_path / "found").iterdir()) == names
     manifest = tmp_path / "found" / "manifest.json"
     assert run("restore", place / "frames.tif", tmp_path / "r.tif", *options, "--vibration", manifest) == 0
     assert (tmp_path / "r.tif").read_bytes() == (place / "out" / "restored.tif").read_bytes()

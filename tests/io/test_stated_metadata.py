@@ -180,7 +180,7 @@ def test_images_are_read_as_stored_and_their_orientation_is_kept(tmp_path, capsy
     config = ("--config", tmp_path / "camera.toml")
     for output in ("images", "restored.tif", "restored.h5", "restored.zarr", "restored.raw", "restored.mp4"):
         name = tmp_path / "out" / output
-        assert rsvib("run", tmp_path / "frames", tmp_path / "out", *config, "--output", output) == 0
+        assert rsvib("run", tmp_path / "frames", tmp_path / "out", *config, "--output", output, "--overwrite") == 0
         assert "displayed rotated by 90 degrees clockwise" in capsys.readouterr().out
         assert read_stack_info(name).orientation == 6
         restored = read_stack(name)

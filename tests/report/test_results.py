@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from rsvib_torch.commands.terminal import print_detection
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.motion.timing import SensorTiming
@@ -132,6 +131,7 @@ def put(data, value, *keys):
         (lambda d: put(d, -3.0, "vibration", "amplitude", 0, 0), "vibration: amplitude must not be negative"),
         (lambda d: put(d, [True], "reliable"), "reliable: expected 2 entries, got [True]"),
         (lambda d: put(d, 2, "version"), "version: expected 1, got 2"),
+        (lambda d: put(d, "rsvib windows", "format"), "not a vibration.json, but a file of the format 'rsvib windows'"),
         (lambda d: put(d, 0.0, "timing", "row_time"), "timing: row_time must be larger than 0"),
         (lambda d: put(d, 1, "colour"), "colour: unknown key"),
     ],
@@ -260,15 +260,3 @@ def test_comparison_draws_the_same_crop_of_both_frames(tmp_path, shape):
         assert after.get_array().mean() < before.get_array().mean()  # the grey scale is common to both
     save_figure(figure, tmp_path / "before_after.png", dpi=40)
     assert (tmp_path / "before_after.png").stat().st_size > 1000
-
-
-def test_printed_detection(capsys, result):
-    print_detection(result)
-    out = capsys.readouterr().out
-    assert "2.000 ± 0.010" in out  # two significant digits of the standard deviation
-    assert "60.000 ± 0.010" in out
-    assert out.count("∞") == 0
-    words = " ".join(out.split())
-    assert "image motion 20.00 ± 0.10 px/s; reliable" in words
-    assert "y: residual" in words
-    assert words.endswith("not reliable: only one period is seen")

@@ -76,7 +76,7 @@ def test_correct_vibration_helps(scene, name, noise, scale):
     timing, motion = camera(), scaled_motion(scale)
     frames = frames_of(scene(name), timing, motion, noise)
     verdict, restored = judged(frames, timing, motion.vibration())
-    assert verdict.overall == "helps", verdict.summary
+    assert verdict.overall == "helps", verdict.sentence
     assert verdict.helped.all()
     assert (verdict.misfit_after < (0.2 * verdict.misfit_before).clamp(min=0.05)).all()
     # the displacement between the frames, from its own formula
@@ -112,7 +112,7 @@ def test_wrong_vibration_is_rejected(scene, name, noise, scale, wrong):
     timing, motion = camera(), scaled_motion(scale)
     frames = frames_of(scene(name), timing, motion, noise)
     verdict, _ = judged(frames, timing, WRONG[wrong](motion).vibration())
-    assert verdict.overall in ("partly", "worse"), verdict.summary
+    assert verdict.overall in ("partly", "worse"), verdict.sentence
     assert not verdict.helped.any()
     if wrong == "half amplitude":
         ratio = verdict.misfit_after / verdict.misfit_before
@@ -127,7 +127,7 @@ def test_vibration_that_does_not_exist_is_rejected(scene, name, noise, scale):
     frames = frames_of(scene(name), camera(), scaled_motion(0.0), noise)
     verdict, _ = judged(frames, camera(), scaled_motion(scale).vibration())
     assert verdict.overall == "worse"
-    assert "frames lie" in verdict.summary
+    assert "frames lie" in verdict.sentence
     joint, _ = judged(frames, camera(), scaled_motion(scale).vibration(), joint=True)
     assert joint.overall == "worse"
 
@@ -140,7 +140,7 @@ def test_blind_vibration_is_unknown(scene, noise):
         verdict, _ = judged(frames, camera(), vibration)
         assert verdict.overall == "unknown"
         assert not verdict.helped.any()
-        assert "all are displaced alike" in verdict.summary
+        assert "all are displaced alike" in verdict.sentence
 
 
 def test_disagreement_of_the_restored_frames_reduces_the_gain(scene):
@@ -275,7 +275,7 @@ def test_frames_may_differ_in_brightness(scene, joint, gain, offset):
     frames = frames_of(scene("city"), timing, motion, 0.005)
     frames = torch.stack([frames[0], gain * frames[1] + offset])
     verdict, _ = judged(frames, timing, motion.vibration(), joint=joint)
-    assert verdict.overall == "helps", verdict.summary
+    assert verdict.overall == "helps", verdict.sentence
     for wrong in WRONG.values():
         assert judged(frames, timing, wrong(motion).vibration(), joint=joint)[0].overall in ("partly", "worse")
 
@@ -290,7 +290,7 @@ def test_small_wrong_motion_beside_a_large_correct_motion_is_accepted(scene, axi
     slightly[axis] = 0.06
     verdict, restored = judged(frames, timing, Vibration(slightly, FREQUENCY, (0.4, 1.3)))
     assert decibel(restored[1], crop(scene("city"))) > decibel(frames[1], crop(scene("city"))) + 10
-    assert verdict.overall in ("helps", "unknown"), verdict.summary
+    assert verdict.overall in ("helps", "unknown"), verdict.sentence
     much = list(large)
     much[axis] = 2.0
     assert judged(frames, timing, Vibration(much, FREQUENCY, (0.4, 1.3)))[0].overall == "worse"
@@ -389,7 +389,7 @@ def test_the_gain_never_contradicts_the_outcome(scene, noise, factor):
     verdict, _ = judged(frames, timing, motion.scaled(factor).vibration())
     gain = float(verdict.predicted_gain)
     sign = {"helps": 1, "partly": 1, "worse": -1, "unknown": 0}[verdict.overall]
-    assert math.isnan(gain) or sign * gain >= 0, verdict.summary
+    assert math.isnan(gain) or sign * gain >= 0, verdict.sentence
     assert sign != 1 if factor in (2.2, 3.0) else sign != -1 or noise == 0.08
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.presentation import Result, measured_text, wrapped
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
@@ -24,8 +25,8 @@ from rsvib_torch.registration import Registration, RegistrationOptions
 __all__ = ["ClockAlignment", "align_motion"]
 
 
-@dataclass(frozen=True, eq=False)
-class ClockAlignment:
+@dataclass(frozen=True, eq=False, repr=False)
+class ClockAlignment(Result, units={"offset": "s", "offset_std": "s", "drift": "px/s", "unexplained": "px"}):
     """Time of the frames within a recorded motion: ``scale t + offset`` on its clock.
 
     Attributes:
@@ -51,6 +52,20 @@ class ClockAlignment:
     unexplained: Tensor
     reliable: bool
     reasons: tuple[str, ...]
+
+    def summary(self) -> str:
+        """Offset and scale of the clock with standard deviations, gain, drift, and the verdict."""
+        verdict = "reliable" if self.reliable else f"not reliable: {'; '.join(self.reasons)}"
+        drift, left = self.drift.tolist(), self.unexplained.tolist()
+        return "\n".join(
+            [
+                f"time 0 of the frames is {measured_text(self.offset, self.offset_std)} s of the recording",
+                f"scale {measured_text(self.scale, self.scale_std or None, digits=8)}",
+                f"x: gain {self.gain[0]:.4f}, drift {drift[0]:.3g} px/s, {left[0]:.2g} px unexplained",
+                f"y: gain {self.gain[1]:.4f}, drift {drift[1]:.3g} px/s, {left[1]:.2g} px unexplained",
+                wrapped(verdict),
+            ]
+        )
 
 
 @dataclass(frozen=True)

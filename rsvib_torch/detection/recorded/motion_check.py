@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.presentation import Result, measured_text, text_table
 from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.shapes.free import start_curve
@@ -26,8 +27,8 @@ __all__ = ["MotionCheck", "check_motion"]
 _MIN_CHANGE = 0.05  # px, registration errors of bands
 
 
-@dataclass(frozen=True, eq=False)
-class MotionCheck:
+@dataclass(frozen=True, eq=False, repr=False)
+class MotionCheck(Result, units={"before": "px", "after": "px"}):
     """Offsets of rows between frames, before and after a given motion is subtracted.
 
     Attributes:
@@ -42,6 +43,15 @@ class MotionCheck:
     after: Tensor
     helps: bool
     reasons: tuple[str, ...]
+
+    def summary(self) -> str:
+        """Offsets before and after the motion is subtracted, and the verdict."""
+        rows = [
+            [name, measured_text(before, digits=3), measured_text(after, digits=3)]
+            for name, before, after in zip("xy", self.before, self.after, strict=True)
+        ]
+        table = text_table(("axis", "offset between frames (px rms)", "without the motion (px rms)"), rows)
+        return "\n".join([table, "the motion reduces the offsets" if self.helps else "not reduced", *self.reasons])
 
 
 @outside_graphs

@@ -14,6 +14,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -52,6 +53,7 @@ from rsvib_torch.detection.tones.selection import (
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import blind_frequencies
+from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.row_spectra import RowSpectra
 
@@ -66,16 +68,18 @@ class DirectFit:
         measurements: Displacements of blocks of scene rows, measured around the fit.
         fit: The fit to them.
         other_motion: Motion in the measurements that the fit does not explain.
+        robust_weights: (B, N, 2) weights 0 ... 1 by which the information of each row was multiplied; 0 for outliers.
     """
 
     measurements: Measurements
     fit: ToneFit
     other_motion: OtherMotion
+    robust_weights: Tensor
 
 
 def refine_directly(
     spectra: RowSpectra, timing: RowTiming, start: ToneFit, tones: int | None, max_rounds: int = 12
-) -> DirectFit:
+) -> tuple[DirectFit, OffsetCurve, Tensor]:
     """Refine a detected motion on the images.
 
     With two frames, tones equally far above and below a blind frequency have the same gain and differ only within a
@@ -90,7 +94,8 @@ def refine_directly(
         max_rounds: Largest number of rounds of measuring and fitting.
 
     Returns:
-        The last measurements and the fit to them.
+        The last measurements and the fit to them, the measurements as offsets between consecutive frames, and the
+        offsets (B, P, N, 2) in px that the fit predicts.
     """
     intervals = compared_intervals(timing, spectra.values.shape[1], MAX_GROUP_FRAMES, start.active.device)
     motion = shrunk_motion(start, intervals)
@@ -108,7 +113,52 @@ def refine_directly(
     if tones is None:
         found = replace(found, fit=significant_only(found.measurements, found.fit, intervals))
     blur = torch.stack(blur_ratio(groups, timing, shrunk_motion(found.fit, intervals)), -1)
-    return replace(found, other_motion=replace(found.other_motion, blur=blur))
+    found = replace(found, other_motion=replace(found.other_motion, blur=blur))
+    return found, *_offset_curve(found, [group.starts.shape[1] for group in groups])
+
+
+def _offset_curve(found: DirectFit, group_frames: Sequence[int]) -> tuple[OffsetCurve, Tensor]:
+    """Measured offsets between consecutive frames, and those (B, P, N, 2) in px that the fit predicts.
+
+    Args:
+        found: The fit, with the measurements of all groups behind each other.
+        group_frames: Number of frames of each group; neighbouring groups share a frame.
+    """
+    measurements = found.measurements
+    count = measurements.displacements.shape[1] // len(group_frames)
+    parts = [
+        (slice(number * count, (number + 1) * count), slice(frame, frame + 2))
+        for number, frames in enumerate(group_frames)
+        for frame in range(frames - 1)
+    ]
+
+    def of_pairs(values: Tensor) -> tuple[Tensor, Tensor]:
+        """Values (B, N, G, ...) of the earlier and the later frame of each pair, (B, P, N, ...)."""
+        earlier, later = torch.stack([values[:, rows, frames] for rows, frames in parts], 1).unbind(3)
+        return earlier, later
+
+    def of_rows(values: Tensor) -> Tensor:
+        return torch.stack([values[:, rows] for rows, _ in parts], 1)
+
+    starts, later_starts = of_pairs(measurements.exposure_starts)
+    before, after = of_pairs(measurements.displacements)
+    everywhere = replace(measurements, visible=torch.ones_like(measurements.visible))
+    fitted_before, fitted_after = of_pairs(model_displacements(everywhere, found.fit))
+    visible = torch.stack(of_pairs(measurements.visible)).amin(0) > 0
+    weights, robust = of_rows(measurements.weights), of_rows(found.robust_weights)
+    measured = visible & (weights > 0).any(-1)
+    frames = torch.arange(len(parts), device=starts.device)
+    curve = OffsetCurve(
+        pairs=torch.stack([frames, frames + 1], -1),
+        rows=BLOCK_ROWS * (torch.arange(count, dtype=torch.float64, device=starts.device) + 0.5) - 0.5,
+        times=starts,
+        later_times=later_starts,
+        offsets=torch.where(measured[..., None], after - before, torch.nan),
+        quality=torch.where(measured, robust.amin(-1), 0.0),
+        heights=(BLOCK_ROWS, BLOCK_ROWS),
+        std=torch.where(weights > 0, (2.0 * robust / weights).sqrt(), torch.nan),  # of a difference of two
+    )
+    return curve, fitted_after - fitted_before
 
 
 def _refine(
@@ -292,7 +342,12 @@ def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:
 
     frequencies = tones(other.fit.frequencies, one.fit.frequencies)
     fit = fit_tones(measurements, frequencies, tones(other.fit.active, one.fit.active), one.fit.model)
-    return DirectFit(measurements, fit, select_stacks(better, other.other_motion, one.other_motion))
+    return DirectFit(
+        measurements,
+        fit,
+        select_stacks(better, other.other_motion, one.other_motion),
+        torch.where(better[:, None, None], other.robust_weights, one.robust_weights),
+    )
 
 
 def _conclude(measurements: Measurements, fit: ToneFit, gradients: list[RowGradients]) -> DirectFit:
@@ -313,4 +368,5 @@ def _conclude(measurements: Measurements, fit: ToneFit, gradients: list[RowGradi
         measured=measured,
         blur=measured.new_tensor([1.0, 0.0, 0.0]).expand(len(measured), 3),  # replaced once the motion is final
     )
-    return DirectFit(weighted, fit, other)
+    robust_weights = weighted.weights / measurements.weights.clamp(min=1e-300)
+    return DirectFit(weighted, fit, other, robust_weights)

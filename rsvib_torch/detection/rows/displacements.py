@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.progress import steps
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing
 from rsvib_torch.motion.motion import Motion
@@ -227,7 +228,10 @@ def measure_groups(
 ) -> tuple[Measurements, list[RowGradients]]:
     """``measure_group`` of all groups, the measurements as one record."""
     each = [None] * len(groups) if gradients is None else gradients
-    measured = [measure_group(group, timing, motion, own) for group, own in zip(groups, each, strict=True)]
+    measured, advance = [], steps(len(groups), "groups")
+    for group, own in zip(groups, each, strict=True):
+        measured.append(measure_group(group, timing, motion, own))
+        advance()
     return _joined([part for part, _ in measured]), [own for _, own in measured]
 
 

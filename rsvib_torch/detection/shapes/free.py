@@ -17,6 +17,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.presentation import Result, axis_rows, measured_text, verdict_table
 from rsvib_torch.core.splines import bspline_weights, gauss_legendre
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
@@ -41,8 +42,11 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, eq=False)
-class MotionDetection:
+@dataclass(frozen=True, eq=False, repr=False)
+class MotionDetection(
+    Result,
+    units={"times": "s", "displacement": "px", "std": "px", "std_seen": "px", "unseen": "px", "unexplained": "px"},
+):
     """A motion of any shape with its uncertainty. A batch of stacks leads all tensors but ``times``.
 
     Only differences of displacement between frames are measured. A warp that is fixed to the scene is not visible:
@@ -72,6 +76,21 @@ class MotionDetection:
     unexplained: Tensor
     reliable: Tensor
     reasons: tuple[Any, ...]
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading dimensions: empty for one result, (B,) for a batch of stacks."""
+        return self.std_seen.shape[:-1]
+
+    def summary(self) -> str:
+        """Size of the motion of each axis with its standard deviations, and the verdict."""
+        size = self.displacement.square().mean((-3, -2)).sqrt()
+        rows = [
+            [*labels, *(measured_text(value[at], digits=2) for value in (size, self.std_seen, self.unseen))]
+            for at, labels in axis_rows(self.batch_shape)
+        ]
+        head = ("displacement (px rms)", "± between frames (px)", "± common to all (px)")
+        return "\n".join(verdict_table(head, rows, self.batch_shape, self.reliable, self.reasons))
 
     def __getitem__(self, index: int) -> "MotionDetection":
         """The result of one stack out of a batch."""

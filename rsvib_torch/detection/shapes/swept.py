@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.presentation import Result, axis_rows, measured_text, text_table, verdict_lines, verdict_table
 from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
@@ -32,8 +33,19 @@ __all__ = ["SweptTone", "detect_swept_tone"]
 _F_THRESHOLD = 14.0  # decrease of chi-square per parameter: the maximum of noise over the grid of starts stays below
 
 
-@dataclass(frozen=True, eq=False)
-class SweptTone:
+@dataclass(frozen=True, eq=False, repr=False)
+class SweptTone(
+    Result,
+    units={
+        "amplitude": "px",
+        "frequency": "Hz",
+        "decay": "1/s",
+        "chirp": "Hz/s",
+        "phase": "rad",
+        "image_motion": "px/s",
+        "unexplained": "px",
+    },
+):
     """One tone an axis that decays and sweeps: ``A exp(-g t) sin(2 pi (f t + c t^2 / 2) + phi) + v t``.
 
     All values are those at the time origin, in image axes (x, y); an axis without a significant tone has amplitude 0.
@@ -64,6 +76,24 @@ class SweptTone:
     unexplained: Tensor
     reliable: Tensor
     reasons: tuple[Any, ...]
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading dimensions: empty for one result, (B,) for a batch of stacks."""
+        return self.amplitude.shape[:-1]
+
+    def summary(self) -> str:
+        """The tone of each axis with standard deviations, and the verdict; of a batch, amplitudes and frequencies."""
+
+        def text(name: str, at: tuple[int, ...]) -> str:
+            return measured_text(getattr(self, name)[at], self.std[name][at])
+
+        if not self.batch_shape:
+            table = [[f"{name} ({self.units[name]})", text(name, (0,)), text(name, (1,))] for name in self.std]
+            return "\n".join([text_table(("axis", "x", "y"), table), *verdict_lines(self.reliable, self.reasons)])
+        rows = [[*labels, text("amplitude", at), text("frequency", at)] for at, labels in axis_rows(self.batch_shape)]
+        head = ("amplitude (px)", "frequency (Hz)")
+        return "\n".join(verdict_table(head, rows, self.batch_shape, self.reliable, self.reasons))
 
     def __getitem__(self, index: int) -> "SweptTone":
         """The result of one stack out of a batch."""

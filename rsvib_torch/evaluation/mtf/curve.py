@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.presentation import Result, measured_text
 from rsvib_torch.evaluation.mtf.edge import as_real, check_edge, check_roi, fit_edge, start_edge, straighten
 from rsvib_torch.evaluation.mtf.spread import Tail, fit_spread
 from rsvib_torch.frames.arrays import ArrayLike
@@ -15,8 +16,18 @@ from rsvib_torch.frames.arrays import ArrayLike
 __all__ = ["MtfCurve", "slanted_edge_mtf"]
 
 
-@dataclass(frozen=True)
-class MtfCurve:
+@dataclass(frozen=True, repr=False)
+class MtfCurve(
+    Result,
+    units={
+        "frequency": "cycles/px",
+        "mtf50": "cycles/px",
+        "mtf50_std": "cycles/px",
+        "angle": "degrees",
+        "position": "px",
+        "lsf": "1/px",
+    },
+):
     """Modulation transfer function along the normal of an edge.
 
     ``MTF(f) = |int LSF(x) exp(-2 pi i f x) dx|`` with x in px along the normal, from the dark to the bright side.
@@ -53,6 +64,20 @@ class MtfCurve:
     far: Tensor
     levels: Tensor
     noise: Tensor
+
+    def summary(self) -> str:
+        """MTF50, MTF at the Nyquist frequency, the edge, and the noise."""
+        nyquist = int((self.frequency - 0.5).abs().argmin())
+        edge = "vertical" if self.near_vertical else "horizontal"
+        contrast = float(self.levels[1] - self.levels[0])
+        return "\n".join(
+            [
+                f"MTF50 {measured_text(self.mtf50, self.mtf50_std)} cycles/px",
+                f"MTF {measured_text(self.mtf[nyquist], self.std[nyquist])} at the Nyquist frequency",
+                f"edge {self.angle:.2f} degrees from the {edge} axis, contrast {contrast:.4g}",
+                f"noise {measured_text(self.noise, digits=2)} (standard deviation of a pixel)",
+            ]
+        )
 
     def at(self, frequency: float | Tensor) -> Tensor:
         """MTF at frequencies of any shape, cycles/px, computed from the line spread function.

@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
+from rsvib_torch.core.presentation import measured_text
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.evaluation import MtfCurve, find_slanted_edges, slanted_edge_mtf
 from rsvib_torch.motion.timing import SensorTiming
@@ -132,8 +133,8 @@ def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = N
 
 def _edge_row(edge: Edge) -> list[str]:
     """Line of the table of edges."""
-    before = "not measured" if edge.before is None else plots.measured_text(edge.before.mtf50, edge.before.mtf50_std)
-    after = plots.measured_text(edge.after.mtf50, edge.after.mtf50_std)
+    before = "not measured" if edge.before is None else measured_text(edge.before.mtf50, edge.before.mtf50_std)
+    after = measured_text(edge.after.mtf50, edge.after.mtf50_std)
     return [_region(*edge.box), edge.direction, f"{edge.after.angle:.1f}°", before, after]
 
 
@@ -193,7 +194,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
             plots.axis_offset_figure(result, axis),
             f"offsets_{name}",
             f"Offsets along {name}",
-            "Top: offset of every band of rows, and the offset curve of the detected vibration. Bottom: residual, "
+            "Top: measured offset of the rows, and the offset curve of the detected vibration. Bottom: residual, "
             f"{float(result.residual[axis]):.4f} px on average.",
         )
         for axis, name in enumerate("xy")
@@ -246,7 +247,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         "details": _details(before, after, names),
         "offsets": offsets,
         "tones_head": words.TONE_HEAD,
-        "tones": words.tone_rows(result),
+        "tones": words.detected_tones(result),
         "tone_figures": tone_figures,
         "mtf_head": ("edge", "direction", "angle", "MTF50 of the input (cycles/px)", f"MTF50 {names[1]} (cycles/px)"),
         "mtf_rows": [_edge_row(edge) for edge in measured],

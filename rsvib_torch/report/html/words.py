@@ -4,16 +4,18 @@ import math
 from collections.abc import Sequence
 from typing import Literal
 
+from rsvib_torch.core.presentation import measured_text
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration, blind_frequencies
-from rsvib_torch.report.plots import measured_text, motion_blur, tones_text
+from rsvib_torch.motion.vibration import Vibration, blind_frequencies, tone_head, tone_rows
+from rsvib_torch.report.plots import motion_blur, tones_text
 from rsvib_torch.restoration import RestorationVerdict
 
-__all__ = ["TONE_HEAD", "Mark", "camera_rows", "mark_of", "tone_rows", "verdict_sentences"]
+__all__ = ["TONE_HEAD", "Mark", "camera_rows", "detected_tones", "mark_of", "verdict_sentences"]
 
 Mark = Literal["good", "doubt", "bad"]
-TONE_HEAD = ("axis", "amplitude (px)", "frequency (Hz)", "period (ms)", "phase (π)", "gain", "verdict")
+_QUANTITIES = ("amplitude", "frequency", "period", "phase")
+TONE_HEAD = ("axis", *tone_head(_QUANTITIES), "gain", "verdict")
 
 
 def mark_of(result: DetectionResult, verdict: RestorationVerdict | None, restored: bool) -> Mark:
@@ -109,7 +111,7 @@ def verdict_sentences(
     if bool(result.reliable.all()):  # otherwise the reasons are given above
         sentences += [_sentence(note) for note in left_alone]
     if verdict is not None:
-        sentences.append(_sentence(verdict.summary))
+        sentences.append(_sentence(verdict.sentence))
     elif restored:
         sentences.append("No two frames have enough of the scene in common to judge the restoration.")
     return sentences
@@ -119,22 +121,12 @@ def _sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def tone_rows(result: DetectionResult) -> list[list[str]]:
+def detected_tones(result: DetectionResult) -> list[list[str]]:
     """Lines of the table of tones, in the order of ``TONE_HEAD``."""
-    vibration, std = result.vibration, result.std
     return [
-        [
-            name,
-            measured_text(vibration.amplitude[at], std.amplitude[at]),
-            measured_text(vibration.frequency[at], std.frequency[at]),
-            measured_text(1e3 * vibration.period[at], 1e3 * std.period[at]),
-            measured_text(vibration.phase[at] / math.pi, std.phase[at] / math.pi),
-            f"{float(result.gain[at]):+.2f}",
-            "reliable" if bool(result.reliable[axis]) else "not reliable",
-        ]
-        for axis, name in enumerate("xy")
-        for at in ((axis, tone) for tone in range(vibration.amplitude.shape[-1]))
-        if float(vibration.amplitude[at]) > 0
+        [*cells, f"{float(result.gain[at]):+.2f}", "reliable" if bool(result.reliable[at[0]]) else "not reliable"]
+        for at, cells in tone_rows(result.vibration, result.std, _QUANTITIES)
+        if float(result.vibration.amplitude[at]) > 0
     ]
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.core.fourier import extend_rows, extended_length
 from rsvib_torch.core.parallel import in_parallel
+from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.exact.filling import fill_beyond_ends, fill_missing, measured_values
@@ -128,11 +129,13 @@ def restore_exact(
         return images.view(B, -1, *images.shape[1:])
     images = frames.new_empty(count, *frames.shape[2:])
     threads = min(Partition.threads(frames.device), count)
+    advance = steps(count, "frames")
 
     def share(thread: int) -> None:
         partition = Partition(chunk, split)
         for number in range(thread, count, threads):
             images[number] = restored(number, partition)
+            advance()
 
     in_parallel(share, range(threads), frames.device)
     return images.view(B, -1, *images.shape[1:])

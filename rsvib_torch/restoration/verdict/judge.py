@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.presentation import Result, measured_text, text_table, wrapped
+from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.io.files import FramesOrFiles, load_frames
@@ -47,8 +49,10 @@ class RestorationWarning(UserWarning):
     """A restored frame may be worse than the raw one, or a part of the vibration was not undone."""
 
 
-@dataclass(frozen=True, eq=False)
-class RestorationVerdict:
+@dataclass(frozen=True, eq=False, repr=False)
+class RestorationVerdict(
+    Result, units={"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"}
+):
     """Verdict on a restoration from P pairs of frames of one scene.
 
     Displacements and levels are root-mean-square values over the pixels that both frames contain.
@@ -92,8 +96,17 @@ class RestorationVerdict:
         """The outcome of greatest concern over all pairs."""
         return max(self.outcome, key=_OUTCOMES.index)
 
-    @property
     def summary(self) -> str:
+        """The verdict in one line, and a table of the pairs of frames."""
+        rows = []
+        for pair, (outcome, gain) in enumerate(zip(self.outcome, self.predicted_gain.tolist(), strict=True)):
+            sizes = torch.stack([self.misfit_before[pair], self.misfit_after[pair]], -1).flatten()
+            rows.append([str(pair), outcome, *(measured_text(size, digits=2) for size in sizes), f"{gain:+.1f}"])
+        head = ("pair", "outcome", "x before (px)", "x after (px)", "y before (px)", "y after (px)", "gain (dB)")
+        return f"{wrapped(self.sentence)}\n{text_table(head, rows)}"
+
+    @property
+    def sentence(self) -> str:
         """The verdict in one line."""
         worst = self.outcome.index(self.overall)
         gain = float(self.predicted_gain.nanmean())
@@ -248,9 +261,10 @@ def judge_frames(
         TooLittleInCommonError: If two frames have too little in common.
     """
     moves = motion.vibration.moving_axes()[0].tolist()
-    verdicts = [
-        _judge_pair(shared_part(raw, restored, motion, frames, columns, hidden), moves, shared) for frames in pairs
-    ]
+    verdicts, advance = [], steps(len(pairs), "pairs")
+    for frames in pairs:
+        verdicts.append(_judge_pair(shared_part(raw, restored, motion, frames, columns, hidden), moves, shared))
+        advance()
     joined = {
         field.name: torch.stack([getattr(verdict, field.name) for verdict in verdicts])
         for field in fields(RestorationVerdict)

@@ -1,0 +1,105 @@
+"""Answers of the commands: what was detected and restored, what was left unchanged and why, and what to do next."""
+
+import shlex
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rsvib_torch.core.presentation import plain_values, wrapped
+from rsvib_torch.detection import DetectionResult
+from rsvib_torch.restoration import RestorationVerdict
+from rsvib_torch.stacks import RestoredFrames
+
+__all__ = [
+    "command_text",
+    "detection_data",
+    "restoration_data",
+    "restoration_lines",
+    "steps_after_detection",
+    "verdict_data",
+]
+
+
+def command_text(*parts: str | Path) -> str:
+    """A command line of the program that can be copied into a shell."""
+    return shlex.join(["rsvib", *map(str, parts)])
+
+
+def detection_data(result: DetectionResult) -> dict[str, Any]:
+    """A detection without its offset curve."""
+    return {name: value for name, value in result.to_dict().items() if name not in ("offsets", "fitted")}
+
+
+def restored_axes(left_alone: Iterable[str]) -> str:
+    """The axes that were restored, from the sentences about the others."""
+    unchanged = {note[0] for note in left_alone}
+    return " and ".join(name for name in "xy" if name not in unchanged)
+
+
+def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
+    """What was restored and its gain, and which axes were left unchanged and why.
+
+    Args:
+        result: Restored frames with their verdict.
+        count: Number of frames of the stack.
+    """
+    frames = f"{count} frames" if len(result.frames) == count else f"1 image of {count} frames"
+    if not result.restored:
+        lines = [f"{count} frames unchanged"]
+    else:
+        lines = [f"{frames} restored along {restored_axes(result.left_alone)}"]
+    if result.verdict is not None:
+        lines.append(result.verdict.sentence)
+    elif result.restored:
+        lines.append("cannot determine whether restoration helps: no two frames show the same scene")
+    elif not result.moves:
+        lines.append("there is no vibration to remove")
+    refused = "its vibration is not reliable"  # for the reasons of the detection, which are printed before
+    lines += [
+        f"{note[0]} unchanged: {refused}, see the reasons above" if refused in note else note
+        for note in result.left_alone
+    ]
+    return [wrapped(line) for line in lines]
+
+
+def restoration_data(result: RestoredFrames) -> dict[str, Any]:
+    """The same as ``restoration_lines`` for JSON."""
+    return {
+        "frames": "restored" if result.restored else "as taken",
+        "axes": restored_axes(result.left_alone).split(" and ") if result.restored else [],
+        "left_alone": list(result.left_alone),
+        **verdict_data(result.verdict),
+    }
+
+
+def verdict_data(verdict: RestorationVerdict | None) -> dict[str, Any]:
+    """A verdict on restored frames for JSON."""
+    if verdict is None:
+        return {"outcome": None, "predicted_gain_db": None, "summary": None}
+    gain = plain_values(verdict.predicted_gain.nanmean())
+    return {"outcome": verdict.overall, "predicted_gain_db": gain, "summary": verdict.sentence}
+
+
+def steps_after_detection(
+    result: DetectionResult | None, frames: Path, config: Path, vibration: Path | None = None
+) -> list[str]:
+    """What to do after a detection: restore, or try another model.
+
+    Args:
+        result: The detection; None for windows.
+        frames: The stack.
+        config: The configuration file.
+        vibration: The file of the detection, if the frames were not restored by the same command.
+    """
+    lines = []
+    if vibration is not None and (result is None or bool(result.reliable.any())):
+        target = frames.with_name("restored.tif")
+        restore = command_text("restore", frames, target, "--config", config, "--vibration", vibration)
+        lines.append(f"restore the frames:\n  {restore}")
+    reasons = [] if result is None else [reason for axis in result.reasons for reason in axis]
+    if any("model='free'" in reason for reason in reasons):
+        motion = command_text("motion", frames, "--config", config, "--out", "motion.csv")
+        lines.append(f"detect a motion that is not a steady vibration (model='free'):\n  {motion}")
+    if reasons:
+        lines.append("follow the remedies that the reasons above name")
+    return lines

@@ -1,0 +1,391 @@
+"""What all results have: a summary as text and HTML, dictionaries, JSON files, a figure, and moves between devices.
+
+A result is a dataclass of tensors, numbers, texts and other results. ``Result`` gives it the methods; the class writes
+its own ``summary`` with the functions below.
+"""
+
+import base64
+import html
+import io
+import itertools
+import json
+import math
+import os
+import shutil
+import textwrap
+import types
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import copy
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Self, Union, get_args, get_origin, get_type_hints
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.validation import read_json
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "FIGURES",
+    "Result",
+    "Summarised",
+    "axis_head",
+    "axis_rows",
+    "json_text",
+    "measured_text",
+    "plain_values",
+    "text_table",
+    "verdict_lines",
+    "verdict_table",
+    "wrapped",
+    "write_json",
+]
+
+# Figures of results: the function that draws a result of this type with this number of leading dimensions (0: not a
+# batch). report/plots.py fills the table.
+FIGURES: dict[tuple[type, int], Callable[[Any], "Figure"]] = {}
+
+
+# Text
+
+
+def measured_text(value: Tensor | float, std: Tensor | float | None = None, digits: int = 4) -> str:
+    """Format ``value ± std`` with two significant digits of the standard deviation.
+
+    Args:
+        value: The value; an infinite one is written as ∞, and NaN as "unknown".
+        std: Its standard deviation; None to write the value alone.
+        digits: Significant digits of the value if its standard deviation is not given, zero, infinite or unknown.
+
+    Example:
+        >>> measured_text(60.0, 0.01234)
+        '60.000 ± 0.012'
+        >>> measured_text(12345.6, 789.0)
+        '12350 ± 790'
+        >>> measured_text(0.123456)
+        '0.1235'
+    """
+    value, deviation = float(value), 0.0 if std is None else float(std)
+    known = math.isfinite(deviation) and deviation > 0
+    leading = deviation if known else abs(value) if math.isfinite(value) and value else 1.0
+    kept = (2 if known else digits) - 1 - int(f"{leading:.{1 if known else digits - 1}e}".partition("e")[2])
+    decimals = min(9, kept)
+
+    def shown(number: float) -> str:
+        if not math.isfinite(number):
+            return "unknown" if math.isnan(number) else "∞" if number > 0 else "-∞"
+        return f"{round(number, decimals) + 0.0:.{max(0, decimals)}f}"
+
+    return shown(value) if std is None else f"{shown(value)} ± {shown(deviation)}"
+
+
+def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, most: int = 20) -> str:
+    """A table as text with aligned columns; of more than ``most`` rows the first and the last are kept.
+
+    Example:
+        >>> print(text_table(("axis", "amplitude (px)"), [("x", "3.1"), ("y", "5.2")]))
+        axis  amplitude (px)
+        x     3.1
+        y     5.2
+    """
+    rows = [tuple(row) for row in rows]
+    if len(rows) > most:
+        omitted = (f"… {len(rows) - most} more",) + ("",) * (len(head) - 1)
+        rows = [*rows[: most // 2], omitted, *rows[-(most - most // 2) :]]
+    aligned = [row for row in (tuple(head), *rows) if not row[0].startswith("…")]
+    widths = [max(len(row[column]) for row in aligned) for column in range(len(head))]
+    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in (head, *rows))
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def axis_rows(batch_shape: Sequence[int]) -> list[tuple[tuple[int, ...], list[str]]]:
+    """Index (..., axis) of each axis of each result of a batch, and the first cells of its row in a table.
+
+    Example:
+        >>> axis_rows(())
+        [((0,), ['x']), ((1,), ['y'])]
+        >>> axis_rows((1,))
+        [((0, 0), ['0', 'x']), ((0, 1), ['0', 'y'])]
+    """
+    indices = itertools.product(*map(range, batch_shape), range(2))
+    return [(at, [", ".join(map(str, at[:-1]))] * bool(batch_shape) + ["xy"[at[-1]]]) for at in indices]
+
+
+def axis_head(batch_shape: Sequence[int]) -> list[str]:
+    """First cells of the head of a table with ``axis_rows``."""
+    return ["index"] * bool(batch_shape) + ["axis"]
+
+
+def verdict_table(
+    head: Sequence[str], rows: Sequence[Sequence[str]], batch_shape: Sequence[int], reliable: Any, reasons: Any
+) -> list[str]:
+    """A table with one or more rows per axis, and the verdict: lines with reasons, or a column in a batch.
+
+    Args:
+        head: Columns after those of ``axis_head``.
+        rows: Rows that begin with the cells of ``axis_rows``.
+        batch_shape: Leading dimensions.
+        reliable: (..., 2) bool.
+        reasons: Reasons against each axis.
+    """
+    head = [*axis_head(batch_shape), *head]
+    if not batch_shape:
+        return [text_table(head, rows), *verdict_lines(reliable, reasons)]
+    verdicts = {
+        tuple(labels): "reliable" if bool(reliable[at]) else "not reliable" for at, labels in axis_rows(batch_shape)
+    }
+    return [text_table([*head, "verdict"], [[*row, verdicts[tuple(row[:2])]] for row in rows])]
+
+
+def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
+    """Whether each axis (x, y) is reliable, with the reasons.
+
+    Example:
+        >>> verdict_lines([True, False], [(), ("too short", "noisy")])
+        ['x: reliable', 'y: not reliable:', ' - too short', ' - noisy']
+    """
+    lines = []
+    for name, good, why in zip("xy", reliable, reasons, strict=True):
+        lines.append(f"{name}: reliable" if bool(good) else f"{name}: not reliable:")
+        lines += [wrapped(f" - {reason}") for reason in why]
+    return lines
+
+
+def wrapped(text: str) -> str:
+    """Text in lines of the width of the terminal, at most 100 characters; all but the first are indented."""
+    width = min(100, shutil.get_terminal_size((100, 24)).columns) - 2  # an answer of the program is indented by 2
+    return textwrap.fill(text, width, subsequent_indent="   ", break_long_words=False, break_on_hyphens=False)
+
+
+# Dictionaries and files
+
+
+def plain_values(value: Any) -> Any:
+    """A value as JSON can store it: tensors as nested lists, None for numbers that are not finite, results as tables.
+
+    Example:
+        >>> plain_values({"amplitude": torch.tensor([1.5, float("nan")]), "reasons": ("blind",)})
+        {'amplitude': [1.5, None], 'reasons': ['blind']}
+    """
+    if isinstance(value, Tensor):
+        return plain_values(value.detach().cpu().tolist())
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    if is_dataclass(value):
+        return {field.name: plain_values(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain_values(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain_values(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
+    """Write a table as JSON with one key per line, atomically.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    with whole_file(path) as part:
+        part.write_text(json_text(content) + "\n", encoding="utf-8")
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """A table as JSON with one key per line."""
+    lines = (f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
+    return "{\n" + ",\n".join(lines) + "\n}"
+
+
+def _restored(kind: Any, value: Any, path: str, missing: float) -> Any:
+    """Inverse of ``plain_values`` for an annotated type; ``missing`` takes the place of None in a tensor."""
+    if get_origin(kind) in (Union, types.UnionType):
+        if value is None:
+            return None
+        kind = next(member for member in get_args(kind) if member is not types.NoneType)
+    if kind is Tensor:
+        return _tensor(value, path, missing)
+    if get_origin(kind) is dict:
+        if not isinstance(value, dict):
+            raise ValueError(f"{path}: expected a table, got {value!r}")
+        return {key: _restored(get_args(kind)[1], entry, f"{path}.{key}", missing) for key, entry in value.items()}
+    if is_dataclass(kind) and isinstance(kind, type):
+        return _dataclass(kind, value, path)
+    if kind in (float, int, str, bool) and not isinstance(value, (float, int) if kind is float else kind):
+        raise ValueError(f"{path}: expected {kind.__name__}, got {value!r}")
+    return _tuples(value)
+
+
+def _dataclass(kind: type[Any], value: Any, path: str = "") -> Any:
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: expected a table, got {value!r}")
+    hints, start = get_type_hints(kind), f"{path}." if path else ""
+    names = [field.name for field in fields(kind)]
+    if absent := [name for name in names if name not in value]:
+        raise ValueError(f"{start}{absent[0]}: missing key")
+    missing = getattr(kind, "_MISSING", math.nan)
+    return kind(**{name: _restored(hints[name], value[name], start + name, missing) for name in names})
+
+
+def _tensor(value: Any, path: str, missing: float) -> Tensor:
+    def filled(entry: Any) -> Any:
+        return [filled(part) for part in entry] if isinstance(entry, list) else missing if entry is None else entry
+
+    values = filled(value)
+    try:
+        tensor = torch.tensor(values)
+        if tensor.is_floating_point() or not tensor.numel():
+            tensor = torch.tensor(values, dtype=torch.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected numbers in lists of equal lengths: {error}") from error
+    return tensor
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+# Results
+
+
+class Summarised:
+    """A class whose objects print as their summary, in the terminal and in notebooks."""
+
+    def summary(self) -> str:
+        """The result in a few lines."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def __repr__(self) -> str:
+        return self.summary()
+
+    def _repr_html_(self) -> str:
+        """HTML for notebooks: the summary, and the figure if there is one."""
+        return f'<pre style="white-space: pre-wrap">{html.escape(self.summary())}</pre>'
+
+
+class Result(Summarised):
+    """Methods of a dataclass of tensors, numbers, texts and other results.
+
+    The decorator of the class needs ``repr=False``, so that objects print as their summary. Arguments of the class:
+    ``units``, the units of its fields, which are written into files, and ``file_format``, the first entry of its files,
+    by default the name of the class.
+    """
+
+    units: ClassVar[Mapping[str, str]] = {}
+    file_format: ClassVar[str] = ""
+
+    def __init_subclass__(cls, *, units: Mapping[str, str] | None = None, file_format: str | None = None) -> None:
+        super().__init_subclass__()
+        cls.units = cls.units if units is None else units
+        cls.file_format = f"rsvib {cls.__name__}" if file_format is None else file_format
+
+    def summary(self) -> str:
+        """The result in a few lines: here the shapes of its tensors and its other values."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        shown = {name: f"tensor {tuple(v.shape)}" if isinstance(v, Tensor) else str(v) for name, v in values.items()}
+        return "\n".join([type(self).__name__, *(f"  {name}: {text}" for name, text in shown.items())])
+
+    @property
+    def batch_shape(self) -> Sequence[int]:
+        """Leading dimensions of a batch of results; empty for one result."""
+        return ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """All values as nested lists, numbers and texts, which JSON can store; None for numbers that are not finite."""
+        return {field.name: plain_values(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result as JSON, which ``load`` reads; an existing file is replaced.
+
+        Args:
+            path: The file to write; its folder must exist.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
+        write_json(path, {"format": self.file_format, "version": 1, **self.to_dict(), "units": dict(self.units)})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a file that ``save`` wrote.
+
+        Args:
+            path: The file.
+
+        Raises:
+            OSError: If the file cannot be opened.
+            ValueError: If it does not contain a result of this class.
+        """
+        source = Path(path)
+        data = read_json(source, f"file of {cls.__name__}.save")
+        if data.get("format") != cls.file_format or data.get("version") != 1:
+            raise ValueError(
+                f"{source}: expected format {cls.file_format!r} of version 1, as {cls.__name__}.save writes it, got "
+                f"{data.get('format')!r} of version {data.get('version')!r}"
+            )
+        try:
+            result: Self = _dataclass(cls, data)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{source}: {error}") from error
+        return result
+
+    def mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
+        """The same result with ``function``, which must preserve values, applied to every tensor.
+
+        Values are not checked again, so that no device is synchronised.
+        """
+        result = copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                object.__setattr__(result, name, function(value))
+            elif isinstance(value, Result):
+                object.__setattr__(result, name, value.mapped(function))
+            elif isinstance(value, dict):
+                object.__setattr__(result, name, {key: function(entry) for key, entry in value.items()})
+        return result
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same result with its tensors on another device."""
+        return self.mapped(lambda values: values.to(device))
+
+    def plot(self, path: str | os.PathLike[str] | None = None) -> "Figure":
+        """Draw the result.
+
+        Args:
+            path: Picture to write (PNG, SVG, PDF); None to draw only.
+
+        Returns:
+            The figure, which notebooks show.
+
+        Raises:
+            OSError: If the picture cannot be written.
+            TypeError: If there is no figure of this kind of result.
+            ValueError: If it is a batch that has no figure.
+        """
+        draw = FIGURES.get((type(self), len(self.batch_shape)))
+        if draw is None:
+            drawn = sorted({kind.__name__ for kind, _ in FIGURES})
+            if type(self).__name__ in drawn:
+                raise ValueError(
+                    f"a batch of shape {tuple(self.batch_shape)} has no figure: select one, result[0].plot()"
+                )
+            raise TypeError(f"a {type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
+        figure = draw(self)
+        if path is not None:
+            with whole_file(path) as part:
+                figure.savefig(part, dpi=150, facecolor="white")
+        return figure
+
+    def _repr_html_(self) -> str:
+        text = super()._repr_html_()
+        if (type(self), len(self.batch_shape)) not in FIGURES:
+            return text
+        picture = io.BytesIO()
+        self.plot().savefig(picture, format="png", dpi=70, facecolor="white")
+        return f'{text}<img src="data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}">'

@@ -1,0 +1,439 @@
+"""Every command ends with its answer, as text, as JSON or not at all; help, completion, progress, existing results."""
+
+import contextlib
+import fcntl
+import inspect
+import json
+import os
+import pty
+import re
+import shlex
+import struct
+import subprocess
+import sys
+import termios
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+import typer
+from small_config import CAMERA
+from truth import Motion, draw_scene, take_frames
+
+import rsvib_torch as rsv
+from rsvib_torch.commands import main
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.commands.terminal import working
+from rsvib_torch.core.progress import listening, steps
+
+PROGRAM = Path(sys.executable).with_name("rsvib")
+TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=200)
+CONFIG = "[sensor]\nrow_time = 1e-4\nexposure_rows = 6\nframe_rows = 200\nfull_scale = 4095\n"
+COMMANDS = ("run", "detect", "restore", "report", "motion", "known", "calibrate", "simulate")
+
+
+def run(*arguments):
+    return run_command([str(argument) for argument in arguments])
+
+
+def take(vibration, num_frames, seed=3):
+    scene = torch.from_numpy(draw_scene(192 + 80, 128 + 80, seed)).float()
+    noise = rsv.SensorNoise(read_noise=0.003)
+    generator = torch.Generator().manual_seed(seed)
+    return rsv.simulate_frames(
+        scene, TIMING, vibration, num_frames, frame_size=(192, 128), noise=noise, generator=generator
+    )
+
+
+@pytest.fixture(scope="module", name="place")
+def make_place(tmp_path_factory):
+    """Frames of a vibration, of one whose tone along y is blind, of a longer stack, and of a flickering light."""
+    folder = tmp_path_factory.mktemp("answers")
+    (folder / "camera.toml").write_text(CONFIG)
+    steady = rsv.Vibration([1.6, 1.1], [71.0, 113.0], [0.6, -1.2])
+    blind = rsv.Vibration([1.6, 1.1], [71.0, 50.5], [0.6, -1.2])
+    still = rsv.Vibration.still()
+    for name, vibration, count in (
+        ("frames", steady, 2),
+        ("blind", blind, 2),
+        ("long", steady, 7),
+        ("still", still, 2),
+    ):
+        rsv.write_stack(folder / f"{name}.tif", take(vibration, count), dtype="uint16", full_scale=4095)
+    light = 0.4 + 0.2 * torch.cos(2 * torch.pi * torch.arange(512) / 64)
+    rsv.write_stack(folder / "led.png", light[None, :, None].expand(1, 512, 16), dtype="uint16", full_scale=65535)
+    rsv.write_stack(folder / "scene.png", torch.rand(1, 300, 300), dtype="uint16", full_scale=65535)
+    return folder
+
+
+@pytest.fixture(name="config")
+def config_option(place):
+    return "--config", place / "camera.toml"
+
+
+def sections(text):
+    """Lines of the answer by the title above them."""
+    found, title = {}, None
+    for line in text.splitlines():
+        if line and not line.startswith(" "):
+            title = line
+            found[title] = []
+        elif line:
+            found[title].append(line[2:])
+    return found
+
+
+def test_the_answer_of_run_names_everything(place, config, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run("run", place / "frames.tif", "out", *config) == 0
+    shown = capsys.readouterr()
+    assert shown.err == ""
+    answer = sections(shown.out)
+    assert list(answer) == ["Vibration in frames.tif", "Restoration", "Files (open before_after.png first)", "Next"]
+    vibration = answer["Vibration in frames.tif"]
+    assert vibration == rsv.DetectionResult.load("out/vibration.json").summary().splitlines()
+    assert re.match(r"x     1\.(59|60)\d* ± 0\.0\d+  +7[01]\.", vibration[1])
+    assumed = " ".join(line for line in vibration if not re.match("[xy]:", line))
+    assert "assumed: frame_rows, readout direction, scan axis and order of the frames: two frames cannot" in assumed
+    assert "assumed: frame_rows=200: if it is stated 1 % too large, this changes x amplitude" in assumed
+    assert answer["Restoration"][0] == "2 frames restored along x and y"
+    assert re.fullmatch(r"restored frames agree; estimated gain \+\d+\.\d dB", answer["Restoration"][1])
+    names = " ".join(answer["Files (open before_after.png first)"]).removeprefix("out: ").replace(",", "").split()
+    assert sorted(names) == sorted(path.name for path in Path("out").iterdir())
+    assert names[0] == "before_after.png"
+    command = shlex.split(answer["Next"][1])
+    assert command[0] == "rsvib"
+    assert run(*command[1:]) == 0  # the command that is suggested works
+    assert list(sections(capsys.readouterr().out))[2] == "Files (open report.html first)"
+
+
+def test_an_axis_that_is_left_unchanged_is_named_with_the_reason(place, config, tmp_path, capsys):
+    assert run("run", place / "blind.tif", tmp_path / "out", *config) == 0
+    answer = sections(capsys.readouterr().out)
+    reasons = answer["Vibration in blind.tif"]
+    assert "x: reliable" in reasons
+    assert "y: not reliable:" in reasons
+    assert any("nearly blind" in line for line in reasons)
+    assert answer["Restoration"][0] == "2 frames restored along x"
+    assert "y unchanged: its vibration is not reliable, see the reasons above" in answer["Restoration"]
+    assert "follow the remedies that the reasons above name" in answer["Next"]
+
+
+def test_detect_names_the_next_command(place, config, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run("detect", place / "frames.tif", *config, "--out", "found") == 0
+    answer = sections(capsys.readouterr().out)
+    assert answer["Files (open offsets.png first)"] == ["found: offsets.png, vibration.json, offsets.csv"]
+    arguments = shlex.split(answer["Next"][1])[1:]
+    arguments[2] = str(tmp_path / "restored.tif")
+    assert run(*arguments) == 0
+    answer = sections(capsys.readouterr().out)
+    assert answer["File"] == [str(tmp_path / "restored.tif")]
+    assert "2 frames restored along x and y" in answer["Restoration"]
+
+
+def test_windows_have_a_summary_a_table_and_a_figure(place, config, tmp_path, capsys):
+    for command in (
+        ("run", place / "long.tif", tmp_path / "run", *config, "--window", 3),
+        ("detect", place / "long.tif", *config, "--out", tmp_path / "detect", "--window", 3),
+    ):
+        assert run(*command) == 0
+        answer = sections(capsys.readouterr().out)
+        table = next(lines for title, lines in answer.items() if title.startswith("Vibration in"))
+        assert re.match(r"x +3 of 3 +1\.(?:59|60)\d* ± 0\.00\d+ +7[01]\.\d+ ± ", table[1])
+        folder = tmp_path / command[0]
+        assert cv2.imread(str(folder / "windows.png")).std() > 5
+        summary = json.loads((folder / "windows.json").read_text())
+        assert (summary["windows"], summary["tones"]["y"]["reliable_windows"]) == (3, 3)
+        assert summary["tones"]["y"]["frequency"] == pytest.approx(113.0, abs=0.1)
+        assert summary["errors"] == {}
+    restoration = json.loads((tmp_path / "run" / "windows.json").read_text())
+    assert (restoration["restored"], restoration["outcomes"]) == (3, {"helps": 3})
+    assert 10 < restoration["predicted_gain_db"]["lowest"] <= restoration["predicted_gain_db"]["highest"] < 40
+
+
+def test_failed_windows_and_unchanged_axes_are_in_the_summary(place, config, tmp_path, capsys):
+    frames = rsv.read_stack(place / "long.tif")
+    frames[2:] = frames[2]  # a still camera
+    frames[5:] = torch.rand(2, *frames.shape[1:])
+    rsv.write_stack(tmp_path / "f.tif", frames, dtype="uint16", full_scale=4095)
+    assert run("run", tmp_path / "f.tif", tmp_path / "out", *config, "--window", 3) == 0
+    answer = sections(capsys.readouterr().out)
+    assert any(re.match(r"x +1 of 3 ", line) for line in answer["Vibration in f.tif"])
+    assert any(line.startswith("y unchanged in 2 windows; in window 1: y is not") for line in answer["Restoration"])
+
+
+@pytest.mark.parametrize(
+    ("command", "keys"),
+    [
+        (("run", "frames.tif", "{}/o"), {"detection", "restoration"}),
+        (("run", "long.tif", "{}/o", "--window", "3"), {"windows"}),
+        (("detect", "frames.tif", "--out", "{}/o"), {"detection"}),
+        (("detect", "long.tif", "--out", "{}/o", "--window", "3"), {"windows"}),
+        (("report", "frames.tif", "{}/o"), {"detection", "restoration"}),
+        (("motion", "long.tif", "--out", "{}/o.csv"), {"motion", "columns"}),
+        (("motion", "long.tif", "--out", "{}/o.csv", "--model", "swept"), {"motion", "columns"}),
+        (("calibrate", "led.png", "--frequency", "1000", "--out", "{}/o.toml"), {"calibration"}),
+    ],
+)
+def test_json_is_the_only_output(place, tmp_path, capsys, monkeypatch, command, keys):
+    monkeypatch.chdir(place)
+    more = () if command[0] == "calibrate" else ("--config", "camera.toml")
+    assert run(*(part.format(tmp_path) for part in command), *more, "--json") == 0
+    shown = capsys.readouterr()
+    assert shown.err == ""
+    answer = json.loads(shown.out)
+    assert answer.keys() == keys | {"command", "files", "open_first", "next_steps", "notes", "warnings"}
+    assert answer["command"] == command[0]
+    assert answer["open_first"] == answer["files"][0]
+    assert all(Path(file).exists() for file in answer["files"])
+    assert answer["warnings"] == []
+    assert len(shown.out) < 20_000
+    if "detection" in keys:
+        assert len(answer["detection"]["assumptions"]) >= 3
+        assert answer["detection"]["sensitivity"].keys() >= {"amplitude_by_frame_rows", "frequency_by_row_time"}
+        assert answer["detection"]["reliable"] == [True, True]
+        assert answer["detection"]["vibration"]["amplitude"][0][0] == pytest.approx(1.6, rel=0.01)
+    if "restoration" in keys:
+        assert (answer["restoration"]["axes"], answer["restoration"]["outcome"]) == (["x", "y"], "helps")
+
+
+def test_json_of_restore_known_and_simulate(place, config, tmp_path, capsys):
+    frames = place / "long.tif"
+    assert run("detect", frames, *config, "--out", tmp_path / "d", "--quiet") == 0
+    assert run("motion", frames, *config, "--out", tmp_path / "m.csv", "-q") == 0
+    assert capsys.readouterr().out == ""
+    vibration = ("--vibration", tmp_path / "d" / "vibration.json")
+    assert run("restore", frames, tmp_path / "r.tif", *config, *vibration, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["restoration"]["outcome"] == "helps"
+    recording = ("--motion", tmp_path / "m.csv", "--unit", "px", "--offset", 0)
+    assert run("known", frames, tmp_path / "k.tif", *config, *recording, "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["check"]["helps"] is True
+    assert answer["restoration"]["predicted_gain_db"] > 10
+    (tmp_path / "c.toml").write_text(CAMERA + "[simulation]\nframe_size = [96, 64]\n[simulation.vibration]\n")
+    text = "amplitude = [1.0, 2.0]\nfrequency = [130.0, 90.0]\nphase = [0.0, 0.0]\n"
+    (tmp_path / "c.toml").write_text((tmp_path / "c.toml").read_text() + text)
+    assert run("simulate", place / "scene.png", tmp_path / "s.tif", "--config", tmp_path / "c.toml", "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["vibration"]["amplitude"] == [[1.0], [2.0]]
+    assert answer["shape"] == list(rsv.read_stack(tmp_path / "s.tif").shape)
+
+
+def test_warnings_are_in_the_json(place, config, tmp_path, capsys):
+    assert run("run", place / "still.tif", tmp_path / "out", *config, "--json") == 0
+    shown = capsys.readouterr()
+    warning = "no vibration to remove: the frames are written unchanged"
+    assert json.loads(shown.out)["warnings"] == [warning]
+    assert shown.err == f"rsvib: warning: {warning}\n"
+
+
+def test_quiet_prints_warnings_and_errors_only(place, config, tmp_path, capsys):
+    assert run("run", place / "frames.tif", tmp_path / "a", *config, "--quiet") == 0
+    assert capsys.readouterr() == ("", "")
+    assert run("run", place / "still.tif", tmp_path / "b", *config, "-q") == 0
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.startswith("rsvib: warning: no vibration")
+    assert run("run", place / "none.tif", tmp_path / "c", *config, "-q") == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_an_error_prints_no_json(place, config, tmp_path, capsys):
+    assert run("detect", place / "none.tif", *config, "--out", tmp_path / "o", "--json") == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.startswith("rsvib: error: ")
+
+
+EXISTING = {
+    "run": (("run", "frames.tif", "{}"), ["manifest.json", "restored.tif", "windows.csv"]),
+    "detect": (("detect", "frames.tif", "--out", "{}"), ["vibration.json", "windows.json"]),
+    "report": (("report", "frames.tif", "{}"), ["report.html"]),
+    "motion": (("motion", "long.tif", "--out", "{}/m.csv"), ["m.csv"]),
+    "calibrate": (("calibrate", "led.png", "--frequency", "1000", "--out", "{}/c.toml"), ["c.toml"]),
+    "simulate": (("simulate", "scene.png", "{}/s.tif"), ["s.tif"]),
+    "restore": (("restore", "frames.tif", "{}/r.tif", "--vibration", "v.json"), ["r.tif"]),
+    "known": (("known", "frames.tif", "{}/r.tif", "--motion", "m.csv", "--unit", "px"), ["r.tif"]),
+}
+
+
+@pytest.mark.parametrize("name", EXISTING)
+def test_existing_results_are_not_replaced(place, tmp_path, capsys, monkeypatch, name):
+    monkeypatch.chdir(place)
+    (place / "m.csv").write_text("time,x,y\n" + "".join(f"{0.001 * i},0,0\n" for i in range(50)))
+    command, results = EXISTING[name]
+    arguments = [part.format(tmp_path) for part in command]
+    arguments += [] if name == "calibrate" else ["--config", "camera.toml"]
+    for result in results:
+        (tmp_path / result).write_text("precious")
+        assert run(*arguments) == 2
+        error = capsys.readouterr().err
+        assert error == (
+            f"rsvib: error: results exist already in {tmp_path}: {result}; choose another name, or replace them with "
+            "--overwrite\n"
+        )
+        assert (tmp_path / result).read_text() == "precious"
+        assert [path.name for path in tmp_path.iterdir()] == [result]
+        (tmp_path / result).unlink()
+
+
+def test_overwrite_replaces_all_results_of_the_earlier_run(place, config, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "notes.txt").write_text("mine")
+    assert run("run", place / "long.tif", out, *config, "--window", 3) == 0
+    assert (out / "windows.png").exists()
+    assert run("run", place / "frames.tif", out, *config, "--overwrite") == 0
+    names = {path.name for path in out.iterdir()}
+    assert {"vibration.json", "notes.txt"} <= names
+    assert not {"windows.csv", "windows.json", "windows.png"} & names
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_contains_every_text_and_two_examples(capsys, monkeypatch, command):
+    assert run(command, "-h") == 0
+    text = capsys.readouterr().out
+    assert run(command, "--help") == 0
+    assert capsys.readouterr().out == text
+    words = " ".join(text.split())
+    function = next(entry[1] for entry in main._COMMANDS if entry[0] == command)
+    for parameter in inspect.signature(function, eval_str=True).parameters.values():
+        info = next(part for part in parameter.annotation.__metadata__ if hasattr(part, "help"))
+        assert info.help in words, parameter.name  # brackets are not markup
+    for paragraph in inspect.getdoc(function).split("\n\n"):
+        assert " ".join(paragraph.split()) in words
+    examples = text.partition("Examples:\n")[2].replace("\\\n", " ").strip().splitlines()
+    assert len(examples) == 2
+    group = typer.main.get_command(main.app)
+    for example in examples:
+        program, name, *arguments = shlex.split(example)
+        assert (program, name) == ("rsvib", command)
+        group.commands[name].make_context(name, arguments)  # raises an error for options that do not exist
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_help_of_calibrate_keeps_brackets(capsys):
+    run("calibrate", "--help")
+    assert "with the table [sensor]." in " ".join(capsys.readouterr().out.split())
+
+
+def test_list_of_commands_is_not_cut(capsys):
+    assert run("-h") == 0
+    text = capsys.readouterr().out
+    assert "..." not in text.partition("Commands:")[2]
+    assert all(re.search(rf"^  {name} +[A-Z].*\.$", text, flags=re.MULTILINE) for name in COMMANDS)
+
+
+def test_shell_completion():
+    environment = os.environ | {"_RSVIB_COMPLETE": "complete_bash", "COMP_WORDS": "rsvib re", "COMP_CWORD": "1"}
+    done = subprocess.run([PROGRAM], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["restore", "report"]
+    environment |= {"COMP_WORDS": "rsvib detect --wi", "COMP_CWORD": "2"}
+    done = subprocess.run([PROGRAM], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["--window"]
+
+
+def in_terminal(arguments, columns):
+    """What a program prints on a terminal with so many columns, without control sequences."""
+    descriptor, terminal = pty.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 30, columns, 0, 0))
+    environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES", "NO_COLOR")}
+    environment |= {"TERM": "xterm"}
+    shown = b""
+    with subprocess.Popen(arguments, stdin=terminal, stdout=terminal, stderr=terminal, env=environment) as process:
+        os.close(terminal)
+        with contextlib.suppress(OSError):  # the program has ended
+            while part := os.read(descriptor, 65536):
+                shown += part
+    os.close(descriptor)
+    assert process.returncode == 0
+    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.decode())
+
+
+LOOPS = """
+import time
+from rsvib_torch.commands.terminal import counting, output_of, working
+from rsvib_torch.core.progress import listening, steps
+
+with working("restoring"):
+    advance = steps(4, "frames")
+    for _ in range(3):
+        time.sleep(0.15)
+        advance()
+    time.sleep(0.3)
+with counting("restoring frames.tif") as progress:
+    progress(10, 100)  # frames of the interrupted run
+    time.sleep(0.3)
+    progress(20, 100)
+    time.sleep(0.3)
+with output_of(as_json=False, quiet=True), working("reading quietly"):
+    steps(2, "frames")()
+    time.sleep(0.3)
+"""
+
+
+def test_progress_has_rate_and_remaining_time():
+    shown = in_terminal([sys.executable, "-c", LOOPS], 80)
+    assert re.search(r"restoring \S* 0 of 4 frames", shown)
+    assert re.search(r"restoring \S* 3 of 4 frames  \d[\d.]*/s  0:00:00 left", shown)
+    assert re.search(r"restoring frames.tif \S* 20 of 100 frames  \d[\d.]*/s  0:00:0\d left", shown)
+    assert "quietly" not in shown
+
+
+def test_long_operations_report_their_progress(place, tmp_path):
+    """Each loop begins at 0 and ends at its number of steps."""
+    reported = []
+
+    def units(work):
+        reported.clear()
+        with listening(lambda *state: reported.append(state)):
+            result = work()
+        begun = [unit for done, _, unit in reported if done == 0]
+        assert begun == [unit for done, total, unit in reported if done == total]
+        return result, set(begun)
+
+    frames, found = units(lambda: rsv.read_stack(place / "long.tif"))
+    assert found == {"frames"}
+    detection, found = units(lambda: rsv.detect_vibration(frames, TIMING))
+    assert found == {"pairs", "groups"}
+    for method, unit in (("exact", "frames"), ("banded", "chunks"), ("richardson-lucy", "iterations")):
+        restored, found = units(
+            lambda method=method: rsv.restore(frames, TIMING, detection, method=method, check=False)
+        )
+        assert unit in found
+    _, found = units(lambda: rsv.judge_restoration(frames, restored, TIMING, detection))
+    assert found == {"pairs"}
+    _, found = units(lambda: rsv.write_stack(tmp_path / "r.npy", restored))
+    assert found == {"frames"}
+
+
+def test_no_progress_without_a_terminal(capsys):
+    with working("reading"):
+        steps(2, "frames")()
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_answers_fit_the_terminal(place, config, tmp_path, columns):
+    arguments = ["detect", place / "blind.tif", *config, "--out", tmp_path / "o"]
+    shown = in_terminal([PROGRAM, *map(str, arguments)], columns)
+    shown = shown[shown.index("Vibration in") : shown.index("Files")]
+    lines = [line.rstrip() for line in shown.splitlines() if line.strip()]
+    assert max(map(len, lines)) <= min(columns, 100)
+    assert max(map(len, lines)) > 0.8 * min(columns, 100)
+    assert all(line.startswith("  ") for line in lines[1:])
+
+
+def test_true_motion_is_recovered_by_the_command(tmp_path, capsys):
+    """With frames of the independent simulator of the tests."""
+    motion = Motion((1.6, 1.1), (71.0, 113.0), (0.6, -1.2))
+    frames = take_frames(draw_scene(272, 208, 3), TIMING, motion, 3, noise=0.003)
+    rsv.write_stack(tmp_path / "f.npy", torch.from_numpy(frames).float())
+    (tmp_path / "c.toml").write_text(CONFIG)
+    assert run("detect", tmp_path / "f.npy", "--config", tmp_path / "c.toml", "--out", tmp_path / "o", "--json") == 0
+    found = json.loads(capsys.readouterr().out)["detection"]
+    for axis in range(2):
+        error = found["vibration"]["frequency"][axis][0] - motion.frequency[axis]
+        assert abs(error) < 5 * found["std"]["frequency"][axis][0]
