@@ -3,6 +3,7 @@
 import re
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -94,6 +95,18 @@ def test_channels_last_in_blocks_scenes_and_quality(grey, colour):
     with pytest.raises(ValueError, match=r"appears to have its channels last: pass scene.permute\(2, 0, 1\)"):
         rsv.simulate_frames(torch.rand(320, 240, 3), TIMING, VIBRATION)
     assert rsv.psnr(list(grey), list(0.9 * grey), 1.0).shape == (3,)
+
+
+@pytest.mark.parametrize("shape", [(2, 40, 30, 3), (40, 30, 3), (40, 30, 1)])
+def test_arrays_in_files_with_channels_last_are_refused(tmp_path, shape):
+    np.save(tmp_path / "a.npy", np.zeros(shape, np.uint8))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["frames"] = np.zeros(shape, np.uint8)
+    for name, remedy in (("a.npy", r"store \(T, C, H, W\)$"), ("a.h5", "with the attribute axes='THWC'")):
+        with pytest.raises(ValueError, match=rf"{name}: .* appears to have its channels last; .*{remedy}"):
+            rsv.read_stack(tmp_path / name)
+    with pytest.raises(ValueError, match=r"of shape \(8, 30, 3\) would be read as one with channels last; write .tif"):
+        rsv.write_stack(tmp_path / "b.npy", torch.rand(8, 30, 3), channels="first")
 
 
 @pytest.mark.parametrize("scan_axis", [-2, -1])

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice
 
-__all__ = ["ArrayLike", "Channels", "FramesLike", "as_tensor", "channel_axis"]
+__all__ = ["ArrayLike", "Channels", "FramesLike", "as_tensor", "channel_axis", "channels_appear_last"]
 
 ArrayLike = Tensor | NDArray[Any]
 FramesLike = ArrayLike | Sequence[ArrayLike]
@@ -81,6 +81,16 @@ def _stacked(name: str, items: Sequence[Tensor]) -> Tensor:
     return torch.stack(list(items))
 
 
+def channels_appear_last(shape: Sequence[int]) -> bool:
+    """Whether the last axis is one of up to four channels of an image of more than four pixels along each axis.
+
+    Example:
+        >>> channels_appear_last((2, 48, 64, 3)), channels_appear_last((2, 3, 48, 64))
+        (True, False)
+    """
+    return len(shape) >= 3 and shape[-1] <= 4 < min(shape[-3:-1])
+
+
 def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
     """The axis of the channels: -1 if they are last, -3 if they come before the image axes or do not exist.
 
@@ -103,9 +113,9 @@ def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
         ValueError: frames of shape (2, 48, 64, 3) appear to have their channels last: pass channels="last" or...
     """
     check_choice("channels", channels, (None, "first", "last"))
-    shape, most = tuple(shape), 4
-    appears_last = len(shape) >= 3 and shape[-1] <= most < min(shape[-3:-1])
-    appears_first = len(shape) >= 4 and shape[-3] <= most < min(shape[-2:])
+    shape = tuple(shape)
+    appears_last = channels_appear_last(shape)
+    appears_first = len(shape) >= 4 and channels_appear_last((*shape[-2:], shape[-3]))
     if len(shape) == 3 and appears_last and channels != "first":
         raise ValueError(
             f'{name} of shape {shape} appear to be one image (H, W, C): pass {name}[None] with channels="last", or '

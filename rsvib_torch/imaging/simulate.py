@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
-from rsvib_torch.frames.arrays import ArrayLike, as_tensor
+from rsvib_torch.frames.arrays import ArrayLike, as_tensor, channels_appear_last
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.sensor_model import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory
@@ -69,7 +69,7 @@ def simulate_frames(
         raise TypeError("scene must be a floating-point tensor whose full scale is 1")
     if scene.ndim not in (2, 3) or not bool(torch.isfinite(scene).all()):
         raise ValueError(f"scene must be a finite (H, W) or (C, H, W) tensor, got shape {tuple(scene.shape)}")
-    if scene.ndim == 3 and scene.shape[-1] <= 4 < min(scene.shape[:2]):
+    if channels_appear_last(scene.shape):
         raise ValueError(
             f"scene of shape {tuple(scene.shape)} appears to have its channels last: pass scene.permute(2, 0, 1)"
         )

@@ -9,6 +9,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from rsvib_torch.frames.arrays import channels_appear_last
 from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter, check_frames_held
 from rsvib_torch.io.formats import StackFormat
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
@@ -63,11 +64,6 @@ def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any], 
     return shape, fortran_order, dtype, file.tell()
 
 
-def _channels_ambiguous(shape: tuple[int, ...]) -> bool:
-    """Whether an array is more likely (T, H, W, C) than (T, C, H, W)."""
-    return len(shape) == 4 and shape[-1] <= 4 < shape[1]
-
-
 def _open(path: Path) -> ContiguousReader | _FortranOrderReader:
     """Open (H, W), (T, H, W) or (T, C, H, W). Pickled objects are refused."""
     with readable_stack(path, ".npy"):
@@ -77,8 +73,8 @@ def _open(path: Path) -> ContiguousReader | _FortranOrderReader:
             shape = (1, *shape)
         if len(shape) not in (3, 4) or min(shape) < 1:
             raise ValueError(f"array has shape {shape}; expected (H, W), (T, H, W) or (T, C, H, W)")
-        if _channels_ambiguous(shape):
-            raise ValueError(f"array has shape {shape}; expected (T, C, H, W), move the channels to axis 1")
+        if channels_appear_last(shape):
+            raise ValueError(f"array of shape {shape} appears to have its channels last; store (T, C, H, W)")
         info = StackInfo(shape, dtype.name, known_full_scale(dtype))
         return (_FortranOrderReader if fortran_order else ContiguousReader)(path, info, offset, dtype)
 
@@ -95,7 +91,7 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
 
 
 def _check(path: Path, info: StackInfo) -> None:
-    if _channels_ambiguous(info.shape):
+    if channels_appear_last(info.shape):
         raise ValueError(f"{path}: array of shape {info.shape} would be read as one with channels last; write .tif")
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.presentation import Summarised
+from rsvib_torch.frames.arrays import channels_appear_last
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.time_metadata import orientation_of, times_of_attributes
 
@@ -224,12 +225,15 @@ def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], 
     axes = str(attributes.get("axes", {2: "HW", 3: "THW", 4: "TCHW"}.get(len(shape), "")))
     if len(axes) != len(shape) or axes not in ("HW", "THW", "TCHW", "THWC") or min(shape) < 1:
         raise ValueError(f"array of shape {shape} with axes {axes!r}; expected HW, THW, TCHW or THWC")
+    if "axes" not in attributes and channels_appear_last(shape):
+        raise ValueError(
+            f"array of shape {shape} appears to have its channels last; store (T, C, H, W), or (T, H, W, C) with the "
+            "attribute axes='THWC'"
+        )
     if axes == "HW":
         shape = (1, *shape)
     elif axes == "THWC":
         shape = (shape[0], shape[3], shape[1], shape[2])
-    elif axes == "TCHW" and "axes" not in attributes and shape[-1] <= 4 < shape[1]:
-        raise ValueError(f"array has shape {shape}; expected (T, C, H, W), or the attribute axes='THWC'")
     stated: dict[str, Any] = {}
     if attributes.get("frame_times") is not None:
         times = np.asarray(attributes["frame_times"], dtype=np.float64).ravel()

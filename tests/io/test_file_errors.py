@@ -121,7 +121,11 @@ def test_npy_damage_is_refused(tmp_path):
     np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(ValueError, match="pixels are object"):
         read_stack(path)
-    for shape, message in (((5,), "expected"), ((2, 9, 7, 3), r"expected \(T, C, H, W\)"), ((0, 9, 7), "expected")):
+    for shape, message in (
+        ((5,), "expected"),
+        ((2, 9, 7, 3), r"channels last; store \(T, C, H, W\)"),
+        ((0, 9, 7), "expected"),
+    ):
         np.save(path, np.zeros(shape, np.uint8))
         with pytest.raises(ValueError, match=message):
             read_stack(path)
