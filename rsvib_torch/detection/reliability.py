@@ -132,7 +132,7 @@ def _against_tone(
     if gain < MIN_GAIN:
         against.append(
             f"{name} is nearly blind: its gain is {gain:.3f}, {MIN_GAIN} is needed, because every frame is displaced "
-            "alike; use frames at other or unequal intervals"
+            "alike; use frames at other or unequal intervals" + _frame_rate_hint(hertz, hertz_std, timing)
         )
     if hertz * timing.exposure_time > 1.0:
         against.append(
@@ -140,6 +140,20 @@ def _against_tone(
             "shorter exposure"
         )
     return against
+
+
+def _frame_rate_hint(hertz: float, std: float, timing: RowTiming) -> str:
+    """Addition for a tone whose frequency is a multiple of the frame rate: a wrong ``frame_rows`` causes such tones."""
+    multiple = round(hertz * timing.frame_period)
+    if timing.frame_start_times is not None or multiple == 0:
+        return ""
+    if abs(hertz - multiple * timing.frame_rate) > max(3 * std, 1e-3 * hertz):
+        return ""
+    times = "" if multiple == 1 else f"{multiple} times "
+    return (
+        f"; its frequency equals {times}the frame rate of {timing.frame_rate:.5g} Hz, which a wrong frame_rows also "
+        "causes: check that frame_rows counts the blanking rows and is not the image height"
+    )
 
 
 def _sinc(x: float) -> float:

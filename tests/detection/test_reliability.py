@@ -80,6 +80,8 @@ def missing(count):
         ({"max_tones": 1}, "1 tones do not explain the motion"),
         ({"amplitude": 0.002, "std": (1e-5, 0.01)}, "too small"),
         ({"frequency": 1 / 0.04096, "std": (1e-3, 1e-3)}, "nearly blind"),
+        ({"frequency": 1 / 0.04096, "std": (1e-3, 1e-3)}, "equals the frame rate of 24.414 Hz"),
+        ({"frequency": 2 / 0.04096 + 0.01, "std": (1e-3, 1e-2)}, "equals 2 times the frame rate"),
         ({"frequency": 2600.0}, "above 1/T_e = 2500 Hz"),
         ({"fitted": lambda curve: curve + 0.5}, None),
         ({"fitted": lambda curve: 0.3 * curve}, "does not explain the offset curve"),
