@@ -75,9 +75,8 @@ def judge(
         for tone in amplitude.nonzero()[:, 0].tolist():
             against.extend(_against_tone(vibration, std, axis, tone, float(gain[axis, tone]), timing))
         if std.displacement is not None:
-            against.extend(
-                _against_displacement(*(float(value[axis]) for value in (displacement, std.displacement, own_std)))
-            )
+            values = (float(value[axis]) for value in (displacement, std.displacement, own_std))
+            against.extend(_against_displacement(*values, num_tones=int(amplitude.count_nonzero())))
         if other_motion is not None:
             against.extend(_against_rotation(other_motion, axis) + _against_other_motion(other_motion, axis))
             continue
@@ -132,7 +131,7 @@ def _against_tone(
     if gain < MIN_GAIN:
         against.append(
             f"{name} is nearly blind: its gain is {gain:.3f}, {MIN_GAIN} is needed, because every frame is displaced "
-            "alike; use frames at other or unequal intervals"
+            "alike; use frames at other or unequal intervals" + _frame_rate_hint(hertz, hertz_std, timing)
         )
     if hertz * timing.exposure_time > 1.0:
         against.append(
@@ -142,19 +141,33 @@ def _against_tone(
     return against
 
 
+def _frame_rate_hint(hertz: float, std: float, timing: RowTiming) -> str:
+    """Addition for a tone whose frequency is a multiple of the frame rate: a wrong ``frame_rows`` causes such tones."""
+    multiple = round(hertz * timing.frame_period)
+    if timing.frame_start_times is not None or multiple == 0:
+        return ""
+    if abs(hertz - multiple * timing.frame_rate) > max(3 * std, 1e-3 * hertz):
+        return ""
+    times = "" if multiple == 1 else f"{multiple} times "
+    return (
+        f"; its frequency equals {times}the frame rate of {timing.frame_rate:.5g} Hz, which a wrong frame_rows also "
+        "causes: check that frame_rows counts the blanking rows and is not the image height"
+    )
+
+
 def _sinc(x: float) -> float:
     return math.sin(math.pi * x) / (math.pi * x) if x else 1.0
 
 
-def _against_displacement(size: float, std: float, own_std: float) -> list[str]:
+def _against_displacement(size: float, std: float, own_std: float, *, num_tones: int) -> list[str]:
     """Reasons from the displacement of the rows in px and its standard deviations, rms over the rows.
 
     ``own_std`` holds if the number of tones is right, ``std`` allows for a further tone. The limits and their effect
-    are listed in docs/verdicts.md.
+    are listed in docs/verdicts.md; of 18 simulated axes with several tones above 4 %, 3 were known within 2 %.
     """
     uncertain = f"the displacement of the rows is uncertain: {size:.2g} ± {std:.2g} px"
-    if std > max(0.04 * size, 0.01) and std > 1.5 * own_std:
-        return [f"{uncertain}, because the frames also agree with a further tone; use more frames"]
+    if std > max(0.04 * size, 0.01) and (num_tones > 1 or std > 1.5 * own_std):
+        return [f"{uncertain}, because the frames also agree with other tones; use more frames"]
     if std > 0.25 * size:
         return [f"{uncertain}; the standard deviation must be at most 25 % of the displacement; use more frames"]
     return []
@@ -182,7 +195,7 @@ def _against_other_motion(other: OtherMotion, axis: int) -> list[str]:
     size = float(other.size[axis])
     limits = (
         ("rows", float(other.unexplained[axis]), max(0.05, 0.006 * size)),
-        ("neighbouring rows", float(other.correlated[axis]), max(0.01, 0.006 * size)),
+        ("neighbouring rows", float(other.correlated[axis]), max(0.01, 0.0025 * size)),
     )
     for rows, unexplained, allowed in limits:
         if unexplained > allowed:

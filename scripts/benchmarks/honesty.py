@@ -64,7 +64,8 @@ def observable_tones(taken: Recording, axis: int) -> Array:
     for amplitude, frequency, phase in sorted(taken.case.tones[axis].tolist(), key=lambda tone: tone[1]):
         value = amplitude * np.exp(1j * (2 * np.pi * frequency * middle + phase))
         if merged and (frequency - merged[-1][1]) * duration < MERGED:
-            other, between = merged[-1][2], 0.5 * (frequency + merged[-1][1])
+            size, other = merged[-1][0], merged[-1][2]
+            between = (size * merged[-1][1] + amplitude * frequency) / (size + amplitude)
             merged[-1] = [abs(value + other), between, value + other]
         else:
             merged.append([amplitude, frequency, value])

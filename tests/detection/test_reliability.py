@@ -75,11 +75,13 @@ def missing(count):
         ({"displacement_std": 0.084, "own_std": 0.02}, None),  # 4 % of the displacement
         ({"displacement_std": 0.086, "own_std": 0.02}, "uncertain: 2.1 ± 0.086 px, because the frames also agree"),
         ({"displacement_std": 0.09, "own_std": 0.061}, None),
-        ({"displacement_std": 0.09, "own_std": 0.059}, "agree with a further tone"),
+        ({"displacement_std": 0.09, "own_std": 0.059}, "agree with other tones"),
         ({"amplitude": 0.05, "std": (0.001, 0.01), "displacement_std": 0.0075, "own_std": 0.001}, None),
         ({"max_tones": 1}, "1 tones do not explain the motion"),
         ({"amplitude": 0.002, "std": (1e-5, 0.01)}, "too small"),
         ({"frequency": 1 / 0.04096, "std": (1e-3, 1e-3)}, "nearly blind"),
+        ({"frequency": 1 / 0.04096, "std": (1e-3, 1e-3)}, "equals the frame rate of 24.414 Hz"),
+        ({"frequency": 2 / 0.04096 + 0.01, "std": (1e-3, 1e-2)}, "equals 2 times the frame rate"),
         ({"frequency": 2600.0}, "above 1/T_e = 2500 Hz"),
         ({"fitted": lambda curve: curve + 0.5}, None),
         ({"fitted": lambda curve: 0.3 * curve}, "does not explain the offset curve"),
@@ -128,7 +130,7 @@ def test_residual_motion_makes_axes_unreliable(residual, against):
 
 @pytest.mark.parametrize(
     ("residual", "axis", "allowed"),
-    [("unexplained", 0, (0.05, 0.12)), ("correlated", 0, (0.01, 0.12)), ("differential", 1, (0.035, 0.18))],
+    [("unexplained", 0, (0.05, 0.12)), ("correlated", 0, (0.01, 0.05)), ("differential", 1, (0.035, 0.18))],
 )
 @pytest.mark.parametrize("factor", [0.97, 1.03])
 def test_residual_motion_is_compared_with_errors_of_interpolation_and_the_offsets(residual, axis, allowed, factor):
@@ -136,6 +138,26 @@ def test_residual_motion_is_compared_with_errors_of_interpolation_and_the_offset
         reliable, _ = verdict(other_motion=other_motion(**{residual: factor * limit, "size": size}))
         assert bool(reliable[axis]) == (factor < 1)
         assert bool(reliable[1 - axis])
+
+
+def test_the_displacement_by_several_tones_must_be_known_better():
+    tones = Vibration([[2.0, 1.0], [2.0, 0.0]], [[30.0, 45.0], [50.0, 50.0]])
+    small = torch.tensor([[0.01, 0.01], [0.01, 0.0]], dtype=torch.float64)
+    curve = torch.sin(torch.linspace(0, 12, 40, dtype=torch.float64))[:, None].expand(-1, 2)
+    for ratio in (0.03, 0.05):
+        std = VibrationStd(small, small, small, small, torch.zeros(2), torch.zeros(2), torch.full((2,), 1.5 * ratio))
+        reliable, reasons = judge(
+            tones,
+            std,
+            offsets=curve,
+            fitted=curve,
+            visible=torch.ones(40, dtype=torch.bool),
+            intervals=torch.tensor([0.04096], dtype=torch.float64),
+            displacement=torch.tensor([1.5, 1.5]),
+            own_std=std.displacement,
+            timing=TIMING,
+        )
+        assert reliable.tolist() == [ratio < 0.04, True], reasons
 
 
 def test_bands_are_not_judged_where_rows_were_measured():

@@ -88,26 +88,19 @@ def _added(
     measurements: Measurements, fit: ToneFit, exposure_starts: Tensor, axis: int, number_is_known: bool
 ) -> tuple[Tensor, Tensor]:
     """Covariance (B, P, P) of the parameters of an axis, and variance (B,) of its displacement, by further tones."""
-    residual = residual_of(measurements, fit)
-    jacobian, to_all = axis_jacobian(measurements, fit, axis)  # (B, N, G, M), (P, M)
-    spent = (jacobian.square().amax((1, 2)) > 0).sum(-1)
-    spare = (measurements.num_measurements[:, axis] - spent).clamp(min=1.0)
-    variance = (measurements.square(residual)[:, axis] / spare).clamp(min=1e-300)
-    root = (measurements.inverse_variances[..., axis] / variance[:, None]).sqrt()[..., None]  # (B, N, 1)
-    size = _PRIOR_SIZE * fit.amplitude[:, axis].square().sum(-1).sqrt()  # (B,) px
-    precision = torch.where(size > 0, size, 1.0).square().reciprocal()[:, None, None, None]
-    X = (root[..., None] * jacobian).flatten(1, 2)
-    inverse = torch.linalg.pinv(X)  # (B, M, D)
-    r = (root * residual[..., axis]).flatten(1)
+    root, X, r, to_all = _whitened(measurements, fit, axis)
     rows = exposure_starts.expand(len(r), -1)
     of_displacement = displacement_jacobian(fit, rows, measurements.exposure_time)[:, :, axis] @ to_all
     of_displacement = _without_trend(of_displacement, rows)
+    size = _PRIOR_SIZE * fit.amplitude[:, axis].square().sum(-1).sqrt()  # (B,) px
+    precision = torch.where(size > 0, size, 1.0).square().reciprocal()[:, None, None, None]
     eye = torch.eye(2, dtype=r.dtype, device=r.device)
     frequencies, counted = _grid(measurements, fit, axis)
+    inverse = torch.linalg.pinv(X)  # (B, M, D)
     parts = []
-    for chunk in frequencies.split(max(1, _CHUNK // (4 * X[..., 0].numel())), dim=1):
-        each = chunk[:, None].expand(-1, 2, -1)
-        Z = _quadratures(root[..., None] * tone_response(measurements, each)[..., axis, :]).flatten(1, 2)
+    for chunk in frequencies.split(max(1, _CHUNK // (4 * r.numel())), dim=1):
+        response = tone_response(measurements, chunk[:, None].expand(-1, 2, -1))[..., axis, :]
+        Z = _quadratures(root[..., None] * response).flatten(1, 2)  # (B, D, F, 2)
         rounding = 1e-12 * Z.square().sum((1, 3))[..., None, None]
         back = torch.einsum("bmd,bdfq->bfmq", inverse, Z)
         Z = Z - torch.einsum("bdm,bfmq->bdfq", X, back)
@@ -116,21 +109,38 @@ def _added(
         C = torch.linalg.inv(information + (precision + rounding) * eye)
         v = (C @ right[..., None])[..., 0]
         evidence = 0.5 * (right * v).sum(-1) - 0.5 * torch.logdet(eye + information / precision)
-        wave = _wave(fit, rows, chunk, measurements.exposure_time)  # (B, N, F, 2)
-        S = _without_trend(wave, rows) - torch.einsum("bnm,bfmq->bnfq", of_displacement, back)
+        # displacement of the rows by the tone and by the change of the parameters
+        S = _without_trend(_wave(fit, rows, chunk, measurements.exposure_time), rows)
+        S = S - torch.einsum("bnm,bfmq->bnfq", of_displacement, back)
         moved = torch.einsum("bnfp,bnfq->bfpq", S, S) / S.shape[1]
         parts.append((evidence, C + v[..., :, None] * v[..., None, :], back, moved))
     evidence, second, back, moved = (torch.cat(values, 1) for values in zip(*parts, strict=True))
     # equal prior probabilities of one tone more, of any frequency, and of none
     counted = counted & (size > 0)[:, None]
     prior = torch.where(counted, -counted.sum(1, keepdim=True).log(), -math.inf)
-    share = functional.pad(evidence + prior, (1, 0)).softmax(-1)[:, 1:]
-    smooth = _smooth_error(measurements, fit)[:, axis].square()[:, None] * prior.exp()
+    probability = functional.pad(evidence + prior, (1, 0)).softmax(-1)[:, 1:]
     if number_is_known:
-        share = torch.zeros_like(share)
-    second = share[..., None, None] * second + smooth[..., None, None] * eye
+        probability = torch.zeros_like(probability)
+    smooth = _smooth_error(measurements, fit)[:, axis].square()[:, None] * prior.exp()
+    second = probability[..., None, None] * second + smooth[..., None, None] * eye
     covariance = (back @ second @ back.mT).sum(1)
     return to_all @ covariance @ to_all.T, (moved * second).sum((1, 2, 3))
+
+
+def _whitened(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The linearised problem of an axis for errors of variance 1.
+
+    Returns:
+        Factors (B, N, 1) from px to standard deviations, the Jacobian (B, N G, M) of the free parameters, the residual
+        (B, N G), and the matrix (P, M) from the free parameters to all.
+    """
+    residual = residual_of(measurements, fit)
+    jacobian, to_all = axis_jacobian(measurements, fit, axis)  # (B, N, G, M)
+    spent = (jacobian.square().amax((1, 2)) > 0).sum(-1)
+    spare = (measurements.num_measurements[:, axis] - spent).clamp(min=1.0)
+    variance = (measurements.square(residual)[:, axis] / spare).clamp(min=1e-300)
+    root = (measurements.inverse_variances[..., axis] / variance[:, None]).sqrt()[..., None]
+    return root, (root[..., None] * jacobian).flatten(1, 2), (root * residual[..., axis]).flatten(1), to_all
 
 
 def _smooth_error(measurements: Measurements, fit: ToneFit) -> Tensor:
