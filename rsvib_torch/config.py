@@ -1,8 +1,11 @@
 """TOML configuration files: the camera, and the options of simulation, detection and restoration."""
 
+import math
 import os
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -12,14 +15,16 @@ from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.validation import Section, checked, options_section, validate
 from rsvib_torch.detection.detect import ToneOptions
 from rsvib_torch.imaging import SensorNoise
-from rsvib_torch.io.schema import TimingRecord, VibrationRecord
+from rsvib_torch.io.schema import VibrationRecord
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.restoration.exact.priors import PRIORS
 from rsvib_torch.restoration.restore import METHODS, CommonOptions
 from rsvib_torch.stacks import DEFAULT_WINDOW, BadFrames
 
-__all__ = ["Config", "Simulation", "read_config"]
+__all__ = ["Config", "Simulation", "file_section", "presets", "read_config"]
+
+_AGREEMENT = 1e-3  # relative; keys that state the same time twice are rounded by whoever wrote them
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,7 @@ class Config:
     """Content of a configuration file.
 
     Attributes:
+        source: Name of the file, for messages.
         timing: The sensor.
         full_scale: Count that corresponds to 1.0 in integer frames; None if it is not in the file.
         detection: Options of ``detect_vibration`` that are in the file.
@@ -54,6 +60,7 @@ class Config:
         stack: Options ``window`` and ``bad_frames`` of ``process_stack`` that are in the file.
     """
 
+    source: str
     timing: SensorTiming
     full_scale: float | None
     detection: dict[str, Any]
@@ -62,19 +69,68 @@ class Config:
     stack: dict[str, Any]
 
 
-class SensorSection(TimingRecord):
-    """``[sensor]``: the timing, and the full scale of integer frames."""
+class SensorSection(Section):
+    """``[sensor]``: the timing, and the full scale of integer frames.
 
+    Exposure and frame period are in seconds (``exposure_time``, ``frame_rate``) or in row times (``exposure_rows``,
+    ``frame_rows``).
+    """
+
+    row_time: float
+    exposure_time: float | None = Field(
+        default=None, description="Exposure time in seconds; this key or ``exposure_rows`` is required."
+    )
+    exposure_rows: float | None = None
+    frame_rate: float | None = Field(
+        default=None, description="Frames per second of the sensor; this key or ``frame_rows`` is required."
+    )
+    frame_rows: float | None = None
     scan_axis: Literal["y", "x"] = "y"
     readout_direction: Literal["forward", "reverse"] = "forward"
     frame_start_times: list[float] | None = None
-    full_scale: float | None = None
+    full_scale: float | None = Field(
+        default=None,
+        description="Count of an integer file that corresponds to 1.0, for example 4095 for 12-bit counts; 255 for "
+        "8-bit files.",
+    )
 
     @model_validator(mode="after")
-    def _check_full_scale(self) -> Self:
+    def _check(self) -> Self:
+        checked(self.to_timing)
         if self.full_scale is not None:
             check_number("full_scale", self.full_scale, above=0.0)
         return self
+
+    def to_timing(self) -> SensorTiming:
+        """The timing, with exposure and frame period in row times."""
+        row_time = check_number("row_time", self.row_time, above=0.0)
+        rate = self.frame_rate
+        if rate is not None and check_number("frame_rate", rate, above=0.0) < 0.1:
+            raise ValueError(f"frame_rate={rate:g} is less than 0.1; it is in frames per second, 1 / (frame period)")
+        exposure = None if self.exposure_time is None else self.exposure_time / row_time
+        period = None if rate is None else 1.0 / (rate * row_time)
+        return SensorTiming(
+            row_time,
+            _in_rows("exposure_time", self.exposure_time, exposure, "exposure_rows", self.exposure_rows),
+            _in_rows("frame_rate", rate, period, "frame_rows", self.frame_rows),
+            self.scan_axis,
+            self.readout_direction,
+            self.frame_start_times,
+        )
+
+
+def _in_rows(name: str, value: float | None, converted: float | None, rows_name: str, rows: float | None) -> float:
+    """A time in row times that is stated by one of two keys, or by both if they agree."""
+    if rows is None:
+        if converted is None:
+            raise ValueError(f"{name} or {rows_name} is missing")
+        return converted
+    if converted is not None and not math.isclose(converted, rows, rel_tol=_AGREEMENT):
+        raise ValueError(
+            f"{name}={value:g} contradicts {rows_name}={rows:g}: with this row_time it is {rows_name}={converted:.6g}; "
+            "remove one of the two keys"
+        )
+    return rows
 
 
 class VibrationSection(VibrationRecord):
@@ -120,8 +176,13 @@ _DetectionSection = options_section(
 class _StackSection(Section):
     """``[stack]``: processing of stacks in windows."""
 
-    window: int = Field(default=DEFAULT_WINDOW, ge=2)
-    bad_frames: BadFrames = "pass"
+    window: int = Field(
+        default=DEFAULT_WINDOW, ge=2, description="Largest number of frames in which one vibration is detected."
+    )
+    bad_frames: BadFrames = Field(
+        default="pass",
+        description='Frames that cannot be read or used: ``"pass"`` writes them unchanged, ``"skip"`` leaves them out.',
+    )
 
 
 def _restoration_section(method: object) -> Any:
@@ -135,34 +196,9 @@ def _restoration_section(method: object) -> Any:
     )
 
 
-def read_config(path: str | os.PathLike[str]) -> Config:
-    """Read a configuration file.
-
-    Only ``[sensor]`` is required.
-
-    * ``[sensor]``: fields of ``SensorTiming``, and ``full_scale``.
-    * ``[detection]``: options of ``detect_vibration``.
-    * ``[restoration]``: options of ``restore``, with ``saturation`` in the unit of the frames' file.
-    * ``[simulation]``: ``num_frames``, ``frame_size``, ``seed``, ``[simulation.vibration]`` (fields of ``Vibration``)
-      and ``[simulation.noise]`` (fields of ``SensorNoise``).
-    * ``[stack]``: ``window`` and ``bad_frames`` of ``process_stack``.
-
-    Args:
-        path: The TOML file.
-
-    Raises:
-        OSError: If the file cannot be opened.
-        ValueError: If it is not TOML, or a key is missing, unknown or has a wrong type or value: one line per key,
-            with its path, its value and what was expected.
-    """
-    path = Path(path)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: not a TOML file: {error}") from error
-    restoration = data.get("restoration")
-    method = restoration.get("method") if isinstance(restoration, dict) else None
-    root: Any = create_model(
+def file_section(method: object = "exact") -> Any:
+    """Class of the whole file, for a restoration method."""
+    return create_model(
         "_Root",
         __base__=Section,
         sensor=(SensorSection, ...),
@@ -171,16 +207,74 @@ def read_config(path: str | os.PathLike[str]) -> Config:
         simulation=(_SimulationSection | None, None),
         stack=(_StackSection | None, None),
     )
-    checked_data = validate(root, data, str(path))
-    sensor, simulation = checked_data.sensor, checked_data.simulation
+
+
+def presets() -> dict[str, str]:
+    """Text of the configuration files that are part of the package, by name."""
+    folder = files("rsvib_torch") / "presets"
+    return {
+        entry.name.removesuffix(".toml"): entry.read_text(encoding="utf-8")
+        for entry in sorted(folder.iterdir(), key=lambda entry: entry.name)
+    }
+
+
+def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any] | None = None) -> Config:
+    """Read a configuration file.
+
+    Only ``[sensor]`` is required.
+
+    * ``[sensor]``: fields of ``SensorTiming``, with ``exposure_time`` and ``frame_rate`` in place of ``exposure_rows``
+      and ``frame_rows`` if they are known in seconds, and ``full_scale``.
+    * ``[detection]``: options of ``detect_vibration``.
+    * ``[restoration]``: options of ``restore``, with ``saturation`` in the unit of the frames' file.
+    * ``[simulation]``: ``num_frames``, ``frame_size``, ``seed``, ``[simulation.vibration]`` (fields of ``Vibration``)
+      and ``[simulation.noise]`` (fields of ``SensorNoise``).
+    * ``[stack]``: ``window`` and ``bad_frames`` of ``process_stack``.
+
+    Args:
+        path: The TOML file; None if ``sensor`` describes the camera.
+        sensor: Keys of ``[sensor]`` that replace those of the file. ``exposure_time`` also replaces ``exposure_rows``,
+            ``frame_rate`` also ``frame_rows``, and vice versa.
+
+    Raises:
+        OSError: If the file cannot be opened.
+        ValueError: If it is not TOML, or a key is missing, unknown or has a wrong type or value: one line per key,
+            with its path, its value and what was expected.
+
+    Example:
+        >>> camera = {"row_time": 20e-6, "exposure_time": 1e-3, "frame_rate": 25}
+        >>> read_config(None, sensor=camera).timing.frame_rows
+        2000.0
+    """
+    data = {} if path is None else _read_toml(Path(path))
+    source = "the command line" if path is None else str(path)
+    if sensor:
+        stated = data.get("sensor", {})
+        if isinstance(stated, dict):
+            same = ({"exposure_time", "exposure_rows"}, {"frame_rate", "frame_rows"})
+            replaced = set(sensor).union(*(pair for pair in same if pair & set(sensor)))
+            stated = {name: value for name, value in stated.items() if name not in replaced}
+            data["sensor"] = {**stated, **sensor}
+    restoration = data.get("restoration")
+    root = file_section(restoration.get("method") if isinstance(restoration, dict) else None)
+    checked_data = validate(root, data, source)
+    simulation = checked_data.simulation
     return Config(
-        timing=sensor.to_timing(),
-        full_scale=sensor.full_scale,
+        source=source,
+        timing=checked_data.sensor.to_timing(),
+        full_scale=checked_data.sensor.full_scale,
         detection=_given(checked_data.detection),
         restoration=_given(checked_data.restoration),
         simulation=None if simulation is None else simulation.simulation(),
         stack=_given(checked_data.stack),
     )
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: not a TOML file: {error}") from error
 
 
 def _given(section: Any) -> dict[str, Any]:

@@ -9,11 +9,13 @@ import typer
 
 import rsvib_torch
 from rsvib_torch.commands import motion_commands, stack_commands
+from rsvib_torch.commands.init import init
 from rsvib_torch.commands.terminal import error_line, print_line, warnings_in_one_line
 
 __all__ = ["main", "run_command"]
 
 app = typer.Typer(name="rsvib", add_completion=False, pretty_exceptions_enable=False)
+app.command()(init)
 app.command()(stack_commands.run)
 app.command()(stack_commands.detect)
 app.command("restore")(stack_commands.restore_frames)
@@ -57,7 +59,8 @@ def run_command(arguments: Sequence[str]) -> int:
             except typer.Abort:
                 code = _INTERRUPTED
         if code == _INTERRUPTED:
-            error_line("stopped; the windows completed by rsvib run are kept, --resume continues")
+            kept = "; the completed windows are kept, --resume continues" if "run" in arguments[:1] else ""
+            error_line(f"stopped{kept}")
         return code if isinstance(code, int) else 0
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""

@@ -12,17 +12,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
+from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.options import (
-    ConfigOption,
     DeviceOption,
+    FrameRateOption,
     FramesArgument,
     RestoredArgument,
     ScaleOption,
+    camera_options,
     full_scale_of,
+    seconds,
 )
 from rsvib_torch.commands.stack_commands import load, save
 from rsvib_torch.commands.terminal import error_line, print_line, working
-from rsvib_torch.config import read_config
+from rsvib_torch.config import Config
 from rsvib_torch.detection import align_motion, check_motion, detect_motion, detect_swept_tone
 from rsvib_torch.io import check_stack_target, check_writable, read_stack, read_stack_info, whole_file
 from rsvib_torch.motion.recorded import MotionUnit, TimeUnit, read_motion
@@ -37,10 +40,11 @@ Array = NDArray[np.float64]
 MotionTable = tuple[tuple[str, ...], Array]  # names of the columns, and their values (N, columns); s and px
 
 
+@camera_options
 def motion(
     frames: FramesArgument,
     *,
-    config: ConfigOption,
+    settings: Config,
     out: Annotated[
         Path,
         typer.Option(help="CSV file to write: time in s, x and y in px, and their standard deviations (model free)."),
@@ -63,7 +67,6 @@ def motion(
 
     To restore frames with the CSV file: rsvib known --motion FILE --unit px --offset 0.
     """
-    settings = read_config(config)
     check_writable(out)
     stack = load(frames, settings, full_scale, device)
     with working("detecting the motion"):
@@ -119,11 +122,12 @@ def _sampled(motion: FreeMotion, last: float, knots: float) -> tuple[Array, Arra
     return times, motion.displacement(torch.from_numpy(times).to(motion.device)).cpu().numpy()
 
 
+@camera_options
 def known(
     frames: FramesArgument,
     restored: RestoredArgument,
     *,
-    config: ConfigOption,
+    settings: Config,
     motion: Annotated[Path, typer.Option(help="CSV file with the columns time, x and y.")],
     unit: Annotated[MotionUnit, typer.Option(help="Unit of x and y: px, an angle, or an angular rate.")],
     focal_length: Annotated[
@@ -152,7 +156,6 @@ def known(
 
     The recording is compared with the offsets of rows between the frames, and refused if it does not explain them.
     """
-    settings = read_config(config)
     recorded = read_motion(
         motion,
         unit=unit,
@@ -234,9 +237,13 @@ def calibrate(
     ] = None,
     exposure: Annotated[
         list[float] | None,
-        typer.Option(help="Exposure time in s, given once per frame, for a strobe of unknown frequency."),
+        typer.Option(
+            parser=seconds,
+            metavar="TIME",
+            help="Exposure time, e.g. 1/1000, given once per frame, for a strobe of unknown frequency.",
+        ),
     ] = None,
-    frame_rate: Annotated[float | None, typer.Option(help="Frames per second, if the frames are consecutive.")] = None,
+    frame_rate: FrameRateOption = None,
     on_fraction: Annotated[
         float | None,
         typer.Option(help="Duty cycle of a light that is switched on and off; determines the exposure time."),
@@ -285,7 +292,7 @@ def calibrate(
     _print_calibration(result, stack.shape[axis])
     if out is not None:
         with whole_file(out) as file:
-            file.write_text(_sensor_toml(result, scan_axis), encoding="utf-8")
+            file.write_text(_calibrated_toml(result, scan_axis), encoding="utf-8")
         print_line(f"{out}: [sensor]")
 
 
@@ -306,14 +313,14 @@ def _print_calibration(result: RowTimeCalibration, num_rows: int) -> None:
         print_line(note)
 
 
-def _sensor_toml(result: RowTimeCalibration, scan_axis: str) -> str:
+def _calibrated_toml(result: RowTimeCalibration, scan_axis: str) -> str:
     """The table ``[sensor]`` of a configuration file; unknown values are comments to be filled in."""
+    period: dict[str, object] = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
     values = {
-        "row_time": f"{result.row_time:.9g}",
-        "exposure_rows": None if result.exposure_time is None else f"{result.exposure_time / result.row_time:.6g}",
-        "frame_rows": None if result.frame_rows is None else f"{result.frame_rows:.8g}",
-        "scan_axis": f'"{scan_axis}"',
-        "readout_direction": None if result.readout_direction is None else f'"{result.readout_direction}"',
+        "row_time": result.row_time,
+        "exposure_time": result.exposure_time,
+        **period,
+        "scan_axis": scan_axis,
+        "readout_direction": result.readout_direction,
     }
-    lines = [f"# {name} = ?  (unknown)" if text is None else f"{name} = {text}" for name, text in values.items()]
-    return "\n".join(["[sensor]", *lines, *(f"# {note}" for note in result.notes)]) + "\n"
+    return sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])

@@ -10,7 +10,6 @@ from torch import Tensor
 
 import rsvib_torch
 from rsvib_torch.commands.options import (
-    ConfigOption,
     DeviceName,
     DeviceOption,
     ForceOption,
@@ -24,6 +23,7 @@ from rsvib_torch.commands.options import (
     SaturationOption,
     ScaleOption,
     WorkersOption,
+    camera_options,
     full_scale_of,
     restoration_options,
     torch_device,
@@ -36,7 +36,7 @@ from rsvib_torch.commands.terminal import (
     print_restoration,
     working,
 )
-from rsvib_torch.config import Config, read_config
+from rsvib_torch.config import Config
 from rsvib_torch.core.validation import validate
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.imaging import simulate_frames
@@ -139,11 +139,12 @@ def _write_detection(folder: Path, result: DetectionResult, timing: SensorTiming
     return ["vibration.json", "offsets.csv", "offsets.png"]
 
 
+@camera_options
 def simulate(
     scene: Annotated[Path, typer.Argument(help="Image of the scene at rest, larger than the frames.")],
     frames: Annotated[Path, typer.Argument(help="Stack to write.")],
     *,
-    config: ConfigOption,
+    settings: Config,
     device: DeviceOption = "auto",
     full_scale: Annotated[
         float | None, typer.Option(help="Count of the scene's file that corresponds to full scale.")
@@ -156,9 +157,10 @@ def simulate(
 
     The camera, its vibration and its noise are described in the configuration file.
     """
-    settings = read_config(config)
     if settings.simulation is None:
-        raise ValueError(f"{config}: simulation: missing key; expected a table with vibration, num_frames, ...")
+        raise ValueError(
+            f"{settings.source}: simulation: missing key; expected a table with vibration, num_frames, ..."
+        )
     simulation, target = settings.simulation, torch_device(device)
     image = read_stack(scene, full_scale=full_scale)
     if len(image) != 1:
@@ -181,10 +183,11 @@ def simulate(
     print_line(f"{frames}: {len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}")
 
 
+@camera_options
 def detect(
     frames: FramesArgument,
     *,
-    config: ConfigOption,
+    settings: Config,
     out: Annotated[Path, typer.Option(help="Folder for vibration.json, offsets.csv and offsets.png.")],
     window: Annotated[
         int | None,
@@ -202,7 +205,6 @@ def detect(
 
     The vibration is modelled as sinusoids of constant amplitude and frequency. For other motion see rsvib motion.
     """
-    settings = read_config(config)
     check_writable(out, folder=True)
     window = settings.stack.get("window") if window is None else window
     if window is None:
@@ -239,11 +241,12 @@ def _warn_of_failures(windows: int) -> None:
         error_line(f"detection failed in {windows} windows: see manifest.json", "warning")
 
 
+@camera_options
 def restore_frames(
     frames: FramesArgument,
     restored: RestoredArgument,
     *,
-    config: ConfigOption,
+    settings: Config,
     vibration: Annotated[
         Path, typer.Option(help="The vibration.json, or manifest.json of windows, written by detect or run.")
     ],
@@ -262,7 +265,6 @@ def restore_frames(
 
     If the restored frames are judged no better than the input, the input is written unchanged, unless --force is given.
     """
-    settings = read_config(config)
     overrides = Overrides(method, joint, prior, saturation)
     with vibration.open("rb") as file:
         is_manifest = b'"rsvib stack"' in file.read(200)  # bytes; the format is the first key of either file
@@ -324,11 +326,12 @@ def _restore_windows(
     print_line(f"{restored}: {result.frames} frames in {result.windows} windows, {result.restored} windows restored")
 
 
+@camera_options
 def run(
     frames: FramesArgument,
     out: Annotated[Path, typer.Argument(help="Folder for the restored frames, the vibration and the figures.")],
     *,
-    config: ConfigOption,
+    settings: Config,
     output: Annotated[
         str,
         typer.Option(help="Name of the restored stack in that folder; its extension selects the format."),
@@ -371,7 +374,6 @@ def run(
     Stacks of any length are processed in windows. If the restored frames are judged no better than the input, the
     input is written unchanged, unless --force is given. Ctrl-C stops after the current windows; --resume continues.
     """
-    settings = read_config(config)
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
     check_writable(out, folder=True)
@@ -445,11 +447,12 @@ def _draw_comparison(path: Path, frames: Path, full_scale: float | None, first: 
     save_figure(comparison_figure(raw, first.frames[0].cpu(), names=names), path)
 
 
+@camera_options
 def report(
     frames: FramesArgument,
     out: Annotated[Path, typer.Argument(help="Folder for report.html and its figures.")],
     *,
-    config: ConfigOption,
+    settings: Config,
     edge: Annotated[
         list[str] | None,
         typer.Option(
@@ -470,7 +473,6 @@ def report(
     The page is one file that needs no network. The figures are also written as PNG files.
     """
     boxes = [_edge_box(text) for text in edge or []]
-    settings = read_config(config)
     check_writable(out, folder=True)
     stack = load(frames, settings, full_scale, device)
     options = restoration_options(stack.info, stack.full_scale, settings, Overrides(method, joint, prior, saturation))
@@ -479,7 +481,7 @@ def report(
     result = _restore(stack, detection, options, force)
     content = Report(
         title=f"Vibration in {frames.name}",
-        subtitle=f"{frames}, camera of {config}",
+        subtitle=f"{frames}, camera of {settings.source}",
         frames=stack.frames,
         restored=result.frames,
         was_restored=result.restored,

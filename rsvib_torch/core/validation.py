@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
-__all__ = ["Section", "checked", "options_section", "read_json", "validate"]
+__all__ = ["Section", "checked", "expected_text", "options_section", "read_json", "validate"]
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _Result = TypeVar("_Result")
@@ -82,7 +82,7 @@ def _describe(model: type[BaseModel], data: Any, mistake: Any) -> tuple[str, str
                 break  # the rest of the location names a member of a union
             path = f"{path}.{step}" if path else step
             if step not in value:
-                return path, f"missing key; expected {_expected(keys[step])}"
+                return path, f"missing key; expected {expected_text(keys[step])}"
             if kind == "extra_forbidden" and step not in keys:
                 return path, f"unknown key; expected one of {', '.join(keys)}"
             value, expected = value[step], keys.get(step, Any)
@@ -97,7 +97,7 @@ def _describe(model: type[BaseModel], data: Any, mistake: Any) -> tuple[str, str
         return path, f"expected at least {context['ge']}, got {value!r}"
     if kind in ("too_short", "too_long"):
         return path, f"expected {context.get('min_length', context.get('max_length'))} entries, got {value!r}"
-    return path, f"expected {_expected(expected)}, got {value!r}"
+    return path, f"expected {expected_text(expected)}, got {value!r}"
 
 
 def _members(annotation: Any) -> tuple[Any, ...]:
@@ -114,7 +114,7 @@ def _keys(annotation: Any) -> dict[str, Any]:
     return {}
 
 
-def _expected(annotation: Any) -> str:
+def expected_text(annotation: Any) -> str:
     """Description of a type in a message."""
     words: list[str] = []
     for member in _members(annotation):

@@ -27,7 +27,8 @@ class SensorTiming:
     Args:
         row_time: Time between the exposure starts of two neighbouring rows, in seconds.
         exposure_rows: Exposure time in row times (may be fractional).
-        frame_rows: Row times between the exposure starts of one row in consecutive frames.
+        frame_rows: Row times between the exposure starts of one row in consecutive frames: 1 / (frame rate x row time),
+            blanking rows included, and at least the number of rows.
         scan_axis: Axis along which rows are exposed one after another: ``-2`` (or ``"y"``, the default: rows are
             image rows) or ``-1`` (or ``"x"``: rows are image columns).
         readout_direction: ``"forward"`` if the row at index 0 of the scan axis is read first, ``"reverse"`` if the
@@ -73,7 +74,8 @@ class SensorTiming:
             )
         if exposure_rows > frame_rows:
             raise ValueError(
-                f"exposure_rows={exposure_rows:g} exceeds the frame period of frame_rows={frame_rows:g} row times"
+                f"exposure_rows={exposure_rows:g} exceeds the frame period of frame_rows={frame_rows:g} row times: "
+                f"exposure {exposure_rows * row_time:.4g} s, frame period {frame_rows * row_time:.4g} s"
             )
         if isinstance(self.scan_axis, bool) or self.scan_axis not in _SCAN_AXES:
             raise ValueError(f"scan_axis must be -2 ('y') or -1 ('x'), got {self.scan_axis!r}")
@@ -166,7 +168,8 @@ class SensorTiming:
         if self.frame_rows < num_rows:
             raise ValueError(
                 f"frame_rows={self.frame_rows:g} is less than the {num_rows} rows of the frames; it is the number of "
-                "row times from one frame to the next, including blanking rows"
+                f"row times from one frame to the next, including blanking rows, 1 / (frame rate x row time): with "
+                f"{self.frame_rate:g} frames/s, row_time is at most {self.frame_period / num_rows:.6g} s"
             )
 
     def in_row_order(self) -> "RowTiming":
