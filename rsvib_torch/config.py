@@ -1,5 +1,9 @@
-"""TOML configuration files: the camera, and the options of simulation, detection and restoration."""
+"""TOML configuration files: the camera, and the options of simulation, detection and restoration.
 
+A file is checked without torch, whose import takes seconds, except for ``[simulation]``.
+"""
+
+import functools
 import math
 import os
 import tomllib
@@ -7,22 +11,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import Field, create_model, model_validator
 
 from rsvib_torch.core.checks import check_number, check_whole_number
+from rsvib_torch.core.option_types import DEFAULT_WINDOW, METHOD_SETTINGS, BadFrames, DetectionSettings, PriorName
 from rsvib_torch.core.validation import Section, checked, options_section, validate
-from rsvib_torch.detection.detect import ToneOptions
-from rsvib_torch.imaging import SensorNoise
-from rsvib_torch.io.schema import VibrationRecord
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.restoration.exact.priors import PRIORS
-from rsvib_torch.restoration.restore import METHODS, CommonOptions
-from rsvib_torch.stacks import DEFAULT_WINDOW, BadFrames
 
-__all__ = ["Config", "Simulation", "file_section", "presets", "read_config"]
+if TYPE_CHECKING:
+    from rsvib_torch.imaging.sensor_model import SensorNoise
+    from rsvib_torch.motion.vibration import Vibration
+
+__all__ = ["Config", "Simulation", "file_section", "presets", "read_config", "simulation_section"]
 
 _AGREEMENT = 1e-3  # relative; keys that state the same time twice are rounded by whoever wrote them
 
@@ -39,10 +41,10 @@ class Simulation:
         seed: Seed of the noise.
     """
 
-    vibration: Vibration
+    vibration: "Vibration"
     num_frames: int
     frame_size: tuple[int, int] | None
-    noise: SensorNoise | None
+    noise: "SensorNoise | None"
     seed: int
 
 
@@ -133,44 +135,46 @@ def _in_rows(name: str, value: float | None, converted: float | None, rows_name:
     return rows
 
 
-class VibrationSection(VibrationRecord):
-    """``[simulation.vibration]``: phase and image motion are optional."""
+@functools.cache
+def simulation_section() -> Any:
+    """Class of ``[simulation]``; it needs torch, which takes seconds to import."""
+    from rsvib_torch.imaging.sensor_model import SensorNoise  # noqa: PLC0415
+    from rsvib_torch.io.schema import VibrationRecord  # noqa: PLC0415
 
-    phase: list[float] | list[list[float]] = Field(default_factory=lambda: [0.0, 0.0])
-    image_motion: list[float] = Field(default_factory=lambda: [0.0, 0.0])
+    class VibrationSection(VibrationRecord):
+        """``[simulation.vibration]``: phase and image motion are optional."""
+
+        phase: list[float] | list[list[float]] = Field(default_factory=lambda: [0.0, 0.0])
+        image_motion: list[float] = Field(default_factory=lambda: [0.0, 0.0])
+
+    noise_section = options_section("_NoiseSection", SensorNoise)
+
+    class SimulationSection(Section):
+        vibration: VibrationSection
+        num_frames: int = 2
+        frame_size: list[int] | None = None
+        noise: noise_section | None = None  # type: ignore[valid-type]
+        seed: int = 0
+
+        @model_validator(mode="after")
+        def _check(self) -> Self:
+            check_whole_number("num_frames", self.num_frames, at_least=1)
+            check_whole_number("seed", self.seed, at_least=0)
+            if self.frame_size is not None and (len(self.frame_size) != 2 or min(self.frame_size) < 1):
+                raise ValueError(f"frame_size must be [height, width] in px, got {self.frame_size}")
+            checked(self.simulation)
+            return self
+
+        def simulation(self) -> Simulation:
+            """The values as a ``Simulation``."""
+            size = None if self.frame_size is None else (self.frame_size[0], self.frame_size[1])
+            noise = None if self.noise is None else SensorNoise(**_given(self.noise))
+            return Simulation(self.vibration.to_vibration(), self.num_frames, size, noise, self.seed)
+
+    return SimulationSection
 
 
-_NoiseSection = options_section("_NoiseSection", SensorNoise)
-
-
-class _SimulationSection(Section):
-    """``[simulation]``."""
-
-    vibration: VibrationSection
-    num_frames: int = 2
-    frame_size: list[int] | None = None
-    noise: _NoiseSection | None = None  # type: ignore[valid-type]
-    seed: int = 0
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        check_whole_number("num_frames", self.num_frames, at_least=1)
-        check_whole_number("seed", self.seed, at_least=0)
-        if self.frame_size is not None and (len(self.frame_size) != 2 or min(self.frame_size) < 1):
-            raise ValueError(f"frame_size must be [height, width] in px, got {self.frame_size}")
-        checked(self.simulation)
-        return self
-
-    def simulation(self) -> Simulation:
-        """The values as a ``Simulation``."""
-        size = None if self.frame_size is None else (self.frame_size[0], self.frame_size[1])
-        noise = None if self.noise is None else SensorNoise(**_given(self.noise))
-        return Simulation(self.vibration.to_vibration(), self.num_frames, size, noise, self.seed)
-
-
-_DetectionSection = options_section(
-    "_DetectionSection", ToneOptions, skip=("full_scale", "ignore", "window", "window_step")
-)
+_DetectionSection = options_section("_DetectionSection", DetectionSettings)
 
 
 class _StackSection(Section):
@@ -187,24 +191,22 @@ class _StackSection(Section):
 
 def _restoration_section(method: object) -> Any:
     """``[restoration]``: the keys depend on the method."""
-    chosen = METHODS[method if isinstance(method, str) and method in METHODS else "exact"]
-    common: dict[str, Any] = {"method": Literal[*METHODS], "saturation": float | None}
-    if "prior" in chosen.options.__annotations__:
-        common["prior"] = Literal[*PRIORS]
-    return options_section(
-        "_RestorationSection", chosen.options, skip=("method", *CommonOptions.__annotations__), **common
-    )
+    settings = METHOD_SETTINGS.get(method if isinstance(method, str) else "exact", METHOD_SETTINGS["exact"])
+    common: dict[str, Any] = {"method": Literal[*METHOD_SETTINGS], "saturation": float | None}
+    if "prior" in settings.__annotations__:
+        common["prior"] = PriorName
+    return options_section("_RestorationSection", settings, **common)
 
 
 def file_section(method: object = "exact") -> Any:
-    """Class of the whole file, for a restoration method."""
+    """Class of the file for a restoration method, without the keys of ``[simulation]``."""
     return create_model(
         "_Root",
         __base__=Section,
         sensor=(SensorSection, ...),
         detection=(_DetectionSection | None, None),
         restoration=(_restoration_section(method) | None, None),
-        simulation=(_SimulationSection | None, None),
+        simulation=(Any, None),
         stack=(_StackSection | None, None),
     )
 
@@ -257,16 +259,19 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
             data["sensor"] = {**stated, **sensor}
     restoration = data.get("restoration")
     root = file_section(restoration.get("method") if isinstance(restoration, dict) else None)
-    checked_data = validate(root, data, source)
-    simulation = checked_data.simulation
+    content = validate(root, data, source)
+    simulation = None
+    if content.simulation is not None:
+        part: Any = create_model("_Part", __base__=Section, simulation=(simulation_section(), ...))
+        simulation = validate(part, {"simulation": content.simulation}, source).simulation.simulation()
     return Config(
         source=source,
-        timing=checked_data.sensor.to_timing(),
-        full_scale=checked_data.sensor.full_scale,
-        detection=_given(checked_data.detection),
-        restoration=_given(checked_data.restoration),
-        simulation=None if simulation is None else simulation.simulation(),
-        stack=_given(checked_data.stack),
+        timing=content.sensor.to_timing(),
+        full_scale=content.sensor.full_scale,
+        detection=_given(content.detection),
+        restoration=_given(content.restoration),
+        simulation=simulation,
+        stack=_given(content.stack),
     )
 
 

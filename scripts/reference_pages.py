@@ -16,7 +16,7 @@ import typer
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import app
-from rsvib_torch.config import Simulation, file_section
+from rsvib_torch.config import Simulation, file_section, simulation_section
 from rsvib_torch.core.validation import expected_text
 from rsvib_torch.restoration.restore import METHODS
 
@@ -97,7 +97,7 @@ def section_of(model: Any, name: str) -> Any:
 def configuration_page() -> str:
     """Markdown of the reference of the configuration file."""
     file = file_section()
-    simulation = section_of(file, "simulation")
+    simulation = simulation_section()
     plain = [key for key in simulation.model_fields if key not in ("vibration", "noise")]
     vibration, noise = section_of(simulation, "vibration"), section_of(simulation, "noise")
     meaning = documented(rsv.restore) | {"saturation": SATURATION}
@@ -148,7 +148,7 @@ def command_page() -> str:
     for command in app.registered_commands:
         assert command.callback is not None
         name = command.name or command.callback.__name__
-        parameters = inspect.signature(command.callback).parameters.values()
+        parameters = inspect.signature(command.callback, eval_str=True).parameters.values()
         words = [
             each.name.upper() if each.default is inspect.Parameter.empty else f"[{each.name.upper()}]"
             for each in parameters

@@ -1,16 +1,17 @@
 """Command ``init``: a configuration file for the camera of a stack, or one of the presets."""
 
+import itertools
 import math
+import statistics
 import sys
 import textwrap
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import cv2
-import numpy as np
 import typer
 
+from rsvib_torch import io
 from rsvib_torch.commands.options import (
     READOUT_HELP,
     SCAN_AXIS_HELP,
@@ -22,9 +23,10 @@ from rsvib_torch.commands.options import (
 )
 from rsvib_torch.commands.terminal import error_line, print_line, working
 from rsvib_torch.config import presets, read_config
-from rsvib_torch.io import StackInfo, check_writable, open_stack, whole_file
-from rsvib_torch.io.formats import find_format
 from rsvib_torch.motion.timing import SensorTiming
+
+if TYPE_CHECKING:
+    from rsvib_torch.io import StackInfo
 
 __all__ = ["init", "sensor_toml"]
 
@@ -91,7 +93,7 @@ def init(
         raise ValueError("give a stack of frames, or --preset NAME (--list-presets lists them)")
     if out.exists() and not force:
         raise ValueError(f"{out} exists; --force replaces it, --out FILE writes another file")
-    check_writable(out)
+    io.check_writable(out)
     if preset is not None:
         if preset not in presets():
             raise ValueError(f"--preset must be one of {', '.join(presets())}; got {preset!r}")
@@ -99,7 +101,7 @@ def init(
     else:
         assert frames is not None
         text = _describe_camera(frames, given)
-    with whole_file(out) as file:
+    with io.whole_file(out) as file:
         file.write_text(text, encoding="utf-8")
     print_line(f"{out}: written; for the next step: rsvib run {frames or 'FRAMES'} OUT --config {out}")
 
@@ -114,7 +116,7 @@ def _first_comment(text: str) -> str:
 def _describe_camera(path: Path, given: Mapping[str, Any]) -> str:
     """Text of the configuration file: values of the command line, of the file, and of the answers to questions."""
     with working(f"reading {path}"):
-        reader = open_stack(path)
+        reader = io.open_stack(path)
         info = reader.info
         first = reader.frame(0)
         reader.close()
@@ -148,13 +150,13 @@ def _describe_camera(path: Path, given: Mapping[str, Any]) -> str:
     return sensor_toml({name: values[name] for name in order if name in values}, head)
 
 
-def _stated_rate(info: StackInfo) -> float | None:
+def _stated_rate(info: "StackInfo") -> float | None:
     """Frames per second from the frame times of a file; frames may be missing between others."""
     if info.frame_times is None or len(info.frame_times) < 2:
         return None
-    intervals = np.diff(info.frame_times)
-    periods = np.maximum(np.round(intervals / np.median(intervals)), 1)
-    return float(periods.sum() / intervals.sum())
+    intervals = [later - earlier for earlier, later in itertools.pairwise(info.frame_times)]
+    period = statistics.median(intervals)
+    return sum(max(round(interval / period), 1) for interval in intervals) / sum(intervals)
 
 
 def _rotation(path: Path) -> dict[str, str]:
@@ -162,6 +164,10 @@ def _rotation(path: Path) -> dict[str, str]:
 
     A phone stores the picture as its sensor reads it, and the angle by which it has to be turned.
     """
+    import cv2  # noqa: PLC0415
+
+    from rsvib_torch.io.formats import find_format  # noqa: PLC0415
+
     if find_format(path).name != "video":
         return {}
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
@@ -177,6 +183,8 @@ def _rotation(path: Path) -> dict[str, str]:
 
 def _likely_full_scale(pixels: Any) -> float:
     """Largest count of the bit depth that a frame uses; counts that are multiples of 16 are 12 bits shifted by 4."""
+    import numpy as np  # noqa: PLC0415
+
     step = max(int(np.gcd.reduce(pixels.ravel())), 1)
     return float(((1 << max(int(pixels.max()) // step, 255).bit_length()) - 1) * step)
 

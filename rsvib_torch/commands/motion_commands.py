@@ -1,17 +1,16 @@
 """Commands for other motion and for the camera: ``motion``, ``known`` and ``calibrate``."""
 
+from __future__ import annotations
+
 import csv
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
-import torch
 import typer
-from numpy.typing import NDArray
-from torch import Tensor
 
-from rsvib_torch.calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
+import rsvib_torch
+from rsvib_torch import calibration, detection, io, report, restoration
 from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.options import (
     DeviceOption,
@@ -26,18 +25,21 @@ from rsvib_torch.commands.options import (
 from rsvib_torch.commands.stack_commands import load, save
 from rsvib_torch.commands.terminal import error_line, print_line, working
 from rsvib_torch.config import Config
-from rsvib_torch.detection import align_motion, check_motion, detect_motion, detect_swept_tone
-from rsvib_torch.io import check_stack_target, check_writable, read_stack, read_stack_info, whole_file
-from rsvib_torch.motion.recorded import MotionUnit, TimeUnit, read_motion
-from rsvib_torch.motion.spline import FreeMotion
-from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.report.plots import measured_text
-from rsvib_torch.restoration import restore
+from rsvib_torch.core.option_types import MotionUnit, TimeUnit
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from torch import Tensor
+
+    from rsvib_torch.calibration import RowTimeCalibration
+    from rsvib_torch.motion.spline import FreeMotion
+    from rsvib_torch.motion.timing import SensorTiming
+
+    Array = NDArray[np.float64]
+    MotionTable = tuple[tuple[str, ...], Array]  # names of the columns, and their values (N, columns); s and px
 
 __all__ = ["calibrate", "known", "motion"]
-
-Array = NDArray[np.float64]
-MotionTable = tuple[tuple[str, ...], Array]  # names of the columns, and their values (N, columns); s and px
 
 
 @camera_options
@@ -67,14 +69,14 @@ def motion(
 
     To restore frames with the CSV file: rsvib known --motion FILE --unit px --offset 0.
     """
-    check_writable(out)
+    io.check_writable(out)
     stack = load(frames, settings, full_scale, device)
     with working("detecting the motion"):
         if model == "free":
             names, table = _detect_free_motion(stack.frames, stack.timing, knot_rows, search)
         else:
             names, table = _detect_swept_tone(stack.frames, stack.timing, search)
-    with whole_file(out) as file, file.open("w", newline="", encoding="utf-8") as text:
+    with io.whole_file(out) as file, file.open("w", newline="", encoding="utf-8") as text:
         writer = csv.writer(text)
         writer.writerow(names)
         writer.writerows([f"{time:.9f}", *(f"{value:.5f}" for value in row)] for time, *row in table)
@@ -83,7 +85,9 @@ def motion(
 
 def _detect_free_motion(frames: Tensor, timing: SensorTiming, knot_rows: int, search: int) -> MotionTable:
     """Detect a free motion, print its accuracy, and sample it twice per knot."""
-    result = detect_motion(frames, timing, knot_rows=knot_rows, search=search)
+    import numpy as np  # noqa: PLC0415
+
+    result = detection.detect_motion(frames, timing, knot_rows=knot_rows, search=search)
     for axis, name in enumerate("xy"):
         size = float(result.displacement[..., axis].square().mean().sqrt())
         print_line(
@@ -99,7 +103,9 @@ def _detect_free_motion(frames: Tensor, timing: SensorTiming, knot_rows: int, se
 
 def _detect_swept_tone(frames: Tensor, timing: SensorTiming, search: int) -> MotionTable:
     """Detect a swept tone per axis, print its parameters, and sample its motion once per knot."""
-    result = detect_swept_tone(frames, timing, search=search)
+    import numpy as np  # noqa: PLC0415
+
+    result = detection.detect_swept_tone(frames, timing, search=search)
     units = {"amplitude": "px", "frequency": "Hz", "decay": "/s", "chirp": "Hz/s", "phase": "rad"}
     for axis, name in enumerate("xy"):
         values = [
@@ -117,6 +123,9 @@ def _verdict(reasons: tuple[str, ...]) -> str:
 
 def _sampled(motion: FreeMotion, last: float, knots: float) -> tuple[Array, Array]:
     """Displacement (N, 2) of a motion at equidistant times (N,) up to ``last``, at most ``knots`` knots apart."""
+    import numpy as np  # noqa: PLC0415
+    import torch  # noqa: PLC0415
+
     end = max(motion.end, last)
     times = np.linspace(motion.start, end, math.ceil((end - motion.start) / (knots * motion.spacing)) + 1)
     return times, motion.displacement(torch.from_numpy(times).to(motion.device)).cpu().numpy()
@@ -156,20 +165,20 @@ def known(
 
     The recording is compared with the offsets of rows between the frames, and refused if it does not explain them.
     """
-    recorded = read_motion(
+    recorded = rsvib_torch.read_motion(
         motion,
         unit=unit,
         focal_length=focal_length,
         time_unit=time_unit,
         signs=(-1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0),
     )
-    info = read_stack_info(frames)
+    info = io.read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
-    check_stack_target(restored, info.shape, dtype=info.dtype, full_scale=scale)
+    io.check_stack_target(restored, info.shape, dtype=info.dtype, full_scale=scale)
     stack = load(frames, settings, full_scale, device)
     if offset is None:
         with working("aligning the recording with the frames"):
-            found = align_motion(stack.frames, stack.timing, recorded, fit_gain=fit_gain)
+            found = detection.align_motion(stack.frames, stack.timing, recorded, fit_gain=fit_gain)
         print_line(
             f"clock {found.offset:.6f} ± {found.offset_std:.6f} s at the first row of frame 0, rate {found.scale:.7f}; "
             f"gain {found.gain[0]:.4f} and {found.gain[1]:.4f}, drift {found.drift[0]:.4g} and {found.drift[1]:.4g} "
@@ -188,7 +197,7 @@ def known(
             )
     _check_motion(motion, stack.frames, stack.timing, placed, force, required=offset is None)
     with working("restoring the frames"):
-        result = restore(stack.frames, stack.timing, placed, **settings.restoration)
+        result = restoration.restore(stack.frames, stack.timing, placed, **settings.restoration)
     save(restored, result, stack)
     print_line(f"{restored}: {len(result)} frames restored, {info.dtype}")
 
@@ -213,7 +222,7 @@ def _check_motion(
         return
     try:
         with working("comparing the motion with the frames"):
-            check = check_motion(frames, timing, motion)
+            check = detection.check_motion(frames, timing, motion)
     except ValueError as error:
         if required:
             raise
@@ -260,14 +269,16 @@ def calibrate(
     out: Annotated[Path | None, typer.Option(help="Configuration file to write, with the table sensor.")] = None,
 ) -> None:
     """Measure row time, readout direction and exposure of a camera from frames of a flickering light."""
+    import torch  # noqa: PLC0415
+
     if (frequency is None) == (not exposure):
         raise ValueError(
             "give --frequency of the flicker, or --exposure once per frame for a strobe of unknown frequency"
         )
     if out is not None:
-        check_writable(out)
+        io.check_writable(out)
     with working("reading the frames"):
-        stacks = [read_stack(path, full_scale=full_scale) for path in frames]
+        stacks = [io.read_stack(path, full_scale=full_scale) for path in frames]
     for path, stack in zip(frames, stacks, strict=True):
         if stack.shape[1:] != stacks[0].shape[1:]:
             raise ValueError(
@@ -278,9 +289,9 @@ def calibrate(
     axis: Literal[-2, -1] = -1 if scan_axis == "x" else -2
     with working("measuring the flicker"):
         if frequency is None:
-            result = calibrate_row_time_by_exposure(stack, exposure or [], scan_axis=axis, gamma=gamma)
+            result = calibration.calibrate_row_time_by_exposure(stack, exposure or [], scan_axis=axis, gamma=gamma)
         else:
-            result = calibrate_row_time(
+            result = calibration.calibrate_row_time(
                 stack,
                 frequency,
                 frame_rate=frame_rate,
@@ -291,15 +302,15 @@ def calibrate(
             )
     _print_calibration(result, stack.shape[axis])
     if out is not None:
-        with whole_file(out) as file:
+        with io.whole_file(out) as file:
             file.write_text(_calibrated_toml(result, scan_axis), encoding="utf-8")
         print_line(f"{out}: [sensor]")
 
 
 def _print_calibration(result: RowTimeCalibration, num_rows: int) -> None:
     row_time, std = result.row_time, result.row_time_std
-    readout = measured_text(1e3 * row_time * num_rows, 1e3 * std * num_rows)
-    print_line(f"row time {measured_text(1e6 * row_time, 1e6 * std)} us ({num_rows} rows in {readout} ms)")
+    readout = report.measured_text(1e3 * row_time * num_rows, 1e3 * std * num_rows)
+    print_line(f"row time {report.measured_text(1e6 * row_time, 1e6 * std)} us ({num_rows} rows in {readout} ms)")
     print_line(f"flicker {result.flicker_frequency:.6g} Hz")
     print_line(f"bands of {result.period_rows:.3f} rows, contrast {result.contrast:.3g}")
     if result.frame_rows is not None:
@@ -307,7 +318,7 @@ def _print_calibration(result: RowTimeCalibration, num_rows: int) -> None:
     if result.readout_direction is not None:
         print_line(f"readout direction {result.readout_direction}")
     if result.exposure_time is not None and result.exposure_time_std:
-        exposure = measured_text(1e6 * result.exposure_time, 1e6 * result.exposure_time_std)
+        exposure = report.measured_text(1e6 * result.exposure_time, 1e6 * result.exposure_time_std)
         print_line(f"exposure {exposure} us, {result.exposure_time / row_time:.2f} rows")
     for note in result.notes:
         print_line(note)

@@ -6,16 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-import torch
 import typer
 
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.io import StackInfo
-from rsvib_torch.restoration.exact.priors import PRIORS
-from rsvib_torch.restoration.restore import METHODS, method_options
+from rsvib_torch.core.option_types import METHOD_SETTINGS, PriorName, method_options
+
+if TYPE_CHECKING:
+    import torch
+
+    from rsvib_torch.io import StackInfo
 
 __all__ = [
     "READOUT_HELP",
@@ -131,7 +133,9 @@ ScaleOption = Annotated[
 ]
 MethodOption = Annotated[
     str | None,
-    typer.Option(help=f"Restoration method: {', '.join(METHODS)}.", show_default="from the configuration, or exact"),
+    typer.Option(
+        help=f"Restoration method: {', '.join(METHOD_SETTINGS)}.", show_default="from the configuration, or exact"
+    ),
 ]
 JointOption = Annotated[
     str | None,
@@ -142,7 +146,7 @@ JointOption = Annotated[
 ]
 PriorOption = Annotated[
     str | None,
-    typer.Option(help=f"Prior of the scene: {' or '.join(PRIORS)}, for methods that have this option."),
+    typer.Option(help=f"Prior of the scene: {' or '.join(get_args(PriorName))}, for methods that have this option."),
 ]
 SaturationOption = Annotated[
     float | None,
@@ -201,7 +205,7 @@ def camera_options(command: Callable[..., None]) -> Callable[..., None]:
         command(settings=settings, **options)
 
     parameters: list[inspect.Parameter] = []
-    for parameter in inspect.signature(command).parameters.values():
+    for parameter in inspect.signature(command, eval_str=True).parameters.values():
         parameters += camera.values() if parameter.name == "settings" else [parameter]
     with_camera.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     with_camera.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
@@ -225,18 +229,20 @@ class Overrides:
     saturation: float | None
 
 
-def torch_device(name: DeviceName) -> torch.device:
+def torch_device(name: DeviceName) -> "torch.device":
     """Device of that name.
 
     Raises:
         ValueError: If there is no CUDA device.
     """
+    import torch  # noqa: PLC0415
+
     if name == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda: no CUDA device is available; use auto or cpu")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-def full_scale_of(path: Path, info: StackInfo, config: Config, option: float | None) -> float | None:
+def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float | None) -> float | None:
     """Full scale of a stack: from the option, else from the file (or its 8-bit type), else from the configuration.
 
     Raises:
@@ -255,7 +261,7 @@ def full_scale_of(path: Path, info: StackInfo, config: Config, option: float | N
 
 
 def restoration_options(
-    info: StackInfo, full_scale: float | None, config: Config, overrides: Overrides
+    info: "StackInfo", full_scale: float | None, config: Config, overrides: Overrides
 ) -> dict[str, Any]:
     """Options of ``restore``: those of the configuration file, overridden by those of the command line.
 

@@ -1,14 +1,16 @@
 """Commands that detect and remove vibration: ``simulate``, ``detect``, ``restore``, ``run`` and ``report``."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import torch
 import typer
-from torch import Tensor
 
 import rsvib_torch
+from rsvib_torch import detection, imaging, io, stacks
+from rsvib_torch import report as reports
 from rsvib_torch.commands.options import (
     DeviceName,
     DeviceOption,
@@ -37,46 +39,19 @@ from rsvib_torch.commands.terminal import (
     working,
 )
 from rsvib_torch.config import Config
+from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
 from rsvib_torch.core.validation import validate
-from rsvib_torch.detection import DetectionResult, detect_vibration
-from rsvib_torch.imaging import simulate_frames
-from rsvib_torch.io import (
-    StackInfo,
-    check_stack_target,
-    check_writable,
-    exposure_times,
-    open_stack,
-    read_stack,
-    read_stack_info,
-    timing_from_first_frame,
-    whole_folder,
-    write_stack,
-)
-from rsvib_torch.io.full_scale import counts_to_frames
-from rsvib_torch.io.schema import TimingRecord, check_same_timing
-from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.report.html import Box, Report, write_report_page
-from rsvib_torch.report.plots import comparison_figure, offset_figure, save_figure
-from rsvib_torch.report.results import (
-    read_vibration,
-    write_offsets,
-    write_restoration,
-    write_vibration,
-    write_windows,
-)
-from rsvib_torch.restoration.verdict.trust import Detected
-from rsvib_torch.stacks import (
-    DEFAULT_WINDOW,
-    BadFrames,
-    RestoredFrames,
-    WindowResult,
-    detect_stack,
-    iterate_stack,
-    process_stack,
-    read_manifest,
-    restore_trusted,
-)
-from rsvib_torch.stacks.job import RestoreOptions
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rsvib_torch.detection import DetectionResult
+    from rsvib_torch.io import StackInfo
+    from rsvib_torch.motion.timing import SensorTiming
+    from rsvib_torch.report import Box
+    from rsvib_torch.restoration.verdict.trust import Detected
+    from rsvib_torch.stacks import RestoredFrames, WindowResult
+    from rsvib_torch.stacks.job import RestoreOptions
 
 __all__ = ["Stack", "detect", "load", "report", "restore_frames", "run", "save", "simulate"]
 
@@ -101,31 +76,31 @@ class Stack:
 def load(path: Path, config: Config, full_scale: float | None, device: DeviceName) -> Stack:
     """Read a stack; ``full_scale`` and ``device`` are options of the command line."""
     target = torch_device(device)
-    info = read_stack_info(path)
+    info = io.read_stack_info(path)
     scale = full_scale_of(path, info, config, full_scale)
     with working(f"reading {path}"):
-        frames = read_stack(path, full_scale=scale)
-    timing = timing_from_first_frame(config.timing, info)
-    info = replace(info, frame_times=exposure_times(info, config.timing), times_of_playback=False)
+        frames = io.read_stack(path, full_scale=scale)
+    timing = io.timing_from_first_frame(config.timing, info)
+    info = replace(info, frame_times=io.exposure_times(info, config.timing), times_of_playback=False)
     return Stack(frames.to(target), info, scale, timing)
 
 
 def save(path: Path, frames: Tensor, stack: Stack) -> None:
     """Write frames with the data type, full scale and metadata of a stack."""
     with working(f"writing {path.name}"):
-        write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
+        io.write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
 
 
 def _detect(stack: Stack, config: Config) -> DetectionResult:
     with working("detecting the vibration"):
-        result: DetectionResult = detect_vibration(stack.frames, stack.timing, **config.detection)
+        result: DetectionResult = detection.detect_vibration(stack.frames, stack.timing, **config.detection)
     return result
 
 
 def _restore(stack: Stack, detected: Detected, options: dict[str, Any], force: bool) -> RestoredFrames:
     """Restore frames, judge the result on eight pairs of frames, and print the verdict."""
     with working("restoring the frames and judging the result"):
-        result = restore_trusted(stack.frames, stack.timing, detected, options, force=force, most_pairs=8)
+        result = stacks.restore_trusted(stack.frames, stack.timing, detected, options, force=force, most_pairs=8)
     print_restoration(result)
     return result
 
@@ -133,9 +108,9 @@ def _restore(stack: Stack, detected: Detected, options: dict[str, Any], force: b
 def _write_detection(folder: Path, result: DetectionResult, timing: SensorTiming) -> list[str]:
     """Write a detection as JSON, CSV and figure, and return the names of the files."""
     with working("drawing the offset curve"):
-        write_vibration(folder / "vibration.json", result, timing)
-        write_offsets(folder / "offsets.csv", result)
-        save_figure(offset_figure(result), folder / "offsets.png")
+        reports.write_vibration(folder / "vibration.json", result, timing)
+        reports.write_offsets(folder / "offsets.csv", result)
+        reports.save_figure(reports.offset_figure(result), folder / "offsets.png")
     return ["vibration.json", "offsets.csv", "offsets.png"]
 
 
@@ -157,19 +132,21 @@ def simulate(
 
     The camera, its vibration and its noise are described in the configuration file.
     """
+    import torch  # noqa: PLC0415
+
     if settings.simulation is None:
         raise ValueError(
             f"{settings.source}: simulation: missing key; expected a table with vibration, num_frames, ..."
         )
     simulation, target = settings.simulation, torch_device(device)
-    image = read_stack(scene, full_scale=full_scale)
+    image = io.read_stack(scene, full_scale=full_scale)
     if len(image) != 1:
         raise ValueError(f"{scene}: the scene must be one image, this file has {len(image)} frames")
     scale = settings.full_scale
     dtype = "float32" if scale is None else "uint8" if scale <= 255 else "uint16"
-    check_stack_target(frames, (simulation.num_frames, *image.shape[1:]), dtype=dtype, full_scale=scale)
+    io.check_stack_target(frames, (simulation.num_frames, *image.shape[1:]), dtype=dtype, full_scale=scale)
     with working("simulating the frames"):
-        simulated = simulate_frames(
+        simulated = imaging.simulate_frames(
             image[0].to(target),
             settings.timing,
             simulation.vibration,
@@ -179,7 +156,7 @@ def simulate(
             generator=torch.Generator(target).manual_seed(simulation.seed if seed is None else seed),
         )
     with working(f"writing {frames}"):
-        write_stack(frames, simulated, dtype=dtype, full_scale=scale)
+        io.write_stack(frames, simulated, dtype=dtype, full_scale=scale)
     print_line(f"{frames}: {len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}")
 
 
@@ -205,20 +182,20 @@ def detect(
 
     The vibration is modelled as sinusoids of constant amplitude and frequency. For other motion see rsvib motion.
     """
-    check_writable(out, folder=True)
+    io.check_writable(out, folder=True)
     window = settings.stack.get("window") if window is None else window
     if window is None:
         stack = load(frames, settings, full_scale, device)
         result = _detect(stack, settings)
-        with whole_folder(out) as folder:
+        with io.whole_folder(out) as folder:
             names = _write_detection(folder, result, stack.timing)
         print_detection(result)
         print_line(f"{out}: {', '.join(names)}")
         return
-    scale = full_scale_of(frames, read_stack_info(frames), settings, full_scale)
-    with whole_folder(out) as folder:
+    scale = full_scale_of(frames, io.read_stack_info(frames), settings, full_scale)
+    with io.whole_folder(out) as folder:
         with counting(f"detecting in {frames.name}") as progress:
-            detect_stack(
+            stacks.detect_stack(
                 frames,
                 folder / "manifest.json",
                 settings.timing,
@@ -230,8 +207,8 @@ def detect(
                 device=str(torch_device(device)),
                 progress=progress,
             )
-        manifest = read_manifest(folder / "manifest.json")
-        write_windows(folder / "windows.csv", manifest)
+        manifest = stacks.read_manifest(folder / "manifest.json")
+        reports.write_windows(folder / "windows.csv", manifest)
     _warn_of_failures(sum(record.error is not None for record in manifest.windows))
     print_line(f"{out}: manifest.json, windows.csv, {len(manifest.windows)} windows")
 
@@ -273,17 +250,19 @@ def restore_frames(
             raise ValueError("--report needs a vibration.json; the verdict on each window is in its manifest.json")
         _restore_windows(frames, restored, settings, vibration, overrides, force, device, full_scale)
         return
-    detected = read_vibration(vibration, timing_from_first_frame(settings.timing, read_stack_info(frames)))
+    detected = reports.read_vibration(
+        vibration, io.timing_from_first_frame(settings.timing, io.read_stack_info(frames))
+    )
     stack = load(frames, settings, full_scale, device)
     shape = (1, *stack.info.shape[1:]) if joint == "all" else stack.info.shape
-    check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale)
+    io.check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale)
     if report is not None:
-        check_writable(report)
+        io.check_writable(report)
     options = restoration_options(stack.info, stack.full_scale, settings, overrides)
     result = _restore(stack, detected, options, force)
     save(restored, result.frames, stack)
     if report is not None:
-        write_restoration(report, result, options)
+        reports.write_restoration(report, result, options)
     state = "restored" if result.restored else "unchanged"
     print_line(f"{restored}: {len(result.frames)} frames {state}, {stack.info.dtype}")
 
@@ -299,7 +278,9 @@ def _restore_windows(
     full_scale: float | None,
 ) -> None:
     """Restore a stack with the detections of its windows."""
-    manifest = read_manifest(vibration)
+    from rsvib_torch.io.schema import TimingRecord, check_same_timing  # noqa: PLC0415
+
+    manifest = stacks.read_manifest(vibration)
     stored = validate(TimingRecord, manifest.settings.get("sensor", {}), f"{vibration}: settings.sensor")
     timing = config.timing
     if timing.frame_start_times is None:  # frame times of the file were stored with the detection
@@ -308,10 +289,10 @@ def _restore_windows(
     window = manifest.settings.get("window")
     if not isinstance(window, int):
         raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")
-    info = read_stack_info(frames)
+    info = io.read_stack_info(frames)
     scale = full_scale_of(frames, info, config, full_scale)
     with counting(f"restoring {frames.name}") as progress:
-        result = process_stack(
+        result = stacks.process_stack(
             frames,
             restored,
             config.timing,
@@ -376,8 +357,8 @@ def run(
     """
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
-    check_writable(out, folder=True)
-    info = read_stack_info(frames)
+    io.check_writable(out, folder=True)
+    info = io.read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
     options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation))
     common: RestoreOptions = {
@@ -391,7 +372,7 @@ def run(
         "device": str(torch_device(device)),
     }
     with counting(f"restoring {frames.name}") as progress:
-        result = process_stack(
+        result = stacks.process_stack(
             frames,
             out / output,
             settings.timing,
@@ -405,24 +386,24 @@ def run(
         )
     first = result.first
     if first is None:  # the run was complete before, or its first window was
-        first = next(iter(iterate_stack(frames, settings.timing, **common)))
+        first = next(iter(stacks.iterate_stack(frames, settings.timing, **common)))
     names = [output, "manifest.json"]
-    with whole_folder(out) as folder:
+    with io.whole_folder(out) as folder:
         if result.windows == 1:
-            assert isinstance(first.detection, DetectionResult)
+            assert isinstance(first.detection, detection.DetectionResult)
             assert first.restoration is not None
-            write_restoration(folder / "restoration.json", first.restoration, options)
-            timing = timing_from_first_frame(settings.timing, info)
+            reports.write_restoration(folder / "restoration.json", first.restoration, options)
+            timing = io.timing_from_first_frame(settings.timing, info)
             names += ["restoration.json", *_write_detection(folder, first.detection, timing)]
         else:
-            write_windows(folder / "windows.csv", read_manifest(out / "manifest.json"))
+            reports.write_windows(folder / "windows.csv", stacks.read_manifest(out / "manifest.json"))
             names.append("windows.csv")
         if len(first.frames):
             with working("drawing input and restored frame"):
                 _draw_comparison(folder / "before_after.png", frames, scale, first)
             names.append("before_after.png")
     if result.windows == 1:
-        if isinstance(first.detection, DetectionResult):
+        if isinstance(first.detection, detection.DetectionResult):
             print_detection(first.detection)
         if first.restoration is not None:
             print_restoration(first.restoration)
@@ -439,12 +420,14 @@ def run(
 
 def _draw_comparison(path: Path, frames: Path, full_scale: float | None, first: WindowResult) -> None:
     """Draw the first restored frame of a stack beside the frame of the input."""
+    from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
+
     index = first.indices[0] if first.indices else (first.window.first + first.window.last + 1) // 2
-    reader = open_stack(frames)
+    reader = io.open_stack(frames)
     raw = counts_to_frames(reader.frame(index)[None], full_scale or reader.info.full_scale, str(frames))[0]
     reader.close()
     names = ("input", "restored" if first.restored else "unchanged")
-    save_figure(comparison_figure(raw, first.frames[0].cpu(), names=names), path)
+    reports.save_figure(reports.comparison_figure(raw, first.frames[0].cpu(), names=names), path)
 
 
 @camera_options
@@ -473,13 +456,13 @@ def report(
     The page is one file that needs no network. The figures are also written as PNG files.
     """
     boxes = [_edge_box(text) for text in edge or []]
-    check_writable(out, folder=True)
+    io.check_writable(out, folder=True)
     stack = load(frames, settings, full_scale, device)
     options = restoration_options(stack.info, stack.full_scale, settings, Overrides(method, joint, prior, saturation))
     detection = _detect(stack, settings)
     print_detection(detection)
     result = _restore(stack, detection, options, force)
-    content = Report(
+    content = reports.Report(
         title=f"Vibration in {frames.name}",
         subtitle=f"{frames}, camera of {settings.source}",
         frames=stack.frames,
@@ -492,8 +475,8 @@ def report(
         options=options,
         version=rsvib_torch.__version__,
     )
-    with whole_folder(out) as folder, working("writing the page"):
-        files = write_report_page(folder, content, boxes or None)
+    with io.whole_folder(out) as folder, working("writing the page"):
+        files = reports.write_report_page(folder, content, boxes or None)
     print_line(f"{out}: {', '.join(files)}")
 
 

@@ -4,7 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich import box
 from rich.console import Console
@@ -22,9 +22,11 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from rsvib_torch.detection import DetectionResult
-from rsvib_torch.report.plots import measured_text
-from rsvib_torch.stacks import RestoredFrames
+from rsvib_torch import report
+
+if TYPE_CHECKING:
+    from rsvib_torch.detection import DetectionResult
+    from rsvib_torch.stacks import RestoredFrames
 
 __all__ = [
     "counting",
@@ -114,7 +116,7 @@ def counting(description: str) -> Iterator[Callable[[int, int], None]]:
         yield show
 
 
-def print_detection(result: DetectionResult) -> None:
+def print_detection(result: "DetectionResult") -> None:
     """Print a detection as a table with one line per tone, and the verdict on each axis."""
     vibration, std = result.vibration, result.std
     heads = ("axis", "amplitude (px)", "frequency (Hz)", "period (ms)", "phase (π)", "gain")
@@ -126,16 +128,16 @@ def print_detection(result: DetectionResult) -> None:
             cells = []
             for name, scale in (("amplitude", 1), ("frequency", 1), ("period", 1e3), ("phase", 1 / math.pi)):
                 value, deviation = (scale * getattr(values, name)[axis, tone] for values in (vibration, std))
-                cells.append(measured_text(value, deviation))
+                cells.append(report.measured_text(value, deviation))
             table.add_row(letter, *cells, f"{float(result.gain[axis, tone]):.2f}")
     Console(highlight=False, width=None if Console().is_terminal else 100).print(table)
     for axis, name in enumerate("xy"):
-        motion = measured_text(vibration.image_motion[axis], std.image_motion[axis])
+        motion = report.measured_text(vibration.image_motion[axis], std.image_motion[axis])
         verdict = "reliable" if bool(result.reliable[axis]) else f"not reliable: {'; '.join(result.reasons[axis])}"
         print_line(f"{name}: residual {float(result.residual[axis]):.4f} px, image motion {motion} px/s; {verdict}")
 
 
-def print_restoration(result: RestoredFrames) -> None:
+def print_restoration(result: "RestoredFrames") -> None:
     """Print which axes were not restored, and whether restoration helped."""
     for note in result.left_alone:
         print_line(note)

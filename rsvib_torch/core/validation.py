@@ -22,19 +22,18 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
 
 
-def options_section(name: str, options: type, *, skip: tuple[str, ...] = (), **more: Any) -> Any:
+def options_section(name: str, options: type, **more: Any) -> Any:
     """Create a section with the keys and types of typed options; no key is required.
 
     Args:
         name: Name of the section class.
         options: ``TypedDict`` or dataclass of the options.
-        skip: Options that are not keys of the section.
         **more: Types of further keys.
 
     Returns:
         A subclass of ``Section``. Options that are not in a file are None in it and not in ``model_fields_set``.
     """
-    hints = {key: kind for key, kind in get_type_hints(options).items() if key not in skip} | more
+    hints = get_type_hints(options) | more
     fields: dict[str, Any] = {key: (kind, None) for key, kind in hints.items()}
     return create_model(name, __base__=Section, **fields)
 

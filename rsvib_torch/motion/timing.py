@@ -1,14 +1,21 @@
-"""Timing of a rolling-shutter sensor: the exposure start of each row of each frame."""
+"""Timing of a rolling-shutter sensor: the exposure start of each row of each frame.
+
+Configuration files are checked with this module before torch is imported, which takes seconds: functions that need
+torch import it themselves.
+"""
+
+from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Literal
 
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 __all__ = ["RowTiming", "SensorTiming", "check_timing"]
 
@@ -85,6 +92,8 @@ class SensorTiming:
         object.__setattr__(self, "frame_rows", frame_rows)
         object.__setattr__(self, "scan_axis", _SCAN_AXES[self.scan_axis])
         if self.frame_start_times is not None:
+            import torch  # noqa: PLC0415
+
             times = torch.as_tensor(self.frame_start_times, dtype=torch.float64).flatten().tolist()
             starts = tuple(check_number("frame_start_times", start) for start in times)
             if any(later <= earlier for earlier, later in itertools.pairwise(starts)):
@@ -94,7 +103,7 @@ class SensorTiming:
     @classmethod
     def line_sensors(
         cls, line_time: float, delays: Sequence[float], num_lines: int, exposure_lines: float = 1.0
-    ) -> "SensorTiming":
+    ) -> SensorTiming:
         """Timing of images of the same ground from several lines (or bands) of a push-broom sensor.
 
         Every image is recorded line by line while the ground moves; each line records the same ground after its own
@@ -148,6 +157,8 @@ class SensorTiming:
         Raises:
             ValueError: If ``frame_start_times`` has fewer than ``num_frames`` entries.
         """
+        import torch  # noqa: PLC0415
+
         if self.frame_start_times is None:
             return torch.arange(num_frames, dtype=torch.float64, device=device) * self.frame_period
         if len(self.frame_start_times) < num_frames:
@@ -160,6 +171,8 @@ class SensorTiming:
         Returns:
             float64 tensor of shape (num_frames, num_rows); row 0 is the row read first.
         """
+        import torch  # noqa: PLC0415
+
         rows = torch.arange(num_rows, dtype=torch.float64, device=device)
         return self.frame_starts(num_frames, device)[:, None] + rows * self.row_time
 
@@ -172,7 +185,7 @@ class SensorTiming:
                 f"{self.frame_rate:g} frames/s, row_time is at most {self.frame_period / num_rows:.6g} s"
             )
 
-    def in_row_order(self) -> "RowTiming":
+    def in_row_order(self) -> RowTiming:
         """The same timing for frames already turned to row order (rows on axis -2, first row read first)."""
         return RowTiming(self.row_time, self.exposure_rows, self.frame_rows, frame_start_times=self.frame_start_times)
 

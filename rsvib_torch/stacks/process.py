@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Unpack
 
+from rsvib_torch.core.option_types import BadFrames
 from rsvib_torch.io.atomic import whole_file
 from rsvib_torch.io.files import PathLike, check_info_target
 from rsvib_torch.io.schema import DetectedVibration
@@ -16,7 +17,6 @@ from rsvib_torch.io.stack_info import exposure_times
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import (
-    BadFrames,
     DetectOptions,
     RestoreOptions,
     StoredWindow,
@@ -26,9 +26,9 @@ from rsvib_torch.stacks.job import (
 )
 from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_manifest
 from rsvib_torch.stacks.output import Journal, Sink, describe_difference, disk_errors_named
-from rsvib_torch.stacks.windows import DEFAULT_WINDOW, Window
+from rsvib_torch.stacks.windows import Window
 
-__all__ = ["DEFAULT_WINDOW", "StackReport", "detect_stack", "iterate_stack", "process_stack"]
+__all__ = ["StackReport", "detect_stack", "iterate_stack", "process_stack"]
 
 _MAX_INITIAL_FAILURES = 8  # windows; a run stops if all windows up to this number fail
 
