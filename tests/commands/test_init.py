@@ -1,6 +1,7 @@
 """rsvib init: configuration files for the camera of a stack, and presets."""
 
 import io
+import os
 import struct
 import tomllib
 
@@ -13,6 +14,7 @@ from rsvib_torch.commands.main import run_command
 from rsvib_torch.config import presets, read_config
 from rsvib_torch.io import StackInfo, read_stack, write_stack
 
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read by the first video that OpenCV opens or writes
 TIMES = ("--row-time", "40us", "--exposure", "1/1250")
 RATE = ("--frame-rate", "30000/1001")
 
