@@ -34,7 +34,8 @@ demo: ## simulate, detect and restore two scenes into out/demo
 bench: setup ## run the benchmarks and store their results
 	$(PYTHON) scripts/benchmark.py --store
 
-pages: setup ## write docs/benchmarks.md and the drawings anew
+pages: setup ## write the generated pages and drawings of docs/ anew
+	$(PYTHON) scripts/reference_pages.py
 	$(PYTHON) scripts/benchmark_page.py
 	$(PYTHON) scripts/drawings.py --out docs/drawings
 

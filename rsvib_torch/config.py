@@ -1,25 +1,32 @@
-"""TOML configuration files: the camera, and the options of simulation, detection and restoration."""
+"""TOML configuration files: the camera, and the options of simulation, detection and restoration.
 
+A file is checked without torch, whose import takes seconds, except for ``[simulation]``.
+"""
+
+import functools
+import math
 import os
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import Field, create_model, model_validator
 
 from rsvib_torch.core.checks import check_number, check_whole_number
+from rsvib_torch.core.option_types import DEFAULT_WINDOW, METHOD_SETTINGS, BadFrames, DetectionSettings, PriorName
 from rsvib_torch.core.validation import Section, checked, options_section, validate
-from rsvib_torch.detection.detect import ToneOptions
-from rsvib_torch.imaging import SensorNoise
-from rsvib_torch.io.schema import TimingRecord, VibrationRecord
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.restoration.exact.priors import PRIORS
-from rsvib_torch.restoration.restore import METHODS, CommonOptions
-from rsvib_torch.stacks import DEFAULT_WINDOW, BadFrames
 
-__all__ = ["Config", "Simulation", "read_config"]
+if TYPE_CHECKING:
+    from rsvib_torch.imaging.sensor_model import SensorNoise
+    from rsvib_torch.motion.vibration import Vibration
+
+__all__ = ["Config", "Simulation", "file_section", "presets", "read_config", "simulation_section"]
+
+_AGREEMENT = 1e-3  # relative; keys that state the same time twice are rounded by whoever wrote them
 
 
 @dataclass(frozen=True)
@@ -34,10 +41,10 @@ class Simulation:
         seed: Seed of the noise.
     """
 
-    vibration: Vibration
+    vibration: "Vibration"
     num_frames: int
     frame_size: tuple[int, int] | None
-    noise: SensorNoise | None
+    noise: "SensorNoise | None"
     seed: int
 
 
@@ -46,101 +53,182 @@ class Config:
     """Content of a configuration file.
 
     Attributes:
+        source: Name of the file, for messages.
         timing: The sensor.
         full_scale: Count that corresponds to 1.0 in integer frames; None if it is not in the file.
         detection: Options of ``detect_vibration`` that are in the file.
         restoration: Options of ``restore`` that are in the file.
         simulation: Vibration and noise to simulate; None if it is not in the file.
         stack: Options ``window`` and ``bad_frames`` of ``process_stack`` that are in the file.
+        arguments: Options of the program that describe the camera, for the commands that it suggests.
     """
 
+    source: str
     timing: SensorTiming
     full_scale: float | None
     detection: dict[str, Any]
     restoration: dict[str, Any]
     simulation: Simulation | None
     stack: dict[str, Any]
+    arguments: tuple[str, ...] = ()
 
 
-class SensorSection(TimingRecord):
-    """``[sensor]``: the timing, and the full scale of integer frames."""
+class SensorSection(Section):
+    """``[sensor]``: the timing, and the full scale of integer frames.
 
+    Exposure and frame period are in seconds (``exposure_time``, ``frame_rate``) or in row times (``exposure_rows``,
+    ``frame_rows``).
+    """
+
+    row_time: float
+    exposure_time: float | None = Field(
+        default=None, description="Exposure time in seconds; this key or ``exposure_rows`` is required."
+    )
+    exposure_rows: float | None = None
+    frame_rate: float | None = Field(
+        default=None, description="Frames per second of the sensor; this key or ``frame_rows`` is required."
+    )
+    frame_rows: float | None = None
     scan_axis: Literal["y", "x"] = "y"
     readout_direction: Literal["forward", "reverse"] = "forward"
     frame_start_times: list[float] | None = None
-    full_scale: float | None = None
+    full_scale: float | None = Field(
+        default=None,
+        description="Count of an integer file that corresponds to 1.0, for example 4095 for 12-bit counts; 255 for "
+        "8-bit files.",
+    )
 
     @model_validator(mode="after")
-    def _check_full_scale(self) -> Self:
+    def _check(self) -> Self:
+        checked(self.to_timing)
         if self.full_scale is not None:
             check_number("full_scale", self.full_scale, above=0.0)
         return self
 
-
-class VibrationSection(VibrationRecord):
-    """``[simulation.vibration]``: phase and image motion are optional."""
-
-    phase: list[float] | list[list[float]] = Field(default_factory=lambda: [0.0, 0.0])
-    image_motion: list[float] = Field(default_factory=lambda: [0.0, 0.0])
-
-
-_NoiseSection = options_section("_NoiseSection", SensorNoise)
-
-
-class _SimulationSection(Section):
-    """``[simulation]``."""
-
-    vibration: VibrationSection
-    num_frames: int = 2
-    frame_size: list[int] | None = None
-    noise: _NoiseSection | None = None  # type: ignore[valid-type]
-    seed: int = 0
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        check_whole_number("num_frames", self.num_frames, at_least=1)
-        check_whole_number("seed", self.seed, at_least=0)
-        if self.frame_size is not None and (len(self.frame_size) != 2 or min(self.frame_size) < 1):
-            raise ValueError(f"frame_size must be [height, width] in px, got {self.frame_size}")
-        checked(self.simulation)
-        return self
-
-    def simulation(self) -> Simulation:
-        """The values as a ``Simulation``."""
-        size = None if self.frame_size is None else (self.frame_size[0], self.frame_size[1])
-        noise = None if self.noise is None else SensorNoise(**_given(self.noise))
-        return Simulation(self.vibration.to_vibration(), self.num_frames, size, noise, self.seed)
+    def to_timing(self) -> SensorTiming:
+        """The timing, with exposure and frame period in row times."""
+        row_time = check_number("row_time", self.row_time, above=0.0)
+        rate = self.frame_rate
+        if rate is not None and check_number("frame_rate", rate, above=0.0) < 0.1:
+            raise ValueError(f"frame_rate={rate:g} is less than 0.1; it is in frames per second, 1 / (frame period)")
+        exposure = None if self.exposure_time is None else self.exposure_time / row_time
+        period = None if rate is None else 1.0 / (rate * row_time)
+        return SensorTiming(
+            row_time,
+            _in_rows("exposure_time", self.exposure_time, exposure, "exposure_rows", self.exposure_rows),
+            _in_rows("frame_rate", rate, period, "frame_rows", self.frame_rows),
+            self.scan_axis,
+            self.readout_direction,
+            self.frame_start_times,
+        )
 
 
-_DetectionSection = options_section(
-    "_DetectionSection", ToneOptions, skip=("full_scale", "ignore", "channels", "window", "window_step")
-)
+def _in_rows(name: str, value: float | None, converted: float | None, rows_name: str, rows: float | None) -> float:
+    """A time in row times that is stated by one of two keys, or by both if they agree."""
+    if rows is None:
+        if converted is None:
+            raise ValueError(f"{name} or {rows_name} is missing")
+        return converted
+    if converted is not None and not math.isclose(converted, rows, rel_tol=_AGREEMENT):
+        raise ValueError(
+            f"{name}={value:g} contradicts {rows_name}={rows:g}: with this row_time it is {rows_name}={converted:.6g}; "
+            "remove one of the two keys"
+        )
+    return rows
+
+
+@functools.cache
+def simulation_section() -> Any:
+    """Class of ``[simulation]``; it needs torch, which takes seconds to import."""
+    from rsvib_torch.imaging.sensor_model import SensorNoise  # noqa: PLC0415
+    from rsvib_torch.io.schema import VibrationRecord  # noqa: PLC0415
+
+    class VibrationSection(VibrationRecord):
+        """``[simulation.vibration]``: phase and image motion are optional."""
+
+        phase: list[float] | list[list[float]] = Field(default_factory=lambda: [0.0, 0.0])
+        image_motion: list[float] = Field(default_factory=lambda: [0.0, 0.0])
+
+    noise_section = options_section("_NoiseSection", SensorNoise)
+
+    class SimulationSection(Section):
+        vibration: VibrationSection
+        num_frames: int = 2
+        frame_size: list[int] | None = None
+        noise: noise_section | None = None  # type: ignore[valid-type]
+        seed: int = 0
+
+        @model_validator(mode="after")
+        def _check(self) -> Self:
+            check_whole_number("num_frames", self.num_frames, at_least=1)
+            check_whole_number("seed", self.seed, at_least=0)
+            if self.frame_size is not None and (len(self.frame_size) != 2 or min(self.frame_size) < 1):
+                raise ValueError(f"frame_size must be [height, width] in px, got {self.frame_size}")
+            checked(self.simulation)
+            return self
+
+        def simulation(self) -> Simulation:
+            """The values as a ``Simulation``."""
+            size = None if self.frame_size is None else (self.frame_size[0], self.frame_size[1])
+            noise = None if self.noise is None else SensorNoise(**_given(self.noise))
+            return Simulation(self.vibration.to_vibration(), self.num_frames, size, noise, self.seed)
+
+    return SimulationSection
+
+
+_DetectionSection = options_section("_DetectionSection", DetectionSettings)
 
 
 class _StackSection(Section):
     """``[stack]``: processing of stacks in windows."""
 
-    window: int = Field(default=DEFAULT_WINDOW, ge=2)
-    bad_frames: BadFrames = "pass"
+    window: int = Field(
+        default=DEFAULT_WINDOW, ge=2, description="Largest number of frames in which one vibration is detected."
+    )
+    bad_frames: BadFrames = Field(
+        default="pass",
+        description='Frames that cannot be read or used: ``"pass"`` writes them unchanged, ``"skip"`` leaves them out.',
+    )
 
 
 def _restoration_section(method: object) -> Any:
     """``[restoration]``: the keys depend on the method."""
-    chosen = METHODS[method if isinstance(method, str) and method in METHODS else "exact"]
-    common: dict[str, Any] = {"method": Literal[*METHODS], "saturation": float | None}
-    if "prior" in chosen.options.__annotations__:
-        common["prior"] = Literal[*PRIORS]
-    return options_section(
-        "_RestorationSection", chosen.options, skip=("method", *CommonOptions.__annotations__), **common
+    settings = METHOD_SETTINGS.get(method if isinstance(method, str) else "exact", METHOD_SETTINGS["exact"])
+    common: dict[str, Any] = {"method": Literal[*METHOD_SETTINGS], "saturation": float | None}
+    if "prior" in settings.__annotations__:
+        common["prior"] = PriorName
+    return options_section("_RestorationSection", settings, **common)
+
+
+def file_section(method: object = "exact") -> Any:
+    """Class of the file for a restoration method, without the keys of ``[simulation]``."""
+    return create_model(
+        "_Root",
+        __base__=Section,
+        sensor=(SensorSection, ...),
+        detection=(_DetectionSection | None, None),
+        restoration=(_restoration_section(method) | None, None),
+        simulation=(Any, None),
+        stack=(_StackSection | None, None),
     )
 
 
-def read_config(path: str | os.PathLike[str]) -> Config:
+def presets() -> dict[str, str]:
+    """Text of the configuration files that are part of the package, by name."""
+    folder = files("rsvib_torch") / "presets"
+    return {
+        entry.name.removesuffix(".toml"): entry.read_text(encoding="utf-8")
+        for entry in sorted(folder.iterdir(), key=lambda entry: entry.name)
+    }
+
+
+def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any] | None = None) -> Config:
     """Read a configuration file.
 
     Only ``[sensor]`` is required.
 
-    * ``[sensor]``: fields of ``SensorTiming``, and ``full_scale``.
+    * ``[sensor]``: fields of ``SensorTiming``, with ``exposure_time`` and ``frame_rate`` in place of ``exposure_rows``
+      and ``frame_rows`` if they are known in seconds, and ``full_scale``.
     * ``[detection]``: options of ``detect_vibration``.
     * ``[restoration]``: options of ``restore``, with ``saturation`` in the unit of the frames' file.
     * ``[simulation]``: ``num_frames``, ``frame_size``, ``seed``, ``[simulation.vibration]`` (fields of ``Vibration``)
@@ -148,39 +236,52 @@ def read_config(path: str | os.PathLike[str]) -> Config:
     * ``[stack]``: ``window`` and ``bad_frames`` of ``process_stack``.
 
     Args:
-        path: The TOML file.
+        path: The TOML file; None if ``sensor`` describes the camera.
+        sensor: Keys of ``[sensor]`` that replace those of the file. ``exposure_time`` also replaces ``exposure_rows``,
+            ``frame_rate`` also ``frame_rows``, and vice versa.
 
     Raises:
         OSError: If the file cannot be opened.
         ValueError: If it is not TOML, or a key is missing, unknown or has a wrong type or value: one line per key,
             with its path, its value and what was expected.
+
+    Example:
+        >>> camera = {"row_time": 20e-6, "exposure_time": 1e-3, "frame_rate": 25}
+        >>> read_config(None, sensor=camera).timing.frame_rows
+        2000.0
     """
-    path = Path(path)
+    data = {} if path is None else _read_toml(Path(path))
+    source = "the command line" if path is None else str(path)
+    if sensor:
+        stated = data.get("sensor", {})
+        if isinstance(stated, dict):
+            same = ({"exposure_time", "exposure_rows"}, {"frame_rate", "frame_rows"})
+            replaced = set(sensor).union(*(pair for pair in same if pair & set(sensor)))
+            stated = {name: value for name, value in stated.items() if name not in replaced}
+            data["sensor"] = {**stated, **sensor}
+    restoration = data.get("restoration")
+    root = file_section(restoration.get("method") if isinstance(restoration, dict) else None)
+    content = validate(root, data, source)
+    simulation = None
+    if content.simulation is not None:
+        part: Any = create_model("_Part", __base__=Section, simulation=(simulation_section(), ...))
+        simulation = validate(part, {"simulation": content.simulation}, source).simulation.simulation()
+    return Config(
+        source=source,
+        timing=content.sensor.to_timing(),
+        full_scale=content.sensor.full_scale,
+        detection=_given(content.detection),
+        restoration=_given(content.restoration),
+        simulation=simulation,
+        stack=_given(content.stack),
+    )
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path}: not a TOML file: {error}") from error
-    restoration = data.get("restoration")
-    method = restoration.get("method") if isinstance(restoration, dict) else None
-    root: Any = create_model(
-        "_Root",
-        __base__=Section,
-        sensor=(SensorSection, ...),
-        detection=(_DetectionSection | None, None),
-        restoration=(_restoration_section(method) | None, None),
-        simulation=(_SimulationSection | None, None),
-        stack=(_StackSection | None, None),
-    )
-    checked_data = validate(root, data, str(path))
-    sensor, simulation = checked_data.sensor, checked_data.simulation
-    return Config(
-        timing=sensor.to_timing(),
-        full_scale=sensor.full_scale,
-        detection=_given(checked_data.detection),
-        restoration=_given(checked_data.restoration),
-        simulation=None if simulation is None else simulation.simulation(),
-        stack=_given(checked_data.stack),
-    )
 
 
 def _given(section: Any) -> dict[str, Any]:

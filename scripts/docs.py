@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Build the documentation as a site: the pages in docs/, and references of the public names and of the commands.
+"""Build the documentation as a site: the pages in docs/, and a reference of the public names.
 
 Needs the extra ``docs``: ``.venv/bin/python -m pip install -c scripts/constraints.txt -e '.[docs]'``. Warnings are
 errors: a broken link, or a docstring with a parameter that its function does not have, fails the build. The site works
@@ -19,10 +19,7 @@ from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from typer.testing import CliRunner
-
 import rsvib_torch as rsv
-from rsvib_torch.commands.main import app
 
 ROOT = Path(__file__).resolve().parents[1]
 # Order of the packages in the reference; others follow in alphabetical order.
@@ -79,17 +76,6 @@ def reference_page(package: str, paths: list[str]) -> str:
     return "\n".join(lines)
 
 
-def command_page() -> str:
-    """Markdown of the command reference: what ``rsvib COMMAND --help`` prints."""
-    runner = CliRunner(env={"COLUMNS": "96", "NO_COLOR": "1", "TERM": "dumb"})
-    names = [command.name or command.callback.__name__ for command in app.registered_commands if command.callback]
-    lines = ["# Commands", "", "The output of `rsvib COMMAND --help`.", ""]
-    for name in names:
-        printed = "\n".join(line.rstrip() for line in runner.invoke(app, [name, "--help"]).stdout.strip().splitlines())
-        lines += [f"## rsvib {name}", "", "```text", printed, "```", ""]
-    return "\n".join(lines)
-
-
 def without_outer_links(text: str, folder: Path) -> str:
     """Markdown whose links to files and folders of the project that are no pages are plain text."""
 
@@ -114,7 +100,6 @@ def write_sources(folder: Path) -> list[object]:
     )
     (folder / "api").mkdir()
     reference: list[object] = [{"Configuration": "configuration.md"}, {"Commands": "commands.md"}]
-    (folder / "commands.md").write_text(command_page(), encoding="utf-8")
     for package, paths in public_names().items():
         (folder / "api" / f"{package}.md").write_text(reference_page(package, paths), encoding="utf-8")
         reference.append({f"rsvib_torch.{package}": f"api/{package}.md"})

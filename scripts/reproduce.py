@@ -19,7 +19,7 @@ from reproduction.page import write_reproduction_page
 from reproduction.pictures import gallery
 from reproduction.work import Plan, run
 
-from rsvib_torch.io import whole_folder
+from rsvib_torch.core.atomic import whole_folder
 
 PLANS = {
     "whole": Plan(size=(2048, 1024), seeds=10, noises=(0.005, 0.002, 0.0), edges=3, speeds=SPEEDS, processes=2),

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from rsvib_torch.config import read_config
+from rsvib_torch.config import presets, read_config
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import blind_frequencies
 
@@ -62,6 +62,33 @@ def test_only_the_sensor_is_required_and_missing_options_are_not_filled_in(tmp_p
     assert config.restoration == {"method": "banded", "half_rows": 8, "noise_to_signal": 1e-3}
 
 
+def test_exposure_and_frame_period_in_seconds(tmp_path):
+    expected = SensorTiming(row_time=2e-5, exposure_rows=25, frame_rows=2000)
+    text = "[sensor]\nrow_time = 2e-5\nexposure_time = 0.5e-3\nframe_rate = 25\n"
+    timing = read(tmp_path, text).timing
+    assert (timing.exposure_rows, timing.frame_rows) == pytest.approx((25, 2000), rel=1e-12)
+    assert read(tmp_path, text + "exposure_rows = 25\nframe_rows = 2000.3\n").timing.frame_rows == 2000.3  # they agree
+    assert read(tmp_path, text.replace("exposure_time = 0.5e-3", "exposure_rows = 25")).timing == expected
+
+
+def test_keys_that_replace_those_of_the_file(tmp_path):
+    (tmp_path / "camera.toml").write_text(SENSOR + "full_scale = 4095\n[detection]\ntones = 2\n")
+    config = read_config(tmp_path / "camera.toml", sensor={"frame_rate": 40.0, "scan_axis": "x"})
+    assert config.timing == SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=1250, scan_axis="x")
+    assert (config.full_scale, config.detection, config.source) == (4095, {"tones": 2}, str(tmp_path / "camera.toml"))
+    alone = read_config(None, sensor={"row_time": 2e-5, "exposure_rows": 20.0, "frame_rows": 512.0})
+    assert alone.timing == read(tmp_path, SENSOR).timing
+    assert alone.source == "the command line"
+    with pytest.raises(ValueError, match="the command line: sensor: exposure_time or exposure_rows is missing"):
+        read_config(None, sensor={"row_time": 2e-5, "frame_rate": 30.0})
+
+
+def test_presets_are_part_of_the_package():
+    files = {path.stem: path.read_text(encoding="utf-8") for path in CONFIGS.iterdir()}
+    assert presets() == files
+    assert list(presets()) == ["in_orbit", "iso12233", "push_scan"]
+
+
 def test_two_tones_per_axis(tmp_path):
     text = "[simulation.vibration]\namplitude = [[1, 0.5], [2, 0]]\nfrequency = [[40, 90], [55, 0]]\n"
     simulation = read(tmp_path, SENSOR + text).simulation
@@ -83,12 +110,28 @@ VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
         (SENSOR.replace("20", "0"), "sensor: exposure_rows must be larger than 0, got 0"),
         (SENSOR.replace("20", "nan"), "sensor: exposure_rows must be finite, got nan"),
         (SENSOR.replace("2e-5", "0.02"), "sensor: row_time=0.02 s is longer than 10 ms; row_time is in seconds"),
-        (SENSOR.replace("frame_rows = 512", ""), "sensor.frame_rows: missing key; expected a number"),
-        ("", "sensor: missing key; expected a table with row_time, exposure_rows"),
-        ("sensor = 3", "sensor: expected a table with row_time, exposure_rows"),
+        (SENSOR.replace("frame_rows = 512", ""), "sensor: frame_rate or frame_rows is missing"),
+        (SENSOR.replace("exposure_rows = 20", ""), "sensor: exposure_time or exposure_rows is missing"),
+        (
+            SENSOR + "frame_rate = 50",
+            "sensor: frame_rate=50 contradicts frame_rows=512: with this row_time it is frame_rows",
+        ),
+        (
+            SENSOR + "exposure_time = 1e-3",
+            "sensor: exposure_time=0.001 contradicts exposure_rows=20: with this row_time",
+        ),
+        (SENSOR.replace("frame_rows = 512", "frame_rate = 0.04"), "sensor: frame_rate=0.04 is less than 0.1; it is in"),
+        (SENSOR.replace("frame_rows = 512", "frame_rate = 0"), "sensor: frame_rate must be larger than 0, got 0"),
+        (SENSOR.replace("exposure_rows = 20", "exposure_time = -1"), "sensor: exposure_rows must be larger than 0"),
+        (
+            SENSOR.replace("exposure_rows = 20", "exposure_time = 0.1"),
+            "sensor: exposure_rows=5000 exceeds the frame period",
+        ),
+        ("", "sensor: missing key; expected a table with row_time, exposure_time"),
+        ("sensor = 3", "sensor: expected a table with row_time, exposure_time"),
         (
             SENSOR + "rows = 5",
-            "sensor.rows: unknown key; expected one of row_time, exposure_rows, frame_rows, scan_axis",
+            "sensor.rows: unknown key; expected one of row_time, exposure_time, exposure_rows, frame_rate",
         ),
         (SENSOR + "[camera]\n", "camera: unknown key; expected one of sensor, detection, restoration, simulation"),
         (SENSOR + "scan_axis = 'z'", "sensor.scan_axis: expected 'y' or 'x', got 'z'"),

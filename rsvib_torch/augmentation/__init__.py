@@ -1,5 +1,5 @@
 """Training data: still images as a vibrating rolling-shutter camera records them."""
 
-from rsvib_torch.augmentation.rolling_shutter import RollingShutterVibration
+import lazy_loader
 
-__all__ = ["RollingShutterVibration"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,5 +1,5 @@
 """Calibration of row time, readout direction and exposure from frames of flickering light."""
 
-from rsvib_torch.calibration.calibrate import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
+import lazy_loader
 
-__all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_exposure"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

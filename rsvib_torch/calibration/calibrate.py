@@ -11,7 +11,8 @@ from torch import Tensor
 from rsvib_torch.calibration.flicker import BandFit, Profiles, find_bands, row_profiles
 from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.presentation import Result, measured_text, wrapped
+from rsvib_torch.core.presentation import Result
+from rsvib_torch.core.text import measured_text, wrapped
 from rsvib_torch.frames.arrays import Channels, FramesLike
 
 __all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_exposure"]

@@ -1,14 +1,19 @@
 """Answers of the commands: what was detected and restored, what was left unchanged and why, and what to do next."""
 
+from __future__ import annotations
+
 import shlex
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rsvib_torch.core.presentation import plain_values, wrapped
-from rsvib_torch.detection import DetectionResult
-from rsvib_torch.restoration import RestorationVerdict
-from rsvib_torch.stacks import RestoredFrames
+from rsvib_torch.core.text import wrapped
+
+if TYPE_CHECKING:
+    from rsvib_torch.config import Config
+    from rsvib_torch.detection import DetectionResult
+    from rsvib_torch.restoration import RestorationVerdict
+    from rsvib_torch.stacks import RestoredFrames
 
 __all__ = [
     "command_text",
@@ -76,29 +81,31 @@ def verdict_data(verdict: RestorationVerdict | None) -> dict[str, Any]:
     """A verdict on restored frames for JSON."""
     if verdict is None:
         return {"outcome": None, "predicted_gain_db": None, "summary": None}
+    from rsvib_torch.core.presentation import plain_values  # noqa: PLC0415
+
     gain = plain_values(verdict.predicted_gain.nanmean())
     return {"outcome": verdict.overall, "predicted_gain_db": gain, "summary": verdict.sentence}
 
 
 def steps_after_detection(
-    result: DetectionResult | None, frames: Path, config: Path, vibration: Path | None = None
+    result: DetectionResult | None, frames: Path, settings: Config, vibration: Path | None = None
 ) -> list[str]:
     """What to do after a detection: restore, or try another model.
 
     Args:
         result: The detection; None for windows.
         frames: The stack.
-        config: The configuration file.
+        settings: The camera.
         vibration: The file of the detection, if the frames were not restored by the same command.
     """
     lines = []
     if vibration is not None and (result is None or bool(result.reliable.any())):
         target = frames.with_name("restored.tif")
-        restore = command_text("restore", frames, target, "--config", config, "--vibration", vibration)
+        restore = command_text("restore", frames, target, *settings.arguments, "--vibration", vibration)
         lines.append(f"restore the frames:\n  {restore}")
     reasons = [] if result is None else [reason for axis in result.reasons for reason in axis]
     if any("model='free'" in reason for reason in reasons):
-        motion = command_text("motion", frames, "--config", config, "--out", "motion.csv")
+        motion = command_text("motion", frames, *settings.arguments, "--out", "motion.csv")
         lines.append(f"detect a motion that is not a steady vibration (model='free'):\n  {motion}")
     if reasons:
         lines.append("follow the remedies that the reasons above name")

@@ -10,6 +10,7 @@ import typer
 
 import rsvib_torch
 from rsvib_torch.commands import motion_commands, stack_commands
+from rsvib_torch.commands.init import init
 from rsvib_torch.commands.options import JsonOption, QuietOption
 from rsvib_torch.commands.terminal import (
     Answer,
@@ -24,6 +25,15 @@ __all__ = ["main", "run_command"]
 
 # Commands in the order of the help: name, function, line in the list of commands, and two examples.
 _COMMANDS: tuple[tuple[str, Callable[..., Answer], str, str], ...] = (
+    (
+        "init",
+        init,
+        "Write a configuration file for the camera of a stack.",
+        """
+        rsvib init frames.tif --row-time 14.6us --exposure 1/500 --frame-rate 29.97
+        rsvib init --preset iso12233 --out camera.toml
+        """,
+    ),
     (
         "run",
         stack_commands.run,
@@ -165,7 +175,8 @@ def run_command(arguments: Sequence[str]) -> int:
             except typer.Abort:
                 code = _INTERRUPTED
         if code == _INTERRUPTED:
-            error_line("stopped; the windows completed by rsvib run are kept, --resume continues")
+            kept = "; the completed windows are kept, --resume continues" if "run" in arguments[:1] else ""
+            error_line(f"stopped{kept}")
         return code if isinstance(code, int) else 0
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""

@@ -1,63 +1,58 @@
 """Commands for other motion and for the camera: ``motion``, ``known`` and ``calibrate``."""
 
+from __future__ import annotations
+
 import csv
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
-import torch
 import typer
-from numpy.typing import NDArray
-from torch import Tensor
 
-from rsvib_torch.calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
+import rsvib_torch
+from rsvib_torch import calibration, detection, io
 from rsvib_torch.commands.answers import command_text, restoration_data, restoration_lines
+from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.options import (
-    ConfigOption,
     DeviceOption,
+    FrameRateOption,
     FramesArgument,
     OverwriteOption,
     RestoredArgument,
     ScaleOption,
+    camera_options,
     check_new,
     full_scale_of,
     restoration_options,
+    seconds,
 )
 from rsvib_torch.commands.stack_commands import load, restore_and_save
 from rsvib_torch.commands.terminal import Answer, error_line, note, working
-from rsvib_torch.config import read_config
-from rsvib_torch.core.presentation import measured_text
-from rsvib_torch.detection import (
-    MotionCheck,
-    MotionDetection,
-    SweptTone,
-    align_motion,
-    check_motion,
-    detect_motion,
-    detect_swept_tone,
-)
-from rsvib_torch.io import (
-    check_stack_target,
-    check_writable,
-    describe_stack,
-    read_stack,
-    read_stack_info,
-    whole_file,
-)
-from rsvib_torch.motion.recorded import MotionUnit, TimeUnit, read_motion
-from rsvib_torch.motion.spline import FreeMotion
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.config import Config
+from rsvib_torch.core.atomic import check_writable, whole_file
+from rsvib_torch.core.option_types import MotionUnit, TimeUnit
+from rsvib_torch.core.text import measured_text
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from torch import Tensor
+
+    from rsvib_torch.calibration import RowTimeCalibration
+    from rsvib_torch.detection import MotionCheck, MotionDetection, SweptTone
+    from rsvib_torch.motion.spline import FreeMotion
+    from rsvib_torch.motion.timing import SensorTiming
+
+    Array = NDArray[np.float64]
 
 __all__ = ["calibrate", "known", "motion"]
 
-Array = NDArray[np.float64]
 
-
+@camera_options
 def motion(
     frames: FramesArgument,
     *,
-    config: ConfigOption,
+    settings: Config,
     out: Annotated[
         Path,
         typer.Option(help="CSV file to write: time in s, x and y in px, and their standard deviations (model free)."),
@@ -81,7 +76,6 @@ def motion(
 
     To restore frames with the CSV file: rsvib known --motion FILE --unit px --offset 0.
     """
-    settings = read_config(config)
     check_writable(out)
     check_new([out], overwrite)
     stack = load(frames, settings, full_scale, device)
@@ -96,12 +90,14 @@ def motion(
         writer.writerow(names)
         writer.writerows([f"{time:.9f}", *(f"{value:.5f}" for value in row)] for time, *row in table)
     target = frames.with_name("restored.tif")
-    restore_it = ("known", frames, target, "--config", config, "--motion", out, "--unit", "px", "--offset", "0")
+    restore_it = command_text(
+        "known", frames, target, *settings.arguments, "--motion", out, "--unit", "px", "--offset", "0"
+    )
     return Answer(
         {f"Motion in {frames.name}": [result.summary()]},
         {"motion": _without_curve(result), "columns": list(names)},
         [out],
-        [f"restore the frames:\n  {command_text(*restore_it)}"] * bool(result.reliable.any()),
+        [f"restore the frames:\n  {restore_it}"] * bool(result.reliable.any()),
     )
 
 
@@ -109,7 +105,9 @@ def _detect_free_motion(
     frames: Tensor, timing: SensorTiming, knot_rows: int, search: int
 ) -> tuple[MotionDetection, tuple[str, ...], Array]:
     """Detect a free motion, and sample it twice per knot."""
-    result = detect_motion(frames, timing, knot_rows=knot_rows, search=search)
+    import numpy as np  # noqa: PLC0415
+
+    result = detection.detect_motion(frames, timing, knot_rows=knot_rows, search=search)
     times, values = _sampled(result.motion, float(result.times.max()) + timing.exposure_time, 0.5)
     measured, stds = result.times.flatten().cpu().numpy(), result.std.flatten(0, 1).cpu().numpy()
     interpolated = [np.interp(times, measured, stds[:, axis]) for axis in range(2)]
@@ -118,29 +116,35 @@ def _detect_free_motion(
 
 def _detect_swept_tone(frames: Tensor, timing: SensorTiming, search: int) -> tuple[SweptTone, tuple[str, ...], Array]:
     """Detect a swept tone per axis, and sample its motion once per knot."""
-    result = detect_swept_tone(frames, timing, search=search)
+    import numpy as np  # noqa: PLC0415
+
+    result = detection.detect_swept_tone(frames, timing, search=search)
     times, samples = _sampled(result.motion, result.motion.end, 1.0)
     return result, ("time", "x", "y"), np.column_stack([times, samples])
 
 
 def _without_curve(result: MotionDetection | SweptTone) -> dict[str, Any]:
     """A detection without its displacements, which are in the CSV file."""
-    curve = ("motion", "times", "displacement") + ("std",) * isinstance(result, MotionDetection)
+    curve = ("motion", "times", "displacement") + ("std",) * isinstance(result, detection.MotionDetection)
     return {name: value for name, value in result.to_dict().items() if name not in curve}
 
 
 def _sampled(motion: FreeMotion, last: float, knots: float) -> tuple[Array, Array]:
     """Displacement (N, 2) of a motion at equidistant times (N,) up to ``last``, at most ``knots`` knots apart."""
+    import numpy as np  # noqa: PLC0415
+    import torch  # noqa: PLC0415
+
     end = max(motion.end, last)
     times = np.linspace(motion.start, end, math.ceil((end - motion.start) / (knots * motion.spacing)) + 1)
     return times, motion.displacement(torch.from_numpy(times).to(motion.device)).cpu().numpy()
 
 
+@camera_options
 def known(
     frames: FramesArgument,
     restored: RestoredArgument,
     *,
-    config: ConfigOption,
+    settings: Config,
     motion: Annotated[Path, typer.Option(help="CSV file with the columns time, x and y.")],
     unit: Annotated[MotionUnit, typer.Option(help="Unit of x and y: px, an angle, or an angular rate.")],
     focal_length: Annotated[
@@ -176,26 +180,25 @@ def known(
     The recording is compared with the offsets of rows between the frames, and refused if it does not explain them. If
     the restored frames are judged no better than the input, the input is written unchanged, unless --force is given.
     """
-    settings = read_config(config)
-    recorded = read_motion(
+    recorded = rsvib_torch.read_motion(
         motion,
         unit=unit,
         focal_length=focal_length,
         time_unit=time_unit,
         signs=(-1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0),
     )
-    info = read_stack_info(frames)
+    info = io.read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
     options = restoration_options(info, scale, settings)
     shape = (1, *info.shape[1:]) if options.get("joint") is True else info.shape
-    check_stack_target(restored, shape, dtype=info.dtype, full_scale=scale, like=info)
+    io.check_stack_target(restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     check_new([restored], overwrite)
     results: dict[str, list[str]] = {}
     data: dict[str, Any] = {"alignment": None, "check": None}
     stack = load(frames, settings, full_scale, device)
     if offset is None:
         with working("aligning the recording"):
-            found = align_motion(stack.frames, stack.timing, recorded, fit_gain=fit_gain)
+            found = detection.align_motion(stack.frames, stack.timing, recorded, fit_gain=fit_gain)
         results["Recording on the clock of the frames"] = [found.summary()]
         data["alignment"] = found.to_dict()
         _refuse(motion, found.reasons, force)
@@ -239,7 +242,7 @@ def _check_motion(
         return None
     try:
         with working("comparing the motion"):
-            check = check_motion(frames, timing, motion)
+            check = detection.check_motion(frames, timing, motion)
     except ValueError as error:
         if required:
             raise
@@ -262,9 +265,13 @@ def calibrate(
     ] = None,
     exposure: Annotated[
         list[float] | None,
-        typer.Option(help="Exposure time in s, given once per frame, for a strobe of unknown frequency."),
+        typer.Option(
+            parser=seconds,
+            metavar="TIME",
+            help="Exposure time, e.g. 1/1000, given once per frame, for a strobe of unknown frequency.",
+        ),
     ] = None,
-    frame_rate: Annotated[float | None, typer.Option(help="Frames per second, if the frames are consecutive.")] = None,
+    frame_rate: FrameRateOption = None,
     on_fraction: Annotated[
         float | None,
         typer.Option(help="Duty cycle of a light that is switched on and off; determines the exposure time."),
@@ -282,6 +289,8 @@ def calibrate(
     overwrite: OverwriteOption = False,
 ) -> Answer:
     """Measure row time, readout direction and exposure of a camera from frames of a flickering light."""
+    import torch  # noqa: PLC0415
+
     if (frequency is None) == (not exposure):
         raise ValueError(
             "give --frequency of the flicker, or --exposure once per frame for a strobe of unknown frequency"
@@ -290,9 +299,9 @@ def calibrate(
         check_writable(out)
         check_new([out], overwrite)
     with working("reading the frames"):
-        stacks = [read_stack(path, full_scale=full_scale) for path in frames]
+        stacks = [io.read_stack(path, full_scale=full_scale) for path in frames]
     for path, stack in zip(frames, stacks, strict=True):
-        for sentence in describe_stack(read_stack_info(path), None):
+        for sentence in io.describe_stack(io.read_stack_info(path), None):
             note(sentence)
         if stack.shape[1:] != stacks[0].shape[1:]:
             raise ValueError(
@@ -303,9 +312,9 @@ def calibrate(
     axis: Literal[-2, -1] = -1 if scan_axis == "x" else -2
     with working("measuring the flicker"):
         if frequency is None:
-            result = calibrate_row_time_by_exposure(stack, exposure or [], scan_axis=axis, gamma=gamma)
+            result = calibration.calibrate_row_time_by_exposure(stack, exposure or [], scan_axis=axis, gamma=gamma)
         else:
-            result = calibrate_row_time(
+            result = calibration.calibrate_row_time(
                 stack,
                 frequency,
                 frame_rate=frame_rate,
@@ -314,10 +323,10 @@ def calibrate(
                 scan_axis=axis,
                 gamma=gamma,
             )
-    table = _sensor_toml(result, scan_axis)
+    table = _calibrated_toml(result, scan_axis)
     rows = stack.shape[axis]
     readout = measured_text(1e3 * result.row_time * rows, 1e3 * result.row_time_std * rows)
-    steps = ["enter the values that are marked as unknown"] * (table.count("?") > 0)
+    steps = ["enter the values that are left open"] * (" = \n" in table)
     if out is None:
         steps = ["write these values into a configuration file with --out, or copy them", *steps]
     else:
@@ -332,14 +341,14 @@ def calibrate(
     )
 
 
-def _sensor_toml(result: RowTimeCalibration, scan_axis: str) -> str:
+def _calibrated_toml(result: RowTimeCalibration, scan_axis: str) -> str:
     """The table ``[sensor]`` of a configuration file; unknown values are comments to be filled in."""
+    period: dict[str, object] = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
     values = {
-        "row_time": f"{result.row_time:.9g}",
-        "exposure_rows": None if result.exposure_time is None else f"{result.exposure_time / result.row_time:.6g}",
-        "frame_rows": None if result.frame_rows is None else f"{result.frame_rows:.8g}",
-        "scan_axis": f'"{scan_axis}"',
-        "readout_direction": None if result.readout_direction is None else f'"{result.readout_direction}"',
+        "row_time": result.row_time,
+        "exposure_time": result.exposure_time,
+        **period,
+        "scan_axis": scan_axis,
+        "readout_direction": result.readout_direction,
     }
-    lines = [f"# {name} = ?  (unknown)" if text is None else f"{name} = {text}" for name, text in values.items()]
-    return "\n".join(["[sensor]", *lines, *(f"# {note}" for note in result.notes)]) + "\n"
+    return sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])

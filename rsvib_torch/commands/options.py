@@ -1,24 +1,33 @@
 """Arguments and options that several commands share, and their combination with the configuration file."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import functools
+import inspect
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-import torch
 import typer
 
-from rsvib_torch.config import Config
+from rsvib_torch.commands.terminal import Answer
+from rsvib_torch.config import Config, read_config
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.io import StackInfo
-from rsvib_torch.restoration.exact.priors import PRIORS
-from rsvib_torch.restoration.restore import METHODS, method_options
+from rsvib_torch.core.option_types import METHOD_SETTINGS, PriorName, method_options
+
+if TYPE_CHECKING:
+    import torch
+
+    from rsvib_torch.io import StackInfo
 
 __all__ = [
-    "ConfigOption",
+    "READOUT_HELP",
+    "SCAN_AXIS_HELP",
     "DeviceName",
     "DeviceOption",
+    "ExposureOption",
     "ForceOption",
+    "FrameRateOption",
     "FramesArgument",
     "JointOption",
     "JsonOption",
@@ -29,16 +38,56 @@ __all__ = [
     "PriorOption",
     "QuietOption",
     "RestoredArgument",
+    "RowTimeOption",
     "SaturationOption",
     "ScaleOption",
     "WorkersOption",
+    "camera_options",
     "check_new",
     "full_scale_of",
+    "rate",
     "restoration_options",
+    "seconds",
     "torch_device",
 ]
 
 DeviceName = Literal["auto", "cpu", "cuda"]
+
+_TIME_UNITS = {"": 1, "s": 1, "ms": 10**3, "us": 10**6, "µs": 10**6, "μs": 10**6, "ns": 10**9}  # per second
+
+
+def seconds(text: str) -> float:
+    """A time in seconds: a number or a fraction, with or without a unit.
+
+    Raises:
+        BadParameter: If it is neither.
+
+    Example:
+        >>> seconds("14.5us"), seconds("1/500"), seconds("2e-5")
+        (1.45e-05, 0.002, 2e-05)
+    """
+    number = text.strip().rstrip("smunµμ")
+    try:
+        return float(Fraction(number) / _TIME_UNITS[text.strip()[len(number) :]])
+    except (ValueError, ArithmeticError, KeyError) as error:
+        raise typer.BadParameter(f"expected a time such as 14.5us, 1/500 or 2e-5 (in s), got {text!r}") from error
+
+
+def rate(text: str) -> float:
+    """Frames per second: a number or a fraction.
+
+    Raises:
+        BadParameter: If it is neither.
+
+    Example:
+        >>> round(rate("30000/1001"), 6)
+        29.97003
+    """
+    try:
+        return float(Fraction(text))
+    except (ValueError, ArithmeticError) as error:
+        raise typer.BadParameter(f"expected a number such as 29.97 or 30000/1001, got {text!r}") from error
+
 
 FramesArgument = Annotated[
     Path,
@@ -51,7 +100,38 @@ RestoredArgument = Annotated[
         "and .mkv are videos with the time stamps and the sound of the input.",
     ),
 ]
-ConfigOption = Annotated[Path, typer.Option(help="TOML configuration file that describes the camera.")]
+_ConfigOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        help="TOML file that describes the camera; rsvib init writes one. Or give --row-time, --exposure and "
+        "--frame-rate.",
+    ),
+]
+RowTimeOption = Annotated[
+    float | None,
+    typer.Option(
+        parser=seconds,
+        metavar="TIME",
+        help="Time between the exposure starts of adjacent rows, e.g. 14.6us or 1.46e-5.",
+    ),
+]
+ExposureOption = Annotated[
+    float | None, typer.Option(parser=seconds, metavar="TIME", help="Exposure time, e.g. 1/500 or 2ms.")
+]
+FrameRateOption = Annotated[
+    float | None,
+    typer.Option(parser=rate, metavar="NUMBER", help="Frames per second of the sensor, e.g. 29.97 or 30000/1001."),
+]
+SCAN_AXIS_HELP = "y: image rows are exposed one after another; x: image columns."
+READOUT_HELP = "forward: the top row (or left column) is read first; reverse: the last one is."
+_ScanAxisOption = Annotated[
+    Literal["y", "x"] | None, typer.Option(help=SCAN_AXIS_HELP, show_default="from the configuration, or y")
+]
+_ReadoutOption = Annotated[
+    Literal["forward", "reverse"] | None,
+    typer.Option(help=READOUT_HELP, show_default="from the configuration, or forward"),
+]
 DeviceOption = Annotated[DeviceName, typer.Option(help="Device for the computation; auto uses a GPU if there is one.")]
 ScaleOption = Annotated[
     float | None,
@@ -62,7 +142,9 @@ ScaleOption = Annotated[
 ]
 MethodOption = Annotated[
     str | None,
-    typer.Option(help=f"Restoration method: {', '.join(METHODS)}.", show_default="from the configuration, or exact"),
+    typer.Option(
+        help=f"Restoration method: {', '.join(METHOD_SETTINGS)}.", show_default="from the configuration, or exact"
+    ),
 ]
 JointOption = Annotated[
     str | None,
@@ -73,7 +155,7 @@ JointOption = Annotated[
 ]
 PriorOption = Annotated[
     str | None,
-    typer.Option(help=f"Prior of the scene: {' or '.join(PRIORS)}, for methods that have this option."),
+    typer.Option(help=f"Prior of the scene: {' or '.join(get_args(PriorName))}, for methods that have this option."),
 ]
 SaturationOption = Annotated[
     float | None,
@@ -100,6 +182,56 @@ WorkersOption = Annotated[
         show_default="number of processors",
     ),
 ]
+
+
+def _read_camera(
+    *,
+    config: _ConfigOption = None,
+    row_time: RowTimeOption = None,
+    exposure: ExposureOption = None,
+    frame_rate: FrameRateOption = None,
+    scan_axis: _ScanAxisOption = None,
+    readout_direction: _ReadoutOption = None,
+) -> Config:
+    """Configuration file and the options that replace its keys, or the options alone."""
+    times = {"--row-time": row_time, "--exposure": exposure, "--frame-rate": frame_rate}
+    missing = [name for name, value in times.items() if value is None]
+    if config is None and missing:
+        raise ValueError(
+            f"the camera is not described: give {', '.join(missing)}, or --config FILE (rsvib init FRAMES writes such "
+            "a file and explains its values)"
+        )
+    sensor = {
+        "row_time": row_time,
+        "exposure_time": exposure,
+        "frame_rate": frame_rate,
+        "scan_axis": scan_axis,
+        "readout_direction": readout_direction,
+    }
+    given = {name: value for name, value in sensor.items() if value is not None}
+    settings = read_config(config, sensor=given)
+    arguments = [] if config is None else ["--config", str(config)]
+    for name, value in given.items():
+        option = "--exposure" if name == "exposure_time" else f"--{name.replace('_', '-')}"
+        arguments += [option, f"{value:.10g}" if isinstance(value, float) else value]
+    return replace(settings, arguments=tuple(arguments))
+
+
+def camera_options(command: Callable[..., Answer]) -> Callable[..., Answer]:
+    """Decorator of a command: the options that describe the camera take the place of its parameter ``settings``."""
+    camera = inspect.signature(_read_camera).parameters
+
+    @functools.wraps(command)
+    def with_camera(**options: Any) -> Answer:
+        settings = _read_camera(**{name: options.pop(name) for name in camera})
+        return command(settings=settings, **options)
+
+    parameters: list[inspect.Parameter] = []
+    for parameter in inspect.signature(command, eval_str=True).parameters.values():
+        parameters += camera.values() if parameter.name == "settings" else [parameter]
+    with_camera.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    with_camera.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return with_camera
 
 
 @dataclass(frozen=True)
@@ -133,18 +265,20 @@ def check_new(paths: Iterable[Path], overwrite: bool) -> None:
         )
 
 
-def torch_device(name: DeviceName) -> torch.device:
+def torch_device(name: DeviceName) -> "torch.device":
     """Device of that name.
 
     Raises:
         ValueError: If there is no CUDA device.
     """
+    import torch  # noqa: PLC0415
+
     if name == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda: no CUDA device is available; use auto or cpu")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-def full_scale_of(path: Path, info: StackInfo, config: Config, option: float | None) -> float | None:
+def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float | None) -> float | None:
     """Full scale of a stack: from the option, else from the file (or its 8-bit type), else from the configuration.
 
     Raises:
@@ -163,7 +297,7 @@ def full_scale_of(path: Path, info: StackInfo, config: Config, option: float | N
 
 
 def restoration_options(
-    info: StackInfo, full_scale: float | None, config: Config, overrides: Overrides = NO_OVERRIDES
+    info: "StackInfo", full_scale: float | None, config: Config, overrides: Overrides = NO_OVERRIDES
 ) -> dict[str, Any]:
     """Options of ``restore``: those of the configuration file, overridden by those of the command line.
 

@@ -1,15 +1,17 @@
 """Commands that detect and remove vibration: ``simulate``, ``detect``, ``restore``, ``run`` and ``report``."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import torch
 import typer
-from torch import Tensor
 
 import rsvib_torch
+from rsvib_torch import detection, imaging, io, stacks
+from rsvib_torch import report as reports
 from rsvib_torch.commands.answers import (
     command_text,
     detection_data,
@@ -18,7 +20,6 @@ from rsvib_torch.commands.answers import (
     steps_after_detection,
 )
 from rsvib_torch.commands.options import (
-    ConfigOption,
     DeviceName,
     DeviceOption,
     ForceOption,
@@ -33,57 +34,30 @@ from rsvib_torch.commands.options import (
     SaturationOption,
     ScaleOption,
     WorkersOption,
+    camera_options,
     check_new,
     full_scale_of,
     restoration_options,
     torch_device,
 )
 from rsvib_torch.commands.terminal import Answer, counting, error_line, note, working
-from rsvib_torch.config import Config, read_config
-from rsvib_torch.core.presentation import write_json
+from rsvib_torch.config import Config
+from rsvib_torch.core.atomic import check_writable, whole_folder
+from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
+from rsvib_torch.core.text import write_json
 from rsvib_torch.core.validation import validate
-from rsvib_torch.detection import DetectionResult, detect_vibration
-from rsvib_torch.imaging import simulate_frames
-from rsvib_torch.io import (
-    StackInfo,
-    check_stack_target,
-    check_writable,
-    describe_stack,
-    exposure_times,
-    metadata_not_kept,
-    open_stack,
-    read_stack,
-    read_stack_info,
-    timing_from_first_frame,
-    whole_folder,
-    write_stack,
-)
-from rsvib_torch.io.full_scale import counts_to_frames
-from rsvib_torch.io.schema import TimingRecord, check_same_timing
-from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.report.html import Box, Report, write_report_page
-from rsvib_torch.report.plots import comparison_figure, offset_figure, save_figure, windows_figure
-from rsvib_torch.report.results import (
-    read_vibration,
-    write_offsets,
-    write_restoration,
-    write_vibration,
-    write_windows,
-)
-from rsvib_torch.restoration.verdict.trust import Detected
-from rsvib_torch.stacks import (
-    DEFAULT_WINDOW,
-    BadFrames,
-    RestoredFrames,
-    WindowResult,
-    detect_stack,
-    iterate_stack,
-    process_stack,
-    read_manifest,
-    restore_trusted,
-)
-from rsvib_torch.stacks.job import RestoreOptions
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rsvib_torch.detection import DetectionResult
+    from rsvib_torch.io import StackInfo
+    from rsvib_torch.motion.motion import Motion
+    from rsvib_torch.motion.timing import SensorTiming
+    from rsvib_torch.report import Box
+    from rsvib_torch.restoration.verdict.trust import Detected
+    from rsvib_torch.stacks import RestoredFrames, WindowResult
+    from rsvib_torch.stacks.job import RestoreOptions
 
 __all__ = ["Stack", "detect", "load", "report", "restore_and_save", "restore_frames", "run", "simulate"]
 
@@ -108,20 +82,20 @@ class Stack:
 def load(path: Path, config: Config, full_scale: float | None, device: DeviceName) -> Stack:
     """Read a stack; ``full_scale`` and ``device`` are options of the command line."""
     target = torch_device(device)
-    info = read_stack_info(path)
+    info = io.read_stack_info(path)
     scale = full_scale_of(path, info, config, full_scale)
     with working(f"reading {path}"):
-        frames = read_stack(path, full_scale=scale)
-    timing = timing_from_first_frame(config.timing, info)
+        frames = io.read_stack(path, full_scale=scale)
+    timing = io.timing_from_first_frame(config.timing, info)
     print_notes(info, config)
-    times = exposure_times(info, config.timing)
+    times = io.exposure_times(info, config.timing)
     info = replace(info, frame_times=times, time_error=0.0, frame_rate=info.frame_rate or config.timing.frame_rate)
     return Stack(frames.to(target), info, scale, timing)
 
 
 def print_notes(info: StackInfo, config: Config) -> None:
     """Print what the file states about orientation, dropped frames and unequal intervals."""
-    for sentence in describe_stack(info, config.timing):
+    for sentence in io.describe_stack(info, config.timing):
         note(sentence)
 
 
@@ -134,22 +108,22 @@ def _note_lost(path: Path, names: Sequence[str]) -> None:
 def _save(path: Path, frames: Tensor, stack: Stack) -> tuple[str, ...]:
     """Write frames with the data type, full scale and metadata of a stack; print and return what is not kept."""
     with working(f"writing {path.name}"):
-        write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
-    names = metadata_not_kept(stack.info, path, tuple(frames.shape))
+        io.write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
+    names = io.metadata_not_kept(stack.info, path, tuple(frames.shape))
     _note_lost(path, names)
     return names
 
 
 def _detect(stack: Stack, config: Config) -> DetectionResult:
     with working("detecting the vibration"):
-        result: DetectionResult = detect_vibration(stack.frames, stack.timing, **config.detection)
+        result: DetectionResult = detection.detect_vibration(stack.frames, stack.timing, **config.detection)
     return result
 
 
 def _restore(stack: Stack, motion: Motion | Detected, options: dict[str, Any], force: bool) -> RestoredFrames:
     """Restore frames, and judge the result on eight pairs of frames."""
     with working("restoring and judging"):
-        result = restore_trusted(stack.frames, stack.timing, motion, options, force=force, most_pairs=8)
+        result = stacks.restore_trusted(stack.frames, stack.timing, motion, options, force=force, most_pairs=8)
     _warn_of_restoration(result)
     return result
 
@@ -166,7 +140,7 @@ def restore_and_save(
     result = _restore(stack, motion, options, force)
     not_kept = _save(path, result.frames, stack)
     if report is not None:
-        write_restoration(report, result, options, not_kept)
+        reports.write_restoration(report, result, options, not_kept)
     return result
 
 
@@ -182,20 +156,20 @@ def _warn_of_restoration(result: RestoredFrames) -> None:
 def _write_detection(folder: Path, result: DetectionResult, timing: SensorTiming) -> list[str]:
     """Write a detection as JSON, CSV and figure, and return the names of the files."""
     with working("drawing the offset curve"):
-        write_vibration(folder / "vibration.json", result, timing)
-        write_offsets(folder / "offsets.csv", result)
-        save_figure(offset_figure(result), folder / "offsets.png")
+        reports.write_vibration(folder / "vibration.json", result, timing)
+        reports.write_offsets(folder / "offsets.csv", result)
+        reports.save_figure(reports.offset_figure(result), folder / "offsets.png")
     return ["offsets.png", "vibration.json", "offsets.csv"]
 
 
 def _write_windows(folder: Path, path: Path) -> list[str]:
     """Write summary, table and figure of the windows of a manifest, and return the names of the files."""
-    manifest = read_manifest(path)
+    manifest = stacks.read_manifest(path)
     with working("drawing the windows"):
         write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **manifest.totals()})
-        write_windows(folder / "windows.csv", manifest)
+        reports.write_windows(folder / "windows.csv", manifest)
         starts = [record.start_time for record in manifest.windows]
-        save_figure(windows_figure(starts, manifest.detections()), folder / "windows.png")
+        reports.save_figure(reports.windows_figure(starts, manifest.detections()), folder / "windows.png")
     return ["windows.png", "windows.json", "windows.csv"]
 
 
@@ -215,11 +189,12 @@ _OF_DETECTION = ("vibration.json", "offsets.csv", "offsets.png")
 _OF_WINDOWS = ("manifest.json", "windows.json", "windows.csv", "windows.png")
 
 
+@camera_options
 def simulate(
     scene: Annotated[Path, typer.Argument(help="Image of the scene at rest, larger than the frames.")],
     frames: Annotated[Path, typer.Argument(help="Stack to write.")],
     *,
-    config: ConfigOption,
+    settings: Config,
     device: DeviceOption = "auto",
     full_scale: Annotated[
         float | None, typer.Option(help="Count of the scene's file that corresponds to full scale.")
@@ -233,19 +208,22 @@ def simulate(
 
     The camera, its vibration and its noise are described in the configuration file.
     """
-    settings = read_config(config)
+    import torch  # noqa: PLC0415
+
     check_new([frames], overwrite)
     if settings.simulation is None:
-        raise ValueError(f"{config}: simulation: missing key; expected a table with vibration, num_frames, ...")
+        raise ValueError(
+            f"{settings.source}: simulation: missing key; expected a table with vibration, num_frames, ..."
+        )
     simulation, target = settings.simulation, torch_device(device)
-    image = read_stack(scene, full_scale=full_scale)
+    image = io.read_stack(scene, full_scale=full_scale)
     if len(image) != 1:
         raise ValueError(f"{scene}: the scene must be one image, this file has {len(image)} frames")
     scale = settings.full_scale
     dtype = "float32" if scale is None else "uint8" if scale <= 255 else "uint16"
-    check_stack_target(frames, (simulation.num_frames, *image.shape[1:]), dtype=dtype, full_scale=scale)
+    io.check_stack_target(frames, (simulation.num_frames, *image.shape[1:]), dtype=dtype, full_scale=scale)
     with working("simulating the frames"):
-        simulated = simulate_frames(
+        simulated = imaging.simulate_frames(
             image[0].to(target),
             settings.timing,
             simulation.vibration,
@@ -255,10 +233,10 @@ def simulate(
             generator=torch.Generator(target).manual_seed(simulation.seed if seed is None else seed),
         )
     with working(f"writing {frames}"):
-        stated = StackInfo(tuple(simulated.shape), dtype, scale, frame_rate=settings.timing.frame_rate)
-        write_stack(frames, simulated, dtype=dtype, full_scale=scale, like=stated)
+        stated = io.StackInfo(tuple(simulated.shape), dtype, scale, frame_rate=settings.timing.frame_rate)
+        io.write_stack(frames, simulated, dtype=dtype, full_scale=scale, like=stated)
     line = f"{len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}"
-    run_it = command_text("run", frames, frames.with_name("results"), "--config", config)
+    run_it = command_text("run", frames, frames.with_name("results"), *settings.arguments)
     return Answer(
         {"Simulated frames": [line, f"vibration:\n{simulation.vibration}"]},
         {"shape": list(simulated.shape), "dtype": dtype, "vibration": simulation.vibration.to_dict()},
@@ -267,10 +245,11 @@ def simulate(
     )
 
 
+@camera_options
 def detect(
     frames: FramesArgument,
     *,
-    config: ConfigOption,
+    settings: Config,
     out: Annotated[Path, typer.Option(help="Folder for vibration.json, offsets.csv and offsets.png.")],
     window: Annotated[
         int | None,
@@ -289,7 +268,6 @@ def detect(
 
     The vibration is modelled as sinusoids of constant amplitude and frequency. For other motion see rsvib motion.
     """
-    settings = read_config(config)
     _check_folder(out, (*_OF_DETECTION, *_OF_WINDOWS), overwrite)
     window = settings.stack.get("window") if window is None else window
     if window is None:
@@ -302,14 +280,14 @@ def detect(
             {f"Vibration in {frames.name}": [result.summary()]},
             {"detection": detection_data(result)},
             [out / name for name in names],
-            steps_after_detection(result, frames, config, out / "vibration.json"),
+            steps_after_detection(result, frames, settings, out / "vibration.json"),
         )
-    info = read_stack_info(frames)
+    info = io.read_stack_info(frames)
     print_notes(info, settings)
     scale = full_scale_of(frames, info, settings, full_scale)
     with whole_folder(out) as folder:
         with counting(f"detecting in {frames.name}") as progress:
-            detect_stack(
+            stacks.detect_stack(
                 frames,
                 folder / "manifest.json",
                 settings.timing,
@@ -323,13 +301,13 @@ def detect(
             )
         names = [*_write_windows(folder, folder / "manifest.json"), "manifest.json"]
     _remove_old(out, _OF_DETECTION, names)
-    manifest = read_manifest(out / "manifest.json")
+    manifest = stacks.read_manifest(out / "manifest.json")
     _warn_of_failures(sum(record.error is not None for record in manifest.windows))
     return Answer(
         {f"Vibration in {len(manifest.windows)} windows of {frames.name}": manifest.lines()[0]},
         {"windows": manifest.totals()},
         [out / name for name in names],
-        steps_after_detection(None, frames, config, out / "manifest.json"),
+        steps_after_detection(None, frames, settings, out / "manifest.json"),
     )
 
 
@@ -338,11 +316,12 @@ def _warn_of_failures(windows: int) -> None:
         error_line(f"detection failed in {windows} windows: see manifest.json", "warning")
 
 
+@camera_options
 def restore_frames(
     frames: FramesArgument,
     restored: RestoredArgument,
     *,
-    config: ConfigOption,
+    settings: Config,
     vibration: Annotated[
         Path, typer.Option(help="The vibration.json, or manifest.json of windows, written by detect or run.")
     ],
@@ -362,7 +341,6 @@ def restore_frames(
 
     If the restored frames are judged no better than the input, the input is written unchanged, unless --force is given.
     """
-    settings = read_config(config)
     overrides = Overrides(method, joint, prior, saturation)
     check_new([restored, *([] if report is None else [report])], overwrite)
     with vibration.open("rb") as file:
@@ -372,11 +350,13 @@ def restore_frames(
             raise ValueError("--report needs a vibration.json; the verdict on each window is in its manifest.json")
         check_new([restored.with_name(f"{restored.name}.manifest.json")], overwrite)
         return _restore_windows(frames, restored, settings, vibration, overrides, force, device, full_scale)
-    detected = read_vibration(vibration, timing_from_first_frame(settings.timing, read_stack_info(frames)))
+    detected = reports.read_vibration(
+        vibration, io.timing_from_first_frame(settings.timing, io.read_stack_info(frames))
+    )
     stack = load(frames, settings, full_scale, device)
     options = restoration_options(stack.info, stack.full_scale, settings, overrides)
     shape = (1, *stack.info.shape[1:]) if options.get("joint") is True else stack.info.shape
-    check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
+    io.check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
     if report is not None:
         check_writable(report)
     result = restore_and_save(restored, stack, detected, options, force, report)
@@ -384,12 +364,12 @@ def restore_frames(
         {"Vibration": [detected.summary()], "Restoration": restoration_lines(result, len(stack.frames))},
         {"detection": detected.to_dict(), "restoration": restoration_data(result)},
         [restored, *([] if report is None else [report])],
-        _steps_after_restoration(result, frames, config),
+        _steps_after_restoration(result, frames, settings),
     )
 
 
-def _steps_after_restoration(result: RestoredFrames, frames: Path, config: Path) -> list[str]:
-    page = command_text("report", frames, frames.with_name("report"), "--config", config)
+def _steps_after_restoration(result: RestoredFrames, frames: Path, settings: Config) -> list[str]:
+    page = command_text("report", frames, frames.with_name("report"), *settings.arguments)
     return [f"write a page with all figures and the sharpness before and after:\n  {page}"] if result.restored else []
 
 
@@ -404,7 +384,9 @@ def _restore_windows(
     full_scale: float | None,
 ) -> Answer:
     """Restore a stack with the detections of its windows."""
-    manifest = read_manifest(vibration)
+    from rsvib_torch.io.schema import TimingRecord, check_same_timing  # noqa: PLC0415
+
+    manifest = stacks.read_manifest(vibration)
     stored = validate(TimingRecord, manifest.settings.get("sensor", {}), f"{vibration}: settings.sensor")
     timing = config.timing
     if timing.frame_start_times is None:  # frame times of the file were stored with the detection
@@ -413,11 +395,11 @@ def _restore_windows(
     window = manifest.settings.get("window")
     if not isinstance(window, int):
         raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")
-    info = read_stack_info(frames)
+    info = io.read_stack_info(frames)
     print_notes(info, config)
     scale = full_scale_of(frames, info, config, full_scale)
     with counting(f"restoring {frames.name}") as progress:
-        result = process_stack(
+        result = stacks.process_stack(
             frames,
             restored,
             config.timing,
@@ -430,7 +412,7 @@ def _restore_windows(
             progress=progress,
         )
     _note_lost(restored, result.not_kept)
-    manifest = read_manifest(result.manifest)
+    manifest = stacks.read_manifest(result.manifest)
     vibration_lines, lines = manifest.lines()
     return Answer(
         {"Vibration": vibration_lines, "Restoration": [result.summary(), *lines[1:]]},
@@ -439,11 +421,12 @@ def _restore_windows(
     )
 
 
+@camera_options
 def run(
     frames: FramesArgument,
     out: Annotated[Path, typer.Argument(help="Folder for the restored frames, the vibration and the figures.")],
     *,
-    config: ConfigOption,
+    settings: Config,
     output: Annotated[
         str,
         typer.Option(
@@ -490,12 +473,11 @@ def run(
     Stacks of any length are processed in windows. If the restored frames are judged no better than the input, the
     input is written unchanged, unless --force is given. Ctrl-C stops after the current windows; --resume continues.
     """
-    settings = read_config(config)
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
     results = (*_OF_DETECTION, *_OF_WINDOWS, "restoration.json", "before_after.png")
     _check_folder(out, (output, *results), overwrite or resume)
-    info = read_stack_info(frames)
+    info = io.read_stack_info(frames)
     print_notes(info, settings)
     scale = full_scale_of(frames, info, settings, full_scale)
     options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation))
@@ -512,7 +494,7 @@ def run(
     one_window = info.shape[0] <= common["window"]
     description = f"restoring {frames.name}"
     with working(description) if one_window else counting(description) as progress:
-        result = process_stack(
+        result = stacks.process_stack(
             frames,
             out / output,
             settings.timing,
@@ -526,7 +508,7 @@ def run(
         )
     first = result.first
     if first is None:  # the run was complete before, or its first window was
-        first = next(iter(iterate_stack(frames, settings.timing, **common)))
+        first = next(iter(stacks.iterate_stack(frames, settings.timing, **common)))
     names = []
     with whole_folder(out) as folder:
         if len(first.frames):
@@ -535,10 +517,10 @@ def run(
             names.append("before_after.png")
         names += [output, "manifest.json"]
         if result.windows == 1:
-            assert isinstance(first.detection, DetectionResult)
+            assert isinstance(first.detection, detection.DetectionResult)
             assert first.restoration is not None
-            write_restoration(folder / "restoration.json", first.restoration, options, result.not_kept)
-            timing = timing_from_first_frame(settings.timing, info)
+            reports.write_restoration(folder / "restoration.json", first.restoration, options, result.not_kept)
+            timing = io.timing_from_first_frame(settings.timing, info)
             names += [*_write_detection(folder, first.detection, timing), "restoration.json"]
         else:
             names += _write_windows(folder, out / "manifest.json")
@@ -547,11 +529,11 @@ def run(
     if result.bad_frames:
         error_line(f"{result.bad_frames} frames could not be used: see manifest.json", "warning")
     _note_lost(out / output, result.not_kept)
-    page = command_text("report", frames, out / "report", "--config", config)
+    page = command_text("report", frames, out / "report", *settings.arguments)
     steps = [f"write a page with all figures and the sharpness before and after:\n  {page}"] if result.restored else []
     files = [out / name for name in names]
     if result.windows == 1:
-        assert isinstance(first.detection, DetectionResult)
+        assert isinstance(first.detection, detection.DetectionResult)
         assert first.restoration is not None
         _warn_of_restoration(first.restoration)
         return Answer(
@@ -561,9 +543,9 @@ def run(
             },
             {"detection": detection_data(first.detection), "restoration": restoration_data(first.restoration)},
             files,
-            steps + steps_after_detection(first.detection, frames, config),
+            steps + steps_after_detection(first.detection, frames, settings),
         )
-    stored = read_manifest(out / "manifest.json")
+    stored = stacks.read_manifest(out / "manifest.json")
     _warn_of_failures(result.failed)
     vibration_lines, lines = stored.lines()
     return Answer(
@@ -576,19 +558,22 @@ def run(
 
 def _draw_comparison(path: Path, frames: Path, full_scale: float | None, first: WindowResult) -> None:
     """Draw the first restored frame of a stack beside the frame of the input."""
+    from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
+
     index = first.indices[0] if first.indices else (first.window.first + first.window.last + 1) // 2
-    reader = open_stack(frames)
+    reader = io.open_stack(frames)
     raw = counts_to_frames(reader.frame(index)[None], full_scale or reader.info.full_scale, str(frames))[0]
     reader.close()
     names = ("input", "restored" if first.restored else "unchanged")
-    save_figure(comparison_figure(raw, first.frames[0].cpu(), names=names), path)
+    reports.save_figure(reports.comparison_figure(raw, first.frames[0].cpu(), names=names), path)
 
 
+@camera_options
 def report(
     frames: FramesArgument,
     out: Annotated[Path, typer.Argument(help="Folder for report.html and its figures.")],
     *,
-    config: ConfigOption,
+    settings: Config,
     edge: Annotated[
         list[str] | None,
         typer.Option(
@@ -610,15 +595,14 @@ def report(
     The page is one file that needs no network. The figures are also written as PNG files.
     """
     boxes = [_edge_box(text) for text in edge or []]
-    settings = read_config(config)
     _check_folder(out, ["report.html"], overwrite)
     stack = load(frames, settings, full_scale, device)
     options = restoration_options(stack.info, stack.full_scale, settings, Overrides(method, joint, prior, saturation))
     detection = _detect(stack, settings)
     result = _restore(stack, detection, options, force)
-    content = Report(
+    content = reports.Report(
         title=f"Vibration in {frames.name}",
-        subtitle=f"{frames}, camera of {config}",
+        subtitle=f"{frames}, camera of {settings.source}",
         frames=stack.frames,
         restored=result.frames,
         was_restored=result.restored,
@@ -630,8 +614,8 @@ def report(
         version=rsvib_torch.__version__,
     )
     with whole_folder(out) as folder, working("writing the page"):
-        files = write_report_page(folder, content, boxes or None)
-    run_it = command_text("run", frames, out, "--config", config)
+        files = reports.write_report_page(folder, content, boxes or None)
+    run_it = command_text("run", frames, out, *settings.arguments)
     return Answer(
         {
             f"Vibration in {frames.name}": [detection.summary()],
@@ -640,7 +624,7 @@ def report(
         {"detection": detection_data(detection), "restoration": restoration_data(result)},
         [out / name for name in files],
         [f"write the restored frames:\n  {run_it}"] * result.restored
-        + steps_after_detection(detection, frames, config),
+        + steps_after_detection(detection, frames, settings),
     )
 
 

@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
 from rich.text import Text
 
-from rsvib_torch.core.presentation import json_text, wrapped
 from rsvib_torch.core.progress import listening
+from rsvib_torch.core.text import json_text, wrapped
 
 __all__ = [
     "Answer",

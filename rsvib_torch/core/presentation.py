@@ -8,15 +8,13 @@ import base64
 import html
 import io
 import itertools
-import json
 import math
 import os
-import shutil
-import textwrap
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import fields, is_dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, Union, get_args, get_origin, get_type_hints
 
@@ -24,6 +22,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.text import text_table, wrapped, write_json
 from rsvib_torch.core.validation import read_json
 
 if TYPE_CHECKING:
@@ -35,71 +34,18 @@ __all__ = [
     "Summarised",
     "axis_head",
     "axis_rows",
-    "json_text",
-    "measured_text",
     "plain_values",
-    "text_table",
     "verdict_lines",
     "verdict_table",
-    "wrapped",
-    "write_json",
 ]
 
 # Figures of results: the function that draws a result of this type with this number of leading dimensions (0: not a
-# batch). report/plots.py fills the table.
+# batch). The module _PLOTS fills the table; it is imported when the first figure is drawn.
 FIGURES: dict[tuple[type, int], Callable[[Any], "Figure"]] = {}
+_PLOTS = "rsvib_torch.report.plots"
 
 
 # Text
-
-
-def measured_text(value: Tensor | float, std: Tensor | float | None = None, digits: int = 4) -> str:
-    """Format ``value ± std`` with two significant digits of the standard deviation.
-
-    Args:
-        value: The value; an infinite one is written as ∞, and NaN as "unknown".
-        std: Its standard deviation; None to write the value alone.
-        digits: Significant digits of the value if its standard deviation is not given, zero, infinite or unknown.
-
-    Example:
-        >>> measured_text(60.0, 0.01234)
-        '60.000 ± 0.012'
-        >>> measured_text(12345.6, 789.0)
-        '12350 ± 790'
-        >>> measured_text(0.123456)
-        '0.1235'
-    """
-    value, deviation = float(value), 0.0 if std is None else float(std)
-    known = math.isfinite(deviation) and deviation > 0
-    leading = deviation if known else abs(value) if math.isfinite(value) and value else 1.0
-    kept = (2 if known else digits) - 1 - int(f"{leading:.{1 if known else digits - 1}e}".partition("e")[2])
-    decimals = min(9, kept)
-
-    def shown(number: float) -> str:
-        if not math.isfinite(number):
-            return "unknown" if math.isnan(number) else "∞" if number > 0 else "-∞"
-        return f"{round(number, decimals) + 0.0:.{max(0, decimals)}f}"
-
-    return shown(value) if std is None else f"{shown(value)} ± {shown(deviation)}"
-
-
-def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, most: int = 20) -> str:
-    """A table as text with aligned columns; of more than ``most`` rows the first and the last are kept.
-
-    Example:
-        >>> print(text_table(("axis", "amplitude (px)"), [("x", "3.1"), ("y", "5.2")]))
-        axis  amplitude (px)
-        x     3.1
-        y     5.2
-    """
-    rows = [tuple(row) for row in rows]
-    if len(rows) > most:
-        omitted = (f"… {len(rows) - most} more",) + ("",) * (len(head) - 1)
-        rows = [*rows[: most // 2], omitted, *rows[-(most - most // 2) :]]
-    aligned = [row for row in (tuple(head), *rows) if not row[0].startswith("…")]
-    widths = [max(len(row[column]) for row in aligned) for column in range(len(head))]
-    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in (head, *rows))
-    return "\n".join(line.rstrip() for line in lines)
 
 
 def axis_rows(batch_shape: Sequence[int]) -> list[tuple[tuple[int, ...], list[str]]]:
@@ -155,12 +101,6 @@ def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
     return lines
 
 
-def wrapped(text: str) -> str:
-    """Text in lines of the width of the terminal, at most 100 characters; all but the first are indented."""
-    width = min(100, shutil.get_terminal_size((100, 24)).columns) - 2  # an answer of the program is indented by 2
-    return textwrap.fill(text, width, subsequent_indent="   ", break_long_words=False, break_on_hyphens=False)
-
-
 # Dictionaries and files
 
 
@@ -182,22 +122,6 @@ def plain_values(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain_values(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
-    """Write a table as JSON with one key per line, atomically.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
-    with whole_file(path) as part:
-        part.write_text(json_text(content) + "\n", encoding="utf-8")
-
-
-def json_text(content: Mapping[str, Any]) -> str:
-    """A table as JSON with one key per line."""
-    lines = (f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
-    return "{\n" + ",\n".join(lines) + "\n}"
 
 
 def _restored(kind: Any, value: Any, path: str, missing: float) -> Any:
@@ -368,6 +292,7 @@ class Result(Summarised):
             TypeError: If there is no figure of this kind of result.
             ValueError: If it is a batch that has no figure.
         """
+        import_module(_PLOTS)
         draw = FIGURES.get((type(self), len(self.batch_shape)))
         if draw is None:
             drawn = sorted({kind.__name__ for kind, _ in FIGURES})
@@ -383,6 +308,7 @@ class Result(Summarised):
         return figure
 
     def _repr_html_(self) -> str:
+        import_module(_PLOTS)
         text = super()._repr_html_()
         if (type(self), len(self.batch_shape)) not in FIGURES:
             return text

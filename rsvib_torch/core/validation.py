@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
-__all__ = ["Section", "checked", "options_section", "read_json", "validate"]
+__all__ = ["Section", "checked", "expected_text", "options_section", "read_json", "validate"]
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _Result = TypeVar("_Result")
@@ -22,19 +22,18 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
 
 
-def options_section(name: str, options: type, *, skip: tuple[str, ...] = (), **more: Any) -> Any:
+def options_section(name: str, options: type, **more: Any) -> Any:
     """Create a section with the keys and types of typed options; no key is required.
 
     Args:
         name: Name of the section class.
         options: ``TypedDict`` or dataclass of the options.
-        skip: Options that are not keys of the section.
         **more: Types of further keys.
 
     Returns:
         A subclass of ``Section``. Options that are not in a file are None in it and not in ``model_fields_set``.
     """
-    hints = {key: kind for key, kind in get_type_hints(options).items() if key not in skip} | more
+    hints = get_type_hints(options) | more
     fields: dict[str, Any] = {key: (kind, None) for key, kind in hints.items()}
     return create_model(name, __base__=Section, **fields)
 
@@ -82,7 +81,7 @@ def _describe(model: type[BaseModel], data: Any, mistake: Any) -> tuple[str, str
                 break  # the rest of the location names a member of a union
             path = f"{path}.{step}" if path else step
             if step not in value:
-                return path, f"missing key; expected {_expected(keys[step])}"
+                return path, f"missing key; expected {expected_text(keys[step])}"
             if kind == "extra_forbidden" and step not in keys:
                 return path, f"unknown key; expected one of {', '.join(keys)}"
             value, expected = value[step], keys.get(step, Any)
@@ -97,7 +96,7 @@ def _describe(model: type[BaseModel], data: Any, mistake: Any) -> tuple[str, str
         return path, f"expected at least {context['ge']}, got {value!r}"
     if kind in ("too_short", "too_long"):
         return path, f"expected {context.get('min_length', context.get('max_length'))} entries, got {value!r}"
-    return path, f"expected {_expected(expected)}, got {value!r}"
+    return path, f"expected {expected_text(expected)}, got {value!r}"
 
 
 def _members(annotation: Any) -> tuple[Any, ...]:
@@ -114,7 +113,7 @@ def _keys(annotation: Any) -> dict[str, Any]:
     return {}
 
 
-def _expected(annotation: Any) -> str:
+def expected_text(annotation: Any) -> str:
     """Description of a type in a message."""
     words: list[str] = []
     for member in _members(annotation):

@@ -1,25 +1,5 @@
 """From offsets to a vibration."""
 
-from rsvib_torch.detection.detect import DetectionMethod, VibrationDetector, detect_vibration
-from rsvib_torch.detection.recorded.alignment import ClockAlignment, align_motion
-from rsvib_torch.detection.recorded.motion_check import MotionCheck, check_motion
-from rsvib_torch.detection.result import DetectionResult
-from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
-from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
-from rsvib_torch.motion.vibration import VibrationStd
+import lazy_loader
 
-__all__ = [
-    "ClockAlignment",
-    "DetectionMethod",
-    "DetectionResult",
-    "MotionCheck",
-    "MotionDetection",
-    "SweptTone",
-    "VibrationDetector",
-    "VibrationStd",
-    "align_motion",
-    "check_motion",
-    "detect_motion",
-    "detect_swept_tone",
-    "detect_vibration",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -6,12 +6,13 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, TypedDict, Unpack, overload
+from typing import Literal, Unpack, overload
 
 import torch
 from torch import Tensor, nn
 
 from rsvib_torch.core.checks import check_choice, check_whole_number
+from rsvib_torch.core.option_types import BandSettings, DetectionMethod, Registration, ToneSettings
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.reliability import judge
@@ -37,34 +38,24 @@ from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.io.files import FramesOrFiles
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
-from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOptions
+from rsvib_torch.registration import OffsetCurve, RegistrationOptions
 
 __all__ = ["DetectionMethod", "VibrationDetector", "VibrationModel", "detect_vibration"]
 
-DetectionMethod = Literal["direct", "bands"]
 VibrationModel = Literal["tones", "free", "swept"]
 
 
-class BandOptions(TypedDict, total=False):
+class BandOptions(BandSettings, total=False):
     """Options of all models, see ``detect_vibration``."""
 
-    registration: Registration
-    band_rows: int
-    band_step: int
-    search: int
     ignore: ArrayLike | None
     full_scale: float | None
     channels: Channels
 
 
-class ToneOptions(BandOptions, total=False):
+class ToneOptions(BandOptions, ToneSettings, total=False):
     """Options of the model of tones, see ``detect_vibration``."""
 
-    method: DetectionMethod
-    tones: Literal["auto"] | int
-    harmonics: int
-    image_acceleration: bool
-    columns: int | None
     window: int | None
     window_step: int | None
 

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.presentation import Result, axis_head, axis_rows, plain_values, text_table
+from rsvib_torch.core.presentation import Result, axis_head, axis_rows, plain_values
+from rsvib_torch.core.text import text_table
 from rsvib_torch.io.schema import TimingRecord, detection_summary
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd

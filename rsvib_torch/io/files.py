@@ -35,6 +35,7 @@ __all__ = [
     "open_stack",
     "read_stack",
     "read_stack_info",
+    "register_format",
     "write_frames",
     "write_stack",
 ]

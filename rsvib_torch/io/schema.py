@@ -12,7 +12,8 @@ import torch
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from torch import Tensor
 
-from rsvib_torch.core.presentation import Result, plain_values, verdict_table, wrapped
+from rsvib_torch.core.presentation import Result, plain_values, verdict_table
+from rsvib_torch.core.text import wrapped
 from rsvib_torch.core.validation import Section, checked
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, image_motion_line, tone_head, tone_rows

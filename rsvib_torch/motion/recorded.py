@@ -4,19 +4,17 @@ import csv
 import math
 import os
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import check_choice, check_number
+from rsvib_torch.core.option_types import MotionUnit, TimeUnit
 from rsvib_torch.motion.spline import FreeMotion
 
 __all__ = ["MotionUnit", "TimeUnit", "read_motion"]
-
-MotionUnit = Literal["px", "rad", "mrad", "urad", "deg", "arcsec", "rad/s", "deg/s"]
-TimeUnit = Literal["s", "ms", "us", "ns"]
 
 _RADIANS = {
     "rad": 1.0,

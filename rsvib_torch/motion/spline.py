@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.presentation import axis_head, axis_rows, measured_text, text_table
+from rsvib_torch.core.presentation import axis_head, axis_rows
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, gauss_legendre
+from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.vibration import TensorLike, Vibration
 

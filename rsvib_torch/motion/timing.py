@@ -1,14 +1,21 @@
-"""Timing of a rolling-shutter sensor: the exposure start of each row of each frame."""
+"""Timing of a rolling-shutter sensor: the exposure start of each row of each frame.
+
+Configuration files are checked with this module before torch is imported, which takes seconds: functions that need
+torch import it themselves.
+"""
+
+from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Literal
 
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 __all__ = ["RowTiming", "SensorTiming", "check_timing"]
 
@@ -27,7 +34,8 @@ class SensorTiming:
     Args:
         row_time: Time between the exposure starts of two neighbouring rows, in seconds.
         exposure_rows: Exposure time in row times (may be fractional).
-        frame_rows: Row times between the exposure starts of one row in consecutive frames.
+        frame_rows: Row times between the exposure starts of one row in consecutive frames: 1 / (frame rate x row time),
+            blanking rows included, and at least the number of rows.
         scan_axis: Axis along which rows are exposed one after another: ``-2`` (or ``"y"``, the default: rows are
             image rows) or ``-1`` (or ``"x"``: rows are image columns).
         readout_direction: ``"forward"`` if the row at index 0 of the scan axis is read first, ``"reverse"`` if the
@@ -73,7 +81,8 @@ class SensorTiming:
             )
         if exposure_rows > frame_rows:
             raise ValueError(
-                f"exposure_rows={exposure_rows:g} exceeds the frame period of frame_rows={frame_rows:g} row times"
+                f"exposure_rows={exposure_rows:g} exceeds the frame period of frame_rows={frame_rows:g} row times: "
+                f"exposure {exposure_rows * row_time:.4g} s, frame period {frame_rows * row_time:.4g} s"
             )
         if isinstance(self.scan_axis, bool) or self.scan_axis not in _SCAN_AXES:
             raise ValueError(f"scan_axis must be -2 ('y') or -1 ('x'), got {self.scan_axis!r}")
@@ -83,6 +92,8 @@ class SensorTiming:
         object.__setattr__(self, "frame_rows", frame_rows)
         object.__setattr__(self, "scan_axis", _SCAN_AXES[self.scan_axis])
         if self.frame_start_times is not None:
+            import torch  # noqa: PLC0415
+
             times = torch.as_tensor(self.frame_start_times, dtype=torch.float64).flatten().tolist()
             starts = tuple(check_number("frame_start_times", start) for start in times)
             if any(later <= earlier for earlier, later in itertools.pairwise(starts)):
@@ -92,7 +103,7 @@ class SensorTiming:
     @classmethod
     def line_sensors(
         cls, line_time: float, delays: Sequence[float], num_lines: int, exposure_lines: float = 1.0
-    ) -> "SensorTiming":
+    ) -> SensorTiming:
         """Timing of images of the same ground from several lines (or bands) of a push-broom sensor.
 
         Every image is recorded line by line while the ground moves; each line records the same ground after its own
@@ -146,6 +157,8 @@ class SensorTiming:
         Raises:
             ValueError: If ``frame_start_times`` has fewer than ``num_frames`` entries.
         """
+        import torch  # noqa: PLC0415
+
         if self.frame_start_times is None:
             return torch.arange(num_frames, dtype=torch.float64, device=device) * self.frame_period
         if len(self.frame_start_times) < num_frames:
@@ -158,6 +171,8 @@ class SensorTiming:
         Returns:
             float64 tensor of shape (num_frames, num_rows); row 0 is the row read first.
         """
+        import torch  # noqa: PLC0415
+
         rows = torch.arange(num_rows, dtype=torch.float64, device=device)
         return self.frame_starts(num_frames, device)[:, None] + rows * self.row_time
 
@@ -166,10 +181,11 @@ class SensorTiming:
         if self.frame_rows < num_rows:
             raise ValueError(
                 f"frame_rows={self.frame_rows:g} is less than the {num_rows} rows of the frames; it is the number of "
-                "row times from one frame to the next, including blanking rows"
+                f"row times from one frame to the next, including blanking rows, 1 / (frame rate x row time): with "
+                f"{self.frame_rate:g} frames/s, row_time is at most {self.frame_period / num_rows:.6g} s"
             )
 
-    def in_row_order(self) -> "RowTiming":
+    def in_row_order(self) -> RowTiming:
         """The same timing for frames already turned to row order (rows on axis -2, first row read first)."""
         return RowTiming(self.row_time, self.exposure_rows, self.frame_rows, frame_start_times=self.frame_start_times)
 

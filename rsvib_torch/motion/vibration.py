@@ -8,7 +8,8 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.presentation import Result, axis_head, axis_rows, measured_text, text_table
+from rsvib_torch.core.presentation import Result, axis_head, axis_rows
+from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 

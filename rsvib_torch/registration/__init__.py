@@ -1,6 +1,5 @@
 """Displacements of row bands and of single rows between frames, measured on the images."""
 
-from rsvib_torch.registration.methods import Registration, RegistrationOptions
-from rsvib_torch.registration.register import OffsetCurve, register_bands
+import lazy_loader
 
-__all__ = ["OffsetCurve", "Registration", "RegistrationOptions", "register_bands"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice, check_whole_number
+from rsvib_torch.core.option_types import Registration
 from rsvib_torch.registration.bands import BandTask
 from rsvib_torch.registration.ncc import register_ncc
 from rsvib_torch.registration.phase import register_phase
@@ -14,10 +14,8 @@ from rsvib_torch.registration.projection import register_projection
 
 __all__ = ["BAND_METHODS", "Registration", "RegistrationOptions"]
 
-Registration = Literal["projection", "ncc", "phase"]
-
 # Contract of a band registration method. To add one, write ``register_<name>`` in a file of its own, add it to this
-# table, and its name to ``Registration``, from which configuration files take the valid names.
+# table, and its name to ``Registration`` in core/option_types.py, from which configuration files take the valid names.
 #
 #   register(task: BandTask) -> (offsets, quality)
 #

@@ -1,1 +1,5 @@
 """Results on disk: JSON and CSV files, plots and HTML pages."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

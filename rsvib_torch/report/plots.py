@@ -17,12 +17,13 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.presentation import FIGURES, Result, measured_text
+from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.presentation import FIGURES, Result
+from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult, MotionDetection, SweptTone
 from rsvib_torch.evaluation import MtfCurve
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
-from rsvib_torch.io import whole_file
 from rsvib_torch.io.schema import Detection
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion

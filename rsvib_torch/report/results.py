@@ -9,10 +9,11 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from rsvib_torch.core.presentation import plain_values, write_json
+from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.presentation import plain_values
+from rsvib_torch.core.text import write_json
 from rsvib_torch.core.validation import read_json, validate
 from rsvib_torch.detection import DetectionResult
-from rsvib_torch.io import whole_file
 from rsvib_torch.io.schema import DetectedVibration, DetectionRecord, TimingRecord, check_same_timing
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks import RestoredFrames, StackManifest

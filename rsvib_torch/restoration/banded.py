@@ -130,7 +130,7 @@ def restore_banded(
     Args:
         frames: (B, T, C, H, W) in row order.
         motion: Motion of the frames.
-        half_rows: l.
+        half_rows: Half height l of a slab, in rows.
         stride: Central rows kept per slab: 2 takes half the time of 1 and costs 0.02 dB (paper camera, noise 0.003).
         interpolation: Interpolation in the PSF: ``"linear"`` is that of the paper (Eqs. 26-39, N_e samples), whose own
             blur is deconvolved as well; ``"cubic"`` is a cubic B-spline across rows, exact along them.

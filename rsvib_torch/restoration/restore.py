@@ -8,7 +8,13 @@ from typing import Any, Literal, Required, TypedDict, Unpack, overload
 
 from torch import Tensor, nn
 
-from rsvib_torch.core.checks import check_choice
+from rsvib_torch.core.option_types import (
+    BandedSettings,
+    DewarpSettings,
+    ExactSettings,
+    RichardsonLucySettings,
+    method_options,
+)
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.frames.arrays import Channels
 from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
@@ -24,15 +30,7 @@ from rsvib_torch.restoration.verdict.judge import RestorationWarning, judge_fram
 from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError, pairs_to_judge
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
-__all__ = [
-    "METHODS",
-    "RestorationMethod",
-    "VibrationRestorer",
-    "method_options",
-    "restore",
-    "restore_prepared",
-    "unchanged_frames",
-]
+__all__ = ["METHODS", "RestorationMethod", "VibrationRestorer", "restore", "restore_prepared", "unchanged_frames"]
 
 
 class CommonOptions(TypedDict, total=False):
@@ -45,42 +43,28 @@ class CommonOptions(TypedDict, total=False):
     check: bool
 
 
-class ExactOptions(CommonOptions, total=False):
+class ExactOptions(CommonOptions, ExactSettings, total=False):
     """Options of method ``"exact"``, see ``restore_exact``."""
 
     method: Literal["exact"]
-    joint: bool | int
-    prior: str
-    noise: float | Literal["auto"]
-    regularisation: float
-    chunk_frequencies: int | None
-    segments: int | None
 
 
-class BandedOptions(CommonOptions, total=False):
+class BandedOptions(CommonOptions, BandedSettings, total=False):
     """Options of method ``"banded"``, see ``restore_banded``."""
 
     method: Required[Literal["banded"]]
-    half_rows: int
-    stride: int
-    interpolation: Literal["linear", "cubic"]
-    noise_to_signal: float | Literal["auto"]
-    chunk_rows: int | None
 
 
-class DewarpOptions(CommonOptions, total=False):
+class DewarpOptions(CommonOptions, DewarpSettings, total=False):
     """Options of method ``"dewarp"``, see ``restore_dewarp``."""
 
     method: Required[Literal["dewarp"]]
-    chunk_rows: int
 
 
-class RichardsonLucyOptions(CommonOptions, total=False):
+class RichardsonLucyOptions(CommonOptions, RichardsonLucySettings, total=False):
     """Options of method ``"richardson-lucy"``, see ``restore_richardson_lucy``."""
 
     method: Required[Literal["richardson-lucy"]]
-    joint: bool | int
-    iterations: int
 
 
 @dataclass(frozen=True)
@@ -89,12 +73,10 @@ class RestorationMethod:
 
     Attributes:
         function: The method, see the contract above ``METHODS``.
-        options: Names and types of its options.
         masks: Masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels).
     """
 
     function: Callable[..., Tensor]
-    options: type
     masks: tuple[Literal["ignore", "clipped"], ...] = ()
 
 
@@ -110,29 +92,14 @@ class RestorationMethod:
 #         option ``joint=True``.
 #
 # Frames of one stack must not affect other stacks, ``frames`` must not be changed, and gradients must flow to frames
-# and motion. A new method is one module, one TypedDict of its name and options, one line here, and one overload of
-# ``restore`` and of ``VibrationRestorer``.
+# and motion. A new method is one module, its options in core/option_types.py, one line here, and one TypedDict
+# and overload of ``restore`` and of ``VibrationRestorer``.
 METHODS: dict[str, RestorationMethod] = {
-    "exact": RestorationMethod(restore_exact, ExactOptions, ("ignore", "clipped")),
-    "banded": RestorationMethod(restore_banded, BandedOptions),
-    "dewarp": RestorationMethod(restore_dewarp, DewarpOptions),
-    "richardson-lucy": RestorationMethod(restore_richardson_lucy, RichardsonLucyOptions, ("ignore",)),
+    "exact": RestorationMethod(restore_exact, ("ignore", "clipped")),
+    "banded": RestorationMethod(restore_banded),
+    "dewarp": RestorationMethod(restore_dewarp),
+    "richardson-lucy": RestorationMethod(restore_richardson_lucy, ("ignore",)),
 }
-
-
-def method_options(method: str) -> tuple[str, ...]:
-    """Names of the options of a restoration method.
-
-    Raises:
-        ValueError: If there is no such method.
-
-    Example:
-        >>> method_options("dewarp")
-        ('chunk_rows',)
-    """
-    check_choice("method", method, tuple(METHODS))
-    common = ("method", *CommonOptions.__annotations__)
-    return tuple(name for name in METHODS[method].options.__annotations__ if name not in common)
 
 
 def _check_options(method: str, options: Mapping[str, Any]) -> None:

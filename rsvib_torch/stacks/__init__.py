@@ -1,24 +1,5 @@
 """Stacks of any length, processed window by window: windows, engines, journal and resume, manifest, memory planning."""
 
-from rsvib_torch.stacks.job import BadFrames, WindowResult
-from rsvib_torch.stacks.manifest import StackManifest, read_manifest
-from rsvib_torch.stacks.process import DEFAULT_WINDOW, StackReport, detect_stack, iterate_stack, process_stack
-from rsvib_torch.stacks.window_restoration import RestoredFrames, restore_block, restore_trusted
-from rsvib_torch.stacks.windows import Window, cut_windows
+import lazy_loader
 
-__all__ = [
-    "DEFAULT_WINDOW",
-    "BadFrames",
-    "RestoredFrames",
-    "StackManifest",
-    "StackReport",
-    "Window",
-    "WindowResult",
-    "cut_windows",
-    "detect_stack",
-    "iterate_stack",
-    "process_stack",
-    "read_manifest",
-    "restore_block",
-    "restore_trusted",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

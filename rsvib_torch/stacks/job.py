@@ -4,7 +4,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, TypedDict, get_args
+from typing import Any, TypedDict, get_args
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice, check_whole_number
+from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
 from rsvib_torch.core.presentation import Summarised, plain_values
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.io.files import PathLike, open_stack, read_stack_info
@@ -23,11 +24,10 @@ from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.memory import parse_memory, windows_at_once
 from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted
-from rsvib_torch.stacks.windows import DEFAULT_WINDOW, Window, cut_windows, window_timing
+from rsvib_torch.stacks.windows import Window, cut_windows, window_timing
 
-__all__ = ["BadFrames", "StackJob", "StoredWindow", "WindowFrames", "WindowReader", "WindowResult", "plan_job"]
+__all__ = ["StackJob", "StoredWindow", "WindowFrames", "WindowReader", "WindowResult", "plan_job"]
 
-BadFrames = Literal["pass", "skip"]
 WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why a frame cannot be read
 
 

@@ -12,7 +12,8 @@ from typing import Any, Literal
 import torch
 from pydantic import Field
 
-from rsvib_torch.core.presentation import Summarised, measured_text, text_table, wrapped
+from rsvib_torch.core.presentation import Summarised
+from rsvib_torch.core.text import measured_text, text_table, wrapped
 from rsvib_torch.core.validation import Section, read_json, validate
 from rsvib_torch.io.schema import DetectedVibration, DetectionRecord, TimingRecord, detection_to_json
 from rsvib_torch.stacks.job import StackJob

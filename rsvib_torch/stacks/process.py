@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.option_types import BadFrames
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept
 from rsvib_torch.io.frame_times import exposure_times
@@ -17,7 +18,6 @@ from rsvib_torch.io.schema import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import (
-    BadFrames,
     DetectOptions,
     RestoreOptions,
     StoredWindow,
@@ -27,9 +27,9 @@ from rsvib_torch.stacks.job import (
 )
 from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_manifest
 from rsvib_torch.stacks.output import Journal, Sink, describe_difference, disk_errors_named
-from rsvib_torch.stacks.windows import DEFAULT_WINDOW, Window
+from rsvib_torch.stacks.windows import Window
 
-__all__ = ["DEFAULT_WINDOW", "StackReport", "detect_stack", "iterate_stack", "process_stack"]
+__all__ = ["StackReport", "detect_stack", "iterate_stack", "process_stack"]
 
 _MAX_INITIAL_FAILURES = 8  # windows; a run stops if all windows up to this number fail
 

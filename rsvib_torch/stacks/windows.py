@@ -8,9 +8,7 @@ import torch
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.motion.timing import SensorTiming
 
-__all__ = ["DEFAULT_WINDOW", "Window", "cut_windows", "window_timing"]
-
-DEFAULT_WINDOW = 8  # frames
+__all__ = ["Window", "cut_windows", "window_timing"]
 
 
 @dataclass(frozen=True)

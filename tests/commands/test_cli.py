@@ -315,6 +315,22 @@ def test_full_scale_comes_from_option_file_or_config(place, tmp_path, capsys):
     assert not (tmp_path / "out2").exists()
 
 
+def test_options_describe_the_camera_without_a_file(place, tmp_path):
+    camera = ("--row-time", "40us", "--exposure", "0.48ms", "--frame-rate", 1 / (512 * 4e-5))
+    assert run("detect", place / "frames.tif", *camera, "--out", tmp_path / "options") == 0
+    found = json.loads((tmp_path / "options" / "vibration.json").read_text())
+    assert [tones[0] for tones in found["vibration"]["amplitude"]] == pytest.approx(AMPLITUDE, rel=0.02)
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(CONFIG.replace("4e-5", "5e-5").replace("exposure_rows = 12", "exposure_time = 0.48e-3"))
+    arguments = (place / "frames.tif", "--config", wrong, "--row-time", "40us", "--out", tmp_path / "replaced")
+    assert run("detect", *arguments) == 0
+    check_detection(tmp_path / "replaced")
+    assert run("run", place / "frames.tif", tmp_path / "run", *camera) == 0
+    frames = (place / "frames.tif", tmp_path / "restored.tif", *camera)
+    assert run("restore", *frames, "--vibration", tmp_path / "options" / "vibration.json") == 0
+    assert (tifffile.imread(tmp_path / "restored.tif") == tifffile.imread(tmp_path / "run" / "restored.tif")).all()
+
+
 def save_frames(change):
     def make(place, folder):
         frames = change(read_stack(place / "frames.tif"))
@@ -395,7 +411,7 @@ BAD_INPUT = {
         edit_config("band_step", "bandstep"),
         "detection.bandstep: unknown key; expected one of registration",
     ),
-    "missing key": (edit_config("frame_rows = 512", ""), "sensor.frame_rows: missing key; expected a number"),
+    "missing key": (edit_config("frame_rows = 512", ""), "sensor: frame_rate or frame_rows is missing"),
     "wrong value": (edit_config("search = 8", "search = 1"), "search must be at least 2, got 1"),
     "no TOML": (edit_config("[sensor]", "[sensor"), "bad.toml: not a TOML file"),
 }
@@ -516,7 +532,17 @@ def test_simulated_noise_has_a_seed(place, tmp_path):
 
 def test_usage_errors(capsys, tmp_path):
     for arguments, message in (
-        (["detect", "f.tif"], "Missing option '--config'"),
+        (["detect", "f.tif"], "Missing option '--out'"),
+        (
+            ["detect", "f.tif", "--out", tmp_path, "--exposure", "1ms"],
+            "the camera is not described: give --row-time, --frame-rate, or --config FILE (rsvib init FRAMES writes",
+        ),
+        (["detect", "f.tif", "--out", tmp_path, "--row-time", "20um"], "expected a time such as 14.5us, 1/500 or 2e-5"),
+        (["detect", "f.tif", "--out", tmp_path, "--exposure", "1/0"], "expected a time such as"),
+        (
+            ["detect", "f.tif", "--out", tmp_path, "--frame-rate", "fast"],
+            "expected a number such as 29.97 or 30000/1001",
+        ),
         (["paint"], "No such command 'paint'"),
         (["detect", "f.tif", "--config", "c.toml", "--out", tmp_path, "--device", "tpu"], "'tpu' is not one of"),
         (

@@ -104,7 +104,7 @@ def test_interrupted_run_can_be_continued(place, tmp_path):
         process.send_signal(signal.SIGINT)
         error = process.communicate(timeout=60)[1]
     assert process.returncode == 130
-    assert error == "rsvib: error: stopped; the windows completed by rsvib run are kept, --resume continues\n"
+    assert error == "rsvib: error: stopped; the completed windows are kept, --resume continues\n"
     assert not (out / "restored.tif").exists()
     done = journal.read_bytes().count(b"\n")
     assert 2 <= done < 35

@@ -11,7 +11,8 @@ import torch
 from truth import Motion, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.core.presentation import Result, measured_text, text_table
+from rsvib_torch.core.presentation import Result
+from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.report.results import VibrationFile
 
 TIMING = rsv.SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=300)

@@ -12,6 +12,7 @@ import torch
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, detect_vibration
+from rsvib_torch.core.option_types import METHOD_SETTINGS, method_options
 from rsvib_torch.restoration import (
     RestorationWarning,
     VibrationRestorer,
@@ -19,7 +20,7 @@ from rsvib_torch.restoration import (
     restore,
     trusted_vibration,
 )
-from rsvib_torch.restoration.restore import METHODS, method_options
+from rsvib_torch.restoration.restore import METHODS
 
 TIMING = SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=448)
 MOTION = Motion((2.1, 3.2), (71.0, 113.0), (0.4, 1.3))
@@ -335,7 +336,7 @@ def test_typed_options_are_those_of_the_function(name):
     assert set(method.masks) == {"ignore", "clipped"} & set(keywords)
     assert {*method_options(name), *method.masks} == set(keywords)
     for option in method_options(name):
-        assert method.options.__annotations__[option] == keywords[option]
+        assert METHOD_SETTINGS[name].__annotations__[option] == keywords[option]
 
 
 @pytest.mark.parametrize(

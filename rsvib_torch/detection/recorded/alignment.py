@@ -11,7 +11,8 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.core.presentation import Result, measured_text, wrapped
+from rsvib_torch.core.presentation import Result
+from rsvib_torch.core.text import measured_text, wrapped
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.core.presentation import Result, measured_text, text_table
+from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.splines import gauss_legendre
+from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.shapes.free import start_curve
 from rsvib_torch.detection.start import grey_frames, measurements_of_curve

@@ -17,8 +17,9 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.core.presentation import Result, axis_rows, measured_text, verdict_table
+from rsvib_torch.core.presentation import Result, axis_rows, verdict_table
 from rsvib_torch.core.splines import bspline_weights, gauss_legendre
+from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.start import GreyFrames, band_curve, grey_frames, measurements_of_curve

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.core.presentation import Result, axis_rows, measured_text, text_table, verdict_lines, verdict_table
+from rsvib_torch.core.presentation import Result, axis_rows, verdict_lines, verdict_table
 from rsvib_torch.core.splines import gauss_legendre
+from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import (

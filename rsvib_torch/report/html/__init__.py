@@ -1,16 +1,5 @@
 """Self-contained HTML pages: figures, tables and text in one file that needs no network."""
 
-from rsvib_torch.report.html.page import Box, Report, write_report_page
-from rsvib_torch.report.html.template import BeforeAfter, Drawing, before_after, data_uri, drawing, write_page
+import lazy_loader
 
-__all__ = [
-    "BeforeAfter",
-    "Box",
-    "Drawing",
-    "Report",
-    "before_after",
-    "data_uri",
-    "drawing",
-    "write_page",
-    "write_report_page",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

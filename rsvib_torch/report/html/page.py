@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from rsvib_torch.core.presentation import measured_text
+from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.evaluation import MtfCurve, find_slanted_edges, slanted_edge_mtf
 from rsvib_torch.motion.timing import SensorTiming

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from rsvib_torch.io import whole_file
+from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.report.plots import picture
 
 __all__ = ["BeforeAfter", "Drawing", "before_after", "data_uri", "drawing", "write_page"]

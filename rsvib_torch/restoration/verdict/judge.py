@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.presentation import Result, measured_text, text_table, wrapped
+from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
+from rsvib_torch.core.text import measured_text, text_table, wrapped
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.io.files import FramesOrFiles, load_frames

@@ -1,0 +1,148 @@
+from . import augmentation as augmentation
+from . import calibration as calibration
+from . import detection as detection
+from . import evaluation as evaluation
+from . import imaging as imaging
+from . import io as io
+from . import motion as motion
+from . import registration as registration
+from . import report as report
+from . import restoration as restoration
+from . import stacks as stacks
+from .augmentation import RollingShutterVibration
+from .calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
+from .detection import (
+    ClockAlignment,
+    DetectionResult,
+    MotionCheck,
+    MotionDetection,
+    SweptTone,
+    VibrationDetector,
+    align_motion,
+    check_motion,
+    detect_motion,
+    detect_swept_tone,
+    detect_vibration,
+)
+from .evaluation import (
+    MtfCurve,
+    SlantedEdge,
+    find_slanted_edges,
+    offset_endpoint_error,
+    psnr,
+    slanted_edge_mtf,
+    ssim,
+)
+from .imaging import Optics, RowVaryingBlur, SensorNoise, row_psf, simulate_frames
+from .io import (
+    StackInfo,
+    TimingWarning,
+    open_stack,
+    read_stack,
+    read_stack_info,
+    timing_from_first_frame,
+    write_stack,
+)
+from .motion.recorded import read_motion
+from .motion.spline import FreeMotion
+from .motion.timing import SensorTiming
+from .motion.vibration import Vibration, VibrationStd, blind_frequencies
+from .registration import OffsetCurve, register_bands
+from .report import (
+    comparison_figure,
+    gain_figure,
+    motion_figure,
+    mtf_figure,
+    offset_figure,
+    psf_figure,
+    read_vibration,
+    rows_figure,
+    save_figure,
+    windows_figure,
+    write_offsets,
+    write_vibration,
+    write_windows,
+)
+from .restoration import (
+    RestorationVerdict,
+    RestorationWarning,
+    VibrationRestorer,
+    judge_restoration,
+    predict_noise_gain,
+    restore,
+    trusted_vibration,
+    visible_pixels,
+)
+from .stacks import StackReport, iterate_stack, process_stack, read_manifest, restore_block
+
+__all__ = [
+    "ClockAlignment",
+    "DetectionResult",
+    "FreeMotion",
+    "MotionCheck",
+    "MotionDetection",
+    "MtfCurve",
+    "OffsetCurve",
+    "Optics",
+    "RestorationVerdict",
+    "RestorationWarning",
+    "RollingShutterVibration",
+    "RowTimeCalibration",
+    "RowVaryingBlur",
+    "SensorNoise",
+    "SensorTiming",
+    "SlantedEdge",
+    "StackInfo",
+    "StackReport",
+    "SweptTone",
+    "TimingWarning",
+    "Vibration",
+    "VibrationDetector",
+    "VibrationRestorer",
+    "VibrationStd",
+    "align_motion",
+    "blind_frequencies",
+    "calibrate_row_time",
+    "calibrate_row_time_by_exposure",
+    "check_motion",
+    "comparison_figure",
+    "detect_motion",
+    "detect_swept_tone",
+    "detect_vibration",
+    "find_slanted_edges",
+    "gain_figure",
+    "iterate_stack",
+    "judge_restoration",
+    "motion_figure",
+    "mtf_figure",
+    "offset_endpoint_error",
+    "offset_figure",
+    "open_stack",
+    "predict_noise_gain",
+    "process_stack",
+    "psf_figure",
+    "psnr",
+    "read_manifest",
+    "read_motion",
+    "read_stack",
+    "read_stack_info",
+    "read_vibration",
+    "register_bands",
+    "restore",
+    "restore_block",
+    "row_psf",
+    "rows_figure",
+    "save_figure",
+    "simulate_frames",
+    "slanted_edge_mtf",
+    "ssim",
+    "timing_from_first_frame",
+    "trusted_vibration",
+    "visible_pixels",
+    "windows_figure",
+    "write_offsets",
+    "write_stack",
+    "write_vibration",
+    "write_windows",
+]
+__version__: str

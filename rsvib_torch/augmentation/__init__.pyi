@@ -1,0 +1,3 @@
+from .rolling_shutter import RollingShutterVibration
+
+__all__ = ["RollingShutterVibration"]

@@ -1,0 +1,3 @@
+from .calibrate import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
+
+__all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_exposure"]

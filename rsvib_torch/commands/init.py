@@ -1,0 +1,244 @@
+"""Command ``init``: a configuration file for the camera of a stack, or one of the presets."""
+
+import itertools
+import math
+import statistics
+import sys
+import textwrap
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from rsvib_torch import io
+from rsvib_torch.commands.answers import command_text
+from rsvib_torch.commands.options import (
+    READOUT_HELP,
+    SCAN_AXIS_HELP,
+    ExposureOption,
+    FrameRateOption,
+    RowTimeOption,
+    rate,
+    seconds,
+)
+from rsvib_torch.commands.terminal import Answer, error_line, note, working
+from rsvib_torch.config import presets, read_config
+from rsvib_torch.core.atomic import check_writable, whole_file
+from rsvib_torch.motion.timing import SensorTiming
+
+if TYPE_CHECKING:
+    from rsvib_torch.io import StackInfo
+
+__all__ = ["init", "sensor_toml"]
+
+# How to find each value of [sensor]: comments of the file, and the text of questions and errors.
+_HINTS = {
+    "row_time": "Time between the exposure starts of adjacent rows, in s. Data sheets call it line time or row period; "
+    "'rsvib calibrate' measures it with a flickering light. It is not 1 / (frame rate x rows), because sensors have "
+    "blanking rows.",
+    "exposure_time": "Exposure time in s: the setting of the camera (shutter, integration time), not the frame period.",
+    "exposure_rows": "Exposure time divided by row_time.",
+    "frame_rate": "Frames per second of the sensor. A slow-motion or time-lapse video is played at another rate.",
+    "frame_rows": "Frame period divided by row_time, blanking rows included: 1 / (frame rate x row_time).",
+    "scan_axis": "'y' if image rows are exposed one after another, 'x' for image columns (a camera on its side).",
+    "readout_direction": "'forward' if the top row (or left column) is read first, 'reverse' if the last one is.",
+    "full_scale": "Count of a saturated pixel: 4095 for 12 bits, also in a 16-bit file.",
+}
+
+
+def init(
+    frames: Annotated[
+        Path | None,
+        typer.Argument(help="Stack of frames of the camera; its size, frame rate and times are read."),
+    ] = None,
+    *,
+    out: Annotated[Path, typer.Option(help="Configuration file to write.")] = Path("camera.toml"),
+    row_time: RowTimeOption = None,
+    exposure: ExposureOption = None,
+    frame_rate: FrameRateOption = None,
+    scan_axis: Annotated[Literal["y", "x"] | None, typer.Option(help=SCAN_AXIS_HELP, show_default="y")] = None,
+    readout_direction: Annotated[
+        Literal["forward", "reverse"] | None,
+        typer.Option(help=READOUT_HELP, show_default="forward"),
+    ] = None,
+    full_scale: Annotated[
+        float | None,
+        typer.Option(help="Count that corresponds to full scale, e.g. 4095 for 12 bits.", show_default="from the file"),
+    ] = None,
+    preset: Annotated[str | None, typer.Option(help=f"Copy a preset instead: {', '.join(presets())}.")] = None,
+    list_presets: Annotated[bool, typer.Option("--list-presets", help="List the presets and exit.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing configuration file.")] = False,
+) -> Answer:
+    """Write a configuration file for the camera of a stack of frames.
+
+    What the file does not state is taken from the options, or asked in a terminal with an explanation where to find it.
+    """
+    if list_presets:
+        listed = {name: _first_comment(text) for name, text in presets().items()}
+        return Answer({"Presets": [f"{name}: {text}" for name, text in listed.items()]}, {"presets": listed})
+    sensor = {
+        "row_time": row_time,
+        "exposure_time": exposure,
+        "frame_rate": frame_rate,
+        "scan_axis": scan_axis,
+        "readout_direction": readout_direction,
+        "full_scale": full_scale,
+    }
+    given = {name: value for name, value in sensor.items() if value is not None}
+    if preset is not None and (frames is not None or given):
+        raise ValueError("--preset is a complete configuration: give no frames and no values of the sensor with it")
+    if preset is None and frames is None:
+        raise ValueError("give a stack of frames, or --preset NAME (--list-presets lists them)")
+    if out.exists() and not force:
+        raise ValueError(f"{out} exists; --force replaces it, --out FILE writes another file")
+    check_writable(out)
+    if preset is not None:
+        if preset not in presets():
+            raise ValueError(f"--preset must be one of {', '.join(presets())}; got {preset!r}")
+        text = presets()[preset]
+    else:
+        assert frames is not None
+        text = _describe_camera(frames, given)
+    with whole_file(out) as file:
+        file.write_text(text, encoding="utf-8")
+    step = command_text("run", frames or "FRAMES", "results", "--config", out)
+    return Answer({}, {}, [out], [f"detect the vibration and restore the frames:\n  {step}"])
+
+
+def _first_comment(text: str) -> str:
+    """The comment at the top of a preset in one line."""
+    lines = text.splitlines()
+    end = next(number for number, line in enumerate(lines) if not line.startswith("#"))
+    return " ".join(line.removeprefix("#").strip() for line in lines[:end])
+
+
+def _describe_camera(path: Path, given: Mapping[str, Any]) -> str:
+    """Text of the configuration file: values of the command line, of the file, and of the answers to questions."""
+    with working(f"reading {path}"):
+        reader = io.open_stack(path)
+        info = reader.info
+        first = reader.frame(0)
+        reader.close()
+    size = f"{info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px (height x width), {info.dtype}"
+    note(f"{path}: {size}")
+    values = dict(given)
+    rows = info.shape[-1] if values.get("scan_axis") == "x" else info.shape[-2]
+    stated = _stated_rate(info)
+    if stated is not None and "frame_rate" not in given:
+        values["frame_rate"] = stated
+        note(f"frame rate {stated:.6g} per second, from the times in the file")
+    elif stated is not None and not math.isclose(stated, given["frame_rate"], rel_tol=0.01):
+        error_line(f"--frame-rate is {given['frame_rate']:g}, the times in the file give {stated:.6g}", "warning")
+    likely = None
+    if info.is_integer and info.full_scale is None:
+        likely = _likely_full_scale(first)
+    elif info.dtype != "uint8" and info.full_scale is not None:
+        values.setdefault("full_scale", info.full_scale)
+    _complete(values, rows, likely)
+    settings = read_config(None, sensor=values)
+    _check_timing(settings.timing, rows)
+    head = [
+        f"Camera of {path.name}: {size}. Written by rsvib init.",
+        "Values hold for one mode of the camera: resolution, cropping, binning and frame rate change the row time.",
+    ]
+    if info.frame_times is not None and not info.time_error:
+        head.append("The frames file states the time of every frame, which all commands use.")
+    order = ("row_time", "exposure_time", "frame_rate", "scan_axis", "readout_direction", "full_scale")
+    defaults = {"scan_axis": "y", "readout_direction": "forward"}
+    values = defaults | values
+    return sensor_toml({name: values[name] for name in order if name in values}, head)
+
+
+def _stated_rate(info: "StackInfo") -> float | None:
+    """Frames per second from the frame times of a file, between which frames may be missing, or from its rate."""
+    if info.frame_times is None or len(info.frame_times) < 2:
+        return info.frame_rate
+    intervals = [later - earlier for earlier, later in itertools.pairwise(info.frame_times)]
+    period = statistics.median(intervals)
+    return sum(max(round(interval / period), 1) for interval in intervals) / sum(intervals)
+
+
+def _likely_full_scale(pixels: Any) -> float:
+    """Largest count of the bit depth that a frame uses; counts that are multiples of 16 are 12 bits shifted by 4."""
+    import numpy as np  # noqa: PLC0415
+
+    step = max(int(np.gcd.reduce(pixels.ravel())), 1)
+    return float(((1 << max(int(pixels.max()) // step, 255).bit_length()) - 1) * step)
+
+
+def _complete(values: dict[str, Any], rows: int, likely: float | None) -> None:
+    """Ask for the values that are missing in a terminal, otherwise name all of them in an error."""
+    questions: dict[str, tuple[str, Callable[[str], float]]] = {
+        "frame_rate": ("--frame-rate", rate),
+        "row_time": ("--row-time", seconds),
+        "exposure_time": ("--exposure", seconds),
+    }
+    if likely is not None:
+        questions["full_scale"] = ("--full-scale", rate)
+    missing = {name: question for name, question in questions.items() if name not in values}
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        lines = [f"{option} is missing. {_hint(name, values, rows, likely)}" for name, (option, _) in missing.items()]
+        if lines:
+            raise ValueError("\n".join(lines))
+    for name, (option, convert) in missing.items():
+        typer.echo(f"\n{_hint(name, values, rows, likely)}", err=True)
+        limits = {"row_time": 1.0 / rows, "exposure_time": 1.0}  # frame periods
+        longest = limits[name] / values["frame_rate"] if name in limits else math.inf
+
+        def checked_answer(text: str, convert: Callable[[str], float] = convert, longest: float = longest) -> float:
+            value = convert(text)
+            if not 0 < value <= longest:
+                limit = "" if math.isinf(longest) else f" and at most {longest:.4g} s; units such as us can be added"
+                raise typer.BadParameter(f"expected a number above 0{limit}; got {text!r}")
+            return value
+
+        default = f"{likely:g}" if name == "full_scale" and likely is not None else None
+        values[name] = typer.prompt(
+            option.strip("-").replace("-", " "), default=default, value_proc=checked_answer, err=True
+        )
+
+
+def _hint(name: str, values: Mapping[str, Any], rows: int, likely: float | None) -> str:
+    """How to find a value, with the limits that follow from the frames."""
+    if name == "row_time" and values.get("frame_rate"):
+        return f"{_HINTS[name]} Here it is less than {1e6 / (values['frame_rate'] * rows):.4g} us."
+    if name == "full_scale" and likely is not None:
+        return f"{_HINTS[name]} Frame 0 indicates {likely:g}."
+    return _HINTS[name]
+
+
+def _check_timing(timing: SensorTiming, rows: int) -> None:
+    """Refuse a row time that is too long for the frame rate, and warn of values that are typical mistakes."""
+    timing.check_rows(rows)
+    used = rows / timing.frame_rows
+    readout, period = 1e3 * rows * timing.row_time, 1e3 * timing.frame_period
+    note(f"readout of {rows} rows takes {readout:.4g} ms of the frame period of {period:.4g} ms")
+    if used > 0.995:  # of the frame period; sensors have at least some blanking rows, data sheets three digits
+        error_line(
+            "the row time equals 1 / (frame rate x rows), which is rarely true, because sensors have blanking rows: "
+            "take it from the data sheet, or measure it with rsvib calibrate",
+            "warning",
+        )
+    elif used < 0.01:  # of the frame period: rarer than a value in a wrong unit
+        error_line(
+            f"the readout takes only {100 * used:.2g} % of the frame period: check the unit of the row time", "warning"
+        )
+
+
+def sensor_toml(values: Mapping[str, object], head: list[str]) -> str:
+    """Text of a configuration file with the table ``[sensor]``.
+
+    Args:
+        values: Values by key; the key of an unknown value (None) is a comment to be completed.
+        head: Lines of comments at the top.
+    """
+
+    def comment(text: str) -> list[str]:
+        return textwrap.wrap(text, 100, initial_indent="# ", subsequent_indent="# ")
+
+    lines = [*(line for text in head for line in comment(text)), "", "[sensor]"]
+    for name, value in values.items():
+        text = f'"{value}"' if isinstance(value, str) else f"{value:.10g}" if isinstance(value, float) else str(value)
+        lines += ["", *comment(_HINTS[name]), f"# {name} = " if value is None else f"{name} = {text}"]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,87 @@
+"""Numbers, tables and JSON as text, without torch."""
+
+import json
+import math
+import os
+import shutil
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rsvib_torch.core.atomic import whole_file
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["json_text", "measured_text", "text_table", "wrapped", "write_json"]
+
+
+def measured_text(value: "Tensor | float", std: "Tensor | float | None" = None, digits: int = 4) -> str:
+    """Format ``value ± std`` with two significant digits of the standard deviation.
+
+    Args:
+        value: The value; an infinite one is written as ∞, and NaN as "unknown".
+        std: Its standard deviation; None to write the value alone.
+        digits: Significant digits of the value if its standard deviation is not given, zero, infinite or unknown.
+
+    Example:
+        >>> measured_text(60.0, 0.01234)
+        '60.000 ± 0.012'
+        >>> measured_text(12345.6, 789.0)
+        '12350 ± 790'
+        >>> measured_text(0.123456)
+        '0.1235'
+    """
+    value, deviation = float(value), 0.0 if std is None else float(std)
+    known = math.isfinite(deviation) and deviation > 0
+    leading = deviation if known else abs(value) if math.isfinite(value) and value else 1.0
+    kept = (2 if known else digits) - 1 - int(f"{leading:.{1 if known else digits - 1}e}".partition("e")[2])
+    decimals = min(9, kept)
+
+    def shown(number: float) -> str:
+        if not math.isfinite(number):
+            return "unknown" if math.isnan(number) else "∞" if number > 0 else "-∞"
+        return f"{round(number, decimals) + 0.0:.{max(0, decimals)}f}"
+
+    return shown(value) if std is None else f"{shown(value)} ± {shown(deviation)}"
+
+
+def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, most: int = 20) -> str:
+    """A table as text with aligned columns; of more than ``most`` rows the first and the last are kept.
+
+    Example:
+        >>> print(text_table(("axis", "amplitude (px)"), [("x", "3.1"), ("y", "5.2")]))
+        axis  amplitude (px)
+        x     3.1
+        y     5.2
+    """
+    rows = [tuple(row) for row in rows]
+    if len(rows) > most:
+        omitted = (f"… {len(rows) - most} more",) + ("",) * (len(head) - 1)
+        rows = [*rows[: most // 2], omitted, *rows[-(most - most // 2) :]]
+    aligned = [row for row in (tuple(head), *rows) if not row[0].startswith("…")]
+    widths = [max(len(row[column]) for row in aligned) for column in range(len(head))]
+    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in (head, *rows))
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def wrapped(text: str) -> str:
+    """Text in lines of the width of the terminal, at most 100 characters; all but the first are indented."""
+    width = min(100, shutil.get_terminal_size((100, 24)).columns) - 2  # an answer of the program is indented by 2
+    return textwrap.fill(text, width, subsequent_indent="   ", break_long_words=False, break_on_hyphens=False)
+
+
+def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
+    """Write a table as JSON with one key per line, atomically.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    with whole_file(path) as part:
+        part.write_text(json_text(content) + "\n", encoding="utf-8")
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """A table as JSON with one key per line."""
+    lines = (f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
+    return "{\n" + ",\n".join(lines) + "\n}"

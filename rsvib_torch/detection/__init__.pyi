@@ -1,0 +1,21 @@
+from .detect import DetectionMethod, VibrationDetector, detect_vibration
+from .recorded.alignment import ClockAlignment, align_motion
+from .recorded.motion_check import MotionCheck, check_motion
+from .result import DetectionResult
+from .shapes.free import MotionDetection, detect_motion
+from .shapes.swept import SweptTone, detect_swept_tone
+
+__all__ = [
+    "ClockAlignment",
+    "DetectionMethod",
+    "DetectionResult",
+    "MotionCheck",
+    "MotionDetection",
+    "SweptTone",
+    "VibrationDetector",
+    "align_motion",
+    "check_motion",
+    "detect_motion",
+    "detect_swept_tone",
+    "detect_vibration",
+]

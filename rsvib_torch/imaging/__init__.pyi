@@ -1,0 +1,21 @@
+from .blur import RowVaryingBlur, blur_rows, blur_rows_adjoint
+from .psf import RowPSF, row_psf, trajectory_psf
+from .sensor_model import Optics, SensorNoise
+from .simulate import simulate_frames
+from .trajectory import exposure_nodes, exposure_trajectory, gauss_node_count, rows_showing
+
+__all__ = [
+    "Optics",
+    "RowPSF",
+    "RowVaryingBlur",
+    "SensorNoise",
+    "blur_rows",
+    "blur_rows_adjoint",
+    "exposure_nodes",
+    "exposure_trajectory",
+    "gauss_node_count",
+    "row_psf",
+    "rows_showing",
+    "simulate_frames",
+    "trajectory_psf",
+]

@@ -1,0 +1,31 @@
+from .files import (
+    check_stack_target,
+    metadata_not_kept,
+    open_stack,
+    read_stack,
+    read_stack_info,
+    register_format,
+    write_stack,
+)
+from .formats import FrameReader, FrameWriter, StackFormat
+from .frame_times import TimingWarning, describe_stack, exposure_times, timing_from_first_frame
+from .stack_info import FrameError, StackInfo
+
+__all__ = [
+    "FrameError",
+    "FrameReader",
+    "FrameWriter",
+    "StackFormat",
+    "StackInfo",
+    "TimingWarning",
+    "check_stack_target",
+    "describe_stack",
+    "exposure_times",
+    "metadata_not_kept",
+    "open_stack",
+    "read_stack",
+    "read_stack_info",
+    "register_format",
+    "timing_from_first_frame",
+    "write_stack",
+]

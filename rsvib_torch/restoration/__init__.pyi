@@ -1,0 +1,21 @@
+from .frame_motion import visible_pixels
+from .noise.high_pass import estimate_noise
+from .noise_gain import predict_noise_gain
+from .restore import VibrationRestorer, restore
+from .verdict.judge import RestorationVerdict, RestorationWarning, judge_restoration
+from .verdict.pairs import TooLittleInCommonError
+from .verdict.trust import displacement_uncertainty, trusted_vibration
+
+__all__ = [
+    "RestorationVerdict",
+    "RestorationWarning",
+    "TooLittleInCommonError",
+    "VibrationRestorer",
+    "displacement_uncertainty",
+    "estimate_noise",
+    "judge_restoration",
+    "predict_noise_gain",
+    "restore",
+    "trusted_vibration",
+    "visible_pixels",
+]

@@ -1,0 +1,20 @@
+from .job import WindowResult
+from .manifest import StackManifest, read_manifest
+from .process import StackReport, detect_stack, iterate_stack, process_stack
+from .window_restoration import RestoredFrames, restore_block, restore_trusted
+from .windows import Window, cut_windows
+
+__all__ = [
+    "RestoredFrames",
+    "StackManifest",
+    "StackReport",
+    "Window",
+    "WindowResult",
+    "cut_windows",
+    "detect_stack",
+    "iterate_stack",
+    "process_stack",
+    "read_manifest",
+    "restore_block",
+    "restore_trusted",
+]

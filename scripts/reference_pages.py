@@ -1,0 +1,179 @@
+#!/usr/bin/env python
+"""Write docs/configuration.md (all keys of the TOML file) and docs/commands.md (all commands).
+
+Types and defaults come from the sections of the configuration and the parameters of the commands, descriptions from
+docstrings and help texts. A test fails if the pages are out of date.
+"""
+
+import argparse
+import inspect
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import griffe
+import typer
+
+import rsvib_torch as rsv
+from rsvib_torch.commands.main import app
+from rsvib_torch.config import Simulation, file_section, simulation_section
+from rsvib_torch.core.validation import expected_text
+from rsvib_torch.restoration.restore import METHODS
+
+ROOT = Path(__file__).resolve().parents[1]
+NOTE = "<!-- Written by scripts/reference_pages.py: change the docstrings and help texts, then run make pages. -->"
+CONFIGURATION = f"""{NOTE}
+
+# Configuration
+
+A TOML file describes a camera and the processing of its frames. `rsvib init FRAMES` writes one, and
+`rsvib init --preset NAME` copies a complete example. Only `[sensor]` is required. The options `--row-time`,
+`--exposure`, `--frame-rate`, `--scan-axis` and `--readout-direction` of the [commands](commands.md) replace keys of
+`[sensor]`, or the file. Unknown keys and wrong values are errors, one line each, with the path of the key, its value
+and the expected value.
+"""
+SENSOR = """The camera. Exposure and frame period are in seconds (`exposure_time`, `frame_rate`) or in row times
+(`exposure_rows`, `frame_rows`); both keys of a pair may be given if they agree within 0.1 %.
+[Your own camera](your_own_camera.md) explains how to find the values."""
+SATURATION = "Level from which pixels are saturated, in the unit of the file; without it full scale for integer files."
+COMMANDS = f"""{NOTE}
+
+# Commands
+
+`rsvib COMMAND --help` prints the same. A time is in seconds, with a unit (`14.6us`, `2ms`) or as a fraction (`1/500`).
+Exit code 0: done; 2: an error of the input or the options, one line on standard error; 130: stopped by Ctrl-C.
+"""
+
+
+def documented(thing: object) -> dict[str, str]:
+    """Descriptions of the arguments or attributes in a docstring, by name."""
+    sections = griffe.Docstring(inspect.getdoc(thing) or "").parse("google", warnings=False)
+    kinds = (griffe.DocstringSectionKind.parameters, griffe.DocstringSectionKind.attributes)
+    return {entry.name: entry.description for section in sections if section.kind in kinds for entry in section.value}
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """A Markdown table."""
+    cells = [[" ".join(cell.replace("``", "`").split()).replace("|", "\\|") for cell in row] for row in rows]
+    return [*(f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *cells)), ""]
+
+
+def value_text(value: object) -> str:
+    """A value as in a TOML file; empty for none."""
+    if value is None or value is inspect.Parameter.empty:
+        return ""
+    text = str(value).lower() if isinstance(value, bool) else repr(value)
+    return "`" + text.replace("'", '"') + "`"
+
+
+def key_table(
+    section: Any, meaning: dict[str, str], function: Callable[..., Any] | None = None, keys: Iterable[str] = ()
+) -> list[str]:
+    """Table of the keys of a section.
+
+    Args:
+        section: Class of the section.
+        meaning: Descriptions of the keys whose field has none.
+        function: Its arguments have the defaults; None if the fields of the section have them.
+        keys: Keys to list, by default all.
+    """
+    arguments = inspect.signature(function).parameters if function else {}
+    rows = []
+    for name in keys or section.model_fields:
+        field = section.model_fields[name]
+        default = arguments[name].default if function else field.get_default(call_default_factory=True)
+        shown = "required" if field.is_required() else value_text(default)
+        kind = expected_text(field.annotation).replace("'", '"')
+        rows.append([f"`{name}`", kind, shown, field.description or meaning[name]])
+    return table(("key", "type", "default", "meaning"), rows)
+
+
+def section_of(model: Any, name: str) -> Any:
+    """Class of a table of a section."""
+    annotation = model.model_fields[name].annotation
+    return next((member for member in get_args(annotation) if hasattr(member, "model_fields")), annotation)
+
+
+def configuration_page() -> str:
+    """Markdown of the reference of the configuration file."""
+    file = file_section()
+    simulation = simulation_section()
+    plain = [key for key in simulation.model_fields if key not in ("vibration", "noise")]
+    vibration, noise = section_of(simulation, "vibration"), section_of(simulation, "noise")
+    meaning = documented(rsv.restore) | {"saturation": SATURATION}
+    lines = [CONFIGURATION, "## [sensor]", "", SENSOR, ""]
+    lines += key_table(section_of(file, "sensor"), documented(rsv.SensorTiming))
+    lines += ["## [detection]", "", "Options of `detect_vibration`.", ""]
+    lines += key_table(section_of(file, "detection"), documented(rsv.detect_vibration), rsv.detect_vibration)
+    lines += ["## [restoration]", "", "Options of `restore` for all methods:", ""]
+    lines += key_table(section_of(file, "restoration"), meaning, rsv.restore, ("method", "saturation"))
+    for name, method in METHODS.items():
+        section = section_of(file_section(name), "restoration")
+        own = [key for key in section.model_fields if key not in ("method", "saturation")]
+        lines += [f'Options of `method = "{name}"`:', ""]
+        lines += key_table(section, documented(method.function), method.function, own)
+    lines += ["## [stack]", "", "Processing of stacks in windows.", "", *key_table(section_of(file, "stack"), {})]
+    lines += ["## [simulation]", "", "For `rsvib simulate`.", ""]
+    lines += key_table(simulation, documented(Simulation), keys=plain)
+    lines += ["## [simulation.vibration]", "", "The motion that is simulated; required for a simulation.", ""]
+    lines += key_table(vibration, documented(rsv.Vibration))
+    lines += ["## [simulation.noise]", "", "Noise of the sensor; none without this table.", ""]
+    lines += key_table(noise, documented(rsv.SensorNoise), rsv.SensorNoise)
+    return "\n".join(lines)
+
+
+def parameter_row(parameter: inspect.Parameter) -> list[str]:
+    """Name with its value, default and meaning of an argument or option of a command."""
+    kind, info = get_args(parameter.annotation)
+    names = {"float": "NUMBER", "int": "NUMBER", "str": "TEXT", "Path": "PATH"}
+    types = [member for member in get_args(kind) or (kind,) if member is not type(None)]
+    choices = get_args(types[0]) or (types if isinstance(types[0], str) else ())
+    choices = [choice for choice in choices if isinstance(choice, str)]
+    value = info.metavar or "|".join(choices) or names.get(getattr(types[0], "__name__", ""), "TEXT")
+    named = [info.default, *(info.param_decls or ())]  # typer takes the first name in an annotation for a default
+    option = next((name for name in named if isinstance(name, str)), "--" + parameter.name.replace("_", "-"))
+    if isinstance(info, typer.models.ArgumentInfo):
+        text = parameter.name.upper()
+    else:
+        text = option if kind is bool else f"{option} {value}"
+    required = parameter.default is inspect.Parameter.empty
+    stated = "" if parameter.default in (None, False) else f"`{parameter.default}`"
+    default = info.show_default if isinstance(info.show_default, str) else stated
+    return [f"`{text}`", "required" if required else default, info.help or ""]
+
+
+def command_page() -> str:
+    """Markdown of the reference of the commands."""
+    lines = [COMMANDS]
+    for command in app.registered_commands:
+        assert command.callback is not None
+        name = command.name or command.callback.__name__
+        parameters = inspect.signature(command.callback, eval_str=True).parameters.values()
+        words = [
+            each.name.upper() if each.default is inspect.Parameter.empty else f"[{each.name.upper()}]"
+            for each in parameters
+            if isinstance(get_args(each.annotation)[1], typer.models.ArgumentInfo)
+        ]
+        lines += [f"## rsvib {name}", "", "```text", " ".join(["rsvib", name, *words, "[OPTIONS]"]), "```", ""]
+        lines += [inspect.getdoc(command.callback) or "", ""]
+        lines += table(("argument or option", "default", "meaning"), map(parameter_row, parameters))
+    return "\n".join(lines)
+
+
+def pages() -> dict[Path, str]:
+    """Text of the pages, by path."""
+    docs = ROOT / "docs"
+    return {docs / "configuration.md": configuration_page(), docs / "commands.md": command_page()}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(
+        arguments
+    )
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")
+        print(path)
+
+
+if __name__ == "__main__":
+    main()

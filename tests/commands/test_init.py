@@ -1,0 +1,228 @@
+"""rsvib init: configuration files for the camera of a stack, and presets."""
+
+import io
+import os
+import struct
+import tomllib
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.config import presets, read_config
+from rsvib_torch.io import StackInfo, read_stack, write_stack
+
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read by the first video that OpenCV opens or writes
+TIMES = ("--row-time", "40us", "--exposure", "1/1250")
+RATE = ("--frame-rate", "30000/1001")
+
+
+def init(*arguments):
+    return run_command(["init", *map(str, arguments)])
+
+
+@pytest.fixture(name="frames")
+def make_frames():
+    return torch.rand(4, 64, 48, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.fixture(name="place")
+def go_to_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def write_video(path, rate, angle=0):
+    """A video of five frames whose file states that they have to be turned by an angle."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), rate, (48, 64))
+    for level in range(5):
+        frame = np.full((64, 48, 3), 20 * level, np.uint8)
+        frame[:8] = 250
+        writer.write(frame)
+    writer.release()
+    cosine, sine = {0: (1, 0), 90: (0, 1), 180: (-1, 0), 270: (0, -1)}[angle]
+    data = bytearray(path.read_bytes())
+    matrix = data.index(b"tkhd") + 44  # ISO 14496-12, track header of version 0
+    values = (cosine, sine, 0, -sine, cosine, 0, 0, 0, 1)
+    data[matrix : matrix + 36] = struct.pack(
+        ">9i", *(value << (30 if i == 8 else 16) for i, value in enumerate(values))
+    )
+    path.write_bytes(data)
+
+
+def test_values_of_a_video_and_of_options(place, capsys):
+    write_video(place / "clip.mp4", 25.0)
+    assert init("clip.mp4", *TIMES) == 0
+    text = (place / "camera.toml").read_text()
+    assert tomllib.loads(text)["sensor"] == {
+        "row_time": 4e-5,
+        "exposure_time": 8e-4,
+        "frame_rate": 25.0,
+        "scan_axis": "y",
+        "readout_direction": "forward",
+    }
+    assert text.startswith("# Camera of clip.mp4: 5 frames of 64 x 48 px (height x width), uint8.")
+    assert "rsvib calibrate" in text
+    timing = read_config(place / "camera.toml").timing
+    assert (timing.exposure_rows, timing.frame_rate) == pytest.approx((20, 25))
+    assert "rsvib run clip.mp4 OUT --config camera.toml" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("angle", "axis", "direction", "first"),
+    [
+        (90, "x", "reverse", (slice(None), slice(-8, None))),
+        (180, "y", "reverse", (slice(-8, None), slice(None))),
+        (270, "x", "forward", (slice(None), slice(8))),
+    ],
+)
+def test_rotated_video(place, capsys, angle, axis, direction, first):
+    """The rows that the sensor reads first are bright in the decoded frames where the result says."""
+    write_video(place / "clip.mp4", 25.0, angle)
+    assert init("clip.mp4", *TIMES) == 0
+    sensor = tomllib.loads((place / "camera.toml").read_text())["sensor"]
+    assert (sensor["scan_axis"], sensor["readout_direction"]) == (axis, direction)
+    assert f"rotated by {angle} degrees" in capsys.readouterr().out
+    assert read_stack(place / "clip.mp4")[0, 0][first].min() > 0.8
+    assert init("clip.mp4", *TIMES, "--scan-axis", "y", "--force") == 0  # options are preferred
+    assert tomllib.loads((place / "camera.toml").read_text())["sensor"]["scan_axis"] == "y"
+
+
+def test_frame_times_and_full_scale_of_the_file(place, frames, capsys):
+    times = (0.0, 0.04, 0.08, 0.16)  # a frame was dropped
+    write_stack(
+        "f.h5", frames, dtype="uint16", full_scale=4095, like=StackInfo(tuple(frames.shape), "uint16", 4095, times)
+    )
+    assert init("f.h5", *TIMES) == 0
+    config = read_config(place / "camera.toml")
+    assert config.timing.frame_rate == pytest.approx(25.0)
+    assert config.full_scale == 4095
+    assert "states the time of every frame" in (place / "camera.toml").read_text()
+    assert init("f.h5", *TIMES, "--frame-rate", 50, "--force") == 0
+    assert "--frame-rate is 50, the times in the file give 25" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("factor", "likely"), [(1, "4095"), (16, "65520")])
+def test_unknown_full_scale_is_suggested(place, frames, capsys, factor, likely):
+    np.save("f.npy", (frames * 4000).numpy().astype(np.uint16) * np.uint16(factor))
+    assert init("f.npy", *TIMES, *RATE) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("rsvib: error: --full-scale is missing.")
+    assert f"Frame 0 indicates {likely}." in error
+    assert error.count("\n") == 1
+    assert init("f.npy", *TIMES, *RATE, "--full-scale", likely) == 0
+    assert read_config(place / "camera.toml").full_scale == float(likely)
+
+
+def test_missing_values_are_explained_in_one_line_each(place, frames, capsys):
+    write_stack("f.npy", frames)
+    assert init("f.npy") == 2
+    errors = capsys.readouterr().err.splitlines()
+    assert [line.split(" is missing.")[0] for line in errors] == [
+        f"rsvib: error: {option}" for option in ("--frame-rate", "--row-time", "--exposure")
+    ]
+    assert init("f.npy", *RATE) == 2
+    error = capsys.readouterr().err
+    assert "rsvib calibrate" in error
+    assert (
+        "It is not 1 / (frame rate x rows), because sensors have blanking rows. Here it is less than 521.4 us." in error
+    )
+    assert not (place / "camera.toml").exists()
+
+
+class Terminal(io.StringIO):
+    """Standard input or error that is a terminal."""
+
+    def isatty(self):
+        return True
+
+
+def test_questions_in_a_terminal(place, frames, monkeypatch):
+    np.save("f.npy", (frames * 1000).numpy().astype(np.uint16))
+    answers = ["soon", "25", "40", "40us", "2", "1/1250", ""]
+    monkeypatch.setattr("sys.stdin", Terminal("\n".join(answers) + "\n"))
+    shown = Terminal()
+    monkeypatch.setattr("sys.stderr", shown)
+    assert init("f.npy") == 0
+    config = read_config(place / "camera.toml")
+    assert (config.timing.frame_rate, config.timing.row_time, config.timing.exposure_time) == pytest.approx(
+        (25, 4e-5, 8e-4)
+    )
+    assert config.full_scale == 1023
+    text = shown.getvalue()
+    assert "expected a number such as 29.97 or 30000/1001, got 'soon'" in text
+    assert "at most 0.000625 s; units such as us can be added; got '40'" in text
+    assert "at most 0.04 s" in text
+    assert "Here it is less than 625 us." in text
+
+
+def test_end_of_the_answers_writes_nothing(place, frames, monkeypatch, capsys):
+    write_stack("f.npy", frames)
+    monkeypatch.setattr("sys.stdin", Terminal("25\n"))
+    monkeypatch.setattr("sys.stderr", Terminal())
+    assert init("f.npy") == 130
+    assert not (place / "camera.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--row-time", "40"), "row_time=40 s is longer than 10 ms; row_time is in seconds (40 us is 40e-6)"),
+        (("--row-time", "-40us"), "row_time must be larger than 0"),
+        (("--row-time", "600us"), "with 29.97 frames/s, row_time is at most 0.000521354 s"),
+        (("--row-time", "nan"), "expected a time such as 14.5us"),
+        (("--exposure", "1/10"), "exposure 0.1 s, frame period 0.03337 s"),
+        (("--frame-rate", "0.033"), "frame_rate=0.033 is less than 0.1; it is in frames per second"),
+        (("--frame-rate", "1000"), "is less than the 64 rows of the frames"),
+        (("--full-scale", "-1"), "full_scale must be larger than 0"),
+        (("--scan-axis", "z"), "'z' is not one of"),
+        (("--preset", "iso12233"), "give no frames and no values of the sensor with it"),
+        (("--out", "none/camera.toml"), "folder"),
+    ],
+)
+def test_errors_are_one_line_and_write_nothing(place, frames, capsys, options, message):
+    write_stack("f.npy", frames)
+    values = dict(zip((*TIMES, *RATE)[::2], (*TIMES, *RATE)[1::2], strict=True)) | {options[0]: options[1]}
+    assert init("f.npy", *(part for pair in values.items() for part in pair)) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("rsvib: error: ")
+    assert message in error
+    assert error.count("\n") == 1
+    assert sorted(path.name for path in place.iterdir()) == ["f.npy"]
+
+
+@pytest.mark.parametrize(
+    ("row_time", "message"),
+    [
+        ("520.8us", "equals 1 / (frame rate x rows), which is rarely true"),
+        ("40ns", "only 0.0077 % of the frame period"),
+    ],
+)
+def test_typical_mistakes_are_warned_of(place, frames, capsys, row_time, message):
+    write_stack("f.npy", frames)
+    assert init("f.npy", "--row-time", row_time, "--exposure", "1ms", *RATE) == 0
+    assert message in capsys.readouterr().err
+
+
+def test_presets(place, frames, capsys):
+    assert init("--list-presets") == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in shown] == list(presets())
+    assert shown[1].endswith("a rolling-shutter camera in front of an ISO 12233 chart.")
+    assert list(place.iterdir()) == []
+    assert init("--preset", "in_orbit") == 0
+    assert (place / "camera.toml").read_text() == presets()["in_orbit"]
+    capsys.readouterr()
+    for arguments, message in (
+        (("--preset", "push_scan"), "camera.toml exists; --force replaces it"),
+        (("--preset", "moon", "--force"), "--preset must be one of in_orbit, iso12233, push_scan; got 'moon'"),
+        ((), "give a stack of frames, or --preset NAME"),
+        (("none.mp4", *TIMES, "--out", "c.toml"), "none.mp4 does not exist"),
+    ):
+        assert init(*arguments) == 2
+        assert message in capsys.readouterr().err
+    assert (place / "camera.toml").read_text() == presets()["in_orbit"]
+    assert init("--preset", "push_scan", "--force") == 0
+    assert (place / "camera.toml").read_text() == presets()["push_scan"]

@@ -1,0 +1,145 @@
+"""Start of the package and of the program: what is imported when, and names that type checkers and editors find."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+import rsvib_torch as rsv
+from rsvib_torch.config import read_config
+from rsvib_torch.core.option_types import (
+    METHOD_SETTINGS,
+    BadFrames,
+    DetectionMethod,
+    MotionUnit,
+    PriorName,
+    Registration,
+)
+from rsvib_torch.detection import detect
+from rsvib_torch.motion import recorded
+from rsvib_torch.registration.methods import BAND_METHODS
+from rsvib_torch.restoration.exact.priors import PRIORS
+from rsvib_torch.restoration.restore import METHODS
+
+PACKAGE = Path(rsv.__file__).parent
+LIBRARIES = ("kornia", "cv2", "scipy", "tifffile", "h5py", "zarr", "matplotlib", "jinja2", "dask", "imagecodecs")
+PROGRAM = ("torch", "numpy", *LIBRARIES)
+BAD_CONFIG = """
+[sensor]
+row_time = 2e-5
+exposure_time = 1e-3
+frame_rate = 25
+frame_row = 512
+[detection]
+search = "far"
+[restoration]
+method = "banded"
+prior = "edges"
+[stack]
+window = 1
+"""
+
+
+def loaded(code, names, folder):
+    """Names of modules that a new interpreter has imported after running some code."""
+    program = f"{code}\nimport sys\nprint(*(name for name in {names!r} if name in sys.modules), file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=folder, check=True)
+    return done.stderr.splitlines()[-1].split()
+
+
+def run_code(*arguments):
+    return f"from rsvib_torch.commands.main import run_command\nrun_command({arguments!r})"
+
+
+@pytest.mark.parametrize(
+    ("code", "names"),
+    [
+        ("import rsvib_torch", ("torch", "numpy", "pydantic", "typer", "rich", *LIBRARIES)),
+        ("import torch, rsvib_torch as rsv\nrsv.SensorTiming, rsv.Vibration, rsv.io, rsv.restoration", LIBRARIES),
+        ("import rsvib_torch.config", PROGRAM),
+        ("from rsvib_torch.config import read_config\nread_config('camera.toml')", PROGRAM),
+        (run_code("--help"), PROGRAM),
+        (run_code("--version"), PROGRAM),
+        (run_code("run", "--help"), PROGRAM),
+        (run_code("known", "--help"), PROGRAM),
+        (run_code("run", "frames.tif", "out"), PROGRAM),
+        (run_code("run", "frames.tif", "out", "--config", "none.toml"), PROGRAM),
+        (run_code("detect", "frames.tif", "--out", "out", "--config", "bad.toml"), PROGRAM),
+        (run_code("detect", "frames.tif", "--out", "out", "--config", "camera.toml", "--row-time", "20"), PROGRAM),
+        (run_code("detect", "frames.tif", "--out", "out", "--config", "camera.toml", "--exposure", "1"), PROGRAM),
+        (run_code("init", "--list-presets"), PROGRAM),
+    ],
+)
+def test_libraries_are_imported_when_they_are_used(tmp_path, code, names):
+    (tmp_path / "bad.toml").write_text(BAD_CONFIG)
+    (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 2e-5\nexposure_rows = 20\nframe_rows = 512\n")
+    assert loaded(code, names, tmp_path) == []
+
+
+def test_errors_of_all_sections_are_listed_together(tmp_path):
+    (tmp_path / "bad.toml").write_text(BAD_CONFIG)
+    with pytest.raises(ValueError) as caught:
+        read_config(tmp_path / "bad.toml")
+    assert [line.split(": ")[1] for line in str(caught.value).splitlines()] == [
+        "sensor.frame_row",
+        "detection.search",
+        "restoration.prior",
+        "stack.window",
+    ]
+
+
+def test_names_of_options_are_those_of_the_tables():
+    assert list(METHOD_SETTINGS) == list(METHODS)
+    assert set(get_args(PriorName)) == set(PRIORS)
+    assert set(get_args(Registration)) == set(BAND_METHODS)
+    assert set(get_args(DetectionMethod)) == set(detect._METHODS)
+    assert set(get_args(MotionUnit)) == {"px", *recorded._RADIANS}
+    assert get_args(BadFrames) == ("pass", "skip")
+
+
+def stubs():
+    return sorted(PACKAGE.rglob("*.pyi"))
+
+
+@pytest.mark.parametrize("stub", stubs(), ids=lambda path: path.parent.name)
+def test_stub_lists_what_the_package_has(stub):
+    """Every name of a stub can be imported, and its list of names is that of the package."""
+    tree = ast.parse(stub.read_text(encoding="utf-8"))
+    listed = next(ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign))
+    module = ".".join(("rsvib_torch", *stub.relative_to(PACKAGE).parts[:-1]))
+    package = __import__(module, fromlist=["x"])
+    assert sorted(package.__all__) == sorted(listed)
+    for name in listed:
+        if name != "__version__":
+            assert getattr(package, name) is not None
+            assert name in dir(package)
+    with pytest.raises(AttributeError):
+        package.no_such_name  # noqa: B018
+
+
+def test_functions_named_like_their_module_stay_functions():
+    code = (
+        "import rsvib_torch.restoration.restore\nfrom rsvib_torch.restoration import restore\nassert callable(restore)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_type_checker_knows_the_names(tmp_path):
+    pytest.importorskip("mypy")
+    (tmp_path / "user.py").write_text(
+        "import rsvib_torch as rsv\n"
+        "from rsvib_torch.io import StackInfo\n"
+        "timing = rsv.SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)\n"
+        "info: StackInfo = rsv.read_stack_info('frames.tif')\n"
+        "reveal_type(rsv.restore(rsv.read_stack('frames.tif'), timing, rsv.Vibration.still()))\n"
+        "rsv.evaluation.cramer_rao_bound\n"
+        "rsv.restor\n"
+    )
+    command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path), "user.py"]
+    shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False).stdout
+    assert 'note: Revealed type is "torch._tensor.Tensor"' in shown
+    assert 'user.py:7: error: Module has no attribute "restor"' in shown
+    assert shown.count("error:") == 1
