@@ -148,7 +148,8 @@ def command_page() -> str:
     for command in app.registered_commands:
         assert command.callback is not None
         name = command.name or command.callback.__name__
-        parameters = inspect.signature(command.callback, eval_str=True).parameters.values()
+        signature = inspect.signature(command.callback, eval_str=True)
+        parameters = [each for each in signature.parameters.values() if hasattr(each.annotation, "__metadata__")]
         words = [
             each.name.upper() if each.default is inspect.Parameter.empty else f"[{each.name.upper()}]"
             for each in parameters

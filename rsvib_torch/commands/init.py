@@ -68,7 +68,7 @@ def init(
     ] = None,
     preset: Annotated[str | None, typer.Option(help=f"Copy a preset instead: {', '.join(presets())}.")] = None,
     list_presets: Annotated[bool, typer.Option("--list-presets", help="List the presets and exit.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing configuration file.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing configuration file.")] = False,
 ) -> Answer:
     """Write a configuration file for the camera of a stack of frames.
 
@@ -90,8 +90,8 @@ def init(
         raise ValueError("--preset is a complete configuration: give no frames and no values of the sensor with it")
     if preset is None and frames is None:
         raise ValueError("give a stack of frames, or --preset NAME (--list-presets lists them)")
-    if out.exists() and not force:
-        raise ValueError(f"{out} exists; --force replaces it, --out FILE writes another file")
+    if out.exists() and not overwrite:
+        raise ValueError(f"{out} exists; --overwrite replaces it, --out FILE writes another file")
     check_writable(out)
     if preset is not None:
         if preset not in presets():

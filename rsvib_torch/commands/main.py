@@ -121,7 +121,8 @@ def _with_output(name: str, function: Callable[..., Answer]) -> Callable[..., No
         with output_of(as_json=as_json, quiet=quiet):
             show_answer(name, function(**arguments))
 
-    parameters, hints = inspect.signature(function).parameters.values(), get_type_hints(function, include_extras=True)
+    parameters = inspect.signature(function, eval_str=True).parameters.values()
+    hints = get_type_hints(function, include_extras=True)
     own = inspect.signature(command).parameters
     options = {"as_json": JsonOption, "quiet": QuietOption}
     added = [own[option].replace(annotation=kind) for option, kind in options.items()]

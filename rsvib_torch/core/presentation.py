@@ -146,7 +146,8 @@ def _restored(kind: Any, value: Any, path: str, missing: float) -> Any:
 def _dataclass(kind: type[Any], value: Any, path: str = "") -> Any:
     if not isinstance(value, dict):
         raise ValueError(f"{path}: expected a table, got {value!r}")
-    hints, start = get_type_hints(kind), f"{path}." if path else ""
+    # SensorTiming does not import torch, whose Tensor its annotations name
+    hints, start = get_type_hints(kind, localns={"Tensor": torch.Tensor}), f"{path}." if path else ""
     names = [field.name for field in fields(kind)]
     if absent := [name for name in names if name not in value]:
         raise ValueError(f"{start}{absent[0]}: missing key")

@@ -67,27 +67,21 @@ def test_values_of_a_video_and_of_options(place, capsys):
     assert "rsvib calibrate" in text
     timing = read_config(place / "camera.toml").timing
     assert (timing.exposure_rows, timing.frame_rate) == pytest.approx((20, 25))
-    assert "rsvib run clip.mp4 OUT --config camera.toml" in capsys.readouterr().out
+    assert "rsvib run clip.mp4 results --config camera.toml" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("angle", "axis", "direction", "first"),
-    [
-        (90, "x", "reverse", (slice(None), slice(-8, None))),
-        (180, "y", "reverse", (slice(-8, None), slice(None))),
-        (270, "x", "forward", (slice(None), slice(8))),
-    ],
-)
-def test_rotated_video(place, capsys, angle, axis, direction, first):
-    """The rows that the sensor reads first are bright in the decoded frames where the result says."""
+@pytest.mark.parametrize("angle", [90, 180, 270])
+def test_rotated_video(place, angle):
+    """Frames are read as stored: the rows that the sensor reads first are the first rows at any rotation."""
     write_video(place / "clip.mp4", 25.0, angle)
     assert init("clip.mp4", *TIMES) == 0
     sensor = tomllib.loads((place / "camera.toml").read_text())["sensor"]
-    assert (sensor["scan_axis"], sensor["readout_direction"]) == (axis, direction)
-    assert f"rotated by {angle} degrees" in capsys.readouterr().out
-    assert read_stack(place / "clip.mp4")[0, 0][first].min() > 0.8
-    assert init("clip.mp4", *TIMES, "--scan-axis", "y", "--force") == 0  # options are preferred
-    assert tomllib.loads((place / "camera.toml").read_text())["sensor"]["scan_axis"] == "y"
+    assert (sensor["scan_axis"], sensor["readout_direction"]) == ("y", "forward")
+    first = read_stack(place / "clip.mp4")[0, 0]
+    assert first[:7].min() > 0.8
+    assert first[9:].max() < 0.2
+    assert init("clip.mp4", *TIMES, "--scan-axis", "x", "--overwrite") == 0  # options are preferred
+    assert tomllib.loads((place / "camera.toml").read_text())["sensor"]["scan_axis"] == "x"
 
 
 def test_frame_times_and_full_scale_of_the_file(place, frames, capsys):
@@ -100,7 +94,7 @@ def test_frame_times_and_full_scale_of_the_file(place, frames, capsys):
     assert config.timing.frame_rate == pytest.approx(25.0)
     assert config.full_scale == 4095
     assert "states the time of every frame" in (place / "camera.toml").read_text()
-    assert init("f.h5", *TIMES, "--frame-rate", 50, "--force") == 0
+    assert init("f.h5", *TIMES, "--frame-rate", 50, "--overwrite") == 0
     assert "--frame-rate is 50, the times in the file give 25" in capsys.readouterr().err
 
 
@@ -209,20 +203,21 @@ def test_typical_mistakes_are_warned_of(place, frames, capsys, row_time, message
 def test_presets(place, frames, capsys):
     assert init("--list-presets") == 0
     shown = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in shown] == list(presets())
-    assert shown[1].endswith("a rolling-shutter camera in front of an ISO 12233 chart.")
+    assert shown[0] == "Presets"
+    assert [line.split(":")[0].strip() for line in shown[1:] if line] == list(presets())
+    assert shown[2].endswith("a rolling-shutter camera in front of an ISO 12233 chart.")
     assert list(place.iterdir()) == []
     assert init("--preset", "in_orbit") == 0
     assert (place / "camera.toml").read_text() == presets()["in_orbit"]
     capsys.readouterr()
     for arguments, message in (
-        (("--preset", "push_scan"), "camera.toml exists; --force replaces it"),
-        (("--preset", "moon", "--force"), "--preset must be one of in_orbit, iso12233, push_scan; got 'moon'"),
+        (("--preset", "push_scan"), "camera.toml exists; --overwrite replaces it"),
+        (("--preset", "moon", "--overwrite"), "--preset must be one of in_orbit, iso12233, push_scan; got 'moon'"),
         ((), "give a stack of frames, or --preset NAME"),
         (("none.mp4", *TIMES, "--out", "c.toml"), "none.mp4 does not exist"),
     ):
         assert init(*arguments) == 2
         assert message in capsys.readouterr().err
     assert (place / "camera.toml").read_text() == presets()["in_orbit"]
-    assert init("--preset", "push_scan", "--force") == 0
+    assert init("--preset", "push_scan", "--overwrite") == 0
     assert (place / "camera.toml").read_text() == presets()["push_scan"]
