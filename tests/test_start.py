@@ -140,7 +140,7 @@ def test_type_checker_knows_the_names(tmp_path):
         "rsv.restor\n"
     )
     command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path), "user.py"]
-    found = os.environ | {"MYPYPATH": str(PACKAGE.parent)}  # mypy does not follow the hooks of editable installations
+    found = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}  # mypy does not follow the hooks of editable installations
     shown = subprocess.run(command, cwd=tmp_path, env=found, capture_output=True, text=True, check=False).stdout
     assert 'note: Revealed type is "torch._tensor.Tensor"' in shown
     assert 'user.py:7: error: Module has no attribute "restor"' in shown
