@@ -1,0 +1,98 @@
+"""The result of one trial of an attack, and how a child process is watched."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import psutil
+
+__all__ = ["FAILURES", "OUTCOMES", "Outcome", "Process", "Trial", "outcome_of_command", "rsvib", "run_watched"]
+
+Outcome = Literal["completed", "refused", "lost", "wrong", "traceback", "hang", "memory"]
+OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
+FAILURES = OUTCOMES[2:]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One trial.
+
+    Attributes:
+        name: What was tried, precise enough to repeat it.
+        outcome: ``completed``: correct result. ``refused``: a one-line error, and nothing was changed. ``lost``: a file
+            of the user, or a finished part of the result, is damaged or missing. ``wrong``: success was reported, but
+            the result is wrong or incomplete. ``traceback``: an exception that is neither ValueError, TypeError nor OSError
+            in Python, or a traceback or another exit code than 0 and 2 on the command line. ``hang``: the time limit
+            passed. ``memory``: more memory than permitted was used.
+        detail: Message or difference, for the list of failures.
+    """
+
+    name: str
+    outcome: Outcome
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class Process:
+    """A finished child process: exit code (None after the time limit), output, seconds, peak memory in bytes."""
+
+    code: int | None
+    output: str
+    seconds: float
+    peak_memory: int
+
+
+def _memory_of_tree(process: psutil.Process) -> int:
+    total = 0
+    for member in [process, *process.children(recursive=True)]:
+        try:
+            total += member.memory_info().rss
+        except psutil.NoSuchProcess:  # ended since it was listed
+            continue
+    return total
+
+
+def run_watched(command: Sequence[str], *, limit: float, folder: Path) -> Process:
+    """Run a command with a time limit and measure the peak resident memory of its process tree.
+
+    Args:
+        command: Program and arguments.
+        limit: Time limit in s; after it all processes of the tree are ended.
+        folder: Working directory; ``output.txt`` in it receives the output.
+    """
+    begin = time.perf_counter()
+    path = folder / "output.txt"
+    with path.open("wb") as output:
+        child = subprocess.Popen(command, cwd=folder, stdout=output, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
+        tree, peak = psutil.Process(child.pid), 0
+        while child.poll() is None and time.perf_counter() - begin < limit:
+            try:
+                peak = max(peak, _memory_of_tree(tree))
+            except psutil.NoSuchProcess:
+                break
+            time.sleep(0.02)
+        expired = child.poll() is None and time.perf_counter() - begin >= limit
+        if expired:
+            for member in [*tree.children(recursive=True), tree]:
+                member.kill()
+        child.wait()
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return Process(None if expired else child.returncode, text, time.perf_counter() - begin, peak)
+
+
+def rsvib(*arguments: str | Path) -> list[str]:
+    """Command line of the ``rsvib`` program of this interpreter."""
+    return [sys.executable, "-m", "rsvib_torch", *map(str, arguments)]
+
+
+def outcome_of_command(process: Process) -> Outcome:
+    """``completed``, ``refused``, ``traceback`` or ``hang``, from exit code and output of ``rsvib``."""
+    if process.code is None:
+        return "hang"
+    if "Traceback (most recent call last)" in process.output or process.code not in (0, 2):
+        return "traceback"
+    return "completed" if process.code == 0 else "refused"
