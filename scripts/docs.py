@@ -42,6 +42,7 @@ SECTIONS = {
         "concepts.md",
         "your_own_camera.md",
         "stacks.md",
+        "reliability.md",
         "ml_pipeline.md",
         "measuring.md",
         "gallery.md",
