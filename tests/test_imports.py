@@ -22,6 +22,7 @@ LAYERS = (
     {"config"},
     {"report"},
     {"commands"},
+    {"__main__"},
 )
 INNER_LAYERS = {
     "detection": (
@@ -142,7 +143,7 @@ def test_no_two_modules_share_a_name():
 
 
 def test_the_top_level_holds_packages_and_the_configuration():
-    assert {path.name for path in PACKAGE.glob("*.py")} == {"__init__.py", "config.py"}
+    assert {path.name for path in PACKAGE.glob("*.py")} == {"__init__.py", "__main__.py", "config.py"}
 
 
 def test_modules_that_use_a_displacement_per_row_state_the_invariant():
