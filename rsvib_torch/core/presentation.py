@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
+    "AXIS_NAMES",
     "FIGURES",
     "Result",
     "Summarised",
@@ -48,7 +49,10 @@ _PLOTS = "rsvib_torch.report.plots"
 # Text
 
 
-def axis_rows(batch_shape: Sequence[int]) -> list[tuple[tuple[int, ...], list[str]]]:
+AXIS_NAMES = ("x", "y", "roll", "zoom")
+
+
+def axis_rows(batch_shape: Sequence[int], axes: int = 2) -> list[tuple[tuple[int, ...], list[str]]]:
     """Index (..., axis) of each axis of each result of a batch, and the first cells of its row in a table.
 
     Example:
@@ -57,8 +61,8 @@ def axis_rows(batch_shape: Sequence[int]) -> list[tuple[tuple[int, ...], list[st
         >>> axis_rows((1,))
         [((0, 0), ['0', 'x']), ((0, 1), ['0', 'y'])]
     """
-    indices = itertools.product(*map(range, batch_shape), range(2))
-    return [(at, [", ".join(map(str, at[:-1]))] * bool(batch_shape) + ["xy"[at[-1]]]) for at in indices]
+    indices = itertools.product(*map(range, batch_shape), range(axes))
+    return [(at, [", ".join(map(str, at[:-1]))] * bool(batch_shape) + [AXIS_NAMES[at[-1]]]) for at in indices]
 
 
 def axis_head(batch_shape: Sequence[int]) -> list[str]:
@@ -75,27 +79,28 @@ def verdict_table(
         head: Columns after those of ``axis_head``.
         rows: Rows that begin with the cells of ``axis_rows``.
         batch_shape: Leading dimensions.
-        reliable: (..., 2) bool.
+        reliable: (..., A) bool, one for each axis.
         reasons: Reasons against each axis.
     """
     head = [*axis_head(batch_shape), *head]
     if not batch_shape:
         return [text_table(head, rows), *verdict_lines(reliable, reasons)]
     verdicts = {
-        tuple(labels): "reliable" if bool(reliable[at]) else "not reliable" for at, labels in axis_rows(batch_shape)
+        tuple(labels): "reliable" if bool(reliable[at]) else "not reliable"
+        for at, labels in axis_rows(batch_shape, reliable.shape[-1])
     }
     return [text_table([*head, "verdict"], [[*row, verdicts[tuple(row[:2])]] for row in rows])]
 
 
 def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
-    """Whether each axis (x, y) is reliable, with the reasons.
+    """Whether each axis (x, y, roll, zoom) is reliable, with the reasons.
 
     Example:
         >>> verdict_lines([True, False], [(), ("too short", "noisy")])
         ['x: reliable', 'y: not reliable:', ' - too short', ' - noisy']
     """
     lines = []
-    for name, good, why in zip("xy", reliable, reasons, strict=True):
+    for name, good, why in zip(AXIS_NAMES, reliable, reasons, strict=False):
         lines.append(f"{name}: reliable" if bool(good) else f"{name}: not reliable:")
         lines += [wrapped(f" - {reason}") for reason in why]
     return lines

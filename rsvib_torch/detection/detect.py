@@ -15,20 +15,23 @@ from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.option_types import BandSettings, DetectionMethod, Registration, ToneSettings
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.reliability import judge
+from rsvib_torch.detection.reliability import judge, rotation_found
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, stacked
 from rsvib_torch.detection.rows.direct import refine_directly
-from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals, stack_spectra
+from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
+from rsvib_torch.detection.rows.measured_rows import strip_rows, whole_rows
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
 from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
-from rsvib_torch.detection.start import band_curve, grey_frames, measurements_of_curve
+from rsvib_torch.detection.start import BandStart, band_start, field_start, grey_frames
+from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import (
     MotionModel,
     ToneFit,
     displacement_std,
     model_displacements,
     residual_of,
+    shrunk_motion,
     vibration_of_fit,
 )
 from rsvib_torch.detection.tones.further import with_further_tones
@@ -71,11 +74,13 @@ class _FitOptions:
         tones: Number of tones of each axis; None to select it by significance.
         model: Harmonics and order of the image motion.
         bands: Registration of the row bands.
+        scale: Components of the motion.
     """
 
     tones: int | None
     model: MotionModel
     bands: RegistrationOptions
+    scale: FieldScale
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,16 +102,16 @@ class _Found:
     other_motion: OtherMotion | None = None
 
 
-_Fit = Callable[[OffsetCurve, Tensor, Tensor | None, RowTiming, _FitOptions], _Found]
+_Fit = Callable[[BandStart, Tensor, Tensor | None, RowTiming, _FitOptions], _Found]
 
 
 @dataclass(frozen=True)
 class _Method:
-    """A method of detection: ``fit(curve, frames, valid, timing, options)`` -> result.
+    """A method of detection: ``fit(start, frames, valid, timing, options)`` -> result.
 
-    The arguments of ``fit`` are the offset curve (B, P, N) in px with NaN where a band could not be registered, the
-    grey frames (B, T, H, W) in row order, their valid pixels (bool of that shape, or None for all), the sensor in row
-    order, and the options. Stacks of a batch must not affect each other.
+    The arguments of ``fit`` are the offset curve (B, P, N) of row bands with its measurements, the grey frames
+    (B, T, H, W) in row order, their valid pixels (bool of that shape, or None for all), the sensor in row order, and the
+    options. Stacks of a batch must not affect each other.
 
     Attributes:
         fit: The function.
@@ -120,7 +125,7 @@ class _Method:
 
 
 def _fit_bands(
-    curve: OffsetCurve,
+    start: BandStart,
     frames: Tensor,
     valid: Tensor | None,
     timing: RowTiming,
@@ -128,28 +133,36 @@ def _fit_bands(
     accuracy: float = 0.0,
 ) -> _Found:
     """The paper's method: tones are fitted to the offsets of row bands."""
-    measurements = measurements_of_curve(curve, timing, options.bands.band_step)
+    measurements = start.measurements
     interval = options.bands.band_step * timing.row_time
-    blind = blind_frequencies(timing, 0.5 / interval).to(curve.offsets.device)
-    fit = find_tones(measurements, interval, options.tones, options.model, blind=blind, accuracy=accuracy)
+    blind = blind_frequencies(timing, 0.5 / interval).to(frames.device)
+    fit = find_tones(
+        measurements, interval, options.tones, options.model, start=start.fit, blind=blind, accuracy=accuracy
+    )
     weighted = measurements.reweighted(residual_of(measurements, fit))
-    return _Found(fit, weighted, curve, _band_offsets(curve, fit, timing, options))
+    return _Found(fit, weighted, start.curve, _band_offsets(start, fit))
 
 
-def _band_offsets(curve: OffsetCurve, fit: ToneFit, timing: RowTiming, options: _FitOptions) -> Tensor:
-    """Offsets (B, P, N, 2) in px of row bands that a fit predicts."""
-    predicted = model_displacements(measurements_of_curve(curve, timing, options.bands.band_step), fit)
-    offsets: Tensor = (predicted[:, :, 1] - predicted[:, :, 0]).unflatten(1, curve.quality.shape[1:])
+def _band_offsets(start: BandStart, fit: ToneFit) -> Tensor:
+    """Offsets (B, P, N, A) in px of row bands that a fit predicts."""
+    predicted = model_displacements(start.measurements, fit)
+    offsets: Tensor = (predicted[:, :, 1] - predicted[:, :, 0]).unflatten(1, start.curve.quality.shape[1:])
     return offsets
 
 
 def _fit_direct(
-    curve: OffsetCurve, frames: Tensor, valid: Tensor | None, timing: RowTiming, options: _FitOptions
+    start: BandStart, frames: Tensor, valid: Tensor | None, timing: RowTiming, options: _FitOptions
 ) -> _Found:
     """The fit to bands, refined on the images."""
     # px; the gradients of rows reach a few tenths of a pixel, so that a start with this error converges
-    start = _fit_bands(curve, frames, valid, timing, options, accuracy=0.15).fit
-    found, offsets, fitted = refine_directly(stack_spectra(frames, valid), timing, start, options.tones)
+    fit = _fit_bands(start, frames, valid, timing, options, accuracy=0.15).fit
+    intervals = compared_intervals(timing, frames.shape[1], MAX_GROUP_FRAMES, frames.device)
+    motion, scale = shrunk_motion(fit, intervals), options.scale
+    if scale.axes == 2:
+        rows = whole_rows(frames, valid, timing, motion)
+    else:
+        rows = strip_rows(frames, valid, timing, motion, scale)
+    found, offsets, fitted = refine_directly(rows, intervals, fit, options.tones)
     return _Found(found.fit, found.measurements, offsets, fitted, found.other_motion)
 
 
@@ -204,6 +217,8 @@ def detect_vibration(
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
     channels: Channels = None,
+    roll: bool | Literal["auto"] = False,
+    zoom: bool | Literal["auto"] = False,
 ) -> DetectionResult | MotionDetection | SweptTone:
     """Detect the vibration of the camera from consecutive frames (Sec. 2 of Liu et al. 2023).
 
@@ -239,6 +254,10 @@ def detect_vibration(
         full_scale: Count that means 1.0, for integer frames.
         channels: ``"last"`` for frames (T, H, W, C) or (B, T, H, W, C). By default channels come before the image axes,
             and frames that appear to have them last are refused; ``"first"`` omits this check.
+        roll: Measure the rotation about the optical axis as a third component of the motion, in rad: True, False, or
+            ``"auto"``: if the halves of the rows move apart. Results then have three axes instead of two, see
+            ``Vibration``.
+        zoom: The same for the change of scale, as a fourth component; includes roll.
 
     Returns:
         The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve: a
@@ -293,24 +312,28 @@ def detect_vibration(
     if columns is not None:
         check_whole_number("columns", columns, at_least=64)  # px; narrower bands are often registered wrongly
     bands = RegistrationOptions(registration, band_rows, band_step, search)
-    options = _FitOptions(
-        None if tones == "auto" else tones, MotionModel(harmonics, 2 if image_acceleration else 1), bands
-    )
+    for name, value in (("roll", roll), ("zoom", zoom)):
+        if value not in (True, False, "auto"):
+            raise ValueError(f"{name} must be True, False or 'auto', got {value!r}")
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
+    field = _Field(roll, zoom, stacks.images.shape[-1], stacks.images.shape[-2])
+    model_of_tones = MotionModel(harmonics, 2 if image_acceleration else 1)
+    options = _FitOptions(None if tones == "auto" else tones, model_of_tones, bands, field.scale(2))
     if columns is not None:
         stacks = stacks.narrowed(columns)
     grey, valid_pixels = stacks.images, stacks.valid
     if window is None:
-        found = _detect(grey, valid_pixels, timing, _METHODS[method], options)
+        found = _detect_field(grey, valid_pixels, timing, _METHODS[method], options, field)
     else:
         found = stacked(
             [
-                _detect(
+                _detect_field(
                     grey[:, part],
                     None if valid_pixels is None else valid_pixels[:, part],
                     window_timing,
                     _METHODS[method],
                     options,
+                    field,
                 )
                 for part, window_timing in _windows(grey.shape[1], window, window_step, timing)
             ]
@@ -336,13 +359,70 @@ def _windows(num_frames: int, window: int, step: int | None, timing: SensorTimin
     ]
 
 
-def _detect(
-    frames: Tensor, valid: Tensor | None, timing: SensorTiming, method: _Method, options: _FitOptions
+@dataclass(frozen=True)
+class _Field:
+    """Whether roll and zoom are measured (True, False or ``"auto"``), and the size of the frames."""
+
+    roll: bool | Literal["auto"]
+    zoom: bool | Literal["auto"]
+    width: int
+    height: int
+
+    def scale(self, axes: int) -> FieldScale:
+        """Lengths for a motion of so many components."""
+        return FieldScale(axes, self.width, self.height)
+
+    @property
+    def most_axes(self) -> int:
+        """Number of components, if roll and zoom are found."""
+        return 4 if self.zoom else 3 if self.roll else 2
+
+    @property
+    def least_axes(self) -> int:
+        """Number of components that were requested."""
+        return 4 if self.zoom is True else 3 if self.roll is True else 2
+
+
+def _detect_field(
+    frames: Tensor, valid: Tensor | None, timing: SensorTiming, method: _Method, options: _FitOptions, field: _Field
 ) -> DetectionResult:
-    """``detect_vibration`` of grey frames (B, T, H, W) in row order; the result is a batch in image axes."""
-    row_timing, bands = timing.in_row_order(), options.bands
-    curve = band_curve(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve)
-    found = method.fit(curve, frames, valid, row_timing, options)
+    """``_detect`` with as many components as were requested or, with ``"auto"``, as the frames require."""
+    found, fit, rotates = _detect(frames, valid, timing, method, options)
+    if field.most_axes == 2 or (field.least_axes == 2 and not rotates):
+        return found
+    other, _, _ = _detect(frames, valid, timing, method, replace(options, scale=field.scale(field.most_axes)), fit)
+    moving = (other.vibration.amplitude > 0).flatten(0, -3).any(0).any(-1).tolist()
+    axes = max([field.least_axes, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
+    return found if axes == 2 else other.with_axes(axes)
+
+
+def _detect(
+    frames: Tensor,
+    valid: Tensor | None,
+    timing: SensorTiming,
+    method: _Method,
+    options: _FitOptions,
+    translation: ToneFit | None = None,
+) -> tuple[DetectionResult, ToneFit, bool]:
+    """``detect_vibration`` of grey frames (B, T, H, W) in row order.
+
+    Args:
+        frames: The frames.
+        valid: Their valid pixels, or None for all.
+        timing: The sensor.
+        method: How tones are fitted.
+        options: Its options.
+        translation: Fit without roll and zoom, from which a fit with roll or zoom starts.
+
+    Returns:
+        A batch of results in image axes, their fit, and whether the halves of the rows of any stack move apart.
+    """
+    row_timing, bands, scale = timing.in_row_order(), options.bands, options.scale
+    if scale.axes == 2:
+        start = band_start(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve)
+    else:
+        start = field_start(frames, valid, row_timing, bands, scale, translation)
+    found = method.fit(start, frames, valid, row_timing, options)
     fit, other_motion, measured = found.fit, found.other_motion, found.offsets
     starts = row_timing.frame_starts(frames.shape[1], frames.device)[:, None]
     starts = (starts + torch.arange(frames.shape[-2], device=frames.device)[::8] * row_timing.row_time).flatten()
@@ -354,7 +434,7 @@ def _detect(
     moved = tones.mean_displacement(starts.expand(len(frames), -1), row_timing.exposure_time)
     residual = (measured.offsets - found.fitted).abs().nanmean(dim=(1, 2))
 
-    fitted = _band_offsets(curve, fit, row_timing, options)
+    curve, fitted = start.curve, _band_offsets(start, fit)
     # an image motion may carry bands out of the later frame
     later = curve.rows + fitted[..., 1]
     visible = (later >= 0.5 * bands.band_rows) & (later <= frames.shape[-2] - 1 - 0.5 * bands.band_rows)
@@ -372,28 +452,32 @@ def _detect(
             timing=row_timing,
             other_motion=None if other_motion is None else other_motion[index],
             max_tones=MAX_TONES if options.tones is None and options.model.harmonics == 1 else math.inf,
+            scale=scale,
         )
         for index in range(len(frames))
     ]
     reliable = torch.stack([verdict[0] for verdict in verdicts])
+    rotates = other_motion is not None and any(rotation_found(other_motion[index]) for index in range(len(frames)))
     swap = timing.scan_axis == -1
-    in_image = vibration.from_row_order(timing)
+    order = ([1, 0, 2, 3] if swap else [0, 1, 2, 3])[: scale.axes]
+    units = scale.units(residual)
+    in_image = scale.motion(vibration).from_row_order(timing)
     sensitivity = timing_sensitivity(fit, row_timing, frames.shape[1], frames.shape[-2])
-    sensitivity = sensitivity.flip(-2) if swap else sensitivity
-    return DetectionResult(
+    sensitivity = sensitivity.mapped(lambda values: values[..., order, :])
+    result = DetectionResult(
         vibration=in_image,
-        std=std.from_row_order(timing),
+        std=scale.std(std).from_row_order(timing),
         offsets=replace(
             measured,
-            offsets=offsets_from_row_order(measured.offsets, timing),
-            std=measured.std if measured.std is None or not swap else measured.std.flip(-1),
+            offsets=offsets_from_row_order(measured.offsets * units, timing),
+            std=None if measured.std is None else (measured.std * units)[..., order],
             heights=(measured.heights[1], measured.heights[0]) if swap else measured.heights,
         ),
-        fitted=offsets_from_row_order(found.fitted, timing),
+        fitted=offsets_from_row_order(found.fitted * units, timing),
         gain=in_image.gain(float(intervals[0])),
-        residual=residual.flip(-1) if swap else residual,
-        reliable=reliable.flip(-1) if swap else reliable,
-        reasons=tuple((reasons[1], reasons[0]) if swap else reasons for _, reasons in verdicts),
+        residual=(residual * units)[..., order],
+        reliable=reliable[..., order],
+        reasons=tuple(tuple(reasons[axis] for axis in order) for _, reasons in verdicts),
         sensitivity=sensitivity,
         assumptions=tuple(
             assumptions(in_image[index], sensitivity[index], row_timing, frames.shape[1])
@@ -401,6 +485,7 @@ def _detect(
         ),
         timing=timing,
     )
+    return result, fit, rotates
 
 
 class VibrationDetector(nn.Module):

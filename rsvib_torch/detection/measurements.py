@@ -11,12 +11,15 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-__all__ = ["Measurements", "trimmed_mean"]
+__all__ = ["Measurements", "cholesky_root", "trimmed_mean"]
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
     """Displacements of scene rows in the frames of a batch of stacks, in row order.
+
+    With roll and zoom, displacements have three or four components instead of two, those of ``motion.field`` times a
+    length in px (``detection.strips``).
 
     Every scene row n is measured in a group of G frames (two of them give an offset). The position of the scene itself
     is unknown, so only differences within a group are measured: the mean over the group is subtracted from the
@@ -31,6 +34,7 @@ class Measurements:
             factor; 0 where nothing was measured.
         exposure_time: T_e in seconds.
         average_times: Duration over which each displacement (x, y) is an average: rows of a band times the row time.
+            Roll and zoom have that of x.
         independent: Fraction of the measurements that are independent (bands may overlap).
     """
 
@@ -81,8 +85,10 @@ class Measurements:
 
     @cached_property
     def smearing_times(self) -> Tensor:
-        """(2, 1, 2, 1) seconds over which displacements (x, y) are averages: the exposure, the rows of a band."""
-        times = [(self.exposure_time, self.exposure_time), self.average_times]
+        """(2, 1, A, 1) seconds over which displacements are averages: the exposure, the rows of a band."""
+        axes = self.displacements.shape[-1]
+        along, across = self.average_times
+        times = [[self.exposure_time] * axes, [along, across, along, along][:axes]]
         return torch.tensor(times, dtype=self.exposure_starts.dtype, device=self.exposure_starts.device)[
             :, None, :, None
         ]
@@ -101,10 +107,11 @@ class Measurements:
     @property
     def inverse_variances(self) -> Tensor:
         """(B, N, 2) inverse variance ``1 / (W^-1)_aa`` of the displacement of each axis, W the information."""
-        first, both, second = (self.information[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-        conditional = torch.stack([first, second], -1)
-        explained = torch.where(conditional > 0, both[..., None].square() / conditional.clamp(min=1e-300), 0.0)
-        return (conditional - explained.flip(-1)).clamp(min=0.0)
+        axes, inverse = self.information.shape[-1], []
+        for axis in range(axes):  # the last pivot of a Cholesky factor belongs to an axis that is conditioned on none
+            order = [*(other for other in range(axes) if other != axis), axis]
+            inverse.append(cholesky_root(self.information[..., order, :][..., order])[..., -1, -1].square())
+        return torch.stack(inverse, -1)
 
     @property
     def num_differences(self) -> Tensor:
@@ -238,6 +245,18 @@ class Measurements:
         size = self.sizes(residual)
         spread = 1.4826 * size.nanmedian(dim=1, keepdim=True).values
         return (size / (6.0 * spread.nan_to_num(1.0).clamp(min=1e-9))).nan_to_num(1.0).clamp(max=1.0)
+
+
+def cholesky_root(information: Tensor) -> Tensor:
+    """Upper triangular R (..., A, A) with ``W = R^T R`` of information matrices W, rows of 0 where W is singular."""
+    axes = information.shape[-1]
+    root, rest = torch.zeros_like(information), information
+    for axis in range(axes):
+        pivot = rest[..., axis, axis].clamp(min=0.0).sqrt()[..., None]
+        row = torch.where(pivot > 0, rest[..., axis, :] / torch.where(pivot > 0, pivot, 1.0), 0.0)
+        root[..., axis, axis:] = row[..., axis:]
+        rest = rest - row[..., :, None] * row[..., None, :]
+    return root
 
 
 def trimmed_mean(values: Tensor, *, fraction: float = 0.7) -> Tensor:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.result import OtherMotion
+from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
 from rsvib_torch.detection.tones.selection import MIN_OFFSET, MIN_SIGNIFICANCE
 from rsvib_torch.motion.timing import RowTiming
@@ -28,7 +29,8 @@ def judge(
     other_motion: OtherMotion | None = None,
     max_tones: float = math.inf,
     min_bands: float = 0.5,
-) -> tuple[Tensor, tuple[tuple[str, ...], tuple[str, ...]]]:
+    scale: FieldScale,
+) -> tuple[Tensor, tuple[tuple[str, ...], ...]]:
     """Verdict on one vibration (not a batch), from the measurements that it was fitted to.
 
     These are the displacements of rows if ``other_motion`` is given, else the offsets of bands.
@@ -46,11 +48,12 @@ def judge(
         other_motion: Motion of the rows that the vibration does not explain; None if it was fitted to bands.
         max_tones: Largest number of tones that was tried on an axis; an axis with so many may have more.
         min_bands: Fraction of the visible bands or rows that must be registered.
+        scale: Components of the motion. Roll and zoom are in px, at ``scale.radius`` px from the centre.
 
     Returns:
-        (2,) bool and the reasons against each axis.
+        (A,) bool and the reasons against each of the A axes.
     """
-    reasons: tuple[list[str], list[str]] = ([], [])
+    reasons: list[list[str]] = [[] for _ in range(scale.axes)]
     good = torch.isfinite(offsets).all(-1) & visible
     # condition (24) concerns the tones only: the blur by a uniform motion is exact at any speed
     tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
@@ -78,7 +81,7 @@ def judge(
             values = (float(value[axis]) for value in (displacement, std.displacement, own_std))
             against.extend(_against_displacement(*values, num_tones=int(amplitude.count_nonzero())))
         if other_motion is not None:
-            against.extend(_against_rotation(other_motion, axis) + _against_other_motion(other_motion, axis))
+            against.extend(_against_rotation(other_motion, axis, scale) + _against_other_motion(other_motion, axis))
             continue
         if bool(good.any()):
             against.extend(_against_fit(offsets[good, axis], fitted[good, axis]))
@@ -88,7 +91,7 @@ def judge(
                 f"{max_within_row} px: the camera does not move as a whole, or row_time is wrong; check row_time"
             )
     reliable = torch.tensor([not against for against in reasons], device=vibration.device)
-    return reliable, (tuple(reasons[0]), tuple(reasons[1]))
+    return reliable, tuple(map(tuple, reasons))
 
 
 def _against_measurements(
@@ -206,19 +209,37 @@ def _against_other_motion(other: OtherMotion, axis: int) -> list[str]:
     return []
 
 
-def _against_rotation(other: OtherMotion, axis: int) -> list[str]:
+def _max_apart(other: OtherMotion, axis: int) -> float:
+    """Largest permitted difference in px of the displacements along a row, for the verdict on an axis."""
+    return max(0.035, 0.009 * float(other.size[axis]))
+
+
+def rotation_found(other: OtherMotion) -> bool:
+    """Whether the halves of the rows of one stack move apart, as roll and zoom cause it."""
+    return any(float(other.differential[1 - axis]) > _max_apart(other, axis) for axis in range(2))
+
+
+def _against_rotation(other: OtherMotion, axis: int, scale: FieldScale) -> list[str]:
     """Reasons from rotation and zoom, which move the halves of a row apart along the other axis.
 
     A roll by theta moves the halves of a row by ``theta W / 4`` along y in opposite directions, and rows by up to
     ``theta H / 2`` along x. A zoom does the same with the axes exchanged. Rows of both axes are concerned by parallax.
     """
-    apart = float(other.differential[1 - axis])
-    allowed = max(0.035, 0.009 * float(other.size[axis]))
+    if scale.axes > 2:
+        apart, allowed = float(other.differential.amax()), _max_apart(other, axis)
+        if apart <= allowed:
+            return []
+        return [
+            f"strips of columns move apart by {apart:.3g} px that roll and zoom do not explain, {allowed:.2g} px are "
+            "allowed: the scene has parallax, or the lens is distorted; select a part of the frame with one distance"
+        ]
+    apart, allowed = float(other.differential[1 - axis]), _max_apart(other, axis)
     if apart <= allowed:
         return []
     return [
         f"left and right halves of the rows move apart by {apart:.3g} px along {'yx'[axis]}, {allowed:.2g} px are "
-        "allowed: the camera rolls or zooms, or the scene has parallax; select a part of the frame with one distance"
+        "allowed: the camera rolls or zooms, or the scene has parallax; pass roll='auto', zoom='auto', or select a part "
+        "of the frame with one distance"
     ]
 
 

@@ -1,6 +1,6 @@
 """Result of detection: vibration, standard deviations, verdict, and the offset curve."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -89,10 +89,6 @@ class TimingSensitivity(Result):
         """The part of one stack out of a batch."""
         return TimingSensitivity(*(getattr(self, field.name)[index] for field in fields(self)))
 
-    def flip(self, axis: int) -> "TimingSensitivity":
-        """With the entries along an axis in the opposite order."""
-        return TimingSensitivity(*(getattr(self, field.name).flip(axis) for field in fields(self)))
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DetectionResult(
@@ -146,6 +142,40 @@ class DetectionResult(
         values["period"] = plain_values(self.vibration.period)
         curve = {name: values.pop(name) for name in ("offsets", "fitted")}  # long, therefore last
         return values | curve
+
+    def with_axes(self, count: int) -> "DetectionResult":
+        """The result with the first axes of (x, y, roll, zoom) only."""
+        batch = len(self.batch_shape)
+
+        def first(values: Tensor) -> Tensor:
+            return values[..., :count]
+
+        def of_tones(values: Any) -> Any:
+            kept = {name: value for name, value in vars(values).items() if isinstance(value, Tensor)}
+            return type(values)(
+                **{name: v[..., :count, :] if v.ndim == batch + 2 else v[..., :count] for name, v in kept.items()}
+            )
+
+        def of_reasons(reasons: tuple[Any, ...], depth: int) -> tuple[Any, ...]:
+            return reasons[:count] if depth == 0 else tuple(of_reasons(part, depth - 1) for part in reasons)
+
+        curve = replace(
+            self.offsets,
+            offsets=first(self.offsets.offsets),
+            std=None if self.offsets.std is None else first(self.offsets.std),
+        )
+        return replace(
+            self,
+            vibration=of_tones(self.vibration),
+            std=of_tones(self.std),
+            offsets=curve,
+            fitted=first(self.fitted),
+            gain=self.gain[..., :count, :],
+            residual=first(self.residual),
+            reliable=first(self.reliable),
+            reasons=of_reasons(self.reasons, batch),
+            sensitivity=of_tones(self.sensitivity),
+        )
 
     def __getitem__(self, index: int) -> "DetectionResult":
         """The result of one stack out of a batch."""

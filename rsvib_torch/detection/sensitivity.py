@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, motion_of_fit
@@ -42,14 +43,15 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
         return rows.T.expand(batch, -1, -1)  # (B, N, T)
 
     times = starts(timing)
-    eye = torch.eye(2, dtype=times.dtype, device=device).expand(*times.shape[:2], 2, 2)
-    displacements = times.new_zeros(*times.shape, 2)
+    axes = fit.coefficients.shape[1]
+    eye = torch.eye(axes, dtype=times.dtype, device=device).expand(*times.shape[:2], axes, axes)
+    displacements = times.new_zeros(*times.shape, axes)
     record = Measurements(times, displacements, torch.ones_like(times), eye, timing.exposure_time)
     # parameters of the fit at the middle of this record
     turn = 2 * math.pi * fit.frequencies * (record.centre - fit.centre)[:, None, None]
     fit = replace(fit, coefficients=fit.coefficients * torch.polar(torch.ones_like(turn), turn), centre=record.centre)
     motion, inverses = motion_of_fit(fit), []
-    for axis in range(2):
+    for axis in range(axes):
         jacobian, to_all = axis_jacobian(record, fit, axis)
         inverses.append(to_all @ torch.linalg.pinv(jacobian.flatten(1, 2)))
 
@@ -62,7 +64,7 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
     for name in ("row_time", "frame_rows", "exposure_rows"):
         lower, higher = (_scaled(timing, name, 1 + sign * _STEP) for sign in (-1, 1))
         change = (predicted(higher) - predicted(lower)) / (2 * _STEP)
-        moved = torch.stack([-inverses[axis] @ change[..., axis].flatten(1)[..., None] for axis in range(2)], 1)
+        moved = torch.stack([-inverses[axis] @ change[..., axis].flatten(1)[..., None] for axis in range(axes)], 1)
         tones = moved[:, :, : 3 * size.shape[-1], 0].unflatten(-1, (-1, 3))  # (B, 2, K, 3)
         along = fit.coefficients.conj() * torch.complex(tones[..., 0], tones[..., 1])
         amplitude = torch.where(fit.active, along.real / size.square(), 0.0)
@@ -112,7 +114,7 @@ def assumptions(
 def _effect(name: str, sensitivity: TimingSensitivity, value: float) -> str:
     """Sentence about the effect of an error of 1 % of a stated time, on the strongest tone of each axis."""
     of_axes = []
-    for axis, letter in enumerate("xy"):
+    for axis, letter in enumerate(AXIS_NAMES[: sensitivity.amplitude_by_row_time.shape[-2]]):
         amplitude, frequency = (
             float(getattr(sensitivity, f"{of}_by_{name}")[axis, 0]) for of in ("amplitude", "frequency")
         )

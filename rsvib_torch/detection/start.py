@@ -10,6 +10,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
+from rsvib_torch.detection.tones.fit import ToneFit, with_axes
 from rsvib_torch.frames.arrays import Channels
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import prepare_frames
@@ -18,7 +20,16 @@ from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
 from rsvib_torch.registration.register import check_frame_size, register_rows
 
-__all__ = ["GreyFrames", "band_curve", "constant_frame", "grey_frames", "measurements_of_curve"]
+__all__ = [
+    "BandStart",
+    "GreyFrames",
+    "band_curve",
+    "band_start",
+    "constant_frame",
+    "field_start",
+    "grey_frames",
+    "measurements_of_curve",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +159,71 @@ def band_curve(
         offsets=torch.where(missing[..., None], torch.nan, curve.offsets),
         quality=torch.where(missing, 0.0, curve.quality),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class BandStart:
+    """Offsets of row bands, with which every detection starts.
+
+    Attributes:
+        curve: (B, P, N) offsets; with roll and zoom in px (``FieldScale``).
+        measurements: The same as input of a fit.
+        fit: Tones that are known; None if there are none.
+    """
+
+    curve: OffsetCurve
+    measurements: Measurements
+    fit: ToneFit | None = None
+
+
+def band_start(
+    frames: Tensor, valid: Tensor | None, timing: RowTiming, options: RegistrationOptions, *, mere_start: bool
+) -> BandStart:
+    """``band_curve`` with its measurements."""
+    curve = band_curve(frames, valid, timing, options, mere_start=mere_start)
+    return BandStart(curve, measurements_of_curve(curve, timing, options.band_step))
+
+
+def field_start(
+    frames: Tensor,
+    valid: Tensor | None,
+    timing: RowTiming,
+    options: RegistrationOptions,
+    scale: FieldScale,
+    translation: ToneFit | None,
+) -> BandStart:
+    """Offsets of row bands for a motion with roll or zoom, from two to four parts of the columns.
+
+    Bands of parts of the width are often registered wrongly. The tones of x and y are therefore taken from a fit without
+    roll and zoom, which is disturbed by them much less.
+
+    Args:
+        frames: As in ``band_curve``.
+        valid: As in ``band_curve``.
+        timing: As in ``band_curve``.
+        options: As in ``band_curve``.
+        scale: Components of the motion.
+        translation: Fit without roll and zoom.
+    """
+    check_frame_size(frames.shape[-2], frames.shape[-1], options)
+    count = min(4, max(2, frames.shape[-1] // 128))
+    parts, columns = cut_into_strips(frames, count, 0)
+    valid_parts = None if valid is None else cut_into_strips(valid, count, 0)[0]
+    each = band_curve(parts, valid_parts, timing, options, mere_start=False)
+    rows = (each.rows - 0.5 * (scale.height - 1)).repeat(len(each.pairs))
+    factors = scale.factors(columns[:, None].expand(-1, len(rows)), rows.expand(count, -1))
+    of_parts = measurements_of_curve(each, timing, options.band_step)
+    measurements, _ = combined_strips(of_parts, factors.expand(len(frames), *factors.shape))
+    shape = each.quality.shape[1:]
+    good = (measurements.weights > 0).all(-1)
+    offsets = measurements.displacements[:, :, 1] - measurements.displacements[:, :, 0]
+    quality = each.quality.unflatten(0, (-1, count)).amin(1)
+    curve = replace(
+        each,
+        offsets=torch.where(good[..., None], offsets, torch.nan).unflatten(1, shape),
+        quality=torch.where(good.unflatten(1, shape), quality, 0.0),
+    )
+    return BandStart(curve, measurements, None if translation is None else with_axes(translation, scale.axes))
 
 
 def measurements_of_curve(curve: OffsetCurve, timing: RowTiming, band_step: int) -> Measurements:

@@ -82,9 +82,8 @@ def exposure_trajectory(
     if quadrature == "gauss" and num_nodes is None:
         num_nodes = gauss_node_count(vibration, timing.exposure_time)
     times, weights = exposure_nodes(timing, quadrature, num_nodes)
-    starts = starts.to(dtype=torch.float64, device=vibration.device)
     times, weights = times.to(vibration.device), weights.to(vibration.device)
-    return vibration.displacement(starts[..., None] + times), weights
+    return vibration.path(starts, times), weights
 
 
 def rows_showing(

@@ -21,7 +21,8 @@ class Motion(Result, ABC):
     Contract of a motion type. It is a frozen dataclass (``eq=False, repr=False``) whose fields are float64 tensors that
     begin with the batch dimensions, other motions of the same batch shape, and plain numbers that hold for the whole
     batch. It implements the abstract members below; everything else follows from them. The last axis of every result
-    counts the components of the displacement, today (x, y) in px, positive to the right and down. Methods that take
+    counts the components of the motion: x and y in px, positive to the right and down, then roll in rad and zoom
+    (relative) if there are three or four (see ``motion.field``). Methods that take
     times accept tensors of any shape S whose leading dimensions are the batch dimensions (or 1), in seconds since the
     exposure start of row 0 of frame 0, return float64 tensors (S, axes), and are differentiable with respect to tensors
     that require gradients. Bounds are not differentiable. A motion is an immutable value: methods that change it return
@@ -97,6 +98,18 @@ class Motion(Result, ABC):
         """Number of components of the displacement."""
         return self.largest_oscillation().shape[-1]
 
+    def path(self, starts: Tensor, delays: Tensor) -> Tensor:
+        """Displacement during exposures in px.
+
+        Args:
+            starts: Exposure starts in seconds, shape S as in ``displacement``.
+            delays: (N,) s, times from the start of an exposure.
+
+        Returns:
+            float64 tensor of shape (S, N, axes).
+        """
+        return self.displacement(starts.to(dtype=torch.float64, device=self.device)[..., None] + delays)
+
     def offset(self, starts: Tensor, later_starts: Tensor, exposure_time: float) -> Tensor:
         """Offset: mean displacement of the later exposure minus that of the earlier one, in px (Eq. 4).
 
@@ -132,7 +145,8 @@ class Motion(Result, ABC):
     def to_row_order(self, timing: SensorTiming) -> Self:
         """The motion, given in image axes, as it appears in frames in row order.
 
-        Transposing frames exchanges x and y; flipping them along the rows changes the sign of y.
+        Transposing frames exchanges x and y; flipping them along the rows changes the sign of y. Both are reflections
+        and change the sign of roll.
         """
         order, signs = self._row_axes(timing)
         return self.with_axes(order, signs)
@@ -144,10 +158,15 @@ class Motion(Result, ABC):
 
     def _row_axes(self, timing: SensorTiming) -> tuple[list[int], list[float]]:
         order, signs = list(range(self.num_axes)), [1.0] * self.num_axes
+        reflections = 0
         if timing.scan_axis == -1:
             order[:2] = [1, 0]
+            reflections += 1
         if timing.readout_direction == "reverse":
             signs[1] = -1.0
+            reflections += 1
+        if self.num_axes > 2:  # a reflection changes the direction of rotation
+            signs[2] = (-1.0) ** reflections
         return order, signs
 
     def detached(self) -> Self:

@@ -28,7 +28,8 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
     ``period``, ``phase``, ``image_motion`` and ``image_acceleration`` are those of ``tones``.
 
     Args:
-        coefficients: c in px, (2, N) or (..., 2, N), N >= 4, axes (x, y).
+        coefficients: c in px, (2, N) or (..., 2, N), N >= 4, axes (x, y); 3 or 4 instead of 2 for (x, y, roll) and
+            (x, y, roll, zoom), roll in rad and zoom relative.
         start: Time of the first knot in seconds; the last is at ``start + (N - 3) spacing``.
         spacing: Time between knots in seconds.
         tones: Tones and image motion of the same batch shape; by default none.
@@ -51,14 +52,19 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
 
     def __init__(self, coefficients: TensorLike, start: float, spacing: float, tones: Vibration | None = None) -> None:
         values = torch.as_tensor(coefficients, dtype=torch.float64)
-        if values.ndim < 2 or values.shape[-2] != 2 or values.shape[-1] < 4:
-            raise ValueError(f"coefficients must have shape (..., 2, N) with N >= 4, got {tuple(values.shape)}")
+        if values.ndim < 2 or not 2 <= values.shape[-2] <= 4 or values.shape[-1] < 4:
+            raise ValueError(
+                "coefficients must have shape (..., 2, N) with N >= 4 (3 for x, y, roll; 4 for x, y, roll, zoom), got "
+                f"{tuple(values.shape)}"
+            )
         if not bool(torch.isfinite(values).all()):
             raise ValueError("coefficients must be finite")
-        tones = Vibration.still(values.shape[:-2], values.device) if tones is None else tones.to(values.device)
-        if tones.batch_shape != values.shape[:-2]:
+        axes = values.shape[-2]
+        tones = Vibration.still(values.shape[:-2], values.device, axes=axes) if tones is None else tones.to(values.device)
+        if tones.batch_shape != values.shape[:-2] or tones.num_axes != axes:
             raise ValueError(
-                f"tones of batch shape {tuple(tones.batch_shape)} do not fit coefficients {tuple(values.shape)}"
+                f"tones of batch shape {tuple(tones.batch_shape)} and {tones.num_axes} axes do not fit coefficients "
+                f"{tuple(values.shape)}"
             )
         object.__setattr__(self, "coefficients", values)
         object.__setattr__(self, "start", check_number("start", start))
@@ -67,7 +73,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
 
     @classmethod
     def through(cls, times: TensorLike, displacement: TensorLike, tones: Vibration | None = None) -> "FreeMotion":
-        """The motion that passes through displacements (N, 2) in px at evenly spaced times (N,) in seconds.
+        """The motion that passes through displacements (N, A) in px at evenly spaced times (N,) in seconds.
 
         Raises:
             ValueError: If times are not evenly spaced and increasing, or shapes do not fit.
@@ -94,11 +100,11 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         spacing: float | None = None,
         tones: Vibration | None = None,
     ) -> "FreeMotion":
-        """The motion through displacements (N, 2) at increasing times, interpolated in between by cubic splines.
+        """The motion through displacements (N, A) at increasing times, interpolated in between by cubic splines.
 
         Args:
             times: Seconds, strictly increasing.
-            displacement: px.
+            displacement: px; roll, the third of A = 3 columns, in rad, and zoom, the fourth, relative.
             spacing: Time between knots; by default half the median step.
             tones: Tones that are added.
         """
@@ -134,9 +140,11 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         moved = self.displacement(times.expand(*self.batch_shape, -1)).detach()
         low, high = moved.amin(-2), moved.amax(-2)
         rows = [
-            [*labels, measured_text(low[at]), measured_text(high[at])] for at, labels in axis_rows(self.batch_shape)
+            [*labels, measured_text(low[at]), measured_text(high[at])]
+            for at, labels in axis_rows(self.batch_shape, self.num_axes)
         ]
-        head = [*axis_head(self.batch_shape), "smallest displacement (px)", "largest (px)"]
+        unit = ("px", "px; roll: rad", "px; roll: rad; zoom: 1")[self.num_axes - 2]
+        head = [*axis_head(self.batch_shape), f"smallest displacement ({unit})", "largest"]
         first = f"{self.start:.6g} … {self.end:.6g} s, {count} knots {1e3 * self.spacing:.4g} ms apart"
         tones = [self.tones.summary()] if bool(self.tones.moving_axes().any()) else []
         return "\n".join([first, text_table(head, rows), *tones])
@@ -229,7 +237,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         if not batch:
             return self.coefficients.movedim(-2, -1)[index].movedim(-1, -2), place - cell
         index = index.expand(*batch, *index.shape[len(batch) :])
-        flat = index.reshape(*batch, 1, -1).expand(*batch, 2, -1)
+        flat = index.reshape(*batch, 1, -1).expand(*batch, self.coefficients.shape[-2], -1)
         picked = self.coefficients.gather(-1, flat).unflatten(-1, index.shape[len(batch) :])
         return picked.movedim(len(batch), -2), (place - cell).expand(index.shape[:-1])
 
@@ -288,10 +296,11 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
 
 
 def _check_samples(times: Tensor, displacement: Tensor) -> None:
-    """Raise a ValueError unless times are (N,), displacements (N, 2), N >= 4, and all values finite."""
-    if times.ndim != 1 or len(times) < 4 or displacement.shape != (len(times), 2):
+    """Raise a ValueError unless times are (N,), displacements (N, 2 to 4), N >= 4, and all values finite."""
+    fits = displacement.ndim == 2 and len(displacement) == len(times) and 2 <= displacement.shape[1] <= 4
+    if times.ndim != 1 or len(times) < 4 or not fits:
         raise ValueError(
-            "times must be (N,) and displacement (N, 2) with N >= 4, got "
+            "times must be (N,) and displacement (N, 2) with N >= 4 (3 columns with roll, 4 with zoom), got "
             f"{tuple(times.shape)}, {tuple(displacement.shape)}"
         )
     if not bool(torch.isfinite(times).all() and torch.isfinite(displacement).all()):

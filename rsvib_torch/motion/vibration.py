@@ -7,6 +7,7 @@ from typing import Self
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows
 from rsvib_torch.core.text import measured_text, text_table
@@ -16,12 +17,12 @@ from rsvib_torch.motion.timing import SensorTiming
 __all__ = ["Vibration", "VibrationStd", "blind_frequencies", "image_motion_line", "tone_head", "tone_rows"]
 
 _UNITS = {
-    "amplitude": "px",
+    "amplitude": "px; of roll rad, of zoom 1",
     "frequency": "Hz",
     "period": "s",
     "phase": "rad at the first row of frame 0",
-    "image_motion": "px/s",
-    "image_acceleration": "px/s^2",
+    "image_motion": "px/s; of roll rad/s, of zoom 1/s",
+    "image_acceleration": "px/s^2; of roll rad/s^2, of zoom 1/s^2",
 }
 _COLUMNS = {"amplitude": ("px", 1.0), "frequency": ("Hz", 1.0), "period": ("ms", 1e3), "phase": ("rad", 1.0)}
 _QUANTITIES = ("amplitude", "frequency", "phase")
@@ -29,27 +30,34 @@ _QUANTITIES = ("amplitude", "frequency", "phase")
 TensorLike = Tensor | float | Sequence[float] | Sequence[Sequence[float]]
 
 
-def _per_tone(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
-    """Convert a float, (2,), (2, K) or (..., 2, K) value to a (..., 2, K) float64 tensor."""
-    tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
-    if tensor.ndim == 0:
-        tensor = tensor.expand(2)
-    if tensor.ndim == 1:
-        tensor = tensor[:, None]
-    if tensor.shape[-2] != 2:
-        raise ValueError(
-            f"{name} must have shape (2,), (2, K) or (..., 2, K) for axes (x, y), got {tuple(tensor.shape)}"
-        )
-    return tensor
+def _per_tone(values: dict[str, TensorLike], device: torch.device | None) -> list[Tensor]:
+    """Convert floats, (A,), (A, K) or (..., A, K) values to (..., A, K) float64 tensors with the same number A."""
+    tensors, axes = {}, 0
+    for name, value in values.items():
+        tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
+        tensors[name] = tensor if tensor.ndim == 0 else tensor[:, None] if tensor.ndim == 1 else tensor
+        if tensor.ndim == 0:
+            continue
+        count = tensors[name].shape[-2]
+        if not 2 <= count <= 4 or axes not in (0, count):
+            others = "" if axes in (0, count) else f"; the other values have {axes} axes"
+            raise ValueError(
+                f"{name} must have shape (2,), (2, K) or (..., 2, K) for axes (x, y), with 3 for (x, y, roll) and 4 for "
+                f"(x, y, roll, zoom), got {tuple(tensor.shape)}{others}"
+            )
+        axes = count
+    return [tensor.expand(axes or 2, 1) if tensor.ndim == 0 else tensor for tensor in tensors.values()]
 
 
-def _per_axis(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
-    """Convert a float, (2,) or (..., 2) value to a (..., 2) float64 tensor."""
+def _per_axis(name: str, value: TensorLike, axes: int, device: torch.device | None) -> Tensor:
+    """Convert a float, (2,) or (..., 2) value, or one with all axes, to a (..., A) float64 tensor."""
     tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
     tensor = tensor.expand(2) if tensor.ndim == 0 else tensor
-    if tensor.shape[-1] != 2:
-        raise ValueError(f"{name} must have shape (..., 2) for axes (x, y), got {tuple(tensor.shape)}")
-    return tensor
+    if tensor.shape[-1] not in (2, axes):
+        raise ValueError(
+            f"{name} must have shape (..., 2) for axes (x, y), or (..., {axes}) for all axes, got {tuple(tensor.shape)}"
+        )
+    return functional.pad(tensor, (0, axes - tensor.shape[-1]))
 
 
 def _with_trailing(value: float | Tensor, dimensions: int) -> float | Tensor:
@@ -81,11 +89,17 @@ class Vibration(Motion, units=_UNITS):
     ordered (x, y). Tones are sorted by amplitude, largest first; an axis with fewer tones than the other has
     amplitude 0 for the remaining ones.
 
+    With three or four axes, the camera also rolls about the optical axis by theta(t) in rad, and its scale changes by
+    zeta(t): content at (x, y) px from the centre of the frame is displaced by
+    ``(X - theta y + zeta x, Y + theta x + zeta y)``.
+
     Args:
-        amplitude: A >= 0 in px: a float, ``(2,)`` (one tone per axis), ``(2, K)`` or ``(..., 2, K)`` for a batch.
+        amplitude: A >= 0: a float, ``(2,)`` (one tone per axis, px), ``(2, K)`` or ``(..., 2, K)`` for a batch; 3
+            instead of 2 for the axes (x, y, roll), roll in rad, and 4 for (x, y, roll, zoom), zoom relative.
         frequency: f >= 0 in Hz, same shape.
         phase: phi in rad at the time origin (exposure start of the first row of frame 0), same shape.
-        image_motion: v in px/s at the time origin, ``(2,)`` or ``(..., 2)``.
+        image_motion: v in px/s at the time origin, ``(2,)`` or ``(..., 2)``; with roll and zoom also one value for
+            each axis, in rad/s and 1/s.
         image_acceleration: a in px/s^2, same shape.
 
     Raises:
@@ -119,12 +133,10 @@ class Vibration(Motion, units=_UNITS):
     ) -> None:
         given = (amplitude, frequency, phase, image_motion, image_acceleration)
         device = next((value.device for value in given if isinstance(value, Tensor)), None)
-        tones = [
-            _per_tone(name, value, device)
-            for name, value in (("amplitude", amplitude), ("frequency", frequency), ("phase", phase))
-        ]
-        motion = _per_axis("image_motion", image_motion, device)
-        acceleration = _per_axis("image_acceleration", image_acceleration, device)
+        tones = _per_tone({"amplitude": amplitude, "frequency": frequency, "phase": phase}, device)
+        axes = tones[0].shape[-2]
+        motion = _per_axis("image_motion", image_motion, axes, device)
+        acceleration = _per_axis("image_acceleration", image_acceleration, axes, device)
         try:
             tones = list(torch.broadcast_tensors(*tones))
             batch = torch.broadcast_shapes(tones[0].shape[:-2], motion.shape[:-1], acceleration.shape[:-1])
@@ -136,19 +148,21 @@ class Vibration(Motion, units=_UNITS):
         order = tones[0].detach().argsort(dim=-1, descending=True, stable=True)
         for name, tensor in zip(("amplitude", "frequency", "phase"), tones, strict=True):
             object.__setattr__(self, name, tensor.take_along_dim(order, dim=-1))
-        object.__setattr__(self, "image_motion", motion.expand(*batch, 2))
-        object.__setattr__(self, "image_acceleration", acceleration.expand(*batch, 2))
+        object.__setattr__(self, "image_motion", motion.expand(*batch, axes))
+        object.__setattr__(self, "image_acceleration", acceleration.expand(*batch, axes))
 
     @classmethod
-    def still(cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None) -> Self:
+    def still(
+        cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None, *, axes: int = 2
+    ) -> Self:
         """No vibration and no image motion: the camera stands still."""
-        zeros = torch.zeros(*batch_shape, 2, 1, dtype=torch.float64, device=device)
+        zeros = torch.zeros(*batch_shape, axes, 1, dtype=torch.float64, device=device)
         return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0])
 
     def summary(self) -> str:
         """The tones of each axis as a table; of a batch, the strongest tone of each axis."""
         rows = [cells for _, cells in tone_rows(self)]
-        table = text_table([*axis_head(self.batch_shape), *tone_head()], rows)
+        table = text_table([*axis_head(self.batch_shape), *tone_head(axes=self.num_axes)], rows)
         return "\n".join([table, *image_motion_line(self)])
 
     @property
@@ -178,8 +192,8 @@ class Vibration(Motion, units=_UNITS):
         return 2 * math.pi * frequency * times[..., None, None] + phase, amplitude, frequency
 
     def _image_motion(self, times: Tensor) -> tuple[Tensor, Tensor]:
-        """Velocity and acceleration (S, 2) of the image motion at the time origin, to broadcast with times (S, 1)."""
-        shape = (*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), 2)
+        """Velocity and acceleration (S, A) of the image motion at the time origin, to broadcast with times (S, 1)."""
+        shape = (*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), self.amplitude.shape[-2])
         return self.image_motion.reshape(shape), self.image_acceleration.reshape(shape)
 
     def drift(self, times: Tensor) -> Tensor:
@@ -251,8 +265,12 @@ class Vibration(Motion, units=_UNITS):
         return (self.amplitude.detach() * path).sum(-1) + self.image_motion.detach().abs() * duration
 
     def periods_within(self, duration: float) -> Tensor:
-        """Periods of the fastest tone in ``duration`` seconds, (..., 2); tones below 1e-4 px do not count."""
-        visible = self.amplitude.detach() > 1e-4
+        """Periods of the fastest tone in ``duration`` seconds, (..., 2); tones below 1e-4 px do not count.
+
+        Roll and zoom count from 1e-7 on, which is 1e-4 px at 1000 px from the centre.
+        """
+        smallest = self.amplitude.new_tensor([1e-4, 1e-4, 1e-7, 1e-7][: self.amplitude.shape[-2]])
+        visible = self.amplitude.detach() > smallest[:, None]
         return torch.where(visible, self.frequency.detach() * duration, 0.0).amax(-1)
 
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
@@ -303,7 +321,8 @@ class VibrationStd(Result, units=_UNITS | {"displacement": "px"}):
             [*labels, *(measured_text(getattr(self, name)[at], digits=2) for name in _QUANTITIES)]
             for at, labels in _tones(self)
         ]
-        return "standard deviations\n" + text_table([*axis_head(self.batch_shape), *tone_head()], rows)
+        head = [*axis_head(self.batch_shape), *tone_head(axes=self.amplitude.shape[-2])]
+        return "standard deviations\n" + text_table(head, rows)
 
     def __getitem__(self, index: int) -> "VibrationStd":
         """The standard deviations of one stack of a batch."""
@@ -314,10 +333,11 @@ class VibrationStd(Result, units=_UNITS | {"displacement": "px"}):
         """The standard deviations, given in row order, in image axes: as ``Motion.from_row_order`` without signs."""
         if timing.scan_axis == -2:
             return self
+        order = [1, 0, 2, 3][: self.amplitude.shape[-2]]
         tones = (self.amplitude, self.frequency, self.period, self.phase)
-        amplitude, frequency, period, phase = (values.flip(-2) for values in tones)
-        motion, acceleration = self.image_motion.flip(-1), self.image_acceleration.flip(-1)
-        displacement = None if self.displacement is None else self.displacement.flip(-1)
+        amplitude, frequency, period, phase = (values[..., order, :] for values in tones)
+        motion, acceleration = self.image_motion[..., order], self.image_acceleration[..., order]
+        displacement = None if self.displacement is None else self.displacement[..., order]
         return VibrationStd(amplitude, frequency, period, phase, motion, acceleration, displacement)
 
 
@@ -330,13 +350,16 @@ def _tones(values: Vibration | VibrationStd) -> list[tuple[tuple[int, ...], list
     An axis without a tone has one row.
     """
     count = 1 if values.batch_shape else values.amplitude.shape[-1]
-    rows = [((*at, tone), labels) for at, labels in axis_rows(values.batch_shape) for tone in range(count)]
+    axes = values.amplitude.shape[-2]
+    rows = [((*at, tone), labels) for at, labels in axis_rows(values.batch_shape, axes) for tone in range(count)]
     return [(at, labels) for at, labels in rows if at[-1] == 0 or float(values.amplitude[at]) > 0]
 
 
-def tone_head(quantities: Sequence[str] = _QUANTITIES) -> list[str]:
-    """Heads of the columns of ``tone_rows`` behind the axis."""
-    return [f"{name} ({_COLUMNS[name][0]})" for name in quantities]
+def tone_head(quantities: Sequence[str] = _QUANTITIES, axes: int = 2) -> list[str]:
+    """Heads of the columns of ``tone_rows`` behind the axis, for motions with this number of axes."""
+    units = {name: unit for name, (unit, _) in _COLUMNS.items()}
+    units["amplitude"] = ("px", "px; roll: rad", "px; roll: rad; zoom: 1")[axes - 2]
+    return [f"{name} ({units[name]})" for name in quantities]
 
 
 def tone_rows(
@@ -367,8 +390,8 @@ def image_motion_line(vibration: Vibration, std: VibrationStd | None = None) -> 
     """A line with the image motion of one vibration, if it exceeds 1 px/s and four standard deviations."""
     if vibration.batch_shape:
         return []
-    speeds = vibration.image_motion.tolist()
-    stds = [0.0, 0.0] if std is None else std.image_motion.tolist()
+    speeds = vibration.image_motion[:2].tolist()
+    stds = [0.0, 0.0] if std is None else std.image_motion[:2].tolist()
     if not any(math.isfinite(e) and abs(v) > max(4 * e, 1.0 if e else 0.0) for v, e in zip(speeds, stds, strict=True)):
         return []
     texts = [measured_text(v, e or None) for v, e in zip(speeds, stds, strict=True)]

@@ -41,7 +41,8 @@ class OffsetCurve(Result, units={"times": "s", "later_times": "s", "offsets": "p
         times: (..., P, N) float64, exposure start of the centre row in the earlier frame, s.
         later_times: (..., P, N) float64, exposure start in the later frame, s: of the same row, or, in the direct
             method, of the row with the same part of the scene.
-        offsets: (..., P, N, 2) float64 px, axes (x, y); NaN where nothing was measured.
+        offsets: (..., P, N, 2) float64 px, axes (x, y); NaN where nothing was measured. A detection with roll or zoom
+            has three or four components, roll in rad and zoom relative.
         quality: (..., P, N) float64 in 0 ... 1, 0 where nothing was measured: correlation of the matched bands, or, in
             the direct method, weight in the fit (0 for outliers).
         heights: Rows averaged for the offset along x and y, (x, y).

@@ -3,7 +3,8 @@
 Every round of ``_refine`` has four steps:
 
 1. warp the frames to the scene by the current motion,
-2. measure the residual displacement and the information matrix of every scene row (``rows.displacements``),
+2. measure the residual displacement and the information matrix of every scene row (``rows.displacements``), with roll
+   and zoom in strips of columns (``rows.measured_rows``),
 3. fit tones and image motion to the measurements by weighted least squares (``tones``),
 4. stop if the next round would change the motion by much less than its standard deviation.
 
@@ -23,18 +24,8 @@ from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import OtherMotion
-from rsvib_torch.detection.rows.displacements import (
-    BLOCK_ROWS,
-    MAX_GROUP_FRAMES,
-    FrameGroup,
-    blur_ratio,
-    compared_intervals,
-    differential_motion,
-    differently_blurred,
-    frame_groups,
-    measure_groups,
-    remove_column_pattern,
-)
+from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
+from rsvib_torch.detection.rows.measured_rows import MeasuredRows, RowRecord
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
     fit_tones,
@@ -42,20 +33,18 @@ from rsvib_torch.detection.tones.fit import (
     residual_of,
     select_stacks,
     shrunk_motion,
+    strongest_only,
 )
 from rsvib_torch.detection.tones.selection import (
     find_tones,
     robust_fit,
     significant_only,
-    strongest_only,
     typical_size,
 )
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import blind_frequencies
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.registration.gradients import RowGradients
-from rsvib_torch.registration.row_spectra import RowSpectra
 
 __all__ = ["DirectFit", "refine_directly"]
 
@@ -78,7 +67,7 @@ class DirectFit:
 
 
 def refine_directly(
-    spectra: RowSpectra, timing: RowTiming, start: ToneFit, tones: int | None, max_rounds: int = 12
+    rows: MeasuredRows, intervals: Tensor, start: ToneFit, tones: int | None, max_rounds: int = 12
 ) -> tuple[DirectFit, OffsetCurve, Tensor]:
     """Refine a detected motion on the images.
 
@@ -87,8 +76,8 @@ def refine_directly(
     the mirrored frequency is computed as well, and the better one is returned.
 
     Args:
-        spectra: Spectra of all frames, from ``stack_spectra``. A column pattern of the sensor is subtracted in place.
-        timing: The sensor, in row order.
+        rows: The frames. A column pattern of the sensor is subtracted in place.
+        intervals: (M,) s, times between the frames that are compared.
         start: Fit to the offsets of row bands.
         tones: Number of tones of each axis; None to select it by significance.
         max_rounds: Largest number of rounds of measuring and fitting.
@@ -97,11 +86,9 @@ def refine_directly(
         The last measurements and the fit to them, the measurements as offsets between consecutive frames, and the
         offsets (B, P, N, 2) in px that the fit predicts.
     """
-    intervals = compared_intervals(timing, spectra.values.shape[1], MAX_GROUP_FRAMES, start.active.device)
     motion = shrunk_motion(start, intervals)
-    groups = frame_groups(spectra, timing, motion, pairs_if_blurred_differently=True)
-    found = _refine(groups, timing, intervals, start, tones, max_rounds)
-    if any(bool(differently_blurred(group.starts, spectra.height, timing, motion).any()) for group in groups):
+    found = _refine(rows, intervals, start, tones, max_rounds)
+    if rows.differently_blurred(motion):
         tried = torch.zeros_like(start.active[..., 0])
         for _ in range(2):  # one axis after the other
             frequencies, mirrored = _mirrored_frequencies(found, start, tried)
@@ -109,12 +96,12 @@ def refine_directly(
                 break
             tried = tried | mirrored
             other, _ = robust_fit(found.measurements, frequencies, strongest_only(found.fit).active, start.model)
-            found = _better_of_each(found, _refine(groups, timing, intervals, other, tones, max_rounds))
+            found = _better_of_each(found, _refine(rows, intervals, other, tones, max_rounds))
     if tones is None:
         found = replace(found, fit=significant_only(found.measurements, found.fit, intervals))
-    blur = torch.stack(blur_ratio(groups, timing, shrunk_motion(found.fit, intervals)), -1)
+    blur = rows.blur_ratio(shrunk_motion(found.fit, intervals))
     found = replace(found, other_motion=replace(found.other_motion, blur=blur))
-    return found, *_offset_curve(found, [group.starts.shape[1] for group in groups])
+    return found, *_offset_curve(found, [group.starts.shape[1] for group in rows.groups])
 
 
 def _offset_curve(found: DirectFit, group_frames: Sequence[int]) -> tuple[OffsetCurve, Tensor]:
@@ -162,15 +149,14 @@ def _offset_curve(found: DirectFit, group_frames: Sequence[int]) -> tuple[Offset
 
 
 def _refine(
-    groups: list[FrameGroup],
-    timing: RowTiming,
+    rows: MeasuredRows,
     intervals: Tensor,
     start: ToneFit,
     tones: int | None,
     max_rounds: int,
 ) -> DirectFit:
     """Measure around the motion, fit, repeat."""
-    fit, model = start, start.model
+    timing, fit, model = rows.timing, start, start.model
     motion = shrunk_motion(fit, intervals)
     gradients: list[RowGradients] | None = None  # None: compute them from the warped frames
     steps: list[_Step] = []
@@ -179,7 +165,8 @@ def _refine(
     interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)  # exposures average out faster tones
     blind = blind_frequencies(timing, 0.5 / interval).to(motion.device)
     for number in range(max_rounds):
-        measurements, measured_gradients = measure_groups(groups, timing, motion, gradients)
+        record = rows.measure(motion, gradients)
+        measurements = record.measurements
         residual = residual_of(measurements, fit)
         previous = fit
         if number == search_round:
@@ -188,7 +175,7 @@ def _refine(
             fit = find_tones(independent, interval, tones, model, 0.02, strongest_only(fit), blind)
         else:
             fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual)
-        warped_by, motion, gradients = motion, shrunk_motion(fit, intervals), measured_gradients
+        warped_by, motion, gradients = motion, shrunk_motion(fit, intervals), record.gradients
         if number == max_rounds - 1:
             break
 
@@ -196,7 +183,7 @@ def _refine(
         same_tones = torch.equal(previous.active, fit.active)
         ratio = step.ratio_to(steps[-1]) if steps and same_tones else None
         if number >= search_round and _converged(previous, fit, ratio):
-            if pattern_rounds == 0 or not remove_column_pattern(groups, timing, motion, gradients):
+            if pattern_rounds == 0 or not rows.remove_column_pattern(motion, gradients):
                 break
             pattern_rounds, search_round = pattern_rounds - 1, number + 1
             gradients, steps = None, []
@@ -210,7 +197,7 @@ def _refine(
             step = _Step.between(measurements, warped_by, motion)
         if float(step.change.abs().amax()) > 0.05:  # px; over smaller distances the gradients of the scene are the same
             gradients = None
-    return _conclude(measurements, fit, measured_gradients)
+    return _conclude(record, fit)
 
 
 # Convergence
@@ -261,7 +248,8 @@ def _converged(previous: ToneFit, fit: ToneFit, ratio: Tensor | None) -> bool:
     """
     if previous.active.shape != fit.active.shape:
         return False
-    deviation = fit.covariance.diagonal(dim1=-2, dim2=-1).unflatten(-1, (2, -1)).clamp(min=0.0).sqrt()
+    deviation = fit.covariance.diagonal(dim1=-2, dim2=-1)
+    deviation = deviation.unflatten(-1, (fit.coefficients.shape[1], -1)).clamp(min=0.0).sqrt()
     std = deviation[..., : 3 * fit.frequencies.shape[-1]].unflatten(-1, (-1, 3))  # of Re C, Im C and f
     turn = 2 * math.pi * previous.frequencies * (fit.centre - previous.centre)[:, None, None]
     change = (previous.coefficients * torch.polar(torch.ones_like(turn), turn) - fit.coefficients).abs()
@@ -350,8 +338,9 @@ def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:
     )
 
 
-def _conclude(measurements: Measurements, fit: ToneFit, gradients: list[RowGradients]) -> DirectFit:
+def _conclude(record: RowRecord, fit: ToneFit) -> DirectFit:
     """The last fit, to the measurements themselves, with a covariance that accounts for correlated residuals."""
+    measurements = record.measurements
     residual = residual_of(measurements, fit)
     weighted = measurements.reweighted(residual)
     share = weighted.independent_fraction(residual) * measurements.share_counted(residual)
@@ -364,7 +353,7 @@ def _conclude(measurements: Measurements, fit: ToneFit, gradients: list[RowGradi
         size=math.sqrt(2) * measurements.distances(tones).square().nanmean(1).sqrt(),
         unexplained=measurements.unexplained(residual),
         correlated=measurements.correlated(residual),
-        differential=differential_motion(gradients),
+        differential=record.differential(),
         measured=measured,
         blur=measured.new_tensor([1.0, 0.0, 0.0]).expand(len(measured), 3),  # replaced once the motion is final
     )

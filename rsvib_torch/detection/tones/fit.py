@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.measurements import Measurements, cholesky_root
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
 if TYPE_CHECKING:
@@ -36,8 +37,10 @@ __all__ = [
     "residual_of",
     "select_stacks",
     "shrunk_motion",
+    "strongest_only",
     "tone_response",
     "vibration_of_fit",
+    "with_axes",
 ]
 
 MIN_GAIN = 0.1  # px of offset per px of displacement; below it, amplitudes are ten times noisier than offsets
@@ -72,6 +75,7 @@ class ToneFit:
         active: (B, 2, K) bool, tones that exist.
         drift: (B, 2, J) float64 d in px/s^j.
         covariance: (B, 2 P, 2 P) float64 of the P = 3 K + J parameters [Re C, Im C, f of each tone, d] of x, then of y.
+            With roll and zoom there are A = 3 or 4 axes instead of 2, in the units of the measurements.
         centre: (B,) float64 s, the middle of the record, where phase and frequency are least correlated.
         model: Structure of the motion.
     """
@@ -222,22 +226,16 @@ class _Problem:
 
     def __init__(self, measurements: Measurements, active: Tensor, model: MotionModel) -> None:
         self.measurements, self.active, self.model = measurements, active, model
-        self.tones, order = active.shape[-1], model.drift_order
-        self.to_all = torch.block_diag(*[_constraints(model, self.tones, active.device)] * 2)  # (2 P, M)
+        (self.axes, self.tones), order = active.shape[1:], model.drift_order
+        self.to_all = torch.block_diag(*[_constraints(model, self.tones, active.device)] * self.axes)  # (A P, M)
         of_tones = active[..., None].expand(-1, -1, -1, 3).flatten(-2)
         exists = torch.cat([of_tones, torch.ones_like(of_tones[..., :1]).expand(-1, -1, order)], -1)
         place = torch.arange(exists.shape[-1], device=active.device)
         self.is_frequency = (place < 3 * self.tones) & (place % 3 == 2)  # (P,)
         self.free = exists.flatten(1).double() @ self.to_all > 0  # (B, M)
         self.linear = (exists & ~self.is_frequency).flatten(1).double() @ self.to_all > 0
-        self.drift_columns = drift_response(measurements, order)[..., None, :].expand(-1, -1, -1, 2, -1)
-        # Cholesky factor of the information, zero where nothing was measured
-        first, both, second = (measurements.information[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-        size = first.clamp(min=0.0).sqrt()
-        slant = torch.where(size > 0, both / torch.where(size > 0, size, 1.0), 0.0)
-        rest = (second - slant.square()).clamp(min=0.0).sqrt()
-        root = torch.stack([size, slant, torch.zeros_like(size), rest], -1)
-        self.root = root.unflatten(-1, (2, 2))[:, :, None]  # (B, N, 1, 2, 2)
+        self.drift_columns = drift_response(measurements, order)[..., None, :].expand(-1, -1, -1, self.axes, -1)
+        self.root = cholesky_root(measurements.information)[:, :, None]  # (B, N, 1, A, A)
 
     def unpack(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Coefficients (B, 2, K), frequencies (B, 2, K) and drifts (B, 2, J) of parameters (B, 2, P)."""
@@ -260,16 +258,19 @@ class _Problem:
     def covariance(self, state: _Estimate, deviation: Tensor) -> Tensor:
         """Covariance (B, 2 P, 2 P) for errors of a row of the covariance ``S W^-1 S``, S the deviations (B, 2)."""
         _, inverse = _step(state, self.free, torch.zeros_like(state.cost))
-        # W = R^T R, and the whitened errors R e have the covariance T T^T with the triangular T = R S R^-1
-        size, slant, rest = (self.root[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-        (x, y), measured = deviation[:, None, None].unbind(-1), rest > 0
-        mixed = torch.where(measured, slant / torch.where(measured, rest, 1.0), 0.0) * (y - x)
-        first, second = self.jacobian(state.values).unbind(-2)  # (B, N, G, P)
-        upper = torch.cat([(size * x)[..., None] * first, (slant * x)[..., None] * second], -1)
-        both = torch.cat([(size * mixed)[..., None] * first, (slant * mixed + rest * y)[..., None] * second], -1)
-        columns = torch.cat([upper.flatten(1, 2), both.flatten(1, 2)], 1) @ (self.to_all @ inverse)
+        # W = R^T R, and the whitened errors R e have the covariance T T^T with T = R S R^-1; T^T R = R^-T S W
+        diagonal = self.root.diagonal(dim1=-2, dim2=-1)
+        safe = self.root + torch.diag_embed((diagonal == 0).to(diagonal))
+        scaled = deviation[:, None, None, :, None] * (self.root.mT @ self.root)
+        mixed = torch.linalg.solve_triangular(safe.mT, scaled, upper=False)  # (B, N, 1, A, A)
+        columns = self._whitened(mixed, self.jacobian(state.values)) @ (self.to_all @ inverse)
         covariance: Tensor = self.to_all @ (columns.mT @ columns) @ self.to_all.T
         return covariance
+
+    @staticmethod
+    def _whitened(root: Tensor, jacobian: Tensor) -> Tensor:
+        """Derivatives (B, N G A, A P) of the displacements times ``root``, from those of each axis (B, N, G, A, P)."""
+        return (root[..., None] * jacobian[..., None, :, :]).flatten(-2).flatten(1, 3)
 
     def evaluate(self, values: Tensor) -> _Estimate:
         """Residual and normal equations at the parameters ``values`` (B, 2, P)."""
@@ -277,14 +278,14 @@ class _Problem:
         linear = torch.where(self.is_frequency, 0.0, values)[:, None, None]
         residual = self.measurements.displacements - (jacobian * linear).sum(-1)
         whitened = (self.root @ residual[..., None]).flatten(1)
-        columns = (self.root[..., None] * jacobian[..., None, :, :]).flatten(-2).flatten(1, 3)  # (B, 2 N G, 2 P)
+        columns = self._whitened(self.root, jacobian)
         matrix = self.to_all.T @ (columns.mT @ columns) @ self.to_all
         right = (columns.mT @ whitened[..., None])[..., 0] @ self.to_all
         return _Estimate(values, residual, whitened.square().sum(-1), matrix, right)
 
     def moved(self, values: Tensor, step: Tensor) -> Tensor:
         """Parameters after a step (B, M) of the free ones; frequencies stay positive."""
-        values = values + (step @ self.to_all.T).unflatten(1, (2, -1))
+        values = values + (step @ self.to_all.T).unflatten(1, (self.axes, -1))
         return torch.where(self.is_frequency, values.abs(), values)
 
     def solve(self, start: Tensor | ToneFit, iterations: int, tolerance: float) -> _Estimate:
@@ -299,7 +300,7 @@ class _Problem:
             tones = torch.stack([start.coefficients.real, start.coefficients.imag, start.frequencies], -1)
             state = self.evaluate(torch.cat([tones.flatten(-2), start.drift], -1))
         else:  # amplitudes, phases and drifts are linear once the frequencies are given
-            values = start.new_zeros(len(start), 2, len(self.is_frequency))
+            values = start.new_zeros(len(start), self.axes, len(self.is_frequency))
             values[..., self.is_frequency] = torch.where(self.active, start, 0.0)
             state = self.evaluate(values)
             step, _ = _step(state, self.linear, torch.zeros_like(state.cost))
@@ -361,7 +362,7 @@ def fit_tones(
     """
     problem = _Problem(measurements, active, model or MotionModel())
     state = problem.solve(start, iterations=30, tolerance=1e-7)
-    spent = problem.free.unflatten(1, (2, -1)).sum(-1)
+    spent = problem.free.unflatten(1, (problem.axes, -1)).sum(-1)
     # `num_measurements` counts independent measurements only: overlapping bands repeat each other
     variance = measurements.square(state.residual) / (measurements.num_measurements - spent).clamp(min=1.0)
     return problem.fit(state.values, problem.covariance(state, variance.sqrt()))
@@ -443,7 +444,8 @@ def displacement_jacobian(fit: ToneFit, exposure_starts: Tensor, exposure_time: 
     """Derivatives (B, N, 2, P) of the mean displacements of exposures from starts (B, N) by the parameters."""
     time = (exposure_starts + 0.5 * exposure_time - fit.centre[:, None])[..., None, None, None]
     smearing = torch.tensor([exposure_time, 0.0], dtype=time.dtype, device=time.device)[:, None, None, None]
-    tones = _jacobian_of_tones(smearing.expand(2, 1, 2, 1), time, fit.coefficients, fit.frequencies)
+    axes = fit.coefficients.shape[1]
+    tones = _jacobian_of_tones(smearing.expand(2, 1, axes, 1), time, fit.coefficients, fit.frequencies)
     powers = [time, 0.5 * time.square()][: fit.drift.shape[-1]]
     drift = torch.cat(powers, -1).expand(*tones.shape[:-1], -1)
     return torch.cat([tones, drift], -1)[:, :, 0]
@@ -454,7 +456,7 @@ def axis_jacobian(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[
     problem = _Problem(measurements, fit.active, fit.model)
     tones = torch.stack([fit.coefficients.real, fit.coefficients.imag, fit.frequencies], -1)
     jacobian = problem.jacobian(torch.cat([tones.flatten(-2), fit.drift], -1))[..., axis, :]
-    free = problem.free.unflatten(1, (2, -1))[:, axis]
+    free = problem.free.unflatten(1, (problem.axes, -1))[:, axis]
     to_all = _constraints(fit.model, fit.active.shape[-1], fit.active.device)
     return (jacobian @ to_all) * free[:, None, None], to_all
 
@@ -481,10 +483,42 @@ def shrunk_motion(fit: ToneFit, intervals: Tensor) -> Vibration:
     return motion_of_fit(replace(fit, coefficients=fit.coefficients * share))
 
 
+def strongest_only(fit: ToneFit) -> ToneFit:
+    """The fit with only the strongest tone (or family) of each axis."""
+    harmonics = fit.model.harmonics
+    family = fit.amplitude.unflatten(-1, (-1, harmonics)).sum(-1).argmax(-1)[..., None, None]
+    place = family.expand(-1, -1, 1, harmonics)
+
+    def pick(values: Tensor) -> Tensor:
+        picked: Tensor = values.unflatten(-1, (-1, harmonics)).gather(2, place)[:, :, 0]
+        return picked
+
+    return replace(fit, coefficients=pick(fit.coefficients), frequencies=pick(fit.frequencies), active=pick(fit.active))
+
+
+def with_axes(fit: ToneFit, axes: int) -> ToneFit:
+    """The strongest tones of a fit as one with further axes, which have no tones; without a covariance."""
+    fit = strongest_only(fit)
+    missing = axes - fit.active.shape[1]
+
+    def extended(values: Tensor) -> Tensor:
+        return functional.pad(values, (0, 0, 0, missing))
+
+    return replace(
+        fit,
+        coefficients=extended(fit.coefficients),
+        frequencies=extended(fit.frequencies),
+        active=extended(fit.active),
+        drift=extended(fit.drift),
+        covariance=fit.covariance[:, :0, :0],
+    )
+
+
 def _covariance_of_axes(fit: ToneFit) -> Tensor:
     """Covariances (B, 2, P, P) of the parameters of each axis."""
-    size = fit.covariance.shape[-1] // 2
-    return fit.covariance.reshape(-1, 2, size, 2, size).diagonal(dim1=1, dim2=3).movedim(-1, 1)
+    axes = fit.coefficients.shape[1]
+    size = fit.covariance.shape[-1] // axes
+    return fit.covariance.reshape(-1, axes, size, axes, size).diagonal(dim1=1, dim2=3).movedim(-1, 1)
 
 
 def _direction(fit: ToneFit) -> tuple[Tensor, Tensor, Tensor]:

@@ -60,11 +60,12 @@ def with_further_tones(
         The fit, and the standard deviation (B, 2) in px of the displacement of rows without mean and linear trend, rms
         over the rows.
     """
-    size = fit.covariance.shape[-1] // 2
+    axes = fit.coefficients.shape[1]
+    size = fit.covariance.shape[-1] // axes
     covariance = fit.covariance.clone()
-    of_parameters = covariance.view(len(covariance), 2, size, 2, size)
+    of_parameters = covariance.view(len(covariance), axes, size, axes, size)
     variance = displacement_std(fit, exposure_starts, measurements.exposure_time).square()
-    for axis in range(2):
+    for axis in range(axes):
         added, moved = _added(measurements, fit, exposure_starts, axis, number_is_known)
         of_parameters[:, axis, :, axis] += added
         variance[:, axis] += moved
@@ -99,7 +100,7 @@ def _added(
     inverse = torch.linalg.pinv(X)  # (B, M, D)
     parts = []
     for chunk in frequencies.split(max(1, _CHUNK // (4 * r.numel())), dim=1):
-        response = tone_response(measurements, chunk[:, None].expand(-1, 2, -1))[..., axis, :]
+        response = tone_response(measurements, chunk[:, None].expand(-1, fit.coefficients.shape[1], -1))[..., axis, :]
         Z = _quadratures(root[..., None] * response).flatten(1, 2)  # (B, D, F, 2)
         rounding = 1e-12 * Z.square().sum((1, 3))[..., None, None]
         back = torch.einsum("bmd,bdfq->bfmq", inverse, Z)

@@ -41,7 +41,8 @@ def power(measurements: Measurements, frequencies: Tensor, weights: Tensor) -> T
     Returns:
         Weighted squares (B, S, 2, F).
     """
-    together = [slice(0, 2)] if frequencies.shape[1] == 1 else [slice(0, 1), slice(1, 2)]
+    count = measurements.displacements.shape[-1]
+    together = [slice(0, count)] if frequencies.shape[1] == 1 else [slice(axis, axis + 1) for axis in range(count)]
     parts = (_power(measurements, frequencies[:, axes.start], weights, axes) for axes in together)
     return torch.cat(list(parts), dim=2)
 
@@ -132,7 +133,8 @@ def strongest_frequencies(
     segments = 1 << max(0, int(pieces - 1).bit_length())
     segments = max(1, min(segments, rows // 64))
     longest = float(measurements.in_segments(segments).duration.amax())
-    grid = frequency_grid(longest, sample_interval, device).expand(batch, 2, -1)
+    axes = measurements.displacements.shape[-1]
+    grid = frequency_grid(longest, sample_interval, device).expand(batch, axes, -1)
     total = _of_families(score(measurements, weights, segments, grid[:, :1]), grid[:, None], harmonics).flatten(0, 1)
     # a peak is the maximum within half of 1 / duration on either side
     window = _OVERSAMPLING // 2
@@ -247,7 +249,7 @@ def best_candidate(
 
     def chosen(values: Tensor, axis: int) -> Tensor:
         each = values.unflatten(0, (-1, count)).movedim(axis + 1, 2)  # (B, C, 2, ...)
-        place = best.reshape(-1, 1, 2, *(1,) * (each.ndim - 3)).expand(-1, 1, -1, *each.shape[3:])
+        place = best.reshape(-1, 1, best.shape[-1], *(1,) * (each.ndim - 3)).expand(-1, 1, -1, *each.shape[3:])
         picked: Tensor = each.gather(1, place)[:, 0].movedim(1, axis)
         return picked
 

@@ -16,6 +16,7 @@ from rsvib_torch.detection.tones.fit import (
     offset_gain,
     residual_of,
     select_stacks,
+    strongest_only,
 )
 from rsvib_torch.detection.tones.periodogram import best_candidate, visibility
 
@@ -26,7 +27,6 @@ __all__ = [
     "find_tones",
     "robust_fit",
     "significant_only",
-    "strongest_only",
     "typical_size",
 ]
 
@@ -97,8 +97,9 @@ def find_tones(
         The fit, with K the largest number of tones of any axis (at least 1).
     """
     model = model or MotionModel()
+    axes = measurements.displacements.shape[-1]
     none = measurements.exposure_starts.new_zeros(
-        len(measurements.exposure_starts), 2, model.harmonics, dtype=torch.bool
+        len(measurements.exposure_starts), axes, model.harmonics, dtype=torch.bool
     )
     if start is None:
         accepted, (fit, weighed) = none[..., :0], robust_fit(measurements, none.double(), none, model)
@@ -253,16 +254,3 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor
             if not bool(keep.any())
             else fit_tones(measurements, fit.frequencies, fit.active & ~dropped | keep, fit.model)
         )
-
-
-def strongest_only(fit: ToneFit) -> ToneFit:
-    """The fit with only the strongest tone (or family) of each axis."""
-    harmonics = fit.model.harmonics
-    family = fit.amplitude.unflatten(-1, (-1, harmonics)).sum(-1).argmax(-1)[..., None, None]
-    place = family.expand(-1, -1, 1, harmonics)
-
-    def pick(values: Tensor) -> Tensor:
-        picked: Tensor = values.unflatten(-1, (-1, harmonics)).gather(2, place)[:, :, 0]
-        return picked
-
-    return replace(fit, coefficients=pick(fit.coefficients), frequencies=pick(fit.frequencies), active=pick(fit.active))

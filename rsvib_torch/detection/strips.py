@@ -1,0 +1,147 @@
+"""Components of a motion with roll and zoom, from the displacements of strips of columns.
+
+Roll and zoom displace the content of a row by amounts that depend on the column (``motion.field``). Strips of columns
+are therefore measured like stacks of their own. With the displacement ``d_s`` of a row in strip s, its information
+``W_s`` and the factors ``F_s`` from the components q of the motion to the displacement at the strip, the components of
+the row are the weighted least-squares solution
+
+    ``(sum_s F_s^T W_s F_s) q = sum_s F_s^T W_s d_s``,
+
+whose matrix is the information of q. Fits then do not differ from those of whole rows. Components of roll and zoom are
+multiplied by a length, the rms distance of the pixels from the centre, so that all components are in px.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.motion.field import displacement_factors
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.registration.row_spectra import MARGIN
+
+__all__ = ["FieldScale", "combined_strips", "cut_into_strips"]
+
+
+@dataclass(frozen=True)
+class FieldScale:
+    """Lengths of a frame that roll and zoom refer to.
+
+    Attributes:
+        axes: Number of components of the motion, 2 to 4.
+        width: Columns of a frame.
+        height: Rows of a frame.
+    """
+
+    axes: int
+    width: int
+    height: int
+
+    @property
+    def radius(self) -> float:
+        """Root-mean-square distance of the pixels from the centre of the frame, in px."""
+        return math.sqrt((self.width**2 + self.height**2 - 2) / 12)
+
+    def units(self, like: Tensor) -> Tensor:
+        """(A,) factors from components in px to (px, px, rad, 1)."""
+        return like.new_tensor([1.0, 1.0, 1 / self.radius, 1 / self.radius][: self.axes])
+
+    def motion(self, fitted: Vibration) -> Vibration:
+        """The motion with roll in rad and relative zoom, of one whose components are all in px."""
+        factor = self.units(fitted.amplitude)
+        return Vibration(
+            fitted.amplitude * factor[:, None],
+            fitted.frequency,
+            fitted.phase,
+            fitted.image_motion * factor,
+            fitted.image_acceleration * factor,
+        )
+
+    def std(self, fitted: VibrationStd) -> VibrationStd:
+        """The same for standard deviations."""
+        factor = self.units(fitted.amplitude)
+        return replace(
+            fitted,
+            amplitude=fitted.amplitude * factor[:, None],
+            image_motion=fitted.image_motion * factor,
+            image_acceleration=fitted.image_acceleration * factor,
+            displacement=None if fitted.displacement is None else fitted.displacement * factor,
+        )
+
+    def factors(self, x: Tensor, y: Tensor) -> Tensor:
+        """Displacement (S, 2, A) at positions (S) in px from the centre by unit components in px."""
+        return displacement_factors(x, y, self.axes) * self.units(x)
+
+
+def combined_strips(measured: Measurements, factors: Tensor) -> tuple[Measurements, Tensor]:
+    """Components of the motion of every row from the displacements of strips.
+
+    Args:
+        measured: Displacements (B S, N, G, 2) of the strips.
+        factors: (B, S, N, 2, A) displacements by unit components.
+
+    Returns:
+        Measurements (B, N, G, A), and ``apart`` of ``RowRecord``.
+    """
+    strips, axes = factors.shape[1], factors.shape[-1]
+
+    def of_strips(values: Tensor) -> Tensor:
+        return values.unflatten(0, (-1, strips))
+
+    visible = of_strips(measured.visible).amin(1)
+    everywhere = replace(measured, visible=visible.repeat_interleave(strips, 0))
+    displacements = of_strips(everywhere.relative(measured.displacements))  # (B, S, N, G, 2)
+    W = of_strips(measured.information)  # (B, S, N, 2, 2)
+    weighted = W @ factors
+    information = (factors.mT @ weighted).sum(1)  # (B, N, A, A)
+    right = torch.einsum("bsnia,bsngi->bnga", weighted, displacements)
+    size = information.diagonal(dim1=-2, dim2=-1)
+    unit = size.clamp(min=1e-300).rsqrt()
+    normal = information * unit[..., :, None] * unit[..., None, :]
+    values, vectors = torch.linalg.eigh(torch.where((size > 0).all(-1)[..., None, None], normal, 0.0))
+    regular = values[..., 0] > 1e-6  # fewer than two strips with detail do not determine roll
+    solvable = torch.where(regular[..., None], values, 1.0)
+    solved = torch.einsum("bnij,bnj,bnkj,bngk->bngi", vectors, 1 / solvable, vectors, right * unit[:, :, None])
+    components = torch.where(regular[:, :, None, None], solved * unit[:, :, None], 0.0)
+    rest = displacements - torch.einsum("bsnia,bnga->bsngi", factors, components)
+    counted = (W.diagonal(dim1=-2, dim2=-1) > 0).to(W) * regular[:, None, :, None]
+    noise = torch.where(counted > 0, 1 / W.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300), 0.0)
+    frames = (visible.sum(-1) - 1).clamp(min=1.0)[:, None, :, None]
+    spare = (counted.sum(1) - 0.5 * axes).clamp(min=1.0)
+    share = 1 - 0.5 * axes / counted.sum(1).clamp(min=1.0)  # the fit of the components takes part of the noise
+    apart = (counted * rest.square().sum(3) / frames).sum(1) / spare - (noise.sum(1) * share) / spare
+    apart = torch.where(regular[..., None] & (visible.sum(-1) > 1)[..., None], apart, torch.nan)
+    combined = Measurements(
+        of_strips(measured.exposure_starts).mean(1),
+        components,
+        visible,
+        torch.where(regular[..., None, None], information, 0.0),
+        measured.exposure_time,
+        measured.average_times,
+        measured.independent,
+    )
+    return combined, apart
+
+
+def cut_into_strips(values: Tensor, count: int, edge: int) -> tuple[Tensor, Tensor]:
+    """Images (B, T, H, W) in strips of columns (B S, T, H, w), and the middles (S,) of the strips.
+
+    The columns that have weight in ``RowGradients`` begin ``edge`` px from the ends of a strip, with a ramp of
+    ``MARGIN`` px. Neighbouring strips overlap so that these ramps add up to 1: every column counts once.
+
+    Args:
+        values: The images.
+        count: Number S of strips.
+        edge: px without weight at each end.
+    """
+    width = values.shape[-1]
+    pitch = (width - 2 * edge - MARGIN) / count
+    columns = round(pitch) + 2 * edge + MARGIN
+    firsts = [round(number * (width - columns) / max(1, count - 1)) for number in range(count)]
+    strips = torch.stack([values[..., first : first + columns] for first in firsts], 1).flatten(0, 1)
+    middles = torch.tensor(firsts, dtype=torch.float64, device=values.device) + 0.5 * (columns - width)
+    return strips, middles
+
+

@@ -1,0 +1,172 @@
+"""Displacement fields of a camera that rolls about its optical axis or changes its scale.
+
+A motion with three or four components (X, Y, theta, zeta) displaces scene content at (x, y) px from the centre of the
+frame by ``(X - theta y + zeta x, Y + theta x + zeta y)``, with theta in rad and zeta relative. In one column, the
+displacement depends on the row only. Code that requires this (docs/architecture.md) is applied to strips of columns,
+each with the ``ColumnMotion`` of its middle.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.timing import RowTiming
+
+__all__ = ["ColumnMotion", "check_two_axes", "displacement_at", "displacement_factors"]
+
+
+def displacement_factors(x: Tensor, y: Tensor, axes: int) -> Tensor:
+    """Displacement by unit components at positions of the scene: ``((1, 0, -y, x), (0, 1, x, y))``.
+
+    Args:
+        x: px from the centre of the frame, shape S.
+        y: The same along y, shape S.
+        axes: Number A of components, 2 to 4.
+
+    Returns:
+        (S, 2, A): the displacement in px is its product with the components.
+
+    Example:
+        >>> displacement_factors(torch.tensor(100.0), torch.tensor(-50.0), 3).tolist()
+        [[1.0, 0.0, 50.0], [0.0, 1.0, 100.0]]
+    """
+    x, y = torch.broadcast_tensors(x, y)
+    one, zero = torch.ones_like(x), torch.zeros_like(x)
+    along = torch.stack([one, zero, -y, x][:axes], -1)
+    across = torch.stack([zero, one, x, y][:axes], -1)
+    return torch.stack([along, across], -2)
+
+
+def displacement_at(components: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Displacement (S, 2) in px of scene content at (x, y) px (S) from the centre, by components (S, A)."""
+    if components.shape[-1] == 2:
+        return components
+    moved: Tensor = (displacement_factors(x, y, components.shape[-1]) @ components[..., None])[..., 0]
+    return moved
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ColumnMotion(Motion):
+    """Displacement (x, y) in px of the content of single columns, by a motion with roll or zoom, in row order.
+
+    The displacement at time t is that of the row that is being exposed at that time: a row belongs to the frame that
+    started last, and its content lies at the height y of the scene with
+    ``row = middle + y + Y(t) + theta(t) x + zeta(t) y``.
+
+    Args:
+        components: Motion with A = 3 or 4 components, in row order.
+        column: (...) px from the centre of the frame, one for each motion of the batch.
+        frame_starts: Exposure starts of the first rows of the frames in seconds, increasing.
+        row_time: Seconds from one row to the next.
+        num_rows: Rows of a frame.
+    """
+
+    components: Motion
+    column: Tensor
+    frame_starts: tuple[float, ...]
+    row_time: float
+    num_rows: int
+
+    @classmethod
+    def of_columns(
+        cls, motion: Motion, columns: Tensor, timing: RowTiming, num_frames: int, num_rows: int
+    ) -> "ColumnMotion":
+        """Motions (B S) of columns (S,) in px from the centre for a motion (B), those of one stack behind each other."""
+        repeated = motion.mapped(lambda values: values.repeat_interleave(len(columns), 0))
+        column = columns.to(dtype=torch.float64, device=motion.device).repeat(*motion.batch_shape)
+        return cls(repeated, column, tuple(timing.frame_starts(num_frames).tolist()), timing.row_time, num_rows)
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading dimensions: (B,)."""
+        return self.components.batch_shape
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the parameters."""
+        return self.components.device
+
+    @property
+    def num_axes(self) -> int:
+        """2: the displacement of one column along x and y."""
+        return 2
+
+    def _column(self, dimensions: int) -> Tensor:
+        """The columns with trailing dimensions of size 1, to broadcast with a tensor of so many dimensions."""
+        return self.column.reshape(*self.column.shape, *(1,) * (dimensions - self.column.ndim))
+
+    def _positions(self, starts: Tensor, components: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions (x, y) in the scene (S each) of rows with exposures from ``starts`` (S) on, at components (S, A)."""
+        frames = torch.tensor(self.frame_starts, dtype=torch.float64, device=self.device)
+        frame = torch.searchsorted(frames, (starts + 1e-9 * self.row_time).contiguous(), right=True) - 1
+        row = (starts - frames[frame.clamp(min=0)]) / self.row_time
+        row, _ = torch.broadcast_tensors(row, components[..., 0])
+        x = self._column(row.ndim).expand_as(row)
+        scale = 1.0 + components[..., 3] if components.shape[-1] > 3 else 1.0
+        moved = components[..., 1] + components[..., 2] * x
+        return x, (row - 0.5 * (self.num_rows - 1) - moved) / scale
+
+    def displacement(self, times: Tensor) -> Tensor:
+        """Displacement in px of the rows that begin their exposure at these times."""
+        times = times.to(dtype=torch.float64, device=self.device)
+        components = self.components.displacement(times)
+        return displacement_at(components, *self._positions(times, components))
+
+    def path(self, starts: Tensor, delays: Tensor) -> Tensor:
+        """Displacement in px during exposures, as ``Motion.path``: a row keeps its position in the frame."""
+        starts = starts.to(dtype=torch.float64, device=self.device)
+        components = self.components.path(starts, delays)
+        return displacement_at(components, *self._positions(starts[..., None], components))
+
+    def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
+        """Mean displacement over exposures in px."""
+        starts = starts.to(dtype=torch.float64, device=self.device)
+        components = self.components.mean_displacement(starts, exposure_time)
+        return displacement_at(components, *self._positions(starts, components))
+
+    def velocity(self, times: Tensor) -> Tensor:
+        """Velocity in px/s of the content of the row that begins its exposure at these times."""
+        times = times.to(dtype=torch.float64, device=self.device)
+        positions = self._positions(times, self.components.displacement(times))
+        return displacement_at(self.components.velocity(times), *positions)
+
+    def drift(self, times: Tensor) -> Tensor:
+        """Part of the displacement in the middle row that grows with time, in px."""
+        components = self.components.drift(times.to(dtype=torch.float64, device=self.device))
+        x = self._column(components.ndim - 1)
+        return displacement_at(components, x, torch.zeros_like(x))
+
+    def _at_ends_of_rows(self, components: Tensor) -> Tensor:
+        """Bound (..., 2) on the displacement by components within bounds (..., A), in any row."""
+        last_row = torch.full_like(self.column, 0.5 * self.num_rows)
+        reach = displacement_factors(self.column, last_row, components.shape[-1])
+        moved: Tensor = (reach.abs() @ components[..., None])[..., 0]
+        return moved
+
+    def largest_oscillation(self) -> Tensor:
+        """Bound on ``|D(t) - drift(t)|`` during the frames, (..., 2), in px."""
+        last = self.frame_starts[-1] + (self.num_rows + 1) * self.row_time
+        turned = self.components.largest_displacement(self.frame_starts[0], last)  # roll and zoom with their drift
+        return self._at_ends_of_rows(torch.cat([self.components.largest_oscillation()[..., :2], turned[..., 2:]], -1))
+
+    def displacement_within(self, duration: float) -> Tensor:
+        """Bound on the displacement between two times ``duration`` seconds apart, (..., 2), in px."""
+        return self._at_ends_of_rows(self.components.displacement_within(duration))
+
+    def periods_within(self, duration: float) -> Tensor:
+        """Periods of the fastest tone in ``duration`` seconds, (..., 2)."""
+        return self.components.periods_within(duration).amax(-1, keepdim=True).expand(*self.batch_shape, 2)
+
+    def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
+        """Columns have a position in frames in row order: their axes are not exchanged."""
+        raise NotImplementedError("a ColumnMotion stays in row order; exchange the axes of its components")
+
+
+def check_two_axes(motion: Motion, function: str) -> None:
+    """Raise a ``ValueError`` for a motion with roll or zoom where a function does not support it."""
+    if motion.num_axes > 2:
+        raise ValueError(f"{function} does not support roll and zoom; pass a motion with the axes (x, y)")
