@@ -10,10 +10,12 @@ from torch import Tensor
 
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
+from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.arrays import ArrayLike, as_tensor, channels_appear_last
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.sensor_model import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.motion.field import ColumnMotion, largest_in_frame
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 
@@ -87,7 +89,9 @@ def simulate_frames(
 
     first = timing_in_rows.frame_starts(num_frames)
     last = float(first[-1]) + timing.frame_period + timing.exposure_time
-    reach = motion.largest_displacement(float(first[0]), last).tolist()
+    reach = largest_in_frame(
+        motion.largest_displacement(float(first[0]), last), scene.shape[-1], scene.shape[-2]
+    ).tolist()
     margins = tuple(_MARGIN + math.ceil(r) for r in reversed(reach))
     available = tuple(size - 2 * margin for size, margin in zip(scene.shape[-2:], margins, strict=True))
     size = (min(available[0], int(timing.frame_rows)), available[1]) if frame_size is None else frame_size
@@ -99,9 +103,27 @@ def simulate_frames(
         )
     timing_in_rows.check_rows(size[0])
     starts = timing_in_rows.row_starts(num_frames, size[0], scene.device)
-    frames = _form_rows(scene, starts, timing_in_rows, motion, size[1])
+    frames = _form_frames(scene, starts, timing_in_rows, motion, size[1])
     frames = frames_from_row_order(frames, timing)
     return frames if noise is None else noise.apply(frames, generator)
+
+
+def _form_frames(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion, width: int) -> Tensor:
+    """``_form_rows``, in strips of columns if the motion has roll or zoom.
+
+    Strips of 16 px differ in their displacement by 0.03 px for a roll of 2 mrad; the linear interpolation between them
+    is then accurate to 1e-4 of full scale.
+    """
+    if motion.num_axes == 2:
+        return _form_rows(scene, starts, timing, motion, width)
+    strips = ColumnStrips.of(width, max_pitch=16, margin=0)
+    beyond = 2 * ((scene.shape[-1] - width) // 2)  # columns of the scene beside the frame
+    of_strips = ColumnMotion.of_columns(motion.expanded(1), strips.columns, timing, *starts.shape)
+    formed = [
+        _form_rows(scene[..., first : first + strips.width + beyond], starts, timing, of_strip, strips.width)
+        for first, of_strip in zip(strips.firsts, (of_strips[i] for i in range(len(strips.firsts))), strict=True)
+    ]
+    return strips.joined(torch.stack(formed))[0]
 
 
 def _form_rows(

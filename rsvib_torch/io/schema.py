@@ -1,7 +1,8 @@
 """JSON schema of timing, vibration, standard deviations and detections, shared by all files that the package writes.
 
 ``vibration.json``, ``manifest.json`` and the journal of a stack, and the TOML configuration use these records. Lists
-are ordered (x, y), with one list of tones for each axis; null stands for a value that is unknown or not finite.
+are ordered (x, y), with one list of tones for each axis; a motion with roll and zoom has three or four axes. null stands
+for a value that is unknown or not finite.
 """
 
 import math
@@ -91,8 +92,11 @@ class VibrationRecord(Section):
     def _check(self) -> Self:
         for name in ("amplitude", "frequency", "phase"):
             rows = getattr(self, name)
-            if len(rows) != 2 or len({len(row) if isinstance(row, list) else 1 for row in rows}) != 1:
-                raise ValueError(f"{name} must be two numbers (x, y), or two lists of the same length, got {rows}")
+            if not 2 <= len(rows) <= 4 or len({len(row) if isinstance(row, list) else 1 for row in rows}) != 1:
+                raise ValueError(
+                    f"{name} must be two numbers (x, y), or two lists of the same length (three with roll, four with "
+                    f"zoom), got {rows}"
+                )
         checked(self.to_vibration)
         return self
 
@@ -160,7 +164,8 @@ def detection_summary(detection: Detection) -> str:
     """Tones of each axis with standard deviations, then the verdict; of a batch, a table with one row per axis."""
     vibration, std = detection.vibration, detection.std
     rows = [cells for _, cells in tone_rows(vibration, std)]
-    table, *verdict = verdict_table(tone_head(), rows, vibration.batch_shape, detection.reliable, detection.reasons)
+    head = tone_head(axes=vibration.num_axes)
+    table, *verdict = verdict_table(head, rows, vibration.batch_shape, detection.reliable, detection.reasons)
     if not vibration.batch_shape:  # those sentences that concern two frames
         verdict += [wrapped(f"assumed: {text}") for text in detection.assumptions if text.startswith("frame_")]
     return "\n".join([table, *image_motion_line(vibration, std), *verdict])
@@ -200,8 +205,8 @@ class DetectionRecord(Section):
     std: StdRecord
     gain: list[Numbers]
     residual: Numbers
-    reliable: list[bool] = Field(min_length=2, max_length=2)
-    reasons: list[list[str]] = Field(min_length=2, max_length=2)
+    reliable: list[bool] = Field(min_length=2, max_length=4)
+    reasons: list[list[str]] = Field(min_length=2, max_length=4)
     assumptions: list[str] = Field(default_factory=list[str])
 
     @classmethod
@@ -233,6 +238,8 @@ class DetectionRecord(Section):
         vibration, std = self.vibration.to_vibration(), self.std.to_std()
         if any(values.shape != vibration.amplitude.shape for values in (std.amplitude, std.frequency, std.phase)):
             raise ValueError("std must have as many tones as the vibration")
+        if not len(self.reliable) == len(self.reasons) == vibration.num_axes:
+            raise ValueError(f"reliable and reasons must have {vibration.num_axes} entries, one for each axis")
         return DetectedVibration(
             vibration,
             std,

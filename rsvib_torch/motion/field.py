@@ -16,7 +16,7 @@ from torch import Tensor
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
 
-__all__ = ["ColumnMotion", "check_two_axes", "displacement_at", "displacement_factors"]
+__all__ = ["ColumnMotion", "check_two_axes", "displacement_at", "displacement_factors", "largest_in_frame"]
 
 
 def displacement_factors(x: Tensor, y: Tensor, axes: int) -> Tensor:
@@ -46,6 +46,13 @@ def displacement_at(components: Tensor, x: Tensor, y: Tensor) -> Tensor:
     if components.shape[-1] == 2:
         return components
     moved: Tensor = (displacement_factors(x, y, components.shape[-1]) @ components[..., None])[..., 0]
+    return moved
+
+
+def largest_in_frame(components: Tensor, width: int, height: int) -> Tensor:
+    """Bound (..., 2) in px on the displacement in a frame, by components within bounds (..., A)."""
+    half = components.new_tensor([0.5 * width, 0.5 * height])
+    moved: Tensor = (displacement_factors(half[0], half[1], components.shape[-1]).abs() @ components[..., None])[..., 0]
     return moved
 
 
@@ -135,10 +142,8 @@ class ColumnMotion(Motion):
         return displacement_at(self.components.velocity(times), *positions)
 
     def drift(self, times: Tensor) -> Tensor:
-        """Part of the displacement in the middle row that grows with time, in px."""
-        components = self.components.drift(times.to(dtype=torch.float64, device=self.device))
-        x = self._column(components.ndim - 1)
-        return displacement_at(components, x, torch.zeros_like(x))
+        """Drift of X and Y in px, the same for all columns; that of roll and zoom counts as oscillation."""
+        return self.components.drift(times)[..., :2]
 
     def _at_ends_of_rows(self, components: Tensor) -> Tensor:
         """Bound (..., 2) on the displacement by components within bounds (..., A), in any row."""

@@ -24,7 +24,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact.exact import restore_exact
-from rsvib_torch.restoration.frame_motion import frame_motion
+from rsvib_torch.restoration.field_motion import judged_strip, restore_in_strips
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
 from rsvib_torch.restoration.verdict.judge import RestorationWarning, judge_frames
 from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError, pairs_to_judge
@@ -236,7 +236,7 @@ def restore_prepared(
     options |= {name: masks[name] for name in chosen.masks if masks[name] is not None}
     images = frames.images if "ignore" in chosen.masks else frames.filled
     motion = _motion_in_row_order(frames, vibration)
-    return chosen.function(images, frame_motion(motion, frames.timing, images.shape[1], images.shape[-2]), **options)
+    return restore_in_strips(chosen.function, images, motion, frames.timing, options)
 
 
 def unchanged_frames(frames: PreparedFrames, joint: bool | int) -> Tensor:
@@ -282,15 +282,11 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Motion, 
         still = motion[stack].detached()
         if not bool(still.moving_axes().any()):
             continue
+        missing = None if frames.missing is None else frames.missing[stack]
+        seen = judged_strip(raw[stack], restored[stack], missing, still.expanded(1), frames.timing)
         try:
             verdict = judge_frames(
-                raw[stack],
-                restored[stack],
-                frame_motion(still.expanded(1), frames.timing, count, raw.shape[-2]),
-                pairs,
-                shared=min(shared, count),
-                columns=160,
-                hidden=None if frames.missing is None else frames.missing[stack],
+                seen[0], seen[1], seen[3], pairs, shared=min(shared, count), columns=160, hidden=seen[2]
             )
         except TooLittleInCommonError:
             continue  # frames that share no scene cannot be compared

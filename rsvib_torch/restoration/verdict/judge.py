@@ -21,7 +21,8 @@ from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.io.files import FramesOrFiles, load_frames
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, joint_groups
+from rsvib_torch.restoration.field_motion import judged_strip
+from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise.high_pass import estimate_noise
 from rsvib_torch.restoration.verdict.pairs import FramePair, equally_bright, misfit, pairs_to_judge, shared_part
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
@@ -355,16 +356,13 @@ def judge_prepared(
     limit = None if most_pairs is None else check_whole_number("most_pairs", most_pairs, at_least=1)
     if vibration.batch_shape:
         raise ValueError(f"vibration must be one for the stack, got batch shape {tuple(vibration.batch_shape)}")
-    count, height = frames.images.shape[1], frames.images.shape[-2]
+    count = frames.images.shape[1]
     shared = len(joint_groups(count, joint)[0][0])
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
     motion = vibration.to_row_order(frames.image_timing).to(frames.images.device).expanded(1)
-    verdict = judge_frames(
-        frames.filled[0].to(dtype),
-        restored[0].to(dtype),
-        frame_motion(motion, frames.timing, count, height),
-        pairs_to_judge(count, joint, limit),
-        shared=shared,
-        hidden=None if frames.missing is None else frames.missing[0],
+    missing = None if frames.missing is None else frames.missing[0]
+    raw, image, hidden, of_part = judged_strip(
+        frames.filled[0].to(dtype), restored[0].to(dtype), missing, motion, frames.timing
     )
+    verdict = judge_frames(raw, image, of_part, pairs_to_judge(count, joint, limit), shared=shared, hidden=hidden)
     return verdict.in_image_axes(frames.image_timing)

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
@@ -109,15 +110,16 @@ def trusted_vibration(
         at = (index,) if batched else ()
         reasons = detected.reasons[index] if batched else detected.reasons
         where = f"stack {index}: " if batched else ""
-        for axis, name in enumerate("xy"):
+        for axis, name in enumerate(AXIS_NAMES[: vibration.num_axes]):
             here = (*at, axis)
             if not bool(reliable[here]):
                 why = "; ".join(reasons[axis])
                 notes.append(f"{where}{name} is not restored: its vibration is not reliable ({why})")
             elif not bool(accurate[here]):
+                unit = ("px", "px", "rad", "(zoom)")[axis]
                 notes.append(
-                    f"{where}{name} is not restored: its displacement of {float(size[here]):.2g} px has a standard "
-                    f"deviation of {float(error[here]):.2g} px; detect it from more frames"
+                    f"{where}{name} is not restored: its displacement of {float(size[here]):.2g} {unit} has a standard "
+                    f"deviation of {float(error[here]):.2g} {unit}; detect it from more frames"
                 )
     keep = reliable & accurate
     trusted = Vibration(

@@ -1,0 +1,91 @@
+"""Strips of columns for motions with roll or zoom, in which the displacement depends on the row only.
+
+Restoration methods require a displacement that depends on the row only. With roll or zoom it changes slowly along a row.
+Frames are then restored in strips of columns that overlap by half, each by the ``ColumnMotion`` of its middle, and the
+strips are added up with triangular weights: between two middles, the displacement is interpolated linearly.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.frames.column_strips import ColumnStrips
+from rsvib_torch.frames.pixels import detailed_columns
+from rsvib_torch.motion.field import ColumnMotion
+from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.timing import RowTiming
+from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
+
+__all__ = ["judged_strip", "restore_in_strips"]
+
+_SLIDE = 0.16  # px, difference of the displacements of neighbouring strips; see docs/ablation.md
+_PITCHES = (48, 160)  # px, bounds on the distance of the strips: narrow ones cost time, wide ones memory
+_MARGIN = 24  # px of a strip without weight, beyond the displacement: the restoration is not exact near its ends
+
+
+def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) -> ColumnStrips:
+    """Strips for frames of (height, width), for a motion (B) between two times in seconds."""
+    turning = float(motion.largest_displacement(first, last)[..., 2:].amax())
+    narrowest, widest = _PITCHES
+    pitch = min(max(_SLIDE / max(turning, 1e-9), narrowest), widest)
+    along = float(motion.largest_oscillation()[..., 0].amax()) + turning * 0.5 * sum(size)
+    return ColumnStrips.of(size[1], pitch, _MARGIN + math.ceil(along))
+
+
+def restore_in_strips(
+    method: Callable[..., Tensor], images: Tensor, motion: Motion, timing: RowTiming, options: Mapping[str, Any]
+) -> Tensor:
+    """Frames restored by a method, in strips of columns if the motion has roll or zoom.
+
+    Args:
+        method: A restoration method, see the contract above ``METHODS``.
+        images: (B, T, C, H, W) in row order.
+        motion: (B) in row order.
+        timing: The sensor.
+        options: Options of the method; masks shaped like the images are cut as well.
+
+    Returns:
+        Restored frames as from the method.
+    """
+    count, (height, width) = images.shape[1], images.shape[-2:]
+    if motion.num_axes == 2:
+        return method(images, frame_motion(motion, timing, count, height), **options)
+    starts = timing.frame_starts(count).tolist()
+    strips = _strips(motion, (height, width), starts[0], starts[-1] + height * timing.row_time + timing.exposure_time)
+    of_strips = ColumnMotion.of_columns(motion, strips.columns, timing, count, height)
+    cut = {
+        name: strips.cut(value) if isinstance(value, Tensor) and value.shape[-2:] == images.shape[-2:] else value
+        for name, value in options.items()
+    }
+    return strips.joined(method(strips.cut(images), frame_motion(of_strips, timing, count, height), **cut))
+
+
+def judged_strip(
+    raw: Tensor, restored: Tensor, hidden: Tensor | None, motion: Motion, timing: RowTiming, *, columns: int = 160
+) -> tuple[Tensor, Tensor, Tensor | None, FrameMotion]:
+    """The part of the frames of a stack by which their restoration is judged, and its motion.
+
+    With roll or zoom, this is a strip of columns: of those in the middle of both halves, the one with more detail.
+
+    Args:
+        raw: (T, C, H, W) in row order.
+        restored: (T, C, H, W) or (1, C, H, W).
+        hidden: Mask shaped like ``raw`` of pixels that were not measured.
+        motion: (1) in row order.
+        timing: The sensor.
+        columns: Width of the strip.
+    """
+    count, (height, width) = len(raw), raw.shape[-2:]
+    if motion.num_axes == 2:
+        return raw, restored, hidden, frame_motion(motion, timing, count, height)
+    strip = min(columns, width // 2)
+    halves = [slice(middle - strip // 2, middle - strip // 2 + strip) for middle in (width // 4, width - width // 4)]
+    both = torch.cat([raw[0][..., half] for half in halves], -1)
+    half = halves[0 if detailed_columns(both, strip).start < strip // 2 else 1]
+    column = torch.tensor([half.start + 0.5 * (strip - 1) - 0.5 * (width - 1)], dtype=torch.float64)
+    of_strip = ColumnMotion.of_columns(motion, column, timing, count, height)
+    masked = None if hidden is None else hidden[..., half]
+    return raw[..., half], restored[..., half], masked, frame_motion(of_strip, timing, count, height)
