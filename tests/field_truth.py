@@ -1,7 +1,7 @@
 """Frames of a camera that rolls and zooms, independent of the package: SciPy splines in two dimensions, float64.
 
-A pixel p sees the scene position s with ``p - c = (s - c) + (X - theta y + zeta x, Y + theta x + zeta y)``, (x, y) = s - c
-and c the centre of the frame. Every pixel is sampled at its own position and time.
+A pixel p sees the scene position s with ``p - c = (s - c) + (X - theta y + zeta x, Y + theta x + zeta y)``, where c is
+the centre of the frame and (x, y) = s - c. Every pixel is sampled at its own position and time.
 """
 
 from dataclasses import dataclass

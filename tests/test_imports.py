@@ -27,7 +27,9 @@ LAYERS = (
 INNER_LAYERS = {
     "detection": (
         {"measurements", "result"},
-        {"start", "tones"},
+        {"strips"},
+        {"tones"},
+        {"start"},
         {"rows", "reliability", "sensitivity"},
         {"shapes"},
         {"recorded"},
@@ -37,6 +39,7 @@ INNER_LAYERS = {
     "report": ({"results", "plots"}, {"html"}),
     "restoration": (
         {"frame_motion"},
+        {"field_motion"},
         {"scene_model"},
         {"noise"},
         {"exact", "banded", "dewarp", "verdict"},

@@ -110,8 +110,8 @@ class _Method:
     """A method of detection: ``fit(start, frames, valid, timing, options)`` -> result.
 
     The arguments of ``fit`` are the offset curve (B, P, N) of row bands with its measurements, the grey frames
-    (B, T, H, W) in row order, their valid pixels (bool of that shape, or None for all), the sensor in row order, and the
-    options. Stacks of a batch must not affect each other.
+    (B, T, H, W) in row order, their valid pixels (bool of that shape, or None for all), the sensor in row order, and
+    the options. Stacks of a batch must not affect each other.
 
     Attributes:
         fit: The function.
@@ -452,7 +452,7 @@ def _detect(
             timing=row_timing,
             other_motion=None if other_motion is None else other_motion[index],
             max_tones=MAX_TONES if options.tones is None and options.model.harmonics == 1 else math.inf,
-            scale=scale,
+            radius=scale.radius,
         )
         for index in range(len(frames))
     ]

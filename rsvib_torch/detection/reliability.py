@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.result import OtherMotion
-from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
 from rsvib_torch.detection.tones.selection import MIN_OFFSET, MIN_SIGNIFICANCE
 from rsvib_torch.motion.timing import RowTiming
@@ -29,7 +28,7 @@ def judge(
     other_motion: OtherMotion | None = None,
     max_tones: float = math.inf,
     min_bands: float = 0.5,
-    scale: FieldScale,
+    radius: float = 0.0,
 ) -> tuple[Tensor, tuple[tuple[str, ...], ...]]:
     """Verdict on one vibration (not a batch), from the measurements that it was fitted to.
 
@@ -48,12 +47,12 @@ def judge(
         other_motion: Motion of the rows that the vibration does not explain; None if it was fitted to bands.
         max_tones: Largest number of tones that was tried on an axis; an axis with so many may have more.
         min_bands: Fraction of the visible bands or rows that must be registered.
-        scale: Components of the motion. Roll and zoom are in px, at ``scale.radius`` px from the centre.
+        radius: Distance from the centre, in px, at which roll and zoom are displacements in px.
 
     Returns:
         (A,) bool and the reasons against each of the A axes.
     """
-    reasons: list[list[str]] = [[] for _ in range(scale.axes)]
+    reasons: list[list[str]] = [[] for _ in range(vibration.num_axes)]
     good = torch.isfinite(offsets).all(-1) & visible
     # condition (24) concerns the tones only: the blur by a uniform motion is exact at any speed
     tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
@@ -81,7 +80,8 @@ def judge(
             values = (float(value[axis]) for value in (displacement, std.displacement, own_std))
             against.extend(_against_displacement(*values, num_tones=int(amplitude.count_nonzero())))
         if other_motion is not None:
-            against.extend(_against_rotation(other_motion, axis, scale) + _against_other_motion(other_motion, axis))
+            against.extend(_against_rotation(other_motion, axis, vibration.num_axes))
+            against.extend(_against_other_motion(other_motion, axis))
             continue
         if bool(good.any()):
             against.extend(_against_fit(offsets[good, axis], fitted[good, axis]))
@@ -90,6 +90,8 @@ def judge(
                 f"the image moves {within_row[axis]:.2g} px within a row time, condition (24) allows "
                 f"{max_within_row} px: the camera does not move as a whole, or row_time is wrong; check row_time"
             )
+    for against in reasons[2:]:
+        against[:] = [f"{text} (px: at {radius:.0f} px from the centre)" if " px" in text else text for text in against]
     reliable = torch.tensor([not against for against in reasons], device=vibration.device)
     return reliable, tuple(map(tuple, reasons))
 
@@ -219,13 +221,13 @@ def rotation_found(other: OtherMotion) -> bool:
     return any(float(other.differential[1 - axis]) > _max_apart(other, axis) for axis in range(2))
 
 
-def _against_rotation(other: OtherMotion, axis: int, scale: FieldScale) -> list[str]:
+def _against_rotation(other: OtherMotion, axis: int, axes: int) -> list[str]:
     """Reasons from rotation and zoom, which move the halves of a row apart along the other axis.
 
     A roll by theta moves the halves of a row by ``theta W / 4`` along y in opposite directions, and rows by up to
     ``theta H / 2`` along x. A zoom does the same with the axes exchanged. Rows of both axes are concerned by parallax.
     """
-    if scale.axes > 2:
+    if axes > 2:
         apart, allowed = float(other.differential.amax()), _max_apart(other, axis)
         if apart <= allowed:
             return []
@@ -238,8 +240,8 @@ def _against_rotation(other: OtherMotion, axis: int, scale: FieldScale) -> list[
         return []
     return [
         f"left and right halves of the rows move apart by {apart:.3g} px along {'yx'[axis]}, {allowed:.2g} px are "
-        "allowed: the camera rolls or zooms, or the scene has parallax; pass roll='auto', zoom='auto', or select a part "
-        "of the frame with one distance"
+        "allowed: the camera rolls or zooms, or the scene has parallax; pass roll='auto', zoom='auto', or select a "
+        "part of the frame with one distance"
     ]
 
 

@@ -194,8 +194,8 @@ def field_start(
 ) -> BandStart:
     """Offsets of row bands for a motion with roll or zoom, from two to four parts of the columns.
 
-    Bands of parts of the width are often registered wrongly. The tones of x and y are therefore taken from a fit without
-    roll and zoom, which is disturbed by them much less.
+    Bands of parts of the width are often registered wrongly. The tones of x and y are therefore taken from a fit
+    without roll and zoom, which has smaller errors.
 
     Args:
         frames: As in ``band_curve``.

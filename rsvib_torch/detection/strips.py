@@ -72,7 +72,8 @@ class FieldScale:
 
     def factors(self, x: Tensor, y: Tensor) -> Tensor:
         """Displacement (S, 2, A) at positions (S) in px from the centre by unit components in px."""
-        return displacement_factors(x, y, self.axes) * self.units(x)
+        factors: Tensor = displacement_factors(x, y, self.axes) * self.units(x)
+        return factors
 
 
 def combined_strips(measured: Measurements, factors: Tensor) -> tuple[Measurements, Tensor]:
@@ -143,5 +144,3 @@ def cut_into_strips(values: Tensor, count: int, edge: int) -> tuple[Tensor, Tens
     strips = torch.stack([values[..., first : first + columns] for first in firsts], 1).flatten(0, 1)
     middles = torch.tensor(firsts, dtype=torch.float64, device=values.device) + 0.5 * (columns - width)
     return strips, middles
-
-

@@ -1,7 +1,7 @@
 """Strips of columns that overlap by half and are added up with triangular weights.
 
-Roll and zoom displace the content of a row by amounts that change slowly along the row. What requires a displacement per
-row is applied to strips, each with the displacement of its middle; between two middles the result is interpolated.
+Roll and zoom displace the content of a row by amounts that change slowly along the row. What requires a displacement
+per row is applied to strips, each with the displacement of its middle; between middles the result is interpolated.
 """
 
 import math

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
-from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.arrays import ArrayLike, as_tensor, channels_appear_last
+from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.sensor_model import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory

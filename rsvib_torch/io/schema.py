@@ -1,8 +1,8 @@
 """JSON schema of timing, vibration, standard deviations and detections, shared by all files that the package writes.
 
 ``vibration.json``, ``manifest.json`` and the journal of a stack, and the TOML configuration use these records. Lists
-are ordered (x, y), with one list of tones for each axis; a motion with roll and zoom has three or four axes. null stands
-for a value that is unknown or not finite.
+are ordered (x, y), with one list of tones for each axis; a motion with roll and zoom has three or four axes. null
+stands for a value that is unknown or not finite.
 """
 
 import math

@@ -82,7 +82,7 @@ class ColumnMotion(Motion):
     def of_columns(
         cls, motion: Motion, columns: Tensor, timing: RowTiming, num_frames: int, num_rows: int
     ) -> "ColumnMotion":
-        """Motions (B S) of columns (S,) in px from the centre for a motion (B), those of one stack behind each other."""
+        """Motions (B S) of columns (S,) in px from the centre for a motion (B), stack after stack."""
         repeated = motion.mapped(lambda values: values.repeat_interleave(len(columns), 0))
         column = columns.to(dtype=torch.float64, device=motion.device).repeat(*motion.batch_shape)
         return cls(repeated, column, tuple(timing.frame_starts(num_frames).tolist()), timing.row_time, num_rows)
@@ -107,7 +107,7 @@ class ColumnMotion(Motion):
         return self.column.reshape(*self.column.shape, *(1,) * (dimensions - self.column.ndim))
 
     def _positions(self, starts: Tensor, components: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions (x, y) in the scene (S each) of rows with exposures from ``starts`` (S) on, at components (S, A)."""
+        """Positions x and y (S) in the scene of rows exposed from ``starts`` (S) on, at components (S, A)."""
         frames = torch.tensor(self.frame_starts, dtype=torch.float64, device=self.device)
         frame = torch.searchsorted(frames, (starts + 1e-9 * self.row_time).contiguous(), right=True) - 1
         row = (starts - frames[frame.clamp(min=0)]) / self.row_time

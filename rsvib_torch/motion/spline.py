@@ -60,7 +60,9 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         if not bool(torch.isfinite(values).all()):
             raise ValueError("coefficients must be finite")
         axes = values.shape[-2]
-        tones = Vibration.still(values.shape[:-2], values.device, axes=axes) if tones is None else tones.to(values.device)
+        tones = (
+            Vibration.still(values.shape[:-2], values.device, axes=axes) if tones is None else tones.to(values.device)
+        )
         if tones.batch_shape != values.shape[:-2] or tones.num_axes != axes:
             raise ValueError(
                 f"tones of batch shape {tuple(tones.batch_shape)} and {tones.num_axes} axes do not fit coefficients "

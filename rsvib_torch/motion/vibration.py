@@ -42,8 +42,8 @@ def _per_tone(values: dict[str, TensorLike], device: torch.device | None) -> lis
         if not 2 <= count <= 4 or axes not in (0, count):
             others = "" if axes in (0, count) else f"; the other values have {axes} axes"
             raise ValueError(
-                f"{name} must have shape (2,), (2, K) or (..., 2, K) for axes (x, y), with 3 for (x, y, roll) and 4 for "
-                f"(x, y, roll, zoom), got {tuple(tensor.shape)}{others}"
+                f"{name} must have shape (2,), (2, K) or (..., 2, K) for axes (x, y), with 3 for (x, y, roll) and 4 "
+                f"for (x, y, roll, zoom), got {tuple(tensor.shape)}{others}"
             )
         axes = count
     return [tensor.expand(axes or 2, 1) if tensor.ndim == 0 else tensor for tensor in tensors.values()]
@@ -152,9 +152,7 @@ class Vibration(Motion, units=_UNITS):
         object.__setattr__(self, "image_acceleration", acceleration.expand(*batch, axes))
 
     @classmethod
-    def still(
-        cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None, *, axes: int = 2
-    ) -> Self:
+    def still(cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None, *, axes: int = 2) -> Self:
         """No vibration and no image motion: the camera stands still."""
         zeros = torch.zeros(*batch_shape, axes, 1, dtype=torch.float64, device=device)
         return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0])

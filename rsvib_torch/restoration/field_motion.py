@@ -1,8 +1,8 @@
 """Strips of columns for motions with roll or zoom, in which the displacement depends on the row only.
 
-Restoration methods require a displacement that depends on the row only. With roll or zoom it changes slowly along a row.
-Frames are then restored in strips of columns that overlap by half, each by the ``ColumnMotion`` of its middle, and the
-strips are added up with triangular weights: between two middles, the displacement is interpolated linearly.
+Restoration methods require a displacement that depends on the row only. With roll or zoom it changes slowly along a
+row. Frames are then restored in strips of columns that overlap by half, each by the ``ColumnMotion`` of its middle, and
+added up with triangular weights: between two middles, the displacement is interpolated linearly.
 """
 
 import math

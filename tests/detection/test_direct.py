@@ -8,7 +8,7 @@ from scipy import ndimage
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, detect_vibration, register_bands, simulate_frames
-from rsvib_torch.detection.rows import direct
+from rsvib_torch.detection.rows import direct, measured_rows
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
 from rsvib_torch.evaluation import resolution_chart
 from rsvib_torch.registration.gradients import residual_products, row_equations, row_gradients
@@ -290,8 +290,8 @@ def test_further_rounds_change_the_result_by_less_than_its_std(paper_camera, mon
     """Compared with a detection that uses all rounds."""
     frames = noisy_frames(paper_camera, Motion((3.1, 5.2), (50.0, 30.0), (0.4, -1.1)), 91, 0.005)
     rounds = []
-    measure = direct.measure_groups
-    monkeypatch.setattr(direct, "measure_groups", lambda *given: (rounds.append(1), measure(*given))[1])
+    measure = measured_rows.measure_groups
+    monkeypatch.setattr(measured_rows, "measure_groups", lambda *given: (rounds.append(1), measure(*given))[1])
     found = detect_vibration(frames, paper_camera)
     few = len(rounds)
     monkeypatch.setattr(direct, "_converged", lambda *given: False)

@@ -21,7 +21,7 @@ def test_number_of_axes():
     assert vibration.image_motion.tolist() == [4.0, 0.0, 0.0]
     assert vibration.displacement(torch.zeros(5)).shape == (5, 3)
     assert "roll" in str(vibration)
-    with pytest.raises(ValueError, match="frequency must have shape .* the other values have 3 axes"):
+    with pytest.raises(ValueError, match=r"frequency must have shape .* the other values have 3 axes"):
         Vibration((3.1, 5.2, 1e-3), (90.0, 61.0))
     with pytest.raises(ValueError, match="image_motion must have shape"):
         Vibration((3.1, 5.2, 1e-3, 0.0), (90.0, 61.0, 70.0, 1.0), image_motion=(1.0, 2.0, 3.0))
@@ -35,9 +35,7 @@ def test_displacement_field():
     torch.testing.assert_close(moved, torch.tensor([0.9, 2.2], dtype=torch.float64))
 
 
-@given(
-    st.tuples(*[st.floats(-3, 3)] * 4), st.floats(-200, 200), st.floats(-100, 100), st.sampled_from(ORIENTATIONS)
-)
+@given(st.tuples(*[st.floats(-3, 3)] * 4), st.floats(-200, 200), st.floats(-100, 100), st.sampled_from(ORIENTATIONS))
 def test_row_order_is_a_reflection_of_the_field(values, x, y, orientation):
     """The displacement of a turned point by the turned motion is the turned displacement."""
     timing = SensorTiming(8e-5, 20, 300, scan_axis=orientation[0], readout_direction=orientation[1])

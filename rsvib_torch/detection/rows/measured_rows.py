@@ -1,4 +1,7 @@
-"""Rows of frames as they are measured for a fit: as a whole, or in strips of columns for roll and zoom."""
+"""Rows of frames as they are measured for a fit: as a whole, or in strips of columns for roll and zoom.
+
+Invariant: the displacement depends on the row only (docs/architecture.md), in each strip.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -83,9 +86,7 @@ class MeasuredRows:
         """Whether the frames of any group are blurred differently."""
         view = self.view(motion)
         height = self.groups[0].spectra.height
-        return any(
-            bool(differently_blurred(group.starts, height, self.timing, view).any()) for group in self.groups
-        )
+        return any(bool(differently_blurred(group.starts, height, self.timing, view).any()) for group in self.groups)
 
 
 def whole_rows(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration) -> MeasuredRows:
@@ -164,7 +165,8 @@ class StripRows(MeasuredRows):
             factors = self.scale.factors(x, y)
             along = self.scale.factors(x + 1, y) - factors  # change of the displacement per column
             each.append(factors + mean_place @ along)
-        return torch.cat(each, 1).unflatten(0, (-1, strips))
+        of_groups: Tensor = torch.cat(each, 1).unflatten(0, (-1, strips))
+        return of_groups
 
     def blur_ratio(self, motion: Vibration) -> Tensor:
         """(B, 3), the weighted mean over the strips."""

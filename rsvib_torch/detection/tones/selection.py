@@ -1,7 +1,5 @@
 """Number of tones: added one by one, strongest first, while they are significant, with weights against outliers."""
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -16,7 +14,6 @@ from rsvib_torch.detection.tones.fit import (
     offset_gain,
     residual_of,
     select_stacks,
-    strongest_only,
 )
 from rsvib_torch.detection.tones.periodogram import best_candidate, visibility
 
