@@ -1,0 +1,85 @@
+"""Detection and restoration of frames of a camera that rolls and zooms, against an independent camera."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from field_truth import FieldMotion, take_field_frames
+from truth import decibel, draw_scene
+
+from rsvib_torch import DetectionResult, SensorTiming, detect_vibration, judge_restoration, restore
+from rsvib_torch.report.results import read_vibration
+
+TIMING = SensorTiming(row_time=8e-5, exposure_rows=12, frame_rows=280)
+TRUTH = FieldMotion((1.4, 1.9, 2.5e-3, 0.0), (38.0, 31.0, 26.0, 0.0), (0.3, 1.1, 2.0, 0.0))
+SIZE = (224, 288)
+
+
+@pytest.fixture(scope="module")
+def rolling():
+    """Scene at rest and four frames with noise."""
+    scene = draw_scene(304, 368, 11, blur=1.2)
+    frames = take_field_frames(scene, TIMING, TRUTH, SIZE, 4, nodes=6)
+    still = take_field_frames(scene, TIMING, FieldMotion((0.0,) * 4), SIZE, 1, nodes=1)[0]
+    noise = 0.004 * np.random.default_rng(5).standard_normal(frames.shape)
+    return still, torch.from_numpy(frames + noise).float()
+
+
+@pytest.fixture(scope="module")
+def detection(rolling):
+    return detect_vibration(rolling[1], TIMING, roll=True)
+
+
+def test_roll_is_detected(detection):
+    assert detection.vibration.amplitude.shape[-2] == 3
+    assert detection.reliable.tolist() == [True, True, True]
+    expected = TRUTH.vibration(3)
+    for name in ("amplitude", "frequency", "phase"):
+        error = (getattr(detection.vibration, name) - getattr(expected, name)).abs()[:, 0]
+        std = getattr(detection.std, name)[:, 0]
+        assert bool((error < 3.5 * std).all()), (name, error, std)
+    assert abs(float(detection.vibration.amplitude[2, 0]) / TRUTH.amplitude[2] - 1) < 0.02
+    assert float(detection.std.amplitude[2, 0]) < 1e-4
+
+
+def test_ignored_roll_is_named_as_the_reason(rolling):
+    found = detect_vibration(rolling[1], TIMING)
+    assert not bool(found.reliable[0])
+    assert "roll='auto'" in " ".join(found.reasons[0])
+
+
+def test_the_result_is_printed_saved_and_read(detection, tmp_path):
+    text = str(detection)
+    assert "roll" in text
+    assert "rad" in text
+    path = tmp_path / "vibration.json"
+    detection.save(path)
+    again = DetectionResult.load(path)
+    torch.testing.assert_close(again.vibration.amplitude, detection.vibration.amplitude)
+    assert read_vibration(path).vibration.num_axes == 3
+
+
+@pytest.mark.parametrize(("method", "least_gain"), [("dewarp", 2.0), ("exact", 3.0)])
+def test_frames_are_restored(rolling, detection, method, least_gain):
+    """The gain over a restoration without roll is the effect of this motion, not of the vibration."""
+    still, frames = rolling
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        restored = restore(frames[1:3], _later(TIMING, 1), detection, method=method)
+    ignoring = restore(frames[1:3], _later(TIMING, 1), detection.with_axes(2).vibration, method=method, check=False)
+    assert decibel(restored, still) > decibel(ignoring, still) + least_gain
+    verdict = judge_restoration(frames[1:3], restored, _later(TIMING, 1), detection)
+    assert verdict.overall == "helps"
+    wrong = judge_restoration(frames[1:3], ignoring, _later(TIMING, 1), detection)
+    assert float(wrong.misfit_after.amax()) > 2 * float(verdict.misfit_after.amax())
+
+
+def _later(timing, frame):
+    starts = timing.frame_starts(frame + 2)[frame:]
+    return SensorTiming(timing.row_time, timing.exposure_rows, timing.frame_rows, frame_start_times=starts)
+
+
+def test_wrong_values(rolling):
+    with pytest.raises(ValueError, match="roll must be True, False or 'auto', got 'yes'"):
+        detect_vibration(rolling[1], TIMING, roll="yes")
