@@ -52,6 +52,12 @@ class ColumnStrips:
         """(S,) float64 px, middles of the strips from the centre of the frame."""
         return torch.tensor(self.middles, dtype=torch.float64) - 0.5 * (self.frame_width - 1)
 
+    @property
+    def edges(self) -> tuple[int, ...]:
+        """Columns where a part that is nearer to one middle than to the others begins, and the end of the frame."""
+        step = self.frame_width / len(self.firsts)
+        return (*(round(number * step) for number in range(len(self.firsts))), self.frame_width)
+
     def cut(self, images: Tensor) -> Tensor:
         """Strips (B S, ..., w) of images (B, ..., W)."""
         return torch.stack([images[..., first : first + self.width] for first in self.firsts], 1).flatten(0, 1)

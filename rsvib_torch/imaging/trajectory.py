@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.splines import gauss_legendre
+from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 
@@ -78,7 +79,11 @@ def exposure_trajectory(
 
     Returns:
         Displacement (S, N, 2) in px, axes (x, y), and weights (N,), both float64.
+
+    Raises:
+        ValueError: If the motion has roll or zoom, see ``motion.field``.
     """
+    check_two_axes(vibration, "the displacement of a row")
     if quadrature == "gauss" and num_nodes is None:
         num_nodes = gauss_node_count(vibration, timing.exposure_time)
     times, weights = exposure_nodes(timing, quadrature, num_nodes)
@@ -110,6 +115,7 @@ def rows_showing(
     Returns:
         Frame rows, float64, broadcast shape of S and ``frame_start``.
     """
+    check_two_axes(vibration, "the displacement of a row")
     exposure_time = timing.exposure_time if exposure_time is None else exposure_time
     scene_rows = scene_rows.to(torch.float64)
     rows = scene_rows + torch.zeros_like(frame_start)

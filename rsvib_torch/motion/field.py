@@ -171,7 +171,10 @@ class ColumnMotion(Motion):
         raise NotImplementedError("a ColumnMotion stays in row order; exchange the axes of its components")
 
 
-def check_two_axes(motion: Motion, function: str) -> None:
-    """Raise a ``ValueError`` for a motion with roll or zoom where a function does not support it."""
+def check_two_axes(motion: Motion, what: str) -> None:
+    """Raise a ``ValueError`` for a motion with roll or zoom where they are not supported."""
     if motion.num_axes > 2:
-        raise ValueError(f"{function} does not support roll and zoom; pass a motion with the axes (x, y)")
+        raise ValueError(
+            f"{what} is not defined with roll and zoom, which displace the columns of a row differently; pass a motion "
+            "with the axes (x, y) only"
+        )

@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
 from rsvib_torch.imaging.trajectory import rows_showing
+from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 
@@ -72,6 +74,13 @@ def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows
     return FrameMotion(vibration, timing, starts, shift)
 
 
+def _of_column(motion: Motion, column: Tensor, timing: RowTiming, num_frames: int, num_rows: int) -> Motion:
+    """Displacement (B) of a column in px from the centre of the frame, by a motion (B) in row order."""
+    if motion.num_axes == 2:
+        return motion
+    return ColumnMotion.of_columns(motion, column[None], timing, num_frames, num_rows)
+
+
 def visible_pixels(
     timing: SensorTiming, vibration: Motion, size: tuple[int, int], num_frames: int
 ) -> tuple[Tensor, Tensor]:
@@ -99,15 +108,23 @@ def visible_pixels(
     check_whole_number("num_frames", num_frames, at_least=1)
     height, width = size if timing.scan_axis == -2 else (size[1], size[0])
     batch = vibration.batch_shape
-    rowwise = vibration.to_row_order(timing)
+    rowwise, row_timing = vibration.to_row_order(timing), timing.in_row_order()
     rowwise = rowwise if batch else rowwise.expanded(1)
-    motion = frame_motion(rowwise, timing.in_row_order(), num_frames, height)
-    rows = motion.frame_rows(torch.arange(height, dtype=torch.float64, device=vibration.device))
-    starts = motion.row_starts(rows)
-    displacement = rowwise.mean_displacement(starts, timing.exposure_time)[..., 0] - motion.shift[..., 0, None]
-    columns = torch.arange(width, device=vibration.device) + displacement[..., None]
-    visible_rows = ((rows >= 0) & (rows <= height - 1))[..., None]
-    mask = frames_from_row_order(visible_rows & (columns >= 0) & (columns <= width - 1), timing)
+    strips = ColumnStrips.of(width, max_pitch=width if rowwise.num_axes == 2 else 16, margin=0)
+    parts = []
+    for first, last, column in zip(strips.edges[:-1], strips.edges[1:], strips.columns, strict=True):
+        motion = frame_motion(
+            _of_column(rowwise, column, row_timing, num_frames, height), row_timing, num_frames, height
+        )
+        rows = motion.frame_rows(torch.arange(height, dtype=torch.float64, device=vibration.device))
+        starts = motion.row_starts(rows)
+        displacement = (
+            motion.vibration.mean_displacement(starts, timing.exposure_time)[..., 0] - motion.shift[..., 0, None]
+        )
+        columns = torch.arange(first, last, device=vibration.device) + displacement[..., None]
+        visible_rows = ((rows >= 0) & (rows <= height - 1))[..., None]
+        parts.append(visible_rows & (columns >= 0) & (columns <= width - 1))
+    mask = frames_from_row_order(torch.cat(parts, -1), timing)
     shift = offsets_from_row_order(motion.shift, timing)
     return (mask, shift) if batch else (mask[0], shift[0])
 

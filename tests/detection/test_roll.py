@@ -8,7 +8,15 @@ import torch
 from field_truth import FieldMotion, take_field_frames
 from truth import decibel, draw_scene
 
-from rsvib_torch import DetectionResult, SensorTiming, detect_vibration, judge_restoration, restore
+from rsvib_torch import (
+    DetectionResult,
+    SensorTiming,
+    detect_vibration,
+    judge_restoration,
+    restore,
+    row_psf,
+    visible_pixels,
+)
 from rsvib_torch.report.results import read_vibration
 
 TIMING = SensorTiming(row_time=8e-5, exposure_rows=12, frame_rows=280)
@@ -83,3 +91,22 @@ def _later(timing, frame):
 def test_wrong_values(rolling):
     with pytest.raises(ValueError, match="roll must be True, False or 'auto', got 'yes'"):
         detect_vibration(rolling[1], TIMING, roll="yes")
+
+
+def test_visible_pixels_follow_the_roll():
+    """A pixel is visible if its content at rest lies inside the frame while its row is exposed."""
+    motion = FieldMotion((0.0, 0.0, 2e-2, 0.0))
+    mask, shift = visible_pixels(TIMING, motion.vibration(3), SIZE, 2)
+    assert shift.abs().sum() == 0
+    height, width = SIZE
+    y, x = np.mgrid[:height, :width] - np.array([(height - 1) / 2, (width - 1) / 2])[:, None, None]
+    middles = TIMING.row_starts(2, height).numpy()[..., None] + 0.5 * TIMING.exposure_time
+    roll = motion.components(middles)[2]
+    expected = (np.abs(x - roll * y) <= (width - 1) / 2) & (np.abs(y + roll * x) <= (height - 1) / 2)
+    # the roll is taken at the row at rest here, and at the row in the frame by the function
+    assert np.mean(mask.numpy() != expected) < 0.15 * np.mean(~expected)
+
+
+def test_row_functions_refuse_roll():
+    with pytest.raises(ValueError, match="not defined with roll and zoom"):
+        row_psf(TRUTH.vibration(3), TIMING.row_starts(1, 8), TIMING)
