@@ -41,6 +41,7 @@ SECTIONS = {
         "quickstart.md",
         "concepts.md",
         "your_own_camera.md",
+        "roll_and_zoom.md",
         "stacks.md",
         "reliability.md",
         "ml_pipeline.md",
