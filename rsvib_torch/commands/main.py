@@ -17,6 +17,7 @@ from rsvib_torch.commands.terminal import (
     error_line,
     output_of,
     print_line,
+    running,
     show_answer,
     warnings_in_one_line,
 )
@@ -170,7 +171,7 @@ def run_command(arguments: Sequence[str]) -> int:
     logging.getLogger("tifffile").addHandler(logging.NullHandler())  # damaged files raise an error of this package
     command = typer.main.get_command(app)
     try:
-        with warnings_in_one_line():
+        with running(arguments), warnings_in_one_line():
             try:
                 code = command.main(args=list(arguments) or ["--help"], prog_name="rsvib", standalone_mode=False)
             except typer.Abort:

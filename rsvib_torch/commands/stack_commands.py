@@ -17,6 +17,8 @@ from rsvib_torch.commands.answers import (
     detection_data,
     restoration_data,
     restoration_lines,
+    step_parts,
+    step_with_force,
     steps_after_detection,
 )
 from rsvib_torch.commands.options import (
@@ -40,7 +42,7 @@ from rsvib_torch.commands.options import (
     restoration_options,
     torch_device,
 )
-from rsvib_torch.commands.terminal import Answer, counting, error_line, note, working
+from rsvib_torch.commands.terminal import Answer, counting, error_line, note, running_command, working
 from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable, whole_folder
 from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
@@ -120,11 +122,13 @@ def _detect(stack: Stack, config: Config) -> DetectionResult:
     return result
 
 
-def _restore(stack: Stack, motion: Motion | Detected, options: dict[str, Any], force: bool) -> RestoredFrames:
-    """Restore frames, and judge the result on eight pairs of frames."""
+def _restore(
+    stack: Stack, motion: Motion | Detected, options: dict[str, Any], force: bool, output: str = "frames"
+) -> RestoredFrames:
+    """Restore frames, and judge the result on eight pairs of frames; ``output`` names what will be written."""
     with working("restoring and judging"):
         result = stacks.restore_trusted(stack.frames, stack.timing, motion, options, force=force, most_pairs=8)
-    _warn_of_restoration(result)
+    _warn_of_restoration(result, output)
     return result
 
 
@@ -144,12 +148,13 @@ def restore_and_save(
     return result
 
 
-def _warn_of_restoration(result: RestoredFrames) -> None:
+def _warn_of_restoration(result: RestoredFrames, output: str = "frames") -> None:
     """Print a warning if there is nothing to restore, or if restoration does not help or helps in part only."""
+    kept = "the frames are written unchanged" if output == "frames" else "the page has the input frames only"
     if not result.moves:
-        error_line("no vibration to remove: the frames are written unchanged", "warning")
+        error_line(f"no vibration to remove: {kept}", "warning")
     elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
-        unchanged = "" if result.restored else "; the frames are written unchanged, --force writes the restored ones"
+        unchanged = "" if result.restored else f"; {kept}, --force writes the restored ones"
         error_line(result.verdict.sentence + unchanged, "warning")
 
 
@@ -529,7 +534,8 @@ def run(
     if result.bad_frames:
         error_line(f"{result.bad_frames} frames could not be used: see manifest.json", "warning")
     _note_lost(out / output, result.not_kept)
-    page = command_text("report", frames, out / "report", *settings.arguments)
+    windows = ["--manifest", out / "manifest.json"] if result.windows > 1 else []
+    page = command_text("report", frames, out / "report", *settings.arguments, *windows)
     steps = [f"write a page with all figures and the sharpness before and after:\n  {page}"] if result.restored else []
     files = [out / name for name in names]
     if result.windows == 1:
@@ -581,6 +587,12 @@ def report(
             show_default="edges are searched for",
         ),
     ] = None,
+    manifest: Annotated[
+        Path | None,
+        typer.Option(
+            help="The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows."
+        ),
+    ] = None,
     method: MethodOption = None,
     joint: JointOption = None,
     prior: PriorOption = None,
@@ -595,11 +607,18 @@ def report(
     The page is one file that needs no network. The figures are also written as PNG files.
     """
     boxes = [_edge_box(text) for text in edge or []]
+    windows = None if manifest is None else stacks.read_manifest(manifest)
     _check_folder(out, ["report.html"], overwrite)
     stack = load(frames, settings, full_scale, device)
     options = restoration_options(stack.info, stack.full_scale, settings, Overrides(method, joint, prior, saturation))
     detection = _detect(stack, settings)
-    result = _restore(stack, detection, options, force)
+    result = _restore(stack, detection, options, force, "page")
+    if result.restored:
+        run_it = command_text("run", frames, out, *settings.arguments)
+        steps = [f"write the restored frames:\n  {run_it}"]
+    else:
+        steps = step_with_force("report", result, frames, out.with_name(f"{out.name}_forced"), settings)
+    steps += steps_after_detection(detection, frames, settings)
     content = reports.Report(
         title=f"Vibration in {frames.name}",
         subtitle=f"{frames}, camera of {settings.source}",
@@ -612,10 +631,12 @@ def report(
         left_alone=result.left_alone,
         options=options,
         version=rsvib_torch.__version__,
+        next_steps=tuple(step_parts(step) for step in steps),
+        command=running_command(),
+        windows=windows,
     )
     with whole_folder(out) as folder, working("writing the page"):
         files = reports.write_report_page(folder, content, boxes or None)
-    run_it = command_text("run", frames, out, *settings.arguments)
     return Answer(
         {
             f"Vibration in {frames.name}": [detection.summary()],
@@ -623,8 +644,7 @@ def report(
         },
         {"detection": detection_data(detection), "restoration": restoration_data(result)},
         [out / name for name in files],
-        [f"write the restored frames:\n  {run_it}"] * result.restored
-        + steps_after_detection(detection, frames, settings),
+        steps,
     )
 
 

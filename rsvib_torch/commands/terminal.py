@@ -1,8 +1,9 @@
 """Terminal output: progress, the answer of a command as text or JSON, and warnings and errors in one line each."""
 
+import shlex
 import textwrap
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -23,6 +24,8 @@ __all__ = [
     "note",
     "output_of",
     "print_line",
+    "running",
+    "running_command",
     "show_answer",
     "warnings_in_one_line",
     "working",
@@ -57,6 +60,22 @@ class _Output:
 
 
 _outputs: list[_Output] = [_Output()]  # of the running command, last
+_command_lines: list[str] = []  # the running one is the last
+
+
+@contextmanager
+def running(arguments: Sequence[str]) -> Iterator[None]:
+    """Remember the command line while it runs."""
+    _command_lines.append(shlex.join(["rsvib", *arguments]))
+    try:
+        yield
+    finally:
+        _command_lines.pop()
+
+
+def running_command() -> str | None:
+    """The running command line, as it can be copied into a shell; None outside of the program."""
+    return _command_lines[-1] if _command_lines else None
 
 
 @contextmanager

@@ -306,7 +306,7 @@ def free_motion_figure(result: MotionDetection) -> Figure:
 
 
 def verdict_figure(verdict: RestorationVerdict) -> Figure:
-    """Draw the displacement between the frames of each pair before and after restoration, and the estimated gain.
+    """Draw the displacement between the frames of each pair before and after restoration, and the improvement.
 
     Args:
         verdict: The verdict on a restoration.
@@ -327,7 +327,7 @@ def verdict_figure(verdict: RestorationVerdict) -> Figure:
     panels[0].legend(fontsize=9, frameon=False)
     panels[2].plot(pairs, verdict.predicted_gain.cpu(), "o-", color=_AXIS_COLOURS["x"], markersize=4)
     panels[2].axhline(0.0, color=_GREY, linewidth=0.8)
-    panels[2].set_title("estimated gain (dB)", loc="left", fontsize=10, color=_INK)
+    panels[2].set_title("estimated improvement (dB)", loc="left", fontsize=10, color=_INK)
     for panel in panels:
         panel.set_xlabel("pair of frames")
         panel.xaxis.get_major_locator().set_params(integer=True)
@@ -350,10 +350,10 @@ def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
 
 
 def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
-    """Draw the gain of a pair of frames over frequency, and the detected tones with two standard deviations.
+    """Draw the offset gain of a pair of frames over frequency, and the detected tones with two standard deviations.
 
-    The gain is ``|2 sin(pi f m T_row) sinc(f T_e)|``, px of offset per px of displacement (Eqs. 2 and 7 of Liu et al.
-    2023). Blind frequencies are dashed lines.
+    The offset gain is ``|2 sin(pi f m T_row) sinc(f T_e)|``, px of offset per px of displacement (Eqs. 2 and 7 of Liu
+    et al. 2023). Blind frequencies are dashed lines.
 
     Args:
         result: A detection (not a batch).
@@ -392,7 +392,7 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     upper.set_ylim(0, 2.4)
     lower.set_ylim(0, 1.15 * lower.get_ylim()[1])
     upper.set_xlim(0, highest)
-    upper.set_ylabel("gain (px per px)")
+    upper.set_ylabel("offset gain (px per px)")
     lower.set_ylabel("amplitude (px)")
     lower.set_xlabel("frequency (Hz)")
     plain_axes(upper)

@@ -98,7 +98,7 @@ def test_the_answer_of_run_names_everything(place, config, tmp_path, capsys, mon
     assert "assumed: frame_rows, readout direction, scan axis and order of the frames: two frames cannot" in assumed
     assert "assumed: frame_rows=200: if it is stated 1 % too large, this changes x amplitude" in assumed
     assert answer["Restoration"][0] == "2 frames restored along x and y"
-    assert re.fullmatch(r"restored frames agree; estimated gain \+\d+\.\d dB", answer["Restoration"][1])
+    assert re.fullmatch(r"restored frames agree; estimated improvement \+\d+\.\d dB", answer["Restoration"][1])
     names = " ".join(answer["Files (open before_after.png first)"]).removeprefix("out: ").replace(",", "").split()
     assert sorted(names) == sorted(path.name for path in Path("out").iterdir())
     assert names[0] == "before_after.png"

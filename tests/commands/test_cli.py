@@ -241,7 +241,7 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     report = json.loads((out / "restoration.json").read_text())
     assert report["options"] == {"method": "banded", "half_rows": 8, "saturation": 4000 / 4095}
     assert (report["outcome"], report["frames"], report["left_alone"]) == ("helps", "restored", [])
-    assert "restored frames agree; estimated gain +" in capsys.readouterr().out
+    assert "restored frames agree; estimated improvement +" in capsys.readouterr().out
     # options of the configured method are dropped with it
     assert run(*common, "--method", "exact", "--joint", "all", "--saturation", 4095) == 0
     report = json.loads((out / "restoration.json").read_text())

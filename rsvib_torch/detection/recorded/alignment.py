@@ -62,8 +62,8 @@ class ClockAlignment(Result, units={"offset": "s", "offset_std": "s", "drift": "
             [
                 f"time 0 of the frames is {measured_text(self.offset, self.offset_std)} s of the recording",
                 f"scale {measured_text(self.scale, self.scale_std or None, digits=8)}",
-                f"x: gain {self.gain[0]:.4f}, drift {drift[0]:.3g} px/s, {left[0]:.2g} px unexplained",
-                f"y: gain {self.gain[1]:.4f}, drift {drift[1]:.3g} px/s, {left[1]:.2g} px unexplained",
+                f"x: recorded motion times {self.gain[0]:.4f}, drift {drift[0]:.3g} px/s, {left[0]:.2g} px unexplained",
+                f"y: recorded motion times {self.gain[1]:.4f}, drift {drift[1]:.3g} px/s, {left[1]:.2g} px unexplained",
                 wrapped(verdict),
             ]
         )

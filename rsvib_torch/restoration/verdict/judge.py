@@ -68,8 +68,8 @@ class RestorationVerdict(
         noise: (P,) standard deviation of the noise of the raw frames.
         chi_square: (P,) mean square of that frame's difference from its prediction, over the variance of the noise:
             1 ... 2 where motion, blur and noise explain the frame.
-        predicted_gain: (P,) dB, estimated PSNR of the restored frames minus that of the raw ones. It is valid where the
-            motion is right and complete, and NaN where it is not and has the opposite sign of the outcome.
+        predicted_gain: (P,) dB, improvement: estimated PSNR of the restored frames minus that of the raw ones. It is
+            valid where the motion is right and complete, NaN where it is not and has the opposite sign of the outcome.
         outcome: For each pair: ``"helps"``; ``"partly"``: the vibration explains only a part of the displacement;
             ``"worse"``; ``"unknown"``: cannot be determined from this pair (vibration too small, or at a blind
             frequency; frames without contrast; too many missing pixels).
@@ -103,7 +103,7 @@ class RestorationVerdict(
         for pair, (outcome, gain) in enumerate(zip(self.outcome, self.predicted_gain.tolist(), strict=True)):
             sizes = torch.stack([self.misfit_before[pair], self.misfit_after[pair]], -1).flatten()
             rows.append([str(pair), outcome, *(measured_text(size, digits=2) for size in sizes), f"{gain:+.1f}"])
-        head = ("pair", "outcome", "x before (px)", "x after (px)", "y before (px)", "y after (px)", "gain (dB)")
+        head = ("pair", "outcome", "x before (px)", "x after (px)", "y before (px)", "y after (px)", "improvement (dB)")
         return f"{wrapped(self.sentence)}\n{text_table(head, rows)}"
 
     @property
@@ -113,7 +113,7 @@ class RestorationVerdict(
         gain = float(self.predicted_gain.nanmean())
         counted = f" ({self.outcome.count(self.overall)} of {len(self.outcome)} pairs)" if len(self.outcome) > 1 else ""
         sentences = {
-            "helps": "restored frames agree" + ("" if math.isnan(gain) else f"; estimated gain {gain:+.1f} dB"),
+            "helps": "restored frames agree" + ("" if math.isnan(gain) else f"; estimated improvement {gain:+.1f} dB"),
             "unknown": f"cannot determine whether restoration helps{counted}: {self.reasons[worst]}",
             "partly": f"restoration helps in part only{counted}: {self.reasons[worst]}",
             "worse": f"restored is no better than raw{counted}: {self.reasons[worst]}",
@@ -187,8 +187,8 @@ def _outcome(
     if outcome in ("partly", "worse") or gain >= 0 or not motion_is_complete:
         return outcome, reason
     if gain < -_GAIN_ERROR:
-        return "worse", f"noise and artefacts outweigh the restored sharpness (estimated gain {gain:.1f} dB)"
-    return "unknown", reason or f"the estimated gain of {gain:.1f} dB is within its error of {_GAIN_ERROR:g} dB"
+        return "worse", f"noise and artefacts outweigh the restored sharpness (estimated improvement {gain:.1f} dB)"
+    return "unknown", reason or f"the estimated improvement of {gain:.1f} dB is within its error of {_GAIN_ERROR:g} dB"
 
 
 def _mean_square(difference: Tensor) -> Tensor:
