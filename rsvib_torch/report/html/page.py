@@ -29,7 +29,7 @@ from rsvib_torch.report.html.template import (
 from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
 from rsvib_torch.stacks import StackManifest
 
-__all__ = ["Box", "Edge", "Report", "measure_edges", "write_report_page"]
+__all__ = ["Box", "Edge", "Report", "frames_in_turn", "measure_edges", "whole_frame", "write_report_page"]
 
 Box = tuple[int, int, int, int]  # top, left, height, width in px
 
@@ -197,7 +197,7 @@ def _grey_scale(levels: GreyLevels) -> str:
     )
 
 
-def _whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: tuple[str, ...]) -> BeforeAfter:
+def whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: tuple[str, ...]) -> BeforeAfter:
     """One frame of the input, and the restored one beside it if there is one, with a part at full resolution."""
     grey = _grey(frames[-1]).float()
     place = plots.detailed_places(grey, min(96, *grey.shape), count=1, rim=16)[0]
@@ -216,7 +216,7 @@ def _whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: 
     return replace(pair, caption=f"{'. '.join([*parts, _grey_scale(pair.levels)])}{alike}.")
 
 
-def _blinking(report: Report, index: int, removed: Vibration, size: int = 480) -> Blink | None:
+def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 480) -> Blink | None:
     """Two consecutive frames before and after restoration, at full resolution where detail is strongest.
 
     Uniform motion along the image is compensated by whole px, the same for input and restored frames, so that the
@@ -365,8 +365,8 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         "tried": tried,
         "next_steps": report.next_steps,
         "frames_title": "Input and restored frame" if restored else "Input frame",
-        "overview": _whole_frame(report, index, shown, names),
-        "blink": _blinking(report, index, removed),
+        "overview": whole_frame(report, index, shown, names),
+        "blink": frames_in_turn(report, index, removed),
         "details": [] if after is None else _details(before, after, names),
         "offsets": offsets,
         "tones_head": words.TONE_HEAD,
