@@ -235,7 +235,7 @@ def sensor_toml(values: Mapping[str, object], head: list[str]) -> str:
     """
 
     def comment(text: str) -> list[str]:
-        return textwrap.wrap(text, 100, initial_indent="# ", subsequent_indent="# ")
+        return textwrap.wrap(text, 76, initial_indent="# ", subsequent_indent="# ")
 
     lines = [*(line for text in head for line in comment(text)), "", "[sensor]"]
     for name, value in values.items():

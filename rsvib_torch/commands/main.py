@@ -98,7 +98,8 @@ _COMMANDS: tuple[tuple[str, Callable[..., Answer], str, str], ...] = (
         motion_commands.calibrate,
         "Measure row time and exposure with a flickering light.",
         """
-        rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 --out camera.toml
+        rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
+              --out camera.toml
         rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025
         """,
     ),

@@ -151,10 +151,11 @@ def restore_and_save(
 def _warn_of_restoration(result: RestoredFrames, output: str = "frames") -> None:
     """Print a warning if there is nothing to restore, or if restoration does not help or helps in part only."""
     kept = "the frames are written unchanged" if output == "frames" else "the page has the input frames only"
+    forced = "writes" if output == "frames" else "shows"
     if not result.moves:
         error_line(f"no vibration to remove: {kept}", "warning")
     elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
-        unchanged = "" if result.restored else f"; {kept}, --force writes the restored ones"
+        unchanged = "" if result.restored else f"; {kept}, --force {forced} the restored ones"
         error_line(result.verdict.sentence + unchanged, "warning")
 
 
@@ -583,6 +584,7 @@ def report(
     edge: Annotated[
         list[str] | None,
         typer.Option(
+            metavar="EDGE",
             help="Slanted edge to measure: TOP,LEFT,HEIGHT,WIDTH in px; may be given several times.",
             show_default="edges are searched for",
         ),
@@ -597,7 +599,9 @@ def report(
     joint: JointOption = None,
     prior: PriorOption = None,
     saturation: SaturationOption = None,
-    force: ForceOption = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Show the restored frames even if they are judged no better than the input.")
+    ] = False,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
     overwrite: OverwriteOption = False,

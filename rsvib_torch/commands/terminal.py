@@ -128,12 +128,17 @@ def note(message: str) -> None:
 
 
 def error_line(message: str, kind: str = "error") -> None:
-    """Print a message to standard error, with the prefix ``rsvib: error:`` on each of its lines."""
+    """Print a message to standard error, with the prefix ``rsvib: error:`` on each of its lines.
+
+    Lines are wrapped between words in a terminal, and not at all in a file or pipe.
+    """
     if kind == "warning":
         _outputs[-1].warnings.append(message)
     console = Console(stderr=True, highlight=False)
     for line in message.splitlines() or [""]:
-        console.print(Text.assemble(("rsvib: ", "bold"), (f"{kind}: ", "bold red"), line), soft_wrap=True)
+        console.print(
+            Text.assemble(("rsvib: ", "bold"), (f"{kind}: ", "bold red"), line), soft_wrap=not console.is_terminal
+        )
 
 
 @contextmanager
