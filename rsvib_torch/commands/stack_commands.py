@@ -535,7 +535,7 @@ def run(
     if result.bad_frames:
         error_line(f"{result.bad_frames} frames could not be used: see manifest.json", "warning")
     _note_lost(out / output, result.not_kept)
-    windows = ["--manifest", out / "manifest.json"] if result.windows > 1 else []
+    windows = ["--manifest", str(out / "manifest.json")] if result.windows > 1 else []
     page = command_text("report", frames, out / "report", *settings.arguments, *windows)
     steps = [f"write a page with all figures and the sharpness before and after:\n  {page}"] if result.restored else []
     files = [out / name for name in names]
