@@ -252,7 +252,8 @@ def test_files_are_read(grey, tmp_path):
     with pytest.raises(ValueError, match=r"counts reach 65535, beyond full_scale=4095"):
         rsv.restore(paths, TIMING, VIBRATION, full_scale=4095)
     offsets = rsv.register_bands(paths, TIMING, full_scale=65535).offsets
-    assert torch.equal(offsets, rsv.register_bands(counts, TIMING, full_scale=65535).offsets)
+    expected_offsets = rsv.register_bands(counts, TIMING, full_scale=65535).offsets
+    torch.testing.assert_close(offsets, expected_offsets, rtol=0, atol=0, equal_nan=True)
     judged = rsv.judge_restoration(paths, paths, TIMING, VIBRATION, full_scale=65535)
     from_counts = rsv.judge_restoration(counts, counts, TIMING, VIBRATION, full_scale=65535)
     torch.testing.assert_close(judged.misfit_after, from_counts.misfit_after, rtol=0, atol=0, equal_nan=True)
@@ -337,3 +338,11 @@ def test_motions_and_kernels_of_another_type_are_refused(grey):
         rsv.align_motion(grey, TIMING, VIBRATION)
     with pytest.raises(TypeError, match=r"psf must be a RowPSF \(row_psf\), got SensorTiming"):
         rsv.RowVaryingBlur(TIMING)
+
+
+def test_copies_of_frames_are_named(grey):
+    """A converter that repeats a frame changes the time of all following ones."""
+    with pytest.raises(ValueError, match="frames 1 and 2 are identical: one of them is a copy"):
+        rsv.detect_vibration(grey[[0, 1, 1, 2]], TIMING)
+    still = rsv.detect_vibration(grey[[0, 0, 0]], TIMING)  # a camera at rest
+    assert not still.reliable.any()

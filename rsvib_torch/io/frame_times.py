@@ -116,8 +116,8 @@ def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] |
     period. Exact times are returned as they are. Times with an error, e.g. the presentation times of a video, are used
     only if their interval is the frame period of the sensor to 1 %, or their intervals include it. If they are whole
     numbers of intervals apart to within their error or 2 % of a period, the result consists of multiples of the
-    sensor's frame period, with gaps where frames were dropped. Otherwise the frame rate is variable: the times are returned as they
-    are if their error is less than a tenth of a period.
+    sensor's frame period, with gaps where frames were dropped. Otherwise the frame rate is variable: the times are
+    returned as they are if their error is less than a tenth of a period.
 
     Args:
         info: What the file states.
