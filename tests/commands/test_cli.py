@@ -345,6 +345,14 @@ def test_the_frame_rate_of_the_file_and_the_full_scale_are_in_the_next_command(p
     assert "the camera is not described: give --frame-rate, or --config" in capsys.readouterr().err
 
 
+def test_patterns_that_the_shell_expands(place, tmp_path, capsys):
+    assert run("run", tmp_path / "a.png", tmp_path / "b.png", tmp_path / "out") == 2
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1
+    assert "Got unexpected extra argument" in error
+    assert "give a sequence of files as their folder" in error
+
+
 def test_video_is_a_name_of_the_output(place, tmp_path, capsys):
     config = ("--config", place / "camera.toml")
     assert run("run", place / "frames.tif", tmp_path / "out", *config, "--method", "dewarp", "--video") == 0
