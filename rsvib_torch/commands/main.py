@@ -188,7 +188,9 @@ def run_command(arguments: Sequence[str]) -> int:
         error_line(str(error) or type(error).__name__)
     except Exception as error:
         if hasattr(error, "format_message"):  # a usage error of click, or of the parser that typer bundles
-            error_line(error.format_message().replace("Value error, ", ""))  # added by some versions of typer
+            message = error.format_message().replace("Value error, ", "")  # added by some versions of typer
+            several = "; give a sequence of files as their folder" if "unexpected extra argument" in message else ""
+            error_line(f"{message}{several}")
         elif isinstance(error, MemoryError) or "allocate" in str(error):
             error_line("not enough memory for a stack of this size: process fewer frames at a time")
         else:

@@ -440,6 +440,14 @@ def run(
             ".mp4 or .mkv for a video with the time stamps and the sound of the input."
         ),
     ] = "restored.tif",
+    video: Annotated[
+        bool,
+        typer.Option(
+            "--video",
+            help="Write a video: restored.mp4 (H.264) from .mp4, restored.mov from .mov, else restored.mkv (FFV1, "
+            "without loss).",
+        ),
+    ] = False,
     compression: Annotated[str | None, typer.Option(help="Compression of a TIFF stack: zlib or lzma.")] = None,
     method: MethodOption = None,
     joint: JointOption = None,
@@ -479,6 +487,7 @@ def run(
     Stacks of any length are processed in windows. If the restored frames are judged no better than the input, the
     input is written unchanged, unless --force is given. Ctrl-C stops after the current windows; --resume continues.
     """
+    output = _video_name(frames, output) if video else output
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
     results = (*_OF_DETECTION, *_OF_WINDOWS, "restoration.json", "before_after.png")
@@ -561,6 +570,14 @@ def run(
         files,
         steps,
     )
+
+
+def _video_name(frames: Path, output: str) -> str:
+    """Name of the restored video: H.264 for the endings that H.264 is written to, else FFV1."""
+    if output != "restored.tif":
+        raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
+    ending = frames.suffix.lower()
+    return f"restored{ending if ending in ('.mp4', '.mov', '.m4v') else '.mkv'}"
 
 
 def _draw_comparison(path: Path, frames: Path, full_scale: float | None, first: WindowResult) -> None:

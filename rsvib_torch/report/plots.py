@@ -29,6 +29,7 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
+from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationVerdict
 
 __all__ = [
@@ -591,6 +592,22 @@ def _curve_figure(curve: MtfCurve) -> Figure:
     return mtf_figure({f"MTF50 {measured_text(curve.mtf50, curve.mtf50_std)} cycles/px": [curve]})
 
 
+def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
+    """Draw the measured offsets of each axis, with error bars of one standard deviation if they are known."""
+    figure = _Drawing(figsize=(13, 4.2), layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True, squeeze=False)
+    times, good = (values.cpu().numpy() for values in (1e3 * curve.times, curve.good))
+    for axis, (name, panel) in enumerate(zip("xy", panels[0], strict=True)):
+        offsets = curve.offsets[..., axis].cpu().numpy()[good]
+        std = None if curve.std is None else curve.std[..., axis].cpu().numpy()[good]
+        panel.errorbar(times[good], offsets, std, fmt=".", color=_AXIS_COLOURS[name], ecolor=_GRID, zorder=2)
+        panel.set_title(f"Offset along {name}", loc="left", fontsize=12, fontweight="bold", color=_INK)
+        panel.set_xlabel("exposure start of the rows in the earlier frame (ms)", color=_INK)
+        panel.set_ylabel("offset (px)", color=_INK)
+        plain_axes(panel)
+    return figure
+
+
 FIGURES.update(
     {
         (DetectionResult, 0): offset_figure,
@@ -600,6 +617,7 @@ FIGURES.update(
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,
         (MtfCurve, 0): _curve_figure,
+        (OffsetCurve, 0): _measured_offsets_figure,
         (RestorationVerdict, 0): verdict_figure,
     }
 )

@@ -149,6 +149,10 @@ def align_motion(
         ...
         ValueError: at least 2 frames are needed, got 1
     """
+    if not isinstance(recorded, FreeMotion):
+        raise TypeError(
+            f"recorded must be a FreeMotion (read_motion, FreeMotion.from_samples), got {type(recorded).__name__}"
+        )
     if recorded.batch_shape:
         raise ValueError("align_motion takes one motion, not a batch")
     stack = grey_frames(frames, timing, full_scale, ignore, channels)

@@ -16,7 +16,7 @@ from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
 from rsvib_torch.core.text import measured_text, text_table, wrapped
-from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor
+from rsvib_torch.frames.arrays import Channels, as_tensor
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.io.files import FramesOrFiles, load_frames
 from rsvib_torch.motion.motion import Motion
@@ -277,7 +277,7 @@ def judge_frames(
 
 def judge_restoration(
     frames: FramesOrFiles,
-    restored: FramesLike,
+    restored: FramesOrFiles,
     timing: SensorTiming,
     vibration: Motion | Detected,
     *,
@@ -316,10 +316,12 @@ def judge_restoration(
         TypeError: If an argument has the wrong type.
         ValueError: If there is one frame only, shapes differ, or two frames have too little in common.
     """
+    given_scale = full_scale
     frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, minimum_frames=2)
     if prepared.batched:
         raise ValueError(f"frames must be one stack (T, H, W) or (T, C, H, W), got shape {prepared.shape}")
+    restored, restored_scale = load_frames(restored, given_scale)
     restored = as_tensor("restored", restored)
     expected = (1, *prepared.shape[1:]) if joint is True else prepared.shape
     if tuple(restored.shape) != expected:
@@ -327,7 +329,12 @@ def judge_restoration(
     count, height = prepared.images.shape[1], prepared.images.shape[-2]
     vibration, _ = vibration_to_undo(vibration, timing, count, height)
     images = prepare_frames(
-        restored, timing, full_scale=full_scale, channels=channels, allow_missing=False, name="restored"
+        restored,
+        timing,
+        full_scale=restored_scale or full_scale,
+        channels=channels,
+        allow_missing=False,
+        name="restored",
     ).images
     return judge_prepared(prepared, images, vibration, joint=joint, most_pairs=most_pairs)
 
