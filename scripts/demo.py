@@ -9,6 +9,7 @@ import argparse
 import inspect
 import json
 import math
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -29,6 +30,7 @@ from rsvib_torch.commands.terminal import warnings_in_one_line, working
 from rsvib_torch.core.atomic import whole_folder
 from rsvib_torch.detection.detect import DetectionMethod
 from rsvib_torch.evaluation import city_and_fields, resolution_chart
+from rsvib_torch.report.html import Report, write_report_page
 from rsvib_torch.report.plots import detailed_places, offset_figure, save_figure
 from rsvib_torch.report.results import write_offsets, write_vibration
 from rsvib_torch.restoration.restore import METHODS
@@ -51,6 +53,7 @@ class Trial:
     name: str
     seed: int
     methods: dict[str, dict[str, str]]  # options of detection and restoration
+    arguments: Sequence[str]  # of the command line
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
@@ -152,6 +155,8 @@ def run(trial: Trial, size: tuple[int, int], out: Path, console: Console) -> Non
     with trial.step("restoring both frames"):
         restored = rsv.restore(frames, TIMING, detection.vibration, **trial.methods["restoration"])
     still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    with trial.step("judging the restored frames"):
+        verdict = rsv.judge_restoration(frames, restored, TIMING, detection.vibration)
     with trial.step("comparing with the still scene"):
         quality = {
             f"{what}_{when}": [round(value, 4) for value in measure(images, still, 1.0, rim=RIM).tolist()]
@@ -167,6 +172,22 @@ def run(trial: Trial, size: tuple[int, int], out: Path, console: Console) -> Non
         write_offsets(folder / "offsets.csv", detection)
         save_figure(offset_figure(detection), folder / "offsets.png")
         save_figure(before_after(frames[0], restored[0], still), folder / "before_after.png", dpi=80)
+        (folder / "report").mkdir()
+        report = Report(
+            title=f"Demonstration: {trial.name}",
+            subtitle=f"2 simulated frames of {size[0]} x {size[1]} px with the camera of Liu et al. 2023",
+            frames=frames,
+            restored=restored,
+            was_restored=True,
+            timing=TIMING,
+            detection=detection,
+            verdict=verdict,
+            left_alone=(),
+            options=trial.methods["restoration"],
+            version=rsv.__version__,
+            command=shlex.join(["python", "scripts/demo.py", *trial.arguments]),
+        )
+        write_report_page(folder / "report", report)
         summary = {
             "scene": trial.name,
             "seed": trial.seed,
@@ -187,6 +208,7 @@ def run(trial: Trial, size: tuple[int, int], out: Path, console: Console) -> Non
             "versions": {"rsvib_torch": rsv.__version__, "torch": torch.__version__},
         }
         (folder / "summary.json").write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    console.print(f"report with all figures: {out / 'report' / 'report.html'}\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -196,6 +218,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--quick", action="store_true", help="narrow frames: 2048 rows of 320 px")
     parser.add_argument("--detection", choices=get_args(DetectionMethod), help="method of detection")
     parser.add_argument("--restoration", choices=tuple(METHODS), help="method of restoration")
+    arguments = sys.argv[1:] if arguments is None else arguments
     options = parser.parse_args(arguments)
     methods = {
         name: {"method": chosen} if chosen else {}
@@ -205,7 +228,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     begin = time.perf_counter()
     for name in SCENES:
         with warnings_in_one_line():
-            run(Trial(name, options.seed, methods), (2048, 320 if options.quick else 2048), options.out / name, console)
+            trial = Trial(name, options.seed, methods, arguments)
+            run(trial, (2048, 320 if options.quick else 2048), options.out / name, console)
     console.print(f"{time.perf_counter() - begin:.0f} s; results are in {options.out}")
 
 

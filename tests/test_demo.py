@@ -63,6 +63,15 @@ def test_files_are_those_of_the_command_line(demo, scene):
     assert (folder / "before_after.png").stat().st_size < 400_000
 
 
+@pytest.mark.parametrize("scene", ["chart", "city"])
+def test_report_is_written_and_named(demo, scene):
+    path = demo[0] / scene / "report" / "report.html"
+    text = path.read_text(encoding="utf-8")
+    assert "The vibration of the camera was measured and removed; restoration improves the frames." in text
+    assert "python scripts/demo.py --quick --out" in text
+    assert f"report with all figures: {path}" in "\n".join(line for line in demo[1] if isinstance(line, str))
+
+
 def test_tables_are_printed(demo):
     tables = [thing for thing in demo[1] if hasattr(thing, "columns")]
     assert [table.title for table in tables] == [

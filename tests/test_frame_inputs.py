@@ -208,7 +208,11 @@ def test_lists_are_stacked(grey, colour):
         ),
         ([np.ma.masked_array(np.zeros((5, 7)))], TypeError, r"frames\[0\] must not be a masked array"),
         ([], ValueError, r"frames must have shape .* got \(0,\)"),
-        ((frame for frame in torch.zeros(2, 5, 7)), TypeError, "got generator"),
+        ((frame for frame in torch.zeros(2, 5, 7)), TypeError, "got generator; pass a list"),
+        (torch.zeros(2, 5, 7).to_sparse(), TypeError, r"layout torch.sparse_coo; pass frames.to_dense\(\)"),
+        (torch.zeros(2, 5, 7) > 0, TypeError, r"got torch.bool; pass frames.float\(\)"),
+        (torch.zeros(5, 7), ValueError, r"got \(5, 7\); one grey image is frames\[None\]"),
+        (torch.full((2, 5, 7), torch.nan), ValueError, "no pixel with data: all are NaN or in ignore"),
         (None, TypeError, "got NoneType"),
     ],
 )
@@ -247,8 +251,12 @@ def test_files_are_read(grey, tmp_path):
             rsv.restore(frames, TIMING, VIBRATION)
     with pytest.raises(ValueError, match=r"counts reach 65535, beyond full_scale=4095"):
         rsv.restore(paths, TIMING, VIBRATION, full_scale=4095)
-    with pytest.raises(TypeError, match="got list; read files with read_stack"):
-        rsv.register_bands(paths, TIMING)
+    offsets = rsv.register_bands(paths, TIMING, full_scale=65535).offsets
+    expected_offsets = rsv.register_bands(counts, TIMING, full_scale=65535).offsets
+    torch.testing.assert_close(offsets, expected_offsets, rtol=0, atol=0, equal_nan=True)
+    judged = rsv.judge_restoration(paths, paths, TIMING, VIBRATION, full_scale=65535)
+    from_counts = rsv.judge_restoration(counts, counts, TIMING, VIBRATION, full_scale=65535)
+    torch.testing.assert_close(judged.misfit_after, from_counts.misfit_after, rtol=0, atol=0, equal_nan=True)
     with pytest.raises(ValueError, match="path must contain at least one file"):
         rsv.read_stack([])
 
@@ -268,3 +276,73 @@ def test_half_precision_is_accurate_to_its_quantisation(grey, dtype, scale):
         difference = getattr(found.vibration, name) - getattr(truth.vibration, name)
         assert bool((difference.abs() < 3 * getattr(found.std, name)).all()), name
     assert found.vibration.amplitude.dtype == torch.float64
+
+
+@pytest.mark.parametrize(
+    ("shape", "order"),
+    [
+        ((48, 64, 2), (2, 0, 1)),
+        ((48, 64, 10), (2, 0, 1)),
+        ((48, 64, 3, 10), (3, 2, 0, 1)),
+        ((2, 3, 10, 48, 64), (0, 2, 1, 3, 4)),
+    ],
+)
+def test_frames_on_another_axis_are_refused_with_the_order_of_the_axes(shape, order):
+    frames = torch.zeros(shape)
+    with pytest.raises(ValueError, match=rf"frames.permute{re.escape(str(order))}"):
+        rsv.restore(frames, TIMING, VIBRATION)
+    assert rsv.restore(frames.permute(order), TIMING, VIBRATION).shape == frames.permute(order).shape
+    assert rsv.restore(frames, TIMING, VIBRATION, channels="first").shape == shape
+
+
+def test_one_frame_of_several_channels_is_explained():
+    """A stack of three or four grey frames that tifffile.imwrite has written is one colour image."""
+    with pytest.raises(ValueError, match=r"at least 2 frames are needed, got 1 of 4 channels; store grey frames"):
+        rsv.detect_vibration(torch.rand(1, 4, 96, 96), TIMING)
+
+
+def test_augmentation_refuses_channels_last():
+    augmentation = rsv.RollingShutterVibration(TIMING)
+    for shape in ((2, 48, 64, 3), (48, 64, 3)):
+        with pytest.raises(ValueError, match=r"appear to have their channels last: pass images.movedim\(-1, -3\)"):
+            augmentation(torch.rand(shape))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_scenes_of_half_precision_are_simulated(dtype):
+    scene = torch.rand(96, 96).to(dtype)
+    frames = rsv.simulate_frames(scene, TIMING, VIBRATION)
+    assert frames.dtype == dtype
+    assert torch.equal(frames, rsv.simulate_frames(scene.float(), TIMING, VIBRATION).to(dtype))
+    with pytest.raises(TypeError, match=r"got torch.uint8; divide counts by their full scale, e.g. scene / 255"):
+        rsv.simulate_frames((255 * scene.float()).to(torch.uint8), TIMING, VIBRATION)
+
+
+@pytest.mark.parametrize(("dtype", "full_scale"), [("uint8", None), ("uint16", 4095), ("int32", 2**31 - 1)])
+def test_counts_are_written_as_they_are(tmp_path, dtype, full_scale):
+    largest = 255 if full_scale is None else full_scale
+    counts = np.random.default_rng(0).integers(0, largest, (2, 20, 30), endpoint=True).astype(dtype)
+    rsv.write_stack(tmp_path / "counts.tif", counts, full_scale=full_scale)
+    info, reader = rsv.read_stack_info(tmp_path / "counts.tif"), rsv.open_stack(tmp_path / "counts.tif")
+    assert (info.dtype, info.full_scale) == (dtype, largest)
+    assert all(np.array_equal(reader.frame(index), counts[index]) for index in range(2))
+    reader.close()
+    if full_scale is not None:
+        with pytest.raises(ValueError, match=r"full scale of .* unknown"):
+            rsv.write_stack(tmp_path / "other.tif", counts)
+        assert not (tmp_path / "other.tif").exists()
+
+
+def test_motions_and_kernels_of_another_type_are_refused(grey):
+    with pytest.raises(TypeError, match=r"recorded must be a FreeMotion .*, got Vibration"):
+        rsv.align_motion(grey, TIMING, VIBRATION)
+    with pytest.raises(TypeError, match=r"psf must be a RowPSF \(row_psf\), got SensorTiming"):
+        rsv.RowVaryingBlur(TIMING)
+
+
+def test_copies_of_frames_are_named(grey):
+    """A converter that repeats a frame changes the time of all following ones."""
+    with pytest.raises(ValueError, match="frames 1 and 2 are identical: one of them is a copy"):
+        rsv.detect_vibration(grey[[0, 1, 1, 2]], TIMING)
+    still = rsv.detect_vibration(grey[[0, 0, 0]], TIMING)  # a camera at rest
+    assert not still.reliable.any()

@@ -17,6 +17,7 @@ from torch import Tensor
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.core.precision import full_precision
 from rsvib_torch.core.splines import gauss_legendre, mirrored
+from rsvib_torch.frames.arrays import channels_appear_last
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging import blur_rows, gauss_node_count, rows_showing, trajectory_psf
 from rsvib_torch.imaging.psf import Interpolation
@@ -273,7 +274,15 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
     def apply_transform(
         self, input: Tensor, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
-        """Distort and blur images (B, C, H, W)."""
+        """Distort and blur images (B, C, H, W).
+
+        Raises:
+            ValueError: If the images appear to have their channels last.
+        """
+        if channels_appear_last(input.shape):
+            raise ValueError(
+                f"images of shape {tuple(input.shape)} appear to have their channels last: pass images.movedim(-1, -3)"
+            )
         if input.numel() == 0:
             return input
         images = frames_to_row_order(input, self.timing)

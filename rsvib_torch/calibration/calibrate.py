@@ -13,7 +13,8 @@ from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text, wrapped
-from rsvib_torch.frames.arrays import Channels, FramesLike
+from rsvib_torch.frames.arrays import Channels
+from rsvib_torch.io.files import FramesOrFiles
 
 __all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_exposure"]
 
@@ -78,7 +79,7 @@ class RowTimeCalibration(
 
 
 def calibrate_row_time(
-    frames: FramesLike,
+    frames: FramesOrFiles,
     flicker_frequency: float,
     *,
     frame_rate: float | None = None,
@@ -101,7 +102,7 @@ def calibrate_row_time(
     contrast is known: ``sinc(f T_e)`` of it.
 
     Args:
-        frames: (T, H, W) or (T, C, H, W); floats of full scale 1, or integers.
+        frames: (T, H, W) or (T, C, H, W); floats of full scale 1, integers, or files.
         flicker_frequency: f in Hz. Mains light flickers at twice the frequency of the mains.
         frame_rate: Frames per second, T >= 2 consecutive ones.
         on_fraction: Fraction of time that an on-off light is on (0.5 for a square wave).
@@ -169,7 +170,7 @@ def calibrate_row_time(
 
 
 def calibrate_row_time_by_exposure(
-    frames: FramesLike,
+    frames: FramesOrFiles,
     exposure_times: Sequence[float],
     *,
     scan_axis: ScanAxis = -2,
@@ -184,7 +185,7 @@ def calibrate_row_time_by_exposure(
     the brightness of the rows of all frames, with pulse, period and row time in common.
 
     Args:
-        frames: (T, H, W) or (T, C, H, W), T >= 2.
+        frames: (T, H, W) or (T, C, H, W), T >= 2, or files.
         exposure_times: Exposure of each frame in seconds, not all the same.
         scan_axis: As in ``calibrate_row_time``.
         gamma: As in ``calibrate_row_time``; it matters here.

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice, check_number
-from rsvib_torch.frames.arrays import Channels, FramesLike, channel_axis
+from rsvib_torch.frames.arrays import Channels, channel_axis
 from rsvib_torch.frames.prepare import as_float_frames
+from rsvib_torch.io.files import FramesOrFiles, load_frames
 
 __all__ = ["BandFit", "Profiles", "SceneModel", "find_bands", "row_profiles"]
 
@@ -36,12 +37,12 @@ class Profiles:
 
 
 def row_profiles(
-    frames: FramesLike, scan_axis: int | str, full_scale: float | None, gamma: float, channels: Channels = None
+    frames: FramesOrFiles, scan_axis: int | str, full_scale: float | None, gamma: float, channels: Channels = None
 ) -> Profiles:
     """Mean brightness of the rows of a stack (T, H, W) or (T, C, H, W).
 
     Args:
-        frames: The stack; floats of full scale 1, or integers.
+        frames: The stack; floats of full scale 1, integers, or files.
         scan_axis: The axis along which rows follow each other, as in ``SensorTiming``.
         full_scale: Count that means 1.0, for integers.
         gamma: Pixels are raised to this power to make them proportional to light.
@@ -52,6 +53,7 @@ def row_profiles(
     """
     check_choice("scan_axis", scan_axis, (-2, "y", -1, "x"))
     check_number("gamma", gamma, above=0.0, at_most=4.0)
+    frames, full_scale = load_frames(frames, full_scale)
     images = as_float_frames(frames, full_scale, channels=channels)
     if images.ndim == 5:
         raise ValueError(f"calibration takes one stack, got a batch of shape {tuple(images.shape)}")

@@ -20,6 +20,8 @@ __all__ = [
     "detection_data",
     "restoration_data",
     "restoration_lines",
+    "step_parts",
+    "step_with_force",
     "steps_after_detection",
     "verdict_data",
 ]
@@ -110,3 +112,22 @@ def steps_after_detection(
     if reasons:
         lines.append("follow the remedies that the reasons above name")
     return lines
+
+
+def step_with_force(command: str, result: RestoredFrames, frames: Path, out: Path, settings: Config) -> list[str]:
+    """The step to look at restored frames that were judged no better than the input."""
+    if result.restored or not result.moves:
+        return []
+    forced = command_text(command, frames, out, *settings.arguments, "--force")
+    return [f"inspect the restored frames nevertheless:\n  {forced}"]
+
+
+def step_parts(step: str) -> tuple[str, str]:
+    r"""Sentence and command of a step; the command is empty if there is none.
+
+    Example:
+        >>> step_parts("restore the frames:\n  rsvib restore")
+        ('Restore the frames:', 'rsvib restore')
+    """
+    sentence, _, command = step.partition("\n")
+    return f"{sentence[0].upper()}{sentence[1:]}{'' if command else '.'}", command.strip()

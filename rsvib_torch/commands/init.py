@@ -1,13 +1,11 @@
 """Command ``init``: a configuration file for the camera of a stack, or one of the presets."""
 
-import itertools
 import math
-import statistics
 import sys
 import textwrap
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -21,14 +19,12 @@ from rsvib_torch.commands.options import (
     RowTimeOption,
     rate,
     seconds,
+    stated_rate,
 )
 from rsvib_torch.commands.terminal import Answer, error_line, note, working
 from rsvib_torch.config import presets, read_config
 from rsvib_torch.core.atomic import check_writable, whole_file
 from rsvib_torch.motion.timing import SensorTiming
-
-if TYPE_CHECKING:
-    from rsvib_torch.io import StackInfo
 
 __all__ = ["init", "sensor_toml"]
 
@@ -124,7 +120,7 @@ def _describe_camera(path: Path, given: Mapping[str, Any]) -> str:
     note(f"{path}: {size}")
     values = dict(given)
     rows = info.shape[-1] if values.get("scan_axis") == "x" else info.shape[-2]
-    stated = _stated_rate(info)
+    stated = stated_rate(info)
     if stated is not None and "frame_rate" not in given:
         values["frame_rate"] = stated
         note(f"frame rate {stated:.6g} per second, from the times in the file")
@@ -148,15 +144,6 @@ def _describe_camera(path: Path, given: Mapping[str, Any]) -> str:
     defaults = {"scan_axis": "y", "readout_direction": "forward"}
     values = defaults | values
     return sensor_toml({name: values[name] for name in order if name in values}, head)
-
-
-def _stated_rate(info: "StackInfo") -> float | None:
-    """Frames per second from the frame times of a file, between which frames may be missing, or from its rate."""
-    if info.frame_times is None or len(info.frame_times) < 2:
-        return info.frame_rate
-    intervals = [later - earlier for earlier, later in itertools.pairwise(info.frame_times)]
-    period = statistics.median(intervals)
-    return sum(max(round(interval / period), 1) for interval in intervals) / sum(intervals)
 
 
 def _likely_full_scale(pixels: Any) -> float:
@@ -235,7 +222,7 @@ def sensor_toml(values: Mapping[str, object], head: list[str]) -> str:
     """
 
     def comment(text: str) -> list[str]:
-        return textwrap.wrap(text, 100, initial_indent="# ", subsequent_indent="# ")
+        return textwrap.wrap(text, 76, initial_indent="# ", subsequent_indent="# ")
 
     lines = [*(line for text in head for line in comment(text)), "", "[sensor]"]
     for name, value in values.items():

@@ -17,6 +17,7 @@ from rsvib_torch.commands.terminal import (
     error_line,
     output_of,
     print_line,
+    running,
     show_answer,
     warnings_in_one_line,
 )
@@ -97,7 +98,8 @@ _COMMANDS: tuple[tuple[str, Callable[..., Answer], str, str], ...] = (
         motion_commands.calibrate,
         "Measure row time and exposure with a flickering light.",
         """
-        rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 --out camera.toml
+        rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
+              --out camera.toml
         rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025
         """,
     ),
@@ -170,7 +172,7 @@ def run_command(arguments: Sequence[str]) -> int:
     logging.getLogger("tifffile").addHandler(logging.NullHandler())  # damaged files raise an error of this package
     command = typer.main.get_command(app)
     try:
-        with warnings_in_one_line():
+        with running(arguments), warnings_in_one_line():
             try:
                 code = command.main(args=list(arguments) or ["--help"], prog_name="rsvib", standalone_mode=False)
             except typer.Abort:
@@ -186,7 +188,9 @@ def run_command(arguments: Sequence[str]) -> int:
         error_line(str(error) or type(error).__name__)
     except Exception as error:
         if hasattr(error, "format_message"):  # a usage error of click, or of the parser that typer bundles
-            error_line(error.format_message().replace("Value error, ", ""))  # added by some versions of typer
+            message = error.format_message().replace("Value error, ", "")  # added by some versions of typer
+            several = "; give a sequence of files as their folder" if "unexpected extra argument" in message else ""
+            error_line(f"{message}{several}")
         elif isinstance(error, MemoryError) or "allocate" in str(error):
             error_line("not enough memory for a stack of this size: process fewer frames at a time")
         else:

@@ -2,6 +2,8 @@
 
 import functools
 import inspect
+import itertools
+import statistics
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -10,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 
-from rsvib_torch.commands.terminal import Answer
+from rsvib_torch import io
+from rsvib_torch.commands.terminal import Answer, note
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.option_types import METHOD_SETTINGS, PriorName, method_options
@@ -48,6 +51,7 @@ __all__ = [
     "rate",
     "restoration_options",
     "seconds",
+    "stated_rate",
     "torch_device",
 ]
 
@@ -121,7 +125,12 @@ ExposureOption = Annotated[
 ]
 FrameRateOption = Annotated[
     float | None,
-    typer.Option(parser=rate, metavar="NUMBER", help="Frames per second of the sensor, e.g. 29.97 or 30000/1001."),
+    typer.Option(
+        parser=rate,
+        metavar="NUMBER",
+        help="Frames per second of the sensor, e.g. 29.97 or 30000/1001.",
+        show_default="from the file, or the configuration",
+    ),
 ]
 SCAN_AXIS_HELP = "y: image rows are exposed one after another; x: image columns."
 READOUT_HELP = "forward: the top row (or left column) is read first; reverse: the last one is."
@@ -192,8 +201,16 @@ def _read_camera(
     frame_rate: FrameRateOption = None,
     scan_axis: _ScanAxisOption = None,
     readout_direction: _ReadoutOption = None,
+    frames: Path | None = None,
 ) -> Config:
-    """Configuration file and the options that replace its keys, or the options alone."""
+    """Configuration file and the options that replace its keys, or the options alone.
+
+    Without either the frame rate is the one that the file of the frames states.
+    """
+    if config is None and frame_rate is None and None not in (row_time, exposure) and frames is not None:
+        frame_rate = stated_rate(io.read_stack_info(frames))
+        if frame_rate is not None:
+            note(f"frame rate {frame_rate:.6g} per second, from the times in {frames}; --frame-rate replaces it")
     times = {"--row-time": row_time, "--exposure": exposure, "--frame-rate": frame_rate}
     missing = [name for name, value in times.items() if value is None]
     if config is None and missing:
@@ -217,17 +234,34 @@ def _read_camera(
     return replace(settings, arguments=tuple(arguments))
 
 
+def stated_rate(info: "StackInfo") -> float | None:
+    """Frames per second from the frame times of a file, between which frames may be missing, or from its rate."""
+    if info.frame_times is None or len(info.frame_times) < 2:
+        return info.frame_rate
+    intervals = [later - earlier for earlier, later in itertools.pairwise(info.frame_times)]
+    period = statistics.median(intervals)
+    return sum(max(round(interval / period), 1) for interval in intervals) / sum(intervals)
+
+
 def camera_options(command: Callable[..., Answer]) -> Callable[..., Answer]:
     """Decorator of a command: the options that describe the camera take the place of its parameter ``settings``."""
-    camera = inspect.signature(_read_camera).parameters
+    camera = {
+        name: parameter for name, parameter in inspect.signature(_read_camera).parameters.items() if name != "frames"
+    }
+
+    stated = inspect.signature(command, eval_str=True).parameters
+    scaled = "full_scale" in stated and stated["full_scale"].annotation == ScaleOption
 
     @functools.wraps(command)
     def with_camera(**options: Any) -> Answer:
-        settings = _read_camera(**{name: options.pop(name) for name in camera})
+        settings = _read_camera(**{name: options.pop(name) for name in camera}, frames=options.get("frames"))
+        if options.get("full_scale") is not None and scaled:
+            scale = ("--full-scale", f"{options['full_scale']:.10g}")
+            settings = replace(settings, arguments=(*settings.arguments, *scale))
         return command(settings=settings, **options)
 
     parameters: list[inspect.Parameter] = []
-    for parameter in inspect.signature(command, eval_str=True).parameters.values():
+    for parameter in stated.values():
         parameters += camera.values() if parameter.name == "settings" else [parameter]
     with_camera.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     with_camera.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}

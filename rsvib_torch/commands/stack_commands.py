@@ -17,6 +17,8 @@ from rsvib_torch.commands.answers import (
     detection_data,
     restoration_data,
     restoration_lines,
+    step_parts,
+    step_with_force,
     steps_after_detection,
 )
 from rsvib_torch.commands.options import (
@@ -40,7 +42,7 @@ from rsvib_torch.commands.options import (
     restoration_options,
     torch_device,
 )
-from rsvib_torch.commands.terminal import Answer, counting, error_line, note, working
+from rsvib_torch.commands.terminal import Answer, counting, error_line, note, running_command, working
 from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable, whole_folder
 from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
@@ -120,11 +122,13 @@ def _detect(stack: Stack, config: Config) -> DetectionResult:
     return result
 
 
-def _restore(stack: Stack, motion: Motion | Detected, options: dict[str, Any], force: bool) -> RestoredFrames:
-    """Restore frames, and judge the result on eight pairs of frames."""
+def _restore(
+    stack: Stack, motion: Motion | Detected, options: dict[str, Any], force: bool, output: str = "frames"
+) -> RestoredFrames:
+    """Restore frames, and judge the result on eight pairs of frames; ``output`` names what will be written."""
     with working("restoring and judging"):
         result = stacks.restore_trusted(stack.frames, stack.timing, motion, options, force=force, most_pairs=8)
-    _warn_of_restoration(result)
+    _warn_of_restoration(result, output)
     return result
 
 
@@ -144,12 +148,14 @@ def restore_and_save(
     return result
 
 
-def _warn_of_restoration(result: RestoredFrames) -> None:
+def _warn_of_restoration(result: RestoredFrames, output: str = "frames") -> None:
     """Print a warning if there is nothing to restore, or if restoration does not help or helps in part only."""
+    kept = "the frames are written unchanged" if output == "frames" else "the page has the input frames only"
+    forced = "writes" if output == "frames" else "shows"
     if not result.moves:
-        error_line("no vibration to remove: the frames are written unchanged", "warning")
+        error_line(f"no vibration to remove: {kept}", "warning")
     elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
-        unchanged = "" if result.restored else "; the frames are written unchanged, --force writes the restored ones"
+        unchanged = "" if result.restored else f"; {kept}, --force {forced} the restored ones"
         error_line(result.verdict.sentence + unchanged, "warning")
 
 
@@ -434,6 +440,14 @@ def run(
             ".mp4 or .mkv for a video with the time stamps and the sound of the input."
         ),
     ] = "restored.tif",
+    video: Annotated[
+        bool,
+        typer.Option(
+            "--video",
+            help="Write a video: restored.mp4 (H.264) from .mp4, restored.mov from .mov, else restored.mkv (FFV1, "
+            "without loss).",
+        ),
+    ] = False,
     compression: Annotated[str | None, typer.Option(help="Compression of a TIFF stack: zlib or lzma.")] = None,
     method: MethodOption = None,
     joint: JointOption = None,
@@ -473,6 +487,7 @@ def run(
     Stacks of any length are processed in windows. If the restored frames are judged no better than the input, the
     input is written unchanged, unless --force is given. Ctrl-C stops after the current windows; --resume continues.
     """
+    output = _video_name(frames, output) if video else output
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
     results = (*_OF_DETECTION, *_OF_WINDOWS, "restoration.json", "before_after.png")
@@ -529,7 +544,8 @@ def run(
     if result.bad_frames:
         error_line(f"{result.bad_frames} frames could not be used: see manifest.json", "warning")
     _note_lost(out / output, result.not_kept)
-    page = command_text("report", frames, out / "report", *settings.arguments)
+    windows = ["--manifest", str(out / "manifest.json")] if result.windows > 1 else []
+    page = command_text("report", frames, out / "report", *settings.arguments, *windows)
     steps = [f"write a page with all figures and the sharpness before and after:\n  {page}"] if result.restored else []
     files = [out / name for name in names]
     if result.windows == 1:
@@ -556,6 +572,14 @@ def run(
     )
 
 
+def _video_name(frames: Path, output: str) -> str:
+    """Name of the restored video: H.264 for the endings that H.264 is written to, else FFV1."""
+    if output != "restored.tif":
+        raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
+    ending = frames.suffix.lower()
+    return f"restored{ending if ending in ('.mp4', '.mov', '.m4v') else '.mkv'}"
+
+
 def _draw_comparison(path: Path, frames: Path, full_scale: float | None, first: WindowResult) -> None:
     """Draw the first restored frame of a stack beside the frame of the input."""
     from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
@@ -577,15 +601,24 @@ def report(
     edge: Annotated[
         list[str] | None,
         typer.Option(
+            metavar="EDGE",
             help="Slanted edge to measure: TOP,LEFT,HEIGHT,WIDTH in px; may be given several times.",
             show_default="edges are searched for",
+        ),
+    ] = None,
+    manifest: Annotated[
+        Path | None,
+        typer.Option(
+            help="The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows."
         ),
     ] = None,
     method: MethodOption = None,
     joint: JointOption = None,
     prior: PriorOption = None,
     saturation: SaturationOption = None,
-    force: ForceOption = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Show the restored frames even if they are judged no better than the input.")
+    ] = False,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
     overwrite: OverwriteOption = False,
@@ -595,11 +628,18 @@ def report(
     The page is one file that needs no network. The figures are also written as PNG files.
     """
     boxes = [_edge_box(text) for text in edge or []]
+    windows = None if manifest is None else stacks.read_manifest(manifest)
     _check_folder(out, ["report.html"], overwrite)
     stack = load(frames, settings, full_scale, device)
     options = restoration_options(stack.info, stack.full_scale, settings, Overrides(method, joint, prior, saturation))
     detection = _detect(stack, settings)
-    result = _restore(stack, detection, options, force)
+    result = _restore(stack, detection, options, force, "page")
+    if result.restored:
+        run_it = command_text("run", frames, out, *settings.arguments)
+        steps = [f"write the restored frames:\n  {run_it}"]
+    else:
+        steps = step_with_force("report", result, frames, out.with_name(f"{out.name}_forced"), settings)
+    steps += steps_after_detection(detection, frames, settings)
     content = reports.Report(
         title=f"Vibration in {frames.name}",
         subtitle=f"{frames}, camera of {settings.source}",
@@ -612,10 +652,12 @@ def report(
         left_alone=result.left_alone,
         options=options,
         version=rsvib_torch.__version__,
+        next_steps=tuple(step_parts(step) for step in steps),
+        command=running_command(),
+        windows=windows,
     )
     with whole_folder(out) as folder, working("writing the page"):
         files = reports.write_report_page(folder, content, boxes or None)
-    run_it = command_text("run", frames, out, *settings.arguments)
     return Answer(
         {
             f"Vibration in {frames.name}": [detection.summary()],
@@ -623,8 +665,7 @@ def report(
         },
         {"detection": detection_data(detection), "restoration": restoration_data(result)},
         [out / name for name in files],
-        [f"write the restored frames:\n  {run_it}"] * result.restored
-        + steps_after_detection(detection, frames, settings),
+        steps,
     )
 
 

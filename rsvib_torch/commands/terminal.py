@@ -1,8 +1,9 @@
 """Terminal output: progress, the answer of a command as text or JSON, and warnings and errors in one line each."""
 
+import shlex
 import textwrap
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -23,6 +24,8 @@ __all__ = [
     "note",
     "output_of",
     "print_line",
+    "running",
+    "running_command",
     "show_answer",
     "warnings_in_one_line",
     "working",
@@ -57,6 +60,22 @@ class _Output:
 
 
 _outputs: list[_Output] = [_Output()]  # of the running command, last
+_command_lines: list[str] = []  # the running one is the last
+
+
+@contextmanager
+def running(arguments: Sequence[str]) -> Iterator[None]:
+    """Remember the command line while it runs."""
+    _command_lines.append(shlex.join(["rsvib", *arguments]))
+    try:
+        yield
+    finally:
+        _command_lines.pop()
+
+
+def running_command() -> str | None:
+    """The running command line, as it can be copied into a shell; None outside of the program."""
+    return _command_lines[-1] if _command_lines else None
 
 
 @contextmanager
@@ -109,12 +128,17 @@ def note(message: str) -> None:
 
 
 def error_line(message: str, kind: str = "error") -> None:
-    """Print a message to standard error, with the prefix ``rsvib: error:`` on each of its lines."""
+    """Print a message to standard error, with the prefix ``rsvib: error:`` on each of its lines.
+
+    Lines are wrapped between words in a terminal, and not at all in a file or pipe.
+    """
     if kind == "warning":
         _outputs[-1].warnings.append(message)
     console = Console(stderr=True, highlight=False)
     for line in message.splitlines() or [""]:
-        console.print(Text.assemble(("rsvib: ", "bold"), (f"{kind}: ", "bold red"), line), soft_wrap=True)
+        console.print(
+            Text.assemble(("rsvib: ", "bold"), (f"{kind}: ", "bold red"), line), soft_wrap=not console.is_terminal
+        )
 
 
 @contextmanager

@@ -306,7 +306,7 @@ class Result(Summarised):
                 raise ValueError(
                     f"a batch of shape {tuple(self.batch_shape)} has no figure: select one, result[0].plot()"
                 )
-            raise TypeError(f"a {type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
+            raise TypeError(f"{type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
         figure = draw(self)
         if path is not None:
             with whole_file(path) as part:

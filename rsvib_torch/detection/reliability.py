@@ -76,7 +76,7 @@ def judge(
             )
         for tone in amplitude.nonzero()[:, 0].tolist():
             against.extend(_against_tone(vibration, std, axis, tone, float(gain[axis, tone]), timing))
-        if std.displacement is not None:
+        if std.displacement is not None and bool((amplitude > 0).any()):
             values = (float(value[axis]) for value in (displacement, std.displacement, own_std))
             against.extend(_against_displacement(*values, num_tones=int(amplitude.count_nonzero())))
         if other_motion is not None:
@@ -135,8 +135,8 @@ def _against_tone(
         )
     if gain < MIN_GAIN:
         against.append(
-            f"{name} is nearly blind: its gain is {gain:.3f}, {MIN_GAIN} is needed, because every frame is displaced "
-            "alike; use frames at other or unequal intervals" + _frame_rate_hint(hertz, hertz_std, timing)
+            f"{name} is nearly blind: its offset gain is {gain:.3f}, {MIN_GAIN} is needed, because every frame is "
+            "displaced alike; use frames at other or unequal intervals" + _frame_rate_hint(hertz, hertz_std, timing)
         )
     if hertz * timing.exposure_time > 1.0:
         against.append(

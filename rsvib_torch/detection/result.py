@@ -103,7 +103,7 @@ class DetectionResult(
         std: Standard deviations of its parameters.
         offsets: The measured offset curve.
         fitted: (..., P, N, 2) px, offsets of the same bands predicted by the vibration.
-        gain: (..., 2, K) gain of Eq. (7) from displacement to offset; a tone with a gain near 0 is nearly blind.
+        gain: (..., 2, K) offset gain of Eq. (7) from displacement to offset; a tone with a gain near 0 is nearly blind.
         residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
         reliable: (..., 2) bool, verdict for each axis.
         reasons: Reasons against each axis (x, y) that is not reliable; a tuple of those for a batch.

@@ -105,18 +105,21 @@ def assumptions(
             "frames can"
         )
         if timing.frame_start_times is None:
-            sentences.append(_effect("frame_rows", sensitivity, timing.frame_rows))
+            sentences.append(_effect("frame_rows", vibration, sensitivity, timing.frame_rows))
     if float(sensitivity.amplitude_by_exposure_rows.abs().amax()) > 0.01:
-        sentences.append(_effect("exposure_rows", sensitivity, timing.exposure_rows))
+        sentences.append(_effect("exposure_rows", vibration, sensitivity, timing.exposure_rows))
     return tuple(sentences)
 
 
-def _effect(name: str, sensitivity: TimingSensitivity, value: float) -> str:
+def _effect(name: str, vibration: Vibration, sensitivity: TimingSensitivity, value: float) -> str:
     """Sentence about the effect of an error of 1 % of a stated time, on the strongest tone of each axis."""
     of_axes = []
-    for axis, letter in enumerate(AXIS_NAMES[: sensitivity.amplitude_by_row_time.shape[-2]]):
+    for axis, letter in enumerate(AXIS_NAMES[: vibration.num_axes]):
+        if float(vibration.amplitude[axis, 0]) <= 0:
+            continue
         amplitude, frequency = (
-            float(getattr(sensitivity, f"{of}_by_{name}")[axis, 0]) for of in ("amplitude", "frequency")
+            round(float(getattr(sensitivity, f"{of}_by_{name}")[axis, 0]), 1) + 0.0  # no -0.0
+            for of in ("amplitude", "frequency")
         )
         of_axes.append(f"{letter} amplitude {amplitude:+.1f} %, frequency {frequency:+.1f} %")
     return f"{name}={value:g}: if it is stated 1 % too large, this changes {'; '.join(of_axes)}"

@@ -89,9 +89,9 @@ def grey_frames(
     Raises:
         TypeError: If frames are not numbers or ``ignore`` is not bool.
         ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or
-            ``ignore`` does not fit.
+            ``ignore`` does not fit; or a frame is a copy of the one before.
     """
-    frames, full_scale = load_frames(frames, full_scale)
+    frames, full_scale = load_frames(frames, full_scale, timing)
     prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, minimum_frames=2)
     images, valid = prepared.filled, None
     if prepared.missing is not None:
@@ -106,6 +106,13 @@ def grey_frames(
     # some rows are enough to find that a frame is not constant
     if bool(_constant(images[..., ::16, :]).any()) and bool((constant := _constant(images)).any()):
         raise ValueError(constant_frame(constant.nonzero()[0].tolist()[-1]))
+    repeated = _repeated(images[..., ::16, :])
+    if bool(repeated.any()) and bool((repeated := _repeated(images)).any()):
+        first = repeated.nonzero()[0].tolist()[-1]
+        raise ValueError(
+            f"frames {first} and {first + 1} are identical: one of them is a copy (video converters repeat frames), "
+            "and its time is wrong; remove copies and state the times of the others in frame_start_times"
+        )
     images = images.mean(2) if images.shape[2] > 1 else images[:, :, 0]
     return GreyFrames(images, valid, prepared.batched)
 
@@ -119,6 +126,12 @@ def _constant(frames: Tensor) -> Tensor:
     """(B, T) bool, frames (B, T, C, H, W) with equal pixels, to rounding."""
     low, high = frames.amin((-3, -2, -1)), frames.amax((-3, -2, -1))
     return high - low <= 1e-6 * torch.maximum(low.abs(), high.abs())
+
+
+def _repeated(frames: Tensor) -> Tensor:
+    """(B, T - 1) bool: frames (B, T, C, H, W) that equal the next one; none in stacks whose frames are all equal."""
+    equal = (frames[:, 1:] == frames[:, :-1]).flatten(2).all(-1)
+    return equal & ~equal.all(-1, keepdim=True)
 
 
 def band_curve(

@@ -1,7 +1,7 @@
 """Conversion of arrays and lists of arrays to tensors, and the axis on which frames have their channels."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -29,7 +29,7 @@ def as_tensor(name: str, value: object) -> Tensor:
         value: The value.
 
     Raises:
-        TypeError: If the value is a masked array or does not consist of numbers.
+        TypeError: If the value is a masked array, a sparse tensor or does not consist of numbers.
         ValueError: If the tensors or arrays of a list differ in shape, dtype or device.
 
     Example:
@@ -39,6 +39,8 @@ def as_tensor(name: str, value: object) -> Tensor:
         torch.Size([2, 4, 5])
     """
     if isinstance(value, Tensor):
+        if value.layout != torch.strided:
+            raise TypeError(f"{name} must be a dense tensor, got one of layout {value.layout}; pass {name}.to_dense()")
         return value
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError(f"{name} must not be a masked array; pass its data, and the mask as ignore=")
@@ -56,7 +58,7 @@ def as_tensor(name: str, value: object) -> Tensor:
         files = isinstance(value, (str, os.PathLike)) or (
             isinstance(value, (list, tuple)) and any(isinstance(item, (str, os.PathLike)) for item in value)
         )
-        remedy = "; read files with read_stack" if files else ""
+        remedy = "; read files with read_stack" if files else "; pass a list" if isinstance(value, Iterator) else ""
         raise TypeError(
             f"{name} must be a tensor or array of numbers, got {type(value).__name__}{kind}{remedy}"
         ) from error
@@ -91,6 +93,22 @@ def channels_appear_last(shape: Sequence[int]) -> bool:
     return len(shape) >= 3 and shape[-1] <= 4 < min(shape[-3:-1])
 
 
+def _check_frame_axis(name: str, shape: tuple[int, ...]) -> None:
+    """Raise a ``ValueError`` if the frames appear to lie on another axis than the first, or second of a batch."""
+    order: tuple[int, ...] | None = None
+    if len(shape) == 3 and 4 * shape[2] <= min(shape[:2]):  # no camera has frames four times as high as wide
+        order, found, otherwise = (2, 0, 1), "(H, W, T)", f"{shape[0]} frames of {shape[1]} x {shape[2]} px"
+    elif len(shape) == 4 and shape[2] <= 4 < min(shape[:2]):
+        order, found, otherwise = (3, 2, 0, 1), "(H, W, C, T)", f"{shape[0]} frames of {shape[2]} x {shape[3]} px"
+    elif len(shape) == 5 and shape[1] == 3 and shape[2] > 4:
+        order, found, otherwise = (0, 2, 1, 3, 4), "(B, C, T, H, W)", f"3 frames of {shape[2]} channels"
+    if order is not None:
+        raise ValueError(
+            f"{name} of shape {shape} appear to be {found}: pass {name}.permute{order}, or "
+            f'channels="first" if these are {otherwise}'
+        )
+
+
 def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
     """The axis of the channels: -1 if they are last, -3 if they come before the image axes or do not exist.
 
@@ -102,7 +120,8 @@ def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
 
     Raises:
         ValueError: If the shape appears to have another position of the channels: up to four of them, in an image of
-            more than four pixels along each axis.
+            more than four pixels along each axis; or, without ``channels``, to have the frames on the last axis
+            (H, W, T), (H, W, C, T), or after three channels (B, C, T, H, W).
 
     Example:
         >>> channel_axis("frames", (2, 48, 64, 3), "last")
@@ -118,9 +137,12 @@ def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
     appears_first = len(shape) >= 4 and channels_appear_last((*shape[-2:], shape[-3]))
     if len(shape) == 3 and appears_last and channels != "first":
         raise ValueError(
-            f'{name} of shape {shape} appear to be one image (H, W, C): pass {name}[None] with channels="last", or '
+            f'{name} of shape {shape} appear to be one image (H, W, C): pass {name}[None] with channels="last"; '
+            f"{name}.permute(2, 0, 1) if the frames lie on the last axis; or "
             f'channels="first" if these are {shape[0]} frames of {shape[1]} x {shape[2]} px'
         )
+    if channels is None:
+        _check_frame_axis(name, shape)
     if appears_last and channels is None:
         order = (0, 3, 1, 2) if len(shape) == 4 else (0, 1, 4, 2, 3)
         raise ValueError(

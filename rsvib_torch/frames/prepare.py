@@ -119,7 +119,7 @@ def prepare_frames(
     missing = _missing_pixels(given, ignore, allow_missing, axis)
     if missing is not None:
         if bool(missing.all()):
-            raise ValueError("ignore leaves no pixel: frame 0 has only 0.0% of pixels with data")
+            raise ValueError(f"{name} have no pixel with data: all are NaN or in ignore")
         given = given.masked_fill(missing, 0)
     images = as_float_frames(given, full_scale, channels=channels, minimum_frames=minimum_frames, name=name)
     saturated = _saturated_pixels(given, saturation, full_scale)
@@ -172,17 +172,24 @@ def as_float_frames(
     if frames.ndim not in (3, 4, 5):
         raise ValueError(
             f"{name} must have shape (T, H, W), (T, C, H, W) or (B, T, C, H, W), got {tuple(frames.shape)}"
+            + (f"; one grey image is {name}[None]" if frames.ndim == 2 else "")
         )
-    channel_axis(name, frames.shape, channels)
+    axis = channel_axis(name, frames.shape, channels)
     count = frames.shape[1 if frames.ndim == 5 else 0]
     if count < minimum_frames:
-        raise ValueError(f"at least {minimum_frames} frames are needed, got {count}")
+        images = frames.shape[axis] if frames.ndim == 4 else 1
+        grey = f" of {images} channels; store grey frames without channels (T, H, W), in TIFF as pages"
+        remedy = grey if images > 1 else ""
+        raise ValueError(f"at least {minimum_frames} frames are needed, got {count}{remedy}")
     if min(frames.shape) == 0:
         raise ValueError(f"{name} must not be empty, got shape {tuple(frames.shape)}")
     if frames.dtype.is_complex or frames.dtype == torch.bool:
-        raise TypeError(f"{name} must be real numbers, got {frames.dtype}")
+        remedy = f"; pass {name}.float()" if frames.dtype == torch.bool else ""
+        raise TypeError(f"{name} must be real numbers, got {frames.dtype}{remedy}")
     if frames.dtype.is_floating_point:
-        if not bool(torch.isfinite(torch.stack(frames.aminmax())).all()):  # one pass; propagates NaN and infinity
+        if not bool(
+            torch.isfinite(torch.stack(frames.detach().aminmax())).all()
+        ):  # one pass; propagates NaN and infinity
             pixel = tuple((~torch.isfinite(frames)).nonzero()[0].tolist())
             raise ValueError(f"{name} must be finite, but pixel {pixel} is {frames[pixel].item()}")
         return frames if frames.dtype == torch.float64 else frames.to(torch.float32)
@@ -190,7 +197,7 @@ def as_float_frames(
         if frames.dtype != torch.uint8:
             raise ValueError(
                 f"full scale of {str(frames.dtype).removeprefix('torch.')} {name} unknown: pass full_scale, e.g. "
-                "full_scale=4095 for 12-bit counts"
+                "full_scale=4095 for 12-bit counts (commands: --full-scale 4095)"
             )
         full_scale = 255.0
     return frames.to(torch.float32) / check_number("full_scale", full_scale, above=0.0)

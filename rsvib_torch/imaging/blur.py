@@ -134,6 +134,8 @@ class RowVaryingBlur(nn.Module):
         scene_size: tuple[int, int] | None = None,
     ) -> None:
         super().__init__()
+        if not isinstance(psf, RowPSF):
+            raise TypeError(f"psf must be a RowPSF (row_psf), got {type(psf).__name__}")
         self.register_buffer("first_tap", psf.first_tap)
         self.register_buffer("weights", psf.weights)
         self.degree = psf.degree

@@ -68,7 +68,10 @@ def simulate_frames(
     """
     scene = as_tensor("scene", scene)
     if not scene.dtype.is_floating_point:
-        raise TypeError("scene must be a floating-point tensor whose full scale is 1")
+        raise TypeError(
+            f"scene must be a floating-point tensor whose full scale is 1, got {scene.dtype}; divide counts by their "
+            "full scale, e.g. scene / 255"
+        )
     if scene.ndim not in (2, 3) or not bool(torch.isfinite(scene).all()):
         raise ValueError(f"scene must be a finite (H, W) or (C, H, W) tensor, got shape {tuple(scene.shape)}")
     if channels_appear_last(scene.shape):
@@ -103,9 +106,11 @@ def simulate_frames(
         )
     timing_in_rows.check_rows(size[0])
     starts = timing_in_rows.row_starts(num_frames, size[0], scene.device)
+    dtype = scene.dtype
+    scene = scene if dtype == torch.float64 else scene.to(torch.float32)
     frames = _form_frames(scene, starts, timing_in_rows, motion, size[1])
     frames = frames_from_row_order(frames, timing)
-    return frames if noise is None else noise.apply(frames, generator)
+    return (frames if noise is None else noise.apply(frames, generator)).to(dtype)
 
 
 def _form_frames(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion, width: int) -> Tensor:

@@ -1,12 +1,14 @@
 """Reading and writing whole stacks: the file ending selects the format."""
 
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -16,7 +18,9 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.io import hdf5, image_folder, npy, raw, tiff, video, zarr_store
 from rsvib_torch.io.formats import FrameReader, StackFormat, find_format, register_format, target_format
+from rsvib_torch.io.frame_times import TimingWarning, timing_of_stack
 from rsvib_torch.io.full_scale import (
+    check_dtype,
     counts_to_frames,
     frames_to_counts,
     full_scale_of_counts,
@@ -24,6 +28,7 @@ from rsvib_torch.io.full_scale import (
     required_full_scale,
 )
 from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.motion.timing import SensorTiming, check_timing
 
 __all__ = [
     "FramesOrFiles",
@@ -167,15 +172,33 @@ def _read_pixels(paths: Sequence[PathLike]) -> tuple[NDArray[Any], float | None]
     return parts[0] if len(parts) == 1 else np.concatenate(parts), infos[0].full_scale
 
 
-def load_frames(frames: FramesOrFiles, full_scale: float | None) -> tuple[FramesLike, float | None]:
+def _warn_of_unused_times(path: PathLike, timing: SensorTiming) -> None:
+    """Warn if the times or the frame rate that a file states differ from the timing of the sensor."""
+    check_timing(timing)
+    if timing_of_stack(timing, read_stack_info(path)) is not timing:
+        warnings.warn(
+            f"{path}: the frame times of the file differ from equal intervals and are not used; pass "
+            f"timing_from_first_frame(timing, read_stack_info({str(path)!r})) as timing",
+            TimingWarning,
+            stacklevel=2,
+        )
+
+
+def load_frames(
+    frames: FramesOrFiles, full_scale: float | None, timing: SensorTiming | None = None
+) -> tuple[FramesLike, float | None]:
     """Read frames that are given by the paths of their files; other frames are returned unchanged.
 
     Args:
         frames: Frames in memory, a path, or a list of paths.
         full_scale: Count that corresponds to 1.0, as in ``read_stack``.
+        timing: The sensor; None if times are not used.
 
     Returns:
         The frames, integers as stored, and their full scale.
+
+    Warns:
+        TimingWarning: If a file states times or a frame rate that are not those of ``timing``.
 
     Example:
         >>> load_frames([[[0.5]]], None)
@@ -188,6 +211,8 @@ def load_frames(frames: FramesOrFiles, full_scale: float | None) -> tuple[Frames
     else:
         return cast(FramesLike, frames), full_scale
     pixels, stated = _read_pixels(paths)
+    if timing is not None and len(paths) == 1:
+        _warn_of_unused_times(paths[0], timing)
     full_scale = stated if full_scale is None else full_scale
     if pixels.dtype.kind == "f":
         return counts_to_frames(pixels, full_scale, str(paths[0])), None
@@ -349,7 +374,7 @@ def write_stack(
     compression: str | None = None,
     like: StackInfo | None = None,
 ) -> None:
-    """Write a stack of frames whose full scale is 1.
+    """Write a stack of frames: floats whose full scale is 1, or integer counts.
 
     The ending selects the format as in ``read_stack``; videos are written as FFV1 (``.mkv``, ``.avi``; without loss) or
     H.264 (``.mp4``, ``.mov``; 8 bits, with loss; also of floats). A path without an ending is a folder of PNG files
@@ -359,10 +384,10 @@ def write_stack(
 
     Args:
         path: The file or folder to write.
-        frames: (T, H, W) or (T, C, H, W), floating point: a tensor, an array or a list of these.
+        frames: (T, H, W) or (T, C, H, W): a tensor, an array or a list of these. Integers are counts.
         channels: ``"last"`` for frames (T, H, W, C). By default channels come before the image axes, and frames that
             appear to have them last are refused; ``"first"`` omits this check.
-        dtype: NumPy name of the data type in the file, by default ``"float32"``.
+        dtype: NumPy name of the data type in the file, by default ``"float32"``, and for integers their own.
         full_scale: Count that corresponds to 1.0; 255 for ``"uint8"`` if not given, required for other integers. Floats
             keep their values.
         compression: ``"zlib"`` or ``"lzma"`` for TIFF files; None for no compression.
@@ -373,7 +398,7 @@ def write_stack(
 
     Raises:
         OSError: If the file cannot be written.
-        TypeError: If the frames are not a floating-point tensor.
+        TypeError: If the frames are not a tensor or array of numbers.
         ValueError: If the format does not support them, or the full scale is unknown.
 
     Example:
@@ -382,7 +407,11 @@ def write_stack(
     path = Path(path)
     frames = as_tensor("frames", frames)
     if not frames.dtype.is_floating_point:
-        raise TypeError(f"frames must be a floating-point tensor whose full scale is 1, got {frames.dtype}")
+        stored = np.dtype(str(frames.dtype).removeprefix("torch."))
+        check_dtype(stored)
+        full_scale = required_full_scale(known_full_scale(stored, full_scale), stored, "frames")
+        dtype = dtype or stored.name
+        frames = frames.to(torch.float64) / full_scale  # exact for integers of 32 bits
     axis = channel_axis("frames", frames.shape, channels)
     frames = frames.movedim(axis, -3) if frames.ndim > 3 else frames
     full_scale = check_stack_target(path, tuple(frames.shape), dtype=dtype, full_scale=full_scale)

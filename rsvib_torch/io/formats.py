@@ -183,7 +183,9 @@ def target_format(path: Path) -> StackFormat:
     if path.suffix.lower() in FORMATS:
         return FORMATS[path.suffix.lower()]
     known = ", ".join(ending for ending in FORMATS if ending)
-    raise ValueError(f"{path}: unknown file ending {path.suffix!r}; expected {known} or a folder of PNG or TIFF files")
+    raise ValueError(
+        f"{path}: unknown file ending {path.suffix!r}; expected {known} or a folder of PNG, TIFF or JPEG files"
+    )
 
 
 def needed_package(name: str, purpose: str, extra: str) -> Any:

@@ -101,9 +101,9 @@ def _warn_of_rate(info: StackInfo, timing: SensorTiming) -> None:
     warnings.warn(
         f"{info.path or 'the file'}: {1.0 / spacing.interval:.5g} frames per second according to its "
         f"{info.time_source}, but {timing.frame_rate:.5g} according to the sensor (frame_rows={timing.frame_rows:g}, "
-        f"row_time={timing.row_time:g} s); {used}. If the file is right, set frame_rows="
-        f"{spacing.interval / timing.row_time:.6g} or correct row_time; if the sensor is right (slow motion), nothing "
-        "needs to be changed",
+        f"row_time={timing.row_time:g} s); {used}. If the file is right, set the frame rate to "
+        f"{1.0 / spacing.interval:.6g} (frame_rows={spacing.interval / timing.row_time:.6g}) or correct row_time; if "
+        "the sensor is right (slow motion), nothing needs to be changed",
         TimingWarning,
         stacklevel=2,
     )
@@ -112,11 +112,12 @@ def _warn_of_rate(info: StackInfo, timing: SensorTiming) -> None:
 def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] | None:
     """Exposure start of every frame according to its file, in seconds; None if it is not stated, or at another rate.
 
-    Exact times are returned as they are. Times with an error, e.g. the presentation times of a video, are used only if
-    their interval is the frame period of the sensor to 1 %, or their intervals include it. If they are whole numbers of
-    intervals apart to within their error or 2 % of a period, the result consists of multiples of the sensor's frame
-    period, with gaps where frames were dropped. Otherwise the frame rate is variable: the times are returned as they
-    are if their error is less than a tenth of a period.
+    If a file without times states that frames are missing, the result consists of multiples of the sensor's frame
+    period. Exact times are returned as they are. Times with an error, e.g. the presentation times of a video, are used
+    only if their interval is the frame period of the sensor to 1 %, or their intervals include it. If they are whole
+    numbers of intervals apart to within their error or 2 % of a period, the result consists of multiples of the
+    sensor's frame period, with gaps where frames were dropped. Otherwise the frame rate is variable: the times are
+    returned as they are if their error is less than a tenth of a period.
 
     Args:
         info: What the file states.
@@ -128,6 +129,8 @@ def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] |
         >>> [round(30 * time) for time in exposure_times(info, timing)]
         [0, 1, 2, 6]
     """
+    if info.frame_times is None and info.frame_numbers is not None:
+        return tuple(number * timing.frame_period for number in info.frame_numbers)
     if info.frame_times is None or info.time_error == 0.0:
         return info.frame_times
     spacing = _spacing(info)
@@ -197,6 +200,9 @@ def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:
         )
     if timing is None or timing.frame_start_times is not None:
         return notes
+    if info.frame_times is None and info.frame_numbers is not None:
+        missing = info.frame_numbers[-1] + 1 - info.shape[0]
+        notes.append(f"{name}: {missing} frames are missing according to the numbers in the file names, which are used")
     times, spacing = exposure_times(info, timing), _spacing(info)
     if times is not None and spacing is not None and len(spacing.numbers):
         missing = round(float(spacing.numbers[-1])) + 1 - len(times)

@@ -58,7 +58,8 @@ def required_full_scale(full_scale: float | None, dtype: np.dtype[Any], name: ob
     """
     if full_scale is None:
         raise ValueError(
-            f"{name}: full scale of {dtype} frames unknown: pass full_scale, e.g. full_scale=4095 for 12-bit counts"
+            f"{name}: full scale of {dtype} frames unknown: pass full_scale, e.g. full_scale=4095 for 12-bit counts "
+            "(commands: --full-scale 4095)"
         )
     return check_full_scale(full_scale, dtype)
 

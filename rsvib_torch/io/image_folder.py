@@ -43,6 +43,26 @@ def _frame_files(path: Path) -> list[Path]:
     return sorted(files[found[0]], key=_natural_key)
 
 
+def _frame_numbers(files: list[Path]) -> tuple[int, ...] | None:
+    """Number of frame intervals from the first file to each one, if the numbers in the names show that some are gone.
+
+    Names must differ in one number, whose most common step is its smallest, and divides all steps: frame_0, frame_1,
+    frame_3. Other names, e.g. with times in ms (frame_0, frame_33, frame_67), state nothing.
+    """
+    names = [re.split(r"(\d+)", file.stem) for file in files]
+    if len(files) < 3 or any(len(name) != len(names[0]) or name[::2] != names[0][::2] for name in names):
+        return None
+    numbers = np.array([[int(part) for part in name[1::2]] for name in names], dtype=object)
+    varying = [column for column in numbers.T if len(set(column)) > 1]
+    if len(varying) != 1:
+        return None
+    steps = np.diff(varying[0])
+    step = min(steps)
+    if step < 1 or np.median(steps.astype(float)) != step or any(steps % step) or all(steps == step):
+        return None
+    return tuple(int(number - varying[0][0]) // step for number in varying[0])
+
+
 def _read_info(file: Path) -> StackInfo:
     if file.suffix.lower() in _PNG:
         return png_info(file)
@@ -100,7 +120,7 @@ class _ImagesReader(FrameReader):
         if first is None or len(self._damaged) > len(self._files) // 2:
             raise next(iter(self._damaged.values()))
         stack = replace(first[0], frame_times=None, metadata=metadata).with_frames(len(self._files))
-        self.info = replace(stack, **merged_times(infos))
+        self.info = replace(stack, frame_numbers=_frame_numbers(self._files), **merged_times(infos))
 
     def frame(self, index: int) -> NDArray[Any]:
         """Pixels of a frame as stored."""

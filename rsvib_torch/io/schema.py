@@ -178,7 +178,7 @@ class DetectedVibration(Result):
     Attributes:
         vibration: The vibration in image axes.
         std: Standard deviations of its parameters, infinite where unknown.
-        gain: (2, K) gain of Eq. (7) from displacement to offset.
+        gain: (2, K) offset gain of Eq. (7) from displacement to offset.
         residual: (2,) px, mean absolute difference of measured and fitted offsets.
         reliable: (2,) bool, verdict for each axis (x, y).
         reasons: Why an axis is not reliable, for each axis.

@@ -72,6 +72,8 @@ class StackInfo(Summarised):
             and EXIF, e.g. 6 for 90 degrees clockwise. Frames always have the stored rows and columns.
         time_error: Largest error of ``frame_times`` in seconds, e.g. rounding in a video; 0 if they are exact exposure
             starts. Times with an error may run at another rate than the exposures (``exposure_times``).
+        frame_numbers: Number of frame intervals from the first frame to each frame, if frames of a recording are
+            missing and the file states this instead of the times.
         time_source: Where the file states times or frame rate, for messages.
         path: The file; None if the stack is not in a file, or has another number of frames than the file.
         metadata: Further metadata of a TIFF file by name, which are kept when it is restored to TIFF; None for those
@@ -89,6 +91,7 @@ class StackInfo(Summarised):
     time_error: float = field(default=0.0, compare=False)
     time_source: str = field(default="frame_times", compare=False)
     path: Path | None = field(default=None, compare=False)
+    frame_numbers: tuple[int, ...] | None = field(default=None, compare=False)
     metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
 
     def summary(self) -> str:
@@ -140,7 +143,9 @@ class StackInfo(Summarised):
         if count == self.shape[0]:
             return self
         shape = (count, *self.shape[1:])
-        return replace(self, shape=shape, frame_times=None, path=None, metadata=self.metadata_for(shape))
+        return replace(
+            self, shape=shape, frame_times=None, frame_numbers=None, path=None, metadata=self.metadata_for(shape)
+        )
 
     def metadata_for(self, shape: tuple[int, ...], dtype: str | None = None) -> dict[str, Tag | None]:
         """The metadata of a stack of another shape or data type: None for those that are not valid for it."""

@@ -24,7 +24,7 @@ __all__ = ["FFV1_FORMAT", "H264_FORMAT", "READ_ONLY_FORMAT"]
 
 _LOSSLESS, _H264 = (".mkv", ".avi"), (".mp4", ".mov", ".m4v")
 _CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}
-_READ_ONLY = (".webm", ".3gp", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv")
+_READ_ONLY = (".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
 _H264_OPTIONS = {"crf": "12"}  # constant rate factor, 0 (no loss) to 51; differences of less than 18 are hardly visible
 _FFV1_OPTIONS = {"level": "3", "g": "1"}  # each frame can be decoded alone: damage does not affect other frames
 _BT709, _LIMITED_RANGE = 1, 1  # codes of ITU-T H.273 and FFmpeg

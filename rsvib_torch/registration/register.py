@@ -16,9 +16,10 @@ from torch.nn import functional
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
-from rsvib_torch.frames.arrays import Channels, FramesLike
+from rsvib_torch.frames.arrays import Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.io.files import FramesOrFiles, load_frames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.registration.bands import BandTask
 from rsvib_torch.registration.methods import BAND_METHODS, Registration, RegistrationOptions
@@ -92,7 +93,7 @@ class OffsetCurve(Result, units={"times": "s", "later_times": "s", "offsets": "p
 
 
 def register_bands(
-    frames: FramesLike,
+    frames: FramesOrFiles,
     timing: SensorTiming,
     *,
     method: Registration = "ncc",
@@ -107,7 +108,8 @@ def register_bands(
     The whole-frame offset is found first and may be hundreds of px (image motion); the search range counts from it.
 
     Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) with T >= 2; tensor, array or list of these.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) with T >= 2; tensor, array, list of these, or
+            files.
         timing: The sensor.
         method: ``"projection"`` (gray projection, the paper), ``"ncc"`` or ``"phase"``.
         band_rows: Rows of a band (the paper's window size).
@@ -132,6 +134,7 @@ def register_bands(
         [4.0, 0.0]
     """
     options = RegistrationOptions(method, band_rows, band_step, search)
+    frames, full_scale = load_frames(frames, full_scale, timing)
     prepared = prepare_frames(
         frames, timing, full_scale=full_scale, channels=channels, minimum_frames=2, allow_missing=False
     )

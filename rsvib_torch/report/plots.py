@@ -29,6 +29,7 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
+from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationVerdict
 
 __all__ = [
@@ -306,7 +307,7 @@ def free_motion_figure(result: MotionDetection) -> Figure:
 
 
 def verdict_figure(verdict: RestorationVerdict) -> Figure:
-    """Draw the displacement between the frames of each pair before and after restoration, and the estimated gain.
+    """Draw the displacement between the frames of each pair before and after restoration, and the improvement.
 
     Args:
         verdict: The verdict on a restoration.
@@ -327,7 +328,7 @@ def verdict_figure(verdict: RestorationVerdict) -> Figure:
     panels[0].legend(fontsize=9, frameon=False)
     panels[2].plot(pairs, verdict.predicted_gain.cpu(), "o-", color=_AXIS_COLOURS["x"], markersize=4)
     panels[2].axhline(0.0, color=_GREY, linewidth=0.8)
-    panels[2].set_title("estimated gain (dB)", loc="left", fontsize=10, color=_INK)
+    panels[2].set_title("estimated improvement (dB)", loc="left", fontsize=10, color=_INK)
     for panel in panels:
         panel.set_xlabel("pair of frames")
         panel.xaxis.get_major_locator().set_params(integer=True)
@@ -350,10 +351,10 @@ def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
 
 
 def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
-    """Draw the gain of a pair of frames over frequency, and the detected tones with two standard deviations.
+    """Draw the offset gain of a pair of frames over frequency, and the detected tones with two standard deviations.
 
-    The gain is ``|2 sin(pi f m T_row) sinc(f T_e)|``, px of offset per px of displacement (Eqs. 2 and 7 of Liu et al.
-    2023). Blind frequencies are dashed lines.
+    The offset gain is ``|2 sin(pi f m T_row) sinc(f T_e)|``, px of offset per px of displacement (Eqs. 2 and 7 of Liu
+    et al. 2023). Blind frequencies are dashed lines.
 
     Args:
         result: A detection (not a batch).
@@ -392,7 +393,7 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     upper.set_ylim(0, 2.4)
     lower.set_ylim(0, 1.15 * lower.get_ylim()[1])
     upper.set_xlim(0, highest)
-    upper.set_ylabel("gain (px per px)")
+    upper.set_ylabel("offset gain (px per px)")
     lower.set_ylabel("amplitude (px)")
     lower.set_xlabel("frequency (Hz)")
     plain_axes(upper)
@@ -591,6 +592,22 @@ def _curve_figure(curve: MtfCurve) -> Figure:
     return mtf_figure({f"MTF50 {measured_text(curve.mtf50, curve.mtf50_std)} cycles/px": [curve]})
 
 
+def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
+    """Draw the measured offsets of each axis, with error bars of one standard deviation if they are known."""
+    figure = _Drawing(figsize=(13, 4.2), layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True, squeeze=False)
+    times, good = (values.cpu().numpy() for values in (1e3 * curve.times, curve.good))
+    for axis, (name, panel) in enumerate(zip("xy", panels[0], strict=True)):
+        offsets = curve.offsets[..., axis].cpu().numpy()[good]
+        std = None if curve.std is None else curve.std[..., axis].cpu().numpy()[good]
+        panel.errorbar(times[good], offsets, std, fmt=".", color=_AXIS_COLOURS[name], ecolor=_GRID, zorder=2)
+        panel.set_title(f"Offset along {name}", loc="left", fontsize=12, fontweight="bold", color=_INK)
+        panel.set_xlabel("exposure start of the rows in the earlier frame (ms)", color=_INK)
+        panel.set_ylabel("offset (px)", color=_INK)
+        plain_axes(panel)
+    return figure
+
+
 FIGURES.update(
     {
         (DetectionResult, 0): offset_figure,
@@ -600,6 +617,7 @@ FIGURES.update(
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,
         (MtfCurve, 0): _curve_figure,
+        (OffsetCurve, 0): _measured_offsets_figure,
         (RestorationVerdict, 0): verdict_figure,
     }
 )

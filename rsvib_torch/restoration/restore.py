@@ -197,7 +197,7 @@ def restore(
         0.5
     """
     _check_options(method, options)
-    frames, full_scale = load_frames(frames, full_scale)
+    frames, full_scale = load_frames(frames, full_scale, timing)
     prepared = prepare_frames(
         frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, saturation=saturation
     )

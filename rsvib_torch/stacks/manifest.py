@@ -111,22 +111,28 @@ class StackManifest(Summarised, Section):
             "bad_frames": self.bad_frames,
         }
 
-    def lines(self) -> tuple[list[str], list[str]]:
-        """The totals as lines of text: about the vibration, and about the restoration."""
-        data = self.totals()
-        rows, count = [], data["windows"]
-        for name, tone in data["tones"].items():
+    def tone_table(self) -> tuple[list[str], list[list[str]]]:
+        """Head and rows of a table of the strongest tone of each axis: median ± standard deviation over the windows."""
+        rows = []
+        for name, tone in self.totals()["tones"].items():
             texts = [
                 "" if tone[quantity] is None else measured_text(tone[quantity], tone[f"{quantity}_spread"])
                 for quantity in ("amplitude", "frequency")
             ]
-            rows.append([name, f"{tone['reliable_windows']} of {count}", *texts])
-        table = text_table(("axis", "reliable windows", "amplitude (px)", "frequency (Hz)"), rows)
-        vibration = [table, "strongest tone: median ± standard deviation over the windows"]
-        restoration = [f"{data['restored']} of {count} windows restored"]
+            rows.append([name, f"{tone['reliable_windows']} of {len(self.windows)}", *texts])
+        return ["axis", "reliable windows", "amplitude (px)", "frequency (Hz)"], rows
+
+    def lines(self) -> tuple[list[str], list[str]]:
+        """The totals as lines of text: about the vibration, and about the restoration."""
+        data = self.totals()
+        vibration = [
+            text_table(*self.tone_table()),
+            "strongest tone: median ± standard deviation over the windows",
+        ]
+        restoration = [f"{data['restored']} of {data['windows']} windows restored"]
         if data["predicted_gain_db"] is not None:
             low, high = data["predicted_gain_db"].values()
-            restoration.append(f"estimated gain {low:+.1f} … {high:+.1f} dB")
+            restoration.append(f"estimated improvement {low:+.1f} … {high:+.1f} dB")
         for name, notes in data["left_alone"].items():
             if notes:
                 window, note = next(iter(notes.items()))

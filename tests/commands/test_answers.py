@@ -13,6 +13,7 @@ import subprocess
 import sys
 import termios
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import pytest
@@ -23,6 +24,7 @@ from truth import Motion, draw_scene, take_frames
 
 import rsvib_torch as rsv
 from rsvib_torch.commands import main
+from rsvib_torch.commands.answers import step_parts, step_with_force
 from rsvib_torch.commands.main import run_command
 from rsvib_torch.commands.terminal import working
 from rsvib_torch.core.progress import listening, steps
@@ -98,7 +100,7 @@ def test_the_answer_of_run_names_everything(place, config, tmp_path, capsys, mon
     assert "assumed: frame_rows, readout direction, scan axis and order of the frames: two frames cannot" in assumed
     assert "assumed: frame_rows=200: if it is stated 1 % too large, this changes x amplitude" in assumed
     assert answer["Restoration"][0] == "2 frames restored along x and y"
-    assert re.fullmatch(r"restored frames agree; estimated gain \+\d+\.\d dB", answer["Restoration"][1])
+    assert re.fullmatch(r"restored frames agree; estimated improvement \+\d+\.\d dB", answer["Restoration"][1])
     names = " ".join(answer["Files (open before_after.png first)"]).removeprefix("out: ").replace(",", "").split()
     assert sorted(names) == sorted(path.name for path in Path("out").iterdir())
     assert names[0] == "before_after.png"
@@ -437,3 +439,23 @@ def test_true_motion_is_recovered_by_the_command(tmp_path, capsys):
     for axis in range(2):
         error = found["vibration"]["frequency"][axis][0] - motion.frequency[axis]
         assert abs(error) < 5 * found["std"]["frequency"][axis][0]
+
+
+@pytest.mark.parametrize(
+    ("restored", "moves", "steps"),
+    [
+        (True, True, []),
+        (False, False, []),  # nothing to look at
+        (
+            False,
+            True,
+            [("Inspect the restored frames nevertheless:", "rsvib report a.tif 'o ut' --row-time 1 --force")],
+        ),
+    ],
+)
+def test_step_to_frames_that_were_not_kept(restored, moves, steps):
+    result = SimpleNamespace(restored=restored, moves=moves)
+    settings = SimpleNamespace(arguments=("--row-time", "1"))
+    found = step_with_force("report", result, Path("a.tif"), Path("o ut"), settings)
+    assert [step_parts(step) for step in found] == steps
+    assert step_parts("follow the remedies") == ("Follow the remedies.", "")

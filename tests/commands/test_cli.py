@@ -241,7 +241,7 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     report = json.loads((out / "restoration.json").read_text())
     assert report["options"] == {"method": "banded", "half_rows": 8, "saturation": 4000 / 4095}
     assert (report["outcome"], report["frames"], report["left_alone"]) == ("helps", "restored", [])
-    assert "restored frames agree; estimated gain +" in capsys.readouterr().out
+    assert "restored frames agree; estimated improvement +" in capsys.readouterr().out
     # options of the configured method are dropped with it
     assert run(*common, "--method", "exact", "--joint", "all", "--saturation", 4095) == 0
     report = json.loads((out / "restoration.json").read_text())
@@ -329,6 +329,39 @@ def test_options_describe_the_camera_without_a_file(place, tmp_path):
     frames = (place / "frames.tif", tmp_path / "restored.tif", *camera)
     assert run("restore", *frames, "--vibration", tmp_path / "options" / "vibration.json") == 0
     assert (tifffile.imread(tmp_path / "restored.tif") == tifffile.imread(tmp_path / "run" / "restored.tif")).all()
+
+
+def test_the_frame_rate_of_the_file_and_the_full_scale_are_in_the_next_command(place, tmp_path, capsys):
+    camera = ("--row-time", "40us", "--exposure", "0.48ms")
+    assert run("detect", place / "frames.tif", *camera, "--full-scale", 65535, "--out", tmp_path / "found") == 0
+    printed = capsys.readouterr()
+    found = json.loads((tmp_path / "found" / "vibration.json").read_text())
+    assert found["timing"]["frame_rows"] == pytest.approx(512)
+    assert [tones[0] for tones in found["vibration"]["amplitude"]] == pytest.approx(AMPLITUDE, rel=0.02)
+    assert "frame rate 48.8281 per second, from the times in" in re.sub(r"\s+", " ", printed.out + printed.err)
+    assert "--full-scale 65535" in printed.out
+    np.save(tmp_path / "frames.npy", np.zeros((2, 96, 96), np.uint8))
+    assert run("detect", tmp_path / "frames.npy", *camera, "--out", tmp_path / "none") == 2
+    assert "the camera is not described: give --frame-rate, or --config" in capsys.readouterr().err
+
+
+def test_patterns_that_the_shell_expands(place, tmp_path, capsys):
+    assert run("run", tmp_path / "a.png", tmp_path / "b.png", tmp_path / "out") == 2
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1
+    assert "Got unexpected extra argument" in error
+    assert "give a sequence of files as their folder" in error
+
+
+def test_video_is_a_name_of_the_output(place, tmp_path, capsys):
+    config = ("--config", place / "camera.toml")
+    assert run("run", place / "frames.tif", tmp_path / "out", *config, "--method", "dewarp", "--video") == 0
+    assert not (tmp_path / "out" / "restored.tif").exists()
+    assert read_stack(tmp_path / "out" / "restored.mkv").shape == read_stack(place / "frames.tif").shape
+    capsys.readouterr()
+    assert run("run", place / "frames.tif", tmp_path / "two", *config, "--video", "--output", "a.tif") == 2
+    assert "--video and --output a.tif are two names" in capsys.readouterr().err
+    assert not (tmp_path / "two").exists()
 
 
 def save_frames(change):

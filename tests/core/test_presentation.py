@@ -180,7 +180,16 @@ def test_results_move_between_devices(results):
     assert detection.offsets.times.device.type == "meta"
 
 
-DRAWN = {"DetectionResult", "MotionDetection", "SweptTone", "Vibration", "FreeMotion", "MtfCurve", "RestorationVerdict"}
+DRAWN = {
+    "DetectionResult",
+    "FreeMotion",
+    "MotionDetection",
+    "MtfCurve",
+    "OffsetCurve",
+    "RestorationVerdict",
+    "SweptTone",
+    "Vibration",
+}
 
 
 def test_results_are_drawn(results, tmp_path):
@@ -189,7 +198,7 @@ def test_results_are_drawn(results, tmp_path):
         if name not in DRAWN:
             with pytest.raises(TypeError, match=r"has no figure; these have one: DetectionResult, FreeMotion, Mot"):
                 result.plot(path)
-        elif name == "Vibration" and result.batch_shape:
+        elif name in ("OffsetCurve", "Vibration") and result.batch_shape:
             with pytest.raises(ValueError, match=r"a batch of shape \(3,\) has no figure: select one, result\[0\]"):
                 result.plot(path)
         else:

@@ -150,7 +150,7 @@ def test_command(frames, gyroscope, tmp_path, capsys):
     assert after < 0.1 * before
     first = rsv.read_stack(tmp_path / "out.tif")
     assert first.shape == frames.shape
-    assert re.search(r"restored frames agree; estimated gain \+\d", printed)
+    assert re.search(r"restored frames agree; estimated improvement \+\d", printed)
     assert run_command([*arguments, "--focal-length", "900", "--offset", str(CLOCK), "--overwrite"]) == 0
     assert (rsv.read_stack(tmp_path / "out.tif") - first).square().mean() < 0.01
     (tmp_path / "out.tif").unlink()

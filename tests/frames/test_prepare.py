@@ -82,8 +82,8 @@ def test_masks_that_broadcast(shape):
     [
         ({"ignore": torch.zeros(5, 5, dtype=torch.bool)}, ValueError, r"ignore \(5, 5\) does not fit .* \(2, 4, 6\)"),
         ({"ignore": torch.zeros(4, 6)}, TypeError, "ignore must be a bool tensor, got torch.float32"),
-        ({"ignore": torch.ones(4, 6, dtype=torch.bool)}, ValueError, "ignore leaves no pixel"),
-        ({"frames": torch.full((2, 4, 6), math.nan)}, ValueError, "ignore leaves no pixel"),
+        ({"ignore": torch.ones(4, 6, dtype=torch.bool)}, ValueError, "no pixel with data"),
+        ({"frames": torch.full((2, 4, 6), math.nan)}, ValueError, "no pixel with data"),
         ({"frames": torch.full((2, 4, 6), math.nan), "allow_missing": False}, ValueError, r"pixel \(0, 0, 0\) is nan"),
         ({"frames": torch.full((2, 4, 6), -math.inf)}, ValueError, r"pixel \(0, 0, 0\) is -inf"),
         ({"frames": torch.rand(2, 3000, 6)}, ValueError, "frame_rows=2048 is less than the 3000 rows"),

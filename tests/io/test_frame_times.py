@@ -16,6 +16,7 @@ import rsvib_torch as rsv
 from rsvib_torch import StackInfo, read_stack_info
 from rsvib_torch.commands.main import run_command
 from rsvib_torch.io import TimingWarning, describe_stack, exposure_times, timing_from_first_frame, write_stack
+from rsvib_torch.io.files import load_frames
 
 KEPT = [0, 1, 2, 4, 5, 9, 10]  # the other frames were dropped
 START = 100.25  # s
@@ -152,7 +153,7 @@ def test_irregular_times_that_are_too_rough_are_reported():
 @pytest.mark.parametrize("interval", [1 / 30, 0.5 * TIMING.frame_period, 4 * TIMING.frame_period])
 def test_a_frame_rate_that_contradicts_the_sensor_is_reported_with_the_remedy(interval):
     rate = re.escape(f"{1 / interval:.5g} frames per second according to its time stamps, but 96.154 according to")
-    remedy = re.escape(f"set frame_rows={interval / 1e-4:.6g}")
+    remedy = re.escape(f"set the frame rate to {1 / interval:.6g} (frame_rows={interval / 1e-4:.6g})")
     for info in (
         info_with(interval * np.arange(9)),
         replace(info_with(interval * np.arange(9)), frame_times=None, frame_rate=1 / interval),
@@ -196,3 +197,33 @@ def test_writing_keeps_times_resolution_and_channel_order(tmp_path):
     assert (info, info.channels_last) == (like, True)
     write_stack(tmp_path / "b.zarr", torch.rand(1, 3, 9, 7), dtype="uint16", full_scale=4095, like=like)
     assert read_stack_info(tmp_path / "b.zarr").frame_times is None
+
+
+@pytest.mark.parametrize(
+    ("names", "numbers"),
+    [
+        (("f_0", "f_1", "f_3", "f_4"), (0, 1, 3, 4)),
+        (("f_8", "f_10", "f_12", "f_20"), (0, 1, 2, 6)),  # every second frame was kept
+        (("cam2_f07", "cam2_f08", "cam2_f10", "cam2_f11"), (0, 1, 3, 4)),
+        (("f_98", "f_99", "f_100", "f_101"), None),
+        (("f_0", "f_33", "f_67", "f_100"), None),  # ms
+        (("2024-05-01_10-00-00", "2024-05-01_10-00-01", "2024-05-02_09-00-00"), None),
+        (("dark", "flat", "scene"), None),
+    ],
+)
+def test_missing_numbers_in_file_names_are_missing_frames(tmp_path, names, numbers):
+    for name in names:
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((8, 8), np.uint8))
+    info = rsv.read_stack_info(tmp_path)
+    timing = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=100)
+    starts = rsv.timing_from_first_frame(timing, info).frame_start_times
+    notes = describe_stack(info, timing)
+    if numbers is None:
+        assert starts is None
+        assert notes == []
+    else:
+        assert starts == pytest.approx([0.01 * number for number in numbers])
+        missing = numbers[-1] + 1 - len(numbers)
+        assert f"{missing} frames are missing according to the numbers in the file names" in notes[0]
+        with pytest.warns(rsv.TimingWarning, match=r"differ from equal intervals .* timing_from_first_frame"):
+            load_frames(tmp_path, None, timing)

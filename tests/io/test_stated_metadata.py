@@ -84,7 +84,7 @@ def test_frame_rate_in_hdf5_is_compared(tmp_path, name, place):
             file[name] = 30.0
         else:
             file[place].attrs[name] = 30.0
-    message = rf"a\.h5: 30 frames per second according to its attribute {name}, but 96\.154 .* set frame_rows=333\.333"
+    message = rf"a\.h5: 30 frames per second according to its attribute {name}, but 96\.154 .* \(frame_rows=333\.333\)"
     with pytest.warns(TimingWarning, match=message):
         timing_from_first_frame(TIMING, read_stack_info(tmp_path / "a.h5"))
 

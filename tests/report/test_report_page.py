@@ -1,10 +1,16 @@
 """Report pages: self-contained, escaped, with the right images, and sentences that match the verdict."""
 
 import base64
+import json
 import math
 import re
+import shlex
+import shutil
+import subprocess
 from dataclasses import replace
+from datetime import UTC, datetime
 from html.parser import HTMLParser
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,13 +27,14 @@ from rsvib_torch.io import write_stack
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
-from rsvib_torch.report.html import Report, before_after, write_page, write_report_page
-from rsvib_torch.report.html.page import measure_edges
-from rsvib_torch.report.html.words import mark_of, verdict_sentences
+from rsvib_torch.report.html import Report, before_after, template, write_page, write_report_page
+from rsvib_torch.report.html.page import frames_in_turn, measure_edges, whole_frame
+from rsvib_torch.report.html.words import TERMS, about_rows, mark_of, verdict_sentences
 from rsvib_torch.report.plots import gain_figure, motion_blur, psf_figure, rows_figure
 from rsvib_torch.restoration import RestorationVerdict
 
 TIMING = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=512)
+COMMAND = "rsvib report '<img src=x>.tif' out"
 SHAKE = Vibration([1.6, 1.1], [71.0, 113.0], [0.6, -1.2])
 
 
@@ -74,7 +81,9 @@ def report_of(**changes):
         verdict=verdict_of("helps"),
         left_alone=(),
         options={"method": "<exact>"},
-        version="0",
+        version="1.2.3",
+        command=COMMAND,
+        created=datetime(2031, 5, 7, 11, 30, 5, tzinfo=UTC),
     )
     return replace(whole, **changes)
 
@@ -151,14 +160,14 @@ def test_page_has_all_sections(page):
         "Offsets along x",
         "Offsets along y",
         "1.6000 ± 0.0010",
-        "Gain of a pair of frames",
+        "Offset gain of a pair of frames",
         "Displacement and motion blur",
         "Point spread functions",
         "Sharpness: MTF of slanted edges",
         "40 µs",
     ):
         assert part in text
-    ranges = [attributes for tag, attributes in page[2].tags if tag == "input"]
+    ranges = [attributes for _, attributes in page[2].tags if attributes.get("type") == "range"]
     assert len(ranges) == 1
     assert "aria-label" in ranges[0]
 
@@ -305,6 +314,156 @@ def test_page_without_vibration(tmp_path):
     assert "psf.png" not in files
 
 
+def test_large_images_keep_a_part_at_full_resolution(monkeypatch):
+    monkeypatch.setattr(template, "_FULL_PIXELS", 40 * 2048)
+    frame = torch.rand(90, 2100, generator=torch.Generator().manual_seed(1))
+    pair = before_after(frame, 1 - frame, names=("a", "b"), caption="", longest=700, exact=True, full_at=(80, 30))
+    assert (pair.width, pair.height, pair.scale) == (700, 30, pytest.approx(1 / 3))
+    full = pair.full
+    assert (full.left, full.top, full.width, full.height) == (0, 50, 2048, 40)  # as near to row 80 as fits
+    low, high = pair.levels
+    for image, source in zip(full.images, (frame, 1 - frame), strict=True):
+        expected = 255 * ((source[50:90, :2048] - low) / (high - low)).clip(0, 1)
+        np.testing.assert_allclose(decoded(image), expected, atol=0.51)
+    monkeypatch.undo()
+    whole = before_after(frame, names=("a",), caption="", longest=700, full_at=(80, 30))
+    assert (whole.width, whole.scale, whole.full) == (2100, 1.0, None)
+
+
+def test_consecutive_frames_are_shown_at_one_place_of_the_scene():
+    speed = 7 / TIMING.frame_period  # px/s along x: 7 px between the frames
+    moving = Vibration([1.6, 1.1], [71.0, 113.0], [0.6, -1.2], [speed, -2 * speed])
+    scene = resolution_chart(300, 320, sigma=0.7)
+    frames = torch.stack([scene[20:276, 40:264], scene[34:290, 33:257]])  # the content moves by (7, -14) px
+    shown = frames_in_turn(report_of(frames=frames, restored=frames.flip(-1)), 0, moving)
+    assert [name for name, _ in shown.panels] == ["input", "restored"]
+    images = [decoded(uri).astype(float) for _, pair in shown.panels for uri in pair]
+    assert np.abs(images[0] - images[1]).max() < 20  # JPEG
+    assert np.abs(images[2] - images[3]).mean() > 20  # these frames are mirrored, and move the other way
+    row, column = map(int, re.findall(r"rows (\d+) … \d+, columns (\d+)", shown.caption)[0])
+    part = frames[0, row : row + shown.height, column : column + shown.width].numpy()
+    assert np.corrcoef(images[0].ravel(), part.ravel())[0, 1] > 0.99
+    assert "Frame 1 is moved by -7 px along x and 14 px along y, the uniform motion." in shown.caption
+
+
+def test_one_frame_and_one_joint_image():
+    report = report_of(restored=report_of().frames[:1])
+    pair = whole_frame(report, 1, (report.frames[1], report.restored[0]), ("input", "restored"))
+    assert pair.caption.startswith("Frame 1, and one image restored jointly from all frames. Grey levels are stretched")
+    assert [name for name, _ in frames_in_turn(report, 1, SHAKE).panels] == ["input"]
+    assert frames_in_turn(report_of(frames=report.frames[:1]), 0, SHAKE) is None
+
+
+def test_page_without_restoration_has_no_pairs_but_what_was_tried(tmp_path):
+    reasons = (("tone of 71 Hz is nearly blind",), ())
+    report = report_of(
+        detection=result_of(reliable=(False, True), reasons=reasons),
+        verdict=verdict_of("worse", "y: frames lie 2 px apart, 2 px remain unexplained"),
+        was_restored=False,
+        next_steps=(("Inspect the restored frames nevertheless:", "rsvib report a&b.tif out --force"),),
+    )
+    files = write_report_page(tmp_path, report, [(0, 0, 40, 40)])
+    reader = read(tmp_path / "report.html")
+    text = "".join(reader.text)
+    tried = text[text.index("What was tried") : text.index("What to do next")]
+    assert "Offsets were measured at 14 rows of 1 pair of frames (100 % of them successfully)" in tried
+    assert "not reliable: tone of 71 Hz is nearly blind" in tried
+    assert "2 px remain unexplained" in tried
+    assert "Frames were restored with method = <exact> and judged; they are not written." in tried
+    assert "rsvib report a&b.tif out --force" in text[text.index("What to do next") : text.index("Input frame")]
+    assert "Input and restored" not in text
+    assert "Details at full resolution" not in text
+    assert [attributes for _, attributes in reader.tags if attributes.get("type") == "range"] == []
+    sources = [attributes["src"] for tag, attributes in reader.tags if tag == "img"]
+    assert len(sources) == len(set(sources))  # no image twice
+    assert len(sources) == 1 + 2 + sum(name.endswith(".png") for name in files)  # frame, frames in turn, figures
+
+
+def test_page_states_how_it_was_made(page):
+    text = "".join(page[2].text).split("This report")[1]
+    for part in ("2031-05-07 11:30:05+00:00", "rsvib_torch 1.2.3", COMMAND):
+        assert part in text
+    assert "x" not in [attributes.get("src") for _, attributes in page[2].tags]
+    assert about_rows(datetime(2031, 5, 7, 11, 30, 5, tzinfo=UTC), "2", None, {}) == [
+        ["created", "2031-05-07 11:30:05+00:00"],
+        ["program", "rsvib_torch 2"],
+    ]
+
+
+def test_gain_has_one_meaning(page):
+    text = "".join(page[2].text)
+    assert "offset gain" in text
+    assert "estimated improvement +3.0 dB" in text
+    assert re.findall(r"(?<!ffset )\bgain\b", text) == []
+
+
+def colours(block):
+    """Red, green and blue of each colour variable."""
+    found = re.findall(r"--([a-z]+): #([0-9a-f]+)", block)
+    whole = {name: digits if len(digits) == 6 else "".join(2 * digit for digit in digits) for name, digits in found}
+    return {name: [int(digits[at : at + 2], 16) for at in (0, 2, 4)] for name, digits in whole.items()}
+
+
+def contrast(first, second):
+    """Ratio of contrast of the Web Content Accessibility Guidelines."""
+    linear = [
+        [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in np.array(colour) / 255]
+        for colour in (first, second)
+    ]
+    low, high = sorted(float(np.dot(colour, (0.2126, 0.7152, 0.0722))) for colour in linear)
+    return (high + 0.05) / (low + 0.05)
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_text_has_enough_contrast(page, dark):
+    style = (page[0] / "report.html").read_text(encoding="utf-8").split("<style>")[1].split("</style>")[0]
+    light_block, dark_block = style.split("prefers-color-scheme: dark")[:2]
+    palette = colours(light_block) | (colours(dark_block.split("}")[0]) if dark else {})
+    assert (sum(palette["paper"]) < 100) == dark
+    for paper in ("paper", "panel"):
+        for ink in ("ink", "faint", "accent", "good", "bad", "doubt"):
+            assert contrast(palette[ink], palette[paper]) >= 4.5, (ink, paper)
+
+
+def script_results(page, motion="motion"):
+    """What the script of a page did with the events that page_dom.js sends."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("needs node")
+    harness = Path(__file__).with_name("page_dom.js")
+    done = subprocess.run([node, harness, page, motion], capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_script_of_the_page(page):
+    found = script_results(page[0] / "report.html")
+    assert [cut for _, cut, _ in found["cuts"]] == ["49%", "48%", "49%", "50%", "49%", "59%", "59%", "100%", "0%"]
+    assert [prevented for _, _, prevented in found["cuts"]] == [True] * 6 + [False] + [True] * 2
+    assert found["spoken"] == "0 % from the left"
+    assert found["off"] == {"drawn": [None, None], "row": "", "column": "", "hidden": True, "pressed": "false"}
+    assert (found["first"]["hidden"], found["first"]["pressed"], found["closed"]) == (False, "true", True)
+    # the stage of 200 x 100 px of the harness shows the frame of 224 x 256 px; the magnifier shows 40 x 40 px
+    row, column = 64, 168
+    expected = [column - 20, row - 20, 40, 40, 0, 0, 40, 40]
+    assert found["pointed"]["drawn"] == [["input", *expected], ["restored", *expected]]
+    assert (found["pointed"]["row"], found["pointed"]["column"]) == (row, column)
+    assert found["entered"]["drawn"][0][1:3] == [column - 20, 0]  # row 5 is closer to the edge than half the square
+    first, second = ["frame 0"] * 2, ["frame 1"] * 2
+    assert found["blink"] == [
+        [True, second, "Stop blinking", True],
+        [False, first, "Stop blinking", True],
+        [True, second, "Stop blinking", True],
+        [True, second, "Start blinking", False],
+        [True, second, "Start blinking", False],  # one step stops
+    ]
+    assert not found["start_hidden"]
+    assert found["tip"] == [TERMS["improvement"], False]
+    assert found["tip_closed"]
+    assert found["unexplained"] == 0
+    assert script_results(page[0] / "report.html", "reduced")["start_hidden"]
+
+
 @pytest.fixture(scope="module", name="place")
 def make_place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("camera")
@@ -321,8 +480,10 @@ def make_place(tmp_path_factory):
 
 
 def test_command_writes_a_page(place, capsys):
-    frames, config, out = (str(place / name) for name in ("chart & <co>.tif", "camera.toml", "out"))
-    assert run_command(["report", frames, out, "--config", config]) == 0
+    frames, config, out, found = (str(place / n) for n in ("chart & <co>.tif", "camera.toml", "out", "windows"))
+    assert run_command(["detect", frames, "--out", found, "--config", config, "--window", "2"]) == 0
+    arguments = ["report", frames, out, "--config", config, "--manifest", str(place / "windows" / "manifest.json")]
+    assert run_command(arguments) == 0
     capsys.readouterr()
     reader = read(place / "out" / "report.html")
     text = "".join(reader.text)
@@ -332,6 +493,30 @@ def test_command_writes_a_page(place, capsys):
     assert float(found[1]) == pytest.approx(1.6, rel=0.01)
     assert float(found[2]) == pytest.approx(71.0, rel=0.002)
     assert (place / "out" / "psf.png").exists()
+    assert shlex.join(["rsvib", *arguments]) in text
+    assert "1 of 1" in text[text.index("Windows of the stack") :]
+    assert (place / "out" / "windows.png").exists()
+
+
+def test_command_refuses_a_missing_manifest(place, capsys):
+    frames, config, out = (str(place / name) for name in ("chart & <co>.tif", "camera.toml", "no folder"))
+    assert run_command(["report", frames, out, "--config", config, "--manifest", str(place / "no.json")]) == 2
+    assert "no.json" in capsys.readouterr().err
+    assert not (place / "no folder").exists()
+
+
+def test_command_without_vibration_names_no_written_frames(place, capsys):
+    still = resolution_chart(256, 224, sigma=0.7).expand(2, -1, -1) + 0.002 * torch.randn(
+        2, 256, 224, generator=torch.Generator().manual_seed(4)
+    )
+    write_stack(place / "still.npy", still)
+    arguments = ["report", str(place / "still.npy"), str(place / "still"), "--config", str(place / "camera.toml")]
+    assert run_command(arguments) == 0
+    printed = capsys.readouterr()
+    assert "no vibration to remove: the page has the input frames only" in printed.err
+    assert "written" not in printed.err
+    assert printed.out.count("no significant tone") == 2
+    assert "displacement of the rows is uncertain" not in printed.out  # there is none
 
 
 @pytest.mark.parametrize("edge", ["1,2,3", "a,b,c,d", "-1,0,40,40", "0,0,4000,40"])

@@ -296,7 +296,7 @@ def test_methods_without_saturation_use_the_saturated_values(lamps, method):
         ({"saturation": -1.0}, ValueError, "saturation must be larger than 0, got -1"),
         ({"saturation": "high"}, TypeError, "saturation must be a number, got 'high'"),
         ({"frames": torch.ones(2, 16, 16), "saturation": 1.0}, ValueError, "every pixel is saturated"),
-        ({"frames": torch.full((2, 16, 16), math.nan)}, ValueError, "ignore leaves no pixel"),
+        ({"frames": torch.full((2, 16, 16), math.nan)}, ValueError, "no pixel with data"),
         ({"frames": torch.full((2, 16, 16), math.inf)}, ValueError, "frames must be finite"),
         ({"ignore": torch.zeros(2, 16, 8, dtype=torch.bool)}, ValueError, "ignore must be a boolean mask of shape"),
         ({"frames": {"a": 1}}, TypeError, "frames must be a tensor or array of numbers, got dict"),

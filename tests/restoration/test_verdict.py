@@ -333,7 +333,7 @@ def test_dtypes_and_detections_of_restore_are_accepted(scene):
         ({"vibration": Vibration(1.0, 50.0).expanded(2)}, ValueError, r"vibration must be one for the stack"),
         ({"timing": Vibration(1.0, 50.0)}, TypeError, "timing must be a SensorTiming, got Vibration"),
         ({"restored": torch.full((2, 96, 96), math.nan)}, ValueError, "restored must be finite"),
-        ({"frames": torch.full((2, 96, 96), math.nan)}, ValueError, "ignore leaves no pixel"),
+        ({"frames": torch.full((2, 96, 96), math.nan)}, ValueError, "no pixel with data"),
     ],
 )
 def test_invalid_arguments_are_named(change, error, message):

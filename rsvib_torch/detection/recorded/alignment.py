@@ -58,12 +58,13 @@ class ClockAlignment(Result, units={"offset": "s", "offset_std": "s", "drift": "
         """Offset and scale of the clock with standard deviations, gain, drift, and the verdict."""
         verdict = "reliable" if self.reliable else f"not reliable: {'; '.join(self.reasons)}"
         drift, left = self.drift.tolist(), self.unexplained.tolist()
+        second = measured_text(self.scale, self.scale_std or None, digits=8)
         return "\n".join(
             [
                 f"time 0 of the frames is {measured_text(self.offset, self.offset_std)} s of the recording",
-                f"scale {measured_text(self.scale, self.scale_std or None, digits=8)}",
-                f"x: gain {self.gain[0]:.4f}, drift {drift[0]:.3g} px/s, {left[0]:.2g} px unexplained",
-                f"y: gain {self.gain[1]:.4f}, drift {drift[1]:.3g} px/s, {left[1]:.2g} px unexplained",
+                f"1 s of the frames is {second} s of the recording",
+                f"x: recorded motion times {self.gain[0]:.4f}, drift {drift[0]:.3g} px/s, {left[0]:.2g} px unexplained",
+                f"y: recorded motion times {self.gain[1]:.4f}, drift {drift[1]:.3g} px/s, {left[1]:.2g} px unexplained",
                 wrapped(verdict),
             ]
         )
@@ -148,6 +149,10 @@ def align_motion(
         ...
         ValueError: at least 2 frames are needed, got 1
     """
+    if not isinstance(recorded, FreeMotion):
+        raise TypeError(
+            f"recorded must be a FreeMotion (read_motion, FreeMotion.from_samples), got {type(recorded).__name__}"
+        )
     if recorded.batch_shape:
         raise ValueError("align_motion takes one motion, not a batch")
     stack = grey_frames(frames, timing, full_scale, ignore, channels)

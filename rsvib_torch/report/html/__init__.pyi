@@ -1,12 +1,14 @@
 from .page import Box, Report, write_report_page
-from .template import BeforeAfter, Drawing, before_after, data_uri, drawing, write_page
+from .template import BeforeAfter, Blink, Drawing, before_after, blink, data_uri, drawing, write_page
 
 __all__ = [
     "BeforeAfter",
+    "Blink",
     "Box",
     "Drawing",
     "Report",
     "before_after",
+    "blink",
     "data_uri",
     "drawing",
     "write_page",

@@ -1,7 +1,8 @@
 """The report page of a stack of frames: verdict, comparison, measured offsets, vibration and sharpness."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,24 @@ from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.evaluation import MtfCurve, find_slanted_edges, slanted_edge_mtf
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report import plots
 from rsvib_torch.report.html import words
-from rsvib_torch.report.html.template import BeforeAfter, Drawing, before_after, drawing, write_page
+from rsvib_torch.report.html.template import (
+    PERCENTILES,
+    BeforeAfter,
+    Blink,
+    Drawing,
+    GreyLevels,
+    before_after,
+    blink,
+    drawing,
+    write_page,
+)
 from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
+from rsvib_torch.stacks import StackManifest
 
-__all__ = ["Box", "Edge", "Report", "measure_edges", "write_report_page"]
+__all__ = ["Box", "Edge", "Report", "frames_in_turn", "measure_edges", "whole_frame", "write_report_page"]
 
 Box = tuple[int, int, int, int]  # top, left, height, width in px
 
@@ -37,6 +50,10 @@ class Report:
         left_alone: A sentence for each axis that was not restored.
         options: Options of ``restore``.
         version: Version of the package.
+        next_steps: What to do next, and the command that does it, or an empty text.
+        command: The command line that wrote the page; None for a page written from Python.
+        windows: Windows of the stack that were processed separately; None if there are none.
+        created: Time at which the page was made.
     """
 
     title: str
@@ -50,6 +67,10 @@ class Report:
     left_alone: tuple[str, ...]
     options: dict[str, Any]
     version: str
+    next_steps: tuple[tuple[str, str], ...] = ()
+    command: str | None = None
+    windows: StackManifest | None = None
+    created: datetime = field(default_factory=lambda: datetime.now().astimezone())
 
 
 @dataclass(frozen=True)
@@ -131,22 +152,22 @@ def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = N
     return edges, notes
 
 
-def _edge_row(edge: Edge) -> list[str]:
+def _edge_row(edge: Edge, restored: bool) -> list[str]:
     """Line of the table of edges."""
     before = "not measured" if edge.before is None else measured_text(edge.before.mtf50, edge.before.mtf50_std)
     after = measured_text(edge.after.mtf50, edge.after.mtf50_std)
-    return [_region(*edge.box), edge.direction, f"{edge.after.angle:.1f}°", before, after]
+    return [_region(*edge.box), edge.direction, f"{edge.after.angle:.1f}°", before, *([after] if restored else [])]
 
 
-def _mtf_drawings(edges: list[Edge], names: tuple[str, str]) -> list[Drawing]:
+def _mtf_drawings(edges: list[Edge], names: tuple[str, ...]) -> list[Drawing]:
     drawings = []
     for direction in ("horizontal", "vertical"):
         chosen = [edge for edge in edges if edge.direction == direction]
         if chosen:
-            before = [edge.before for edge in chosen if edge.before is not None]
+            before, after = [edge.before for edge in chosen if edge.before is not None], [edge.after for edge in chosen]
             drawings.append(
                 drawing(
-                    plots.mtf_figure(dict(zip(names, (before, [edge.after for edge in chosen]), strict=True))),
+                    plots.mtf_figure(dict(zip(names, (before, after), strict=False))),
                     f"mtf_{direction}",
                     f"{direction.capitalize()} sharpness",
                     "Thin lines: single edges; bold lines: their mean. The displacement of rows does not count as "
@@ -156,7 +177,7 @@ def _mtf_drawings(edges: list[Edge], names: tuple[str, str]) -> list[Drawing]:
     return drawings
 
 
-def _details(before: Tensor, after: Tensor, names: tuple[str, str]) -> list[BeforeAfter]:
+def _details(before: Tensor, after: Tensor, names: tuple[str, ...]) -> list[BeforeAfter]:
     """Crops at full resolution where the restored frame has the strongest detail."""
     grey = _grey(after).float()
     size = min(96, *grey.shape)
@@ -166,6 +187,99 @@ def _details(before: Tensor, after: Tensor, names: tuple[str, str]) -> list[Befo
         caption = _region(row, column, size, size)
         pairs.append(before_after(before[crop], after[crop], names=names, caption=caption, exact=True))
     return pairs
+
+
+def _grey_scale(levels: GreyLevels) -> str:
+    low, high = PERCENTILES
+    return (
+        f"Grey levels are stretched: black is {levels[0]:.3f} and white {levels[1]:.3f} of full scale, the "
+        f"percentiles {low:g} and {high:g}"
+    )
+
+
+def whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: tuple[str, ...]) -> BeforeAfter:
+    """One frame of the input, and the restored one beside it if there is one, with a part at full resolution."""
+    grey = _grey(frames[-1]).float()
+    place = plots.detailed_places(grey, min(96, *grey.shape), count=1, rim=16)[0]
+    pair = before_after(*frames, names=names, caption="", full_at=(place[0] + 48, place[1] + 48))
+    parts = [
+        f"Frame {index}"
+        if len(report.restored) > 1 or not report.was_restored
+        else f"Frame {index}, and one image restored jointly from all frames"
+    ]
+    if pair.scale < 1:
+        parts[0] += f", reduced to {100 * pair.scale:.2g} %"
+    if pair.full is not None:
+        part = _region(pair.full.top, pair.full.left, pair.full.height, pair.full.width)
+        parts.append(f"The magnifier shows {part}")
+    alike = " of both images" if len(frames) > 1 else ""
+    return replace(pair, caption=f"{'. '.join([*parts, _grey_scale(pair.levels)])}{alike}.")
+
+
+def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 480) -> Blink | None:
+    """Two consecutive frames before and after restoration, at full resolution where detail is strongest.
+
+    Uniform motion along the image is compensated by whole px, the same for input and restored frames, so that the
+    displacement by the vibration remains.
+
+    Args:
+        report: The content of the page.
+        index: Frame on the page.
+        removed: The vibration that was removed.
+        size: Largest side of the part in px.
+    """
+    count = len(report.frames)
+    if count < 2:
+        return None
+    first = min(index, count - 2)
+    frames, names = [report.frames], ["input"]
+    if report.was_restored and len(report.restored) == count:
+        frames, names = [report.frames, report.restored], ["input", "restored"]
+    starts = report.timing.frame_starts(count)
+    moved = (removed.image_motion * float(starts[first + 1] - starts[first])).round().int().tolist()
+    height, width = report.frames.shape[-2:]
+    rows, columns = (max(0, length - abs(step)) for length, step in ((height, moved[1]), (width, moved[0])))
+    if min(rows, columns) < 32:  # px; the two frames have too little in common
+        return None
+    top, left = max(0, -moved[1]), max(0, -moved[0])  # of the part of the first frame that both contain
+    size = min(size, rows, columns)
+    common = _grey(frames[-1][first])[top : top + rows, left : left + columns]
+    row, column = plots.detailed_places(common.float(), size, count=1, rim=16)[0]
+    row, column = row + top, column + left
+
+    def part(frame: Tensor, down: int, right: int) -> Tensor:
+        return frame[..., row + down : row + down + size, column + right : column + right + size]
+
+    pairs = [(part(stack[first], 0, 0), part(stack[first + 1], moved[1], moved[0])) for stack in frames]
+    caption = f"Frames {first} and {first + 1}, {_region(row, column, size, size)}."
+    if any(moved):
+        caption += (
+            f" Frame {first + 1} is moved by {-moved[0]} px along x and {-moved[1]} px along y, the uniform motion."
+        )
+    if len(frames) > 1:
+        caption += (
+            " The motion between the input frames is the vibration; it is absent from the restored frames where "
+            "restoration is right."
+        )
+    return blink(pairs, names=names, frames=(first, first + 1), caption=caption)
+
+
+def _windows(manifest: StackManifest) -> dict[str, Any]:
+    """Tones of all windows of a stack: lines, table and figure."""
+    vibration, restoration = manifest.lines()
+    head, rows = manifest.tone_table()
+    starts = [record.start_time for record in manifest.windows]
+    return {
+        "lines": [*vibration[1:], *(restoration if manifest.output is not None else [])],
+        "head": head,
+        "rows": rows,
+        "figure": drawing(
+            plots.windows_figure(starts, manifest.detections()),
+            "windows",
+            "Amplitude and frequency over the windows",
+            "Error bars of two standard deviations. Hollow points are not reliable.",
+        ),
+    }
 
 
 def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None = None) -> list[str]:
@@ -187,8 +301,8 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     num_rows = report.frames.shape[int(timing.scan_axis)]
     removed = trusted_vibration(result, timing, len(report.frames), num_rows)[0].to("cpu")
     index = len(report.frames) // 2 if len(report.restored) < len(report.frames) else 0
-    before, after = report.frames[index], report.restored[min(index, len(report.restored) - 1)]
-    names = ("input", "restored" if report.was_restored else "unchanged")
+    before = report.frames[index]
+    after = report.restored[min(index, len(report.restored) - 1)] if report.was_restored else None
     offsets = [
         drawing(
             plots.axis_offset_figure(result, axis),
@@ -202,11 +316,11 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     tone_figures = [
         drawing(
             plots.gain_figure(result, timing),
-            "gain",
-            "Gain of a pair of frames",
-            "Top: offset in px per px of displacement. Dashed: blind frequencies, at which all frames are displaced "
-            "alike or the exposure averages the vibration to zero. Bottom: detected tones, with error bars of two "
-            "standard deviations.",
+            "offset_gain",
+            "Offset gain of a pair of frames",
+            "Top: offset gain, offset in px per px of displacement. Dashed: blind frequencies, at which all frames are "
+            "displaced alike or the exposure averages the vibration to zero. Bottom: detected tones, with error bars "
+            "of two standard deviations.",
         )
     ]
     if bool(removed.moving_axes().any()):
@@ -226,38 +340,49 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
                 "displacement of its row. Line: path of the image during the exposure.",
             ),
         ]
-    measured, notes = measure_edges(_grey(before), _grey(after), edges)
+    shown = (before,) if after is None else (before, after)
+    names = ("input", "restored")[: len(shown)]
+    measured, notes = measure_edges(_grey(before), _grey(shown[-1]), edges)
     mtf_figures = _mtf_drawings(measured, names)
-    options = ", ".join(f"{name} = {value}" for name, value in report.options.items())
+    restored = report.was_restored
     sentences = words.verdict_sentences(
         result,
         removed,
         timing,
         num_rows,
-        restored=report.was_restored,
+        restored=restored,
         left_alone=report.left_alone,
         verdict=report.verdict,
     )
+    tried = [] if restored else words.tried_sentences(result, report.options, report.verdict, sentences[1:])
+    windows = None if report.windows is None else _windows(report.windows)
+    mtf_head = ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in names)]
     content = {
         "title": report.title,
         "subtitle": report.subtitle,
-        "mark": words.mark_of(result, report.verdict, report.was_restored),
-        "verdict": sentences,
-        "overview": before_after(before, after, names=names, caption=f"Frame {index}.", longest=1180),
-        "details": _details(before, after, names),
+        "mark": words.mark_of(result, report.verdict, restored),
+        "verdict": sentences if restored else sentences[:1],
+        "tried": tried,
+        "next_steps": report.next_steps,
+        "frames_title": "Input and restored frame" if restored else "Input frame",
+        "overview": whole_frame(report, index, shown, names),
+        "blink": frames_in_turn(report, index, removed),
+        "details": [] if after is None else _details(before, after, names),
         "offsets": offsets,
         "tones_head": words.TONE_HEAD,
         "tones": words.detected_tones(result),
         "tone_figures": tone_figures,
-        "mtf_head": ("edge", "direction", "angle", "MTF50 of the input (cycles/px)", f"MTF50 {names[1]} (cycles/px)"),
-        "mtf_rows": [_edge_row(edge) for edge in measured],
+        "windows": windows,
+        "mtf_head": mtf_head,
+        "mtf_rows": [_edge_row(edge, restored) for edge in measured],
         "mtf_notes": notes,
         "mtf_figures": mtf_figures,
         "camera": words.camera_rows(timing, report.frames.shape),
-        "footer": f"rsvib_torch {report.version}" + (f"; restored with {options}" * report.was_restored),
+        "about": words.about_rows(report.created, report.version, report.command, report.options if restored else {}),
+        "terms": words.TERMS,
     }
     write_page(folder / "report.html", "report.html", content)
-    figures = [*offsets, *tone_figures, *mtf_figures]
+    figures = [*offsets, *tone_figures, *mtf_figures, *([windows["figure"]] if windows else [])]
     for figure in figures:
         (folder / f"{figure.name}.png").write_bytes(figure.png)
     return ["report.html", *(f"{figure.name}.png" for figure in figures)]

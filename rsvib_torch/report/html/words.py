@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from datetime import datetime
+from typing import Any, Literal
 
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
@@ -11,11 +12,52 @@ from rsvib_torch.motion.vibration import Vibration, blind_frequencies, tone_head
 from rsvib_torch.report.plots import motion_blur, tones_text
 from rsvib_torch.restoration import RestorationVerdict
 
-__all__ = ["TONE_HEAD", "Mark", "camera_rows", "detected_tones", "mark_of", "verdict_sentences"]
+__all__ = [
+    "TERMS",
+    "TONE_HEAD",
+    "Mark",
+    "about_rows",
+    "camera_rows",
+    "detected_tones",
+    "mark_of",
+    "tried_sentences",
+    "verdict_sentences",
+]
 
 Mark = Literal["good", "doubt", "bad"]
 _QUANTITIES = ("amplitude", "frequency", "period", "phase")
-TONE_HEAD = ("axis", *tone_head(_QUANTITIES), "gain", "verdict")
+TONE_HEAD = ("axis", *tone_head(_QUANTITIES), "offset gain", "verdict")
+# Terms that the page explains, in the order of its list; a head or first cell of a table with this text, up to a
+# parenthesis, has the explanation as a tooltip.
+TERMS = {
+    "displacement": "Distance in px by which the vibration moves the content of a row in the image; positive towards "
+    "larger x and y.",
+    "offset": "Displacement of a row in a frame minus its displacement in the frame before. Offsets are measured by "
+    "comparing the two frames; displacements follow from them.",
+    "residual": "Measured offset minus the offset that the detected vibration predicts.",
+    "amplitude": "Largest displacement of a sinusoid in px; the image moves by this amount to either side.",
+    "frequency": "Periods of the vibration per second.",
+    "period": "Duration of one oscillation, 1 / frequency.",
+    "phase": "Angle of the sinusoid at the exposure start of the first row of frame 0.",
+    "offset gain": "Offset between two consecutive frames in px per px of displacement, 2 sin(π f T) for the frequency "
+    "f and the frame period T. Errors of the offsets are divided by it, so that a tone with an offset gain near zero "
+    "cannot be measured. A negative sign reverses the offsets.",
+    "improvement": "PSNR of the restored frames minus PSNR of the input frames in dB, estimated without the true "
+    "scene. An increase of 6 dB is half the error.",
+    "PSNR": "Peak signal-to-noise ratio in dB: full scale over the root-mean-square error of a frame.",
+    "blind frequencies": "Frequencies that these frames cannot contain: multiples of the frame rate, at which all "
+    "frames are displaced alike, and multiples of 1 / exposure time, which the exposure averages to zero.",
+    "verdict": "Reliable: the vibration of this axis is significant, explains the measured offsets, and is accurate "
+    "enough to be removed. Otherwise the axis is left unchanged.",
+    "row time": "Time between the exposure starts of adjacent rows.",
+    "exposure time": "Duration of the exposure of one row; motion during it blurs the row.",
+    "frame period": "Time between the exposure starts of the same row in consecutive frames, blanking rows included.",
+    "scan axis": "Image axis along which the rows are read one after another, and the direction.",
+    "point spread function": "Image of a point of the scene: the path of the displacement during the exposure of a "
+    "row.",
+    "MTF50": "Spatial frequency at which the contrast (modulation transfer function, MTF) is one half; larger is "
+    "sharper. The Nyquist frequency is 0.5 cycles/px.",
+}
 
 
 def mark_of(result: DetectionResult, verdict: RestorationVerdict | None, restored: bool) -> Mark:
@@ -71,8 +113,8 @@ def _blind_sentences(result: DetectionResult, timing: SensorTiming, within: floa
             if abs(nearest - frequency) < within:
                 sentences.append(
                     f"The tone at {frequency:.1f} Hz along {name} is {abs(nearest - frequency):.1f} Hz from the blind "
-                    f"frequency {nearest:.1f} Hz, at which all frames are displaced alike; errors are amplified (gain "
-                    f"{abs(float(result.gain[axis, tone])):.2f})."
+                    f"frequency {nearest:.1f} Hz, at which all frames are displaced alike; errors are amplified "
+                    f"(offset gain {abs(float(result.gain[axis, tone])):.2f})."
                 )
     return sentences
 
@@ -115,6 +157,41 @@ def verdict_sentences(
     elif restored:
         sentences.append("No two frames have enough of the scene in common to judge the restoration.")
     return sentences
+
+
+def tried_sentences(
+    result: DetectionResult, options: dict[str, Any], verdict: RestorationVerdict | None, found: Sequence[str]
+) -> list[str]:
+    """What was tried where no frame was restored: the detection, its findings, and the restoration.
+
+    Args:
+        result: A detection (not a batch).
+        options: Options of the restoration.
+        verdict: The verdict on the restored frames that were not kept; None if there were none.
+        found: Sentences about the detected vibration and the verdict.
+    """
+    curve = result.offsets
+    pairs, rows = curve.offsets.shape[-3:-1]
+    measured = f"{100 * float(curve.good.double().mean()):.0f} %"
+    sentences = [
+        f"Offsets were measured at {rows} rows of {pairs} {'pair' if pairs == 1 else 'pairs'} of frames ({measured} of "
+        "them successfully), and sinusoids were fitted to them along both axes.",
+        *found,
+    ]
+    if verdict is None:
+        return [*sentences, "Frames were not restored, because along no axis a vibration is known accurately enough."]
+    chosen = ", ".join(f"{name} = {value}" for name, value in options.items())
+    return [*sentences, f"Frames were restored{f' with {chosen}' * bool(chosen)} and judged; they are not written."]
+
+
+def about_rows(created: datetime, version: str, command: str | None, options: dict[str, Any]) -> list[list[str]]:
+    """Lines of the table of the report itself: when and how it was made."""
+    rows = [["created", created.isoformat(" ", "seconds")], ["program", f"rsvib_torch {version}"]]
+    if command is not None:
+        rows.append(["command", command])
+    if options:
+        rows.append(["restored with", ", ".join(f"{name} = {value}" for name, value in options.items())])
+    return rows
 
 
 def _sentence(text: str) -> str:

@@ -16,7 +16,7 @@ from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
 from rsvib_torch.core.text import measured_text, text_table, wrapped
-from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor
+from rsvib_torch.frames.arrays import Channels, as_tensor
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.io.files import FramesOrFiles, load_frames
 from rsvib_torch.motion.motion import Motion
@@ -69,8 +69,8 @@ class RestorationVerdict(
         noise: (P,) standard deviation of the noise of the raw frames.
         chi_square: (P,) mean square of that frame's difference from its prediction, over the variance of the noise:
             1 ... 2 where motion, blur and noise explain the frame.
-        predicted_gain: (P,) dB, estimated PSNR of the restored frames minus that of the raw ones. It is valid where the
-            motion is right and complete, and NaN where it is not and has the opposite sign of the outcome.
+        predicted_gain: (P,) dB, improvement: estimated PSNR of the restored frames minus that of the raw ones. It is
+            valid where the motion is right and complete, NaN where it is not and has the opposite sign of the outcome.
         outcome: For each pair: ``"helps"``; ``"partly"``: the vibration explains only a part of the displacement;
             ``"worse"``; ``"unknown"``: cannot be determined from this pair (vibration too small, or at a blind
             frequency; frames without contrast; too many missing pixels).
@@ -104,7 +104,7 @@ class RestorationVerdict(
         for pair, (outcome, gain) in enumerate(zip(self.outcome, self.predicted_gain.tolist(), strict=True)):
             sizes = torch.stack([self.misfit_before[pair], self.misfit_after[pair]], -1).flatten()
             rows.append([str(pair), outcome, *(measured_text(size, digits=2) for size in sizes), f"{gain:+.1f}"])
-        head = ("pair", "outcome", "x before (px)", "x after (px)", "y before (px)", "y after (px)", "gain (dB)")
+        head = ("pair", "outcome", "x before (px)", "x after (px)", "y before (px)", "y after (px)", "improvement (dB)")
         return f"{wrapped(self.sentence)}\n{text_table(head, rows)}"
 
     @property
@@ -114,7 +114,7 @@ class RestorationVerdict(
         gain = float(self.predicted_gain.nanmean())
         counted = f" ({self.outcome.count(self.overall)} of {len(self.outcome)} pairs)" if len(self.outcome) > 1 else ""
         sentences = {
-            "helps": "restored frames agree" + ("" if math.isnan(gain) else f"; estimated gain {gain:+.1f} dB"),
+            "helps": "restored frames agree" + ("" if math.isnan(gain) else f"; estimated improvement {gain:+.1f} dB"),
             "unknown": f"cannot determine whether restoration helps{counted}: {self.reasons[worst]}",
             "partly": f"restoration helps in part only{counted}: {self.reasons[worst]}",
             "worse": f"restored is no better than raw{counted}: {self.reasons[worst]}",
@@ -188,8 +188,8 @@ def _outcome(
     if outcome in ("partly", "worse") or gain >= 0 or not motion_is_complete:
         return outcome, reason
     if gain < -_GAIN_ERROR:
-        return "worse", f"noise and artefacts outweigh the restored sharpness (estimated gain {gain:.1f} dB)"
-    return "unknown", reason or f"the estimated gain of {gain:.1f} dB is within its error of {_GAIN_ERROR:g} dB"
+        return "worse", f"noise and artefacts outweigh the restored sharpness (estimated improvement {gain:.1f} dB)"
+    return "unknown", reason or f"the estimated improvement of {gain:.1f} dB is within its error of {_GAIN_ERROR:g} dB"
 
 
 def _mean_square(difference: Tensor) -> Tensor:
@@ -278,7 +278,7 @@ def judge_frames(
 
 def judge_restoration(
     frames: FramesOrFiles,
-    restored: FramesLike,
+    restored: FramesOrFiles,
     timing: SensorTiming,
     vibration: Motion | Detected,
     *,
@@ -317,10 +317,12 @@ def judge_restoration(
         TypeError: If an argument has the wrong type.
         ValueError: If there is one frame only, shapes differ, or two frames have too little in common.
     """
+    given_scale = full_scale
     frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, minimum_frames=2)
     if prepared.batched:
         raise ValueError(f"frames must be one stack (T, H, W) or (T, C, H, W), got shape {prepared.shape}")
+    restored, restored_scale = load_frames(restored, given_scale)
     restored = as_tensor("restored", restored)
     expected = (1, *prepared.shape[1:]) if joint is True else prepared.shape
     if tuple(restored.shape) != expected:
@@ -328,7 +330,12 @@ def judge_restoration(
     count, height = prepared.images.shape[1], prepared.images.shape[-2]
     vibration, _ = vibration_to_undo(vibration, timing, count, height)
     images = prepare_frames(
-        restored, timing, full_scale=full_scale, channels=channels, allow_missing=False, name="restored"
+        restored,
+        timing,
+        full_scale=restored_scale or full_scale,
+        channels=channels,
+        allow_missing=False,
+        name="restored",
     ).images
     return judge_prepared(prepared, images, vibration, joint=joint, most_pairs=most_pairs)
 
