@@ -391,7 +391,7 @@ def _detect(
             axes = contradicted_axes(vibration[index], other_motion[index], max_tones)
             if not any(axes):
                 continue
-            own = found.measurements._mapped(lambda values, at=index: values[at : at + 1])
+            own = found.measurements.mapped(lambda values, at=index: values[at : at + 1])
             of_stack = frames[index : index + 1], None if valid is None else valid[index : index + 1]
             cause = _wrong_setting(*of_stack, own, axes, timing, method, options)
             if cause is not None:

@@ -32,7 +32,6 @@ from benchmarks.measure import one_thread
 import rsvib_torch as rsv
 
 SCENES = ("city", "chart", "text")
-VIBRATIONS = 3  # of each scene
 NUM_FRAMES = (2, 4, 8, 12)
 EXPOSURE = 100.0  # rows of a frame of 2048 rows, so that twice and half of it differ in their blur
 RESTORED = 2  # frames
@@ -85,8 +84,6 @@ MISTAKES: dict[str, Mistake] = {
         f"row_time {error:+.0%}, frame rate correct": wrong_row_time(1 + error)
         for error in (-0.10, -0.03, -0.01, 0.01, 0.03, 0.10)
     },
-    # all times by one factor: any factor gives the same result with frequencies over this factor
-    **{f"row_time {error:+.0%}, frame_rows correct": wrong_times(1 + error) for error in (-0.10, 0.10)},
     **{f"frame_rows {error:+.1%}": wrong_frame_rows(1 + error) for error in (-0.02, -0.005, 0.005, 0.02)},
     "exposure x 0.5": scaled("exposure_rows", "check exposure_rows", exposure_rows=0.5),
     "exposure x 2": scaled("exposure_rows", "check exposure_rows", exposure_rows=2.0),
@@ -95,6 +92,7 @@ MISTAKES: dict[str, Mistake] = {
     ),
     "scan axis exchanged": Mistake(lambda timing: replace(timing, scan_axis="x"), "scan axis", "agree with scan_axis"),
     "frame_rows = image height": wrong_frame_rows(1 / BLANKING),
+    # all times are wrong by one factor; every other factor gives the same result, with frequencies over this factor
     "row_time = 1 / (frame rate x height)": wrong_times(BLANKING),
     "both of these": wrong_row_time(BLANKING),
 }
@@ -156,13 +154,16 @@ def judge_recording(scene: str, number: int, size: int) -> list[dict[str, Any]]:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this section."""
     group = parser.add_argument_group("timing mistakes")
-    group.add_argument("--mistake-size", type=int, default=192, help="rows and columns of the frames (default: 192)")
+    group.add_argument("--mistake-size", type=int, default=160, help="rows and columns of the frames (default: 160)")
+    group.add_argument("--mistake-vibrations", type=int, default=3, help="vibrations of each scene (default: 3)")
     group.add_argument("--mistake-processes", type=int, default=2, help="processes (default: 2)")
 
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     """All mistakes with all recordings."""
-    recordings = [(scene, number, options.mistake_size) for scene in SCENES for number in range(VIBRATIONS)]
+    recordings = [
+        (scene, number, options.mistake_size) for scene in SCENES for number in range(options.mistake_vibrations)
+    ]
     with ProcessPoolExecutor(options.mistake_processes, multiprocessing.get_context("spawn")) as pool:
         each = list(pool.map(judge_recording, *zip(*recordings, strict=True)))
     return [case for cases in each for case in cases]
@@ -206,9 +207,10 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         return ["", head, "", f"| mistake | {columns} |", "|---" * (1 + len(NUM_FRAMES)) + "|", *counted]
 
     return [
-        f"Frames of {options.mistake_size} x {options.mistake_size} px, exposed for {EXPOSURE:.0f} / 2048 of their rows; "
-        f"a frame period has {BLANKING:g} row times per row. {len(SCENES)} scenes with {VIBRATIONS} vibrations each, one "
-        "tone along each axis. Every cell has both axes of these recordings; the row 'none' has the false alarms.",
+        f"Frames of {options.mistake_size} x {options.mistake_size} px, exposed for {EXPOSURE:.0f} / 2048 of their rows;",
+        f"a frame period has {BLANKING:g} row times per row. {len(SCENES)} scenes with {options.mistake_vibrations}",
+        "vibrations each, one tone along each axis. Every cell has both axes of these recordings. The row 'none' has the",
+        "false alarms.",
         *table("Percentage of axes that are detected as doubtful (of all axes, with the cause named):", detected),
         *table(
             "Percentage of axes that are reliable and wrong, with / without the setting among the assumptions:", wrong
