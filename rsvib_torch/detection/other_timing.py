@@ -19,6 +19,7 @@ _ROWS = (32, 128)  # measured rows that are used in the search and its refinemen
 _SHORTEST, _LONGEST, _STEP = 0.8, 1.5, 0.02  # frame periods that are tried, over the stated one
 _LEVELS, _POINTS = 4, 9  # refinement of the best one, each level in steps four times smaller
 _SMALLER = 0.5  # of the square of the residual with the stated timing; correct alternatives reach 0.3 or less
+_MINIMA, _EQUAL = 4, 4.0  # minima that are refined, and their squared residual over the least to count as equal
 
 
 def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int) -> float | None:
@@ -49,20 +50,30 @@ def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int
         if frequencies is None:
             fit = find_tones(trial, interval, 1)
         else:
-            frequencies = frequencies.expand(len(factors), -1, -1)
             fit, _ = robust_fit(trial, frequencies, torch.ones_like(frequencies, dtype=torch.bool), MotionModel())
         return typical_size(trial, fit), fit.frequencies
 
     ends = starts.new_tensor([1.0, -1.0])
     coarse = torch.arange(_SHORTEST, _LONGEST, _STEP, dtype=starts.dtype, device=starts.device)
-    factors = torch.cat([ends, coarse])
-    sizes, frequencies = fits(factors, _ROWS[0])
-    stated, best = sizes[0], int(sizes.argmin())
-    factor, least, step = factors[best], sizes[best], _STEP
-    if factor > 0:
-        for _ in range(_LEVELS):
-            near = factor + step * torch.linspace(-1.0, 1.0, _POINTS, dtype=starts.dtype, device=starts.device)
-            sizes, frequencies = fits(near, _ROWS[1], frequencies[best])
-            best = int(sizes.argmin())
-            factor, least, step = near[best], sizes[best], step / 4.0
-    return float(factor) if bool(least < _SMALLER * stated) else None
+    sizes, frequencies = fits(torch.cat([ends, coarse]), _ROWS[0])
+    (stated, reverse), sizes, frequencies = sizes[:2], sizes[2:], frequencies[2:]
+    if bool(reverse < torch.minimum(sizes.min(), _SMALLER * stated)):
+        return -1.0
+    # a tone has the same phase after 1 / f more, so that several frame periods may agree: the next to 1 is probable
+    inner = (sizes[1:-1] < sizes[:-2]) & (sizes[1:-1] < sizes[2:])
+    minima = (inner.nonzero()[:, 0] + 1).tolist()
+    minima = sorted(minima, key=sizes.tolist().__getitem__)[:_MINIMA]
+    if not minima:
+        return None
+    factors, frequencies, step = coarse[minima], frequencies[minima], _STEP
+    for _ in range(_LEVELS):
+        around = step * torch.linspace(-1.0, 1.0, _POINTS, dtype=starts.dtype, device=starts.device)
+        near = factors[:, None] + around
+        sizes, found = fits(near.flatten(), _ROWS[1], frequencies.repeat_interleave(_POINTS, 0))
+        least, best = sizes.unflatten(0, near.shape).min(1)
+        factors = near.gather(1, best[:, None])[:, 0]
+        frequencies = found.unflatten(0, near.shape)[torch.arange(len(best), device=best.device), best]
+        step /= 4.0
+    distance = torch.where(least <= _EQUAL * least.min(), (factors - 1.0).abs(), torch.inf)
+    chosen = int(distance.argmin())
+    return float(factors[chosen]) if bool(least[chosen] < _SMALLER * stated) else None

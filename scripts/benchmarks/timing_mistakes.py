@@ -207,10 +207,10 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         return ["", head, "", f"| mistake | {columns} |", "|---" * (1 + len(NUM_FRAMES)) + "|", *counted]
 
     return [
-        f"Frames of {options.mistake_size} x {options.mistake_size} px, exposed for {EXPOSURE:.0f} / 2048 of their rows;",
+        f"Frames of {options.mistake_size} x {options.mistake_size} px, exposed for {EXPOSURE:.0f} / 2048 of the rows;",
         f"a frame period has {BLANKING:g} row times per row. {len(SCENES)} scenes with {options.mistake_vibrations}",
-        "vibrations each, one tone along each axis. Every cell has both axes of these recordings. The row 'none' has the",
-        "false alarms.",
+        "vibrations each, one tone along each axis. Every cell has both axes of these recordings. The row 'none' is",
+        "for correct timing, and contains the false alarms.",
         *table("Percentage of axes that are detected as doubtful (of all axes, with the cause named):", detected),
         *table(
             "Percentage of axes that are reliable and wrong, with / without the setting among the assumptions:", wrong
