@@ -36,8 +36,8 @@ from rsvib_torch.detection.tones.further import with_further_tones
 from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
-from rsvib_torch.io.files import FramesOrFiles
-from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.io.files import FramesOrFiles, timing_of_files
+from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
 
@@ -217,7 +217,8 @@ def detect_vibration(
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, floating point, or
             integers of known full scale: a tensor, an array, a list of these, or a path or list of paths of files,
             which are read as by ``read_stack``. NaN marks missing pixels.
-        timing: The sensor. Frame start times at unequal intervals (dropped frames) remove blind frequencies.
+        timing: The sensor. Frame start times at unequal intervals (dropped frames) remove blind frequencies. If frames
+            is a path, the frame times in the file are used.
         model: ``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape; ``"swept"``: one tone per
             axis whose amplitude decays or grows and whose frequency sweeps. The last two take the options from
             ``registration`` to ``search``, ``ignore``, ``full_scale`` and ``channels``; ``detect_motion`` and
@@ -245,6 +246,9 @@ def detect_vibration(
         The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve: a
         ``DetectionResult``, or the ``MotionDetection`` of the free and the ``SweptTone`` of the swept model.
 
+    Warns:
+        TimingWarning: If frames is a path, and the file states another frame rate than the sensor has.
+
     Raises:
         TypeError: If frames are not numbers.
         ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or an option
@@ -258,6 +262,8 @@ def detect_vibration(
         ValueError: at least 2 frames are needed, got 1
     """
     check_choice("model", model, ("tones", *_OTHER_MODELS))
+    check_timing(timing)
+    timing = timing_of_files(frames, timing)
     if model != "tones":
         tone_options = (
             ("method", method, "direct"),

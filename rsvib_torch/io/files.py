@@ -23,7 +23,9 @@ from rsvib_torch.io.full_scale import (
     known_full_scale,
     required_full_scale,
 )
+from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.motion.timing import SensorTiming
 
 __all__ = [
     "FramesOrFiles",
@@ -36,6 +38,7 @@ __all__ = [
     "read_stack",
     "read_stack_info",
     "register_format",
+    "timing_of_files",
     "write_frames",
     "write_stack",
 ]
@@ -192,6 +195,21 @@ def load_frames(frames: FramesOrFiles, full_scale: float | None) -> tuple[Frames
     if pixels.dtype.kind == "f":
         return counts_to_frames(pixels, full_scale, str(paths[0])), None
     return pixels, full_scale_of_counts(pixels, full_scale, str(paths[0]))
+
+
+def timing_of_files(frames: FramesOrFiles, timing: SensorTiming) -> SensorTiming:
+    """The timing of frames that may be given by the path of their file, with the frame times that the file states.
+
+    Args:
+        frames: Frames in memory, a path, or a list of paths.
+        timing: The sensor.
+
+    Warns:
+        TimingWarning: As ``timing_from_first_frame``, if the file states another frame rate than the sensor has.
+    """
+    if isinstance(frames, (str, os.PathLike)):
+        return timing_from_first_frame(timing, read_stack_info(frames))
+    return timing
 
 
 def check_info_target(
