@@ -16,6 +16,7 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.io import hdf5, image_folder, npy, raw, tiff, video, zarr_store
 from rsvib_torch.io.formats import FrameReader, StackFormat, find_format, register_format, target_format
+from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.full_scale import (
     counts_to_frames,
     frames_to_counts,
@@ -23,7 +24,6 @@ from rsvib_torch.io.full_scale import (
     known_full_scale,
     required_full_scale,
 )
-from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.motion.timing import SensorTiming
 
