@@ -456,7 +456,10 @@ def _wrong_setting(
 
     def agrees(other: RowTiming, change: Callable[[Tensor], Tensor], concerned: tuple[bool, bool] = axes) -> bool:
         pixels = None if valid is None else change(valid)
-        reliable = _detect(change(frames), pixels, other, method, options).reliable[0].tolist()
+        try:
+            reliable = _detect(change(frames), pixels, other, method, options).reliable[0].tolist()
+        except ValueError:  # columns may lack the detail that rows have
+            return False
         return all(good or not axis for good, axis in zip(reliable, concerned, strict=True))
 
     row_timing = timing.in_row_order()

@@ -111,7 +111,14 @@ def judge_mistake(taken: Recording, name: str, num_frames: int) -> dict[str, Any
     stated = replace(taken, frames=taken.frames[:num_frames], timing=timing, starts=taken.starts[:num_frames])
     case: dict[str, Any] = {"mistake": name, "num_frames": num_frames}
     frames = torch.from_numpy(stated.frames).float()
-    found = rsv.detect_vibration(frames, timing)
+    first = replace(stated, frames=stated.frames[:RESTORED], starts=stated.starts[:RESTORED])
+    stills = [taken.still(frame) for frame in range(RESTORED)]
+    case["raw_db"] = psnr(first.frames, first, stills)
+    try:
+        found = rsv.detect_vibration(frames, timing)
+    except ValueError as error:  # refused with another message
+        refused = {"outcomes": ["detected"] * 2, "named": [False] * 2, "reasons": [[str(error)]] * 2}
+        return case | refused | {"restored_db": case["raw_db"]}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", rsv.RestorationWarning)
         restored = rsv.restore(frames[:RESTORED], timing, found)
@@ -133,9 +140,6 @@ def judge_mistake(taken: Recording, name: str, num_frames: int) -> dict[str, Any
         case["named"].append(outcome == "detected" and any(mistake.name in text for text in reasons))
         case["reasons"].append(reasons)
     case["warnings"], case["assumptions"] = warned, list(found.assumptions)
-    first = replace(stated, frames=stated.frames[:RESTORED], starts=stated.starts[:RESTORED])
-    stills = [taken.still(frame) for frame in range(RESTORED)]
-    case["raw_db"] = psnr(first.frames, first, stills)
     case["restored_db"] = psnr(restored.double().numpy(), first, stills)
     return case
 
