@@ -29,7 +29,7 @@ INNER_LAYERS = {
     "detection": (
         {"measurements", "result"},
         {"start", "tones"},
-        {"rows", "reliability", "sensitivity"},
+        {"rows", "other_timing", "reliability", "sensitivity"},
         {"shapes"},
         {"recorded"},
         {"detect"},

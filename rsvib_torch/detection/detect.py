@@ -6,6 +6,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Literal, Unpack, overload
 
 import torch
@@ -15,7 +16,8 @@ from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.option_types import BandSettings, DetectionMethod, Registration, ToneSettings
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.reliability import judge
+from rsvib_torch.detection.other_timing import period_factor
+from rsvib_torch.detection.reliability import contradicted_axes, judge
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, stacked
 from rsvib_torch.detection.rows.direct import refine_directly
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals, stack_spectra
@@ -35,7 +37,7 @@ from rsvib_torch.detection.tones.further import with_further_tones
 from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
-from rsvib_torch.io.files import FramesOrFiles
+from rsvib_torch.io.files import FramesOrFiles, timing_of_files
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
@@ -216,7 +218,8 @@ def detect_vibration(
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, floating point, or
             integers of known full scale: a tensor, an array, a list of these, or a path or list of paths of files,
             which are read as by ``read_stack``. NaN marks missing pixels.
-        timing: The sensor. Frame start times at unequal intervals (dropped frames) remove blind frequencies.
+        timing: The sensor. Frame start times at unequal intervals (dropped frames) remove blind frequencies. If frames
+            is a path, the frame times in the file are used.
         model: ``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape; ``"swept"``: one tone per
             axis whose amplitude decays or grows and whose frequency sweeps. The last two take the options from
             ``registration`` to ``search``, ``ignore``, ``full_scale`` and ``channels``; ``detect_motion`` and
@@ -244,6 +247,9 @@ def detect_vibration(
         The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve: a
         ``DetectionResult``, or the ``MotionDetection`` of the free and the ``SweptTone`` of the swept model.
 
+    Warns:
+        TimingWarning: If frames is a path, and the file states another frame rate than the sensor has.
+
     Raises:
         TypeError: If frames are not numbers.
         ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or an option
@@ -257,6 +263,7 @@ def detect_vibration(
         ValueError: at least 2 frames are needed, got 1
     """
     check_choice("model", model, ("tones", *_OTHER_MODELS))
+    timing = timing_of_files(frames, timing)
     if model != "tones":
         tone_options = (
             ("method", method, "direct"),
@@ -301,7 +308,7 @@ def detect_vibration(
         stacks = stacks.narrowed(columns)
     grey, valid_pixels = stacks.images, stacks.valid
     if window is None:
-        found = _detect(grey, valid_pixels, timing, _METHODS[method], options)
+        found = _detect(grey, valid_pixels, timing, _METHODS[method], options, find_cause=True)
     else:
         found = stacked(
             [
@@ -337,9 +344,18 @@ def _windows(num_frames: int, window: int, step: int | None, timing: SensorTimin
 
 
 def _detect(
-    frames: Tensor, valid: Tensor | None, timing: SensorTiming, method: _Method, options: _FitOptions
+    frames: Tensor,
+    valid: Tensor | None,
+    timing: SensorTiming,
+    method: _Method,
+    options: _FitOptions,
+    *,
+    find_cause: bool = False,
 ) -> DetectionResult:
-    """``detect_vibration`` of grey frames (B, T, H, W) in row order; the result is a batch in image axes."""
+    """``detect_vibration`` of grey frames (B, T, H, W) in row order; the result is a batch in image axes.
+
+    With ``find_cause``, other timings are tried if the measurements contradict the stated one.
+    """
     row_timing, bands = timing.in_row_order(), options.bands
     curve = band_curve(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve)
     found = method.fit(curve, frames, valid, row_timing, options)
@@ -359,6 +375,7 @@ def _detect(
     later = curve.rows + fitted[..., 1]
     visible = (later >= 0.5 * bands.band_rows) & (later <= frames.shape[-2] - 1 - 0.5 * bands.band_rows)
     intervals = compared_intervals(row_timing, frames.shape[1], method.max_group_frames, frames.device)
+    max_tones = MAX_TONES if options.tones is None and options.model.harmonics == 1 else math.inf
     verdicts = [
         judge(
             vibration[index],
@@ -371,10 +388,23 @@ def _detect(
             own_std=own_std[index],
             timing=row_timing,
             other_motion=None if other_motion is None else other_motion[index],
-            max_tones=MAX_TONES if options.tones is None and options.model.harmonics == 1 else math.inf,
+            max_tones=max_tones,
         )
         for index in range(len(frames))
     ]
+    if find_cause and other_motion is not None:
+        for index, (_, reasons) in enumerate(verdicts):
+            axes = contradicted_axes(vibration[index], other_motion[index], max_tones)
+            if not any(axes):
+                continue
+            part = slice(index, index + 1)
+            own = found.measurements.mapped(itemgetter(part))
+            of_stack = frames[part], None if valid is None else valid[part]
+            cause = _wrong_setting(*of_stack, own, axes, timing, method, options)
+            if cause is not None:
+                # the axes have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong
+                both = ((cause, *reasons[0]), (cause, *reasons[1]))
+                verdicts[index] = (torch.zeros_like(verdicts[index][0]), both)
     reliable = torch.stack([verdict[0] for verdict in verdicts])
     swap = timing.scan_axis == -1
     in_image = vibration.from_row_order(timing)
@@ -396,11 +426,71 @@ def _detect(
         reasons=tuple((reasons[1], reasons[0]) if swap else reasons for _, reasons in verdicts),
         sensitivity=sensitivity,
         assumptions=tuple(
-            assumptions(in_image[index], sensitivity[index], row_timing, frames.shape[1])
+            assumptions(in_image[index], sensitivity[index], row_timing, frames.shape[1], frames.shape[-2])
             for index in range(len(frames))
         ),
         timing=timing,
     )
+
+
+def _wrong_setting(
+    frames: Tensor,
+    valid: Tensor | None,
+    measurements: Measurements,
+    axes: tuple[bool, bool],
+    timing: SensorTiming,
+    method: _Method,
+    options: _FitOptions,
+) -> str | None:
+    """Sentence about another timing with which the frames of one stack agree; None if none was found.
+
+    A timing agrees if detection with it is reliable along the axes that contradict the stated one.
+
+    Args:
+        frames: (1, T, H, W) in row order.
+        valid: Their valid pixels.
+        measurements: Displacements of the rows.
+        axes: Axes (x, y) in row order that contradict the stated timing.
+        timing: The stated timing, in image order.
+        method: The method.
+        options: Its options.
+    """
+
+    def agrees(other: RowTiming, change: Callable[[Tensor], Tensor], concerned: tuple[bool, bool] = axes) -> bool:
+        pixels = None if valid is None else change(valid)
+        try:
+            reliable = _detect(change(frames), pixels, other, method, options).reliable[0].tolist()
+        except ValueError:  # columns may lack the detail that rows have
+            return False
+        return all(good or not axis for good, axis in zip(reliable, concerned, strict=True))
+
+    row_timing = timing.in_row_order()
+    factor = period_factor(measurements, row_timing, frames.shape[1]) if frames.shape[1] > 2 else None
+    if factor is not None and factor < 0:
+        if agrees(row_timing, lambda images: images.flip(-2)):
+            other = "reverse" if timing.readout_direction == "forward" else "forward"
+            return f"the frames agree with readout_direction={other!r}, not with {timing.readout_direction!r}"
+    elif factor is not None and timing.frame_start_times is None:
+        frame_rows = factor * timing.frame_rows
+        changed = replace(row_timing, frame_rows=max(frame_rows, frames.shape[-2], timing.exposure_rows))
+        if changed.frame_rows == frame_rows and agrees(changed, lambda images: images):
+            return (
+                f"the frames agree with frame_rows={frame_rows:.5g}, not with {timing.frame_rows:g}: frame_rows counts "
+                "the blanking rows and is not the image height; if the frame rate is known, row_time is 1 / (frame "
+                f"rate x frame_rows), with {timing.frame_rate:.5g} frames/s {timing.row_time / factor:.5g} s"
+            )
+    elif factor is not None:
+        times = {name: getattr(timing, name) * factor for name in ("frame_rows", "exposure_rows")}
+        changed = replace(row_timing, row_time=timing.row_time / factor, **times)
+        if agrees(changed, lambda images: images):
+            return (
+                f"the frames agree with row_time={changed.row_time:.5g} s, not with {timing.row_time:g} s, if the "
+                "start times of the frames are right"
+            )
+    if frames.shape[-1] <= timing.frame_rows and agrees(row_timing, lambda images: images.mT, (axes[1], axes[0])):
+        other, stated = ("x", "y") if timing.scan_axis == -2 else ("y", "x")
+        return f"the frames agree with scan_axis={other!r}, not with {stated!r}"
+    return None
 
 
 class VibrationDetector(nn.Module):

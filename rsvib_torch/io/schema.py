@@ -161,8 +161,8 @@ def detection_summary(detection: Detection) -> str:
     vibration, std = detection.vibration, detection.std
     rows = [cells for _, cells in tone_rows(vibration, std)]
     table, *verdict = verdict_table(tone_head(), rows, vibration.batch_shape, detection.reliable, detection.reasons)
-    if not vibration.batch_shape:  # those sentences that concern two frames
-        verdict += [wrapped(f"assumed: {text}") for text in detection.assumptions if text.startswith("frame_")]
+    if not vibration.batch_shape:
+        verdict += [wrapped(f"assumed: {text}") for text in detection.assumptions]
     return "\n".join([table, *image_motion_line(vibration, std), *verdict])
 
 

@@ -19,7 +19,7 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.prepare import prepare_frames
-from rsvib_torch.io.files import FramesOrFiles, load_frames
+from rsvib_torch.io.files import FramesOrFiles, load_frames, timing_of_files
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.registration.bands import BandTask
 from rsvib_torch.registration.methods import BAND_METHODS, Registration, RegistrationOptions
@@ -133,7 +133,8 @@ def register_bands(
         [4.0, 0.0]
     """
     options = RegistrationOptions(method, band_rows, band_step, search)
-    frames, full_scale = load_frames(frames, full_scale, timing)
+    timing = timing_of_files(frames, timing)
+    frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(
         frames, timing, full_scale=full_scale, channels=channels, minimum_frames=2, allow_missing=False
     )

@@ -18,7 +18,7 @@ from rsvib_torch.core.option_types import (
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.frames.arrays import Channels
 from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
-from rsvib_torch.io.files import FramesOrFiles, load_frames
+from rsvib_torch.io.files import FramesOrFiles, load_frames, timing_of_files
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.banded import restore_banded
@@ -197,7 +197,8 @@ def restore(
         0.5
     """
     _check_options(method, options)
-    frames, full_scale = load_frames(frames, full_scale, timing)
+    timing = timing_of_files(frames, timing)
+    frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(
         frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, saturation=saturation
     )

@@ -18,7 +18,7 @@ from rsvib_torch.detection.rows.displacements import frame_groups, measure_group
 from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
 from rsvib_torch.detection.start import grey_frames, measurements_of_curve
 from rsvib_torch.frames.arrays import ArrayLike, Channels
-from rsvib_torch.io.files import FramesOrFiles
+from rsvib_torch.io.files import FramesOrFiles, timing_of_files
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
@@ -155,6 +155,7 @@ def align_motion(
         )
     if recorded.batch_shape:
         raise ValueError("align_motion takes one motion, not a batch")
+    timing = timing_of_files(frames, timing)
     stack = grey_frames(frames, timing, full_scale, ignore, channels)
     if stack.batched:
         raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")

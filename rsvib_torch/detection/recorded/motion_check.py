@@ -18,7 +18,7 @@ from rsvib_torch.detection.shapes.free import start_curve
 from rsvib_torch.detection.start import grey_frames, measurements_of_curve
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
-from rsvib_torch.io.files import FramesOrFiles
+from rsvib_torch.io.files import FramesOrFiles, timing_of_files
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
@@ -103,6 +103,7 @@ def check_motion(
         ...
         ValueError: at least 2 frames are needed, got 1
     """
+    timing = timing_of_files(frames, timing)
     stack = grey_frames(frames, timing, full_scale, ignore, channels)
     if stack.batched or motion.batch_shape:
         raise ValueError("check_motion takes one stack and one motion, not a batch")

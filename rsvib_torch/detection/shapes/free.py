@@ -25,7 +25,7 @@ from rsvib_torch.detection.rows.displacements import frame_groups, measure_group
 from rsvib_torch.detection.start import GreyFrames, band_curve, grey_frames, measurements_of_curve
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
-from rsvib_torch.io.files import FramesOrFiles
+from rsvib_torch.io.files import FramesOrFiles, timing_of_files
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
@@ -155,6 +155,7 @@ def detect_motion(
     """
     check_whole_number("knot_rows", knot_rows, at_least=4)
     check_whole_number("iterations", iterations, at_least=1)
+    timing = timing_of_files(frames, timing)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     results = [_detect(stacks.one(i), timing, bands, knot_rows, iterations) for i in range(len(stacks.images))]

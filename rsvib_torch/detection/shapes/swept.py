@@ -24,7 +24,7 @@ from rsvib_torch.detection.shapes.free import (
 )
 from rsvib_torch.detection.start import GreyFrames, grey_frames, measurements_of_curve
 from rsvib_torch.frames.arrays import ArrayLike, Channels
-from rsvib_torch.io.files import FramesOrFiles
+from rsvib_torch.io.files import FramesOrFiles, timing_of_files
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
@@ -151,6 +151,7 @@ def detect_swept_tone(
         ValueError: at least 2 frames are needed, got 1
     """
     check_whole_number("iterations", iterations, at_least=1)
+    timing = timing_of_files(frames, timing)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     fitted = [_detect(stacks.one(index), timing, bands, iterations) for index in range(len(stacks.images))]

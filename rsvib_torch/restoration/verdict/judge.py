@@ -18,7 +18,7 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.core.text import measured_text, text_table, wrapped
 from rsvib_torch.frames.arrays import Channels, as_tensor
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
-from rsvib_torch.io.files import FramesOrFiles, load_frames
+from rsvib_torch.io.files import FramesOrFiles, load_frames, timing_of_files
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, joint_groups
@@ -317,6 +317,7 @@ def judge_restoration(
         ValueError: If there is one frame only, shapes differ, or two frames have too little in common.
     """
     given_scale = full_scale
+    timing = timing_of_files(frames, timing)
     frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, minimum_frames=2)
     if prepared.batched:
