@@ -134,6 +134,7 @@ def write_sources(folder: Path) -> list[object]:
         shutil.copy(ROOT / name, folder / page)
     for page in folder.glob("*.md"):
         text = page.read_text(encoding="utf-8").replace("](docs/", "](").replace("](../README.md", "](index.md")
+        text = text.replace(".ipynb)", ".md)")
         page.write_text(without_outer_links(text, folder), encoding="utf-8")
     font = files("ziamath") / "fonts" / "STIXTwoMath-Regular.ttf"
     for path in (DOCUMENTATION / STYLE, DOCUMENTATION / SEARCH_SHIM, Path(str(font))):

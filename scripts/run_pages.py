@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Run the code of the tutorials and write its output into them anew.
+"""Run the code of the tutorials and notebooks and write its output into them anew.
 
 A page is run from top to bottom in an empty folder: blocks of ``python`` share their variables, blocks of ``bash`` are
 commands. A block of ``text`` directly below one of them is its output. Pictures of the page that its code has written
@@ -19,9 +19,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import nbclient
+import nbformat
+
 from rsvib_torch.commands.main import run_command
 
-TUTORIALS = Path(__file__).resolve().parents[1] / "docs" / "tutorials"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 BLOCK = re.compile(r"^```(python|bash|text)\n(.*?)^```\n", flags=re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 FAILS = "  # exit code 2"  # written behind commands that are refused
@@ -107,16 +110,32 @@ def pictures(page: str) -> list[str]:
     return re.findall(r"!\[[^\]]*\]\(([\w.-]+)\)", page)
 
 
+def run_notebook(notebook: Path) -> nbformat.NotebookNode:
+    """Execute a notebook; returns it with its outputs."""
+    cells = nbformat.read(notebook, as_version=4)
+    return nbclient.NotebookClient(cells, timeout=300, record_timing=False).execute()
+
+
+def notebook_text(cells: nbformat.NotebookNode) -> str:
+    """What the code of a notebook prints, as text."""
+    outputs = [output for cell in cells.cells if cell.cell_type == "code" for output in cell.outputs]
+    return "\n".join(output.text if "text" in output else output.data.get("text/plain", "") for output in outputs)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pages", nargs="*", type=Path, default=sorted(TUTORIALS.glob("*.md")))
+    default = [*sorted(DOCS.glob("tutorials/*.md")), *sorted(DOCS.glob("notebooks/*.ipynb"))]
+    parser.add_argument("pages", nargs="*", type=Path, default=default, help="pages and notebooks (default: all)")
     for page in parser.parse_args(arguments).pages:
+        print(page)
+        if page.suffix == ".ipynb":
+            nbformat.write(run_notebook(page), page)
+            continue
         with tempfile.TemporaryDirectory() as folder:
             text, _ = run_page(page, Path(folder))
             for name in pictures(text):
                 shutil.copy(Path(folder) / name, page.parent / name)
         page.write_text(text, encoding="utf-8")
-        print(page)
 
 
 if __name__ == "__main__":

@@ -144,11 +144,17 @@ def detect_swept_tone(
         ValueError: If they cannot be registered, see ``detect_motion``, or an option is out of range.
 
     Example:
-        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=256)
-        >>> detect_swept_tone(torch.rand(1, 256, 256), timing)
-        Traceback (most recent call last):
-        ...
-        ValueError: at least 2 frames are needed, got 1
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> times = torch.arange(0.0, 0.06, 2e-4, dtype=torch.float64)
+        >>> decaying = 3.0 * torch.exp(-20 * times) * torch.sin(2 * torch.pi * 105 * times)  # px, 20/s
+        >>> motion = rsv.FreeMotion.through(times, torch.stack([decaying, 0.5 * decaying], -1))
+        >>> frames = rsv.simulate_frames(city_and_fields(280, 220, seed=3), timing, motion, num_frames=4)
+        >>> found = rsv.detect_swept_tone(frames, timing)
+        >>> [round(value, 0) for value in (found.frequency[0].item(), found.decay[0].item())]
+        ?
     """
     check_whole_number("iterations", iterations, at_least=1)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)

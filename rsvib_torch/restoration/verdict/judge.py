@@ -315,6 +315,20 @@ def judge_restoration(
     Raises:
         TypeError: If an argument has the wrong type.
         ValueError: If there is one frame only, shapes differ, or two frames have too little in common.
+
+    Example:
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> wrong = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[3.6, 4.1])  # opposite phase
+        >>> for candidate in (vibration, wrong):
+        ...     restored = rsv.restore(frames, timing, candidate, check=False)
+        ...     verdict = rsv.judge_restoration(frames, restored, timing, candidate)
+        ...     print(verdict.outcome)
+        ('helps',)
+        ('worse',)
     """
     frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, minimum_frames=2)
