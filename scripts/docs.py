@@ -168,6 +168,7 @@ def settings(sources: Path, navigation: list[object], site: Path) -> dict[str, o
         "members_order": "source",
         "filters": ["!^_"],
         "separate_signature": True,
+        "show_overloads": False,  # the implementation lists all options
         "show_signature_annotations": True,
     }
     return {

@@ -58,6 +58,17 @@ def read_motion(
         OSError: If the file cannot be opened.
         ValueError: If a column is missing, a value is not a number, times do not increase or have gaps, or values or
             time steps indicate another unit; the message names the line of the file.
+
+    Example:
+        >>> import tempfile
+        >>> import torch
+        >>> from pathlib import Path
+        >>> import rsvib_torch as rsv
+        >>> path = Path(tempfile.mkdtemp()) / "gyroscope.csv"
+        >>> rows = [f"{0.001 * i},{0.1 * i},{-0.2 * i}" for i in range(50)]
+        >>> _ = path.write_text("\n".join(["time,x,y", *rows]))
+        >>> rsv.read_motion(path, unit="px").displacement(torch.tensor(0.01)).round(decimals=3).tolist()
+        ?
     """
     path = Path(path)
     check_choice("unit", unit, get_args(MotionUnit))

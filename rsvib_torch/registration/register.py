@@ -54,7 +54,7 @@ class OffsetCurve(Result, units={"times": "s", "later_times": "s", "offsets": "p
         >>> scene = torch.rand(96, 132, generator=torch.Generator().manual_seed(0))
         >>> curve = rsv.register_bands(torch.stack([scene[:, 4:], scene[:, :-4]]), timing)
         >>> curve.offsets.shape, curve.quality.shape  # (frame pair, band, axis), (frame pair, band)
-        ?
+        (torch.Size([1, 5, 2]), torch.Size([1, 5]))
     """
 
     pairs: Tensor

@@ -47,7 +47,17 @@ def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timin
         ValueError: If the result is a batch, or the timing is unknown.
 
     Example:
-        >>> write_vibration("vibration.json", detection)  # doctest: +SKIP
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> import tempfile
+        >>> detection = rsv.detect_vibration(frames, timing, method="bands", tones=1)
+        >>> path = tempfile.mkdtemp() + "/vibration.json"
+        >>> rsv.write_vibration(path, detection)
+        >>> rsv.read_vibration(path, timing).vibration.frequency[:, 0].round().tolist()  # Hz
+        [111.0, 90.0]
     """
     if result.batch_shape:
         raise ValueError(
@@ -71,7 +81,18 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
         ValueError: If it is not a complete ``vibration.json``, or was detected with another timing.
 
     Example:
-        >>> restored = restore(frames, timing, read_vibration("vibration.json", timing))  # doctest: +SKIP
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> import tempfile
+        >>> path = tempfile.mkdtemp() + "/vibration.json"
+        >>> rsv.detect_vibration(frames, timing, method="bands", tones=1).save(path)
+        >>> found = rsv.read_vibration(path, timing)
+        >>> restored = rsv.restore(frames, timing, found, method="dewarp", check=False)
+        >>> found.reliable.tolist()
+        [True, False]
     """
     path = Path(path)
     data = read_json(path, "vibration.json")

@@ -334,7 +334,7 @@ class VibrationRestorer(nn.Module):
         >>> batch = frames[None, :, None].requires_grad_()  # (B, T, C, H, W)
         >>> model(restorer(batch, vibration).flatten(0, 1)).square().mean().backward()
         >>> batch.grad.shape
-        ?
+        torch.Size([1, 2, 1, 284, 202])
     """
 
     @overload

@@ -107,8 +107,18 @@ def iterate_stack(source: PathLike, timing: SensorTiming, **options: Unpack[Rest
         ValueError: If a value is out of range, or the stack is not readable.
 
     Example:
-        >>> for result in iterate_stack("frames.tif", timing):  # doctest: +SKIP
-        ...     print(result.indices, result.restored)
+        >>> import tempfile
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
+        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> folder = tempfile.mkdtemp()
+        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
+        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
+        >>> for result in rsv.iterate_stack(f"{folder}/frames.tif", timing, window=3, detection={"tones": 1}, restoration={"method": "dewarp"}):
+        ...     print(result.indices, result.detection.vibration.frequency[:, 0].round().tolist())
+        (0,) [155.0, 145.0]
+        (1, 2, 3) [155.0, 145.0]
     """
     job, windows, at_once = plan_job(source, timing, options)
     yield from compute_here(job, windows, lambda result, _: result, at_once=at_once)
@@ -207,7 +217,21 @@ def process_stack(
             input, settings or versions differ from those of the run to resume.
 
     Example:
-        >>> report = process_stack("frames.tif", "restored.tif", timing, memory="2GB")  # doctest: +SKIP
+        >>> import tempfile
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
+        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> folder = tempfile.mkdtemp()
+        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
+        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
+        >>> report = rsv.process_stack(
+        ...     f"{folder}/frames.tif", f"{folder}/restored.tif", timing, window=3, detection={"tones": 1}, restoration={"method": "dewarp"}
+        ... )
+        >>> [window.outcome for window in report.windows]
+        ?
+        >>> rsv.read_stack(f"{folder}/restored.tif").shape == frames.shape
+        True
     """
     start, sink = time.perf_counter(), Path(sink)
     job, windows, at_once = plan_job(source, timing, options, given=given, bad_frames=bad_frames)

@@ -165,7 +165,7 @@ def align_motion(
         >>> late = rsv.FreeMotion.from_samples(times + 0.002, path)  # a gyroscope whose clock is 2 ms ahead
         >>> found = rsv.align_motion(frames, timing, late, offsets=(-0.004, 0.004))
         >>> round(1e3 * found.offset, 2)  # ms
-        ?
+        2.0
     """
     if recorded.batch_shape:
         raise ValueError("align_motion takes one motion, not a batch")

@@ -46,7 +46,10 @@ class MotionCheck(Result, units={"before": "px", "after": "px"}):
         >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
         >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
         >>> print(rsv.check_motion(frames, timing, vibration))
-        ?
+        axis  offset between frames (px rms)  without the motion (px rms)
+        x     2.36                            0.0661
+        y     0.576                           0.0953
+        the motion reduces the offsets
     """
 
     before: Tensor
@@ -112,7 +115,7 @@ def check_motion(
         >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
         >>> check = rsv.check_motion(frames, timing, vibration)
         >>> check.helps, bool((check.after < 0.2 * check.before).all())
-        ?
+        (True, True)
     """
     stack = grey_frames(frames, timing, full_scale, ignore, channels)
     if stack.batched or motion.batch_shape:
