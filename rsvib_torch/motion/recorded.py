@@ -66,9 +66,9 @@ def read_motion(
         >>> import rsvib_torch as rsv
         >>> path = Path(tempfile.mkdtemp()) / "gyroscope.csv"
         >>> rows = [f"{0.001 * i},{0.1 * i},{-0.2 * i}" for i in range(50)]
-        >>> _ = path.write_text("\n".join(["time,x,y", *rows]))
-        >>> rsv.read_motion(path, unit="px").displacement(torch.tensor(0.01)).round(decimals=3).tolist()
-        ?
+        >>> _ = path.write_text(chr(10).join(["time,x,y", *rows]))
+        >>> rsv.read_motion(path, unit="px").displacement(torch.tensor(0.01)).round(decimals=3).tolist()  # px, without the mean
+        [-1.45, 2.9]
     """
     path = Path(path)
     check_choice("unit", unit, get_args(MotionUnit))

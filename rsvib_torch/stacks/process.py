@@ -49,6 +49,26 @@ class StackReport(Summarised):
         first: Result of the first window, if it was computed in this process.
         manifest: Path of the manifest.
         not_kept: Metadata of the input that the output does not contain.
+
+    Example:
+        >>> import tempfile
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
+        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> folder = tempfile.mkdtemp()
+        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
+        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
+        >>> report = rsv.process_stack(
+        ...     f"{folder}/frames.tif",
+        ...     f"{folder}/restored.tif",
+        ...     timing,
+        ...     window=3,
+        ...     detection={"tones": 1},
+        ...     restoration={"method": "dewarp"},
+        ... )
+        >>> report.frames, report.windows, report.restored, report.failed
+        (4, 2, 2, 0)
     """
 
     frames: int
@@ -226,10 +246,15 @@ def process_stack(
         >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
         >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
         >>> report = rsv.process_stack(
-        ...     f"{folder}/frames.tif", f"{folder}/restored.tif", timing, window=3, detection={"tones": 1}, restoration={"method": "dewarp"}
+        ...     f"{folder}/frames.tif",
+        ...     f"{folder}/restored.tif",
+        ...     timing,
+        ...     window=3,
+        ...     detection={"tones": 1},
+        ...     restoration={"method": "dewarp"},
         ... )
-        >>> [window.outcome for window in report.windows]
-        ?
+        >>> report.windows, report.restored, report.bad_frames
+        (2, 2, 0)
         >>> rsv.read_stack(f"{folder}/restored.tif").shape == frames.shape
         True
     """
