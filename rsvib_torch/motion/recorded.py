@@ -67,7 +67,8 @@ def read_motion(
         >>> path = Path(tempfile.mkdtemp()) / "gyroscope.csv"
         >>> rows = [f"{0.001 * i},{0.1 * i},{-0.2 * i}" for i in range(50)]
         >>> _ = path.write_text(chr(10).join(["time,x,y", *rows]))
-        >>> rsv.read_motion(path, unit="px").displacement(torch.tensor(0.01)).round(decimals=3).tolist()  # px, without the mean
+        >>> motion = rsv.read_motion(path, unit="px")
+        >>> motion.displacement(torch.tensor(0.01)).round(decimals=3).tolist()  # px, without the mean
         [-1.45, 2.9]
     """
     path = Path(path)

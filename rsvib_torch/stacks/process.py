@@ -135,7 +135,8 @@ def iterate_stack(source: PathLike, timing: SensorTiming, **options: Unpack[Rest
         >>> folder = tempfile.mkdtemp()
         >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
         >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
-        >>> for result in rsv.iterate_stack(f"{folder}/frames.tif", timing, window=3, detection={"tones": 1}, restoration={"method": "dewarp"}):
+        >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
+        >>> for result in rsv.iterate_stack(f"{folder}/frames.tif", timing, **options):
         ...     print(result.indices, result.detection.vibration.frequency[:, 0].round().tolist())
         (0,) [155.0, 145.0]
         (1, 2, 3) [155.0, 145.0]
