@@ -441,7 +441,7 @@ class VibrationDetector(nn.Module):
         >>> detector = rsv.VibrationDetector(timing, method="bands", tones=1)
         >>> found = detector(torch.stack([frames, 0.5 * frames])[:, :, None])  # two stacks (B, T, C, H, W)
         >>> found.vibration.frequency[..., 0].round(decimals=0).tolist()  # Hz, (B, 2)
-        [120.0, 149.0]
+        [[111.0, 90.0], [111.0, 90.0]]
     """
 
     def __init__(
