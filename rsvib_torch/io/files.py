@@ -116,7 +116,7 @@ def read_stack_info(path: PathLike) -> StackInfo:
         >>> rsv.write_stack(path, frames, dtype="uint16", full_scale=4095)
         >>> info = rsv.read_stack_info(path)
         >>> info.shape, info.dtype, info.full_scale
-        (torch.Size([3, 64, 48]), tensor(True))
+        ((3, 64, 48), 'uint16', 4095.0)
     """
     reader = open_stack(path)
     reader.close()
@@ -157,7 +157,7 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
         >>> path = tempfile.mkdtemp() + "/frames.tif"
         >>> rsv.write_stack(path, frames, dtype="uint16", full_scale=4095)  # 12 bits in a 16-bit file
         >>> rsv.read_stack(path).shape, rsv.read_stack(path).max() <= 1.0  # the file states its full scale
-        ((3, 64, 48), 'uint16', 4095.0)
+        (torch.Size([3, 64, 48]), tensor(True))
     """
     paths = [path] if isinstance(path, (str, os.PathLike)) else list(path)
     pixels, stated = _read_pixels(paths)
