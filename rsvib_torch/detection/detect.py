@@ -256,11 +256,26 @@ def detect_vibration(
             is out of range.
 
     Example:
-        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
-        >>> detect_vibration(torch.rand(1, 256, 256), timing)
-        Traceback (most recent call last):
-        ...
-        ValueError: at least 2 frames are needed, got 1
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> detection = rsv.detect_vibration(frames, timing)
+        >>> detection.vibration.amplitude[:, 0].round(decimals=2).tolist()  # px along x and y
+        [2.1, 1.6]
+        >>> detection.vibration.frequency[:, 0].round(decimals=1).tolist()  # Hz
+        [110.0, 90.0]
+        >>> detection.reliable.tolist(), detection.reasons
+        ([True, True], ((), ()))
+
+        Near a blind frequency (here 83.3 Hz, the frame rate) the axis is refused, with the reason:
+
+        >>> blind = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 83.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, blind, num_frames=2)
+        >>> detection = rsv.detect_vibration(frames, timing)
+        >>> detection.reliable.tolist()
+        [True, False]
     """
     check_choice("model", model, ("tones", *_OTHER_MODELS))
     timing = timing_of_files(frames, timing)
@@ -508,9 +523,15 @@ class VibrationDetector(nn.Module):
         ValueError: If another model is given.
 
     Example:
-        >>> detector = VibrationDetector(SensorTiming(20.52e-6, 20, 2048), method="bands", tones=1)
-        >>> detector.options
-        {'method': 'bands', 'tones': 1}
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> detector = rsv.VibrationDetector(timing, method="bands", tones=1)
+        >>> found = detector(torch.stack([frames, 0.5 * frames])[:, :, None])  # two stacks (B, T, C, H, W)
+        >>> found.vibration.frequency[..., 0].round(decimals=0).tolist()  # Hz, (B, 2)
+        [[111.0, 90.0], [111.0, 90.0]]
     """
 
     def __init__(

@@ -79,9 +79,16 @@ def open_stack(path: PathLike) -> FrameReader:
         ValueError: If it is not a readable stack. Damage of single frames is detected when they are read.
 
     Example:
-        >>> reader = open_stack("frames.tif")  # doctest: +SKIP
-        >>> reader.frame(0).shape == reader.info.shape[1:]  # doctest: +SKIP
-        True
+        >>> import tempfile
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
+        >>> path = tempfile.mkdtemp() + "/frames.npy"
+        >>> rsv.write_stack(path, frames)
+        >>> reader = rsv.open_stack(path)
+        >>> reader.info.shape, reader.frame(2).shape  # reads one frame
+        ((3, 64, 48), (64, 48))
+        >>> reader.close()
     """
     path = Path(path)
     if not path.exists():
@@ -106,8 +113,15 @@ def read_stack_info(path: PathLike) -> StackInfo:
         ValueError: If it is not a readable stack.
 
     Example:
-        >>> read_stack_info("frames.tif").shape  # doctest: +SKIP
-        (8, 1024, 1024)
+        >>> import tempfile
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
+        >>> path = tempfile.mkdtemp() + "/frames.tif"
+        >>> rsv.write_stack(path, frames, dtype="uint16", full_scale=4095)
+        >>> info = rsv.read_stack_info(path)
+        >>> info.shape, info.dtype, info.full_scale
+        ((3, 64, 48), 'uint16', 4095.0)
     """
     reader = open_stack(path)
     reader.close()
@@ -141,7 +155,14 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
         ValueError: If it is damaged, its frames differ in size, or the full scale is unknown or exceeded.
 
     Example:
-        >>> frames = read_stack("frames.tif", full_scale=4095)  # doctest: +SKIP
+        >>> import tempfile
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
+        >>> path = tempfile.mkdtemp() + "/frames.tif"
+        >>> rsv.write_stack(path, frames, dtype="uint16", full_scale=4095)  # 12 bits in a 16-bit file
+        >>> rsv.read_stack(path).shape, rsv.read_stack(path).max() <= 1.0  # the file states its full scale
+        (torch.Size([3, 64, 48]), tensor(True))
     """
     paths = [path] if isinstance(path, (str, os.PathLike)) else list(path)
     pixels, stated = _read_pixels(paths)
@@ -401,7 +422,14 @@ def write_stack(
         ValueError: If the format does not support them, or the full scale is unknown.
 
     Example:
-        >>> write_stack("restored.tif", restored, dtype="uint16", full_scale=4095)  # doctest: +SKIP
+        >>> import tempfile
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
+        >>> path = tempfile.mkdtemp() + "/frames.tif"
+        >>> rsv.write_stack(path, frames, dtype="uint16", full_scale=4095)
+        >>> bool((rsv.read_stack(path) - frames).abs().max() <= 0.51 / 4095)  # rounded to counts
+        True
     """
     path = Path(path)
     frames = as_tensor("frames", frames)

@@ -47,6 +47,15 @@ class OffsetCurve(Result, units={"times": "s", "later_times": "s", "offsets": "p
             the direct method, weight in the fit (0 for outliers).
         heights: Rows averaged for the offset along x and y, (x, y).
         std: (..., P, N, 2) px, standard deviations of the offsets; None if unknown.
+
+    Example:
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> timing = rsv.SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
+        >>> scene = torch.rand(96, 132, generator=torch.Generator().manual_seed(0))
+        >>> curve = rsv.register_bands(torch.stack([scene[:, 4:], scene[:, :-4]]), timing)
+        >>> curve.offsets.shape, curve.quality.shape  # (frame pair, band, axis), (frame pair, band)
+        (torch.Size([1, 5, 2]), torch.Size([1, 5]))
     """
 
     pairs: Tensor
