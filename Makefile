@@ -38,6 +38,7 @@ pages: setup ## write the generated pages and drawings of docs/ anew
 	$(PYTHON) scripts/reference_pages.py
 	$(PYTHON) scripts/benchmark_page.py
 	$(PYTHON) scripts/drawings.py --out docs/drawings
+	$(PYTHON) scripts/run_pages.py
 
 docs: setup ## build the documentation into out/site; warnings are errors
 	$(PYTHON) scripts/docs.py

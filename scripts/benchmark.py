@@ -2,9 +2,9 @@
 """Speed and accuracy of the package and of other software, in one run on one machine.
 
 Sections (see benchmarks/sections.py): registration, cost, detection, restoration, pipeline, scaling, roofline,
-streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict, honesty. Results are printed as Markdown
-tables and written to --out; with --store also to scripts/benchmarks/results, from which scripts/benchmark_page.py
-generates docs/benchmarks.md.
+streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict, honesty, timing. Results are printed as
+Markdown tables and written to --out; with --store also to scripts/benchmarks/results, from which
+scripts/benchmark_page.py generates docs/benchmarks.md.
 """
 
 import argparse
@@ -28,6 +28,7 @@ from benchmarks import (
     streaming,
     streaming_dask,
     streaming_memory,
+    timing_mistakes,
     verdict_roc,
 )
 from benchmarks.sections import SECTIONS, machine_line
@@ -52,7 +53,11 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=5, help="timed runs of each method (default: 5)")
     default = [name for name, section in SECTIONS.items() if section.by_default]
     parser.add_argument(
-        "--only", choices=SECTIONS, nargs="+", default=default, help="default: all sections but verdict and honesty"
+        "--only",
+        choices=SECTIONS,
+        nargs="+",
+        default=default,
+        help="default: all sections but verdict, honesty and timing",
     )
     for part in (
         measure,
@@ -68,6 +73,7 @@ def main() -> None:
         slanted_edge,
         verdict_roc,
         honesty,
+        timing_mistakes,
     ):
         part.add_options(parser)
     options = parser.parse_args()

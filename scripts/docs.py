@@ -3,12 +3,13 @@
 
 Needs the extra ``docs``: ``.venv/bin/python -m pip install -c scripts/constraints.txt -e '.[docs]'``. Warnings are
 errors: a broken link, or a docstring with a parameter that its function does not have, fails the build. The site works
-without a network and has a search; it is written to out/site.
+without a network and without a server, its search included; it is written to out/site.
 """
 
 import argparse
 import inspect
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -16,6 +17,7 @@ import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -35,8 +37,28 @@ PACKAGES = (
     "evaluation",
     "augmentation",
 )
+# Names with which the page of a package begins; others follow in alphabetical order.
+FIRST_NAMES = (
+    *("SensorTiming", "Vibration", "VibrationStd", "FreeMotion", "read_motion"),
+    *("detect_vibration", "DetectionResult", "VibrationDetector", "detect_motion", "MotionDetection"),
+    *("detect_swept_tone", "SweptTone", "align_motion", "ClockAlignment", "check_motion", "MotionCheck"),
+    *("restore", "VibrationRestorer", "judge_restoration", "RestorationVerdict", "RestorationWarning"),
+    *("simulate_frames", "SensorNoise", "Optics", "row_psf", "RowVaryingBlur"),
+    *("register_bands", "OffsetCurve"),
+    *("calibrate_row_time", "calibrate_row_time_by_exposure", "RowTimeCalibration"),
+    *("read_stack", "write_stack", "read_stack_info", "StackInfo", "open_stack"),
+    *("process_stack", "StackReport", "iterate_stack", "restore_block", "read_manifest"),
+    *("slanted_edge_mtf", "MtfCurve", "find_slanted_edges", "SlantedEdge", "psnr", "ssim"),
+    *("read_vibration", "write_vibration", "write_offsets", "write_windows", "save_figure"),
+)
 # Sections of the site and the order of their pages; pages that are missing here are added to the last section.
 SECTIONS = {
+    "Tutorials": (
+        "tutorials/satellite.md",
+        "tutorials/video.md",
+        "tutorials/training.md",
+        "notebooks/first_vibration.md",
+    ),
     "Guides": (
         "quickstart.md",
         "concepts.md",
@@ -51,7 +73,9 @@ SECTIONS = {
     "Method": ("method.md", "conventions.md", "verdicts.md", "bound.md", "accuracy.md", "benchmarks.md"),
     "Development": ("architecture.md", "ablation.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"),
 }
-STYLE = "site.css"  # wide pages, and tables that wrap
+DOCUMENTATION = ROOT / "scripts" / "documentation"  # extensions of the builder, and files of the site
+STYLE, SEARCH_SHIM = "site.css", "iframe-worker.js"
+BUILDERS = ("mkdocs", "mkdocstrings", "material", "nbconvert", "latex2mathml", "ziamath")
 OUTSIDE_DOCS = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")  # pages that lie at the top level of the project
 
 
@@ -73,8 +97,9 @@ def reference_page(package: str, paths: list[str]) -> str:
     """Markdown of one page of the reference."""
     module = sys.modules[f"rsvib_torch.{package}"]
     lines = [f"# {package}", "", inspect.getdoc(module) or "", ""]
-    for path in sorted(paths, key=str.casefold):
-        lines += [f"::: {path}", ""]
+    by_name = {path.rsplit(".", 1)[1]: path for path in paths}
+    for name in ordered(by_name, FIRST_NAMES):
+        lines += [f"::: {by_name[name]}", ""]
     return "\n".join(lines)
 
 
@@ -89,39 +114,53 @@ def without_outer_links(text: str, folder: Path) -> str:
     return re.sub(r"\[([^\]\n]+)\]\(([^)\s]+)\)", kept, text)
 
 
+def notebook_page(notebook: Path) -> None:
+    """Write a notebook with its stored outputs as a page, with its pictures in a folder beside it, and remove it."""
+    from nbconvert import MarkdownExporter  # part of the extra docs # noqa: PLC0415
+
+    text, resources = MarkdownExporter().from_filename(str(notebook), {"output_files_dir": notebook.stem})
+    notebook.with_suffix(".md").write_text(text, encoding="utf-8")
+    for name, data in resources["outputs"].items():
+        (notebook.parent / name).parent.mkdir(exist_ok=True)
+        (notebook.parent / name).write_bytes(data)
+    notebook.unlink()
+
+
 def write_sources(folder: Path) -> list[object]:
     """Fill a folder with the pages of the site; returns its navigation."""
-    shutil.copytree(ROOT / "docs", folder, dirs_exist_ok=True)
+    shutil.copytree(ROOT / "docs", folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns(".ipynb_checkpoints"))
+    for notebook in folder.rglob("*.ipynb"):
+        notebook_page(notebook)
     for name, page in (("README.md", "index.md"), *((name, name) for name in OUTSIDE_DOCS)):
         shutil.copy(ROOT / name, folder / page)
     for page in folder.glob("*.md"):
         text = page.read_text(encoding="utf-8").replace("](docs/", "](").replace("](../README.md", "](index.md")
+        text = text.replace(".ipynb)", ".md)")
         page.write_text(without_outer_links(text, folder), encoding="utf-8")
-    (folder / STYLE).write_text(
-        ".wy-nav-content {max-width: 60rem} .wy-table-responsive table td {white-space: normal}"
-    )
+    font = files("ziamath") / "fonts" / "STIXTwoMath-Regular.ttf"
+    for path in (DOCUMENTATION / STYLE, DOCUMENTATION / SEARCH_SHIM, Path(str(font))):
+        shutil.copy(path, folder)
     (folder / "api").mkdir()
     reference: list[object] = [{"Configuration": "configuration.md"}, {"Commands": "commands.md"}]
     for package, paths in public_names().items():
         (folder / "api" / f"{package}.md").write_text(reference_page(package, paths), encoding="utf-8")
         reference.append({f"rsvib_torch.{package}": f"api/{package}.md"})
-    existing = {page.name for page in folder.glob("*.md")} - {"index.md", "commands.md", "configuration.md"}
+    pages = {str(page.relative_to(folder)) for page in folder.rglob("*.md") if page.parent.name != "api"}
+    existing = pages - {"index.md", "commands.md", "configuration.md"}
     sections = {title: [page for page in pages if page in existing] for title, pages in SECTIONS.items()}
     sections["Development"] += sorted(existing - {page for pages in sections.values() for page in pages})
-    return [
-        {"Home": "index.md"},
-        {"Guides": sections["Guides"]},
-        {"Reference": reference},
-        {"Method": sections["Method"]},
-        {"Development": sections["Development"]},
-    ]
+    navigation: list[object] = [{"Home": "index.md"}]
+    for title, section in sections.items():
+        navigation += [{"Reference": reference}] if title == "Method" else []
+        navigation.append({title: section})
+    return navigation
 
 
 def settings(sources: Path, navigation: list[object], site: Path) -> dict[str, object]:
     """Configuration of MkDocs."""
     options = {
         "docstring_style": "google",
-        "extensions": [str(ROOT / "scripts" / "documentation" / "examples.py")],
+        "extensions": [str(DOCUMENTATION / "examples.py")],
         "show_source": False,
         "show_root_heading": True,
         "show_root_full_path": False,
@@ -130,6 +169,7 @@ def settings(sources: Path, navigation: list[object], site: Path) -> dict[str, o
         "members_order": "source",
         "filters": ["!^_"],
         "separate_signature": True,
+        "show_overloads": False,  # the implementation lists all options
         "show_signature_annotations": True,
     }
     return {
@@ -138,12 +178,36 @@ def settings(sources: Path, navigation: list[object], site: Path) -> dict[str, o
         "site_dir": str(site),
         "nav": navigation,
         "validation": {"unrecognized_links": "warn", "anchors": "warn", "absolute_links": "warn"},
-        # without highlightjs the theme loads nothing from the network
-        "theme": {"name": "readthedocs", "highlightjs": False, "navigation_depth": 3},
+        "theme": {
+            "name": "material",
+            "font": False,  # fonts of the system; others are loaded from the network
+            "features": ["navigation.tabs", "navigation.footer", "toc.follow", "content.code.copy", "search.highlight"],
+            "icon": {"logo": "material/sine-wave"},
+            "palette": [
+                {
+                    "media": f"(prefers-color-scheme: {scheme})",
+                    "scheme": name,
+                    "primary": "indigo",
+                    "toggle": {"icon": f"material/weather-{icon}", "name": f"Change to {other} colours"},
+                }
+                for scheme, name, icon, other in (
+                    ("light", "default", "sunny", "dark"),
+                    ("dark", "slate", "night", "light"),
+                )
+            ],
+        },
+        "extra": {"generator": False, "polyfills": [SEARCH_SHIM]},
         "extra_css": [STYLE],
-        "markdown_extensions": ["tables", "fenced_code", {"codehilite": {"noclasses": True, "guess_lang": False}}],
+        "markdown_extensions": [
+            "tables",
+            "formulas",
+            "pymdownx.superfences",
+            {"pymdownx.highlight": {"guess_lang": False}},
+            {"toc": {"permalink": True}},
+        ],
         "plugins": [
             "search",
+            "offline",
             {"mkdocstrings": {"handlers": {"python": {"paths": [str(ROOT)], "options": options}}}},
         ],
     }
@@ -155,7 +219,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--out", type=Path, default=ROOT / "out" / "site", help="folder of the site (default: out/site)"
     )
     options = parser.parse_args(arguments)
-    if any(find_spec(name) is None for name in ("mkdocs", "mkdocstrings")):
+    if any(find_spec(name) is None for name in BUILDERS):
         parser.error("MkDocs is missing: .venv/bin/python -m pip install -c scripts/constraints.txt -e '.[docs]'")
     with tempfile.TemporaryDirectory() as folder:
         site = Path(folder) / "site"
@@ -165,7 +229,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # JSON is YAML
         config.write_text(json.dumps(settings(sources, navigation, site)), encoding="utf-8")
         command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--clean", "-f", str(config)]
-        code = subprocess.run(command, check=False).returncode
+        paths = [str(DOCUMENTATION), *filter(None, [os.environ.get("PYTHONPATH")])]
+        # the theme prints an advertisement of another builder without NO_MKDOCS_2_WARNING
+        variables = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "NO_MKDOCS_2_WARNING": "1"}
+        code = subprocess.run(command, check=False, env=variables).returncode
         if code:
             raise SystemExit(code)
         shutil.copytree(site, options.out, dirs_exist_ok=True)

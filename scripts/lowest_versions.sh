@@ -6,7 +6,7 @@ cd "$(dirname "$0")/.."
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 uv venv --quiet "$folder/venv"
-uv pip install --quiet --python "$folder/venv/bin/python" --resolution lowest-direct '.[formats,distributed]' \
+uv pip install --quiet --python "$folder/venv/bin/python" --resolution lowest-direct '.[formats,distributed,video]' \
   'pytest>=8.3' 'hypothesis>=6.100' 'scikit-image>=0.25'
 export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive}
 # old packages use names that newer ones of their dependencies deprecate

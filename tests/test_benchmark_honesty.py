@@ -154,3 +154,24 @@ def test_outcomes_of_an_axis_follow_the_criteria():
     assert louder[0]["largest_z"] == pytest.approx(0.03 * float(true[0][0]) / 1e-4)
     inverted = outcome(rsv.Vibration(*true[:2], true[2] + np.pi), True, True)
     assert [(axis["wrong_parameter"], axis["wrong_displacement"]) for axis in inverted] == [(False, True)] * 2
+
+
+def test_mistakes_of_the_timing_are_counted():
+    """Two frames with correct timing and with the image height as frame_rows; the tables contain every mistake."""
+    from benchmarks import timing_mistakes
+
+    taken = timing_mistakes.take("city", 0, 128)
+    cases = {name: timing_mistakes.judge_mistake(taken, name, 2) for name in ("none", "frame_rows = image height")}
+    assert cases["none"]["outcomes"] == ["right", "right"]
+    assert cases["none"]["restored_db"] > cases["none"]["raw_db"] + 6
+    assert "right" not in cases["frame_rows = image height"]["outcomes"]
+    results = [
+        {**cases["none"], "scene": "city", "number": 0, "mistake": name, "num_frames": count}
+        for name in timing_mistakes.MISTAKES
+        for count in timing_mistakes.NUM_FRAMES
+    ]
+    results[-1] |= {"outcomes": ["detected", "missed"], "named": [True, False], "restored_db": 10.0}
+    text = timing_mistakes.lines(results, argparse.Namespace(mistake_size=128, mistake_vibrations=1))
+    assert "| both of these | 0 (0) | 0 (0) | 0 (0) | 50 (50) |" in text
+    assert "| both of these | 0 / 0 | 0 / 0 | 0 / 0 | 0 / 50 |" in text
+    assert f"| both of these | 0.0 | 0.0 | 0.0 | {cases['none']['restored_db'] - 10.0:.1f} |" in text

@@ -19,14 +19,18 @@ def docs():
 
 
 def test_every_page_is_in_the_navigation(docs, tmp_path):
+    pytest.importorskip("nbconvert")
+    pytest.importorskip("ziamath")
     navigation = docs["write_sources"](tmp_path / "sources")
     sections = {title: pages for section in navigation for title, pages in section.items()}
-    listed = [page for title in ("Guides", "Method", "Development") for page in sections[title]]
+    listed = [page for title in ("Tutorials", "Guides", "Method", "Development") for page in sections[title]]
     reference = [page for entry in sections["Reference"] for page in entry.values()]
     outside = {"CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md"}
-    pages = {path.name for path in (ROOT / "docs").glob("*.md")} | outside
+    pages = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")} | outside
+    pages |= {f"notebooks/{path.stem}.md" for path in (ROOT / "docs" / "notebooks").glob("*.ipynb")}
     assert sorted(listed) == sorted(pages - {"commands.md", "configuration.md"})
     assert sections["Guides"][0] == "quickstart.md"
+    assert [Path(page).stem for page in sections["Tutorials"]] == ["satellite", "video", "training", "first_vibration"]
     assert set(reference) == {"configuration.md", "commands.md"} | {f"api/{name}.md" for name in docs["public_names"]()}
 
 
@@ -37,6 +41,17 @@ def test_names_in_a_given_order_come_first(docs):
 def test_every_public_name_is_in_the_reference(docs):
     paths = [path for package in docs["public_names"]().values() for path in package]
     assert sorted(path.rsplit(".", 1)[1] for path in paths) == sorted(rsv.__all__)
+
+
+def test_reference_begins_with_the_main_function(docs):
+    for package, first in (
+        ("detection", ["detect_vibration", "DetectionResult", "VibrationDetector"]),
+        ("restoration", ["restore", "VibrationRestorer", "judge_restoration"]),
+        ("imaging", ["simulate_frames"]),
+        ("motion", ["SensorTiming", "Vibration"]),
+    ):
+        page = docs["reference_page"](package, docs["public_names"]()[package])
+        assert re.findall(r"^::: .*\.(\w+)$", page, flags=re.MULTILINE)[: len(first)] == first
 
 
 def test_reference_pages_are_up_to_date():
@@ -90,10 +105,19 @@ def test_missing_builder_is_named(docs, capsys):
 
 @pytest.mark.skipif(importlib.util.find_spec("mkdocstrings") is None, reason="MkDocs is not installed (extra docs)")
 def test_site_builds_without_a_warning(docs, tmp_path):
-    docs["main"](["--out", str(tmp_path / "site")])
-    page = (tmp_path / "site" / "api" / "augmentation" / "index.html").read_text(encoding="utf-8")
-    assert "RollingShutterVibration" in page
-    assert (tmp_path / "site" / "search" / "search_index.json").stat().st_size > 100_000
-    home = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
-    assert not re.findall(r'<(?:script|link)[^>]*(?:src|href)="(?:https?:)?//', home)  # no resources from the network
-    assert (tmp_path / "site" / "ml_pipeline" / "index.html").exists()
+    site = tmp_path / "site"
+    docs["main"](["--out", str(site)])
+    assert "RollingShutterVibration" in (site / "api" / "augmentation.html").read_text(encoding="utf-8")
+    assert (site / "ml_pipeline.html").exists()
+    index = (site / "search" / "search_index.js").read_text(encoding="utf-8")
+    assert len(index) > 100_000  # the search also works without a server
+    assert "RollingShutterVibration" in index
+    resource = re.compile(r'<(?:script|link|img)[^>]*(?:src|href)="(?:https?:)?//')
+    pages = {path: path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
+    assert not [path for path, text in pages.items() if resource.search(text)]  # no resources from the network
+    assert 'src="iframe-worker.js"' in pages[site / "index.html"]
+    assert pages[site / "bound.html"].count("<math") > 20
+    assert '<span class="k">import</span>' in pages[site / "tutorials" / "training.html"] or (
+        '<span class="kn">import</span>' in pages[site / "tutorials" / "training.html"]
+    )
+    assert pages[site / "notebooks" / "first_vibration.html"].count("<img") >= 3

@@ -31,7 +31,7 @@ INNER_LAYERS = {
         {"strips"},
         {"tones"},
         {"start"},
-        {"rows", "reliability", "sensitivity"},
+        {"rows", "other_timing", "reliability", "sensitivity"},
         {"shapes"},
         {"recorded"},
         {"detect"},

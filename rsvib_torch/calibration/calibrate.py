@@ -47,6 +47,14 @@ class RowTimeCalibration(
         exposure_time: T_e in seconds.
         exposure_time_std: Its standard deviation.
         notes: Reasons for undetermined values, and warnings.
+
+    Example:
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> light = 0.4 + 0.2 * torch.cos(2 * torch.pi * torch.arange(512) / 64)  # 1000 Hz, 64 rows per period
+        >>> found = rsv.calibrate_row_time(light[None, :, None].expand(1, 512, 16), 1000.0)
+        >>> f"{1e6 * found.row_time:.3f} us per row"
+        '15.625 us per row'
     """
 
     row_time: float

@@ -6,6 +6,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Literal, Unpack, overload
 
 import torch
@@ -15,7 +16,8 @@ from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.option_types import BandSettings, DetectionMethod, Registration, ToneSettings
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.reliability import judge, rotation_found
+from rsvib_torch.detection.other_timing import period_factor
+from rsvib_torch.detection.reliability import contradicted_axes, judge, rotation_found
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, stacked
 from rsvib_torch.detection.rows.direct import refine_directly
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
@@ -38,7 +40,7 @@ from rsvib_torch.detection.tones.further import with_further_tones
 from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
-from rsvib_torch.io.files import FramesOrFiles
+from rsvib_torch.io.files import FramesOrFiles, timing_of_files
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
@@ -231,7 +233,8 @@ def detect_vibration(
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames, floating point, or
             integers of known full scale: a tensor, an array, a list of these, or a path or list of paths of files,
             which are read as by ``read_stack``. NaN marks missing pixels.
-        timing: The sensor. Frame start times at unequal intervals (dropped frames) remove blind frequencies.
+        timing: The sensor. Frame start times at unequal intervals (dropped frames) remove blind frequencies. If frames
+            is a path, the frame times in the file are used.
         model: ``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape; ``"swept"``: one tone per
             axis whose amplitude decays or grows and whose frequency sweeps. The last two take the options from
             ``registration`` to ``search``, ``ignore``, ``full_scale`` and ``channels``; ``detect_motion`` and
@@ -263,19 +266,38 @@ def detect_vibration(
         The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve: a
         ``DetectionResult``, or the ``MotionDetection`` of the free and the ``SweptTone`` of the swept model.
 
+    Warns:
+        TimingWarning: If frames is a path, and the file states another frame rate than the sensor has.
+
     Raises:
         TypeError: If frames are not numbers.
         ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or an option
             is out of range.
 
     Example:
-        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
-        >>> detect_vibration(torch.rand(1, 256, 256), timing)
-        Traceback (most recent call last):
-        ...
-        ValueError: at least 2 frames are needed, got 1
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> detection = rsv.detect_vibration(frames, timing)
+        >>> detection.vibration.amplitude[:, 0].round(decimals=2).tolist()  # px along x and y
+        [2.1, 1.6]
+        >>> detection.vibration.frequency[:, 0].round(decimals=1).tolist()  # Hz
+        [110.0, 90.0]
+        >>> detection.reliable.tolist(), detection.reasons
+        ([True, True], ((), ()))
+
+        Near a blind frequency (here 83.3 Hz, the frame rate) the axis is refused, with the reason:
+
+        >>> blind = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 83.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, blind, num_frames=2)
+        >>> detection = rsv.detect_vibration(frames, timing)
+        >>> detection.reliable.tolist()
+        [True, False]
     """
     check_choice("model", model, ("tones", *_OTHER_MODELS))
+    timing = timing_of_files(frames, timing)
     if model != "tones":
         tone_options = (
             ("method", method, "direct"),
@@ -323,7 +345,7 @@ def detect_vibration(
         stacks = stacks.narrowed(columns)
     grey, valid_pixels = stacks.images, stacks.valid
     if window is None:
-        found = _detect_field(grey, valid_pixels, timing, _METHODS[method], options, field)
+        found = _detect_field(grey, valid_pixels, timing, _METHODS[method], options, field, find_cause=True)
     else:
         found = stacked(
             [
@@ -384,10 +406,18 @@ class _Field:
 
 
 def _detect_field(
-    frames: Tensor, valid: Tensor | None, timing: SensorTiming, method: _Method, options: _FitOptions, field: _Field
+    frames: Tensor,
+    valid: Tensor | None,
+    timing: SensorTiming,
+    method: _Method,
+    options: _FitOptions,
+    field: _Field,
+    *,
+    find_cause: bool = False,
 ) -> DetectionResult:
     """``_detect`` with as many components as were requested or, with ``"auto"``, as the frames require."""
-    found, fit, rotates = _detect(frames, valid, timing, method, options)
+    cause = "unless rotating" if find_cause and field.most_axes > 2 else find_cause
+    found, fit, rotates = _detect(frames, valid, timing, method, options, find_cause=cause)
     if field.most_axes == 2 or (field.least_axes == 2 and not rotates):
         return found
     other, _, _ = _detect(frames, valid, timing, method, replace(options, scale=field.scale(field.most_axes)), fit)
@@ -403,6 +433,8 @@ def _detect(
     method: _Method,
     options: _FitOptions,
     translation: ToneFit | None = None,
+    *,
+    find_cause: bool | Literal["unless rotating"] = False,
 ) -> tuple[DetectionResult, ToneFit, bool]:
     """``detect_vibration`` of grey frames (B, T, H, W) in row order.
 
@@ -413,6 +445,7 @@ def _detect(
         method: How tones are fitted.
         options: Its options.
         translation: Fit without roll and zoom, from which a fit with roll or zoom starts.
+        find_cause: Whether to try other timings if the measurements contradict the stated one.
 
     Returns:
         A batch of results in image axes, their fit, and whether the halves of the rows of any stack move apart.
@@ -439,6 +472,7 @@ def _detect(
     later = curve.rows + fitted[..., 1]
     visible = (later >= 0.5 * bands.band_rows) & (later <= frames.shape[-2] - 1 - 0.5 * bands.band_rows)
     intervals = compared_intervals(row_timing, frames.shape[1], method.max_group_frames, frames.device)
+    max_tones = MAX_TONES if options.tones is None and options.model.harmonics == 1 else math.inf
     verdicts = [
         judge(
             vibration[index],
@@ -451,13 +485,26 @@ def _detect(
             own_std=own_std[index],
             timing=row_timing,
             other_motion=None if other_motion is None else other_motion[index],
-            max_tones=MAX_TONES if options.tones is None and options.model.harmonics == 1 else math.inf,
+            max_tones=max_tones,
             radius=scale.radius,
         )
         for index in range(len(frames))
     ]
-    reliable = torch.stack([verdict[0] for verdict in verdicts])
     rotates = other_motion is not None and any(rotation_found(other_motion[index]) for index in range(len(frames)))
+    if other_motion is not None and (find_cause is True or (find_cause and not rotates)):
+        for index, (_, reasons) in enumerate(verdicts):
+            axes = contradicted_axes(vibration[index], other_motion[index], max_tones)
+            if not any(axes):
+                continue
+            part = slice(index, index + 1)
+            own = found.measurements.mapped(itemgetter(part))
+            of_stack = frames[part], None if valid is None else valid[part]
+            cause = _wrong_setting(*of_stack, own, axes, timing, method, options)
+            if cause is not None:
+                # the axes have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong
+                both = ((cause, *reasons[0]), (cause, *reasons[1]))
+                verdicts[index] = (torch.zeros_like(verdicts[index][0]), both)
+    reliable = torch.stack([verdict[0] for verdict in verdicts])
     swap = timing.scan_axis == -1
     order = ([1, 0, 2, 3] if swap else [0, 1, 2, 3])[: scale.axes]
     units = scale.units(residual)
@@ -480,12 +527,72 @@ def _detect(
         reasons=tuple(tuple(reasons[axis] for axis in order) for _, reasons in verdicts),
         sensitivity=sensitivity,
         assumptions=tuple(
-            assumptions(in_image[index], sensitivity[index], row_timing, frames.shape[1])
+            assumptions(in_image[index], sensitivity[index], row_timing, frames.shape[1], frames.shape[-2])
             for index in range(len(frames))
         ),
         timing=timing,
     )
     return result, fit, rotates
+
+
+def _wrong_setting(
+    frames: Tensor,
+    valid: Tensor | None,
+    measurements: Measurements,
+    axes: tuple[bool, bool],
+    timing: SensorTiming,
+    method: _Method,
+    options: _FitOptions,
+) -> str | None:
+    """Sentence about another timing with which the frames of one stack agree; None if none was found.
+
+    A timing agrees if detection with it is reliable along the axes that contradict the stated one.
+
+    Args:
+        frames: (1, T, H, W) in row order.
+        valid: Their valid pixels.
+        measurements: Displacements of the rows.
+        axes: Axes (x, y) in row order that contradict the stated timing.
+        timing: The stated timing, in image order.
+        method: The method.
+        options: Its options.
+    """
+
+    def agrees(other: RowTiming, change: Callable[[Tensor], Tensor], concerned: tuple[bool, bool] = axes) -> bool:
+        pixels = None if valid is None else change(valid)
+        try:
+            found, _, _ = _detect(change(frames), pixels, other, method, options)
+        except ValueError:  # columns may lack the detail that rows have
+            return False
+        return all(good or not axis for good, axis in zip(found.reliable[0].tolist(), concerned, strict=True))
+
+    row_timing = timing.in_row_order()
+    factor = period_factor(measurements, row_timing, frames.shape[1]) if frames.shape[1] > 2 else None
+    if factor is not None and factor < 0:
+        if agrees(row_timing, lambda images: images.flip(-2)):
+            other = "reverse" if timing.readout_direction == "forward" else "forward"
+            return f"the frames agree with readout_direction={other!r}, not with {timing.readout_direction!r}"
+    elif factor is not None and timing.frame_start_times is None:
+        frame_rows = factor * timing.frame_rows
+        changed = replace(row_timing, frame_rows=max(frame_rows, frames.shape[-2], timing.exposure_rows))
+        if changed.frame_rows == frame_rows and agrees(changed, lambda images: images):
+            return (
+                f"the frames agree with frame_rows={frame_rows:.5g}, not with {timing.frame_rows:g}: frame_rows counts "
+                "the blanking rows and is not the image height; if the frame rate is known, row_time is 1 / (frame "
+                f"rate x frame_rows), with {timing.frame_rate:.5g} frames/s {timing.row_time / factor:.5g} s"
+            )
+    elif factor is not None:
+        times = {name: getattr(timing, name) * factor for name in ("frame_rows", "exposure_rows")}
+        changed = replace(row_timing, row_time=timing.row_time / factor, **times)
+        if agrees(changed, lambda images: images):
+            return (
+                f"the frames agree with row_time={changed.row_time:.5g} s, not with {timing.row_time:g} s, if the "
+                "start times of the frames are right"
+            )
+    if frames.shape[-1] <= timing.frame_rows and agrees(row_timing, lambda images: images.mT, (axes[1], axes[0])):
+        other, stated = ("x", "y") if timing.scan_axis == -2 else ("y", "x")
+        return f"the frames agree with scan_axis={other!r}, not with {stated!r}"
+    return None
 
 
 class VibrationDetector(nn.Module):
@@ -503,9 +610,15 @@ class VibrationDetector(nn.Module):
         ValueError: If another model is given.
 
     Example:
-        >>> detector = VibrationDetector(SensorTiming(20.52e-6, 20, 2048), method="bands", tones=1)
-        >>> detector.options
-        {'method': 'bands', 'tones': 1}
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> detector = rsv.VibrationDetector(timing, method="bands", tones=1)
+        >>> found = detector(torch.stack([frames, 0.5 * frames])[:, :, None])  # two stacks (B, T, C, H, W)
+        >>> found.vibration.frequency[..., 0].round(decimals=0).tolist()  # Hz, (B, 2)
+        [[111.0, 90.0], [111.0, 90.0]]
     """
 
     def __init__(

@@ -11,7 +11,7 @@ from rsvib_torch.detection.tones.selection import MIN_OFFSET, MIN_SIGNIFICANCE
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
-__all__ = ["judge"]
+__all__ = ["contradicted_axes", "judge"]
 
 
 def judge(
@@ -94,6 +94,19 @@ def judge(
         against[:] = [f"{text} (px: at {radius:.0f} px from the centre)" if " px" in text else text for text in against]
     reliable = torch.tensor([not against for against in reasons], device=vibration.device)
     return reliable, tuple(map(tuple, reasons))
+
+
+def contradicted_axes(vibration: Vibration, other_motion: OtherMotion, max_tones: float) -> tuple[bool, bool]:
+    """Whether the measured rows contradict the tones of each axis, so that another timing may be the cause.
+
+    Args:
+        vibration: The detected vibration (not a batch).
+        other_motion: Motion of the rows that it does not explain.
+        max_tones: As in ``judge``.
+    """
+    many = (vibration.amplitude.count_nonzero(-1) >= max_tones).tolist()
+    first, second = (many[axis] or bool(_against_other_motion(other_motion, axis)) for axis in range(2))
+    return first, second
 
 
 def _against_measurements(
@@ -262,5 +275,5 @@ def _against_exposure(other: OtherMotion, timing: RowTiming) -> list[str]:
     likely = f" (about {rows * math.sqrt(ratio):.2g} rows agree with the blur)" if ratio > 0 else ""
     return [
         f"the difference of the blur between frames is {ratio:.2g} times the value expected for an exposure of "
-        f"{rows:g} rows; check exposure_rows{likely}"
+        f"{rows:g} rows; check exposure_rows{likely}, and frame_rows and row_time, which determine the motion"
     ]

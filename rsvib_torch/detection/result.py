@@ -112,6 +112,22 @@ class DetectionResult(
         timing: The sensor of the frames.
 
     ``save`` writes a ``vibration.json`` as the program does, which ``rsvib restore`` and ``read_vibration`` read.
+
+    Example:
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> detection = rsv.detect_vibration(frames, timing)
+        >>> detection.std.amplitude.shape, detection.offsets.offsets.shape[-1]  # (axis, tone); x and y
+        (torch.Size([2, 1]), 2)
+        >>> (detection.vibration.amplitude - vibration.amplitude).abs().max().item() < 0.02
+        True
+        >>> detection.gain[:, 0].round(decimals=2).tolist()  # offset of the later frame over displacement
+        [-1.69, -0.5]
+        >>> detection.save("vibration.json")  # doctest: +SKIP
+        >>> detection = rsv.DetectionResult.load("vibration.json")  # doctest: +SKIP
     """
 
     vibration: Vibration

@@ -80,7 +80,7 @@ def _scaled(timing: RowTiming, name: str, factor: float) -> RowTiming:
 
 
 def assumptions(
-    vibration: Vibration, sensitivity: TimingSensitivity, timing: RowTiming, num_frames: int
+    vibration: Vibration, sensitivity: TimingSensitivity, timing: RowTiming, num_frames: int, num_rows: int
 ) -> tuple[str, ...]:
     """What the frames cannot contradict, with its effect, one sentence for each.
 
@@ -89,6 +89,7 @@ def assumptions(
         sensitivity: Its sensitivity, in image axes.
         timing: The sensor.
         num_frames: Frames of the stack.
+        num_rows: Rows of a frame.
     """
     if not bool((vibration.amplitude > 0).any()):
         return ()
@@ -97,6 +98,11 @@ def assumptions(
         sentences.append(
             f"row_time={timing.row_time:g} s: the frames cannot contradict it, and all frequencies are inversely "
             "proportional to it"
+        )
+    if timing.frame_start_times is None and timing.frame_rows == num_rows:
+        sentences.append(
+            f"frame_rows={num_rows} is the number of rows of the frames: there are no blanking rows, which is rare; "
+            "otherwise frame_rows, and a row_time of 1 / (frame rate x rows), are wrong"
         )
     if num_frames == 2:
         what = "frame_rows" if timing.frame_start_times is None else "frame_start_times"

@@ -91,7 +91,7 @@ def grey_frames(
         ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or
             ``ignore`` does not fit; or a frame is a copy of the one before.
     """
-    frames, full_scale = load_frames(frames, full_scale, timing)
+    frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, minimum_frames=2)
     images, valid = prepared.filled, None
     if prepared.missing is not None:

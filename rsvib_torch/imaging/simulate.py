@@ -61,10 +61,17 @@ def simulate_frames(
         ValueError: If the scene is too small for the frame and motion, or is not finite.
 
     Example:
-        >>> from rsvib_torch import Vibration
-        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
-        >>> simulate_frames(torch.rand(128, 256), timing, Vibration(2.0, 50.0)).shape
-        torch.Size([2, 92, 220])
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> scene = city_and_fields(320, 240, seed=3)
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(scene, timing, vibration, num_frames=2)
+        >>> frames.shape  # the rim that the motion could cross is cut off
+        torch.Size([2, 284, 202])
+        >>> still = rsv.simulate_frames(scene, timing, rsv.Vibration.still(), frame_size=(284, 202))
+        >>> rsv.psnr(frames, still, 1.0).round(decimals=1).tolist()  # dB, the loss by the vibration
+        [22.8, 24.1]
     """
     scene = as_tensor("scene", scene)
     if not scene.dtype.is_floating_point:

@@ -1,7 +1,6 @@
 """Reading and writing whole stacks: the file ending selects the format."""
 
 import os
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.io import hdf5, image_folder, npy, raw, tiff, video, zarr_store
 from rsvib_torch.io.formats import FrameReader, StackFormat, find_format, register_format, target_format
-from rsvib_torch.io.frame_times import TimingWarning, timing_of_stack
+from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.full_scale import (
     check_dtype,
     counts_to_frames,
@@ -41,6 +40,7 @@ __all__ = [
     "read_stack",
     "read_stack_info",
     "register_format",
+    "timing_of_files",
     "write_frames",
     "write_stack",
 ]
@@ -79,9 +79,16 @@ def open_stack(path: PathLike) -> FrameReader:
         ValueError: If it is not a readable stack. Damage of single frames is detected when they are read.
 
     Example:
-        >>> reader = open_stack("frames.tif")  # doctest: +SKIP
-        >>> reader.frame(0).shape == reader.info.shape[1:]  # doctest: +SKIP
-        True
+        >>> import tempfile
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
+        >>> path = tempfile.mkdtemp() + "/frames.npy"
+        >>> rsv.write_stack(path, frames)
+        >>> reader = rsv.open_stack(path)
+        >>> reader.info.shape, reader.frame(2).shape  # reads one frame
+        ((3, 64, 48), (64, 48))
+        >>> reader.close()
     """
     path = Path(path)
     if not path.exists():
@@ -106,8 +113,15 @@ def read_stack_info(path: PathLike) -> StackInfo:
         ValueError: If it is not a readable stack.
 
     Example:
-        >>> read_stack_info("frames.tif").shape  # doctest: +SKIP
-        (8, 1024, 1024)
+        >>> import tempfile
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
+        >>> path = tempfile.mkdtemp() + "/frames.tif"
+        >>> rsv.write_stack(path, frames, dtype="uint16", full_scale=4095)
+        >>> info = rsv.read_stack_info(path)
+        >>> info.shape, info.dtype, info.full_scale
+        ((3, 64, 48), 'uint16', 4095.0)
     """
     reader = open_stack(path)
     reader.close()
@@ -141,7 +155,14 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
         ValueError: If it is damaged, its frames differ in size, or the full scale is unknown or exceeded.
 
     Example:
-        >>> frames = read_stack("frames.tif", full_scale=4095)  # doctest: +SKIP
+        >>> import tempfile
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
+        >>> path = tempfile.mkdtemp() + "/frames.tif"
+        >>> rsv.write_stack(path, frames, dtype="uint16", full_scale=4095)  # 12 bits in a 16-bit file
+        >>> rsv.read_stack(path).shape, rsv.read_stack(path).max() <= 1.0  # the file states its full scale
+        (torch.Size([3, 64, 48]), tensor(True))
     """
     paths = [path] if isinstance(path, (str, os.PathLike)) else list(path)
     pixels, stated = _read_pixels(paths)
@@ -172,33 +193,15 @@ def _read_pixels(paths: Sequence[PathLike]) -> tuple[NDArray[Any], float | None]
     return parts[0] if len(parts) == 1 else np.concatenate(parts), infos[0].full_scale
 
 
-def _warn_of_unused_times(path: PathLike, timing: SensorTiming) -> None:
-    """Warn if the times or the frame rate that a file states differ from the timing of the sensor."""
-    check_timing(timing)
-    if timing_of_stack(timing, read_stack_info(path)) is not timing:
-        warnings.warn(
-            f"{path}: the frame times of the file differ from equal intervals and are not used; pass "
-            f"timing_from_first_frame(timing, read_stack_info({str(path)!r})) as timing",
-            TimingWarning,
-            stacklevel=2,
-        )
-
-
-def load_frames(
-    frames: FramesOrFiles, full_scale: float | None, timing: SensorTiming | None = None
-) -> tuple[FramesLike, float | None]:
+def load_frames(frames: FramesOrFiles, full_scale: float | None) -> tuple[FramesLike, float | None]:
     """Read frames that are given by the paths of their files; other frames are returned unchanged.
 
     Args:
         frames: Frames in memory, a path, or a list of paths.
         full_scale: Count that corresponds to 1.0, as in ``read_stack``.
-        timing: The sensor; None if times are not used.
 
     Returns:
         The frames, integers as stored, and their full scale.
-
-    Warns:
-        TimingWarning: If a file states times or a frame rate that are not those of ``timing``.
 
     Example:
         >>> load_frames([[[0.5]]], None)
@@ -211,12 +214,29 @@ def load_frames(
     else:
         return cast(FramesLike, frames), full_scale
     pixels, stated = _read_pixels(paths)
-    if timing is not None and len(paths) == 1:
-        _warn_of_unused_times(paths[0], timing)
     full_scale = stated if full_scale is None else full_scale
     if pixels.dtype.kind == "f":
         return counts_to_frames(pixels, full_scale, str(paths[0])), None
     return pixels, full_scale_of_counts(pixels, full_scale, str(paths[0]))
+
+
+def timing_of_files(frames: FramesOrFiles, timing: SensorTiming) -> SensorTiming:
+    """The timing of frames that may be given by the path of their file, with the frame times that the file states.
+
+    Args:
+        frames: Frames in memory, a path, or a list of paths.
+        timing: The sensor.
+
+    Warns:
+        TimingWarning: As ``timing_from_first_frame``, if the file states another frame rate than the sensor has.
+
+    Raises:
+        TypeError: If ``timing`` is not a ``SensorTiming``.
+    """
+    check_timing(timing)
+    if isinstance(frames, (str, os.PathLike)):
+        return timing_from_first_frame(timing, read_stack_info(frames))
+    return timing
 
 
 def check_info_target(
@@ -402,7 +422,14 @@ def write_stack(
         ValueError: If the format does not support them, or the full scale is unknown.
 
     Example:
-        >>> write_stack("restored.tif", restored, dtype="uint16", full_scale=4095)  # doctest: +SKIP
+        >>> import tempfile
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
+        >>> path = tempfile.mkdtemp() + "/frames.tif"
+        >>> rsv.write_stack(path, frames, dtype="uint16", full_scale=4095)
+        >>> bool((rsv.read_stack(path) - frames).abs().max() <= 0.51 / 4095)  # rounded to counts
+        True
     """
     path = Path(path)
     frames = as_tensor("frames", frames)

@@ -31,7 +31,19 @@ _ORIENTATIONS = {
 
 
 class TimingWarning(UserWarning):
-    """The frame rate or the times in a file contradict the timing of the sensor."""
+    """The frame rate or the times in a file contradict the timing of the sensor.
+
+    Example:
+        >>> import warnings
+        >>> import rsvib_torch as rsv
+        >>> timing = rsv.SensorTiming(row_time=1 / 30000, exposure_rows=20, frame_rows=1000)  # 30 frames per second
+        >>> info = rsv.StackInfo((8, 256, 256), "uint8", 255, frame_rate=97.0)  # the file states another rate
+        >>> with warnings.catch_warnings(record=True) as caught:
+        ...     warnings.simplefilter("always")
+        ...     timing = rsv.timing_from_first_frame(timing, info)
+        >>> caught[0].category.__name__
+        'TimingWarning'
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +188,11 @@ def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTimi
         TimingWarning: If the file states another frame rate than the sensor has, or irregular times that are too rough.
 
     Example:
-        >>> timing = timing_from_first_frame(timing, read_stack_info("clip.mp4"))  # doctest: +SKIP
-        >>> detection = detect_vibration(read_stack("clip.mp4"), timing)  # doctest: +SKIP
+        >>> import rsvib_torch as rsv
+        >>> timing = rsv.SensorTiming(row_time=1e-4, exposure_rows=20, frame_rows=333.3)  # 30 frames per second
+        >>> info = rsv.StackInfo((3, 256, 256), "uint8", 255, frame_times=(5.0, 5.03333, 5.1))  # a dropped frame
+        >>> rsv.timing_from_first_frame(timing, info).frame_starts(3).round(decimals=4).tolist()  # s
+        [0.0, 0.0333, 0.1]
     """
     of_stack = timing_of_stack(timing, info)
     if timing.frame_start_times is not None or of_stack.frame_start_times is None:

@@ -166,8 +166,8 @@ def detection_summary(detection: Detection) -> str:
     rows = [cells for _, cells in tone_rows(vibration, std)]
     head = tone_head(axes=vibration.num_axes)
     table, *verdict = verdict_table(head, rows, vibration.batch_shape, detection.reliable, detection.reasons)
-    if not vibration.batch_shape:  # those sentences that concern two frames
-        verdict += [wrapped(f"assumed: {text}") for text in detection.assumptions if text.startswith("frame_")]
+    if not vibration.batch_shape:
+        verdict += [wrapped(f"assumed: {text}") for text in detection.assumptions]
     return "\n".join([table, *image_motion_line(vibration, std), *verdict])
 
 

@@ -78,6 +78,14 @@ class StackInfo(Summarised):
         path: The file; None if the stack is not in a file, or has another number of frames than the file.
         metadata: Further metadata of a TIFF file by name, which are kept when it is restored to TIFF; None for those
             that cannot be kept.
+
+    Example:
+        >>> import rsvib_torch as rsv
+        >>> times = (0.0, 0.0333, 0.0667)
+        >>> info = rsv.StackInfo((3, 3, 256, 256), "uint8", 255, frame_times=times)  # colour video
+        >>> info.axes
+        'TCHW'
+        >>> rsv.write_stack("clip.mp4", frames, dtype="uint8", like=info)  # doctest: +SKIP
     """
 
     shape: tuple[int, ...]

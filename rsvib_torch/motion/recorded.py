@@ -58,6 +58,18 @@ def read_motion(
         OSError: If the file cannot be opened.
         ValueError: If a column is missing, a value is not a number, times do not increase or have gaps, or values or
             time steps indicate another unit; the message names the line of the file.
+
+    Example:
+        >>> import tempfile
+        >>> import torch
+        >>> from pathlib import Path
+        >>> import rsvib_torch as rsv
+        >>> path = Path(tempfile.mkdtemp()) / "gyroscope.csv"
+        >>> rows = [f"{0.001 * i},{0.1 * i},{-0.2 * i}" for i in range(50)]
+        >>> _ = path.write_text(chr(10).join(["time,x,y", *rows]))
+        >>> motion = rsv.read_motion(path, unit="px")
+        >>> motion.displacement(torch.tensor(0.01)).round(decimals=3).tolist()  # px, without the mean
+        [-1.45, 2.9]
     """
     path = Path(path)
     check_choice("unit", unit, get_args(MotionUnit))

@@ -296,6 +296,16 @@ class VibrationStd(Result, units=_UNITS | {"displacement": "px"}):
     ``displacement`` (..., 2) in px is that of the displacement of the rows of the record, rms over the rows and without
     their mean. It contains the image motion and the correlations of all parameters: a record shorter than a period
     leaves amplitude and frequency uncertain, and may still determine the displacement. None: not known.
+
+    Example:
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> std = rsv.detect_vibration(frames, timing).std
+        >>> bool((std.frequency < 0.1).all())  # Hz
+        True
     """
 
     _MISSING = math.inf  # None in a file: an unknown standard deviation

@@ -19,7 +19,7 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.prepare import prepare_frames
-from rsvib_torch.io.files import FramesOrFiles, load_frames
+from rsvib_torch.io.files import FramesOrFiles, load_frames, timing_of_files
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.registration.bands import BandTask
 from rsvib_torch.registration.methods import BAND_METHODS, Registration, RegistrationOptions
@@ -48,6 +48,15 @@ class OffsetCurve(Result, units={"times": "s", "later_times": "s", "offsets": "p
             the direct method, weight in the fit (0 for outliers).
         heights: Rows averaged for the offset along x and y, (x, y).
         std: (..., P, N, 2) px, standard deviations of the offsets; None if unknown.
+
+    Example:
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> timing = rsv.SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
+        >>> scene = torch.rand(96, 132, generator=torch.Generator().manual_seed(0))
+        >>> curve = rsv.register_bands(torch.stack([scene[:, 4:], scene[:, :-4]]), timing)
+        >>> curve.offsets.shape, curve.quality.shape  # (frame pair, band, axis), (frame pair, band)
+        (torch.Size([1, 5, 2]), torch.Size([1, 5]))
     """
 
     pairs: Tensor
@@ -134,7 +143,8 @@ def register_bands(
         [4.0, 0.0]
     """
     options = RegistrationOptions(method, band_rows, band_step, search)
-    frames, full_scale = load_frames(frames, full_scale, timing)
+    timing = timing_of_files(frames, timing)
+    frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(
         frames, timing, full_scale=full_scale, channels=channels, minimum_frames=2, allow_missing=False
     )

@@ -96,7 +96,13 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150)
         OSError: If the file cannot be written.
 
     Example:
-        >>> save_figure(offset_figure(detection), "offsets.png")  # doctest: +SKIP
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import rsvib_torch as rsv
+        >>> path = Path(tempfile.mkdtemp()) / "motion.png"
+        >>> rsv.save_figure(rsv.motion_figure(rsv.Vibration([3.1, 5.2], [50.0, 30.0])), path)
+        >>> path.exists()
+        True
     """
     with whole_file(path) as part:
         FigureCanvasAgg(figure).print_figure(str(part), dpi=dpi, facecolor="white")
@@ -167,7 +173,14 @@ def offset_figure(result: DetectionResult) -> Figure:
         result: A detection (not a batch).
 
     Example:
-        >>> save_figure(offset_figure(detection), "offsets.png")  # doctest: +SKIP
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> detection = rsv.detect_vibration(frames, timing, method="bands", tones=1)
+        >>> [panel.get_ylabel() for panel in rsv.offset_figure(detection).axes]
+        ['offset (px)', 'offset (px)', 'residual (px)', 'residual (px)', 'quality (0: outlier)']
     """
     _check_one(result)
     figure = _Drawing(figsize=(13, 6.4), layout="constrained")
@@ -200,9 +213,27 @@ def windows_figure(
         time_label: Label of the horizontal axis.
 
     Example:
-        >>> manifest = read_manifest("manifest.json")  # doctest: +SKIP
-        >>> starts = [window.start_time for window in manifest.windows]  # doctest: +SKIP
-        >>> figure = windows_figure(starts, manifest.detections())  # doctest: +SKIP
+        >>> import tempfile
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
+        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> folder = tempfile.mkdtemp()
+        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
+        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
+        >>> report = rsv.process_stack(
+        ...     f"{folder}/frames.tif",
+        ...     f"{folder}/restored.tif",
+        ...     timing,
+        ...     window=3,
+        ...     detection={"tones": 1},
+        ...     restoration={"method": "dewarp"},
+        ... )
+        >>> manifest = rsv.read_manifest(report.manifest)
+        >>> starts = [window.start_time for window in manifest.windows]
+        >>> figure = rsv.windows_figure(starts, manifest.detections())
+        >>> [panel.get_ylabel() for panel in figure.axes]
+        ['amplitude (px)', 'amplitude (px)', 'frequency (Hz)', 'frequency (Hz)']
     """
     figure = _Drawing(figsize=(11, 5.6), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, squeeze=False)
@@ -361,7 +392,14 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
         timing: The sensor.
 
     Example:
-        >>> save_figure(gain_figure(detection, timing), "gain.png")  # doctest: +SKIP
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> detection = rsv.detect_vibration(frames, timing, method="bands", tones=1)
+        >>> rsv.gain_figure(detection, timing).axes[-1].get_xlabel()
+        'frequency (Hz)'
     """
     _check_one(result)
     vibration, std = result.vibration, result.std
@@ -456,7 +494,12 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
         num_rows: Rows of a frame.
 
     Example:
-        >>> save_figure(psf_figure(detection.vibration, timing, num_rows=2048), "psf.png")  # doctest: +SKIP
+        >>> import rsvib_torch as rsv
+        >>> timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+        >>> vibration = rsv.Vibration(amplitude=[3.1, 5.2], frequency=[50.0, 30.0])
+        >>> figure = rsv.psf_figure(vibration, timing, num_rows=2048)
+        >>> len(figure.axes)  # rows and exposures
+        24
     """
     _check_one(vibration)
     down, across = 3, 8

@@ -47,7 +47,17 @@ def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timin
         ValueError: If the result is a batch, or the timing is unknown.
 
     Example:
-        >>> write_vibration("vibration.json", detection)  # doctest: +SKIP
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> import tempfile
+        >>> detection = rsv.detect_vibration(frames, timing, method="bands", tones=1)
+        >>> path = tempfile.mkdtemp() + "/vibration.json"
+        >>> rsv.write_vibration(path, detection)
+        >>> rsv.read_vibration(path, timing).vibration.frequency[:, 0].round().tolist()  # Hz
+        [111.0, 90.0]
     """
     if result.batch_shape:
         raise ValueError(
@@ -71,7 +81,18 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
         ValueError: If it is not a complete ``vibration.json``, or was detected with another timing.
 
     Example:
-        >>> restored = restore(frames, timing, read_vibration("vibration.json", timing))  # doctest: +SKIP
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> import tempfile
+        >>> path = tempfile.mkdtemp() + "/vibration.json"
+        >>> rsv.detect_vibration(frames, timing).save(path)
+        >>> found = rsv.read_vibration(path, timing)
+        >>> restored = rsv.restore(frames, timing, found, method="dewarp", check=False)
+        >>> found.reliable.tolist()
+        [True, True]
     """
     path = Path(path)
     data = read_json(path, "vibration.json")
@@ -102,7 +123,17 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
         OSError: If the file cannot be written.
 
     Example:
-        >>> write_offsets("offsets.csv", detection)  # doctest: +SKIP
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> path = Path(tempfile.mkdtemp()) / "offsets.csv"
+        >>> rsv.write_offsets(path, rsv.detect_vibration(frames, timing, method="bands", tones=1))
+        >>> path.read_text().splitlines()[0]
+        'earlier_frame,later_frame,row,time_s,offset_x_px,offset_y_px,fitted_x_px,fitted_y_px,quality'
     """
     curve = result.offsets
     count = curve.times.shape[-1]
@@ -142,7 +173,26 @@ def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None
         OSError: If the file cannot be written.
 
     Example:
-        >>> write_windows("windows.csv", read_manifest("manifest.json"))  # doctest: +SKIP
+        >>> import tempfile
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
+        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> folder = tempfile.mkdtemp()
+        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
+        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
+        >>> report = rsv.process_stack(
+        ...     f"{folder}/frames.tif",
+        ...     f"{folder}/restored.tif",
+        ...     timing,
+        ...     window=3,
+        ...     detection={"tones": 1},
+        ...     restoration={"method": "dewarp"},
+        ... )
+        >>> rsv.write_windows(f"{folder}/windows.csv", rsv.read_manifest(report.manifest))
+        >>> with open(f"{folder}/windows.csv") as file:
+        ...     print(len(file.readlines()))  # a line for each window below the header
+        3
     """
     quantities = ("amplitude", "frequency", "phase")
     head = ["window", "first_frame", "last_frame", "start_s"]

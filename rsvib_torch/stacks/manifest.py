@@ -269,7 +269,25 @@ def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
         ValueError: If it is not a complete manifest.
 
     Example:
-        >>> [record.outcome for record in read_manifest("manifest.json").windows]  # doctest: +SKIP
+        >>> import tempfile
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
+        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> folder = tempfile.mkdtemp()
+        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
+        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
+        >>> report = rsv.process_stack(
+        ...     f"{folder}/frames.tif",
+        ...     f"{folder}/restored.tif",
+        ...     timing,
+        ...     window=3,
+        ...     detection={"tones": 1},
+        ...     restoration={"method": "dewarp"},
+        ... )
+        >>> manifest = rsv.read_manifest(report.manifest)
+        >>> manifest.detections()[0].vibration.frequency[:, 0].round().tolist()  # Hz, first window
+        [155.0, 145.0]
     """
     path = Path(path)
     manifest = validate(StackManifest, read_json(path, "manifest.json"), str(path))

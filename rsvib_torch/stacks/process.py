@@ -49,6 +49,26 @@ class StackReport(Summarised):
         first: Result of the first window, if it was computed in this process.
         manifest: Path of the manifest.
         not_kept: Metadata of the input that the output does not contain.
+
+    Example:
+        >>> import tempfile
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
+        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> folder = tempfile.mkdtemp()
+        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
+        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
+        >>> report = rsv.process_stack(
+        ...     f"{folder}/frames.tif",
+        ...     f"{folder}/restored.tif",
+        ...     timing,
+        ...     window=3,
+        ...     detection={"tones": 1},
+        ...     restoration={"method": "dewarp"},
+        ... )
+        >>> report.frames, report.windows, report.restored, report.failed
+        (4, 2, 2, 0)
     """
 
     frames: int
@@ -107,8 +127,19 @@ def iterate_stack(source: PathLike, timing: SensorTiming, **options: Unpack[Rest
         ValueError: If a value is out of range, or the stack is not readable.
 
     Example:
-        >>> for result in iterate_stack("frames.tif", timing):  # doctest: +SKIP
-        ...     print(result.indices, result.restored)
+        >>> import tempfile
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
+        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> folder = tempfile.mkdtemp()
+        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
+        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
+        >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
+        >>> for result in rsv.iterate_stack(f"{folder}/frames.tif", timing, **options):
+        ...     print(result.indices, result.detection.vibration.frequency[:, 0].round().tolist())
+        (0,) [155.0, 145.0]
+        (1, 2, 3) [155.0, 145.0]
     """
     job, windows, at_once = plan_job(source, timing, options)
     yield from compute_here(job, windows, lambda result, _: result, at_once=at_once)
@@ -207,7 +238,26 @@ def process_stack(
             input, settings or versions differ from those of the run to resume.
 
     Example:
-        >>> report = process_stack("frames.tif", "restored.tif", timing, memory="2GB")  # doctest: +SKIP
+        >>> import tempfile
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
+        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> folder = tempfile.mkdtemp()
+        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
+        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
+        >>> report = rsv.process_stack(
+        ...     f"{folder}/frames.tif",
+        ...     f"{folder}/restored.tif",
+        ...     timing,
+        ...     window=3,
+        ...     detection={"tones": 1},
+        ...     restoration={"method": "dewarp"},
+        ... )
+        >>> report.windows, report.restored, report.bad_frames
+        (2, 2, 0)
+        >>> rsv.read_stack(f"{folder}/restored.tif").shape == frames.shape
+        True
     """
     start, sink = time.perf_counter(), Path(sink)
     job, windows, at_once = plan_job(source, timing, options, given=given, bad_frames=bad_frames)

@@ -119,6 +119,8 @@ def judge_axis(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[
     """Outcome of one axis with its figures."""
     num_frames, height = taken.starts.shape
     stated = taken.timing.row_starts(num_frames, height)
+    if taken.timing.readout_direction == "reverse":  # in the order of the image rows
+        stated = stated.flip(1)
     shown = found.vibration.mean_displacement(stated, taken.timing.exposure_time)[..., axis].numpy()
     true = np.zeros((0, 3)) if taken.case.tones is None else observable_tones(taken, axis)
     truths = [without_trend(taken.displacement()[axis], taken.starts)]

@@ -20,6 +20,7 @@ from benchmarks import (
     streaming,
     streaming_dask,
     streaming_memory,
+    timing_mistakes,
     verdict_roc,
 )
 
@@ -62,6 +63,7 @@ SECTIONS: dict[str, Section] = {
     "slanted_edge": Section("Slanted-edge MTF", slanted_edge.rows, slanted_edge.lines),
     "verdict": Section("Verdict on restorations", verdict_roc.rows, verdict_roc.lines, by_default=False),
     "honesty": Section("Reliable results that are wrong", honesty.rows, honesty.lines, by_default=False),
+    "timing": Section("Mistakes of the timing", timing_mistakes.rows, timing_mistakes.lines, by_default=False),
 }
 
 

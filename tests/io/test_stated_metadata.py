@@ -269,3 +269,7 @@ def test_commands_and_functions_warn_once_of_another_frame_rate(tmp_path, capsys
         rsv.process_stack(tmp_path / "a.h5", tmp_path / "b.tif", TIMING, **options)
     with pytest.warns(TimingWarning, match="30 frames per second"):
         next(rsv.iterate_stack(tmp_path / "a.h5", TIMING, **options))
+    with pytest.warns(TimingWarning, match="30 frames per second"):
+        rsv.detect_vibration(tmp_path / "a.h5", TIMING, **OPTIONS["detection"])
+    with pytest.warns(TimingWarning, match="30 frames per second"):
+        rsv.restore(tmp_path / "a.h5", TIMING, rsv.Vibration(1.0, 30.0), method="dewarp", check=False)

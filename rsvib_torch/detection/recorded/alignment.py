@@ -18,7 +18,7 @@ from rsvib_torch.detection.rows.displacements import frame_groups, measure_group
 from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
 from rsvib_torch.detection.start import grey_frames, measurements_of_curve
 from rsvib_torch.frames.arrays import ArrayLike, Channels
-from rsvib_torch.io.files import FramesOrFiles
+from rsvib_torch.io.files import FramesOrFiles, timing_of_files
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
@@ -41,6 +41,19 @@ class ClockAlignment(Result, units={"offset": "s", "offset_std": "s", "drift": "
         unexplained: (2,) px, rms displacement of rows that the aligned motion does not explain, beyond their noise.
         reliable: Whether the recording explains the measurements, at this offset only.
         reasons: Why not.
+
+    Example:
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> times = torch.linspace(0.0, 0.05, 51, dtype=torch.float64)
+        >>> path = torch.stack([1.5 * torch.sin(700 * times), 1.1 * torch.sin(500 * times)], -1)  # px
+        >>> motion = rsv.FreeMotion.from_samples(times, path)
+        >>> frames = rsv.simulate_frames(city_and_fields(260, 220, seed=3), timing, motion, num_frames=3)
+        >>> found = rsv.align_motion(frames, timing, motion, offsets=(-0.004, 0.004))
+        >>> abs(found.offset) < 1e-4  # s: the clocks agree
+        True
     """
 
     motion: FreeMotion
@@ -142,12 +155,18 @@ def align_motion(
             frames cannot be registered, or an option is out of range.
 
     Example:
-        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=256)
-        >>> recorded = FreeMotion.from_samples(torch.arange(0, 1, 0.01), torch.zeros(100, 2))
-        >>> align_motion(torch.rand(1, 256, 256), timing, recorded)
-        Traceback (most recent call last):
-        ...
-        ValueError: at least 2 frames are needed, got 1
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> times = torch.linspace(0.0, 0.05, 51, dtype=torch.float64)
+        >>> path = torch.stack([1.5 * torch.sin(700 * times), 1.1 * torch.sin(500 * times)], -1)  # px
+        >>> motion = rsv.FreeMotion.from_samples(times, path)
+        >>> frames = rsv.simulate_frames(city_and_fields(260, 220, seed=3), timing, motion, num_frames=3)
+        >>> late = rsv.FreeMotion.from_samples(times + 0.002, path)  # a gyroscope whose clock is 2 ms ahead
+        >>> found = rsv.align_motion(frames, timing, late, offsets=(-0.004, 0.004))
+        >>> round(1e3 * found.offset, 2)  # ms
+        2.0
     """
     if not isinstance(recorded, FreeMotion):
         raise TypeError(
@@ -155,6 +174,7 @@ def align_motion(
         )
     if recorded.batch_shape:
         raise ValueError("align_motion takes one motion, not a batch")
+    timing = timing_of_files(frames, timing)
     stack = grey_frames(frames, timing, full_scale, ignore, channels)
     if stack.batched:
         raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")

@@ -24,7 +24,7 @@ from rsvib_torch.detection.shapes.free import (
 )
 from rsvib_torch.detection.start import GreyFrames, grey_frames, measurements_of_curve
 from rsvib_torch.frames.arrays import ArrayLike, Channels
-from rsvib_torch.io.files import FramesOrFiles
+from rsvib_torch.io.files import FramesOrFiles, timing_of_files
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
@@ -64,6 +64,18 @@ class SweptTone(
         unexplained: (..., 2) px, rms displacement of rows that it does not explain, beyond their noise.
         reliable: (..., 2) bool.
         reasons: Why not, for each axis; a tuple of those for a batch.
+
+    Example:
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> times = torch.arange(0.0, 0.06, 2e-4, dtype=torch.float64)
+        >>> growing = 0.5 * torch.exp(30 * times) * torch.sin(2 * torch.pi * 105 * times)  # px, -30/s
+        >>> motion = rsv.FreeMotion.through(times, torch.stack([growing, growing], -1))
+        >>> frames = rsv.simulate_frames(city_and_fields(280, 220, seed=3), timing, motion, num_frames=4)
+        >>> bool(rsv.detect_swept_tone(frames, timing).decay[0] < -20)  # 1/s
+        True
     """
 
     amplitude: Tensor
@@ -144,13 +156,20 @@ def detect_swept_tone(
         ValueError: If they cannot be registered, see ``detect_motion``, or an option is out of range.
 
     Example:
-        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=256)
-        >>> detect_swept_tone(torch.rand(1, 256, 256), timing)
-        Traceback (most recent call last):
-        ...
-        ValueError: at least 2 frames are needed, got 1
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> times = torch.arange(0.0, 0.06, 2e-4, dtype=torch.float64)
+        >>> decaying = 3.0 * torch.exp(-20 * times) * torch.sin(2 * torch.pi * 105 * times)  # px, 20/s
+        >>> motion = rsv.FreeMotion.through(times, torch.stack([decaying, 0.5 * decaying], -1))
+        >>> frames = rsv.simulate_frames(city_and_fields(280, 220, seed=3), timing, motion, num_frames=4)
+        >>> found = rsv.detect_swept_tone(frames, timing)
+        >>> [round(value, 0) for value in (found.frequency[0].item(), found.decay[0].item())]
+        [105.0, 20.0]
     """
     check_whole_number("iterations", iterations, at_least=1)
+    timing = timing_of_files(frames, timing)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     fitted = [_detect(stacks.one(index), timing, bands, iterations) for index in range(len(stacks.images))]

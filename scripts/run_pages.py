@@ -1,0 +1,144 @@
+#!/usr/bin/env python
+"""Run the code of the tutorials and notebooks and write its output into them anew.
+
+A page is run from top to bottom in an empty folder: blocks of ``python`` share their variables, blocks of ``bash`` are
+commands. A block of ``text`` directly below one of them is its output. Pictures of the page that its code has written
+are copied beside the page.
+"""
+
+import argparse
+import contextlib
+import io
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import nbclient
+import nbformat
+
+from rsvib_torch.commands.main import run_command
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+BLOCK = re.compile(r"^```(python|bash|text)\n(.*?)^```\n", flags=re.DOTALL | re.MULTILINE)
+NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+FAILS = "  # exit code 2"  # written behind commands that are refused
+
+
+def run_commands(lines: str) -> None:
+    """Run commands of a shell; ``rsvib`` runs in this process, which saves the time to import PyTorch."""
+    for line in lines.replace("\\\n", " ").splitlines():
+        command = line.removesuffix(FAILS)
+        if command.startswith("rsvib "):
+            code = run_command(shlex.split(command)[1:])
+        else:
+            done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+            print(done.stdout + done.stderr, end="")
+            code = done.returncode
+        if code != (2 if line.endswith(FAILS) else 0):
+            raise RuntimeError(f"{line!r} ended with exit code {code}")
+
+
+def run_page(page: Path, folder: Path) -> tuple[str, dict[str, Any]]:
+    """Run the code of a page in a folder.
+
+    Returns:
+        The page with the outputs of this run, and the variables of its Python code.
+    """
+    names: dict[str, Any] = {"__name__": "page"}
+    text = page.read_text(encoding="utf-8")
+    parts, end, output = [], 0, None
+    columns = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "100"
+    try:
+        for block in BLOCK.finditer(text):
+            between, (language, code) = text[end : block.start()], block.groups()
+            if language == "text":
+                if output is not None and not between.strip():
+                    code = "".join(f"{line.rstrip()}\n" for line in output.strip("\n").splitlines())
+                output = None
+            else:
+                written = io.StringIO()
+                with contextlib.chdir(folder), contextlib.redirect_stdout(written), contextlib.redirect_stderr(written):
+                    if language == "bash":
+                        run_commands(code)
+                    else:
+                        line = text.count("\n", 0, block.start(2))  # lines of tracebacks are those of the page
+                        exec(compile("\n" * line + code, str(page), "exec"), names)
+                output = written.getvalue()
+            parts += [between, f"```{language}\n{code}```\n"]
+            end = block.end()
+    finally:
+        os.environ.pop("COLUMNS")
+        if columns is not None:
+            os.environ["COLUMNS"] = columns
+    return "".join([*parts, text[end:]]), names
+
+
+def differing_lines(expected: str, found: str, relative: float = 0.1, absolute: float = 0.05) -> list[str]:
+    """Lines that differ by more than spaces and the last digits of numbers; empty if there are none.
+
+    Args:
+        expected: The page.
+        found: The page with the outputs of a run.
+        relative: Largest relative difference of numbers.
+        absolute: Largest difference of numbers; digits of standard deviations differ between processors.
+    """
+    pairs = [page.splitlines() for page in (expected, found)]
+    if len(pairs[0]) != len(pairs[1]):
+        return [line for line in pairs[1] if line not in pairs[0]] or ["the output has fewer lines"]
+    differing = []
+    for lines in zip(*pairs, strict=True):
+        first, second = (" ".join(line.split()) for line in lines)
+        # computing times depend on the machine, and the sign of a small number on its rounding
+        for changing, fixed in ((r"[\d.]+ s per frame", "s per frame"), (r"[-+](0\.0+)\b", r"\1")):
+            first, second = (re.sub(changing, fixed, line) for line in (first, second))
+        numbers = [[float(number) for number in NUMBER.findall(line)] for line in (first, second)]
+        same = NUMBER.sub("0", first) == NUMBER.sub("0", second) and all(
+            abs(b - a) <= absolute + relative * abs(a) for a, b in zip(*numbers, strict=True)
+        )
+        if not same:
+            differing.append(f"{lines[0]}\n{lines[1]}")
+    return differing
+
+
+def pictures(page: str) -> list[str]:
+    """Names of the pictures that lie beside a page."""
+    return re.findall(r"!\[[^\]]*\]\(([\w.-]+)\)", page)
+
+
+def run_notebook(notebook: Path) -> nbformat.NotebookNode:
+    """Execute a notebook; returns it with its outputs."""
+    cells = nbformat.read(notebook, as_version=4)
+    return nbclient.NotebookClient(cells, timeout=300, record_timing=False).execute()
+
+
+def notebook_text(cells: nbformat.NotebookNode) -> str:
+    """What the code of a notebook prints, as text."""
+    outputs = [output for cell in cells.cells if cell.cell_type == "code" for output in cell.outputs]
+    return "\n".join(output.text if "text" in output else output.data.get("text/plain", "") for output in outputs)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    default = [*sorted(DOCS.glob("tutorials/*.md")), *sorted(DOCS.glob("notebooks/*.ipynb"))]
+    parser.add_argument("pages", nargs="*", type=Path, default=default, help="pages and notebooks (default: all)")
+    for page in parser.parse_args(arguments).pages:
+        print(page)
+        if page.suffix == ".ipynb":
+            nbformat.write(run_notebook(page), page)
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            text, _ = run_page(page, Path(folder))
+            for name in pictures(text):
+                shutil.copy(Path(folder) / name, page.parent / name)
+        page.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

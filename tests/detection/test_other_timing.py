@@ -1,0 +1,110 @@
+"""A timing that the frames contradict: the reasons name the setting that is wrong, with the value that agrees."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from truth import Motion, draw_scene, take_frames
+
+from rsvib_torch import SensorTiming, detect_vibration
+
+HEIGHT, WIDTH, RATE = 200, 160, 24.0
+TIMING = SensorTiming(row_time=1 / (RATE * 230), exposure_rows=8, frame_rows=230)
+MOTION = Motion((1.4, 1.1), (53.0, 65.0), (0.4, 1.3))
+
+
+class Walk(Motion):
+    """Sums of 60 tones below 40 Hz, which no four tones explain."""
+
+    def displacement(self, times):
+        generator = np.random.default_rng(5)
+        frequency = generator.uniform(2.0, 40.0, (2, 60))
+        amplitude = generator.standard_normal((2, 60)) / frequency
+        phase = generator.uniform(-3.0, 3.0, (2, 60))
+        waves = amplitude * np.sin(2 * np.pi * frequency * times[:, None, None] + phase)
+        return 1.5 * waves.sum(-1) / np.linalg.norm(amplitude, axis=-1)
+
+
+def frames_of(motion, num_frames=4):
+    scene = draw_scene(HEIGHT + 80, WIDTH + 80, 8)
+    return torch.from_numpy(take_frames(scene, TIMING, motion, num_frames, 0.005, samples=4)).float()
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return frames_of(MOTION)
+
+
+def causes(found):
+    return {text for reasons in found.reasons for text in reasons if text.startswith("the frames agree with")}
+
+
+def test_correct_timing_is_not_doubted(frames):
+    found = detect_vibration(frames, TIMING)
+    assert found.reliable.all(), found.reasons
+    assert not any("number of rows of the frames" in text for text in found.assumptions)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "factor"),
+    [
+        ({"frame_rows": HEIGHT}, 1.15),
+        ({"frame_rows": HEIGHT, "row_time": 1 / (RATE * HEIGHT), "exposure_rows": 8 / 1.15}, 1.15),
+        ({"frame_rows": 230 * 1.03}, 1 / 1.03),
+    ],
+    ids=["image height", "image height, frame rate correct", "3 %"],
+)
+def test_wrong_frame_rows_are_named_with_the_right_value(frames, wrong, factor):
+    stated = replace(TIMING, **wrong)
+    found = detect_vibration(frames, stated)
+    assert not found.reliable.any()
+    (cause,) = causes(found)
+    agrees = float(re.search(r"frame_rows=([\d.]+), not", cause)[1])
+    row_time = float(re.search(r"frames/s ([\d.e-]+) s", cause)[1])
+    assert agrees == pytest.approx(230, rel=3e-3)
+    assert row_time == pytest.approx(stated.row_time / factor, rel=3e-3)
+    assert agrees * row_time == pytest.approx(stated.frame_period, rel=1e-3)
+    assert any("number of rows of the frames" in text for text in found.assumptions) == (stated.frame_rows == HEIGHT)
+
+
+def test_a_wrong_row_time_is_named_if_the_start_times_are_known(frames):
+    times = tuple(np.arange(4) / RATE)
+    found = detect_vibration(frames, replace(TIMING, row_time=1.04 * TIMING.row_time, frame_start_times=times))
+    assert not found.reliable.all()
+    (cause,) = causes(found)
+    assert float(re.search(r"row_time=([\d.e-]+) s, not", cause)[1]) == pytest.approx(TIMING.row_time, rel=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"), [({"readout_direction": "reverse"}, "readout_direction='forward'"), ({"scan_axis": "x"}, "'y'")]
+)
+def test_a_wrong_readout_is_named(frames, wrong, named):
+    found = detect_vibration(frames, replace(TIMING, **wrong))
+    assert not found.reliable.all()
+    (cause,) = causes(found)
+    assert named in cause
+
+
+def test_a_motion_that_is_no_sum_of_tones_names_no_timing():
+    found = detect_vibration(frames_of(Walk()), TIMING)
+    assert any("no tone explains" in text or "tones do not explain" in text for text in sum(found.reasons, ()))
+    assert causes(found) == set()
+
+
+def test_two_frames_state_the_timing_as_an_assumption(frames):
+    """Two frames cannot contradict frame_rows: the printed result contains what is assumed."""
+    found = detect_vibration(frames[:2], replace(TIMING, frame_rows=HEIGHT))
+    shown = " ".join(str(found).split())
+    assert "assumed: frame_rows=200 is the number of rows of the frames: there are no blanking rows" in shown
+    assert "assumed: frame_rows, readout direction, scan axis and order of the frames: two frames cannot" in shown
+    assert "assumed: row_time=" in shown
+
+
+def test_a_batch_names_the_cause_of_its_own_stack(frames):
+    both = torch.stack([frames, frames.flip(-2)])[:, :, None]
+    found = detect_vibration(both, TIMING)
+    assert found.reliable.tolist()[0] == [True, True]
+    assert causes(found[0]) == set()
+    assert causes(found[1]) == {"the frames agree with readout_direction='reverse', not with 'forward'"}
