@@ -76,6 +76,8 @@ class StackInfo(Summarised):
         path: The file; None if the stack is not in a file, or has another number of frames than the file.
         metadata: Further metadata of a TIFF file by name, which are kept when it is restored to TIFF; None for those
             that cannot be kept.
+        decoding_bytes: Memory that reading needs besides the frame that is returned: frames that are stored together
+            are decoded together.
     """
 
     shape: tuple[int, ...]
@@ -90,6 +92,7 @@ class StackInfo(Summarised):
     time_source: str = field(default="frame_times", compare=False)
     path: Path | None = field(default=None, compare=False)
     metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
+    decoding_bytes: int = field(default=0, compare=False)
 
     def summary(self) -> str:
         """The stack in one line."""
