@@ -44,6 +44,7 @@ from rsvib_torch.commands.terminal import Answer, counting, error_line, note, wo
 from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable, whole_folder
 from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
+from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import write_json
 from rsvib_torch.core.validation import validate
 
@@ -363,6 +364,7 @@ def restore_frames(
     """
     overrides = Overrides(method, joint, prior, saturation)
     check_new([restored, *([] if report is None else [report])], overwrite)
+    check_regular(vibration)
     with vibration.open("rb") as file:
         is_manifest = b'"rsvib stack"' in file.read(200)  # bytes; the format is the first key of either file
     if is_manifest:

@@ -7,6 +7,11 @@ from pathlib import Path
 
 import psutil
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
 __all__ = ["check_fits", "free_memory", "size_text"]
 
 
@@ -35,7 +40,7 @@ def free_memory(root: Path = Path("/")) -> int:
         >>> free_memory() > 1_000_000
         True
     """
-    return max(0, min([int(psutil.virtual_memory().available), *_free_in_groups(root)]))
+    return max(0, min([int(psutil.virtual_memory().available), *_free_in_groups(root), *_free_addresses()]))
 
 
 def check_fits(what: str, needed: int, remedy: str) -> None:
@@ -56,6 +61,14 @@ def check_fits(what: str, needed: int, remedy: str) -> None:
     free = free_memory()
     if needed > free:
         raise ValueError(f"{what} need {size_text(needed)} of memory, of which {size_text(free)} are free; {remedy}")
+
+
+def _free_addresses() -> list[int]:
+    """Free part of the address space, if it is limited (``ulimit -v``, some batch systems)."""
+    if resource is None:
+        return []
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return [] if limit == resource.RLIM_INFINITY else [limit - int(psutil.Process().memory_info().vms)]
 
 
 def _free_in_groups(root: Path) -> Iterator[int]:

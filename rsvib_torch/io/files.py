@@ -16,6 +16,7 @@ from rsvib_torch.core.atomic import check_writable, move_into_place, temporary_f
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.progress import steps
+from rsvib_torch.core.reading import check_regular
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.io import hdf5, image_folder, npy, raw, tiff, video, zarr_store
 from rsvib_torch.io.formats import FrameReader, StackFormat, find_format, register_format, target_format
@@ -44,6 +45,7 @@ __all__ = [
 ]
 
 PathLike = str | os.PathLike[str]
+_MAX_FRAMES = 10**7  # reading that many frames of one pixel takes a minute
 FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]
 
 for _form in (
@@ -84,8 +86,12 @@ def open_stack(path: PathLike) -> FrameReader:
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
+    check_regular(path)
     reader = find_format(path).open(path)
     reader.info = replace(reader.info, path=path)
+    if reader.info.shape[0] > _MAX_FRAMES:
+        reader.close()
+        raise ValueError(f"{path}: {reader.info.shape[0]} frames; a stack has at most {_MAX_FRAMES}, split the file")
     return reader
 
 

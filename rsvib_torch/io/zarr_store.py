@@ -1,6 +1,7 @@
 """Stacks in Zarr v3 arrays in a local folder."""
 
 import math
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,12 @@ def _check_codecs(codecs: Any) -> None:
 def _check_sizes(array: Any, info: StackInfo, folder: Path) -> None:
     """Raise a ``ValueError`` if the pixels cannot be in the folder, before memory is allocated for them."""
     chunk = int(np.prod(array.shards or array.chunks, dtype=object)) * array.dtype.itemsize
-    held = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    held = 0
+    for file in folder.rglob("*"):
+        mode = file.lstat().st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise ValueError(f"it contains {file.name}, which is not a regular file")
+        held += file.lstat().st_size if stat.S_ISREG(mode) else 0
     largest_chunk = 1 << 30  # bytes, also of a frame
     largest_ratio = 100_000  # of pixels to stored bytes; chunks of constant frames are very small
     if max(chunk, info.frame_bytes) > largest_chunk or info.shape[0] * info.frame_bytes > largest_ratio * held:

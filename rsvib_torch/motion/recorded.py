@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.option_types import MotionUnit, TimeUnit
+from rsvib_torch.core.reading import check_regular
 from rsvib_torch.motion.spline import FreeMotion
 
 __all__ = ["MotionUnit", "TimeUnit", "read_motion"]
@@ -82,6 +83,7 @@ def read_motion(
 def _table(path: Path, least_samples: int = 4) -> tuple[Array, Array]:
     """Times (N,) and values (N, 2) of a file; a cubic spline requires at least 4 samples."""
     rows: list[list[float]] = []
+    check_regular(path)
     with path.open(newline="", encoding="utf-8-sig") as file:
         try:
             reader = csv.DictReader(file, skipinitialspace=True)

@@ -183,7 +183,8 @@ def restore(
 
     Raises:
         TypeError: If an argument has the wrong type or the method does not know an option.
-        ValueError: If a value is out of range, or frames, timing and vibration do not fit together.
+        ValueError: If a value is out of range, frames, timing and vibration do not fit together, or the motion within a
+            frame is larger than the frame.
 
     Warns:
         RestorationWarning: If an axis is not restored, or the restored frames are no better than the raw ones. If both
@@ -235,8 +236,9 @@ def restore_prepared(
     masks = {"ignore": frames.missing, "clipped": frames.saturated}
     options |= {name: masks[name] for name in chosen.masks if masks[name] is not None}
     images = frames.images if "ignore" in chosen.masks else frames.filled
-    motion = _motion_in_row_order(frames, vibration)
-    return chosen.function(images, frame_motion(motion, frames.timing, images.shape[1], images.shape[-2]), **options)
+    motion = frame_motion(_motion_in_row_order(frames, vibration), frames.timing, images.shape[1], images.shape[-2])
+    motion.check_fits(*images.shape[-2:])
+    return chosen.function(images, motion, **options)
 
 
 def unchanged_frames(frames: PreparedFrames, joint: bool | int) -> Tensor:

@@ -358,11 +358,13 @@ def judge_prepared(
     count, height = frames.images.shape[1], frames.images.shape[-2]
     shared = len(joint_groups(count, joint)[0][0])
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
-    motion = vibration.to_row_order(frames.image_timing).to(frames.images.device).expanded(1)
+    rowwise = vibration.to_row_order(frames.image_timing).to(frames.images.device).expanded(1)
+    motion = frame_motion(rowwise, frames.timing, count, height)
+    motion.check_fits(*frames.images.shape[-2:])
     verdict = judge_frames(
         frames.filled[0].to(dtype),
         restored[0].to(dtype),
-        frame_motion(motion, frames.timing, count, height),
+        motion,
         pairs_to_judge(count, joint, limit),
         shared=shared,
         hidden=None if frames.missing is None else frames.missing[0],
