@@ -45,6 +45,7 @@ __all__ = [
 ]
 
 PathLike = str | os.PathLike[str]
+_FRAME_COPIES = 24  # bytes per pixel of one frame while it is decoded and converted
 _MAX_FRAMES = 10**7  # reading that many frames of one pixel takes a minute
 FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]
 
@@ -179,9 +180,12 @@ def _read_pixels(
             dtype = np.dtype(info.dtype if stored else np.float32)
             count += info.shape[0]
             joined = count if len(paths) > 1 else 0  # the frames of all files are copied into one array
+            frame_bytes = _FRAME_COPIES * math.prod(info.shape[1:])
             check_fits(
                 f"{path}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px",
-                (info.shape[0] + joined) * math.prod(info.shape[1:]) * dtype.itemsize + info.decoding_bytes,
+                (info.shape[0] + joined) * math.prod(info.shape[1:]) * dtype.itemsize
+                + frame_bytes
+                + info.decoding_bytes,
                 "process the stack in windows (iterate_stack, process_stack, rsvib run)",
             )
             pixels = np.empty(info.shape, dtype)

@@ -14,10 +14,18 @@ from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
 __all__ = ["FORMAT"]
 
+_MAX_HEADER_BYTES = 10_000  # as in numpy, which reads the header before it compares
+
 
 def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
     """Shape, whether the first axis varies fastest, data type, and position of the first pixel."""
     version = np.lib.format.read_magic(file)
+    if version != (1, 0):
+        start = file.tell()
+        length = int.from_bytes(file.read(4), "little")
+        file.seek(start)
+        if length > _MAX_HEADER_BYTES:
+            raise ValueError(f"its header has {length} bytes; expected at most {_MAX_HEADER_BYTES}")
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran_order, dtype = read(file)
     check_dtype(dtype)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.presentation import Summarised
+from rsvib_torch.core.text import one_line
 from rsvib_torch.frames.arrays import channels_appear_last
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.time_metadata import orientation_of, times_of_attributes
@@ -183,7 +184,7 @@ def readable_stack(path: Path, kind: str) -> Iterator[None]:
     except MemoryError:
         raise
     except Exception as error:
-        raise ValueError(f"{path}: not a readable {kind} stack: {' '.join(str(error).split())}") from error
+        raise ValueError(f"{path}: not a readable {kind} stack: {one_line(error)}") from error
 
 
 @contextmanager
@@ -194,7 +195,7 @@ def readable_frame(path: Path, index: int) -> Iterator[None]:
     except (MemoryError, FrameError):
         raise
     except Exception as error:
-        raise FrameError(f"{path}: frame {index} cannot be read: {' '.join(str(error).split())}") from error
+        raise FrameError(f"{path}: frame {index} cannot be read: {one_line(error)}") from error
 
 
 def attributes_of(info: StackInfo) -> dict[str, Any]:

@@ -158,7 +158,7 @@ class _DaskResult:
                 return self.future.result(timeout=1.0)
             except distributed.TimeoutError:
                 if self.future.done():
-                    raise  # an error of the task
+                    return self.future.result()  # or its error
                 if self.client.scheduler_info(n_workers=-1)["workers"]:
                     last_seen = time.monotonic()
                 elif time.monotonic() - last_seen > NO_WORKERS_SECONDS:

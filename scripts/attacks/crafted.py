@@ -88,7 +88,15 @@ for _order, _shape in product(
     ),
 ):
     CASES[f"npy: shape {_shape[:30]}, Fortran order {_order}"] = partial(_data, "a.npy", _npy(_shape, order=_order))
-for _dtype in ("'O'", "'<U1000000000'", "'V1000000000'", "[('a', '<u2')]", "('<f4', (100000, 100000))", "'|S0'", "'M8'"):
+for _dtype in (
+    "'O'",
+    "'<U1000000000'",
+    "'V1000000000'",
+    "[('a', '<u2')]",
+    "('<f4', (100000, 100000))",
+    "'|S0'",
+    "'M8'",
+):
     CASES[f"npy: type {_dtype}"] = partial(_data, "a.npy", _npy("(2, 64, 64)", _dtype))
 CASES["npy: nested header"] = partial(_data, "a.npy", _npy("(" * 5000 + ")" * 5000))
 CASES["npy: header of 4 GB"] = partial(_data, "a.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1) + b"{")
@@ -223,7 +231,9 @@ CASES["TIFF: SubIFD is the page itself"] = partial(_data, "a.tif", _tiff({330: (
 CASES["TIFF: Exif is the page itself"] = partial(_data, "a.tif", _tiff({34665: (4, 1, 8), 40965: (4, 1, 8)}))
 CASES["TIFF: the next page lies beyond the end"] = partial(_data, "a.tif", _tiff({}, 2**32 - 2))
 CASES["TIFF: strips of one byte"] = partial(
-    _data, "a.tif", _tiff({257: (4, 1, 10**6), 278: (4, 1, 1), 273: (4, 10**6, 512), 279: (4, 10**6, 512)}, 0, bytes(5 * 10**6))
+    _data,
+    "a.tif",
+    _tiff({257: (4, 1, 10**6), 278: (4, 1, 1), 273: (4, 10**6, 512), 279: (4, 10**6, 512)}, 0, bytes(5 * 10**6)),
 )
 CASES["TIFF: 60000 x 60000 px in tiles of 16"] = partial(
     _data, "a.tif", _tiff({256: (4, 1, 60000), 257: (4, 1, 60000), 322: (3, 1, 16), 323: (3, 1, 16), 273: (4, 0, 0)})
@@ -241,7 +251,8 @@ for _words in ("ImageJ=1.53\nimages=1000000000\nframes=1000000000\n", "ImageJ=1.
 @case("TIFF: OME-XML with entities")
 def _tiff_ome(folder: Path) -> Path:
     entities = "".join(f'<!ENTITY e{i + 1} "{f"&e{i};" * 10}">' for i in range(9))
-    text = f'<?xml version="1.0"?><!DOCTYPE OME [<!ENTITY e0 "a">{entities}]><OME><Image><Pixels>&e9;</Pixels></Image></OME>'
+    kind = f'<!DOCTYPE OME [<!ENTITY e0 "a">{entities}]>'
+    text = f'<?xml version="1.0"?>{kind}<OME><Image><Pixels>&e9;</Pixels></Image></OME>'
     return _data("a.tif", _tiff({270: (2, len(text) + 1, 600)}, tail=bytes(474) + text.encode() + bytes(4096)), folder)
 
 
@@ -252,7 +263,9 @@ def _tiff_ome_planes(folder: Path) -> Path:
         '<Pixels ID="Pixels:0" DimensionOrder="XYZCT" Type="uint16" SizeX="16" SizeY="16" SizeZ="1" SizeC="1" '
         'SizeT="1000000000"><TiffData/></Pixels></Image></OME>'
     )
-    return _data("a.ome.tif", _tiff({270: (2, len(text) + 1, 600)}, tail=bytes(474) + text.encode() + bytes(900)), folder)
+    return _data(
+        "a.ome.tif", _tiff({270: (2, len(text) + 1, 600)}, tail=bytes(474) + text.encode() + bytes(900)), folder
+    )
 
 
 def _tiff_pages(folder: Path, count: int, alternating: bool = False) -> Path:
@@ -275,19 +288,28 @@ CASES["TIFF: 60000 pages"] = partial(_tiff_pages, count=60_000)
 CASES["TIFF: 20000 pages and thumbnails of different sizes"] = partial(_tiff_pages, count=20_000, alternating=True)
 
 
-@case("TIFF: 7 MB that expand to 7 GB")
+@case("TIFF: 1 MB that expands to 3.6 GB")
 def _tiff_bomb(folder: Path) -> Path:
-    path = folder / "a.tif"
-    frame = np.zeros((30000, 30000), np.uint8)
-    tifffile.imwrite(path, (frame for _ in range(4)), shape=(4, *frame.shape), dtype="u1", compression="zlib")
-    return path
+    packer = zlib.compressobj(9)
+    packed = b"".join(packer.compress(bytes(9 * 10**6)) for _ in range(100)) + packer.flush()
+    data, offset = [b"II*\0" + struct.pack("<I", 8)], 8
+    entries = [(256, 4, 1, 30000), (257, 4, 1, 30000), (258, 3, 1, 8), (259, 3, 1, 8), (262, 3, 1, 1), (273, 4, 1, 512)]
+    entries += [(277, 3, 1, 1), (278, 4, 1, 30000), (279, 4, 1, len(packed))]
+    for page in range(4):  # of the same strip
+        offset += 2 + 12 * len(entries) + 4
+        data.append(_ifd(entries, offset if page < 3 else 0))
+    return _data("a.tif", b"".join(data).ljust(512, b"\0") + packed, folder)
 
 
 @case("TIFF: axes YXT, zlib, expands to 1.2 GB")
 def _tiff_yxt(folder: Path) -> Path:
     path = folder / "a.tif"
     tifffile.imwrite(
-        path, np.zeros((3000, 2000, 200), np.uint8), metadata={"axes": "YXT"}, compression="zlib", photometric="minisblack"
+        path,
+        np.zeros((3000, 2000, 200), np.uint8),
+        metadata={"axes": "YXT"},
+        compression="zlib",
+        photometric="minisblack",
     )
     return path
 
@@ -348,7 +370,7 @@ def _times(file: h5py.File) -> None:
 def _virtual_times(file: h5py.File) -> None:
     file.create_dataset("frames", data=np.zeros((4, 16, 16), "u2"))
     layout = h5py.VirtualLayout(shape=(4,), dtype="f8")
-    layout[:] = h5py.VirtualSource("/dev/zero", "a", shape=(4,))
+    layout[:] = h5py.VirtualSource("/dev/urandom", "a", shape=(4,))
     file.create_virtual_dataset("timestamps", layout)
 
 
@@ -368,13 +390,13 @@ for _name, _write in {
     "chunk of 4 GB": partial(_zeros, shape=(100, 4000, 4000), chunks=(100, 4000, 4000), compression="gzip"),
     "one chunk of 100 MB": partial(_filled, shape=_ONE, chunks=_ONE, compression="gzip"),
     "chunks of 1 x 1 x 1": partial(_filled, shape=(8, 64, 64), chunks=(1, 1, 1)),
-    "virtual dataset of a device": partial(_virtual, source="/dev/zero"),
+    "virtual dataset of a device": partial(_virtual, source="/dev/urandom"),
     "virtual dataset of itself": partial(_virtual, source="a.h5"),
     "virtual times": _virtual_times,
     "2^40 times": _times,
-    "external file /dev/zero": partial(_external, name="/dev/zero"),
+    "external file /dev/urandom": partial(_external, name="/dev/urandom"),
     "external file /etc/passwd": partial(_external, name="/etc/passwd"),
-    "external link": lambda file: file.__setitem__("frames", h5py.ExternalLink("/dev/zero", "/a")),
+    "external link": lambda file: file.__setitem__("frames", h5py.ExternalLink("/dev/urandom", "/a")),
     "soft link to itself": lambda file: file.__setitem__("frames", h5py.SoftLink("/frames")),
     "only a soft link to a group": lambda file: file.__setitem__("a", h5py.SoftLink("/")),
     "dataset of type object": lambda file: file.create_dataset("frames", data=["a"] * 4, dtype=h5py.string_dtype()),
@@ -427,7 +449,7 @@ for _header in ("[" * _DEEP, '{"a":' * _DEEP, '{"shape": ' + "9" * 10**6 + "}"):
     )[0]
 CASES["Zarr: header is a pipe"] = lambda folder: _piped(_zarr(folder), "zarr.json")
 CASES["Zarr: chunk is a pipe"] = lambda folder: _piped(_zarr(folder), "c/0/0/0")
-CASES["Zarr: chunk is a link to a device"] = lambda folder: _linked(_zarr(folder), "c/0/0/0", "/dev/zero")
+CASES["Zarr: chunk is a link to a device"] = lambda folder: _linked(_zarr(folder), "c/0/0/0", "/dev/urandom")
 CASES["Zarr: folder linked to itself"] = lambda folder: _linked(_zarr(folder), "c/1", ".")
 
 
@@ -496,8 +518,8 @@ def _video_frames(folder: Path) -> Path:
     return _data("a.avi", bytes(data), folder)
 
 
-CASES["video: playlist"] = partial(_text, "a.mp4", "#EXTM3U\n/dev/zero\n")
-CASES["video: list of files"] = partial(_text, "a.mkv", "ffconcat version 1.0\nfile /dev/zero\n")
+CASES["video: playlist"] = partial(_text, "a.mp4", "#EXTM3U\n/dev/urandom\n")
+CASES["video: list of files"] = partial(_text, "a.mkv", "ffconcat version 1.0\nfile /dev/urandom\n")
 CASES["video: zeros"] = partial(_sparse, "a.mp4", b"", 10**9)
 CASES["video: zeros after a header of .ts"] = partial(_sparse, "a.mts", b"G" + bytes(187), 10**9)
 
@@ -510,7 +532,7 @@ for _ending in (".tif", ".png", ".npy", ".h5", ".raw", ".mp4", ".jpg", ".toml", 
         return folder / name
 
     def _device(folder: Path, name: str = f"a{_ending}") -> Path:
-        (folder / name).symlink_to("/dev/zero")
+        (folder / name).symlink_to("/dev/urandom")
         return folder / name
 
     def _process_file(folder: Path, name: str = f"a{_ending}") -> Path:

@@ -74,9 +74,7 @@ def test_version_2_throttles_before_its_limit(tmp_path):
     assert free_memory(tmp_path) == 2 * GB
 
 
-@pytest.mark.parametrize(
-    "own", ["0::/", "0::/../other", "0::/docker/abc", "0::/docker/abc/not-visible"]
-)
+@pytest.mark.parametrize("own", ["0::/", "0::/../other", "0::/docker/abc", "0::/docker/abc/not-visible"])
 def test_container_shows_its_group_at_the_mount(tmp_path, own):
     """With and without a namespace of its own, /proc names the group of the host, but only its part is mounted."""
     mounted(tmp_path, own, "31 23 0:28 /docker/abc /sys/fs/cgroup rw - cgroup2 cgroup2 rw")
