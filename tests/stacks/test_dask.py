@@ -78,9 +78,11 @@ def test_workers_that_are_killed_are_replaced(place, tmp_path):
 
 def test_run_ends_if_there_are_no_workers(place, tmp_path, monkeypatch):
     monkeypatch.setattr(engines, "NO_WORKERS_SECONDS", 0.5)
-    with distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=None, protocol="inproc") as cluster:
-        with pytest.raises(OSError, match="no Dask workers for 0.5 s; start workers, and resume the run"):
-            process_small(place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address)
+    with (
+        distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=None, protocol="inproc") as cluster,
+        pytest.raises(OSError, match=r"no Dask workers for 0.5 s; start workers, and resume the run"),
+    ):
+        process_small(place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address)
     assert not (tmp_path / "out.tif").exists()
 
 

@@ -97,7 +97,9 @@ def test_zarr_that_expands_is_refused_by_every_command(tmp_path, free, capsys):
     for arguments in (("calibrate", stack, "--frequency", "100"), ("simulate", stack, f"{out}.tif", *camera)):
         assert run_command([*arguments, "--full-scale", "4095"]) == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zarr", "camera.toml", "motion.csv"]
-    with pytest.raises(ValueError, match=r"96 frames of 6000 x 5500 px need 13.\d GB of memory, of which 1 GB are free"):
+    with pytest.raises(
+        ValueError, match=r"96 frames of 6000 x 5500 px need 13.\d GB of memory, of which 1 GB are free"
+    ):
         rsv.read_stack(tmp_path / "a.zarr", full_scale=4095)
 
 
@@ -127,7 +129,9 @@ def test_simulation_of_many_frames_is_refused(free):
 @pytest.mark.parametrize("method", ["exact", "banded", "dewarp", "richardson-lucy"])
 def test_motion_beyond_the_frame_is_refused(method):
     frames = np.random.default_rng(0).random((2, 64, 48), np.float32)
-    with pytest.raises(ValueError, match=r"the motion along the rows reaches 1e\+05 px within a frame, .* size of 48 px"):
+    with pytest.raises(
+        ValueError, match=r"the motion along the rows reaches 1e\+05 px within a frame, .* size of 48 px"
+    ):
         rsv.restore(frames, TIMING, rsv.Vibration([1e5, 0.0], [50.0, 0.0]), method=method)
     with pytest.raises(ValueError, match=r"the motion across the rows reaches 65 px .* size of 64 px"):
         rsv.restore(frames, TIMING, rsv.Vibration([0.0, 65.0], [0.0, 50.0]), method=method)
