@@ -193,7 +193,7 @@ def test_stack_that_does_not_fit_is_refused_before_it_is_read(tmp_path, monkeypa
     monkeypatch.setattr(free_memory, "free_memory", lambda: needed - 1)
     with pytest.raises(ValueError, match=r"a.npy: 4 frames of 16 x 16 px need .* KB .*; process the stack in windows"):
         read_stack(paths)
-    with pytest.raises(ValueError, match="need .* of memory"):
+    with pytest.raises(ValueError, match=r"need .* of memory"):
         rsv.detect_vibration(paths, TIMING)
 
 
