@@ -637,14 +637,16 @@ def crafted(name: str, folder: Path) -> Trial:
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
     child = context.Process(target=_child, args=(path, sender))
-    begin, base = time.monotonic(), psutil.Process().memory_info().rss
+    begin, lowest = time.monotonic(), psutil.Process().memory_info().rss
     child.start()
     sender.close()
     watched, peak, cpu = psutil.Process(child.pid), 0, 0.0
     outcome: tuple[Outcome, str] | None = None
     while outcome is None and cpu < _CPU_SECONDS and time.monotonic() - begin < _SECONDS:
         try:
-            peak = max(peak, watched.memory_info().rss - base)
+            used = watched.memory_info().rss
+            lowest = min(lowest, used)  # pages of files are not inherited
+            peak = max(peak, used - lowest)
             cpu = sum(watched.cpu_times()[:2])
             if receiver.poll(0.01):
                 outcome = receiver.recv()
