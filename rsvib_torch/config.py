@@ -17,6 +17,7 @@ from pydantic import Field, create_model, model_validator
 
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.option_types import DEFAULT_WINDOW, METHOD_SETTINGS, BadFrames, DetectionSettings, PriorName
+from rsvib_torch.core.reading import read_text
 from rsvib_torch.core.validation import Section, checked, options_section, validate
 from rsvib_torch.motion.timing import SensorTiming
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Config", "Simulation", "file_section", "presets", "read_config", "simulation_section"]
 
+_MAX_BYTES = 10**7  # start times of 500,000 frames
+_MAX_DEPTH = 100  # parts of a key; the deepest key of the format has 3
 _AGREEMENT = 1e-3  # relative; keys that state the same time twice are rounded by whoever wrote them
 
 
@@ -279,8 +282,12 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+        text = read_text(path, at_most=_MAX_BYTES)
+        # the parser takes quadratic time for nested keys; lists of numbers have as many commas as points
+        if any(line.count(".") > line.count(",") + _MAX_DEPTH for line in text.splitlines() if line[:1] != "#"):
+            raise ValueError(f"a key has more than {_MAX_DEPTH} parts")
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not a TOML file: {error}") from error
 
 

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from attacks import crafted, memory, workers
 from attacks.trial import FAILURES, OUTCOMES, Trial
 
 import rsvib_torch as rsv
@@ -41,7 +42,11 @@ class Attack:
 
 
 # A new attack is one module in scripts/attacks and one line here.
-ATTACKS: dict[str, Attack] = {}
+ATTACKS: dict[str, Attack] = {
+    "memory": Attack("`--memory` in different layouts", memory.trials, 17),
+    "crafted": Attack("crafted files", crafted.trials, 500),
+    "workers": Attack("killed and missing Dask workers", workers.trials, 9),
+}
 
 
 def table(results: dict[str, list[Trial]]) -> list[str]:

@@ -195,7 +195,7 @@ def known(
     check_new([restored], overwrite)
     results: dict[str, list[str]] = {}
     data: dict[str, Any] = {"alignment": None, "check": None}
-    stack = load(frames, settings, full_scale, device)
+    stack = load(frames, settings, full_scale, device, options)
     if offset is None:
         with working("aligning the recording"):
             found = detection.align_motion(stack.frames, stack.timing, recorded, fit_gain=fit_gain)
@@ -298,17 +298,16 @@ def calibrate(
     if out is not None:
         check_writable(out)
         check_new([out], overwrite)
-    with working("reading the frames"):
-        stacks = [io.read_stack(path, full_scale=full_scale) for path in frames]
-    for path, stack in zip(frames, stacks, strict=True):
-        for sentence in io.describe_stack(io.read_stack_info(path), None):
+    infos = [io.read_stack_info(path) for path in frames]
+    for path, info in zip(frames, infos, strict=True):
+        for sentence in io.describe_stack(info, None):
             note(sentence)
-        if stack.shape[1:] != stacks[0].shape[1:]:
+        if info.shape[1:] != infos[0].shape[1:]:
             raise ValueError(
-                f"{path}: frames of shape {tuple(stack.shape[1:])}, expected {tuple(stacks[0].shape[1:])} as in "
-                f"{frames[0]}"
+                f"{path}: frames of shape {info.shape[1:]}, expected {infos[0].shape[1:]} as in {frames[0]}"
             )
-    stack = torch.cat(stacks)
+    with working("reading the frames"):
+        stack = torch.cat([io.read_stack(path, full_scale=full_scale) for path in frames])
     axis: Literal[-2, -1] = -1 if scan_axis == "x" else -2
     with working("measuring the flicker"):
         if frequency is None:

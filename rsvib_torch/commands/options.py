@@ -182,7 +182,7 @@ QuietOption = Annotated[
 ]
 MemoryOption = Annotated[
     str | None,
-    typer.Option(help="Memory limit of the process, e.g. 2GB.", show_default="four fifths of the free memory"),
+    typer.Option(help="Memory limit of the process, e.g. 2GB.", show_default="three quarters of the free memory"),
 ]
 WorkersOption = Annotated[
     int | None,

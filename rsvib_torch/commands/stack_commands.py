@@ -46,6 +46,7 @@ from rsvib_torch.commands.terminal import Answer, counting, error_line, note, ru
 from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable, whole_folder
 from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
+from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import write_json
 from rsvib_torch.core.validation import validate
 
@@ -81,11 +82,31 @@ class Stack:
     timing: SensorTiming
 
 
-def load(path: Path, config: Config, full_scale: float | None, device: DeviceName) -> Stack:
-    """Read a stack; ``full_scale`` and ``device`` are options of the command line."""
+def load(
+    path: Path,
+    config: Config,
+    full_scale: float | None,
+    device: DeviceName,
+    restoration: dict[str, Any] | None = None,
+) -> Stack:
+    """Read a stack that is processed as a whole.
+
+    Args:
+        path: The stack.
+        config: The camera.
+        full_scale: Option of the command line.
+        device: Option of the command line.
+        restoration: Options of the restoration that follows; None for detection only.
+
+    Raises:
+        ValueError: If the memory does not suffice.
+    """
+    from rsvib_torch.stacks.memory import check_stack_fits  # noqa: PLC0415
+
     target = torch_device(device)
     info = io.read_stack_info(path)
     scale = full_scale_of(path, info, config, full_scale)
+    check_stack_fits(info, restoration, on_gpu=target.type != "cpu")
     with working(f"reading {path}"):
         frames = io.read_stack(path, full_scale=scale)
     timing = io.timing_from_first_frame(config.timing, info)
@@ -349,6 +370,7 @@ def restore_frames(
     """
     overrides = Overrides(method, joint, prior, saturation)
     check_new([restored, *([] if report is None else [report])], overwrite)
+    check_regular(vibration)
     with vibration.open("rb") as file:
         is_manifest = b'"rsvib stack"' in file.read(200)  # bytes; the format is the first key of either file
     if is_manifest:
@@ -356,15 +378,15 @@ def restore_frames(
             raise ValueError("--report needs a vibration.json; the verdict on each window is in its manifest.json")
         check_new([restored.with_name(f"{restored.name}.manifest.json")], overwrite)
         return _restore_windows(frames, restored, settings, vibration, overrides, force, device, full_scale)
-    detected = reports.read_vibration(
-        vibration, io.timing_from_first_frame(settings.timing, io.read_stack_info(frames))
-    )
-    stack = load(frames, settings, full_scale, device)
-    options = restoration_options(stack.info, stack.full_scale, settings, overrides)
-    shape = (1, *stack.info.shape[1:]) if options.get("joint") is True else stack.info.shape
-    io.check_stack_target(restored, shape, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
+    info = io.read_stack_info(frames)
+    detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
+    scale = full_scale_of(frames, info, settings, full_scale)
+    options = restoration_options(info, scale, settings, overrides)
+    shape = (1, *info.shape[1:]) if options.get("joint") is True else info.shape
+    io.check_stack_target(restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     if report is not None:
         check_writable(report)
+    stack = load(frames, settings, full_scale, device, options)
     result = restore_and_save(restored, stack, detected, options, force, report)
     return Answer(
         {"Vibration": [detected.summary()], "Restoration": restoration_lines(result, len(stack.frames))},
@@ -630,8 +652,10 @@ def report(
     boxes = [_edge_box(text) for text in edge or []]
     windows = None if manifest is None else stacks.read_manifest(manifest)
     _check_folder(out, ["report.html"], overwrite)
-    stack = load(frames, settings, full_scale, device)
-    options = restoration_options(stack.info, stack.full_scale, settings, Overrides(method, joint, prior, saturation))
+    info = io.read_stack_info(frames)
+    scale = full_scale_of(frames, info, settings, full_scale)
+    options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation))
+    stack = load(frames, settings, full_scale, device, options)
     detection = _detect(stack, settings)
     result = _restore(stack, detection, options, force, "page")
     if result.restored:

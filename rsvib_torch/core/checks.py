@@ -58,12 +58,12 @@ def check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}; got {value!r}")
 
 
-def check_whole_number(name: str, value: object, *, at_least: int) -> int:
-    """Return ``value`` as an int that is not smaller than ``at_least``.
+def check_whole_number(name: str, value: object, *, at_least: int, at_most: int | None = None) -> int:
+    """Return ``value`` as an int that is not smaller than ``at_least``, and not larger than ``at_most``.
 
     Raises:
         TypeError: If the value is not a whole number.
-        ValueError: If it is too small.
+        ValueError: If it is too small or too large.
 
     Example:
         >>> check_whole_number("band_rows", 32, at_least=4)
@@ -73,4 +73,6 @@ def check_whole_number(name: str, value: object, *, at_least: int) -> int:
         raise TypeError(f"{name} must be a whole number, got {value!r}")
     if value < at_least:
         raise ValueError(f"{name} must be at least {at_least}, got {value}")
+    if at_most is not None and value > at_most:
+        raise ValueError(f"{name} must be at most {at_most}, got {value}")
     return value

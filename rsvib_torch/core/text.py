@@ -13,7 +13,7 @@ from rsvib_torch.core.atomic import whole_file
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["json_text", "measured_text", "text_table", "wrapped", "write_json"]
+__all__ = ["json_text", "measured_text", "one_line", "text_table", "wrapped", "write_json"]
 
 
 def measured_text(value: "Tensor | float", std: "Tensor | float | None" = None, digits: int = 4) -> str:
@@ -44,6 +44,17 @@ def measured_text(value: "Tensor | float", std: "Tensor | float | None" = None, 
         return f"{round(number, decimals) + 0.0:.{max(0, decimals)}f}"
 
     return shown(value) if std is None else f"{shown(value)} ± {shown(deviation)}"
+
+
+def one_line(message: object, most: int = 400) -> str:
+    """A message in one line of at most ``most`` characters: it may contain what a damaged file contains.
+
+    Example:
+        >>> one_line(" two  words "), one_line("a" * 100, 8)
+        ('two words', 'aaaaaaa…')
+    """
+    line = " ".join(str(message).split())
+    return line if len(line) <= most else f"{line[: most - 1]}…"
 
 
 def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, most: int = 20) -> str:

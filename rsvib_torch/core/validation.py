@@ -8,10 +8,14 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
+from rsvib_torch.core.reading import read_text
+
 __all__ = ["Section", "checked", "expected_text", "options_section", "read_json", "validate"]
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _Result = TypeVar("_Result")
+_MAX_LINES = 20  # of an error message
+_MAX_JSON_BYTES = 10**9  # a manifest has about 2 KB per window
 _TYPE_NAMES = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
 _LIST_NAMES: dict[Any, str] = {float: "numbers", int: "whole numbers", str: "texts", bool: "true or false"}
 
@@ -65,7 +69,8 @@ def validate(model: type[_Model], data: Mapping[str, Any], source: str) -> _Mode
         for mistake in error.errors(include_url=False):
             path, message = _describe(model, data, mistake)
             lines.setdefault(path, f"{source}: {path}: {message}" if path else f"{source}: {message}")
-        raise ValueError("\n".join(lines.values())) from error
+        more = [f"{source}: {len(lines) - _MAX_LINES} more mistakes"] if len(lines) > _MAX_LINES else []
+        raise ValueError("\n".join([*list(lines.values())[:_MAX_LINES], *more])) from error
 
 
 def _describe(model: type[BaseModel], data: Any, mistake: Any) -> tuple[str, str]:
@@ -138,10 +143,11 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 
     Raises:
         OSError: If the file cannot be opened.
-        ValueError: If it is not JSON, or not a table.
+        ValueError: If it is not JSON or not a table, or larger than 1 GB.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_constant)
+        text = read_text(path, at_most=_MAX_JSON_BYTES)
+        data = json.loads(text, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not a {what}: {error}") from error
     if not isinstance(data, dict):

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.fourier import extend_rows, fast_length
+from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
 from rsvib_torch.frames.arrays import ArrayLike, as_tensor, channels_appear_last
 from rsvib_torch.frames.column_strips import ColumnStrips
@@ -24,6 +25,7 @@ __all__ = ["simulate_frames"]
 _DEGREE = 9  # degree of the spline across rows; its error is 2e-5 of the amplitude at a quarter cycle per pixel
 # px between the visible part and the edge of the scene; the prefilter of the spline decays to 4e-4 within it
 _MARGIN = 16
+_CHUNK_ROWS = 64  # rows of all frames that are formed at once
 
 
 def simulate_frames(
@@ -58,7 +60,8 @@ def simulate_frames(
 
     Raises:
         TypeError: If the scene is not a floating-point tensor.
-        ValueError: If the scene is too small for the frame and motion, or is not finite.
+        ValueError: If the scene is too small for the frame and motion, or is not finite, or the frames do not fit into
+            the free memory.
 
     Example:
         >>> import rsvib_torch as rsv
@@ -91,6 +94,14 @@ def simulate_frames(
         raise ValueError(f"num_frames must be at least 1, got {num_frames}")
     if vibration.batch_shape:
         raise ValueError("simulate_frames takes one vibration, not a batch")
+    height, width = map(min, frame_size or scene.shape[-2:], scene.shape[-2:])
+    row_bytes = 400 * min(height, _CHUNK_ROWS) + 12 * height  # per column: spectra of a chunk, frames; measured
+    if scene.device.type == "cpu":
+        check_fits(
+            f"num_frames={num_frames} frames of {height} x {width} px",
+            num_frames * math.prod(scene.shape[:-2]) * width * row_bytes,
+            "simulate fewer frames at a time (timing.frame_start_times)",
+        )
     motion = vibration.to_row_order(timing).to(scene.device)
     if timing.scan_axis == -1 and frame_size is not None:
         frame_size = (frame_size[1], frame_size[0])
@@ -139,7 +150,7 @@ def _form_frames(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motio
 
 
 def _form_rows(
-    scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion, width: int, chunk_rows: int = 64
+    scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion, width: int, chunk_rows: int = _CHUNK_ROWS
 ) -> Tensor:
     """Form frames (T, ..., R, width) whose rows are exposed from ``starts`` (T, R) on, centred on the scene."""
     height, scene_width = scene.shape[-2:]

@@ -1,6 +1,7 @@
 """Stacks whose frames lie one after another in a file: frames are read and written at their offsets."""
 
 import errno
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -8,9 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsvib_torch.io.blocks import BlockReader
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 
-__all__ = ["ContiguousReader", "ContiguousWriter", "check_frames_held"]
+__all__ = ["ContiguousReader", "ContiguousWriter", "InterleavedReader", "check_frames_held"]
+
+_BLOCK_BYTES = 1 << 26  # of frames that are read together; the whole file is read once per block
+_BAND_BYTES = 1 << 24  # of the file that are read at once, so that not the whole file is in memory
 
 
 def check_frames_held(info: StackInfo, offset: int, size: int, *, fraction: float = 0.5) -> None:
@@ -56,17 +61,84 @@ class ContiguousReader:
         if start + size > os.fstat(self._file.fileno()).st_size:
             raise truncated  # before memory is allocated
         pixels = np.empty(self.info.stored_shape[1:], self._dtype)
-        view, done = memoryview(pixels.data).cast("B"), 0
-        self._file.seek(start)
-        while done < size:
-            count = self._file.readinto(view[done:])
-            if not count:
-                raise truncated
-            done += count
+        if not _read_exactly(self._file, start, memoryview(pixels.data).cast("B")):
+            raise truncated
         return self.info.from_stored(pixels)
 
     def close(self) -> None:
         """Close the file."""
+        self._file.close()
+
+
+def _read_exactly(file: Any, start: int, buffer: memoryview) -> bool:
+    """Fill a buffer with the bytes of a file from ``start`` on; whether the file holds them."""
+    file.seek(start)
+    done = 0
+    while done < len(buffer):
+        count = file.readinto(buffer[done:])
+        if not count:
+            return False
+        done += count
+    return True
+
+
+class InterleavedReader(BlockReader):
+    """Uncompressed frames whose pixels do not lie one after another, e.g. an array in Fortran order.
+
+    Files are read instead of mapped into memory: mapped pages count as memory of the process.
+
+    Args:
+        path: The file.
+        info: The stack.
+        offset: Position of the first pixel in bytes.
+        dtype: Data type in the file, with its byte order.
+        shape: Shape of the array in the file, the last axis varies fastest.
+        order: Permutation of its axes to (..., T, H, W) or (..., T, C, H, W) with leading axes of length 1.
+
+    Raises:
+        ValueError: If the file does not hold all frames.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        info: StackInfo,
+        offset: int,
+        dtype: np.dtype[Any],
+        shape: tuple[int, ...],
+        order: tuple[int, ...],
+    ) -> None:
+        check_frames_held(info, offset, path.stat().st_size, fraction=1.0)
+        # the pixels of a block in the order of the file, of which a part is read at a time
+        super().__init__(path, info, max(1, _BLOCK_BYTES // info.frame_bytes), info.frame_bytes + _BAND_BYTES)
+        self._offset, self._dtype, self._shape, self._order = offset, dtype, shape, order
+        self._time = order[len(order) - len(info.shape)]
+        self._file = path.open("rb", buffering=0)
+
+    def read_block(self, first: int, last: int) -> NDArray[Any]:
+        """Frames ``first`` to ``last`` (exclusive), (N, H, W) or (N, C, H, W)."""
+        before, after = (math.prod(part) for part in (self._shape[: self._time], self._shape[self._time + 1 :]))
+        count, size = self._shape[self._time], self._dtype.itemsize
+        block = np.empty((before, last - first, after), self._dtype)
+        run = count * after * size  # bytes between the same frame's pixels
+        at_once = _BAND_BYTES // run
+        for begin in range(0, before, max(1, at_once)):
+            part = block[begin : begin + max(1, at_once)]
+            if at_once:
+                band = np.empty((len(part), count, after), self._dtype)
+                held = _read_exactly(self._file, self._offset + begin * run, memoryview(band.data).cast("B"))
+                part[:] = band[:, first:last]
+            else:
+                start = self._offset + begin * run + first * after * size
+                held = _read_exactly(self._file, start, memoryview(part.data).cast("B"))
+            if not held:
+                raise EOFError("truncated: its pixels lie beyond the end of the file")
+        stored = (*self._shape[: self._time], last - first, *self._shape[self._time + 1 :])
+        return block.reshape(stored).transpose(self._order).reshape(-1, *self.info.shape[1:])
+
+    def close(self) -> None:
+        """Close the file."""
+        self._block = None
         self._file.close()
 
 

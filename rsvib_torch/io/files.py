@@ -1,5 +1,6 @@
 """Reading and writing whole stacks: the file ending selects the format."""
 
+import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -13,7 +14,9 @@ from torch import Tensor
 
 from rsvib_torch.core.atomic import check_writable, move_into_place, temporary_folder
 from rsvib_torch.core.checks import check_choice
+from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.progress import steps
+from rsvib_torch.core.reading import check_regular
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.io import hdf5, image_folder, npy, raw, tiff, video, zarr_store
 from rsvib_torch.io.formats import FrameReader, StackFormat, find_format, register_format, target_format
@@ -46,6 +49,8 @@ __all__ = [
 ]
 
 PathLike = str | os.PathLike[str]
+_FRAME_COPIES = 24  # bytes per pixel of one frame while it is decoded and converted
+_MAX_FRAMES = 10**7  # reading that many frames of one pixel takes a minute
 FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]
 
 for _form in (
@@ -93,8 +98,12 @@ def open_stack(path: PathLike) -> FrameReader:
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
+    check_regular(path)
     reader = find_format(path).open(path)
     reader.info = replace(reader.info, path=path)
+    if reader.info.shape[0] > _MAX_FRAMES:
+        reader.close()
+        raise ValueError(f"{path}: {reader.info.shape[0]} frames; a stack has at most {_MAX_FRAMES}, split the file")
     return reader
 
 
@@ -152,7 +161,8 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
     Raises:
         OSError: If the file cannot be opened.
         ModuleNotFoundError: If an optional package is missing, with the extra to install.
-        ValueError: If it is damaged, its frames differ in size, or the full scale is unknown or exceeded.
+        ValueError: If it is damaged, its frames differ in size, the full scale is unknown or exceeded, or the frames do
+            not fit into the free memory.
 
     Example:
         >>> import tempfile
@@ -165,32 +175,54 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
         (torch.Size([3, 64, 48]), tensor(True))
     """
     paths = [path] if isinstance(path, (str, os.PathLike)) else list(path)
-    pixels, stated = _read_pixels(paths)
-    return counts_to_frames(pixels, stated if full_scale is None else full_scale, str(paths[0]))
+    return torch.from_numpy(_read_pixels(paths, full_scale, as_counts=False)[0])
 
 
-def _read_pixels(paths: Sequence[PathLike]) -> tuple[NDArray[Any], float | None]:
-    """Pixels as stored of the frames of all files, (T, H, W) or (T, C, H, W), and the full scale that they state."""
+def _read_pixels(
+    paths: Sequence[PathLike], full_scale: float | None, *, as_counts: bool
+) -> tuple[NDArray[Any], float | None]:
+    """Frames of all files, (T, H, W) or (T, C, H, W), and their full scale.
+
+    Args:
+        paths: The files.
+        full_scale: As in ``read_stack``.
+        as_counts: Whether integers are returned as stored instead of as float32.
+    """
     if not paths:
         raise ValueError("path must contain at least one file, got an empty list")
     parts: list[NDArray[Any]] = []
-    infos: list[StackInfo] = []
+    first: StackInfo | None = None
+    count = 0  # frames of all files
     for path in paths:
         reader = open_stack(path)
         try:
-            infos.append(reader.info)
-            first, info = infos[0], infos[-1]
+            info = reader.info
+            first = first or info
             if info.kind != first.kind:
                 raise ValueError(f"frames of different size or kind: {paths[0]} is {first.kind}, {path} is {info.kind}")
-            pixels = np.empty(info.shape, dtype=info.dtype)
+            stated = first.full_scale if full_scale is None else full_scale
+            stored = as_counts and info.is_integer
+            dtype = np.dtype(info.dtype if stored else np.float32)
+            count += info.shape[0]
+            joined = count if len(paths) > 1 else 0  # the frames of all files are copied into one array
+            frame_bytes = _FRAME_COPIES * math.prod(info.shape[1:])
+            check_fits(
+                f"{path}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px",
+                (info.shape[0] + joined) * math.prod(info.shape[1:]) * dtype.itemsize
+                + frame_bytes
+                + info.decoding_bytes,
+                "process the stack in windows (iterate_stack, process_stack, rsvib run)",
+            )
+            pixels = np.empty(info.shape, dtype)
             advance = steps(len(pixels), "frames")
             for index in range(len(pixels)):
-                pixels[index] = reader.frame(index)
+                frame = reader.frame(index)
+                pixels[index] = frame if stored else counts_to_frames(frame, stated, str(path))
                 advance()
         finally:
             reader.close()
         parts.append(pixels)
-    return parts[0] if len(parts) == 1 else np.concatenate(parts), infos[0].full_scale
+    return parts[0] if len(parts) == 1 else np.concatenate(parts), stated
 
 
 def load_frames(frames: FramesOrFiles, full_scale: float | None) -> tuple[FramesLike, float | None]:
@@ -213,10 +245,9 @@ def load_frames(frames: FramesOrFiles, full_scale: float | None) -> tuple[Frames
         paths = list(frames)
     else:
         return cast(FramesLike, frames), full_scale
-    pixels, stated = _read_pixels(paths)
-    full_scale = stated if full_scale is None else full_scale
+    pixels, full_scale = _read_pixels(paths, full_scale, as_counts=True)
     if pixels.dtype.kind == "f":
-        return counts_to_frames(pixels, full_scale, str(paths[0])), None
+        return torch.from_numpy(pixels), None
     return pixels, full_scale_of_counts(pixels, full_scale, str(paths[0]))
 
 

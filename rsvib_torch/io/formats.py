@@ -6,14 +6,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.stack_info import StackInfo, readable_frame
+from rsvib_torch.io.stack_info import StackInfo
 
 __all__ = [
     "FORMATS",
-    "ArrayReader",
     "FrameReader",
     "FrameWriter",
     "StackFormat",
@@ -37,22 +35,6 @@ class FrameReader(Protocol):
     def close(self) -> None:
         """Close the file, if it is open between frames."""
         return
-
-
-class ArrayReader(FrameReader):
-    """Frames of an array of HDF5 or Zarr, decoded on access; ``close`` closes its file."""
-
-    def __init__(self, path: Path, info: StackInfo, array: Any, close: Callable[[], None] = lambda: None) -> None:
-        self.info, self._path, self._array, self._close = info, path, array, close
-
-    def frame(self, index: int) -> Frame:
-        """Pixels of a frame as stored."""
-        with readable_frame(self._path, index):
-            return self.info.from_stored(np.asarray(self._array[index] if self._array.ndim > 2 else self._array[...]))
-
-    def close(self) -> None:
-        """Close the file."""
-        self._close()
 
 
 class FrameWriter(Protocol):
@@ -82,10 +64,12 @@ class FrameWriter(Protocol):
 # Orientation: frames have the rows and columns of the file; ``info.orientation`` states how they are displayed.
 # Metadata:    ``keeps`` states what the format stores besides pixels; users are told what their file loses.
 # Reading:     ``open`` must not allocate memory by sizes in a header before it has compared them with the size of the
-#              file, must not execute code or follow links to other files, and raises an ``OSError`` if the file cannot
-#              be opened, a one-line ``ValueError`` that names the file if it is not a stack (``readable_stack``), and
-#              ``ModuleNotFoundError`` if a package is missing (``needed_package``). A reader raises ``FrameError`` for
-#              a damaged frame (``readable_frame``); opening fails if more than half of the frames are missing.
+#              file, must not decode pixels, execute code or follow links to other files, and raises an ``OSError`` if
+#              the file cannot be opened, a one-line ``ValueError`` that names the file if it is not a stack
+#              (``readable_stack``), and ``ModuleNotFoundError`` if a package is missing (``needed_package``). A reader
+#              raises ``FrameError`` for a damaged frame (``readable_frame``); opening fails if more than half of the
+#              frames are missing. Frames that are stored together are decoded once (``io/blocks.py``);
+#              ``info.decoding_bytes`` is the memory that this needs.
 # Writing:     a format defines ``create``, ``write_all``, or neither (it is then only read).
 #              After ``create(path, info, False)`` on an unfinished stack all frames that were synced are still there.
 @dataclass(frozen=True)

@@ -94,7 +94,8 @@ def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str) 
     full_scale = full_scale_of_counts(counts, full_scale, name)
     narrow = counts.dtype.itemsize <= 2  # float32 holds 16-bit counts exactly
     signed = counts.astype(np.int32 if narrow else np.int64)  # torch does not compute with all unsigned types
-    return (torch.from_numpy(signed).to(torch.float32 if narrow else torch.float64) / full_scale).to(torch.float32)
+    floats = torch.from_numpy(signed).to(torch.float32 if narrow else torch.float64)
+    return floats.div_(full_scale).to(torch.float32)
 
 
 def frames_to_counts(frames: Tensor, dtype: np.dtype[Any], full_scale: float | None) -> NDArray[Any]:

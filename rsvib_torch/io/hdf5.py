@@ -1,13 +1,15 @@
 """Stacks in HDF5 files: one dataset of frames with attributes."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rsvib_torch.io.blocks import ArrayReader
 from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
-from rsvib_torch.io.formats import ArrayReader, StackFormat, needed_package
+from rsvib_torch.io.formats import StackFormat, needed_package
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_from_attributes, readable_stack
 from rsvib_torch.io.time_metadata import time_attributes, times_of_attributes
@@ -15,6 +17,7 @@ from rsvib_torch.io.time_metadata import time_attributes, times_of_attributes
 __all__ = ["FORMAT"]
 
 _DATASET = "frames"  # name of the dataset that is written
+_MAX_MEMBERS = 10_000  # groups and datasets; each takes about 0.1 ms
 
 
 def _h5py() -> Any:
@@ -24,42 +27,51 @@ def _h5py() -> Any:
 def _find_dataset(file: Any) -> Any:
     """The only dataset of frames, or the one called ``frames``; links and external data are not followed."""
     h5py = _h5py()
-    found = []
-
-    def search(group: Any, depth: int) -> None:
+    found, groups = [], [file]
+    visited = {file.id}  # a group may be a member of several groups, also of itself
+    count = 0
+    for group in groups:  # grows
         for name in group:
+            count += 1
+            if count > _MAX_MEMBERS:
+                raise ValueError(f"it has more than {_MAX_MEMBERS} members; expected a file with one stack of frames")
             if not isinstance(group.get(name, getlink=True), h5py.HardLink):
                 if name == _DATASET:
                     raise ValueError(f"its dataset {name!r} is a link; frames must be in the file itself")
                 continue
             member = group[name]
-            if isinstance(member, h5py.Group) and depth < 4:
-                search(member, depth + 1)
+            if isinstance(member, h5py.Group) and member.id not in visited:
+                visited.add(member.id)
+                groups.append(member)
             elif isinstance(member, h5py.Dataset) and member.ndim in (2, 3, 4) and member.dtype.kind in "iuf":
                 found.append(member)
-
-    search(file, 0)
     named = [member for member in found if member.name == f"/{_DATASET}"]
     stacks = named or [member for member in found if member.ndim > 2] or found
     if len(stacks) != 1:
         names = ", ".join(sorted(member.name for member in stacks))
         raise ValueError(f"expected one dataset of frames, or one called {_DATASET!r}; found {names or 'none'}")
-    if stacks[0].external or stacks[0].is_virtual:
+    if _is_outside(stacks[0]):
         raise ValueError(f"its dataset {stacks[0].name} lies in other files; frames must be in the file itself")
     return stacks[0]
 
 
-def _check_sizes(dataset: Any, file_size: int) -> None:
-    """Raise a ``ValueError`` if the pixels cannot be in the file, before memory is allocated for them."""
+def _is_outside(dataset: Any) -> bool:
+    """Whether the values of a dataset lie in other files or datasets."""
+    return bool(dataset.external or dataset.is_virtual)
+
+
+def _check_sizes(dataset: Any, file_size: int) -> int:
+    """Size of a chunk in bytes; a ``ValueError`` if the pixels cannot be in the file, before memory is allocated."""
     stored = dataset.id.get_storage_size()
     needed = int(np.prod(dataset.shape, dtype=object)) * dataset.dtype.itemsize
     compressed = dataset.compression or dataset.id.get_create_plist().get_nfilters()
     largest_ratio = 5000 if compressed else 1  # of pixels to stored bytes; gzip reaches 1032
     if stored > file_size or needed > largest_ratio * stored:
         raise ValueError(f"its header states {needed} bytes of pixels, the file holds {stored}")
-    chunk = int(np.prod(dataset.chunks or (1,), dtype=object)) * dataset.dtype.itemsize
+    chunk: int = math.prod(dataset.chunks or (1,)) * int(dataset.dtype.itemsize)
     if chunk > max(needed, 1 << 26):  # 64 MiB are accepted even if the stack is smaller
         raise ValueError(f"its chunks of {chunk} bytes are larger than the stack of {needed}")
+    return chunk
 
 
 def _times_beside(file: Any, dataset: Any, count: int) -> dict[str, Any]:
@@ -74,7 +86,7 @@ def _times_beside(file: Any, dataset: Any, count: int) -> dict[str, Any]:
         }
         found |= time_attributes(group.attrs)
         for name, member in members.items():
-            if member.shape in ((), (1,), (count,)) and member.dtype.kind in "iuf" and not member.external:
+            if member.shape in ((), (1,), (count,)) and member.dtype.kind in "iuf" and not _is_outside(member):
                 found[name] = member[...]
                 found |= {f"{name}_units": member.attrs[key] for key in ("unit", "units") if key in member.attrs}
     return times_of_attributes(found, count)
@@ -89,14 +101,16 @@ def _open(path: Path) -> ArrayReader | ContiguousReader:
             dataset = _find_dataset(file)
             check_dtype(dataset.dtype)
             info = info_from_attributes(dict(dataset.attrs), tuple(dataset.shape), dataset.dtype)
-            _check_sizes(dataset, path.stat().st_size)
+            chunk = _check_sizes(dataset, path.stat().st_size)
             if info.frame_times is None and info.frame_rate is None:
                 info = replace(info, **_times_beside(file, dataset, info.shape[0]))
             offset = dataset.id.get_offset()
             if dataset.chunks is None and offset is not None:
                 return ContiguousReader(path, info, int(offset), dataset.dtype)
             keep_open = True
-            return ArrayReader(path, info, dataset, file.close)
+            # one decoded chunk besides the block; measured with gzip, lzf, shuffle and without compression
+            chunk_frames = dataset.chunks[0] if dataset.chunks and dataset.ndim > 2 else 1
+            return ArrayReader(path, info, dataset, chunk_frames, chunk, file.close)
         finally:
             if not keep_open:
                 file.close()

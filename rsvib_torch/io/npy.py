@@ -1,61 +1,31 @@
 """Stacks in NumPy ``.npy`` files; the file has no room for the full scale."""
 
-import mmap
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsvib_torch.frames.arrays import channels_appear_last
-from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter, check_frames_held
+from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter, InterleavedReader
 from rsvib_torch.io.formats import StackFormat
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
-from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
+from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
 __all__ = ["FORMAT"]
 
-
-class _FortranOrderReader:
-    """Frames of an array whose first axis varies fastest, in a file that is mapped into memory.
-
-    Arguments are those of ``ContiguousReader``; the file must hold all frames.
-    """
-
-    def __init__(self, path: Path, info: StackInfo, offset: int, dtype: np.dtype[Any]) -> None:
-        self.info, self._path = info, path
-        check_frames_held(info, offset, path.stat().st_size, fraction=1.0)
-        self._file = path.open("rb", buffering=0)
-        try:
-            self._map = mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ)
-            self._pixels: NDArray[Any] | None = np.ndarray(info.shape, dtype, self._map, offset, order="F")
-        except BaseException:
-            self._file.close()
-            raise
-        self._end = offset + self._pixels.nbytes
-
-    def frame(self, index: int) -> NDArray[Any]:
-        """Pixels of a frame as stored."""
-        # reading a mapped page beyond the end of the file would end the process
-        if self._pixels is None or os.fstat(self._file.fileno()).st_size < self._end:
-            raise FrameError(f"{self._path}: truncated: frame {index} lies beyond the end of the file")
-        frame: NDArray[Any] = np.array(self._pixels[index], dtype=self._pixels.dtype.newbyteorder("="), order="C")
-        if hasattr(mmap, "MADV_DONTNEED"):
-            self._map.madvise(mmap.MADV_DONTNEED)  # else the pages read so far stay in memory
-        return frame
-
-    def close(self) -> None:
-        """Close the file."""
-        self._pixels = None
-        self._map.close()
-        self._file.close()
+_MAX_HEADER_BYTES = 10_000  # as in numpy, which reads the header before it compares
 
 
 def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
     """Shape, whether the first axis varies fastest, data type, and position of the first pixel."""
     version = np.lib.format.read_magic(file)
+    if version != (1, 0):
+        start = file.tell()
+        length = int.from_bytes(file.read(4), "little")
+        file.seek(start)
+        if length > _MAX_HEADER_BYTES:
+            raise ValueError(f"its header has {length} bytes; expected at most {_MAX_HEADER_BYTES}")
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran_order, dtype = read(file)
     check_dtype(dtype)
@@ -64,7 +34,7 @@ def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any], 
     return shape, fortran_order, dtype, file.tell()
 
 
-def _open(path: Path) -> ContiguousReader | _FortranOrderReader:
+def _open(path: Path) -> ContiguousReader | InterleavedReader:
     """Open (H, W), (T, H, W) or (T, C, H, W). Pickled objects are refused."""
     with readable_stack(path, ".npy"):
         with path.open("rb") as file:
@@ -76,7 +46,10 @@ def _open(path: Path) -> ContiguousReader | _FortranOrderReader:
         if channels_appear_last(shape):
             raise ValueError(f"array of shape {shape} appears to have its channels last; store (T, C, H, W)")
         info = StackInfo(shape, dtype.name, known_full_scale(dtype))
-        return (_FortranOrderReader if fortran_order else ContiguousReader)(path, info, offset, dtype)
+        if fortran_order:
+            axes = tuple(range(len(shape)))
+            return InterleavedReader(path, info, offset, dtype, shape[::-1], axes[::-1])
+        return ContiguousReader(path, info, offset, dtype)
 
 
 def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:

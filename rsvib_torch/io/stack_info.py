@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.presentation import Summarised
+from rsvib_torch.core.text import one_line
 from rsvib_torch.frames.arrays import channels_appear_last
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.time_metadata import orientation_of, times_of_attributes
@@ -78,6 +79,8 @@ class StackInfo(Summarised):
         path: The file; None if the stack is not in a file, or has another number of frames than the file.
         metadata: Further metadata of a TIFF file by name, which are kept when it is restored to TIFF; None for those
             that cannot be kept.
+        decoding_bytes: Memory that reading needs besides the frame that is returned: frames that are stored together
+            are decoded together.
 
     Example:
         >>> import rsvib_torch as rsv
@@ -101,6 +104,7 @@ class StackInfo(Summarised):
     path: Path | None = field(default=None, compare=False)
     frame_numbers: tuple[int, ...] | None = field(default=None, compare=False)
     metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
+    decoding_bytes: int = field(default=0, compare=False)
 
     def summary(self) -> str:
         """The stack in one line."""
@@ -193,7 +197,7 @@ def readable_stack(path: Path, kind: str) -> Iterator[None]:
     except MemoryError:
         raise
     except Exception as error:
-        raise ValueError(f"{path}: not a readable {kind} stack: {' '.join(str(error).split())}") from error
+        raise ValueError(f"{path}: not a readable {kind} stack: {one_line(error)}") from error
 
 
 @contextmanager
@@ -204,7 +208,7 @@ def readable_frame(path: Path, index: int) -> Iterator[None]:
     except (MemoryError, FrameError):
         raise
     except Exception as error:
-        raise FrameError(f"{path}: frame {index} cannot be read: {' '.join(str(error).split())}") from error
+        raise FrameError(f"{path}: frame {index} cannot be read: {one_line(error)}") from error
 
 
 def attributes_of(info: StackInfo) -> dict[str, Any]:

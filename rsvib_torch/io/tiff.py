@@ -11,7 +11,8 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
+from rsvib_torch.io.blocks import BlockReader
+from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter, InterleavedReader
 from rsvib_torch.io.formats import FrameReader, StackFormat
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_frame, readable_stack
@@ -21,34 +22,97 @@ from rsvib_torch.io.time_metadata import orientation_of, tiff_times
 __all__ = ["FORMAT", "open_tiff", "write_tiff"]
 
 
-def _check_page_chain(path: Path) -> None:
-    """Raise a ``ValueError`` if the chain of page headers leaves the file, as in a truncated file, or is circular."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(16)
-        order = {b"II": "<", b"MM": ">"}.get(head[:2])
-        version = struct.unpack(f"{order}H", head[2:4])[0] if order and len(head) >= 8 else 0
-        if version not in (42, 43) or (version == 43 and len(head) < 16):
-            raise ValueError("not a TIFF file" if size else "the file is empty")
-        big = version == 43
-        offset_format, count_format, entry = (f"{order}Q", f"{order}Q", 20) if big else (f"{order}I", f"{order}H", 12)
-        (offset,) = struct.unpack(offset_format, head[8:16] if big else head[4:8])
+# Tags on which the decoded pixels of a page depend, besides their position: subfile type, width, length, bits,
+# compression, photometric interpretation, fill order, samples, rows per strip, planar configuration, predictor, tile
+# size, extra samples, sample format, image depth, tile depth
+_LAYOUT = {254, 255, 256, 257, 258, 259, 262, 266, 277, 278, 284, 317, 322, 323, 338, 339, 32997, 32998}
+_POSITIONS = {273: "offsets", 324: "offsets", 279: "counts", 325: "counts"}
+_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
+_MAX_LAYOUTS = 1000  # of pages in a file; tifffile interprets each once, in about 1 ms
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What is compared of the header of a page: tifffile needs about 1 ms to interpret one, which is too long for all.
+
+    Attributes:
+        layout: Stored values of all tags on which the decoded pixels depend; equal for pages of the same kind.
+        end: Position behind the stored pixels in bytes; None if it does not follow from the header.
+    """
+
+    layout: bytes
+    end: int | None
+
+
+class _Headers:
+    """Reads the headers of all pages, in time and memory linear in the size of the file."""
+
+    def __init__(self, path: Path) -> None:
+        self._size = path.stat().st_size
+        with path.open("rb") as self._file:
+            head = self._bytes(0, 16)
+            self._order = {b"II": "<", b"MM": ">"}.get(head[:2], "")
+            version = struct.unpack(f"{self._order}H", head[2:4])[0] if self._order and len(head) >= 8 else 0
+            if version not in (42, 43) or (version == 43 and len(head) < 16):
+                raise ValueError("not a TIFF file" if self._size else "the file is empty")
+            self._word = "Q" if version == 43 else "I"
+            self.pages = list(self._chain(self._number(self._word, head[8:16] if version == 43 else head[4:8])))
+        if not self.pages:
+            raise ValueError("it contains no page")
+
+    def _bytes(self, start: int, count: int) -> bytes:
+        self._file.seek(min(start, self._size))
+        return self._file.read(min(count, self._size))
+
+    def _number(self, kind: str, data: bytes) -> int:
+        return int(struct.unpack(f"{self._order}{kind}", data)[0])
+
+    def _chain(self, offset: int) -> Iterator[_Header]:
+        """Headers of the pages from ``offset`` on.
+
+        Raises:
+            ValueError: If the chain leaves the file, as in a truncated file, or is circular.
+        """
         visited: set[int] = set()
+        layouts: dict[bytes, bytes] = {}
+        count_kind, entry = ("Q", 20) if self._word == "Q" else ("H", 12)
+        word, count_size = struct.calcsize(self._word), struct.calcsize(count_kind)
         while offset:
             if offset in visited:
                 raise ValueError("its chain of pages runs in a circle")
             visited.add(offset)
-            file.seek(min(offset, size))
-            field = file.read(struct.calcsize(count_format))
-            count = struct.unpack(count_format, field)[0] if len(field) == struct.calcsize(count_format) else size
-            following = offset + len(field) + entry * count
-            file.seek(min(following, size))
-            field = file.read(struct.calcsize(offset_format))
-            if len(field) < struct.calcsize(offset_format):
+            field = self._bytes(offset, count_size)
+            count = self._number(count_kind, field) if len(field) == count_size else self._size
+            table = self._bytes(offset + count_size, entry * count + word)
+            if len(table) < entry * count + word:
                 raise ValueError(f"truncated: the header of page {len(visited) - 1} lies beyond the end of the file")
-            (offset,) = struct.unpack(offset_format, field)
-    if not visited:
-        raise ValueError("it contains no page")
+            header = self._header([table[start : start + entry] for start in range(0, entry * count, entry)])
+            yield _Header(layouts.setdefault(header.layout, header.layout), header.end)  # equal layouts are one object
+            if len(layouts) > _MAX_LAYOUTS:
+                raise ValueError(f"its pages have more than {_MAX_LAYOUTS} different layouts")
+            offset = self._number(self._word, table[-word:])
+
+    def _header(self, entries: list[bytes]) -> _Header:
+        layout = []
+        positions: dict[str, NDArray[Any]] = {}
+        for entry in entries:
+            code, kind = struct.unpack_from(f"{self._order}HH", entry)
+            if code in _LAYOUT:
+                values = self._values(entry, kind, 1 << 10)  # bytes; more than 100 channels are not an image
+                layout.append(struct.pack("HH", code, kind) + values + b";")
+            elif code in _POSITIONS and kind in (3, 4, 13, 16, 18):
+                data = self._values(entry, kind, self._size)
+                positions[_POSITIONS[code]] = np.frombuffer(data, f"{self._order}u{_SIZES[kind]}").astype(object)
+        offsets, counts = positions.get("offsets"), positions.get("counts")
+        known = offsets is not None and counts is not None and 0 < len(offsets) == len(counts)
+        return _Header(b"".join(layout), int(max(offsets + counts)) if known else None)  # type: ignore[operator]
+
+    def _values(self, entry: bytes, kind: int, most: int) -> bytes:
+        """Stored values of a tag, at most ``most`` bytes."""
+        word = struct.calcsize(self._word)
+        size = self._number(self._word, entry[4 : 4 + word]) * _SIZES.get(kind, 1)
+        field = entry[4 + word :]
+        return field[:size] if size <= word else self._bytes(self._number(self._word, field), min(size, most))
 
 
 @dataclass(frozen=True)
@@ -56,11 +120,11 @@ class _Page:
     """What the header of a page states.
 
     Attributes:
-        number: Its number in the file.
+        number: Its number in the file; of pages of the same layout, that of the first.
         shape: (H, W) or (C, H, W).
         dtype: Data type.
         photometric: Meaning of the values.
-        extent: As from ``_extent``.
+        nbytes: Size of its decoded pixels in bytes.
         secondary: Whether it is a thumbnail or a mask of another page.
     """
 
@@ -68,7 +132,7 @@ class _Page:
     shape: tuple[int, ...]
     dtype: Any
     photometric: Any
-    extent: tuple[int, bool]
+    nbytes: int
     secondary: bool
 
     @property
@@ -93,38 +157,46 @@ def _with_channels_first(values: Any, axes: str) -> Any:
     return (values[2], *values[:2]) if isinstance(values, tuple) else np.moveaxis(values, -1, 0)
 
 
-def _read_page(tif: Any, number: int, size: int) -> _Page:
-    """Read the header of a page of a file of ``size`` bytes."""
+def _read_page(tif: Any, number: int) -> _Page:
+    """Interpret the header of a page."""
     page = tif.pages[number]
     if page.axes not in ("YX", "YXS", "SYX"):
         raise ValueError(f"page {number} has shape {page.shape} (axes {page.axes}); expected an image")
     shape = _with_channels_first(page.shape, page.axes)
     secondary = bool(page.subfiletype & 0b101)
-    return _Page(number, shape, page.dtype, page.photometric, _extent(page, size), secondary)
+    return _Page(number, shape, page.dtype, page.photometric, int(page.nbytes), secondary)
 
 
-def _extent(page: Any, size: int) -> tuple[int, bool]:
-    """Bytes of the decoded pixels of a page, and whether the stored ones lie within the file of ``size`` bytes."""
-    ends = (offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True))
-    return int(page.nbytes), max(ends, default=size + 1) <= size
-
-
-def _complete_pages(extents: Sequence[tuple[int, bool]], size: int) -> list[bool]:
-    """Whether the pixels of each page lie within the file of ``size`` bytes.
+def _complete_pages(tif: Any, headers: Sequence[_Header], numbers: Sequence[int], size: int) -> list[bool]:
+    """Whether the stored pixels of pages lie within the file of ``size`` bytes.
 
     Args:
-        extents: Of all pages, as from ``_extent``.
+        tif: The open file.
+        headers: Headers of all pages.
+        numbers: The pages.
         size: Bytes of the file.
 
     Raises:
         ValueError: If the file cannot hold that many pixels, or more than half of the pages are incomplete.
     """
-    declared, complete = sum(nbytes for nbytes, _ in extents), [whole for _, whole in extents]
+    decoded: dict[bytes, int] = {}  # bytes of the pixels of a page, by layout
+    declared, complete = 0, []
+    for number in numbers:
+        header = headers[number]
+        if header.layout not in decoded:
+            decoded[header.layout] = int(tif.pages[number].nbytes)
+        declared += decoded[header.layout]
+        end = header.end
+        if end is None:
+            page = tif.pages[number]
+            ends = (offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True))
+            end = max(ends, default=size + 1)
+        complete.append(end <= size)
     largest_ratio = 5000  # of pixels to the size of the file; deflate reaches 1032
     if declared > largest_ratio * size:
         raise ValueError(f"its header states {declared} bytes of pixels, which {size} bytes cannot hold")
     if sum(complete) < 0.5 * len(complete):
-        raise ValueError(f"truncated: pixels of page {complete.index(False)} lie beyond the end of the file")
+        raise ValueError(f"truncated: pixels of page {numbers[complete.index(False)]} lie beyond the end of the file")
     return complete
 
 
@@ -184,15 +256,22 @@ def _series_info(tif: Any, series: Any) -> tuple[StackInfo, tuple[int, ...]]:
     return _info(tif, stack, series.dtype, series.keyframe.photometric, channels_last=last), (*ones, *kept)
 
 
-class _ArrayReader(FrameReader):
-    """Frames of an array in memory."""
+class _WholeReader(BlockReader):
+    """All frames of a compressed file whose pages are not in the order of the frames, decoded together."""
 
-    def __init__(self, info: StackInfo, pixels: NDArray[Any]) -> None:
-        self.info, self._pixels = info, pixels
+    def __init__(self, path: Path, tif: Any, info: StackInfo, order: tuple[int, ...]) -> None:
+        super().__init__(path, info, info.shape[0], info.shape[0] * info.frame_bytes)  # a copy if axes are reordered
+        self._tif, self._order = tif, order
 
-    def frame(self, index: int) -> NDArray[Any]:
-        """Pixels of a frame as stored."""
-        return np.array(self._pixels[index])
+    def read_block(self, first: int, last: int) -> NDArray[Any]:
+        """All frames, (T, H, W) or (T, C, H, W)."""
+        pixels: NDArray[Any] = self._tif.series[0].asarray(squeeze=False, maxworkers=1)
+        return pixels.transpose(self._order).reshape(self.info.shape)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._block = None
+        self._tif.close()
 
 
 class _SeriesReader:
@@ -235,22 +314,25 @@ class _PageReader:
         ValueError: If the pages differ in size or kind.
     """
 
-    def __init__(self, path: Path, tif: Any) -> None:
-        size = path.stat().st_size
-        pages = [_read_page(tif, number, size) for number in range(len(tif.pages))]
-        pages = [page for page in pages if not page.secondary] or pages
-        first = pages[0]
-        for page in pages:
+    def __init__(self, path: Path, tif: Any, headers: Sequence[_Header]) -> None:
+        kinds: dict[bytes, _Page] = {}
+        for number, header in enumerate(headers):
+            if header.layout not in kinds:
+                kinds[header.layout] = _read_page(tif, number)
+        primary = {layout for layout, page in kinds.items() if not page.secondary} or set(kinds)
+        numbers = [number for number, header in enumerate(headers) if header.layout in primary]
+        first = kinds[headers[numbers[0]].layout]
+        for page in (kinds[layout] for layout in kinds if layout in primary):
             if page.kind != first.kind:
                 raise ValueError(
                     f"frames of different size or kind: page {page.number} is {page.kind}, page {first.number} is "
                     f"{first.kind}"
                 )
-        self._path, self._tif, self._numbers = path, tif, [page.number for page in pages]
-        self._complete = _complete_pages([page.extent for page in pages], size)
+        self._path, self._tif, self._numbers = path, tif, numbers
+        self._complete = _complete_pages(tif, headers, numbers, path.stat().st_size)
         last = tif.pages[first.number].axes == "YXS"
-        info = _info(tif, (len(pages), *first.shape), first.dtype, first.photometric, channels_last=last)
-        lost = {"thumbnails and masks": None} if len(pages) < len(tif.pages) else {}
+        info = _info(tif, (len(numbers), *first.shape), first.dtype, first.photometric, channels_last=last)
+        lost = {"thumbnails and masks": None} if len(numbers) < len(headers) else {}
         self.info = replace(info, metadata={**info.metadata, **lost})
 
     def frame(self, index: int) -> NDArray[Any]:
@@ -275,6 +357,13 @@ def _check_one_page_per_frame(shape: tuple[int, ...], axes: str, pages: int) -> 
         )
 
 
+# programs that state how the pages of a file are arranged, as tifffile names them
+_ARRANGED = (
+    *("shaped", "lsm", "mmstack", "ome", "imagej", "ndtiff", "fluoview", "stk", "sis", "svs", "scn", "qpi", "ndpi"),
+    *("bif", "avs", "eer", "philips", "scanimage", "nih", "mdgel"),
+)
+
+
 def _series_of_all_frames(tif: Any) -> Any | None:
     """The series of pages in which the file arranges all its frames; None if every page is a frame.
 
@@ -288,6 +377,8 @@ def _series_of_all_frames(tif: Any) -> Any | None:
         if pages < len(tif.pages):
             _check_one_page_per_frame(shape, metadata.get("axes", ""), pages)
             return None
+    if not any(getattr(tif, f"is_{kind}", False) for kind in _ARRANGED):
+        return None  # the series of all pages takes 0.3 ms per page
     tif.pages.useframes = len(tif.pages) > 1
     try:
         series = tif.series
@@ -303,31 +394,33 @@ def _series_of_all_frames(tif: Any) -> Any | None:
 def open_tiff(path: Path) -> FrameReader:
     """Open a TIFF file of one or many pages."""
     with readable_stack(path, "TIFF"):
-        _check_page_chain(path)
+        headers = _Headers(path).pages
         tif = tifffile.TiffFile(path)
         reader: FrameReader | None = None
         try:
             series = _series_of_all_frames(tif)
             if series is None:
                 tif.pages.useframes = False
-                reader = _PageReader(path, tif)
+                reader = _PageReader(path, tif, headers)
                 return reader
             info, order = _series_info(tif, series)
             in_order = tuple(sorted(order))
             frame_by_frame = order == in_order or (
                 info.channels_last and (*order[:-3], *order[-2:], order[-3]) == in_order
             )
-            if series.dataoffset is not None and frame_by_frame:
-                return ContiguousReader(path, info, series.dataoffset, series.dtype.newbyteorder(tif.byteorder))
-            size = path.stat().st_size
-            complete = _complete_pages([_extent(page, size) for page in tif.pages], size)
+            if series.dataoffset is not None:
+                dtype = series.dtype.newbyteorder(tif.byteorder)
+                if frame_by_frame:
+                    return ContiguousReader(path, info, series.dataoffset, dtype)
+                shape, axes = (1, *series.get_shape(squeeze=False)), (0, *(axis + 1 for axis in order))
+                return InterleavedReader(path, info, series.dataoffset, dtype, shape, axes)
+            complete = _complete_pages(tif, headers, range(len(headers)), path.stat().st_size)
             try:
                 reader = _SeriesReader(path, tif, info, order, complete)
             except ValueError:
                 if not all(complete):
                     raise
-                pixels: NDArray[Any] = series.asarray(squeeze=False, maxworkers=1)
-                return _ArrayReader(info, pixels.transpose(order).reshape(info.shape))
+                reader = _WholeReader(path, tif, info, order)
             return reader
         finally:
             if reader is None:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.io.formats import StackFormat, needed_package
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 
@@ -41,6 +42,9 @@ _MATRICES = {
     7: (0, -1, -1, 0),
     8: (0, -1, 1, 0),
 }
+
+
+_FRAMES = 8  # decoded frames of a decoder; each has at most 6 bytes per pixel
 
 
 def _av() -> Any:
@@ -111,6 +115,8 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
         stream = container.streams.best("video")
         if stream is None:
             raise ValueError("it contains no video stream")
+        size = stream.width * stream.height
+        check_fits(f"{path}: frames of {stream.height} x {stream.width} px", _FRAMES * 6 * size, "free more memory")
         times, first = [], None
         for frame in _frames(container):
             first = first or frame

@@ -1,5 +1,7 @@
 """Stacks in Zarr v3 arrays in a local folder."""
 
+import math
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -7,13 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.validation import read_json
-from rsvib_torch.io.formats import ArrayReader, FrameWriter, StackFormat, needed_package
+from rsvib_torch.io.blocks import ArrayReader
+from rsvib_torch.io.formats import FrameWriter, StackFormat, needed_package
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_from_attributes, readable_stack
 
 __all__ = ["FORMAT"]
 
 _HEADER = "zarr.json"
+_MAX_CHUNKS = 1 << 14  # per frame; each takes about 0.3 ms
+_CONCURRENT = 10  # chunks that zarr decodes at the same time (async.concurrency)
+_BUFFERS = 3  # of a chunk while it is decoded, at most; measured with gzip, zstd needs 2
 
 
 def _zarr() -> Any:
@@ -50,7 +56,12 @@ def _check_codecs(codecs: Any) -> None:
 def _check_sizes(array: Any, info: StackInfo, folder: Path) -> None:
     """Raise a ``ValueError`` if the pixels cannot be in the folder, before memory is allocated for them."""
     chunk = int(np.prod(array.shards or array.chunks, dtype=object)) * array.dtype.itemsize
-    held = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    held = 0
+    for file in folder.rglob("*"):
+        mode = file.lstat().st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise ValueError(f"it contains {file.name}, which is not a regular file")
+        held += file.lstat().st_size if stat.S_ISREG(mode) else 0
     largest_chunk = 1 << 30  # bytes, also of a frame
     largest_ratio = 100_000  # of pixels to stored bytes; chunks of constant frames are very small
     if max(chunk, info.frame_bytes) > largest_chunk or info.shape[0] * info.frame_bytes > largest_ratio * held:
@@ -74,7 +85,12 @@ def _open(path: Path) -> ArrayReader:
         check_dtype(array.dtype)
         info = info_from_attributes(dict(array.attrs), tuple(int(size) for size in array.shape), array.dtype)
         _check_sizes(array, info, folder)
-        return ArrayReader(path, info, array)
+        chunk_frames = min(array.chunks[0], info.shape[0]) if array.ndim > 2 else 1
+        chunks = math.prod(-(-size // part) for size, part in zip(array.shape[-2:], array.chunks[-2:], strict=True))
+        if chunks > _MAX_CHUNKS:
+            raise ValueError(f"a frame is divided into {chunks} chunks; expected at most {_MAX_CHUNKS}")
+        chunk_bytes = math.prod(array.chunks) * array.dtype.itemsize
+        return ArrayReader(path, info, array, chunk_frames, _BUFFERS * min(chunks, _CONCURRENT) * chunk_bytes)
 
 
 class _ZarrWriter(FrameWriter):

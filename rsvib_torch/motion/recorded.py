@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.option_types import MotionUnit, TimeUnit
+from rsvib_torch.core.reading import check_regular
+from rsvib_torch.core.text import one_line
 from rsvib_torch.motion.spline import FreeMotion
 
 __all__ = ["MotionUnit", "TimeUnit", "read_motion"]
@@ -94,6 +96,7 @@ def read_motion(
 def _table(path: Path, least_samples: int = 4) -> tuple[Array, Array]:
     """Times (N,) and values (N, 2) of a file; a cubic spline requires at least 4 samples."""
     rows: list[list[float]] = []
+    check_regular(path)
     with path.open(newline="", encoding="utf-8-sig") as file:
         try:
             reader = csv.DictReader(file, skipinitialspace=True)
@@ -101,7 +104,7 @@ def _table(path: Path, least_samples: int = 4) -> tuple[Array, Array]:
             missing = [name for name in _COLUMNS if name not in names]
             if missing:
                 present = ", ".join(names) or "nothing"
-                raise ValueError(f"{path}: column {missing[0]!r} is missing; the first line has {present}")
+                raise ValueError(f"{path}: column {missing[0]!r} is missing; the first line has {one_line(present)}")
             reader.fieldnames = names
             rows.extend([_number(path, reader.line_num, name, row[name]) for name in _COLUMNS] for row in reader)
         except (UnicodeDecodeError, csv.Error) as error:
@@ -118,7 +121,7 @@ def _number(path: Path, line: int, name: str, text: str | None) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{path}, line {line}: {name} must be a number, got {text!r}")
+        raise ValueError(f"{path}, line {line}: {name} must be a number, got {one_line(repr(text), 60)}")
     return value
 
 

@@ -52,7 +52,9 @@ def restore_in_strips(
     """
     count, (height, width) = images.shape[1], images.shape[-2:]
     if motion.num_axes == 2:
-        return method(images, frame_motion(motion, timing, count, height), **options)
+        of_frames = frame_motion(motion, timing, count, height)
+        of_frames.check_fits(height, width)
+        return method(images, of_frames, **options)
     starts = timing.frame_starts(count).tolist()
     strips = _strips(motion, (height, width), starts[0], starts[-1] + height * timing.row_time + timing.exposure_time)
     of_strips = ColumnMotion.of_columns(motion, strips.columns, timing, count, height)
@@ -60,7 +62,9 @@ def restore_in_strips(
         name: strips.cut(value) if isinstance(value, Tensor) and value.shape[-2:] == images.shape[-2:] else value
         for name, value in options.items()
     }
-    return strips.joined(method(strips.cut(images), frame_motion(of_strips, timing, count, height), **cut))
+    of_frames = frame_motion(of_strips, timing, count, height)
+    of_frames.check_fits(height, width)
+    return strips.joined(method(strips.cut(images), of_frames, **cut))
 
 
 def judged_strip(
@@ -80,7 +84,9 @@ def judged_strip(
     """
     count, (height, width) = len(raw), raw.shape[-2:]
     if motion.num_axes == 2:
-        return raw, restored, hidden, frame_motion(motion, timing, count, height)
+        of_frames = frame_motion(motion, timing, count, height)
+        of_frames.check_fits(height, width)
+        return raw, restored, hidden, of_frames
     strip = min(columns, width // 2)
     halves = [slice(middle - strip // 2, middle - strip // 2 + strip) for middle in (width // 4, width - width // 4)]
     both = torch.cat([raw[0][..., half] for half in halves], -1)

@@ -46,16 +46,32 @@ class FrameMotion:
             scene_rows - self.shift[..., 1, None], self.frame_starts[:, None], self.timing, self.vibration
         )
 
-    def reaches(self, num_rows: int) -> list[int]:
-        """For each stack, a bound on the displacement along one of ``num_rows`` rows, beyond the shift, in whole px."""
+    def _bounds(self, num_rows: int) -> Tensor:
+        """Bound (B, T, axes) on the displacement in a frame of ``num_rows`` rows, beyond the shift, in px."""
         half = 0.5 * (num_rows * self.timing.row_time + self.timing.exposure_time)
         first, middle, last = (
             self.vibration.drift((self.frame_starts + delay).expand(len(self.shift), -1)).detach()
             for delay in (0.0, half, 2 * half)
         )
         drift = torch.maximum((first - middle).abs(), (last - middle).abs())
-        bound = self.vibration.largest_oscillation()[:, None] + drift
-        return [math.ceil(reach + 0.5) for reach in bound[..., 0].amax(1).tolist()]
+        return self.vibration.largest_oscillation()[:, None] + drift
+
+    def check_fits(self, height: int, width: int) -> None:
+        """Raise a ``ValueError`` if frames of this size, in row order, may move by more than their own size.
+
+        No content is then certain to stay in the frame, and kernels and padding grow with the motion.
+        """
+        bounds = self._bounds(height).amax((0, 1)).tolist()
+        for direction, bound, size in zip(("along", "across"), bounds, (width, height), strict=False):
+            if not bound <= size:  # also NaN
+                raise ValueError(
+                    f"the motion {direction} the rows reaches {bound:.4g} px within a frame, more than its size of "
+                    f"{size} px; check the unit of amplitudes (px) and image motion (px/s)"
+                )
+
+    def reaches(self, num_rows: int) -> list[int]:
+        """For each stack, a bound on the displacement along one of ``num_rows`` rows, beyond the shift, in whole px."""
+        return [math.ceil(reach + 0.5) for reach in self._bounds(num_rows)[..., 0].amax(1).tolist()]
 
     def reach(self, num_rows: int) -> int:
         """The largest of ``reaches``."""
@@ -116,6 +132,7 @@ def visible_pixels(
         motion = frame_motion(
             _of_column(rowwise, column, row_timing, num_frames, height), row_timing, num_frames, height
         )
+        motion.check_fits(height, width)
         rows = motion.frame_rows(torch.arange(height, dtype=torch.float64, device=vibration.device))
         starts = motion.row_starts(rows)
         displacement = (

@@ -183,7 +183,8 @@ def restore(
 
     Raises:
         TypeError: If an argument has the wrong type or the method does not know an option.
-        ValueError: If a value is out of range, or frames, timing and vibration do not fit together.
+        ValueError: If a value is out of range, frames, timing and vibration do not fit together, or the motion within a
+            frame is larger than the frame.
 
     Warns:
         RestorationWarning: If an axis is not restored, or the restored frames are no better than the raw ones. If both

@@ -18,6 +18,8 @@ from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 
 __all__ = ["restore_richardson_lucy"]
 
+_MAX_ITERATIONS = 1000  # each takes the time of four blurs; noise is amplified long before (docs/method.md)
+
 
 def restore_richardson_lucy(
     frames: Tensor,
@@ -41,13 +43,13 @@ def restore_richardson_lucy(
         joint: ``True``: one image from all frames, in the coordinates of the middle one (the time axis keeps length
             1); a number K: every frame from K neighbouring ones; ``False``: every frame from itself. With
             image motion, only the part that a frame shares with the restored one is used.
-        iterations: Number of iterations.
+        iterations: Number of iterations, at most 1000.
         ignore: Boolean mask shaped like the frames of pixels that do not count.
 
     Returns:
         Non-negative restored frames of the same shape, or (B, 1, C, H, W).
     """
-    iterations = check_whole_number("iterations", iterations, at_least=1)
+    iterations = check_whole_number("iterations", iterations, at_least=1, at_most=_MAX_ITERATIONS)
     B, T, _, H, W = frames.shape
     groups = joint_groups(T, joint)
     starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device))

@@ -2,11 +2,12 @@
 
 import logging
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from dataclasses import replace
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import torch
@@ -19,6 +20,7 @@ from rsvib_torch.stacks.windows import Window
 __all__ = ["compute_here", "compute_with_dask"]
 
 _Result = TypeVar("_Result")
+NO_WORKERS_SECONDS = 60.0  # workers of a batch system start within this time after those before them ended
 
 
 def _one_thread_each(windows: Sequence[Window]) -> bool:
@@ -126,11 +128,51 @@ def _dask_client(scheduler: str, workers: int) -> Iterator[Any]:
             yield client
         return
     options = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.ERROR}
-    with (
-        distributed.LocalCluster(**options, processes=True, memory_limit=0) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):
+    with ExitStack() as opened:
+        try:
+            cluster = opened.enter_context(distributed.LocalCluster(**options, processes=True, memory_limit=0))
+            client = opened.enter_context(distributed.Client(cluster, set_as_default=False))
+        except (OSError, RuntimeError) as error:
+            raise OSError(f"Dask workers cannot be started: {' '.join(str(error).split())}") from error
         yield client
+
+
+@dataclass(frozen=True)
+class _DaskResult:
+    """The result of a window that Dask workers compute."""
+
+    client: Any
+    future: Any
+    window: Window
+
+    def result(self) -> Any:
+        """Wait for the result.
+
+        Raises:
+            OSError: If the workers of the window died repeatedly, there are none, or the scheduler does not answer.
+        """
+        distributed = needed_package("distributed", "the Dask engine", "distributed")
+        last_seen = time.monotonic()
+        while True:
+            try:
+                return self.future.result(timeout=1.0)
+            except distributed.TimeoutError:
+                if self.future.done():
+                    return self.future.result()  # or its error
+                if self.client.scheduler_info(n_workers=-1)["workers"]:
+                    last_seen = time.monotonic()
+                elif time.monotonic() - last_seen > NO_WORKERS_SECONDS:
+                    raise OSError(
+                        f"no Dask workers for {NO_WORKERS_SECONDS:g} s; start workers, and resume the run"
+                    ) from None
+            except distributed.KilledWorker as error:
+                raise OSError(
+                    f"Dask workers died {error.allowed_failures + 1} times while they computed window "
+                    f"{self.window.index} (frames {self.window.first} to {self.window.last}); check their memory, "
+                    "and resume the run"
+                ) from None
+            except CancelledError as error:
+                raise OSError("the connection to the Dask scheduler was lost; resume the run") from error
 
 
 def compute_with_dask(
@@ -148,14 +190,18 @@ def compute_with_dask(
 
     Yields:
         Frames to store, in the order of the windows.
+
+    Raises:
+        OSError: If workers cannot be started, die repeatedly, or are missing for a minute.
     """
     job = replace(job, source=job.source.absolute())
     one_thread = _one_thread_each(windows)
     with _dask_client(scheduler, workers) as client:
 
-        def submit(window: Window) -> Any:
+        def submit(window: Window) -> _DaskResult:
             # the job is sent with every task: scattered data are lost with the worker that holds them
-            return client.submit(_compute_on_worker, job.of_window(window), window, one_thread, retries=3, pure=False)
+            task = client.submit(_compute_on_worker, job.of_window(window), window, one_thread, retries=3, pure=False)
+            return _DaskResult(client, task, window)
 
         def two_per_worker() -> int:
             return 2 * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
@@ -165,4 +211,4 @@ def compute_with_dask(
             yield from _results_in_order(windows, submit, two_per_worker, waiting)
         finally:
             with suppress(Exception):
-                client.cancel(list(waiting))
+                client.cancel([result.future for result in waiting])

@@ -22,7 +22,7 @@ from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts, requir
 from rsvib_torch.io.schema import DetectedVibration, detection_to_json
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.stacks.memory import parse_memory, windows_at_once
+from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted
 from rsvib_torch.stacks.windows import Window, cut_windows, window_timing
 
@@ -279,6 +279,7 @@ def plan_job(
     restores: bool = True,
     given: Sequence[DetectedVibration | None] | None = None,
     bad_frames: BadFrames = "pass",
+    here: bool = True,
 ) -> tuple[StackJob, list[Window], int]:
     """The job of a run, its windows, and how many of them to compute at once.
 
@@ -289,11 +290,12 @@ def plan_job(
         restores: Whether frames are restored.
         given: As in ``process_stack``.
         bad_frames: As in ``process_stack``.
+        here: Whether windows are computed on this machine, in the memory that is free.
 
     Raises:
         OSError: If the stack cannot be read.
         TypeError: If an option is unknown.
-        ValueError: If a value is out of range or contradicts the stack.
+        ValueError: If a value is out of range or contradicts the stack, or a window does not fit into the memory.
     """
     known = (RestoreOptions if restores else DetectOptions).__optional_keys__
     if unknown := sorted(options.keys() - known):
@@ -337,5 +339,7 @@ def plan_job(
         most = 1
     else:
         most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    limit = None if options.get("memory") is None else parse_memory(options["memory"])
-    return job, windows, windows_at_once(info, job.window, memory=limit, most=most, restoration=job.restoration)
+    if not here:  # the memory of other machines is not known
+        return job, windows, most
+    limits = {"memory": options.get("memory"), "most": most, "on_gpu": device != "cpu"}
+    return job, windows, windows_at_once(info, job.window, restoration=job.restoration, **limits)

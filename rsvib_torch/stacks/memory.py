@@ -1,15 +1,16 @@
 """Memory planning: how many windows can be processed at once in the available memory."""
 
-import os
 import re
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import psutil
 
+from rsvib_torch.core.free_memory import check_fits, free_memory, size_text
 from rsvib_torch.io.stack_info import StackInfo
 
-__all__ = ["available_memory", "memory_needed", "parse_memory", "windows_at_once"]
+__all__ = ["check_stack_fits", "memory_limit", "memory_needed", "parse_memory", "windows_at_once"]
 
 # bytes; of the process with its libraries, and of a window independent of its size; peaks measured by
 # scripts/benchmark.py --only memory, rounded up
@@ -38,17 +39,24 @@ def parse_memory(text: str | float) -> int:
     return size
 
 
-def available_memory() -> int | None:
-    """Free memory in bytes; None if the system does not report it."""
-    try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return None
+def memory_limit(memory: str | float | None) -> int:
+    """Limit for the memory of the process in bytes: as stated, else three quarters of what it has and can get.
+
+    Args:
+        memory: As in ``iterate_stack``.
+    """
+    if memory is not None:
+        return parse_memory(memory)
+    return int(0.75 * (psutil.Process().memory_info().rss + free_memory()))
 
 
-def memory_needed(info: StackInfo, window: int, restoration: Mapping[str, Any] | None, count: int = 1) -> int:
+def memory_needed(
+    info: StackInfo, window: int, restoration: Mapping[str, Any] | None, count: int = 1, *, on_gpu: bool = False
+) -> int:
     """Memory of the process in bytes while ``count`` windows are processed; arguments as in ``windows_at_once``."""
-    if restoration is None:
+    if on_gpu:
+        pixel_bytes = 8  # frames and result as float32; the rest is in the memory of the GPU
+    elif restoration is None:
         pixel_bytes = min(_PIXEL_BYTES.values())
     elif restoration.get("prior", "gaussian") != "gaussian":  # other priors need at most as much as "edges"
         pixel_bytes = _PIXEL_BYTES["edges"]
@@ -56,34 +64,71 @@ def memory_needed(info: StackInfo, window: int, restoration: Mapping[str, Any] |
         pixel_bytes = _PIXEL_BYTES.get(restoration.get("method", "exact"), max(_PIXEL_BYTES.values()))
     pixels = min(window, info.shape[0]) * int(np.prod(info.shape[1:], dtype=object))
     queued = 2 * pixels * np.dtype(info.dtype).itemsize  # frames read ahead, and frames to be written
-    return _PROCESS_BYTES + queued + count * (_WINDOW_BYTES + pixels * pixel_bytes + queued)
+    once = _PROCESS_BYTES + info.decoding_bytes + queued
+    return once + count * (_WINDOW_BYTES + pixels * pixel_bytes + queued)
 
 
 def windows_at_once(
-    info: StackInfo, window: int, *, memory: int | None, most: int, restoration: Mapping[str, Any] | None
+    info: StackInfo,
+    window: int,
+    *,
+    memory: str | float | None,
+    most: int,
+    restoration: Mapping[str, Any] | None,
+    on_gpu: bool = False,
 ) -> int:
     """Number of windows that can be processed at once.
 
     Args:
         info: The stack.
         window: Frames per window.
-        memory: Limit for the process in bytes; None for 80 % of the free memory.
+        memory: As in ``iterate_stack``.
         most: Number of processors.
         restoration: Options of ``restore``; None for detection only.
+        on_gpu: Whether windows are computed on a GPU; only the memory of the machine is limited.
 
     Raises:
-        ValueError: If a stated limit is too small for one window.
+        ValueError: If the limit is too small for one window, with the required size and the largest window that fits.
     """
-    process, one = (memory_needed(info, window, restoration, count) for count in (0, 1))
-    free = available_memory()
-    if memory is None and free is None:
-        return most
-    limit = memory if memory is not None else int(0.8 * (free or 0))
+    limit = memory_limit(memory)
+
+    def needed(frames: int, count: int = 1) -> int:
+        return memory_needed(info, frames, restoration, count, on_gpu=on_gpu)
+
+    process, one = needed(window, 0), needed(window)
     count = (limit - process) // (one - process)
-    if count < 1 and memory is not None:
+    if count < 1:
+        origin = "" if memory is not None else " (three quarters of the memory that is free or used by this process)"
+        frames = min(window, info.shape[0])
+        fitting = next((smaller for smaller in range(frames - 1, 1, -1) if needed(smaller) <= limit), None)
+        if fitting is not None:
+            remedy = f"allow more (--memory), or process at most {fitting} frames at once (--window)"
+        elif info.decoding_bytes > info.frame_bytes:
+            remedy = (
+                f"allow more (--memory), or store each frame separately: {size_text(info.decoding_bytes)} are needed "
+                "to decode frames that the file stores together"
+            )
+        else:
+            remedy = "allow more (--memory), or process smaller frames"
         raise ValueError(
-            f"memory of {memory / 1e9:.2g} GB is too little: a window of {min(window, info.shape[0])} frames of "
-            f"{info.shape[-2]} x {info.shape[-1]} px takes about {one / 1e9:.2g} GB; allow more, "
-            "or smaller windows"
+            f"memory of {size_text(limit)}{origin} is too little: a window of {frames} frames of {info.shape[-2]} x "
+            f"{info.shape[-1]} px takes about {size_text(one)}; {remedy}"
         )
-    return int(max(1, min(most, count)))
+    return int(min(most, count))
+
+
+def check_stack_fits(info: StackInfo, restoration: Mapping[str, Any] | None = None, *, on_gpu: bool = False) -> None:
+    """Raise a ``ValueError`` if a stack that is processed as a whole does not fit into the free memory.
+
+    Args:
+        info: The stack.
+        restoration: As in ``windows_at_once``.
+        on_gpu: As in ``windows_at_once``.
+    """
+    needed = memory_needed(info, info.shape[0], restoration, on_gpu=on_gpu)
+    check_fits(
+        f"{info.path or 'the frames'}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px, processed "
+        "together,",
+        needed - psutil.Process().memory_info().rss,
+        "process them in windows (rsvib run, rsvib detect --window 8)",
+    )

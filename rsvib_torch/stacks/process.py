@@ -113,8 +113,8 @@ def iterate_stack(source: PathLike, timing: SensorTiming, **options: Unpack[Rest
             - ``restoration``: Options of ``restore``, for frames whose full scale is 1.
             - ``full_scale``: As in ``read_stack``.
             - ``force``: Whether to return restored frames even if they are judged worse than the raw ones.
-            - ``memory``: Limit for the memory of the process, in bytes or like ``"2GB"``; by default 80 % of the free
-              memory.
+            - ``memory``: Limit for the memory of the process, in bytes or like ``"2GB"``; by default three
+              quarters of the memory that is free or used by the process.
             - ``workers``: Maximum number of windows to compute at once; by default the number of processors.
             - ``device``: ``"auto"``, ``"cpu"`` or ``"cuda"``.
 
@@ -124,7 +124,7 @@ def iterate_stack(source: PathLike, timing: SensorTiming, **options: Unpack[Rest
     Raises:
         OSError: If the stack cannot be read.
         TypeError: If an option is unknown.
-        ValueError: If a value is out of range, or the stack is not readable.
+        ValueError: If a value is out of range, the stack is not readable, or a window does not fit into the memory.
 
     Example:
         >>> import tempfile
@@ -234,8 +234,8 @@ def process_stack(
         ModuleNotFoundError: If an optional package is missing, with the extra to install.
         OSError: If a file cannot be read or written; the run can then be resumed.
         TypeError: If an option is unknown.
-        ValueError: If a value is out of range, the stack is not readable, detection fails in all first windows, or
-            input, settings or versions differ from those of the run to resume.
+        ValueError: If a value is out of range, the stack is not readable, a window does not fit into the memory,
+            detection fails in all first windows, or input, settings or versions differ from those of the run to resume.
 
     Example:
         >>> import tempfile
@@ -260,7 +260,8 @@ def process_stack(
         True
     """
     start, sink = time.perf_counter(), Path(sink)
-    job, windows, at_once = plan_job(source, timing, options, given=given, bad_frames=bad_frames)
+    here = scheduler in (None, "local")
+    job, windows, at_once = plan_job(source, timing, options, given=given, bad_frames=bad_frames, here=here)
     if given is not None and len(given) != len(windows):
         raise ValueError(
             f"given has {len(given)} detections for {len(windows)} windows of at most {job.window} frames; "

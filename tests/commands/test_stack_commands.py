@@ -142,7 +142,7 @@ def test_bad_frames_are_reported(place, tmp_path, capsys):
     ("options", "message"),
     [
         (("--memory", "much"), "memory must be like '2GB' or '500MB', got 'much'"),
-        (("--memory", "100MB"), "memory of 0.1 GB is too little: a window of 4 frames of 96 x 64 px takes about"),
+        (("--memory", "100MB"), "memory of 100 MB is too little: a window of 4 frames of 96 x 64 px takes about"),
         (("--window", 1), "window must be at least 2, got 1"),
         (("--output", "../restored.tif"), "--output must be a file name without a folder, got '../restored.tif'"),
         (("--output", "restored.webm"), "wmv files can only be read"),

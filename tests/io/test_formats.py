@@ -128,7 +128,7 @@ def test_npy_file_that_shrinks_while_open_is_an_error(tmp_path, order):
     with (tmp_path / "a.npy").open("r+b") as file:
         file.truncate(5000)
     for index in range(3):
-        with pytest.raises(FrameError, match=f"truncated: frame {index} lies beyond the end of the file"):
+        with pytest.raises(FrameError, match=f"frame {index} .*beyond the end of the file"):
             reader.frame(index)
     reader.close()
 

@@ -13,7 +13,7 @@ from small_stack import FRAMES, OPTIONS, STILL, TIMING, process_small, write_sma
 from truth import decibel
 
 import rsvib_torch as rsv
-from rsvib_torch.stacks import read_manifest
+from rsvib_torch.stacks import Window, engines, read_manifest
 
 
 @pytest.fixture(scope="module", name="place")
@@ -74,6 +74,25 @@ def test_workers_that_are_killed_are_replaced(place, tmp_path):
         assert len(done_at_death) == 2
         assert max(done_at_death) < FRAMES
     assert (tmp_path / "out.tif").read_bytes() == (place / "out.tif").read_bytes()
+
+
+def test_run_ends_if_there_are_no_workers(place, tmp_path, monkeypatch):
+    monkeypatch.setattr(engines, "NO_WORKERS_SECONDS", 0.5)
+    with (
+        distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=None, protocol="inproc") as cluster,
+        pytest.raises(OSError, match=r"no Dask workers for 0.5 s; start workers, and resume the run"),
+    ):
+        process_small(place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address)
+    assert not (tmp_path / "out.tif").exists()
+
+
+def test_window_that_kills_its_workers_is_named():
+    class Future:
+        def result(self, timeout):
+            raise distributed.KilledWorker("task", None, 3)
+
+    with pytest.raises(OSError, match=r"workers died 4 times while they computed window 5 \(frames 10 to 12\)"):
+        engines._DaskResult(None, Future(), Window(5, 10, 12, 2)).result()
 
 
 @pytest.mark.slow

@@ -1,0 +1,122 @@
+"""Memory that this process can still use: of the machine, and of its control groups (containers, batch systems)."""
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+__all__ = ["check_fits", "free_memory", "size_text"]
+
+
+def size_text(count: int) -> str:
+    """A number of bytes with its unit.
+
+    Example:
+        >>> size_text(6_300_000_000), size_text(96_000)
+        ('6.3 GB', '96 KB')
+    """
+    for unit, factor in (("GB", 10**9), ("MB", 10**6)):
+        if count >= factor:
+            return f"{count / factor:.3g} {unit}"
+    return f"{count / 1000:.3g} KB"
+
+
+def free_memory(root: Path = Path("/")) -> int:
+    """Memory in bytes that this process can allocate in addition to what it has: the smallest of all limits.
+
+    Files in the page cache count as free, as the system drops them when memory is needed.
+
+    Args:
+        root: Folder that contains ``proc`` and ``sys``.
+
+    Example:
+        >>> free_memory() > 1_000_000
+        True
+    """
+    return max(0, min([int(psutil.virtual_memory().available), *_free_in_groups(root), *_free_addresses()]))
+
+
+def check_fits(what: str, needed: int, remedy: str) -> None:
+    """Raise a ``ValueError`` if ``needed`` bytes exceed the free memory, before they are allocated.
+
+    Args:
+        what: What needs them, the first words of the message.
+        needed: Bytes in addition to the memory of the process.
+        remedy: What to do, the last words of the message.
+
+    Example:
+        >>> check_fits("frames", 1000, "read fewer")
+        >>> check_fits("16 frames", 10**18, "read fewer")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        ValueError: 16 frames need 1e+09 GB of memory, of which ... are free; read fewer
+    """
+    free = free_memory()
+    if needed > free:
+        raise ValueError(f"{what} need {size_text(needed)} of memory, of which {size_text(free)} are free; {remedy}")
+
+
+def _free_addresses() -> list[int]:
+    """Free part of the address space, if it is limited (``ulimit -v``, some batch systems)."""
+    if resource is None:
+        return []
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return [] if limit == resource.RLIM_INFINITY else [limit - int(psutil.Process().memory_info().vms)]
+
+
+def _free_in_groups(root: Path) -> Iterator[int]:
+    """Free memory of each control group of this process and of those above it, if they have a limit.
+
+    Version 2 (https://docs.kernel.org/admin-guide/cgroup-v2.html) and version 1 (.../cgroup-v1/memory.html).
+    """
+    names = {
+        "cgroup2": (("memory.max", "memory.high"), "memory.current", "inactive_file"),
+        "cgroup": (("memory.limit_in_bytes",), "memory.usage_in_bytes", "total_inactive_file"),
+    }
+    for kind, own, top in _groups(root):
+        limits, usage, cache = names[kind]
+        for group in (own, *own.parents):
+            cached = re.search(rf"^{cache} (\d+)$", _text(group / "memory.stat"), re.MULTILINE)
+            for used in _number(group / usage):
+                for limit in (number for name in limits for number in _number(group / name)):
+                    yield limit - used + (int(cached[1]) if cached else 0)
+            if group == top:
+                break
+
+
+def _groups(root: Path) -> Iterator[tuple[str, Path, Path]]:
+    """Type of the file system, folder of the group of this process, and the folder where they are mounted."""
+    own = {}
+    for line in _text(root / "proc/self/cgroup").splitlines():
+        _, controllers, path = line.split(":", 2)
+        if controllers == "" or "memory" in controllers.split(","):
+            own["cgroup2" if controllers == "" else "cgroup"] = path
+    for line in _text(root / "proc/self/mountinfo").splitlines():
+        before, _, after = line.partition(" - ")
+        mounted, place = before.split()[3:5]
+        kind, _, options = after.split(maxsplit=2)
+        if kind in own and (kind == "cgroup2" or "memory" in options.split(",")):
+            top = root / place.lstrip("/")
+            inside = os.path.relpath(own[kind], mounted)
+            group = top if inside.startswith("..") else top / inside  # another namespace: only the top is visible
+            yield kind, group if group.is_dir() else top, top
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+
+
+def _number(path: Path) -> list[int]:
+    """The number in a file, or nothing: the file does not exist, or contains ``max``."""
+    text = _text(path).strip()
+    return [int(text)] if text.isdecimal() else []

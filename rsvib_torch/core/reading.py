@@ -1,0 +1,48 @@
+"""Reading of files that a user names: only regular files, and only as many bytes as they state."""
+
+import stat
+from pathlib import Path
+
+from rsvib_torch.core.free_memory import size_text
+
+__all__ = ["check_regular", "read_text"]
+
+_KINDS = {stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device"}
+
+
+def check_regular(path: Path) -> None:
+    """Raise an error if a path is neither a regular file nor a folder: reading others can wait or go on forever.
+
+    Raises:
+        OSError: If it does not exist.
+        ValueError: If it is a pipe, a socket or a device.
+
+    Example:
+        >>> check_regular(Path("/dev/null"))
+        Traceback (most recent call last):
+        ...
+        ValueError: /dev/null: expected a regular file, this is a device
+    """
+    mode = path.stat().st_mode
+    for is_kind, name in _KINDS.items():
+        if is_kind(mode):
+            raise ValueError(f"{path}: expected a regular file, this is {name}")
+
+
+def read_text(path: Path, *, at_most: int) -> str:
+    """Text of a file in UTF-8.
+
+    Args:
+        path: The file.
+        at_most: Largest size in bytes.
+
+    Raises:
+        OSError: If it cannot be opened.
+        ValueError: If it is not a regular file, larger, or not UTF-8.
+    """
+    check_regular(path)
+    with path.open("rb") as file:
+        size = path.stat().st_size  # 0 for files of /proc, some of which have no end
+        if size > at_most:
+            raise ValueError(f"{path}: {size_text(size)} are too large; expected at most {size_text(at_most)}")
+        return file.read(size).decode("utf-8")

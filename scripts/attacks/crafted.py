@@ -1,0 +1,672 @@
+"""Files that were crafted to exhaust memory or time: each is opened in a child process with limits for both."""
+
+import io
+import json
+import multiprocessing
+import os
+import resource
+import struct
+import time
+import traceback
+import zlib
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+import av
+import h5py
+import numpy as np
+import psutil
+import tifffile
+import zarr
+from attacks.trial import Outcome, Trial
+from PIL import Image
+
+import rsvib_torch as rsv
+from rsvib_torch.config import read_config
+from rsvib_torch.report.results import read_vibration
+from rsvib_torch.stacks import read_manifest
+
+__all__ = ["CASES", "crafted", "trials"]
+
+_CPU_SECONDS, _SECONDS, _BYTES = 20.0, 90.0, 2 * 10**9  # limits of one file; others may use the processor
+_TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
+_CAMERA = "[sensor]\nrow_time = 1e-4\nexposure_rows = 6\nframe_rows = 104\nfull_scale = 4095\n"
+_HUGE = (2**31 - 1, 2**32 - 1, 2**40, 2**63 - 1, 2**64 - 1)
+_DEEP = 20_000
+
+# A case writes a file into a folder and returns its path. The reader follows from the ending: a stack, a configuration,
+# a recorded motion, a vibration or a manifest.
+Case = Callable[[Path], Path]
+CASES: dict[str, Case] = {}
+
+
+def case(name: str) -> Callable[[Case], Case]:
+    """Add a case."""
+
+    def add(write: Case) -> Case:
+        CASES[name] = write
+        return write
+
+    return add
+
+
+def _text(name: str, text: str, folder: Path) -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def _data(name: str, data: bytes, folder: Path) -> Path:
+    path = folder / name
+    path.write_bytes(data)
+    return path
+
+
+def _sparse(name: str, head: bytes, size: int, folder: Path) -> Path:
+    """A file of a large size of which only the beginning is on the disk."""
+    path = _data(name, head, folder)
+    os.truncate(path, size)
+    return path
+
+
+# --- .npy ---------------------------------------------------------------------------------------------------------
+
+
+def _npy(shape: str, dtype: str = "'<u2'", order: str = "False", held: int = 1000) -> bytes:
+    text = f"{{'descr': {dtype}, 'fortran_order': {order}, 'shape': {shape}, }}"
+    header = text.encode() + b" " * (-(len(text) + 11) % 64) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(held)
+
+
+for _order, _shape in product(
+    ("False", "True"),
+    (
+        *("(1000000000000, 64, 64)", "(2, 4294967296, 4294967296)", "(9223372036854775807, 2, 2)", "(2, 0, 4)"),
+        *("(1, 1, 1)", "(-5, 8, 8)", f"({'9' * 400}, 8, 8)", f"({'2, ' * 60})", "(True, 8, 8)", "(8.0, 8, 8)", "()"),
+    ),
+):
+    CASES[f"npy: shape {_shape[:30]}, Fortran order {_order}"] = partial(_data, "a.npy", _npy(_shape, order=_order))
+for _dtype in (
+    "'O'",
+    "'<U1000000000'",
+    "'V1000000000'",
+    "[('a', '<u2')]",
+    "('<f4', (100000, 100000))",
+    "'|S0'",
+    "'M8'",
+):
+    CASES[f"npy: type {_dtype}"] = partial(_data, "a.npy", _npy("(2, 64, 64)", _dtype))
+CASES["npy: nested header"] = partial(_data, "a.npy", _npy("(" * 5000 + ")" * 5000))
+CASES["npy: header of 4 GB"] = partial(_data, "a.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1) + b"{")
+CASES["npy: sparse file of 64 GB"] = partial(_sparse, "a.npy", _npy("(8, 65536, 65536)"), 2**36 + 1000)
+CASES["npy: sparse file of 64 GB, Fortran order"] = partial(
+    _sparse, "a.npy", _npy("(8, 65536, 65536)", order="True"), 2**36 + 1000
+)
+CASES["npy: 10^8 frames of one pixel"] = partial(_sparse, "a.npy", _npy("(100000000, 1, 1)"), 2 * 10**8 + 1000)
+
+# --- raw ----------------------------------------------------------------------------------------------------------
+
+
+def _raw(folder: Path, *, size: int = 1000, **keys: object) -> Path:
+    content: dict[str, object] = {"format": "rsvib raw", "version": 1, "shape": [2, 16, 16], "axes": "THW"}
+    content |= {"dtype": "uint16"} | keys
+    _text("a.raw.json", json.dumps(content), folder)
+    return _sparse("a.raw", b"", size, folder)
+
+
+for _sizes in ([10**9, 64, 64], [2, 10**12, 10**12], [10**400, 2, 2], [0, 8, 8], [-1, 8, 8], [2] * 1000, []):
+    CASES[f"raw: shape {str(_sizes)[:30]}"] = partial(_raw, shape=_sizes)
+for _offset in _HUGE:
+    CASES[f"raw: offset {_offset}"] = partial(_raw, offset=_offset)
+CASES["raw: 10^6 frame times"] = partial(_raw, frame_times=[0.1 * i for i in range(10**6)])
+CASES["raw: sparse file of 64 GB"] = partial(_raw, size=2**36, shape=[8, 65536, 65536])
+CASES["raw: sidecar nested"] = lambda folder: (_raw(folder), _text("a.raw.json", "[" * _DEEP, folder))[0]
+CASES["raw: sidecar nested objects"] = lambda folder: (_raw(folder), _text("a.raw.json", '{"a":' * _DEEP, folder))[0]
+CASES["raw: sidecar with a long number"] = lambda folder: (
+    _raw(folder),
+    _text("a.raw.json", '{"shape": [' + "9" * 10**6 + ", 1, 1]}", folder),
+)[0]
+CASES["raw: sidecar of 2 GB"] = lambda folder: (_raw(folder), _sparse("a.raw.json", b"{", 2 * 10**9, folder))[0]
+
+# --- PNG and JPEG -------------------------------------------------------------------------------------------------
+
+
+def _chunk(kind: bytes, body: bytes, length: int | None = None) -> bytes:
+    size = len(body) if length is None else length
+    return struct.pack(">I", size) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def _png(width: int, height: int, bits: int = 8, colour: int = 0, pixels: int = 10**4, more: bytes = b"") -> bytes:
+    head = _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0))
+    packer = zlib.compressobj(9)
+    packed = b"".join(packer.compress(bytes(min(10**7, pixels - done))) for done in range(0, pixels, 10**7))
+    return b"\x89PNG\r\n\x1a\n" + head + more + _chunk(b"IDAT", packed + packer.flush()) + _chunk(b"IEND", b"")
+
+
+for _width, _height in ((2**31 - 1, 2**31 - 1), (2**31 - 1, 1), (1, 2**31 - 1), (10**6, 10**6), (0, 0), (2**32 - 1, 9)):
+    for _bits, _colour in ((8, 0), (16, 6)):
+        CASES[f"PNG: {_width} x {_height} px, {_bits} bits, colour type {_colour}"] = partial(
+            _data, "a.png", _png(_width, _height, _bits, _colour)
+        )
+
+
+@case("PNG: 30000 x 30000 px in 1 MB")
+def _png_bomb(folder: Path) -> Path:
+    return _data("a.png", _png(30000, 30000, pixels=30001 * 30000), folder)
+
+
+@case("PNG: folder of 200 bombs")
+def _png_folder(folder: Path) -> Path:
+    (folder / "frames").mkdir()
+    bomb = _png(12000, 12000, pixels=12001 * 12000)
+    for index in range(200):
+        (folder / "frames" / f"{index}.png").write_bytes(bomb)
+    return folder / "frames"
+
+
+CASES["PNG: text that expands to 1 GB"] = partial(
+    _data, "a.png", _png(16, 16, more=_chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(10**7), 9) * 100))
+)
+CASES["PNG: profile that expands"] = partial(
+    _data, "a.png", _png(16, 16, more=_chunk(b"iCCP", b"a\0\0" + zlib.compress(bytes(10**8), 9)))
+)
+CASES["PNG: chunk of 4 GB"] = partial(_data, "a.png", _png(16, 16, more=_chunk(b"tEXt", b"a", 2**32 - 1)))
+CASES["PNG: 10^5 empty chunks"] = partial(_data, "a.png", _png(16, 16, more=_chunk(b"tEXt", b"") * 10**5))
+CASES["PNG: full scale of 10^6 digits"] = partial(
+    _data, "a.png", _png(16, 16, more=_chunk(b"tEXt", b"full_scale\0" + b"9" * 10**6))
+)
+CASES["PNG: Exif that refers to itself"] = partial(
+    _data,
+    "a.png",
+    _png(16, 16, more=_chunk(b"eXIf", b"MM\0*\0\0\0\x08" + struct.pack(">HHHII", 1, 0x8769, 4, 1, 8) + bytes(4))),
+)
+
+
+def _jpeg(width: int, height: int) -> bytes:
+    buffer = io.BytesIO()
+    Image.new("L", (16, 16)).save(buffer, "JPEG")
+    data = buffer.getvalue()
+    start = data.index(b"\xff\xc0") + 5
+    return data[:start] + struct.pack(">HH", height, width) + data[start + 4 :]
+
+
+for _size in ((65500, 65500), (0, 0), (1, 65535), (12000, 12000)):
+    CASES[f"JPEG: {_size[0]} x {_size[1]} px"] = partial(_data, "a.jpg", _jpeg(*_size))
+
+# --- TIFF ---------------------------------------------------------------------------------------------------------
+
+
+def _ifd(entries: list[tuple[int, int, int, int]], following: int, big: bool = False) -> bytes:
+    layout = "<HHQQ" if big else "<HHII"
+    table = b"".join(struct.pack(layout, *entry) for entry in sorted(entries))
+    return struct.pack("<Q" if big else "<H", len(entries)) + table + struct.pack("<Q" if big else "<I", following)
+
+
+def _tiff(more: dict[int, tuple[int, int, int]], following: int = 0, tail: bytes = bytes(4096)) -> bytes:
+    """One page of 16 x 16 px, with other or additional tags (type, count, value or offset)."""
+    tags = {256: (4, 1, 16), 257: (4, 1, 16), 258: (3, 1, 16), 259: (3, 1, 1), 262: (3, 1, 1), 273: (4, 1, 512)}
+    tags |= {277: (3, 1, 1), 278: (4, 1, 16), 279: (4, 1, 512)} | more
+    directory = _ifd([(code, *values) for code, values in tags.items() if values[1]], following)
+    return b"II*\0" + struct.pack("<I", 8) + directory + tail
+
+
+for _code, _name in (
+    *((256, "width"), (257, "length"), (258, "bits"), (259, "compression"), (277, "samples"), (278, "rows per strip")),
+    *((322, "tile width"), (323, "tile length"), (339, "sample format"), (32997, "depth"), (284, "planar")),
+):
+    for _value in (0, 2**31 - 1, 2**32 - 1):
+        CASES[f"TIFF: {_name} {_value}"] = partial(_data, "a.tif", _tiff({_code: (4, 1, _value)}))
+for _code, _name in (
+    *((258, "bits"), (273, "strip offsets"), (279, "strip sizes"), (324, "tile offsets"), (270, "description")),
+    *((330, "SubIFDs"), (34665, "Exif"), (34735, "GeoKeys"), (50839, "ImageJ metadata"), (65000, "private tag")),
+):
+    for _kind, _count in ((3, 2**31 - 1), (2, 2**32 - 1), (12, 2**29)):
+        CASES[f"TIFF: {_name}, type {_kind}, {_count} values"] = partial(
+            _data, "a.tif", _tiff({_code: (_kind, _count, 64)})
+        )
+CASES["TIFF: the next page is the same"] = partial(_data, "a.tif", _tiff({}, 8))
+CASES["TIFF: SubIFD is the page itself"] = partial(_data, "a.tif", _tiff({330: (4, 1, 8)}))
+CASES["TIFF: Exif is the page itself"] = partial(_data, "a.tif", _tiff({34665: (4, 1, 8), 40965: (4, 1, 8)}))
+CASES["TIFF: the next page lies beyond the end"] = partial(_data, "a.tif", _tiff({}, 2**32 - 2))
+CASES["TIFF: strips of one byte"] = partial(
+    _data,
+    "a.tif",
+    _tiff({257: (4, 1, 10**6), 278: (4, 1, 1), 273: (4, 10**6, 512), 279: (4, 10**6, 512)}, 0, bytes(5 * 10**6)),
+)
+CASES["TIFF: 60000 x 60000 px in tiles of 16"] = partial(
+    _data, "a.tif", _tiff({256: (4, 1, 60000), 257: (4, 1, 60000), 322: (3, 1, 16), 323: (3, 1, 16), 273: (4, 0, 0)})
+)
+for _words in ('{"shape": [1000000000, 16, 16]}', '{"shape": [16, 16], "axes": "' + "T" * 10**5 + '"}', "[" * _DEEP):
+    CASES[f"TIFF: description {_words[:30]}"] = partial(
+        _data, "a.tif", _tiff({270: (2, len(_words) + 1, 600)}, tail=bytes(474) + _words.encode() + bytes(4096))
+    )
+for _words in ("ImageJ=1.53\nimages=1000000000\nframes=1000000000\n", "ImageJ=1.53\nimages=2\nslices=1000000\n"):
+    CASES[f"TIFF: {_words[12:40]!r}"] = partial(
+        _data, "a.tif", _tiff({270: (2, len(_words) + 1, 600)}, tail=bytes(474) + _words.encode() + bytes(4096))
+    )
+
+
+@case("TIFF: OME-XML with entities")
+def _tiff_ome(folder: Path) -> Path:
+    entities = "".join(f'<!ENTITY e{i + 1} "{f"&e{i};" * 10}">' for i in range(9))
+    kind = f'<!DOCTYPE OME [<!ENTITY e0 "a">{entities}]>'
+    text = f'<?xml version="1.0"?>{kind}<OME><Image><Pixels>&e9;</Pixels></Image></OME>'
+    return _data("a.tif", _tiff({270: (2, len(text) + 1, 600)}, tail=bytes(474) + text.encode() + bytes(4096)), folder)
+
+
+@case("TIFF: OME-XML with 10^9 planes")
+def _tiff_ome_planes(folder: Path) -> Path:
+    text = (
+        '<?xml version="1.0"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06"><Image ID="Image:0">'
+        '<Pixels ID="Pixels:0" DimensionOrder="XYZCT" Type="uint16" SizeX="16" SizeY="16" SizeZ="1" SizeC="1" '
+        'SizeT="1000000000"><TiffData/></Pixels></Image></OME>'
+    )
+    return _data(
+        "a.ome.tif", _tiff({270: (2, len(text) + 1, 600)}, tail=bytes(474) + text.encode() + bytes(900)), folder
+    )
+
+
+def _tiff_pages(folder: Path, count: int, alternating: bool = False) -> Path:
+    """Pages that share their pixels; every second one can have another size and be marked as a thumbnail."""
+    entries = [(256, 4, 1, 16), (257, 4, 1, 16), (258, 3, 1, 16), (259, 3, 1, 1), (262, 3, 1, 1), (273, 4, 1, 8)]
+    entries += [(277, 3, 1, 1), (278, 4, 1, 16), (279, 4, 1, 512)]
+    thumb = [(254, 4, 1, 1), *entries]
+    data, offset = [b"II*\0" + struct.pack("<I", 520) + bytes(512)], 520
+    for page in range(count):
+        chosen = thumb if alternating and page % 2 else entries
+        if alternating and page % 2:
+            chosen = [(code, kind, n, page if code == 256 else value) for code, kind, n, value in thumb]
+        size = 2 + 12 * len(chosen) + 4
+        offset += size
+        data.append(_ifd(chosen, 0 if page == count - 1 else offset))
+    return _data("a.tif", b"".join(data), folder)
+
+
+CASES["TIFF: 60000 pages"] = partial(_tiff_pages, count=60_000)
+CASES["TIFF: 20000 pages and thumbnails of different sizes"] = partial(_tiff_pages, count=20_000, alternating=True)
+
+
+@case("TIFF: 1 MB that expands to 3.6 GB")
+def _tiff_bomb(folder: Path) -> Path:
+    packer = zlib.compressobj(9)
+    packed = b"".join(packer.compress(bytes(9 * 10**6)) for _ in range(100)) + packer.flush()
+    data, offset = [b"II*\0" + struct.pack("<I", 8)], 8
+    entries = [(256, 4, 1, 30000), (257, 4, 1, 30000), (258, 3, 1, 8), (259, 3, 1, 8), (262, 3, 1, 1), (273, 4, 1, 512)]
+    entries += [(277, 3, 1, 1), (278, 4, 1, 30000), (279, 4, 1, len(packed))]
+    for page in range(4):  # of the same strip
+        offset += 2 + 12 * len(entries) + 4
+        data.append(_ifd(entries, offset if page < 3 else 0))
+    return _data("a.tif", b"".join(data).ljust(512, b"\0") + packed, folder)
+
+
+@case("TIFF: axes YXT, zlib, expands to 1.2 GB")
+def _tiff_yxt(folder: Path) -> Path:
+    path = folder / "a.tif"
+    tifffile.imwrite(
+        path,
+        np.zeros((3000, 2000, 200), np.uint8),
+        metadata={"axes": "YXT"},
+        compression="zlib",
+        photometric="minisblack",
+    )
+    return path
+
+
+# --- HDF5 ---------------------------------------------------------------------------------------------------------
+
+
+def _hdf5(folder: Path, write: Callable[[h5py.File], None]) -> Path:
+    path = folder / "a.h5"
+    with h5py.File(path, "w") as file:
+        write(file)
+    return path
+
+
+def _links_to_root(file: h5py.File, count: int) -> None:
+    for index in range(count):
+        file[f"link{index}"] = file["/"]
+
+
+def _chain(file: h5py.File, count: int) -> None:
+    group = file
+    for _ in range(count):
+        group = group.create_group("a")
+
+
+def _groups(file: h5py.File, count: int) -> None:
+    for index in range(count):
+        file.create_group(f"g{index}")
+
+
+def _mesh(file: h5py.File) -> None:
+    groups = [file.create_group(f"g{i}") for i in range(30)]
+    for group in groups:
+        for index, other in enumerate(groups):
+            group[f"to{index}"] = other
+
+
+def _zeros(file: h5py.File, shape: tuple[int, ...], **options: object) -> None:
+    file.create_dataset("frames", shape=shape, dtype="u2", **options)
+
+
+def _filled(file: h5py.File, shape: tuple[int, ...], **options: object) -> None:
+    data = file.create_dataset("frames", shape=shape, dtype="u2", **options)
+    data[: max(1, shape[0] // 2)] = 1
+
+
+def _virtual(file: h5py.File, source: str) -> None:
+    layout = h5py.VirtualLayout(shape=(4, 16, 16), dtype="u2")
+    layout[:] = h5py.VirtualSource(source, "frames", shape=(4, 16, 16))
+    file.create_virtual_dataset("frames", layout)
+
+
+def _times(file: h5py.File) -> None:
+    file.create_dataset("frames", data=np.zeros((4, 16, 16), "u2"))
+    file.create_dataset("timestamps", shape=(2**40,), dtype="f8", chunks=(1024,))
+
+
+def _virtual_times(file: h5py.File) -> None:
+    file.create_dataset("frames", data=np.zeros((4, 16, 16), "u2"))
+    layout = h5py.VirtualLayout(shape=(4,), dtype="f8")
+    layout[:] = h5py.VirtualSource("/dev/urandom", "a", shape=(4,))
+    file.create_virtual_dataset("timestamps", layout)
+
+
+def _external(file: h5py.File, name: str) -> None:
+    file.create_dataset("frames", shape=(4, 16, 16), dtype="u2", external=[(name, 0, h5py.h5f.UNLIMITED)])
+
+
+_ONE = (200, 512, 512)
+for _name, _write in {
+    "25 groups linked to the root": partial(_links_to_root, count=25),
+    "1000 groups linked to the root": partial(_links_to_root, count=1000),
+    "30 groups that contain each other": _mesh,
+    "2000 groups in each other": partial(_chain, count=2000),
+    "20000 groups": partial(_groups, count=20_000),
+    "no pixels stored, 2^60 bytes": partial(_zeros, shape=(2**25, 2**17, 2**17)),
+    "no chunks stored": partial(_zeros, shape=(2**25, 2**17, 2**17), chunks=(1, 64, 64)),
+    "chunk of 4 GB": partial(_zeros, shape=(100, 4000, 4000), chunks=(100, 4000, 4000), compression="gzip"),
+    "one chunk of 100 MB": partial(_filled, shape=_ONE, chunks=_ONE, compression="gzip"),
+    "chunks of 1 x 1 x 1": partial(_filled, shape=(8, 64, 64), chunks=(1, 1, 1)),
+    "virtual dataset of a device": partial(_virtual, source="/dev/urandom"),
+    "virtual dataset of itself": partial(_virtual, source="a.h5"),
+    "virtual times": _virtual_times,
+    "2^40 times": _times,
+    "external file /dev/urandom": partial(_external, name="/dev/urandom"),
+    "external file /etc/passwd": partial(_external, name="/etc/passwd"),
+    "external link": lambda file: file.__setitem__("frames", h5py.ExternalLink("/dev/urandom", "/a")),
+    "soft link to itself": lambda file: file.__setitem__("frames", h5py.SoftLink("/frames")),
+    "only a soft link to a group": lambda file: file.__setitem__("a", h5py.SoftLink("/")),
+    "dataset of type object": lambda file: file.create_dataset("frames", data=["a"] * 4, dtype=h5py.string_dtype()),
+    "attribute axes of 60 KB": lambda file: file.create_dataset("frames", data=np.zeros((2, 8, 8), "u2")).attrs.update(
+        {"axes": "T" * 60_000}
+    ),
+}.items():
+    CASES[f"HDF5: {_name}"] = partial(_hdf5, write=_write)
+
+# --- Zarr ---------------------------------------------------------------------------------------------------------
+
+
+def _zarr(folder: Path, *, held: int = 100, **keys: object) -> Path:
+    path = folder / "a.zarr"
+    array = zarr.create_array(path, shape=(4, 16, 16), chunks=(1, 16, 16), dtype="u2")
+    array[:] = 1
+    header = json.loads((path / "zarr.json").read_text()) | keys
+    (path / "zarr.json").write_text(json.dumps(header))
+    (path / "more").write_bytes(bytes(held))
+    return path
+
+
+def _chunks(*shape: int) -> dict[str, object]:
+    return {"name": "regular", "configuration": {"chunk_shape": shape}}
+
+
+for _shape3 in ((10**9, 64, 64), (2**62, 2**62, 2**62), (4, 10**6, 10**6), (0, 16, 16), (-1, 16, 16), (10**30, 8, 8)):
+    CASES[f"Zarr: shape {_shape3}"] = partial(_zarr, shape=_shape3)
+for _parts in ((1, 1, 1), (2**40, 2**40, 2**40), (0, 0, 0), (10**9, 16, 16), (4, 16), (-1, -1, -1)):
+    CASES[f"Zarr: chunks {_parts}"] = partial(_zarr, chunk_grid=_chunks(*_parts))
+CASES["Zarr: 10^9 chunks"] = partial(_zarr, held=10**5, shape=(1000, 1000, 1000), chunk_grid=_chunks(1, 1, 1))
+CASES["Zarr: 96 KB that expand to 6.3 GB"] = partial(
+    _zarr, held=96_000, shape=(96, 6000, 5500), chunk_grid=_chunks(1, 6000, 5500)
+)
+CASES["Zarr: chunk of 1 GB"] = partial(_zarr, held=96_000, shape=(512, 1024, 1024), chunk_grid=_chunks(512, 1024, 1024))
+CASES["Zarr: codecs in each other"] = partial(
+    _zarr,
+    codecs=json.loads(
+        '[{"name":"sharding_indexed","configuration":{"chunk_shape":[1,16,16],"codecs":' * 200
+        + '[{"name":"bytes"}]'
+        + "}}]" * 200
+    ),
+)
+CASES["Zarr: unknown codec"] = partial(_zarr, codecs=[{"name": "pickle"}])
+CASES["Zarr: attribute of 20 MB"] = partial(_zarr, attributes={"axes": "T" * (20 * 10**6)})
+for _header in ("[" * _DEEP, '{"a":' * _DEEP, '{"shape": ' + "9" * 10**6 + "}"):
+    CASES[f"Zarr: header {_header[:15]}"] = lambda folder, text=_header: (
+        _zarr(folder),
+        _text("a.zarr/zarr.json", text, folder),
+    )[0]
+CASES["Zarr: header is a pipe"] = lambda folder: _piped(_zarr(folder), "zarr.json")
+CASES["Zarr: chunk is a pipe"] = lambda folder: _piped(_zarr(folder), "c/0/0/0")
+CASES["Zarr: chunk is a link to a device"] = lambda folder: _linked(_zarr(folder), "c/0/0/0", "/dev/urandom")
+CASES["Zarr: folder linked to itself"] = lambda folder: _linked(_zarr(folder), "c/1", ".")
+
+
+def _piped(path: Path, name: str) -> Path:
+    (path / name).unlink()
+    os.mkfifo(path / name)
+    return path
+
+
+def _linked(path: Path, name: str, target: str) -> Path:
+    place = path / name
+    if place.is_dir():
+        place.rename(path / "moved")
+    else:
+        place.unlink()
+    place.symlink_to(target)
+    return path
+
+
+# --- Video --------------------------------------------------------------------------------------------------------
+
+
+def _video(name: str, size: tuple[int, int], count: int, folder: Path) -> Path:
+    path = folder / name
+    with av.open(str(path), "w") as output:
+        stream = output.add_stream("ffv1" if name.endswith("mkv") else "libx264", rate=30)
+        stream.width, stream.height = size
+        stream.pix_fmt = "gray" if name.endswith("mkv") else "yuv420p"
+        frame = av.VideoFrame(*size, format=stream.pix_fmt)
+        for plane in frame.planes:
+            plane.update(bytes(plane.buffer_size))
+        for _ in range(count):
+            output.mux(stream.encode(frame))
+        output.mux(stream.encode())
+    return path
+
+
+CASES["video: 12000 x 12000 px"] = partial(_video, "a.mkv", (12000, 12000), 4)
+
+
+@case("video: .mkv that states 65535 x 65535 px")
+def _video_large(folder: Path) -> Path:
+    path = _video("a.mkv", (64, 64), 4, folder)
+    data = path.read_bytes()
+    data = data.replace(b"\xb0\x81\x40", b"\xb0\x82\xff\xff"[:3]).replace(b"\xba\x81\x40", b"\xba\x82\xff\xff"[:3])
+    return _data("a.mkv", data, folder)
+
+
+@case("video: .mp4 that states 2^32 - 1 samples")
+def _video_samples(folder: Path) -> Path:
+    data = bytearray(_video("a.mp4", (64, 64), 8, folder).read_bytes())
+    for box in (b"stsz", b"stts", b"stco", b"ctts"):
+        place = data.find(box)
+        if place > 0:
+            data[place + 8 : place + 16] = b"\0\0\0\x01\xff\xff\xff\xff"
+    return _data("a.mp4", bytes(data), folder)
+
+
+@case("video: .avi that states 2^32 - 1 frames")
+def _video_frames(folder: Path) -> Path:
+    path = folder / "a.avi"
+    rsv.write_stack(path, np.zeros((4, 64, 64), np.float32), dtype="uint8")
+    data = bytearray(path.read_bytes())
+    place = data.index(b"avih") + 8
+    data[place + 16 : place + 20] = b"\xff\xff\xff\xff"
+    return _data("a.avi", bytes(data), folder)
+
+
+CASES["video: playlist"] = partial(_text, "a.mp4", "#EXTM3U\n/dev/urandom\n")
+CASES["video: list of files"] = partial(_text, "a.mkv", "ffconcat version 1.0\nfile /dev/urandom\n")
+CASES["video: zeros"] = partial(_sparse, "a.mp4", b"", 10**9)
+CASES["video: zeros after a header of .ts"] = partial(_sparse, "a.mts", b"G" + bytes(187), 10**9)
+
+# --- Pipes, devices, links ----------------------------------------------------------------------------------------
+
+for _ending in (".tif", ".png", ".npy", ".h5", ".raw", ".mp4", ".jpg", ".toml", ".csv", ".vibration.json"):
+
+    def _pipe(folder: Path, name: str = f"a{_ending}") -> Path:
+        os.mkfifo(folder / name)
+        return folder / name
+
+    def _device(folder: Path, name: str = f"a{_ending}") -> Path:
+        (folder / name).symlink_to("/dev/urandom")
+        return folder / name
+
+    def _process_file(folder: Path, name: str = f"a{_ending}") -> Path:
+        (folder / name).symlink_to("/proc/self/mem")
+        return folder / name
+
+    CASES[f"pipe {_ending}"], CASES[f"device {_ending}"], CASES[f"/proc {_ending}"] = _pipe, _device, _process_file
+
+
+@case("pipe in a folder of images")
+def _pipe_in_folder(folder: Path) -> Path:
+    (folder / "frames").mkdir()
+    _data("frames/a.png", _png(16, 16, pixels=17 * 16), folder)
+    os.mkfifo(folder / "frames" / "b.png")
+    return folder / "frames"
+
+
+# --- Configuration, motion, vibration, manifest -------------------------------------------------------------------
+
+for _name, _words in {
+    "nested lists": "x = " + "[" * _DEEP + "]" * _DEEP,
+    "nested tables": "x = " + "{a=" * _DEEP + "1" + "}" * _DEEP,
+    "key of 20000 parts": "a" + ".a" * _DEEP + " = 1",
+    "table of 20000 parts": "[" + "a." * _DEEP + "a]\nx = 1",
+    "tables of 400 depths": "".join(f"[[{'.'.join(['a'] * n)}]]\n" for n in range(1, 400)),
+    "10^5 unknown keys": "".join(f"a{n} = 1\n" for n in range(10**5)),
+    "number of 10^6 digits": "x = " + "9" * 10**6,
+    "exponent": _CAMERA.replace("1e-4", "1e-999999999"),
+    "10^9 frames": _CAMERA + "[simulation]\nnum_frames = 1000000000\n[simulation.vibration]\n"
+    "amplitude = [1.0, 1.0]\nfrequency = [50.0, 50.0]\n",
+    "zero bytes": "\0" * 10**6,
+}.items():
+    CASES[f"TOML: {_name}"] = partial(_text, "a.toml", _words)
+CASES["TOML: 64 GB"] = partial(_sparse, "a.toml", b"#", 2**36)
+for _kind in ("vibration", "manifest"):
+    for _name, _words in {
+        "nested lists": "[" * _DEEP,
+        "nested tables": '{"a":' * _DEEP + "1" + "}" * _DEEP,
+        "long number": '{"version": ' + "9" * 10**6 + "}",
+        "nested value": f'{{"format": "rsvib {_kind}", "version": 1, "vibration": ' + "[" * 900 + "]" * 900 + "}",
+        "10^5 unknown keys": "{" + ",".join(f'"a{n}": 1' for n in range(10**5)) + "}",
+        "10^6 tones": '{"format": "rsvib vibration", "version": 1, "vibration": {"amplitude": ['
+        + ",".join(["[" + ",".join(["1.0"] * 10**5) + "]"] * 2)
+        + "]}}",
+    }.items():
+        CASES[f"{_kind}: {_name}"] = partial(_text, f"a.{_kind}.json", _words)
+for _name, _words in {
+    "field of 10 MB": 'time,x,y\n"' + "1" * 10**7,
+    "times of 10^300 s": "time,x,y\n" + "".join(f"{n}e300,0,0\n" for n in range(5)),
+    "10^6 columns": "time,x,y" + ",a" * 10**6 + "\n0,0,0\n",
+    "10^5 lines": "time,x,y\n" + "".join(f"{n / 1000},0,0\n" for n in range(10**5)),
+    "open quotation": 'time,x,y\n"' + "\n" * 10**5,
+}.items():
+    CASES[f"CSV: {_name}"] = partial(_text, "a.csv", _words)
+
+
+def _read(path: Path) -> None:
+    """Read a file as the commands do, and detect its vibration if it is a stack."""
+    name = path.name
+    if name.endswith(".toml"):
+        config = read_config(path)
+        if config.simulation is not None:
+            scene = np.random.default_rng(0).random((96, 96), np.float32)
+            rsv.simulate_frames(scene, config.timing, config.simulation.vibration, config.simulation.num_frames)
+    elif name.endswith(".csv"):
+        rsv.read_motion(path, unit="px")
+    elif name.endswith(".vibration.json"):
+        read_vibration(path, _TIMING)
+    elif name.endswith(".manifest.json"):
+        read_manifest(path).detections()
+    else:
+        frames = rsv.read_stack(path, full_scale=None if name.endswith(("png", "jpg", "mp4", "avi")) else 65535)
+        rsv.detect_vibration(frames[:3, ..., :256, :256], _TIMING, method="bands", tones=1)
+
+
+def _try(path: Path) -> tuple[Outcome, str]:
+    try:
+        _read(path)
+    except (ValueError, TypeError, OSError) as error:
+        lines = str(error).splitlines()
+        if len(lines) > 25 or max(map(len, lines), default=0) > 5000:
+            return "traceback", f"message of {len(lines)} lines, {len(str(error))} characters"
+        return "refused", lines[0][:150] if lines else ""
+    except BaseException as error:  # every other error would be a traceback for the user
+        return "traceback", f"{type(error).__name__}: {error} {traceback.format_exc()[-300:]}"
+    return "completed", ""
+
+
+def _child(path: Path, sender: multiprocessing.connection.Connection) -> None:
+    os.environ["OMP_NUM_THREADS"] = "1"
+    os.chdir(path.parent)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # lines of libpng and ffmpeg
+    limit = psutil.Process().memory_info().vms + _BYTES  # free_memory() respects it
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    sender.send(_try(path))
+    sender.close()
+
+
+def crafted(name: str, folder: Path) -> Trial:
+    """Write one file, and read it in a child process that is forked from this one."""
+    path = CASES[name](folder)
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=_child, args=(path, sender))
+    begin, lowest = time.monotonic(), psutil.Process().memory_info().rss
+    child.start()
+    sender.close()
+    watched, peak, cpu = psutil.Process(child.pid), 0, 0.0
+    outcome: tuple[Outcome, str] | None = None
+    while outcome is None and cpu < _CPU_SECONDS and time.monotonic() - begin < _SECONDS:
+        try:
+            used = watched.memory_info().rss
+            lowest = min(lowest, used)  # pages of files are not inherited
+            peak = max(peak, used - lowest)
+            cpu = sum(watched.cpu_times()[:2])
+            if receiver.poll(0.01):
+                outcome = receiver.recv()
+        except (EOFError, psutil.NoSuchProcess):
+            outcome = ("traceback", "the process ended")
+    child.kill()
+    child.join()
+    if outcome is None:
+        outcome = ("hang", "")
+    elif peak > _BYTES:
+        outcome = ("memory", outcome[1])
+    return Trial(name, outcome[0], f"{outcome[1]} ({cpu:.1f} s, {peak / 1e6:.0f} MB)")
+
+
+def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
+    """Read up to ``count`` crafted files; all of them are read if there are no more, otherwise a random choice."""
+    names = list(CASES)
+    if count < len(names):
+        names = [names[index] for index in np.random.default_rng(seed).permutation(len(names))[:count]]
+    for index, name in enumerate(names):
+        place = folder / f"{index}"
+        place.mkdir()
+        yield crafted(name, place)

@@ -1,0 +1,117 @@
+"""Frames that are stored together are decoded once; the memory that this needs is stated before."""
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+import zarr
+
+from rsvib_torch.io import contiguous, open_stack
+from rsvib_torch.io.stack_info import FrameError
+
+T, H, W = 20, 24, 40
+COUNTS = np.random.default_rng(7).integers(0, 4096, (T, H, W)).astype(np.uint16)
+COLOUR = np.random.default_rng(8).integers(0, 4096, (T, 3, H, W)).astype(np.uint16)
+
+
+def write_hdf5(path, counts=COUNTS, **options):
+    with h5py.File(path, "w") as file:
+        file.create_dataset("frames", data=counts, **options)
+
+
+def write_zarr(path, **options):
+    zarr.create_array(path, shape=COUNTS.shape, dtype="u2", **options)[:] = COUNTS
+
+
+def write_tiff(path, axes, counts=COUNTS, names="TYX", **options):
+    stored = np.ascontiguousarray(counts.transpose([names.index(axis) for axis in axes]))
+    tifffile.imwrite(path, stored, metadata={"axes": axes}, photometric="minisblack", **options)
+
+
+WRITERS = {
+    "one.h5": lambda path: write_hdf5(path, chunks=(T, H, W), compression="gzip"),
+    "parts.h5": lambda path: write_hdf5(path, chunks=(7, 8, 16), compression="lzf"),
+    "one.zarr": lambda path: write_zarr(path, chunks=(T, H, W)),
+    "parts.zarr": lambda path: write_zarr(path, chunks=(7, 8, 16)),
+    "yxt.tif": lambda path: write_tiff(path, "YXT", compression="zlib"),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_block_is_read_once(tmp_path, name, monkeypatch):
+    WRITERS[name](tmp_path / name)
+    reader = open_stack(tmp_path / name)
+    together = 7 if "parts" in name else T
+    reads, read_block = [], type(reader).read_block
+    monkeypatch.setattr(type(reader), "read_block", lambda *args: reads.append(args[1:]) or read_block(*args))
+    frames = [reader.frame(index) for index in range(T)]
+    reader.close()
+    np.testing.assert_array_equal(frames, COUNTS)
+    assert reads == [(first, min(first + together, T)) for first in range(0, T, together)]
+    assert all(frame.base is None for frame in frames)  # a view would keep its block in memory
+    block = together * COUNTS[0].nbytes
+    assert block < reader.info.decoding_bytes < 5 * COUNTS.nbytes
+
+
+def test_frames_in_any_order(tmp_path):
+    WRITERS["parts.h5"](tmp_path / "a.h5")
+    reader = open_stack(tmp_path / "a.h5")
+    for index in (19, 0, 6, 7, 6, 13, 0):
+        np.testing.assert_array_equal(reader.frame(index), COUNTS[index])
+    reader.close()
+
+
+@pytest.mark.parametrize("chunks", [(1, H, W), None])
+def test_frames_that_are_stored_alone_need_no_block(tmp_path, chunks):
+    write_hdf5(tmp_path / "a.h5", chunks=chunks)
+    reader = open_stack(tmp_path / "a.h5")
+    reader.close()
+    assert reader.info.decoding_bytes <= COUNTS[0].nbytes
+
+
+def test_sharded_zarr_is_decoded_frame_by_frame(tmp_path):
+    write_zarr(tmp_path / "a.zarr", chunks=(1, H, W), shards=(T, H, W))
+    reader = open_stack(tmp_path / "a.zarr")
+    assert reader.info.decoding_bytes < 4 * COUNTS[0].nbytes
+    np.testing.assert_array_equal([reader.frame(index) for index in range(T)], COUNTS)
+
+
+def test_channels_last_in_chunks_of_several_frames(tmp_path):
+    write_hdf5(tmp_path / "a.h5", np.moveaxis(COLOUR, 1, -1), chunks=(5, H, W, 3), compression="gzip")
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file["frames"].attrs["axes"] = "THWC"
+    reader = open_stack(tmp_path / "a.h5")
+    np.testing.assert_array_equal([reader.frame(index) for index in range(T)], COLOUR)
+    reader.close()
+
+
+@pytest.mark.parametrize("band", [100, 3000, 10**6])
+@pytest.mark.parametrize("axes", ["YXT", "YTX", "XTY", "CTYX", "YXCT", "TXY"])
+def test_interleaved_frames_are_read_in_bands(tmp_path, monkeypatch, axes, band):
+    monkeypatch.setattr(contiguous, "_BLOCK_BYTES", 6 * COUNTS[0].nbytes)
+    monkeypatch.setattr(contiguous, "_BAND_BYTES", band)
+    counts, names = (COLOUR, "TCYX") if "C" in axes else (COUNTS, "TYX")
+    write_tiff(tmp_path / "a.tif", axes, counts, names, bigtiff=True, byteorder=">")
+    reader = open_stack(tmp_path / "a.tif")
+    assert isinstance(reader, contiguous.InterleavedReader)
+    np.testing.assert_array_equal([reader.frame(index) for index in range(T)], counts)
+    assert reader.info.decoding_bytes <= 6 * COUNTS[0].nbytes + band + counts[0].nbytes
+    np.save(tmp_path / "a.npy", np.asfortranarray(counts))
+    fortran = open_stack(tmp_path / "a.npy")
+    np.testing.assert_array_equal([fortran.frame(index) for index in range(T)], counts)
+    reader.close()
+    fortran.close()
+
+
+def test_damaged_block_is_an_error_of_its_frames(tmp_path):
+    write_hdf5(tmp_path / "a.h5", chunks=(10, H, W), compression="gzip")
+    with h5py.File(tmp_path / "a.h5", "r") as file:
+        place = file["frames"].id.get_chunk_info(1)
+    data = bytearray((tmp_path / "a.h5").read_bytes())
+    data[place.byte_offset + 20 : place.byte_offset + 400] = bytes(380)
+    (tmp_path / "a.h5").write_bytes(data)
+    reader = open_stack(tmp_path / "a.h5")
+    np.testing.assert_array_equal(reader.frame(9), COUNTS[9])
+    with pytest.raises(FrameError, match="frame 12 cannot be read"):
+        reader.frame(12)
+    reader.close()

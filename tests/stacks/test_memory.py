@@ -1,0 +1,149 @@
+"""Memory limits of stacks: what does not fit is refused with the required size and a remedy that works."""
+
+import json
+import re
+
+import h5py
+import numpy as np
+import psutil
+import pytest
+import tifffile
+import zarr
+from small_config import CAMERA
+from small_stack import OPTIONS, TIMING, process_small, write_small
+
+import rsvib_torch as rsv
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.core import free_memory
+from rsvib_torch.io import StackInfo
+from rsvib_torch.stacks import memory
+from rsvib_torch.stacks.memory import memory_limit, memory_needed, windows_at_once
+
+LARGE = StackInfo((100, 4096, 4096), "uint16", 4095.0)
+GB = 10**9
+
+
+@pytest.fixture(name="free")
+def _free(monkeypatch):
+    """Sets the free memory."""
+
+    def set_free(size):
+        for module in (free_memory, memory):
+            monkeypatch.setattr(module, "free_memory", lambda: size)
+
+    return set_free
+
+
+def test_default_limit_is_three_quarters_of_what_the_process_has_and_can_get(free):
+    free(4 * GB)
+    used = psutil.Process().memory_info().rss
+    assert memory_limit(None) == pytest.approx(0.75 * (4 * GB + used), abs=5e6)
+    assert memory_limit("2GB") == 2 * GB
+
+
+def test_window_that_does_not_fit_the_free_memory_is_refused(free):
+    free(5 * GB)
+    with pytest.raises(ValueError, match="three quarters of the memory that is free") as caught:
+        windows_at_once(LARGE, 8, memory=None, most=4, restoration={})
+    message = str(caught.value)
+    required = re.search(r"a window of 8 frames of 4096 x 4096 px takes about ([0-9.]+) GB", message)
+    assert float(required[1]) == pytest.approx(memory_needed(LARGE, 8, {}) / GB, rel=0.01)
+    fitting = int(re.search(r"at most ([0-9]+) frames at once \(--window\)", message)[1])
+    assert windows_at_once(LARGE, fitting, memory=None, most=4, restoration={}) == 1
+    with pytest.raises(ValueError, match="too little"):
+        windows_at_once(LARGE, fitting + 1, memory=None, most=4, restoration={})
+    assert windows_at_once(LARGE, 8, memory="20GB", most=4, restoration={}) == 1
+
+
+def test_frames_that_are_stored_together_count(free):
+    free(100 * GB)
+    info = StackInfo((100, 512, 512), "uint16", 4095.0, decoding_bytes=3 * GB)
+    with pytest.raises(ValueError, match=r"store each frame separately: 3 GB are needed to decode frames"):
+        windows_at_once(info, 2, memory="2GB", most=1, restoration={})
+    assert windows_at_once(info, 2, memory="4GB", most=1, restoration={}) == 1
+
+
+def test_gpu_needs_less_memory_of_the_machine(free):
+    free(5 * GB)
+    assert windows_at_once(LARGE, 8, memory=None, most=1, restoration={}, on_gpu=True) == 1
+
+
+def test_zarr_that_expands_is_refused_by_every_command(tmp_path, free, capsys):
+    """96 KB that state 6.3 GB; no pixel is decoded."""
+    array = zarr.create_array(tmp_path / "a.zarr", shape=(4, 16, 16), chunks=(1, 16, 16), dtype="u2")
+    array[:] = 1
+    header = json.loads((tmp_path / "a.zarr" / "zarr.json").read_text()) | {"shape": [96, 6000, 5500]}
+    header["chunk_grid"]["configuration"]["chunk_shape"] = [1, 6000, 5500]
+    (tmp_path / "a.zarr" / "zarr.json").write_text(json.dumps(header))
+    (tmp_path / "a.zarr" / "more").write_bytes(bytes(96_000))
+    (tmp_path / "camera.toml").write_text(CAMERA.replace("frame_rows = 104", "frame_rows = 7000"))
+    (tmp_path / "motion.csv").write_text("time,x,y\n" + "".join(f"{n / 100},0,0\n" for n in range(100)))
+    free(GB)
+    camera = ("--config", str(tmp_path / "camera.toml"))
+    stack, out = str(tmp_path / "a.zarr"), str(tmp_path / "out")
+    for arguments in (
+        ("run", stack, out),
+        ("detect", stack, "--out", out),
+        ("detect", stack, "--out", out, "--window", "4"),
+        ("report", stack, out),
+        ("motion", stack, "--out", str(tmp_path / "motion-out.csv")),
+        ("known", stack, f"{out}.tif", "--motion", str(tmp_path / "motion.csv"), "--unit", "px"),
+    ):
+        assert run_command([*arguments, *camera]) == 2, arguments
+        error = capsys.readouterr().err
+        assert re.search(r"memory.*(takes about|need) [0-9.]+ GB|need [0-9.]+ GB of memory", error), error
+        assert re.search("--window|--memory", error), error
+        assert len(error.splitlines()) == 1
+    for arguments in (("calibrate", stack, "--frequency", "100"), ("simulate", stack, f"{out}.tif", *camera)):
+        assert run_command([*arguments, "--full-scale", "4095"]) == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zarr", "camera.toml", "motion.csv"]
+    with pytest.raises(
+        ValueError, match=r"96 frames of 6000 x 5500 px need 13.\d GB of memory, of which 1 GB are free"
+    ):
+        rsv.read_stack(tmp_path / "a.zarr", full_scale=4095)
+
+
+def test_output_does_not_depend_on_the_layout(tmp_path):
+    write_small(tmp_path / "a.tif", frames=5)
+    counts = tifffile.imread(tmp_path / "a.tif")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("frames", data=counts, chunks=counts.shape, compression="gzip")
+    np.save(tmp_path / "a.npy", np.asfortranarray(counts))
+    for name in ("a.tif", "a.h5", "a.npy"):
+        process_small(tmp_path / name, tmp_path / f"{name}.out.tif", memory="1GB")
+    outputs = [(tmp_path / f"{name}.out.tif").read_bytes() for name in ("a.tif", "a.h5", "a.npy")]
+    assert outputs[0] == outputs[1] == outputs[2]
+    assert OPTIONS["window"] < len(counts)
+
+
+def test_simulation_of_many_frames_is_refused(free):
+    free(2 * GB)
+    scene = np.random.default_rng(0).random((96, 96), np.float32)
+    vibration = rsv.Vibration(2.0, 50.0)
+    with pytest.raises(ValueError, match=r"num_frames=1000000000 frames of 64 x 64 px need .* GB of memory"):
+        rsv.simulate_frames(scene, TIMING, vibration, 10**9, frame_size=(64, 64))
+    with pytest.raises(ValueError, match="too small"):
+        rsv.simulate_frames(scene, TIMING, vibration, 2, frame_size=(10**9, 10**9))
+
+
+@pytest.mark.parametrize("method", ["exact", "banded", "dewarp", "richardson-lucy"])
+def test_motion_beyond_the_frame_is_refused(method):
+    frames = np.random.default_rng(0).random((2, 64, 48), np.float32)
+    with pytest.raises(
+        ValueError, match=r"the motion along the rows reaches 1e\+05 px within a frame, .* size of 48 px"
+    ):
+        rsv.restore(frames, TIMING, rsv.Vibration([1e5, 0.0], [50.0, 0.0]), method=method)
+    with pytest.raises(ValueError, match=r"the motion across the rows reaches 65 px .* size of 64 px"):
+        rsv.restore(frames, TIMING, rsv.Vibration([0.0, 65.0], [0.0, 50.0]), method=method)
+    with pytest.raises(ValueError, match="motion along the rows"):
+        rsv.restore(frames, TIMING, rsv.Vibration(1.0, 50.0, image_motion=[1e9, 0.0]), method=method)
+    with pytest.raises(ValueError, match="motion along the rows"):
+        rsv.visible_pixels(TIMING, rsv.Vibration([1e5, 0.0], [50.0, 0.0]), (64, 48), 2)
+    fast = rsv.Vibration(1.0, 50.0, image_motion=[30.0 / TIMING.frame_period, 0.0])  # leaves the frame within two
+    rsv.restore(frames, TIMING, fast, method=method, check=False)
+
+
+def test_iterations_are_limited():
+    frames = np.random.default_rng(0).random((2, 64, 48), np.float32)
+    with pytest.raises(ValueError, match="iterations must be at most 1000, got 1000000000"):
+        rsv.restore(frames, TIMING, rsv.Vibration(1.0, 50.0), method="richardson-lucy", iterations=10**9)

@@ -1,0 +1,67 @@
+"""The attack with crafted files: it notices every kind of failure, and no file of it causes one."""
+
+import time
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+
+
+@pytest.fixture(name="module")
+def _module(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    return import_module("attacks.crafted")
+
+
+def outcome(module, monkeypatch, tmp_path, read):
+    monkeypatch.setitem(module.CASES, "two frames", lambda folder: module._data("a.npy", b"", folder))
+    monkeypatch.setattr(module, "_read", read)
+    return module.crafted("two frames", tmp_path).outcome
+
+
+def test_outcomes(module, monkeypatch, tmp_path):
+    def fail(_):
+        raise KeyError("a")
+
+    def refuse(_):
+        raise ValueError("a")
+
+    def end(_):
+        module.os._exit(3)
+
+    def allocate(_):
+        kept = np.ones(10**7)
+        time.sleep(0.3 * kept[-1])
+
+    assert outcome(module, monkeypatch, tmp_path, lambda path: None) == "completed"
+    assert outcome(module, monkeypatch, tmp_path, refuse) == "refused"
+    assert outcome(module, monkeypatch, tmp_path, fail) == "traceback"
+    assert outcome(module, monkeypatch, tmp_path, end) == "traceback"
+    monkeypatch.setattr(module, "_SECONDS", 0.3)
+    assert outcome(module, monkeypatch, tmp_path, lambda path: time.sleep(10)) == "hang"
+    monkeypatch.setattr(module, "_SECONDS", 10.0)
+    monkeypatch.setattr(module, "_BYTES", 5 * 10**7)
+    monkeypatch.setattr(module.resource, "setrlimit", lambda *_: None)
+    assert outcome(module, monkeypatch, tmp_path, allocate) == "memory"
+
+
+@pytest.mark.parametrize(
+    "start", ["npy: shape (1000", "PNG: 2147", "TIFF: the next page is", "HDF5: 25", "pipe .", "TOML: nested"]
+)
+def test_some_crafted_files(module, tmp_path, start):
+    names = [name for name in module.CASES if name.startswith(start)]
+    assert names
+    for index, name in enumerate(names):
+        (tmp_path / str(index)).mkdir()
+        trial = module.crafted(name, tmp_path / str(index))
+        assert trial.outcome == "refused", trial
+
+
+@pytest.mark.slow
+def test_all_crafted_files(module, tmp_path):
+    trials = list(module.trials(tmp_path, 1000, 0))
+    assert len(trials) >= 250
+    assert [trial for trial in trials if trial.outcome not in ("completed", "refused")] == []
