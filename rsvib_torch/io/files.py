@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.atomic import check_writable, move_into_place, temporary_folder
+from rsvib_torch.core.atomic import check_writable, make_folder, move_into_place, sync, sync_tree, temporary_folder
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
@@ -320,6 +320,7 @@ def write_frames(
     """
     if form.write_all is not None and (compression is not None or form.create is None):
         form.write_all(path, info, frames, compression)
+        sync_tree(path)
         return
     assert form.create is not None
     writer = form.create(path, info, True)
@@ -393,5 +394,5 @@ def write_stack(
         part = folder / path.name
         write_frames(form, part, info, _counted(pixels), compression)
         if form.kind == "folder":
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
         move_into_place(part, path, form.kind, form.companions)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Unpack
 
-from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.atomic import make_folder, whole_file
 from rsvib_torch.core.option_types import BadFrames
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept
@@ -20,6 +20,7 @@ from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import (
     DetectOptions,
     RestoreOptions,
+    StackJob,
     StoredWindow,
     WindowFrames,
     WindowResult,
@@ -248,7 +249,7 @@ def process_stack(
             not_kept=tuple(not_kept),
         )
 
-    journal = Journal(sink)
+    journal = Journal(sink, form.companions)
     try:
         if resume and not journal.has_lines and sink.exists() and target.exists():
             complete = read_manifest(target)
@@ -256,26 +257,29 @@ def process_stack(
             if difference:
                 raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
             return report((record.model_dump() for record in complete.windows), len(windows), complete.not_kept)
-        fresh = not journal.open(header, resume=resume)
-        resumed = journal.count
-        with disk_errors_named(journal):
-            writer = Sink(
-                sink, journal.folder, form, out, staged=bad_frames == "skip", compression=compression, fresh=fresh
-            )
+        resumes = journal.open(header, resume=resume)
+        writer = Sink(sink, journal.folder, form, out, staged=bad_frames == "skip", compression=compression)
         try:
+            with disk_errors_named(journal):
+                if resumes:
+                    journal.drop(writer.resume(journal.entries()))
+                else:
+                    writer.begin()
+            resumed = journal.count
+            remaining = [window for window in windows if window.index not in journal]
             if scheduler is None:
-                results = compute_here(job, windows[resumed:], finish, at_once=at_once)
+                results = compute_here(job, remaining, finish, at_once=at_once)
             else:
-                results = compute_with_dask(job, windows[resumed:], scheduler=scheduler, workers=at_once)
-            _store_windows(windows, results, writer, journal, progress)
+                results = compute_with_dask(job, remaining, scheduler=scheduler, workers=at_once)
+            _store_windows(job, windows, results, writer, journal, progress)
             not_kept = metadata_not_kept(job.info, sink, (journal.written, *out.shape[1:]))
             with disk_errors_named(journal):
-                write_manifest(journal.folder / "manifest.json", header, journal.records(), not_kept)
-                writer.finish(journal.written)
+                make_folder(target.parent)
+                with whole_file(target) as part:
+                    write_manifest(part, header, journal.records(), not_kept)
+                    writer.finish(journal.written)
         finally:
             writer.close()
-        target.parent.mkdir(parents=True, exist_ok=True)
-        os.replace(journal.folder / "manifest.json", target)
         summary = report(journal.records(), resumed, not_kept)
         journal.remove()
         return summary
@@ -300,6 +304,7 @@ def _check_not_all_failed(errors: Sequence[str | None], windows: Sequence[Window
 
 
 def _store_windows(
+    job: StackJob,
     windows: Sequence[Window],
     results: Generator[StoredWindow, None, None],
     sink: Sink,
@@ -308,15 +313,17 @@ def _store_windows(
 ) -> None:
     """Store the results of all windows that are not in the journal, while later windows are computed."""
     errors = [record["error"] for record in journal.records()]
-    remaining, total = windows[journal.count :], windows[-1].last + 1
+    remaining = [window for window in windows if window.index not in journal]
+    total = windows[-1].last + 1
+    done = total - sum(window.kept for window in remaining)
 
-    def store(stored: StoredWindow) -> None:
+    def store(window: Window, stored: StoredWindow) -> None:
         with disk_errors_named(journal):
-            sink.put(stored.record["window"], journal.written, stored.frames)
-            journal.add(stored.record)
+            where = sink.put(window.index, window.index if job.joined else window.first, stored.frames)
+            journal.add(stored.record, where)
 
     if progress is not None:
-        progress(remaining[0].first if remaining else total, total)
+        progress(done, total)
     with ThreadPoolExecutor(1, "rsvib-write") as writing, closing(results):
         previous: Future[None] | None = None
         for window, stored in zip(remaining, results, strict=True):
@@ -328,8 +335,9 @@ def _store_windows(
             except ValueError:
                 journal.clear()
                 raise
-            previous = writing.submit(store, stored)
+            previous = writing.submit(store, window, stored)
             if progress is not None:
-                progress(window.first + window.kept, total)
+                done += window.kept
+                progress(done, total)
         if previous is not None:
             previous.result()
