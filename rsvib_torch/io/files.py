@@ -12,10 +12,11 @@ from torch import Tensor
 
 from rsvib_torch.core.atomic import check_writable, make_folder, move_into_place, sync, sync_tree, temporary_folder
 from rsvib_torch.core.checks import check_choice
+from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.io import hdf5, image_folder, npy, raw, tiff, video, zarr_store
-from rsvib_torch.io.formats import FrameReader, StackFormat, find_format, register_format, target_format
+from rsvib_torch.io.formats import FORMATS, FrameReader, StackFormat, find_format, register_format, target_format
 from rsvib_torch.io.full_scale import (
     counts_to_frames,
     frames_to_counts,
@@ -36,6 +37,7 @@ __all__ = [
     "read_stack",
     "read_stack_info",
     "register_format",
+    "stack_files",
     "write_frames",
     "write_stack",
 ]
@@ -192,6 +194,18 @@ def load_frames(frames: FramesOrFiles, full_scale: float | None) -> tuple[Frames
     if pixels.dtype.kind == "f":
         return counts_to_frames(pixels, full_scale, str(paths[0])), None
     return pixels, full_scale_of_counts(pixels, full_scale, str(paths[0]))
+
+
+def stack_files(path: PathLike) -> list[Path]:
+    """The paths that a stack occupies: its file or folder, and the files beside it (sidecars).
+
+    Example:
+        >>> [path.name for path in stack_files("frames.raw")]
+        ['frames.raw', 'frames.raw.json']
+    """
+    path = Path(path)
+    form = FORMATS.get(path.suffix.lower())
+    return [path, *(path.with_name(path.name + ending) for ending in (() if form is None else form.companions))]
 
 
 def check_info_target(
@@ -370,17 +384,19 @@ def write_stack(
         like: The stack from which the frames were computed: its resolution, orientation, frame rate, channel order,
             metadata and, if the number of frames is the same, frame times are stored if the format supports them;
             ``metadata_not_kept`` lists those that are not. If both files are videos, the presentation times of the
-            frames and the audio are copied.
+            frames and the audio are copied. Its file must not be ``path``.
 
     Raises:
         OSError: If the file cannot be written.
         TypeError: If the frames are not a floating-point tensor.
-        ValueError: If the format does not support them, or the full scale is unknown.
+        ValueError: If the format does not support them, the full scale is unknown, or ``path`` is the file of ``like``.
 
     Example:
         >>> write_stack("restored.tif", restored, dtype="uint16", full_scale=4095)  # doctest: +SKIP
     """
     path = Path(path)
+    if like is not None and like.path is not None:
+        check_outputs(stack_files(path), stack_files(like.path))
     frames = as_tensor("frames", frames)
     if not frames.dtype.is_floating_point:
         raise TypeError(f"frames must be a floating-point tensor whose full scale is 1, got {frames.dtype}")

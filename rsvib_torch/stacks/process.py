@@ -1,6 +1,5 @@
 """Processing of stacks of any length: ``iterate_stack``, ``detect_stack`` and ``process_stack``."""
 
-import os
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -10,9 +9,10 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from rsvib_torch.core.atomic import make_folder, whole_file
+from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.option_types import BadFrames
 from rsvib_torch.core.presentation import Summarised
-from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept
+from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.schema import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
@@ -27,7 +27,7 @@ from rsvib_torch.stacks.job import (
     plan_job,
 )
 from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_manifest
-from rsvib_torch.stacks.output import Journal, Sink, describe_difference, disk_errors_named
+from rsvib_torch.stacks.output import Journal, Sink, describe_difference, disk_errors_named, work_folder
 from rsvib_torch.stacks.windows import Window
 
 __all__ = ["StackReport", "detect_stack", "iterate_stack", "process_stack"]
@@ -135,12 +135,14 @@ def detect_stack(
     Raises:
         OSError: If the stack cannot be read, or the manifest cannot be written.
         TypeError: If an option is unknown.
-        ValueError: If a value is out of range, the stack is not readable, or detection fails in all first windows.
+        ValueError: If a value is out of range, the stack is not readable, detection fails in all first windows, or
+            ``manifest`` is a file of the stack.
 
     Example:
         >>> detect_stack("frames.tif", "manifest.json", timing)  # doctest: +SKIP
     """
     job, windows, at_once = plan_job(source, timing, options, restores=False)
+    check_outputs([manifest], stack_files(source))
 
     def records() -> Iterator[dict[str, Any]]:
         errors: list[str | None] = []
@@ -204,8 +206,9 @@ def process_stack(
         ModuleNotFoundError: If an optional package is missing, with the extra to install.
         OSError: If a file cannot be read or written; the run can then be resumed.
         TypeError: If an option is unknown.
-        ValueError: If a value is out of range, the stack is not readable, detection fails in all first windows, or
-            input, settings or versions differ from those of the run to resume.
+        ValueError: If a value is out of range, the stack is not readable, detection fails in all first windows, an
+            output is or contains the input or lies inside it, input, settings or versions differ from those of the run
+            to resume, or its journal is damaged.
 
     Example:
         >>> report = process_stack("frames.tif", "restored.tif", timing, memory="2GB")  # doctest: +SKIP
@@ -227,8 +230,7 @@ def process_stack(
     )
     form = check_info_target(sink, out, compression, check_folder=False)
     target = sink.with_name(sink.name + ".manifest.json") if manifest is None else Path(manifest)
-    if sink.exists() and os.path.samefile(source, sink):
-        raise ValueError(f"{sink}: a stack cannot be written over itself; choose another name")
+    check_outputs([*stack_files(sink), work_folder(sink), target], stack_files(source))
     header = manifest_header(job, sink.name, compression)
     first: WindowResult | None = None
 
