@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from attacks import kills, power_losses
 from attacks.trial import FAILURES, OUTCOMES, Trial
 
 import rsvib_torch as rsv
@@ -41,7 +42,10 @@ class Attack:
 
 
 # A new attack is one module in scripts/attacks and one line here.
-ATTACKS: dict[str, Attack] = {}
+ATTACKS: dict[str, Attack] = {
+    "kills": Attack("runs killed and resumed", kills.trials, 270),
+    "power_losses": Attack("power losses, resumed", power_losses.trials, 450),
+}
 
 
 def table(results: dict[str, list[Trial]]) -> list[str]:

@@ -74,7 +74,8 @@ class Journal:
     def __init__(self, sink: Path, companions: tuple[str, ...] = ()) -> None:
         self.sink, self.count, self.written = sink, 0, 0
         parts = [sink.name, f"{sink.name}.old", *(f"{sink.name}{ending}" for ending in companions), "windows"]
-        self._names = ["journal.jsonl", "journal.jsonl.part", *parts, "run.json.part", "run.json"]  # last: the mark
+        # in the order of their removal: without a journal nothing is resumed, without a header nothing is removed
+        self._names = ["journal.jsonl", "journal.jsonl.part", *parts, "run.json.part", "run.json"]
         self._lines: dict[int, int] = {}  # position of the line of each window
         self._file: int | None = None
         self.folder = PrivateFolder(work_folder(sink), sink)
@@ -267,9 +268,13 @@ class Journal:
         self.folder.close()
 
     def remove(self) -> None:
-        """Remove everything that a run has made: without the journal, which is removed first, nothing is resumed."""
+        """Remove everything that a run has made."""
         if self._marked(self.folder.names()):
-            self.folder.delete(self._names)
+            self.folder.delete(self._names[:1])
+            sync(self.folder.place)
+            self.folder.delete(self._names[1:-1])
+            sync(self.folder.place)
+            self.folder.delete(self._names[-1:])
         self.folder.remove()
         self.has_lines, self.count = False, 0
 
