@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from attacks import kills, power_losses
+from attacks import concurrent, damaged_parts, disks, inputs, journals, kills, links, power_losses
 from attacks.trial import FAILURES, OUTCOMES, Trial
 
 import rsvib_torch as rsv
@@ -45,6 +45,12 @@ class Attack:
 ATTACKS: dict[str, Attack] = {
     "kills": Attack("runs killed and resumed", kills.trials, 270),
     "power_losses": Attack("power losses, resumed", power_losses.trials, 450),
+    "damaged_parts": Attack("damaged parts of interrupted runs, resumed", damaged_parts.trials, 126),
+    "journals": Attack("damaged journals", journals.trials, 250),
+    "links": Attack("links and foreign files as work folders", links.trials, 90),
+    "inputs": Attack("outputs that are or contain inputs", inputs.trials, 250),
+    "concurrent": Attack("several runs with one output", concurrent.trials, 45),
+    "disks": Attack("full and read-only disks", disks.trials, 69),
 }
 
 

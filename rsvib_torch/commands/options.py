@@ -13,8 +13,8 @@ import typer
 from rsvib_torch.commands.terminal import Answer
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.option_types import METHOD_SETTINGS, PriorName, method_options
+from rsvib_torch.core.outputs import check_outputs
 
 if TYPE_CHECKING:
     import torch

@@ -83,9 +83,7 @@ class ContiguousWriter:
         beside: Other files of the stack.
     """
 
-    def __init__(
-        self, path: Path, info: StackInfo, offset: int, *, fresh: bool, beside: Sequence[Path] = ()
-    ) -> None:
+    def __init__(self, path: Path, info: StackInfo, offset: int, *, fresh: bool, beside: Sequence[Path] = ()) -> None:
         self._info, self._offset, self._beside = info, offset, beside
         self._file = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
         needed = offset + info.frame_bytes * info.shape[0]

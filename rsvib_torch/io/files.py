@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.atomic import check_writable, make_folder, move_into_place, sync, sync_tree, temporary_folder
+from rsvib_torch.core.atomic import check_writable, make_folder, move_into_place, sync_tree, temporary_folder
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.progress import steps

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from rsvib_torch.core.atomic import make_folder, whole_file
-from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.option_types import BadFrames
+from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.io.frame_times import exposure_times
@@ -259,21 +259,15 @@ def process_stack(
             if difference:
                 raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
             return report((record.model_dump() for record in complete.windows), len(windows), complete.not_kept)
-        resumes = journal.open(header, resume=resume)
         writer = Sink(sink, journal.folder, form, out, staged=bad_frames == "skip", compression=compression)
         try:
-            with disk_errors_named(journal):
-                if resumes:
-                    journal.drop(writer.resume(journal.entries()))
-                else:
-                    writer.begin()
+            remaining = _begin_or_resume(windows, writer, journal, header, resume)
             resumed = journal.count
-            remaining = [window for window in windows if window.index not in journal]
             if scheduler is None:
                 results = compute_here(job, remaining, finish, at_once=at_once)
             else:
                 results = compute_with_dask(job, remaining, scheduler=scheduler, workers=at_once)
-            _store_windows(job, windows, results, writer, journal, progress)
+            _store_windows(job, windows, remaining, results, writer, journal, progress)
             not_kept = metadata_not_kept(job.info, sink, (journal.written, *out.shape[1:]))
             with disk_errors_named(journal):
                 make_folder(target.parent)
@@ -305,17 +299,30 @@ def _check_not_all_failed(errors: Sequence[str | None], windows: Sequence[Window
         raise ValueError(errors[0])
 
 
+def _begin_or_resume(
+    windows: Sequence[Window], sink: Sink, journal: Journal, header: dict[str, Any], resume: bool
+) -> list[Window]:
+    """Begin a run, or continue an interrupted one; returns the windows that are not on the disk."""
+    resumes = journal.open(header, resume=resume)
+    with disk_errors_named(journal):
+        if resumes:
+            journal.drop(sink.resume(journal.entries()))
+        else:
+            sink.begin()
+    return [window for window in windows if window.index not in journal]
+
+
 def _store_windows(
     job: StackJob,
     windows: Sequence[Window],
+    remaining: Sequence[Window],
     results: Generator[StoredWindow, None, None],
     sink: Sink,
     journal: Journal,
     progress: Callable[[int, int], None] | None,
 ) -> None:
-    """Store the results of all windows that are not in the journal, while later windows are computed."""
+    """Store the results of the remaining windows, while later ones are computed."""
     errors = [record["error"] for record in journal.records()]
-    remaining = [window for window in windows if window.index not in journal]
     total = windows[-1].last + 1
     done = total - sum(window.kept for window in remaining)
 

@@ -46,10 +46,9 @@ def _damage(file: Path, others: list[Path], kind: str, choice: random.Random) ->
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Formats and kinds of damage take turns."""
     reference, choice = Reference(folder / "reference"), random.Random(seed)
-    kinds = {name: killed for name, killed in FORMATS.items()}
     for number in range(count):
-        kind = list(kinds)[number % len(kinds)]
-        damage = _DAMAGES[number // len(kinds) % len(_DAMAGES)]
+        kind = list(FORMATS)[number % len(FORMATS)]
+        damage = _DAMAGES[number // len(FORMATS) % len(_DAMAGES)]
         name, options = FORMATS[kind]
         place = folder / "trial"
         work = place / f".{name}.rsvib"

@@ -68,7 +68,10 @@ def _attacks() -> dict[str, Callable[[Path], None]]:
         "last line twice": lambda lines: [*lines, lines[-1]],
         "window 0 as window 1": lambda lines: [lines[0], _with_value(lines[0], "window", "1"), *lines[2:]],
         "overlapping windows": lambda lines: [lines[0], _with_value(lines[1], "first", "1"), *lines[2:]],
-        "window without frames": lambda lines: [_with_keys(lines[0], lambda table: table.update(written=0)), *lines[1:]],
+        "window without frames": lambda lines: [
+            _with_keys(lines[0], lambda table: table.update(written=0)),
+            *lines[1:],
+        ],
         "unknown key": lambda lines: [_with_keys(lines[0], lambda table: table.update(more=1)), *lines[1:]],
         "empty line": lambda lines: [b"\n", *lines],
         "line of text": lambda lines: [b"window 0\n", *lines],
@@ -130,5 +133,7 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
 def _listing(folder: Path) -> dict[str, Any]:
     """Names, kinds and content of everything in a folder."""
     files = {str(path.relative_to(folder)): path.lstat().st_mode for path in folder.rglob("*") if path.name != "lock"}
-    regular = {name: mode for name, mode in files.items() if (folder / name).is_file() and not (folder / name).is_symlink()}
+    regular = {
+        name: mode for name, mode in files.items() if (folder / name).is_file() and not (folder / name).is_symlink()
+    }
     return {**files, "content": {name: content(folder / name) for name in regular}}

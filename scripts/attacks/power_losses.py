@@ -1,10 +1,10 @@
 """The machine loses power: everything that was not synchronised is discarded, then the run is resumed.
 
-The calls ``fsync`` and ``fdatasync`` of a run are recorded: the content of a file when it was synchronised last, and the
-names in a folder when it was. At a random call the run ends. In every other trial its folder is replaced by what was
-recorded: files that were never synchronised are empty, names that were not are missing. In the others a random part
-of the later changes is kept as well, because a file system may write any of them at any time: new names, removed names,
-and parts of the content.
+The calls ``fsync`` and ``fdatasync`` of a run are recorded: the content of a file when it was synchronised last, and
+the names in a folder when it was. At a random call the run ends. In every other round its folder is replaced by what
+was recorded: files that were never synchronised are empty, names that were not are missing. In the others a random
+part of the later changes is kept as well, because a file system may write any of them at any time: new names, removed
+names, and parts of the content.
 """
 
 import json

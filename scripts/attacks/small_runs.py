@@ -45,6 +45,8 @@ def server() -> Any:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(
         [
+            "rsvib_torch.commands.main",
+            "rsvib_torch.report.results",
             "rsvib_torch.stacks.process",
             "rsvib_torch.restoration.restore",
             "rsvib_torch.detection.detect",
@@ -147,7 +149,9 @@ def _call(function: Callable[..., Any], arguments: tuple[Any, ...], options: dic
         channel.send(("completed", result if isinstance(result, (int, str)) else ""))
 
 
-def fork(function: Callable[..., Any], *arguments: Any, seconds: float | None = None, **options: Any) -> tuple[Any, Any]:
+def fork(
+    function: Callable[..., Any], *arguments: Any, seconds: float | None = None, **options: Any
+) -> tuple[Any, Any]:
     """Call a function in a child process.
 
     Returns:
