@@ -355,11 +355,12 @@ class Sink:
     def _delete_part(self) -> None:
         self._folder.delete([self._path.name, *(self._path.name + ending for ending in self._form.companions)])
 
-    def resume(self, entries: Iterable[dict[str, Any]]) -> list[int]:
+    def resume(self, entries: Iterable[dict[str, Any]], *, complete: bool) -> list[int]:
         """Continue an interrupted run.
 
         Args:
             entries: Those of the journal.
+            complete: Whether these are all windows.
 
         Returns:
             Numbers of the windows whose frames are not on the disk as they were written.
@@ -386,7 +387,7 @@ class Sink:
                     break
         if moved_there is not None:
             moved_there.close()
-        self._moved = self._writer is None and not damaged
+        self._moved = complete and self._writer is None and not damaged
         if not self._moved and (self._writer is None or len(damaged) == count):
             self.close()
             self.begin()

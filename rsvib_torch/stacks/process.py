@@ -306,7 +306,7 @@ def _begin_or_resume(
     resumes = journal.open(header, resume=resume)
     with disk_errors_named(journal):
         if resumes:
-            journal.drop(sink.resume(journal.entries()))
+            journal.drop(sink.resume(journal.entries(), complete=journal.count == len(windows)))
         else:
             sink.begin()
     return [window for window in windows if window.index not in journal]

@@ -41,11 +41,7 @@ def _recorded_run(source: Path, sink: Path, options: dict[str, Any], root: Path,
             part.write_text(json.dumps(names))
             part.rename(records / f"{status.st_ino}.names")
         else:
-            with part.open("wb") as copy:
-                size, start = status.st_size, 0
-                while start < size and (block := os.pread(file, 1 << 20, start)):
-                    copy.write(block)
-                    start += len(block)
+            part.write_bytes(Path(f"/proc/self/fd/{file}").read_bytes())  # it may be open for writing only
             part.rename(records / str(status.st_ino))
 
     names = {entry.name: (entry.inode(), entry.is_dir()) for entry in os.scandir(root)}

@@ -36,7 +36,7 @@ FORMATS: dict[str, tuple[str, dict[str, Any]]] = {
     "video": ("out.mkv", {}),
 }
 _CALLS = ("write", "pwrite", "replace", "fsync", "fdatasync", "ftruncate", "unlink", "mkdir", "rmdir", "rename")
-LIMIT = 120.0  # s for one run, which takes less than one on an idle machine
+LIMIT = 100.0  # s for one run, which takes less than one on an idle machine
 
 
 @functools.cache
@@ -174,25 +174,30 @@ def fork(
     return {"completed": 0, "refused": 2, "traceback": 1}[outcome], result
 
 
-def count_file_calls(die_at: int, before: Callable[[str, Any], None] | None = None) -> list[int]:
+def count_file_calls(die_at: int, after: Callable[[str, Any], None] | None = None) -> list[int]:
     """Kill this process at its n-th call that changes a file (0: never); returns the number of calls so far.
 
     Args:
         die_at: Number of the call.
-        before: Called with the name of a call and its arguments after it has succeeded.
+        after: Called with the name of a call and its arguments after it has succeeded.
     """
-    numbers, lock, done = itertools.count(1), threading.Lock(), [0]
+    numbers, lock, done = itertools.count(1), threading.RLock(), [0]
+    inside = threading.local()
 
     def wrap(name: str, real: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **options: Any) -> Any:
+            if getattr(inside, "call", False):  # of ``after`` itself
+                return real(*arguments, **options)
             with lock:
                 done[0] = next(numbers)
                 if done[0] == die_at:
                     os.kill(os.getpid(), signal.SIGKILL)
                     time.sleep(60)
                 result = real(*arguments, **options)
-                if before is not None:
-                    before(name, arguments)
+                if after is not None:
+                    inside.call = True
+                    after(name, arguments)
+                    inside.call = False
                 return result
 
         return call
