@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Unpack
 
-from rsvib_torch.core.atomic import make_folder, whole_file
+from rsvib_torch.core.atomic import make_folder, sync, whole_file
 from rsvib_torch.core.option_types import BadFrames
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.presentation import Summarised
@@ -274,6 +274,7 @@ def process_stack(
                 with whole_file(target) as part:
                     write_manifest(part, header, journal.records(), not_kept)
                     writer.finish(journal.written)
+                sync(target.absolute().parent)  # the temporary folder is gone as well
         finally:
             writer.close()
         summary = report(journal.records(), resumed, not_kept)

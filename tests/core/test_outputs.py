@@ -73,5 +73,5 @@ def test_folder_of_results_may_contain_an_input_file_but_not_an_input_folder(pla
 
 def test_outputs_must_differ(place):
     for one, other in (("new.tif", "pngs/../new.tif"), ("frames.tif", "hard.tif"), ("out.zarr", "out.zarr/a.json")):
-        with pytest.raises(ValueError, match="cannot write .* and .*; choose two names"):
+        with pytest.raises(ValueError, match=r"cannot write .* and .*; choose two names"):
             check_outputs([one, other], [])

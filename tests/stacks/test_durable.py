@@ -1,5 +1,6 @@
 """Interrupted runs on damaged disks and in hostile folders: frames are verified, links are not followed."""
 
+import functools
 import json
 import os
 import re
@@ -119,13 +120,13 @@ def test_missing_and_truncated_parts_are_computed_again(whole, interrupted, tmp_
 @pytest.mark.parametrize("name", ["out.tif", "out.raw", "out.h5", "out.zarr", "frames", "skipped.npy"])
 def test_frames_are_synchronised_before_their_window_is_entered(whole, tmp_path, monkeypatch, name):
     synchronised, checked = set(), []
+
+    def record(real, file):
+        real(file)
+        synchronised.add((os.fstat(file).st_ino, os.fstat(file).st_size))
+
     for call in ("fsync", "fdatasync"):
-
-        def record(file, real=getattr(os, call)):
-            real(file)
-            synchronised.add((os.fstat(file).st_ino, os.fstat(file).st_size))
-
-        monkeypatch.setattr(os, call, record)
+        monkeypatch.setattr(os, call, functools.partial(record, getattr(os, call)))
     add = Journal.add
 
     def check(journal, record, stored):
@@ -239,7 +240,7 @@ def test_a_line_that_was_not_completely_on_the_disk_is_ignored(whole, interrupte
 def test_damaged_headers_are_refused_in_one_line(whole, interrupted, tmp_path, text):
     work = interrupted("out.tif", tmp_path)
     (work / "run.json").write_text(text)
-    with pytest.raises(ValueError, match="is damaged|cannot resume") as raised:
+    with pytest.raises(ValueError, match=r"is damaged|cannot resume") as raised:
         process_small(whole / "frames.tif", tmp_path / "out.tif", resume=True)
     assert "\n" not in str(raised.value)
 
