@@ -47,7 +47,7 @@ ATTACKS: dict[str, Attack] = {
     "power_losses": Attack("power losses, resumed", power_losses.trials, 450),
     "damaged_parts": Attack("damaged parts of interrupted runs, resumed", damaged_parts.trials, 126),
     "journals": Attack("damaged journals", journals.trials, 250),
-    "links": Attack("links and foreign files as work folders", links.trials, 90),
+    "links": Attack("links and foreign files as work folders", links.trials, 110),
     "inputs": Attack("outputs that are or contain inputs", inputs.trials, 250),
     "concurrent": Attack("several runs with one output", concurrent.trials, 45),
     "disks": Attack("full and read-only disks", disks.trials, 69),
