@@ -64,6 +64,7 @@ class Config:
         simulation: Vibration and noise to simulate; None if it is not in the file.
         stack: Options ``window`` and ``bad_frames`` of ``process_stack`` that are in the file.
         arguments: Options of the program that describe the camera, for the commands that it suggests.
+        path: The file; None if the camera is described by options only.
     """
 
     source: str
@@ -74,6 +75,7 @@ class Config:
     simulation: Simulation | None
     stack: dict[str, Any]
     arguments: tuple[str, ...] = ()
+    path: Path | None = None
 
 
 class SensorSection(Section):
@@ -277,6 +279,7 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
         restoration=_given(content.restoration),
         simulation=simulation,
         stack=_given(content.stack),
+        path=None if path is None else Path(path),
     )
 
 

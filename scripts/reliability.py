@@ -16,7 +16,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from attacks import crafted, memory, workers
+from attacks import (
+    concurrent,
+    crafted,
+    damaged_parts,
+    disks,
+    inputs,
+    journals,
+    kills,
+    links,
+    memory,
+    power_losses,
+    workers,
+)
 from attacks.trial import FAILURES, OUTCOMES, Trial
 
 import rsvib_torch as rsv
@@ -43,6 +55,14 @@ class Attack:
 
 # A new attack is one module in scripts/attacks and one line here.
 ATTACKS: dict[str, Attack] = {
+    "kills": Attack("runs killed and resumed", kills.trials, 270),
+    "power_losses": Attack("power losses, resumed", power_losses.trials, 450),
+    "damaged_parts": Attack("damaged parts of interrupted runs, resumed", damaged_parts.trials, 126),
+    "journals": Attack("damaged journals", journals.trials, 250),
+    "links": Attack("links and foreign files as work folders", links.trials, 110),
+    "inputs": Attack("outputs that are or contain inputs", inputs.trials, 250),
+    "concurrent": Attack("several runs with one output", concurrent.trials, 45),
+    "disks": Attack("full and read-only disks", disks.trials, 69),
     "memory": Attack("`--memory` in different layouts", memory.trials, 17),
     "crafted": Attack("crafted files", crafted.trials, 500),
     "workers": Attack("killed and missing Dask workers", workers.trials, 9),

@@ -32,7 +32,8 @@ STILL = crop(SCENE)
 def fork_server():
     """A multiprocessing context in which processes start quickly because libraries are loaded only once."""
     context = multiprocessing.get_context("forkserver")
-    libraries = ["rsvib_torch.stacks", "scipy.ndimage", "scipy.interpolate", "h5py", "zarr", "pytest", "_pytest.config"]
+    package = ["rsvib_torch.stacks.process", "rsvib_torch.restoration.restore", "rsvib_torch.detection.detect"]
+    libraries = [*package, "scipy.ndimage", "scipy.interpolate", "h5py", "zarr", "pytest", "_pytest.config"]
     context.set_forkserver_preload(libraries)
     return context
 

@@ -24,6 +24,7 @@ from rsvib_torch.commands.options import (
 from rsvib_torch.commands.terminal import Answer, error_line, note, working
 from rsvib_torch.config import presets, read_config
 from rsvib_torch.core.atomic import check_writable, whole_file
+from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.motion.timing import SensorTiming
 
 __all__ = ["init", "sensor_toml"]
@@ -88,6 +89,7 @@ def init(
         raise ValueError("give a stack of frames, or --preset NAME (--list-presets lists them)")
     if out.exists() and not overwrite:
         raise ValueError(f"{out} exists; --overwrite replaces it, --out FILE writes another file")
+    check_outputs([out], [] if frames is None else io.stack_files(frames))
     check_writable(out)
     if preset is not None:
         if preset not in presets():

@@ -76,8 +76,8 @@ def motion(
 
     To restore frames with the CSV file: rsvib known --motion FILE --unit px --offset 0.
     """
+    check_new([out], overwrite, [*io.stack_files(frames), settings.path])
     check_writable(out)
-    check_new([out], overwrite)
     stack = load(frames, settings, full_scale, device)
     result: MotionDetection | SweptTone
     with working("detecting the motion"):
@@ -180,6 +180,7 @@ def known(
     The recording is compared with the offsets of rows between the frames, and refused if it does not explain them. If
     the restored frames are judged no better than the input, the input is written unchanged, unless --force is given.
     """
+    check_new(io.stack_files(restored), overwrite, [*io.stack_files(frames), settings.path, motion])
     recorded = rsvib_torch.read_motion(
         motion,
         unit=unit,
@@ -192,7 +193,6 @@ def known(
     options = restoration_options(info, scale, settings)
     shape = (1, *info.shape[1:]) if options.get("joint") is True else info.shape
     io.check_stack_target(restored, shape, dtype=info.dtype, full_scale=scale, like=info)
-    check_new([restored], overwrite)
     results: dict[str, list[str]] = {}
     data: dict[str, Any] = {"alignment": None, "check": None}
     stack = load(frames, settings, full_scale, device, options)
@@ -296,8 +296,8 @@ def calibrate(
             "give --frequency of the flicker, or --exposure once per frame for a strobe of unknown frequency"
         )
     if out is not None:
+        check_new([out], overwrite, [file for path in frames for file in io.stack_files(path)])
         check_writable(out)
-        check_new([out], overwrite)
     infos = [io.read_stack_info(path) for path in frames]
     for path, info in zip(frames, infos, strict=True):
         for sentence in io.describe_stack(info, None):

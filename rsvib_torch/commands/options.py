@@ -17,6 +17,7 @@ from rsvib_torch.commands.terminal import Answer, note
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.option_types import METHOD_SETTINGS, PriorName, method_options
+from rsvib_torch.core.outputs import check_outputs
 
 if TYPE_CHECKING:
     import torch
@@ -288,8 +289,19 @@ class Overrides:
 NO_OVERRIDES = Overrides(None, None, None, None)
 
 
-def check_new(paths: Iterable[Path], overwrite: bool) -> None:
-    """Raise a ``FileExistsError`` if results exist and must not be replaced; an empty folder does not count."""
+def check_new(
+    paths: Iterable[Path], overwrite: bool, inputs: Iterable[Path | None], *, folder: Path | None = None
+) -> None:
+    """Raise an error if results would replace an input, or exist and must not be replaced.
+
+    Args:
+        paths: Files to write, and folders that are written as a whole. An empty folder may exist.
+        overwrite: Whether existing results are replaced.
+        inputs: Files and folders that are read; None for those that were not given.
+        folder: Folder of the results, as in ``check_outputs``.
+    """
+    paths = list(paths)
+    check_outputs(paths, [path for path in inputs if path is not None], folder=folder)
     existing = [path for path in paths if path.exists() and not (path.is_dir() and not any(path.iterdir()))]
     if existing and not overwrite:
         names = ", ".join(path.name for path in existing)

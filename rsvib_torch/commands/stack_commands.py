@@ -200,10 +200,21 @@ def _write_windows(folder: Path, path: Path) -> list[str]:
     return ["windows.png", "windows.json", "windows.csv"]
 
 
-def _check_folder(folder: Path, names: Iterable[str], overwrite: bool) -> None:
-    """Raise an ``OSError`` if results cannot be written into a folder, or exist there and must not be replaced."""
+def _check_folder(
+    folder: Path, names: Iterable[str], overwrite: bool, inputs: Iterable[Path | None], output: Path | None = None
+) -> None:
+    """Raise an error if results cannot be written into a folder, exist there, or would replace an input.
+
+    Args:
+        folder: The folder.
+        names: Names of files in it.
+        overwrite: Whether existing results are replaced.
+        inputs: Files and folders that are read.
+        output: A stack that is written there as well.
+    """
+    stack = [] if output is None else io.stack_files(output)
+    check_new([*(folder / name for name in names), *stack], overwrite, inputs, folder=folder)
     check_writable(folder, folder=True)
-    check_new([folder / name for name in names], overwrite)
 
 
 def _remove_old(folder: Path, results: Iterable[str], names: Iterable[str]) -> None:
@@ -237,7 +248,7 @@ def simulate(
     """
     import torch  # noqa: PLC0415
 
-    check_new([frames], overwrite)
+    check_new(io.stack_files(frames), overwrite, [*io.stack_files(scene), settings.path])
     if settings.simulation is None:
         raise ValueError(
             f"{settings.source}: simulation: missing key; expected a table with vibration, num_frames, ..."
@@ -295,7 +306,7 @@ def detect(
 
     The vibration is modelled as sinusoids of constant amplitude and frequency. For other motion see rsvib motion.
     """
-    _check_folder(out, (*_OF_DETECTION, *_OF_WINDOWS), overwrite)
+    _check_folder(out, (*_OF_DETECTION, *_OF_WINDOWS), overwrite, [*io.stack_files(frames), settings.path])
     window = settings.stack.get("window") if window is None else window
     if window is None:
         stack = load(frames, settings, full_scale, device)
@@ -369,14 +380,15 @@ def restore_frames(
     If the restored frames are judged no better than the input, the input is written unchanged, unless --force is given.
     """
     overrides = Overrides(method, joint, prior, saturation)
-    check_new([restored, *([] if report is None else [report])], overwrite)
+    outputs, inputs = io.stack_files(restored), [*io.stack_files(frames), settings.path, vibration]
+    check_new([*outputs, *([] if report is None else [report])], overwrite, inputs)
     check_regular(vibration)
     with vibration.open("rb") as file:
         is_manifest = b'"rsvib stack"' in file.read(200)  # bytes; the format is the first key of either file
     if is_manifest:
         if report is not None:
             raise ValueError("--report needs a vibration.json; the verdict on each window is in its manifest.json")
-        check_new([restored.with_name(f"{restored.name}.manifest.json")], overwrite)
+        check_new([*outputs, restored.with_name(f"{restored.name}.manifest.json")], overwrite, inputs)
         return _restore_windows(frames, restored, settings, vibration, overrides, force, device, full_scale)
     info = io.read_stack_info(frames)
     detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
@@ -513,7 +525,7 @@ def run(
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
     results = (*_OF_DETECTION, *_OF_WINDOWS, "restoration.json", "before_after.png")
-    _check_folder(out, (output, *results), overwrite or resume)
+    _check_folder(out, results, overwrite or resume, [*io.stack_files(frames), settings.path], out / output)
     info = io.read_stack_info(frames)
     print_notes(info, settings)
     scale = full_scale_of(frames, info, settings, full_scale)
@@ -651,7 +663,8 @@ def report(
     """
     boxes = [_edge_box(text) for text in edge or []]
     windows = None if manifest is None else stacks.read_manifest(manifest)
-    _check_folder(out, ["report.html"], overwrite)
+    inputs = [*io.stack_files(frames), settings.path, *([] if manifest is None else [manifest])]
+    _check_folder(out, ["report.html"], overwrite, inputs)
     info = io.read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
     options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation))
@@ -682,6 +695,7 @@ def report(
     )
     with whole_folder(out) as folder, working("writing the page"):
         files = reports.write_report_page(folder, content, boxes or None)
+        check_new([out / name for name in files], overwrite=True, inputs=inputs)
     return Answer(
         {
             f"Vibration in {frames.name}": [detection.summary()],

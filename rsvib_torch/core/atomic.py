@@ -1,5 +1,6 @@
-"""Atomic writes: files and folders get their names when they are complete."""
+"""Atomic, durable writes: files and folders get their names when they are complete and on the disk."""
 
+import errno
 import glob
 import os
 import shutil
@@ -16,8 +17,11 @@ except ImportError:  # without it temporary folders of killed processes are not 
 
 __all__ = [
     "check_writable",
+    "make_folder",
     "move_into_place",
     "nearest_folder",
+    "sync",
+    "sync_tree",
     "temporary_folder",
     "whole_file",
     "whole_folder",
@@ -34,6 +38,45 @@ def nearest_folder(path: Path) -> Path:
     return parent
 
 
+def sync(path: Path) -> None:
+    """Return when the content of a file, or the names in a folder, are on the disk: a power loss does not undo them."""
+    try:
+        file = os.open(path, os.O_RDONLY)
+    except PermissionError:
+        if path.is_dir():  # a folder in which files may be created but not listed
+            return
+        raise
+    try:
+        os.fsync(file)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP) or not path.is_dir():  # file systems without this function
+            raise
+    finally:
+        os.close(file)
+
+
+def sync_tree(path: Path) -> None:
+    """``sync`` a file, or a folder with everything in it."""
+    for folder, _, names in os.walk(path, topdown=False):
+        for name in names:
+            sync(Path(folder, name))
+        sync(Path(folder))
+    if path.is_file():
+        sync(path)
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder, and those above it, if it does not exist; its name is on the disk when the function returns."""
+    existing = nearest_folder(path)
+    path.mkdir(parents=True, exist_ok=True)
+    folder = path.absolute().parent
+    while True:
+        sync(folder)
+        if folder in (existing, folder.parent):
+            return
+        folder = folder.parent
+
+
 def _remove_abandoned(parent: Path, name: str) -> None:
     """Remove temporary folders of killed processes: the operating system has released their locks."""
     random_part = "?" * 8  # as made by ``tempfile``
@@ -44,7 +87,8 @@ def _remove_abandoned(parent: Path, name: str) -> None:
             continue
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(folder, ignore_errors=True)
+            if os.fstat(file).st_uid == os.geteuid():
+                shutil.rmtree(folder, ignore_errors=True)
         except OSError:
             pass  # in use
         finally:
@@ -133,7 +177,9 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     with temporary_folder(target) as folder:
         part = folder / target.name
         yield part
+        sync(part)
         os.replace(part, target)
+        sync(target.absolute().parent)
 
 
 @contextmanager
@@ -164,18 +210,21 @@ def _move_files(part: Path, target: Path) -> None:
     files = sorted(part.iterdir())
     for file in files:
         _check_file_target(target / file.name, parent_exists=False)
-    target.mkdir(parents=True, exist_ok=True)
+        sync(file)
+    make_folder(target)
     for file in files:
         os.replace(file, target / file.name)
+    sync(target)
 
 
 def move_into_place(
     part: Path, target: Path, kind: Literal["file", "folder", "tree"] = "file", companions: tuple[str, ...] = ()
 ) -> None:
-    """Rename a complete stack from its temporary name ``part``; may be repeated after an interruption.
+    """Rename a complete stack, which is on the disk, from its temporary name ``part``.
 
-    An existing file or tree is replaced, an existing folder keeps its other files; ``kind`` and ``companions`` are
-    those of ``StackFormat``.
+    It may be repeated after an interruption, and the new name is on the disk when the function returns. An existing
+    file or tree is replaced, an existing folder keeps its other files; ``kind`` and ``companions`` are those of
+    ``StackFormat``.
     """
     for ending in companions:
         companion = part.with_name(part.name + ending)
@@ -188,6 +237,7 @@ def move_into_place(
         old = part.with_name(f"{part.name}.old")
         os.replace(target, old)
         os.replace(part, target)
-        shutil.rmtree(old)
+        old.unlink() if old.is_symlink() else shutil.rmtree(old)
     else:
         os.replace(part, target)
+    sync(target.absolute().parent)

@@ -5,6 +5,7 @@ from .files import (
     read_stack,
     read_stack_info,
     register_format,
+    stack_files,
     write_stack,
 )
 from .formats import FrameReader, FrameWriter, StackFormat
@@ -26,6 +27,7 @@ __all__ = [
     "read_stack",
     "read_stack_info",
     "register_format",
+    "stack_files",
     "timing_from_first_frame",
     "write_stack",
 ]

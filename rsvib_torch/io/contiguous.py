@@ -3,6 +3,7 @@
 import errno
 import math
 import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -149,16 +150,18 @@ class ContiguousWriter:
         path: The file, which exists already.
         info: The stack.
         offset: Position of the first frame in bytes.
-        reserve: Whether to allocate the space on the disk now, so that a full disk is an error before any work.
+        fresh: Whether the file is new: it gets its full length, and the space on the disk is allocated, so that a full
+            disk is an error before any work.
+        beside: Other files of the stack.
     """
 
-    def __init__(self, path: Path, info: StackInfo, offset: int, *, reserve: bool) -> None:
-        self._info, self._offset = info, offset
+    def __init__(self, path: Path, info: StackInfo, offset: int, *, fresh: bool, beside: Sequence[Path] = ()) -> None:
+        self._info, self._offset, self._beside = info, offset, beside
         self._file = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
         needed = offset + info.frame_bytes * info.shape[0]
-        if os.fstat(self._file).st_size < needed:
+        if fresh and os.fstat(self._file).st_size < needed:
             os.ftruncate(self._file, needed)
-        if reserve and hasattr(os, "posix_fallocate"):
+        if fresh and hasattr(os, "posix_fallocate"):
             try:
                 os.posix_fallocate(self._file, 0, needed)
             except OSError as error:
@@ -176,6 +179,24 @@ class ContiguousWriter:
     def sync(self) -> None:
         """Return when all written data are on the disk."""
         os.fdatasync(self._file) if hasattr(os, "fdatasync") else os.fsync(self._file)
+
+    def stored(self, index: int | None) -> Iterator[bytes]:
+        """Bytes of a frame; for None those of the rest of the file, and of the files beside it."""
+        size = self._info.frame_bytes
+        if index is not None:
+            yield from self._blocks(self._offset + index * size, size)
+            return
+        yield from self._blocks(0, self._offset)
+        end = self._offset + self._info.shape[0] * size
+        yield from self._blocks(end, os.fstat(self._file).st_size - end)
+        for path in self._beside:
+            yield path.read_bytes()
+
+    def _blocks(self, start: int, size: int) -> Iterator[bytes]:
+        """Blocks of up to 1 MiB: a damaged header may state any size."""
+        while size > 0 and (block := os.pread(self._file, min(size, 1 << 20), start)):
+            yield block
+            start, size = start + len(block), size - len(block)
 
     def close(self) -> None:
         """Close the file."""

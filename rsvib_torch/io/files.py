@@ -12,14 +12,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.atomic import check_writable, move_into_place, temporary_folder
+from rsvib_torch.core.atomic import check_writable, make_folder, move_into_place, sync_tree, temporary_folder
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.free_memory import check_fits
+from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.progress import steps
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.io import hdf5, image_folder, npy, raw, tiff, video, zarr_store
-from rsvib_torch.io.formats import FrameReader, StackFormat, find_format, register_format, target_format
+from rsvib_torch.io.formats import FORMATS, FrameReader, StackFormat, find_format, register_format, target_format
 from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.full_scale import (
     check_dtype,
@@ -43,6 +44,7 @@ __all__ = [
     "read_stack",
     "read_stack_info",
     "register_format",
+    "stack_files",
     "timing_of_files",
     "write_frames",
     "write_stack",
@@ -270,6 +272,18 @@ def timing_of_files(frames: FramesOrFiles, timing: SensorTiming) -> SensorTiming
     return timing
 
 
+def stack_files(path: PathLike) -> list[Path]:
+    """The paths that a stack occupies: its file or folder, and the files beside it (sidecars).
+
+    Example:
+        >>> [path.name for path in stack_files("frames.raw")]
+        ['frames.raw', 'frames.raw.json']
+    """
+    path = Path(path)
+    form = FORMATS.get(path.suffix.lower())
+    return [path, *(path.with_name(path.name + ending) for ending in (() if form is None else form.companions))]
+
+
 def check_info_target(
     path: Path, info: StackInfo, compression: str | None = None, *, check_folder: bool = True
 ) -> StackFormat:
@@ -396,6 +410,7 @@ def write_frames(
     """
     if form.write_all is not None and (compression is not None or form.create is None):
         form.write_all(path, info, frames, compression)
+        sync_tree(path)
         return
     assert form.create is not None
     writer = form.create(path, info, True)
@@ -445,12 +460,12 @@ def write_stack(
         like: The stack from which the frames were computed: its resolution, orientation, frame rate, channel order,
             metadata and, if the number of frames is the same, frame times are stored if the format supports them;
             ``metadata_not_kept`` lists those that are not. If both files are videos, the presentation times of the
-            frames and the audio are copied.
+            frames and the audio are copied. Its file must not be ``path``.
 
     Raises:
         OSError: If the file cannot be written.
         TypeError: If the frames are not a tensor or array of numbers.
-        ValueError: If the format does not support them, or the full scale is unknown.
+        ValueError: If the format does not support them, the full scale is unknown, or ``path`` is the file of ``like``.
 
     Example:
         >>> import tempfile
@@ -463,6 +478,8 @@ def write_stack(
         True
     """
     path = Path(path)
+    if like is not None and like.path is not None:
+        check_outputs(stack_files(path), stack_files(like.path))
     frames = as_tensor("frames", frames)
     if not frames.dtype.is_floating_point:
         stored = np.dtype(str(frames.dtype).removeprefix("torch."))
@@ -480,5 +497,5 @@ def write_stack(
         part = folder / path.name
         write_frames(form, part, info, _counted(pixels), compression)
         if form.kind == "folder":
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
         move_into_place(part, path, form.kind, form.companions)

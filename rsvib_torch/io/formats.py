@@ -44,8 +44,14 @@ class FrameWriter(Protocol):
         """Write a frame, (H, W) or (C, H, W)."""
 
     def sync(self) -> None:
-        """Return when all written frames are on the disk; needed if the format buffers them."""
+        """Return when all written frames, and the names of their files, are on the disk (``core.atomic.sync``)."""
         return
+
+    def stored(self, index: int | None) -> Iterator[bytes]:
+        """Bytes on the disk that hold a frame, or everything else (headers) for None; fewer if the file is damaged.
+
+        An interrupted run is resumed with the frames for which they are unchanged. Without this method it starts again.
+        """
 
     def close(self) -> None:
         """Finish the file, if it is open between frames."""
@@ -71,7 +77,8 @@ class FrameWriter(Protocol):
 #              frames are missing. Frames that are stored together are decoded once (``io/blocks.py``);
 #              ``info.decoding_bytes`` is the memory that this needs.
 # Writing:     a format defines ``create``, ``write_all``, or neither (it is then only read).
-#              After ``create(path, info, False)`` on an unfinished stack all frames that were synced are still there.
+#              After ``create(path, info, False)`` on an unfinished stack all frames that were synced are still there,
+#              also after a loss of power; it must not change the files of a damaged stack before a frame is written.
 @dataclass(frozen=True)
 class StackFormat:
     """How stacks are stored in files with certain endings.

@@ -132,7 +132,7 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
             h5py.Dataset(dataset).attrs.update(attributes_of(info))
     with h5py.File(path, "r", locking=False) as file:
         offset = int(file[_DATASET].id.get_offset())
-    return ContiguousWriter(path, info, offset, reserve=fresh)
+    return ContiguousWriter(path, info, offset, fresh=fresh)
 
 
 FORMAT = StackFormat(

@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsvib_torch.core.atomic import sync
 from rsvib_torch.io.formats import FrameReader, FrameWriter, StackFormat
 from rsvib_torch.io.jpeg import decode_jpeg, jpeg_info
 from rsvib_torch.io.png import decode_png, encode_png, png_info
@@ -158,7 +160,17 @@ class _ImagesWriter(FrameWriter):
             encode_png(part, np.asarray(frame, dtype=self._info.dtype), one)
         else:
             write_tiff(part, one, iter([frame]), None)
+        sync(part)
         os.replace(part, file)
+
+    def sync(self) -> None:
+        """Return when the names of the files are on the disk."""
+        sync(self._files[0].parent)
+
+    def stored(self, index: int | None) -> Iterator[bytes]:
+        """Content of the file of a frame; there are no other files."""
+        if index is not None:
+            yield self._files[index].read_bytes()
 
 
 def _create_folder(path: Path, info: StackInfo, fresh: bool) -> _ImagesWriter:

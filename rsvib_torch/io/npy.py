@@ -60,7 +60,7 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
     with path.open("rb") as file:
         offset = _read_header(file)[3]
     # channels are always stored second, whatever the input was
-    return ContiguousWriter(path, replace(info, channels_last=False), offset, reserve=fresh)
+    return ContiguousWriter(path, replace(info, channels_last=False), offset, fresh=fresh)
 
 
 def _check(path: Path, info: StackInfo) -> None:

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from rsvib_torch.core.atomic import sync
 from rsvib_torch.core.validation import Section, read_json, validate
 from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
 from rsvib_torch.io.formats import StackFormat
@@ -67,8 +68,9 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
             "resolution": info.resolution,
         }
         _sidecar_path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        sync(_sidecar_path(path))
         path.write_bytes(b"")
-    return ContiguousWriter(path, info, 0, reserve=fresh)
+    return ContiguousWriter(path, info, 0, fresh=fresh, beside=[_sidecar_path(path)])
 
 
 FORMAT = StackFormat(

@@ -456,7 +456,7 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
         tifffile.imwrite(path, data=None, **options)
     with tifffile.TiffFile(path) as tif:
         offset = int(tif.pages.first.dataoffsets[0])
-    return ContiguousWriter(path, stored, offset, reserve=fresh)
+    return ContiguousWriter(path, stored, offset, fresh=fresh)
 
 
 def write_tiff(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:

@@ -2,12 +2,14 @@
 
 import math
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rsvib_torch.core.atomic import sync
 from rsvib_torch.core.validation import read_json
 from rsvib_torch.io.blocks import ArrayReader
 from rsvib_torch.io.formats import FrameWriter, StackFormat, needed_package
@@ -96,12 +98,33 @@ def _open(path: Path) -> ArrayReader:
 class _ZarrWriter(FrameWriter):
     """Frames of a Zarr array, one chunk each."""
 
-    def __init__(self, array: Any, info: StackInfo) -> None:
-        self._array, self._info = array, info
+    def __init__(self, path: Path, array: Any, info: StackInfo) -> None:
+        self._path, self._array, self._info = path, array, info
+        self._written = [path / _HEADER]
+
+    def _chunk(self, index: int) -> Path:
+        """The file of a frame."""
+        position = (index, *(0 for _ in self._info.stored_shape[1:]))
+        return self._path / str(self._array.metadata.encode_chunk_key(position))
 
     def write(self, index: int, frame: NDArray[Any]) -> None:
         """Write the chunk of a frame."""
         self._array[index] = self._info.to_stored(frame)
+        self._written.append(self._chunk(index))
+
+    def sync(self) -> None:
+        """Return when all chunks, and the names of their files and folders, are on the disk."""
+        folders: dict[Path, None] = {}
+        for file in self._written:
+            sync(file)
+            folders |= dict.fromkeys(folder for folder in file.parents if folder.is_relative_to(self._path))
+        for folder in sorted(folders, key=lambda folder: -len(folder.parts)):
+            sync(folder)
+        self._written.clear()
+
+    def stored(self, index: int | None) -> Iterator[bytes]:
+        """Content of the file of a frame; for None that of the header."""
+        yield (self._path / _HEADER if index is None else self._chunk(index)).read_bytes()
 
 
 def _create(path: Path, info: StackInfo, fresh: bool) -> _ZarrWriter:
@@ -109,7 +132,7 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> _ZarrWriter:
     if not fresh:
         for incomplete in path.rglob("*.partial"):  # chunks that a killed process did not complete
             incomplete.unlink()
-        return _ZarrWriter(zarr.open_array(store=str(path), mode="r+", zarr_format=3), info)
+        return _ZarrWriter(path, zarr.open_array(store=str(path), mode="r+", zarr_format=3), info)
     array = zarr.create_array(
         store=str(path),
         shape=info.stored_shape,
@@ -121,7 +144,7 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> _ZarrWriter:
         attributes=attributes_of(info),
         dimension_names=list(info.stored_axes),
     )
-    return _ZarrWriter(array, info)
+    return _ZarrWriter(path, array, info)
 
 
 FORMAT = StackFormat(

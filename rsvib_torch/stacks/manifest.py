@@ -254,8 +254,6 @@ def write_manifest(
             file.write(",\n    " if number else "\n    ")
             file.write(json.dumps(record, allow_nan=False))
         file.write(f'\n  ],\n  "bad_frames": {json.dumps(bad)},\n  "not_kept": {json.dumps(list(not_kept))}\n}}\n')
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def read_manifest(path: str | os.PathLike[str]) -> StackManifest:

@@ -1,12 +1,14 @@
 """The output of a run while it is incomplete: a work folder beside it with a journal and the frames written so far.
 
-A run that was killed continues from the journal: frames are on the disk before their window is entered.
+A run that was killed continues from the journal: frames are on the disk before their window is entered, with a hash by
+which they are recognised when the run is resumed.
 """
 
+import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,15 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.atomic import move_into_place, nearest_folder, whole_file
+from rsvib_torch.core.atomic import move_into_place, sync
+from rsvib_torch.core.validation import read_json
 from rsvib_torch.io.files import write_frames
 from rsvib_torch.io.formats import FrameWriter, StackFormat
 from rsvib_torch.io.stack_info import StackInfo
-
-try:
-    import fcntl
-except ImportError:  # without it two runs are not kept apart
-    fcntl = None  # type: ignore[assignment]
+from rsvib_torch.stacks.private_folder import PrivateFolder
 
 __all__ = ["Journal", "Sink", "describe_difference", "disk_errors_named", "work_folder"]
 
@@ -48,38 +47,50 @@ def describe_difference(old: Any, new: Any, path: str = "") -> str | None:
     return None if old == new else f"{path} was {shortened(old)}, now it is {shortened(new)}"
 
 
+_STORED = ("position", "digests", "head")  # keys of an entry of the journal besides those of ``WindowRecord``
+_CHECKSUM = b', "checksum": "'
+_MAX_LINE = 1 << 28  # bytes of a line; an entry of a window of a million frames has 40 MB
+
+
 class Journal:
     """The work folder of a run, locked while it is open: a header and one line for every window that was written.
 
+    Every line has a checksum that depends on the header as well.
+
     Args:
         sink: The output of the run.
+        companions: Endings of further files of the output, as in ``StackFormat``.
 
     Attributes:
+        folder: The work folder.
         count: Number of windows that were written.
         written: Number of their frames.
+        has_lines: Whether an interrupted run has left windows here.
 
     Raises:
-        OSError: If the folder cannot be created, or another process uses it.
+        OSError: If the folder cannot be created, another process uses it, or no run has made it.
     """
 
-    def __init__(self, sink: Path) -> None:
-        self.sink, self.folder = sink, work_folder(sink)
-        self.count = self.written = 0
-        self._header, self._lines = self.folder / "run.json", self.folder / "journal.jsonl"
-        self._existing = nearest_folder(sink)
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OSError(f"cannot write {sink}: folder {sink.parent} is not writable ({error.strerror})") from error
-        self._lock_path = self.folder / "lock"
-        self._lock: int | None = os.open(self._lock_path, os.O_CREAT | os.O_RDWR)
+    def __init__(self, sink: Path, companions: tuple[str, ...] = ()) -> None:
+        self.sink, self.count, self.written = sink, 0, 0
+        parts = [sink.name, f"{sink.name}.old", *(f"{sink.name}{ending}" for ending in companions), "windows"]
+        # in the order of their removal: without a journal nothing is resumed, without a header nothing is removed
+        self._names = ["journal.jsonl", "journal.jsonl.part", *parts, "run.json.part", "run.json"]
+        self._lines: dict[int, int] = {}  # position of the line of each window
         self._file: int | None = None
+        self.folder = PrivateFolder(work_folder(sink), sink)
         try:
-            if fcntl is not None:
-                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            os.close(self._lock)
-            raise BlockingIOError(f"cannot write {sink}: another run is writing it") from error
+            self.has_lines = self._length() > 0
+        except BaseException:
+            self.folder.close()
+            raise
+
+    def _length(self) -> int:
+        try:
+            with self.folder.reading("journal.jsonl") as file:
+                return file.seek(0, os.SEEK_END)
+        except FileNotFoundError:
+            return 0
 
     def open(self, header: dict[str, Any], *, resume: bool) -> bool:
         """Begin a run, or resume one.
@@ -92,100 +103,180 @@ class Journal:
             Whether an interrupted run is continued.
 
         Raises:
-            FileExistsError: If there is an interrupted run and ``resume`` is False.
+            FileExistsError: If there is an interrupted run and ``resume`` is False, or files that no run has made.
             ValueError: If its input, settings or versions differ, or its journal is damaged.
         """
-        lines = self._complete_lines()
-        if lines and not resume:
+        if self.has_lines and not resume:
+            with self.folder.reading("journal.jsonl") as file:
+                count = sum(block.count(b"\n") for block in iter(lambda: file.read(1 << 20), b""))
             raise FileExistsError(
-                f"{self.sink}: a run was interrupted here after {len(lines)} windows; resume it (--resume), or delete "
-                f"{self.folder} to start over"
+                f"{self.sink}: a run was interrupted here after {count} windows; resume it (--resume), or delete "
+                f"{self.folder.path} to start over"
             )
-        if lines:
-            try:
-                old = json.loads(self._header.read_text(encoding="utf-8"))
-            except ValueError as error:
-                raise ValueError(f"{self._header} is damaged; delete {self.folder} to start over") from error
+        foreign = self._foreign_name()
+        if foreign is not None:
+            raise FileExistsError(
+                f"cannot write {self.sink}: {self.folder.path / foreign} was not made by a run; move it elsewhere, or "
+                f"delete {self.folder.path} to start over"
+            )
+        end = 0
+        if self.has_lines:
+            self._compare(header)
+            self.folder.check()
+            end = self._scan()
+        if not self._lines:
+            self.has_lines = False
+            self.folder.delete(self._names)
+            self.folder.write("run.json", [json.dumps(header).encode()])
+            self.folder.write("journal.jsonl", [])
+            self._key = self._read_key()
+        self._file = self.folder.open("journal.jsonl", os.O_RDWR)
+        os.ftruncate(self._file, end)
+        return bool(self._lines)
+
+    def _foreign_name(self) -> str | None:
+        """A file or folder in the work folder that no run has made; None if there is none."""
+        names = self.folder.names()
+        return min(names - set(self._names) if self._marked(names) else names, default=None)
+
+    @staticmethod
+    def _marked(names: set[str]) -> bool:
+        """Whether a run has made the folder with these names: its header is written first and deleted last."""
+        return "run.json" in names or names <= {"run.json.part"}
+
+    def _read_key(self) -> bytes:
+        with self.folder.reading("run.json") as file:
+            return hashlib.blake2b(file.read(), digest_size=32).digest()
+
+    def _compare(self, header: dict[str, Any]) -> None:
+        """Raise a ``ValueError`` if the header of the interrupted run is damaged or differs."""
+        path, remedy = self.folder.path / "run.json", f"delete {self.folder.path} to start over"
+        try:
+            self._key = self._read_key()
+            old = read_json(self.folder.place / "run.json", "header of a run")
             difference = describe_difference(old, json.loads(json.dumps(header)))
-            if difference:
-                raise ValueError(f"{self.sink}: cannot resume: {difference}; delete {self.folder} to start over")
-            self.count, self.written = len(lines), sum(json.loads(line)["written"] for line in lines)
-        else:
-            for entry in self.folder.iterdir():
-                if entry != self._lock_path:
-                    shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
-            with whole_file(self._header) as part:
-                part.write_text(json.dumps(header), encoding="utf-8")
-        self._file = os.open(self._lines, os.O_CREAT | os.O_RDWR)
-        os.ftruncate(self._file, sum(len(line) for line in lines))
-        os.lseek(self._file, 0, os.SEEK_END)
-        return bool(lines)
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"{path} is damaged; {remedy}") from error
+        if difference:
+            raise ValueError(f"{self.sink}: cannot resume: {difference}; {remedy}")
 
-    @property
-    def has_lines(self) -> bool:
-        """Whether an interrupted run has left windows here."""
-        return self._lines.exists() and self._lines.stat().st_size > 0
+    def _scan(self) -> int:
+        """Find the lines of all windows, and return the end of the last one.
 
-    def _complete_lines(self) -> list[bytes]:
-        """Lines of the journal; the last one is incomplete and ignored if the process was killed while writing it."""
-        lines = self._lines.read_bytes().splitlines(keepends=True) if self._lines.exists() else []
-        if lines and not lines[-1].endswith(b"\n"):
-            lines.pop()
-        for number, line in enumerate(lines):
-            try:
-                valid = json.loads(line)["window"] == number
-            except (ValueError, KeyError, TypeError):
-                valid = False
-            if not valid:
-                raise ValueError(f"{self._lines}: line {number + 1} is damaged; delete {self.folder} to start over")
-        return lines
+        The last line is ignored if the process or the machine stopped while it was written.
+        """
+        end = 0
+        with self.folder.reading("journal.jsonl") as file:
+            for number in range(1, 1 << 62):
+                line = file.readline(_MAX_LINE)
+                entry = self._entry(line)
+                if entry is None or entry["window"] in self._lines:
+                    last = len(line) < _MAX_LINE and not file.read(1)
+                    if last and (not line.endswith(b"\n") or b"\0" in line):
+                        break
+                    raise ValueError(
+                        f"{self.folder.path / 'journal.jsonl'}: line {number} is damaged; delete {self.folder.path} "
+                        "to start over"
+                    )
+                self._lines[entry["window"]] = end
+                self.count += 1
+                self.written += entry["written"]
+                end += len(line)
+        return end
 
-    def add(self, record: dict[str, Any]) -> None:
-        """Enter a window whose frames are on the disk."""
+    def _line(self, entry: dict[str, Any]) -> bytes:
+        body = json.dumps(entry, allow_nan=False).encode()[:-1]
+        return body + _CHECKSUM + self._checksum(body) + b'"}\n'
+
+    def _checksum(self, body: bytes) -> bytes:
+        return hashlib.blake2b(body, key=self._key, digest_size=16).hexdigest().encode()
+
+    def _entry(self, line: bytes) -> dict[str, Any] | None:
+        """The content of a line; None if it is damaged."""
+        body, _, rest = line.rpartition(_CHECKSUM)
+        if rest != self._checksum(body) + b'"}\n':
+            return None
+        entry: dict[str, Any] = json.loads(body + b"}")
+        return entry
+
+    def __contains__(self, window: int) -> bool:
+        return window in self._lines
+
+    def add(self, record: dict[str, Any], stored: dict[str, Any]) -> None:
+        """Enter a window.
+
+        Args:
+            record: Content of its ``WindowRecord``.
+            stored: Where its frames are on the disk, as from ``Sink.put``.
+        """
         assert self._file is not None
-        line = json.dumps(record, allow_nan=False).encode() + b"\n"
+        line = self._line({**record, **stored})
+        position = os.lseek(self._file, 0, os.SEEK_END)
         while line:  # an almost full disk accepts a part of it
             line = line[os.write(self._file, line) :]
         os.fsync(self._file)
+        self._lines[record["window"]] = position
         self.count += 1
         self.written += record["written"]
+
+    def drop(self, windows: Iterable[int]) -> None:
+        """Remove windows whose frames are damaged."""
+        dropped = set(windows)
+        if not dropped:
+            return
+        kept = [entry for entry in self.entries() if entry["window"] not in dropped]
+        lines = [self._line(entry) for entry in kept]
+        self.folder.write("journal.jsonl", lines)
+        assert self._file is not None
+        os.close(self._file)
+        self._file = self.folder.open("journal.jsonl", os.O_RDWR)
+        self._lines, end = {}, 0
+        for entry, line in zip(kept, lines, strict=True):
+            self._lines[entry["window"]] = end
+            end += len(line)
+        self.count, self.written = len(kept), sum(entry["written"] for entry in kept)
 
     def clear(self) -> None:
         """Remove all windows of a run that failed."""
         assert self._file is not None
         os.ftruncate(self._file, 0)
+        self._lines.clear()
         self.count = self.written = 0
+        self.has_lines = False
+
+    def entries(self) -> Iterator[dict[str, Any]]:
+        """Records of all windows in order, with the values of ``Sink.put``."""
+        with self.folder.reading("journal.jsonl") as file:
+            for window in sorted(self._lines):
+                file.seek(self._lines[window])
+                entry = self._entry(file.readline(_MAX_LINE))
+                assert entry is not None  # the folder is locked
+                yield entry
 
     def records(self) -> Iterator[dict[str, Any]]:
-        """Records of all windows."""
-        with self._lines.open("rb") as file:
-            for line in file:
-                yield json.loads(line)
+        """Records of all windows in order."""
+        for entry in self.entries():
+            yield {key: value for key, value in entry.items() if key not in _STORED}
 
     def close(self) -> None:
         """Release the folder; it is removed if it contains no window."""
-        if self._lock is not None and self.count == 0 and not self.has_lines:
+        if self.count == 0 and not self.has_lines:
             self.remove()
-        self._release()
-
-    def _release(self) -> None:
-        for file in (self._file, self._lock):
-            if file is not None:
-                os.close(file)
-        self._file = self._lock = None
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+        self.folder.close()
 
     def remove(self) -> None:
-        """Remove the folder, and the empty folders above it that were created for it."""
-        self._lines.unlink(missing_ok=True)  # first: without it there is nothing to resume
-        shutil.rmtree(self.folder, ignore_errors=True)
-        self._release()
-        folder = self.folder.absolute().parent
-        while folder != self._existing:
-            try:
-                folder.rmdir()
-            except OSError:
-                break
-            folder = folder.parent
+        """Remove everything that a run has made."""
+        if self._marked(self.folder.names()):
+            self.folder.delete(self._names[:1])
+            sync(self.folder.place)
+            self.folder.delete(self._names[1:-1])
+            sync(self.folder.place)
+            self.folder.delete(self._names[-1:])
+        self.folder.remove()
+        self.has_lines, self.count = False, 0
 
 
 @contextmanager
@@ -200,11 +291,29 @@ def disk_errors_named(journal: Journal) -> Iterator[None]:
         raise OSError(error.errno, f"{reason}{kept}", str(journal.sink)) from error
 
 
+def _digest(blocks: Iterable[bytes]) -> str:
+    digest = hashlib.blake2b(digest_size=16)
+    for block in blocks:
+        digest.update(block)
+    return digest.hexdigest()
+
+
+def _digest_on_disk(writer: FrameWriter | None, index: int | None) -> str | None:
+    """Hash of the bytes of a frame, or for None of everything else; None if they cannot be read."""
+    if writer is None or not hasattr(writer, "stored"):  # formats of users may lack it
+        return None
+    try:
+        return _digest(writer.stored(index))
+    except OSError:
+        return None
+
+
 class Sink:
     """The stack that a run writes, under a temporary name in the work folder until it is complete.
 
     If the format can be written in any order and the number of frames is known, frames are written at their final
     positions. Otherwise the frames of each window are stored in a file (staged) and the stack is written at the end.
+    Call ``begin`` or ``resume`` first.
 
     Args:
         path: The stack to write.
@@ -213,50 +322,128 @@ class Sink:
         info: Its content, with the largest possible number of frames.
         staged: Whether the number of frames is unknown.
         compression: As in ``write_stack``.
-        fresh: Whether to begin, or to continue.
     """
 
     def __init__(
         self,
         path: Path,
-        folder: Path,
+        folder: PrivateFolder,
         form: StackFormat,
         info: StackInfo,
         *,
         staged: bool,
         compression: str | None,
-        fresh: bool,
     ) -> None:
         self._path, self._form, self._info, self._compression = path, form, info, compression
-        self._part, self._stage = folder / path.name, folder / "windows"
+        self._folder, self._part, self._stage = folder, folder.place / path.name, folder.place / "windows"
+        self._create = None if staged or compression is not None else form.create
         self._writer: FrameWriter | None = None
-        if form.create is not None and compression is None and not staged:
-            if self._part.exists() or fresh:
-                self._writer = form.create(self._part, info, fresh)
-        elif fresh:
-            self._stage.mkdir()
+        self._head: str | None = None
+        self._moved = False  # whether an interrupted run has already given the stack its name
 
-    def put(self, window: int, first: int, frames: list[NDArray[Any]]) -> None:
+    def begin(self) -> None:
+        """Begin an empty stack."""
+        self._delete_part()
+        if self._create is None:
+            self._stage.mkdir(exist_ok=True)
+        else:
+            self._writer = self._create(self._part, self._info, True)
+            self._writer.sync()
+            self._head = _digest_on_disk(self._writer, None)
+        sync(self._folder.place)
+
+    def _delete_part(self) -> None:
+        self._folder.delete([self._path.name, *(self._path.name + ending for ending in self._form.companions)])
+
+    def resume(self, entries: Iterable[dict[str, Any]], *, complete: bool) -> list[int]:
+        """Continue an interrupted run.
+
+        Args:
+            entries: Those of the journal.
+            complete: Whether these are all windows.
+
+        Returns:
+            Numbers of the windows whose frames are not on the disk as they were written.
+        """
+        if self._create is None:
+            self._stage.mkdir(exist_ok=True)
+            return [entry["window"] for entry in entries if entry["digests"] != self._staged_digests(entry["window"])]
+        for ending in self._form.companions:  # the run may have stopped between the files of the output
+            moved, companion = (path.with_name(path.name + ending) for path in (self._path, self._part))
+            if moved.is_file() and not companion.exists():
+                shutil.copyfile(moved, companion)
+        self._writer, moved_there = self._open(self._part), None
+        if self._writer is None or self._form.kind == "folder":  # the output has its name, or some of its files do
+            moved_there = self._open(self._path)
+        places = [(writer, _digest_on_disk(writer, None)) for writer in (self._writer, moved_there)]
+        self._head = places[0][1]
+        damaged, count = [], 0
+        for entry in entries:
+            count += 1
+            for index, digest in enumerate(entry["digests"], start=entry["position"]):
+                held = (head == entry["head"] and _digest_on_disk(writer, index) == digest for writer, head in places)
+                if digest is None or not any(held):
+                    damaged.append(entry["window"])
+                    break
+        if moved_there is not None:
+            moved_there.close()
+        self._moved = complete and self._writer is None and not damaged
+        if not self._moved and (self._writer is None or len(damaged) == count):
+            self.close()
+            self.begin()
+            return list(range(count)) if self._form.kind != "folder" else damaged
+        return damaged
+
+    def _open(self, path: Path) -> FrameWriter | None:
+        """A stack in the output's format; None if it does not exist or cannot be opened."""
+        assert self._create is not None
+        if path.is_symlink() or not path.exists():
+            return None
+        try:
+            return self._create(path, self._info, False)
+        except Exception:  # decoders raise many kinds of exceptions if a header is damaged
+            return None
+
+    def put(self, window: int, position: int, frames: list[NDArray[Any]]) -> dict[str, Any]:
         """Write the frames of a window; they are on the disk when the function returns.
 
         Args:
             window: Number of the window.
-            first: Index of its first frame in the output.
+            position: Index of its first frame in the output.
             frames: Pixels as stored.
+
+        Returns:
+            Where the frames are, with their hashes: values of the entry in the journal.
         """
         if self._writer is not None:
-            for index, frame in enumerate(frames, start=first):
+            indices = range(position, position + len(frames))
+            for index, frame in zip(indices, frames, strict=True):
                 self._writer.write(index, frame)
             self._writer.sync()
-        elif frames:
-            part = self._stage / f"{window:06d}.part"
+            digests = [_digest_on_disk(self._writer, index) for index in indices]
+            return {"position": position, "digests": digests, "head": self._head}
+        if frames:
+            part = self._staged(window).with_suffix(".part")
             with part.open("wb") as file:
                 stack = np.ascontiguousarray(np.stack(frames))  # channels may be stored last
                 np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(stack))
                 file.write(stack.data)  # errors of np.save do not contain the reason
                 file.flush()
                 os.fsync(file.fileno())
-            os.replace(part, self._stage / f"{window:06d}.npy")
+            os.replace(part, self._staged(window))
+            sync(self._stage)
+        return {"position": position, "digests": self._staged_digests(window), "head": None}
+
+    def _staged(self, window: int) -> Path:
+        return self._stage / f"{window:06d}.npy"
+
+    def _staged_digests(self, window: int) -> list[str]:
+        """Hash of the file of a window; empty if it has none."""
+        try:
+            with self._staged(window).open("rb") as file:
+                return [_digest(iter(lambda: file.read(1 << 20), b""))]
+        except OSError:
+            return []
 
     def finish(self, count: int) -> None:
         """Give the stack its name; may be repeated after an interruption.
@@ -264,18 +451,15 @@ class Sink:
         Args:
             count: Number of frames that were written.
         """
-        if self._writer is not None:
-            self.close()
-        elif self._stage.is_dir():
-            shutil.rmtree(self._part) if self._part.is_dir() else self._part.unlink(missing_ok=True)
+        if self._moved:
+            return
+        if self._create is None:
+            self._delete_part()
             write_frames(
                 self._form, self._part, self._info.with_frames(count), self._staged_frames(), self._compression
             )
-            done = self._stage.with_name("windows.done")
-            os.replace(self._stage, done)  # a partly deleted folder must not be used again
-            shutil.rmtree(done)
-        if self._part.exists():  # otherwise it had its name already when the run was interrupted
-            move_into_place(self._part, self._path, self._form.kind, self._form.companions)
+        self.close()
+        move_into_place(self._part, self._path, self._form.kind, self._form.companions)
 
     def _staged_frames(self) -> Iterator[NDArray[Any]]:
         for file in sorted(self._stage.glob("*.npy")):

@@ -1,6 +1,5 @@
 """Processing of stacks of any length: ``iterate_stack``, ``detect_stack`` and ``process_stack``."""
 
-import os
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -9,10 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Unpack
 
-from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.atomic import make_folder, sync, whole_file
 from rsvib_torch.core.option_types import BadFrames
+from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.presentation import Summarised
-from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept
+from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.schema import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
@@ -20,13 +20,14 @@ from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import (
     DetectOptions,
     RestoreOptions,
+    StackJob,
     StoredWindow,
     WindowFrames,
     WindowResult,
     plan_job,
 )
 from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_manifest
-from rsvib_torch.stacks.output import Journal, Sink, describe_difference, disk_errors_named
+from rsvib_torch.stacks.output import Journal, Sink, describe_difference, disk_errors_named, work_folder
 from rsvib_torch.stacks.windows import Window
 
 __all__ = ["StackReport", "detect_stack", "iterate_stack", "process_stack"]
@@ -165,12 +166,14 @@ def detect_stack(
     Raises:
         OSError: If the stack cannot be read, or the manifest cannot be written.
         TypeError: If an option is unknown.
-        ValueError: If a value is out of range, the stack is not readable, or detection fails in all first windows.
+        ValueError: If a value is out of range, the stack is not readable, detection fails in all first windows, or
+            ``manifest`` is a file of the stack.
 
     Example:
         >>> detect_stack("frames.tif", "manifest.json", timing)  # doctest: +SKIP
     """
     job, windows, at_once = plan_job(source, timing, options, restores=False)
+    check_outputs([manifest], stack_files(source))
 
     def records() -> Iterator[dict[str, Any]]:
         errors: list[str | None] = []
@@ -235,7 +238,8 @@ def process_stack(
         OSError: If a file cannot be read or written; the run can then be resumed.
         TypeError: If an option is unknown.
         ValueError: If a value is out of range, the stack is not readable, a window does not fit into the memory,
-            detection fails in all first windows, or input, settings or versions differ from those of the run to resume.
+            detection fails in all first windows, an output is or contains the input or lies inside it, input, settings
+            or versions differ from those of the run to resume, or its journal is damaged.
 
     Example:
         >>> import tempfile
@@ -277,8 +281,7 @@ def process_stack(
     )
     form = check_info_target(sink, out, compression, check_folder=False)
     target = sink.with_name(sink.name + ".manifest.json") if manifest is None else Path(manifest)
-    if sink.exists() and os.path.samefile(source, sink):
-        raise ValueError(f"{sink}: a stack cannot be written over itself; choose another name")
+    check_outputs([*stack_files(sink), work_folder(sink), target], stack_files(source))
     header = manifest_header(job, sink.name, compression)
     first: WindowResult | None = None
 
@@ -299,7 +302,7 @@ def process_stack(
             not_kept=tuple(not_kept),
         )
 
-    journal = Journal(sink)
+    journal = Journal(sink, form.companions)
     try:
         if resume and not journal.has_lines and sink.exists() and target.exists():
             complete = read_manifest(target)
@@ -307,26 +310,24 @@ def process_stack(
             if difference:
                 raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
             return report((record.model_dump() for record in complete.windows), len(windows), complete.not_kept)
-        fresh = not journal.open(header, resume=resume)
-        resumed = journal.count
-        with disk_errors_named(journal):
-            writer = Sink(
-                sink, journal.folder, form, out, staged=bad_frames == "skip", compression=compression, fresh=fresh
-            )
+        writer = Sink(sink, journal.folder, form, out, staged=bad_frames == "skip", compression=compression)
         try:
+            remaining = _begin_or_resume(windows, writer, journal, header, resume)
+            resumed = journal.count
             if scheduler is None:
-                results = compute_here(job, windows[resumed:], finish, at_once=at_once)
+                results = compute_here(job, remaining, finish, at_once=at_once)
             else:
-                results = compute_with_dask(job, windows[resumed:], scheduler=scheduler, workers=at_once)
-            _store_windows(windows, results, writer, journal, progress)
+                results = compute_with_dask(job, remaining, scheduler=scheduler, workers=at_once)
+            _store_windows(job, windows, remaining, results, writer, journal, progress)
             not_kept = metadata_not_kept(job.info, sink, (journal.written, *out.shape[1:]))
             with disk_errors_named(journal):
-                write_manifest(journal.folder / "manifest.json", header, journal.records(), not_kept)
-                writer.finish(journal.written)
+                make_folder(target.parent)
+                with whole_file(target) as part:
+                    write_manifest(part, header, journal.records(), not_kept)
+                    writer.finish(journal.written)
+                sync(target.absolute().parent)  # the temporary folder is gone as well
         finally:
             writer.close()
-        target.parent.mkdir(parents=True, exist_ok=True)
-        os.replace(journal.folder / "manifest.json", target)
         summary = report(journal.records(), resumed, not_kept)
         journal.remove()
         return summary
@@ -350,24 +351,40 @@ def _check_not_all_failed(errors: Sequence[str | None], windows: Sequence[Window
         raise ValueError(errors[0])
 
 
+def _begin_or_resume(
+    windows: Sequence[Window], sink: Sink, journal: Journal, header: dict[str, Any], resume: bool
+) -> list[Window]:
+    """Begin a run, or continue an interrupted one; returns the windows that are not on the disk."""
+    resumes = journal.open(header, resume=resume)
+    with disk_errors_named(journal):
+        if resumes:
+            journal.drop(sink.resume(journal.entries(), complete=journal.count == len(windows)))
+        else:
+            sink.begin()
+    return [window for window in windows if window.index not in journal]
+
+
 def _store_windows(
+    job: StackJob,
     windows: Sequence[Window],
+    remaining: Sequence[Window],
     results: Generator[StoredWindow, None, None],
     sink: Sink,
     journal: Journal,
     progress: Callable[[int, int], None] | None,
 ) -> None:
-    """Store the results of all windows that are not in the journal, while later windows are computed."""
+    """Store the results of the remaining windows, while later ones are computed."""
     errors = [record["error"] for record in journal.records()]
-    remaining, total = windows[journal.count :], windows[-1].last + 1
+    total = windows[-1].last + 1
+    done = total - sum(window.kept for window in remaining)
 
-    def store(stored: StoredWindow) -> None:
+    def store(window: Window, stored: StoredWindow) -> None:
         with disk_errors_named(journal):
-            sink.put(stored.record["window"], journal.written, stored.frames)
-            journal.add(stored.record)
+            where = sink.put(window.index, window.index if job.joined else window.first, stored.frames)
+            journal.add(stored.record, where)
 
     if progress is not None:
-        progress(remaining[0].first if remaining else total, total)
+        progress(done, total)
     with ThreadPoolExecutor(1, "rsvib-write") as writing, closing(results):
         previous: Future[None] | None = None
         for window, stored in zip(remaining, results, strict=True):
@@ -379,8 +396,9 @@ def _store_windows(
             except ValueError:
                 journal.clear()
                 raise
-            previous = writing.submit(store, stored)
+            previous = writing.submit(store, window, stored)
             if progress is not None:
-                progress(window.first + window.kept, total)
+                done += window.kept
+                progress(done, total)
         if previous is not None:
             previous.result()

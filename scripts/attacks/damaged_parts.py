@@ -1,0 +1,69 @@
+"""After a kill, a file of the work folder is damaged: the result of the resumed run must be complete nevertheless."""
+
+import random
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from attacks.small_runs import FORMATS, Reference, fork, kill_run, resume
+from attacks.trial import Trial
+
+__all__ = ["trials"]
+
+_DAMAGES = ("deleted", "truncated", "emptied", "zeroed", "bit flipped", "swapped", "extended")
+
+
+def _damage(file: Path, others: list[Path], kind: str, choice: random.Random) -> str:
+    """Damage a file, or swap two parts of the output; returns a description."""
+    data = bytearray(file.read_bytes())
+    start = choice.randrange(max(1, len(data)))
+    if kind == "deleted":
+        file.unlink()
+        return ""
+    if kind == "truncated":
+        data = data[:start]
+    elif kind == "emptied":
+        data = bytearray()
+    elif kind == "zeroed":
+        data[start : start + 4096] = bytes(len(data[start : start + 4096]))
+    elif kind == "bit flipped" and data:
+        data[start] ^= 1 << choice.randrange(8)
+    elif kind == "swapped" and others:
+        other = choice.choice(others)
+        content = other.read_bytes()
+        other.write_bytes(data)
+        file.write_bytes(content)
+        return f" with {other.name}"
+    elif kind == "swapped":  # two parts of one file
+        half = len(data) // 2
+        data = data[half:] + data[:half]
+    elif kind == "extended":
+        data += b"more"
+    file.write_bytes(data)
+    return f" at byte {start}"
+
+
+def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
+    """Formats and kinds of damage take turns."""
+    reference, choice = Reference(folder / "reference"), random.Random(seed)
+    for number in range(count):
+        kind = list(FORMATS)[number % len(FORMATS)]
+        damage = _DAMAGES[number // len(FORMATS) % len(_DAMAGES)]
+        name, options = FORMATS[kind]
+        place = folder / "trial"
+        work = place / f".{name}.rsvib"
+        files: list[Path] = []
+        while not files:
+            kill_run(reference, place, kind, choice, windows=2)
+            parts = [work / name, work / f"{name}.json", work / "windows"]
+            files = sorted(file for part in parts for file in [part, *part.rglob("*")] if file.is_file())
+        file = choice.choice(files)
+        where = _damage(file, [other for other in files if other != file], damage, choice)
+        title = f"{kind}: {file.relative_to(work)} {damage}{where}"
+        code, result = fork(resume, reference.source, place / name, options)
+        if code != 0:
+            yield Trial(title, "hang" if code is None else "traceback" if code == 1 else "lost", str(result))
+        else:
+            difference = reference.difference(place, name)
+            yield Trial(title, "wrong" if difference else "completed", difference)
+        shutil.rmtree(place)

@@ -1,0 +1,191 @@
+"""Commands and functions whose output is, contains or lies in one of their inputs, under another name or the same."""
+
+import contextlib
+import io
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from attacks.small_runs import Reference, content, fork, process
+from attacks.trial import Trial
+
+__all__ = ["trials"]
+
+_CAMERA = """
+[sensor]
+row_time = 1e-4
+exposure_rows = 6
+frame_rows = 72
+full_scale = 4095
+[simulation]
+num_frames = 2
+frame_size = [48, 48]
+[simulation.vibration]
+amplitude = [1.0, 1.0]
+frequency = [100.0, 120.0]
+"""
+
+
+def _write_originals(folder: Path, source: Path) -> None:
+    """Inputs of all kinds."""
+    import tifffile  # noqa: PLC0415
+    import torch  # noqa: PLC0415
+
+    from rsvib_torch import write_stack  # noqa: PLC0415
+
+    folder.mkdir()
+    counts = tifffile.imread(source)[:4]
+    frames = torch.from_numpy(counts / 4095.0).float()
+    for name in ("frames.tif", "pngs", "frames.zarr", "frames.raw", "frames.npy", "frames.h5", "frames.mkv"):
+        write_stack(folder / name, frames, dtype="uint16", full_scale=4095)
+    write_stack(folder / "scene.png", frames[:1], dtype="uint16", full_scale=4095)
+    (folder / "camera.toml").write_text(_CAMERA)
+    times = "\n".join(f"{0.001 * index},0.1,0.2" for index in range(100))
+    (folder / "motion.csv").write_text(f"time,x,y\n{times}\n")
+    shutil.copy(source.with_name("vibrations.json"), folder / "vibrations.json")
+
+
+def _aliases(original: Path, *, ending: str = "") -> dict[str, Path]:
+    """Names of an output that are the original, or lie in it; links are made."""
+    ending = ending or original.suffix
+    names = {"itself": original, "another path": original.parent / "pngs" / ".." / original.name}
+    link = original.with_name(f"link{ending}")
+    link.symlink_to(original.name)
+    names["a link"] = link
+    around = original.with_name("around")
+    around.symlink_to(".")
+    names["a path with a link"] = around / original.name
+    if original.is_file():
+        hard = original.with_name(f"hard{ending}")
+        os.link(original, hard)
+        names["a hard link"] = hard
+    else:
+        names["a file in it"] = original / "restored.tif"
+        names["a folder in it"] = original / "deep" / "out"
+        inner = original.with_name("inner")
+        inner.symlink_to(original.name)
+        names["a file in it by a link"] = inner / "restored.tif"
+    return names
+
+
+def _command(arguments: list[str]) -> str:
+    from rsvib_torch.commands.main import run_command  # noqa: PLC0415
+
+    shown = io.StringIO()
+    with contextlib.redirect_stderr(shown):
+        code = run_command(arguments)
+    return f"{code}\n{shown.getvalue()}"
+
+
+def _written(place: str, output: str) -> str:
+    """``write_stack`` with the metadata of an input, onto it."""
+    import rsvib_torch as rsv  # noqa: PLC0415
+
+    frames = rsv.read_stack(place, full_scale=4095)
+    rsv.write_stack(output, frames, dtype="uint16", full_scale=4095, like=rsv.read_stack_info(place))
+    return "0\n"
+
+
+def _processed(place: Path, output: Path, manifest: Path | None) -> str:
+    process(place, output, manifest=manifest, given=None, detection={"method": "bands"})
+    return "0\n"
+
+
+def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., str], tuple[object, ...]]]:
+    """All trials: title, function and arguments; links are made in ``place``."""
+    config = ["--config", str(place / "camera.toml"), "--overwrite"]
+    vibration = ["--vibration", str(place / "vibrations.json")]
+    known = ["--motion", str(place / "motion.csv"), "--unit", "px", "--offset", "0"]
+
+    def command(title: str, *arguments: object) -> tuple[str, Callable[..., str], tuple[object, ...]]:
+        return title, _command, ([str(argument) for argument in arguments],)
+
+    stacks = ("frames.tif", "pngs", "frames.zarr", "frames.raw", "frames.npy", "frames.h5", "frames.mkv")
+    for stack in stacks:
+        source = place / stack
+        for alias, output in _aliases(source).items():
+            yield command(f"restore {stack}: {alias}", "restore", source, output, *config, *vibration)
+            yield command(f"known {stack}: {alias}", "known", source, output, *config, *known)
+            yield f"process_stack {stack}: {alias}", _processed, (source, output, None)
+            yield f"write_stack like {stack}: {alias}", _written, (str(source), str(output))
+        _remove_links(place)
+    folders = {"the input": place / "pngs", "a folder in it": place / "pngs" / "out", "the folder of it": place}
+    for alias, out in folders.items():
+        yield command(f"run pngs: {alias}", "run", place / "pngs", out, *config)
+        yield command(f"detect pngs: {alias}", "detect", place / "pngs", "--out", out, *config)
+        yield command(f"detect in windows: {alias}", "detect", place / "pngs", "--out", out, "--window", 3, *config)
+        yield command(f"report pngs: {alias}", "report", place / "pngs", out, *config)
+    for stack in ("frames.tif", "frames.npy", "frames.raw", "frames.mkv"):
+        arguments = (place / stack, place, "--output", stack, *config)
+        yield command(f"run {stack}: --output is the input", "run", *arguments)
+    for alias, output in _aliases(place / "scene.png").items():
+        yield command(f"simulate: {alias}", "simulate", place / "scene.png", output, *config)
+    _remove_links(place)
+    for stack in ("frames.tif", "pngs"):
+        for alias, output in _aliases(place / stack, ending=".csv").items():
+            yield command(f"motion: {alias}", "motion", place / stack, "--out", output, *config)
+            yield command(
+                f"calibrate: {alias}", "calibrate", place / stack, "--frequency", 100, "--out", output, config[2]
+            )
+            camera = ("--row-time", "1e-4", "--exposure", "6e-4", "--frame-rate", 130, "--out", output, config[2])
+            yield command(f"init: {alias}", "init", place / stack, *camera)
+        _remove_links(place)
+    good = (place / "frames.tif", place / "restored.tif")
+    reports = ("frames.tif", "camera.toml", "vibrations.json", "restored.tif", "pngs/../restored.tif")
+    for name in reports:
+        report = ("--report", place / name)
+        yield command(f"restore --report {name}", "restore", *good, *config, *vibration, *report)
+    for name in ("camera.toml", "motion.csv"):
+        for alias, output in _aliases(place / name).items():
+            yield command(f"motion: {name}, {alias}", "motion", place / "frames.tif", "--out", output, *config)
+            yield command(f"calibrate: {name}, {alias}", "motion", place / "frames.tif", "--out", output, *config)
+        _remove_links(place)
+    for manifest in ("frames.tif", "restored.tif", "pngs/manifest.json"):
+        source = place / ("pngs" if manifest.startswith("pngs") else "frames.tif")
+        yield f"process_stack: manifest {manifest}", _processed, (source, place / "restored.tif", place / manifest)
+    beside = (place / "frames.raw", place / "frames.raw.json")
+    yield command("motion: sidecar of the input", "motion", beside[0], "--out", beside[1], *config)
+    (place / "tree.zarr").mkdir()
+    shutil.copy(place / "frames.zarr" / "zarr.json", place / "tree.zarr")
+    shutil.copy(place / "frames.tif", place / "tree.zarr")
+    inside = place / "tree.zarr" / "frames.tif"
+    yield command("known: folder around the input", "known", inside, place / "tree.zarr", *config, *known)
+    yield "process_stack: folder around the input", _processed, (inside, place / "tree.zarr", None)
+
+
+def _remove_links(place: Path) -> None:
+    for path in list(place.iterdir()):
+        if path.is_symlink() or path.name.startswith("hard"):
+            path.unlink()
+
+
+def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
+    """All combinations, in an order that depends on nothing."""
+    reference, place = Reference(folder / "reference"), folder / "inputs"
+    code, message = fork(_write_originals, place, reference.source)
+    assert code == 0, message
+    for number, (title, function, arguments) in enumerate(_attempts(place)):
+        if number >= count:
+            return
+        harmless = "calibrate: motion.csv" in title or "motion: motion.csv" in title  # not an input of this command
+        if harmless:
+            continue
+        before = content(place)
+        code, result = fork(function, *arguments)
+        changed = sorted(set(before.items()) ^ set(content(place).items()))
+        text = str(result)
+        failed = code == 2 or (code == 0 and text.startswith("2\n"))
+        if changed:
+            yield Trial(title, "lost", f"changed: {changed[0][0]}: {text}")
+            return
+        if code is None:
+            yield Trial(title, "hang")
+        elif "Traceback" in text or code == 1 or (code == 0 and text[:2] not in ("0\n", "2\n")):
+            yield Trial(title, "traceback", text)
+        elif not failed:
+            yield Trial(title, "wrong", f"not refused: {text}")
+        elif "input" in text or "same file" in text or "inside the other" in text:
+            yield Trial(title, "refused", text)
+        else:
+            yield Trial(title, "wrong", f"refused for another reason: {text}")

@@ -1,0 +1,62 @@
+"""Runs are killed at random calls and times, and resumed: the result must be that of an uninterrupted run."""
+
+import random
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from attacks.small_runs import (
+    FORMATS,
+    Reference,
+    calls_of,
+    content,
+    counted_run,
+    fork,
+    lines_of,
+    resume,
+)
+from attacks.trial import Trial
+
+__all__ = ["trials"]
+
+_LONGEST = 0.6  # s; a run takes 0.2 to 0.5 s on an idle core
+
+
+def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
+    """Every other trial is killed at a random call, the others at a random time; every third is killed twice."""
+    reference, choice = Reference(folder / "reference"), random.Random(seed)
+    for number in range(count):
+        kind = list(FORMATS)[number % len(FORMATS)]
+        name, options = FORMATS[kind]
+        place = folder / "trial"
+        place.mkdir()
+        moments = []
+        for _ in range(2 if number % 3 == 0 else 1):
+            if number % 2:
+                moment = choice.uniform(0.0, _LONGEST)
+                fork(counted_run, reference.source, place / name, {**options, "resume": True}, 0, seconds=moment)
+                moments.append(f"{moment:.4f} s")
+            else:
+                call = choice.randint(1, calls_of(reference, kind))
+                fork(counted_run, reference.source, place / name, {**options, "resume": True}, call)
+                moments.append(f"call {call}")
+        yield _resumed(reference, place, kind, f"{kind}, killed at {' and '.join(moments)}")
+        shutil.rmtree(place)
+
+
+def _resumed(reference: Reference, place: Path, kind: str, title: str) -> Trial:
+    name, options = FORMATS[kind]
+    if kind != "PNG folder" and (place / name).exists() and content(place / name) != content(reference.whole / name):
+        return Trial(title, "wrong", "an incomplete output has its name")
+    entered = lines_of(place, name)
+    code, result = fork(resume, reference.source, place / name, options)
+    if code is None:
+        return Trial(title, "hang")
+    if code != 0:
+        return Trial(title, "traceback" if code == 1 else "lost", str(result))
+    difference = reference.difference(place, name)
+    if difference:
+        return Trial(title, "wrong", difference)
+    if result < entered:
+        return Trial(title, "lost", f"{entered} windows were complete, {result} were resumed")
+    return Trial(title, "completed")

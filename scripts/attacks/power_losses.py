@@ -1,0 +1,143 @@
+"""The machine loses power: everything that was not synchronised is discarded, then the run is resumed.
+
+The calls ``fsync`` and ``fdatasync`` of a run are recorded: the content of a file when it was synchronised last, and
+the names in a folder when it was. At a random call the run ends. In every other round its folder is replaced by what
+was recorded: files that were never synchronised are empty, names that were not are missing. In the others a random
+part of the later changes is kept as well, because a file system may write any of them at any time: new names, removed
+names, and parts of the content.
+"""
+
+import json
+import os
+import random
+import shutil
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from attacks.small_runs import FORMATS, WINDOWS, Reference, calls_of, count_file_calls, fork, lines_of, process, resume
+from attacks.trial import Trial
+
+__all__ = ["trials"]
+
+
+def _recorded_run(source: Path, sink: Path, options: dict[str, Any], root: Path, records: Path, die_at: int) -> int:
+    """Process the stack; record what is synchronised below ``root``, and die at a call."""
+    opened: dict[int, int] = {}  # open files, so that their numbers are not given to other files
+
+    def record(name: str, arguments: tuple[Any, ...]) -> None:
+        if name not in ("fsync", "fdatasync"):
+            return
+        file = arguments[0]
+        path, status = Path(os.readlink(f"/proc/self/fd/{file}")), os.fstat(file)
+        if path != root and root not in path.parents:
+            return
+        if status.st_ino not in opened:
+            opened[status.st_ino] = os.dup(file)
+        part = records / "part"
+        if stat.S_ISDIR(status.st_mode):
+            names = {entry.name: (entry.inode(), entry.is_dir()) for entry in os.scandir(file)}
+            part.write_text(json.dumps(names))
+            part.rename(records / f"{status.st_ino}.names")
+        else:
+            part.write_bytes(Path(f"/proc/self/fd/{file}").read_bytes())  # it may be open for writing only
+            part.rename(records / str(status.st_ino))
+
+    names = {entry.name: (entry.inode(), entry.is_dir()) for entry in os.scandir(root)}
+    (records / f"{root.stat().st_ino}.names").write_text(json.dumps(names))
+    done = count_file_calls(die_at, record)
+    process(source, sink, **options)
+    return done[0]
+
+
+class _PowerLoss:
+    """Builds the folder that is left after a power loss."""
+
+    def __init__(self, root: Path, records: Path, choice: random.Random | None) -> None:
+        self._records, self._choice = records, choice
+        self._now = {path.lstat().st_ino: path for path in root.rglob("*")}
+
+    def build(self, number: int, current: Path | None, target: Path) -> None:
+        """Build the folder of a number; ``current`` is the folder as the processes saw it."""
+        target.mkdir()
+        record = self._records / f"{number}.names"
+        names = json.loads(record.read_text()) if record.exists() else {}
+        for name, (member, is_folder) in self._mixed(names, current).items():
+            path = self._now.get(member)
+            if is_folder:
+                self.build(member, path, target / name)
+            else:
+                (target / name).write_bytes(self._content(member, path))
+
+    def _mixed(self, names: dict[str, Any], current: Path | None) -> dict[str, Any]:
+        if self._choice is None or current is None:
+            return names
+        present = {entry.name: [entry.inode(), entry.is_dir()] for entry in os.scandir(current)}
+        mixed = {}
+        for name in sorted(names.keys() | present.keys()):
+            old, new = names.get(name), present.get(name)
+            if new is None and old[0] in self._now:  # renamed: the name is lost only if the other one is there
+                mixed[name] = old
+            else:
+                kept = self._choice.choice([old, new])
+                if kept is not None:
+                    mixed[name] = kept
+        return mixed
+
+    def _content(self, number: int, path: Path | None) -> bytes:
+        record = self._records / str(number)
+        old = record.read_bytes() if record.exists() else b""
+        if self._choice is None or path is None or not path.is_file():
+            return old
+        new = path.read_bytes()
+        kind = self._choice.choice(["old", "new", "blocks", "zeros"])
+        if kind in ("old", "new") or new == old:
+            return old if kind == "old" else new
+        mixed, block = bytearray(new), 512
+        for start in range(0, len(new), block):
+            if self._choice.random() < 0.5:
+                before = old[start : start + block] if kind == "blocks" else b""
+                size = len(new[start : start + block])
+                mixed[start : start + size] = before.ljust(size, b"\0")[:size]
+        for index, (before_it, after_it) in enumerate(zip(old, new, strict=False)):
+            if before_it == after_it:  # synchronised, and not changed later
+                mixed[index] = after_it
+        return bytes(mixed)
+
+
+def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
+    """The formats take turns."""
+    reference, choice = Reference(folder / "reference"), random.Random(seed)
+    for number in range(count):
+        kind = list(FORMATS)[number % len(FORMATS)]
+        name, options = FORMATS[kind]
+        root, records, after = folder / "disk", folder / "records", folder / "after"
+        for path in (root, records):
+            path.mkdir()
+        call, mixed = choice.randint(1, calls_of(reference, kind)), bool(number // len(FORMATS) % 2)
+        title = f"{kind}, call {call}, {'some' if mixed else 'no'} later changes"
+        code, result = fork(_recorded_run, reference.source, root / "new" / name, options, root, records, call)
+        if code in (1, 2, None):
+            yield Trial(title, "traceback", str(result))
+        else:
+            _PowerLoss(root, records, choice if mixed else None).build(root.stat().st_ino, root, after)
+            yield _resumed(reference, after / "new", kind, title)
+        for path in (root, records, after):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _resumed(reference: Reference, place: Path, kind: str, title: str) -> Trial:
+    name, options = FORMATS[kind]
+    entered = lines_of(place, name)
+    code, result = fork(resume, reference.source, place / name, options)
+    if code is None:
+        return Trial(title, "hang")
+    if code != 0:
+        return Trial(title, "traceback" if code == 1 else "lost", str(result))
+    difference = reference.difference(place, name)
+    if difference:
+        return Trial(title, "wrong", difference)
+    if result < min(entered, WINDOWS):
+        return Trial(title, "lost", f"{entered} windows were complete, {result} were resumed")
+    return Trial(title, "completed")

@@ -1,0 +1,250 @@
+"""Short runs of ``process_stack`` in all formats, in child processes that can be killed, for the attacks on storage.
+
+Children are forked from a server that has imported the package, because the import takes longer than a run.
+"""
+
+import functools
+import itertools
+import json
+import multiprocessing
+import os
+import random
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+
+__all__ = ["FORMATS", "Reference", "content", "count_file_calls", "fork", "kill_run", "lines_of", "process", "server"]
+
+FRAMES, SIZE, WINDOW = 13, 64, 3
+WINDOWS = 6
+FORMATS: dict[str, tuple[str, dict[str, Any]]] = {
+    "TIFF": ("out.tif", {}),
+    "TIFF, zlib": ("packed.tif", {"compression": "zlib"}),
+    "npy": ("out.npy", {}),
+    "npy, frames skipped": ("skipped.npy", {"bad_frames": "skip"}),
+    "raw": ("out.raw", {}),
+    "HDF5": ("out.h5", {}),
+    "Zarr": ("out.zarr", {}),
+    "PNG folder": ("frames", {}),
+    "video": ("out.mkv", {}),
+}
+_CALLS = ("write", "pwrite", "replace", "fsync", "fdatasync", "ftruncate", "unlink", "mkdir", "rmdir", "rename")
+LIMIT = 100.0  # s for one run, which takes less than one on an idle machine
+
+
+@functools.cache
+def server() -> Any:
+    """Context of multiprocessing whose server has imported the package."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(
+        [
+            "rsvib_torch.commands.main",
+            "rsvib_torch.report.results",
+            "rsvib_torch.stacks.process",
+            "rsvib_torch.restoration.restore",
+            "rsvib_torch.detection.detect",
+            "torch.fx.experimental.symbolic_shapes",  # torch imports it when it is used first
+            "h5py",
+            "zarr",
+            "av",
+            "attacks.small_runs",
+        ]
+    )
+    return context
+
+
+def _timing() -> Any:
+    from rsvib_torch import SensorTiming  # noqa: PLC0415
+
+    return SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=72)
+
+
+def process(source: Path, sink: Path, **options: Any) -> Any:
+    """Restore the small stack with known vibrations, so that a run takes a fraction of a second."""
+    import torch  # noqa: PLC0415
+
+    from rsvib_torch import process_stack  # noqa: PLC0415
+    from rsvib_torch.stacks import read_manifest  # noqa: PLC0415
+
+    torch.set_num_threads(1)
+    given = read_manifest(source.with_name("vibrations.json")).detections()
+    common = {"window": WINDOW, "restoration": {"method": "dewarp"}, "full_scale": 4095, "workers": 1, "given": given}
+    return process_stack(source, sink, _timing(), **{**common, **options})
+
+
+def _prepare(folder: Path) -> None:
+    """Write the stack, the vibrations of its windows, and the results of uninterrupted runs in all formats."""
+    import torch  # noqa: PLC0415
+    from scipy import ndimage  # noqa: PLC0415
+
+    import rsvib_torch as rsv  # noqa: PLC0415
+    from rsvib_torch.stacks import detect_stack  # noqa: PLC0415
+
+    torch.set_num_threads(1)
+    texture = ndimage.gaussian_filter(np.random.default_rng(2).standard_normal((SIZE + 40, SIZE + 40)), 1.2)
+    scene = torch.from_numpy(np.clip(0.5 + 0.15 * texture / texture.std(), 0, 1)).float()
+    vibration = rsv.Vibration(amplitude=[1.3, 0.9], frequency=[130.0, 170.0], phase=[0.3, 0.9])
+    frames = rsv.simulate_frames(scene, _timing(), vibration, num_frames=FRAMES, frame_size=(SIZE, SIZE))
+    counts = np.round(4095 * frames.numpy()).clip(0, 4095).astype(np.uint16)
+    tifffile.imwrite(folder / "frames.tif", counts, photometric="minisblack", metadata=None)
+    options = {"method": "bands", "band_rows": 16, "band_step": 8, "search": 6, "tones": 1}
+    detect_stack(
+        folder / "frames.tif", folder / "vibrations.json", _timing(), window=WINDOW, detection=options, full_scale=4095
+    )
+    for name, options in FORMATS.values():
+        report = process(folder / "frames.tif", folder / "whole" / name, **options)
+        assert (report.frames, report.windows) == (FRAMES, WINDOWS)
+        assert report.restored > 0
+
+
+class Reference:
+    """The stack and the results of uninterrupted runs, in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir()
+        code, message = fork(_prepare, folder)
+        if code != 0:
+            raise RuntimeError(f"the reference cannot be computed: {message}")
+        self.source, self.whole = folder / "frames.tif", folder / "whole"
+
+    def difference(self, folder: Path, name: str) -> str:
+        """How a result differs from that of an uninterrupted run, with the other files in its folder; "" if not."""
+        if not (folder / name).exists():
+            return "the output is missing"
+        if content(folder / name) != content(self.whole / name):
+            return "the output differs from that of an uninterrupted run"
+        manifest, companion = f"{name}.manifest.json", f"{name}.json"
+        records = [path / manifest for path in (folder, self.whole)]
+        if not records[0].exists() or len({json.dumps(json.loads(path.read_text())) for path in records}) > 1:
+            return "the manifest differs"
+        extra = {path.name for path in folder.iterdir()} - {name, manifest}
+        if (self.whole / companion).exists():
+            extra -= {companion}
+            if (folder / companion).read_bytes() != (self.whole / companion).read_bytes():
+                return f"{companion} differs"
+        return f"files are left: {', '.join(sorted(extra))}" if extra else ""
+
+
+def content(path: Path) -> dict[str, bytes]:
+    """All files at and below a path."""
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    return {str(file.relative_to(path)): file.read_bytes() for file in files}
+
+
+def _call(function: Callable[..., Any], arguments: tuple[Any, ...], options: dict[str, Any], channel: Any) -> None:
+    try:
+        result = function(*arguments, **options)
+    except (ValueError, TypeError, OSError) as error:
+        channel.send(("refused", str(error)))
+    except BaseException as error:
+        channel.send(("traceback", repr(error)))
+    else:
+        channel.send(("completed", result if isinstance(result, (int, str)) else ""))
+
+
+def fork(
+    function: Callable[..., Any], *arguments: Any, seconds: float | None = None, **options: Any
+) -> tuple[Any, Any]:
+    """Call a function in a child process.
+
+    Returns:
+        Exit code (None if it was killed after ``seconds``), and the result or message; 0 and the result after a
+        success, 2 and the message after a ``ValueError``, ``TypeError`` or ``OSError``, 1 after another exception.
+    """
+    receiving, sending = server().Pipe(duplex=False)
+    child = server().Process(target=_call, args=(function, arguments, options, sending))
+    child.start()
+    sending.close()
+    child.join(LIMIT if seconds is None else seconds)
+    if child.exitcode is None:
+        child.kill()
+        child.join()
+        return (None, "killed after the time limit")
+    try:
+        outcome, result = receiving.recv()
+    except EOFError:
+        return child.exitcode, ""
+    return {"completed": 0, "refused": 2, "traceback": 1}[outcome], result
+
+
+def count_file_calls(die_at: int, after: Callable[[str, Any], None] | None = None) -> list[int]:
+    """Kill this process at its n-th call that changes a file (0: never); returns the number of calls so far.
+
+    Args:
+        die_at: Number of the call.
+        after: Called with the name of a call and its arguments after it has succeeded.
+    """
+    numbers, lock, done = itertools.count(1), threading.RLock(), [0]
+    inside = threading.local()
+
+    def wrap(name: str, real: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            if getattr(inside, "call", False):  # of ``after`` itself
+                return real(*arguments, **options)
+            with lock:
+                done[0] = next(numbers)
+                if done[0] == die_at:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                    time.sleep(60)
+                result = real(*arguments, **options)
+                if after is not None:
+                    inside.call = True
+                    after(name, arguments)
+                    inside.call = False
+                return result
+
+        return call
+
+    for name in _CALLS:
+        setattr(os, name, wrap(name, getattr(os, name)))
+    return done
+
+
+def counted_run(source: Path, sink: Path, options: dict[str, Any], die_at: int) -> int:
+    """Process the stack, and die at a call; returns the number of calls."""
+    done = count_file_calls(die_at)
+    process(source, sink, **options)
+    return done[0]
+
+
+def resume(source: Path, sink: Path, options: dict[str, Any]) -> int:
+    """Resume a run; returns the number of windows that were complete before."""
+    resumed: int = process(source, sink, resume=True, **options).resumed
+    return resumed
+
+
+@functools.cache
+def calls_of(reference: Reference, kind: str) -> int:
+    """Number of calls of an uninterrupted run that change files."""
+    name, options = FORMATS[kind]
+    folder = reference.whole.with_name("counted")
+    folder.mkdir(exist_ok=True)
+    code, calls = fork(counted_run, reference.source, folder / name, options, 0)
+    assert code == 0, calls
+    return int(calls)
+
+
+def lines_of(folder: Path, name: str) -> int:
+    """Complete lines of the journal of an interrupted run."""
+    journal = folder / f".{name}.rsvib" / "journal.jsonl"
+    lines = journal.read_bytes().splitlines(keepends=True) if journal.is_file() else []
+    return sum(line.endswith(b"\n") and b"\0" not in line for line in lines)
+
+
+def kill_run(reference: Reference, folder: Path, kind: str, choice: random.Random, *, windows: int) -> None:
+    """A folder with a run that was killed after at least a number of windows."""
+    name, options = FORMATS[kind]
+    while True:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        die_at = choice.randint(1, calls_of(reference, kind))
+        fork(counted_run, reference.source, folder / name, options, die_at)
+        if lines_of(folder, name) >= windows:
+            return
