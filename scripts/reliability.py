@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from attacks.api import api_trials
 from attacks.trial import FAILURES, OUTCOMES, Trial
 
 import rsvib_torch as rsv
@@ -41,7 +42,9 @@ class Attack:
 
 
 # A new attack is one module in scripts/attacks and one line here.
-ATTACKS: dict[str, Attack] = {}
+ATTACKS: dict[str, Attack] = {
+    "api": Attack("hostile arguments of Python functions", api_trials, 3000),
+}
 
 
 def table(results: dict[str, list[Trial]]) -> list[str]:

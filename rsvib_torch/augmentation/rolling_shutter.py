@@ -14,6 +14,7 @@ from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.core.precision import full_precision
 from rsvib_torch.core.splines import gauss_legendre, mirrored
@@ -194,6 +195,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         torch.Size([4, 2, 1])
     """
 
+    @checks_arguments
     def __init__(
         self,
         timing: SensorTiming,
@@ -227,6 +229,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             "interpolation": interpolation,
         }
 
+    @checks_arguments
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> Parameters:
         """Draw one motion per image: amplitude, frequency, phase (B, 2, K), image_motion (B, 2), exposure_rows (B,)."""
         draws = 1 if self.same_on_batch else batch_shape[0]
@@ -241,6 +244,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             for name, value in drawn.items()
         }
 
+    @checks_arguments
     def drawn_vibration(self, params: Parameters | None = None) -> Vibration:
         """The vibration of every image of the last call, in image axes: the ground truth for training.
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.calibration.flicker import BandFit, Profiles, find_bands, row_profiles
 from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text, wrapped
@@ -77,6 +78,7 @@ class RowTimeCalibration(
         return "\n".join([*lines, *map(wrapped, self.notes)])
 
 
+@checks_arguments
 def calibrate_row_time(
     frames: FramesLike,
     flicker_frequency: float,
@@ -168,6 +170,7 @@ def calibrate_row_time(
     )
 
 
+@checks_arguments
 def calibrate_row_time_by_exposure(
     frames: FramesLike,
     exposure_times: Sequence[float],

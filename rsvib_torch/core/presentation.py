@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, Union, get_args, get_orig
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.text import text_table, wrapped, write_json
 from rsvib_torch.core.validation import read_json
@@ -225,6 +226,7 @@ class Result(Summarised):
         """All values as nested lists, numbers and texts, which JSON can store; None for numbers that are not finite."""
         return {field.name: plain_values(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
 
+    @checks_arguments
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as JSON, which ``load`` reads; an existing file is replaced.
 
@@ -237,6 +239,7 @@ class Result(Summarised):
         write_json(path, {"format": self.file_format, "version": 1, **self.to_dict(), "units": dict(self.units)})
 
     @classmethod
+    @checks_arguments
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read a file that ``save`` wrote.
 
@@ -275,10 +278,12 @@ class Result(Summarised):
                 object.__setattr__(result, name, {key: function(entry) for key, entry in value.items()})
         return result
 
+    @checks_arguments
     def to(self, device: torch.device | str) -> Self:
         """The same result with its tensors on another device."""
         return self.mapped(lambda values: values.to(device))
 
+    @checks_arguments
     def plot(self, path: str | os.PathLike[str] | None = None) -> "Figure":
         """Draw the result.
 

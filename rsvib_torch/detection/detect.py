@@ -11,6 +11,7 @@ from typing import Literal, Unpack, overload
 import torch
 from torch import Tensor, nn
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.option_types import BandSettings, DetectionMethod, Registration, ToneSettings
 from rsvib_torch.core.precision import full_precision, outside_graphs
@@ -185,6 +186,7 @@ def detect_vibration(
 @outside_graphs
 @full_precision
 @torch.no_grad()
+@checks_arguments
 def detect_vibration(
     frames: FramesOrFiles,
     timing: SensorTiming,
@@ -423,6 +425,7 @@ class VibrationDetector(nn.Module):
         {'method': 'bands', 'tones': 1}
     """
 
+    @checks_arguments
     def __init__(
         self, timing: SensorTiming, *, model: Literal["tones"] = "tones", **options: Unpack[ToneOptions]
     ) -> None:
@@ -436,6 +439,7 @@ class VibrationDetector(nn.Module):
         self.timing = timing
         self.options = options
 
+    @checks_arguments
     def forward(self, frames: FramesOrFiles) -> DetectionResult:
         """Detect the vibration in a stack of frames."""
         return detect_vibration(frames, self.timing, **self.options)

@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.splines import bspline_weights, spread_taps
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
@@ -71,6 +72,7 @@ def _axis_weights(displacement: Tensor, degree: int) -> tuple[Tensor, Tensor]:
     return first - degree // 2, weights
 
 
+@checks_arguments
 def row_psf(
     vibration: Motion,
     starts: Tensor,

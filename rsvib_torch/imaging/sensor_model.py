@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_number, check_whole_number
 
 __all__ = ["Optics", "SensorNoise"]
@@ -40,6 +41,7 @@ class Optics:
             check_number("cutoff", self.cutoff, above=0.0)
         check_number("pixel", self.pixel, at_least=0.0)
 
+    @checks_arguments
     def transfer(self, u: Tensor, v: Tensor) -> Tensor:
         """Transfer function at horizontal and vertical frequencies in cycles/px, in their broadcast shape."""
         squared = u.square() + v.square()
@@ -49,6 +51,7 @@ class Optics:
             transfer = transfer * (2 / math.pi) * (s.arccos() - s * (1 - s.square()).sqrt())
         return transfer * torch.sinc(self.pixel * u) * torch.sinc(self.pixel * v)
 
+    @checks_arguments
     def apply(self, scene: Tensor) -> Tensor:
         """Scene (..., H, W) as imaged by the optics, with mirrored boundaries; same shape and dtype.
 
@@ -108,6 +111,7 @@ class SensorNoise:
             check_number(name, getattr(self, name), at_least=0.0, at_most=1.0)
         check_whole_number("pattern_seed", self.pattern_seed, at_least=0)
 
+    @checks_arguments
     def fixed_pattern(self, height: int, width: int) -> tuple[Tensor, Tensor]:
         """Gain and offset of every pixel, float64 (height, width), the same in every call.
 
@@ -122,6 +126,7 @@ class SensorNoise:
         )
         return 1 + self.gain_spread * pixels, self.column_offset * columns + self.row_offset * rows
 
+    @checks_arguments
     def apply(self, frames: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return noisy frames of the same shape and dtype.
 

@@ -8,6 +8,7 @@ import math
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
 from rsvib_torch.frames.arrays import ArrayLike, as_tensor, channels_appear_last
@@ -24,6 +25,7 @@ _DEGREE = 9  # degree of the spline across rows; its error is 2e-5 of the amplit
 _MARGIN = 16
 
 
+@checks_arguments
 def simulate_frames(
     scene: ArrayLike,
     timing: SensorTiming,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import check_writable, move_into_place, temporary_folder
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.progress import steps
@@ -59,6 +60,7 @@ for _form in (
     register_format(_form)
 
 
+@checks_arguments
 def open_stack(path: PathLike) -> FrameReader:
     """Open a stack to read its frames one at a time; call ``close`` on the result.
 
@@ -86,6 +88,7 @@ def open_stack(path: PathLike) -> FrameReader:
     return reader
 
 
+@checks_arguments
 def read_stack_info(path: PathLike) -> StackInfo:
     """Read shape, data type and full scale of a stack without its pixels.
 
@@ -109,6 +112,7 @@ def read_stack_info(path: PathLike) -> StackInfo:
     return reader.info
 
 
+@checks_arguments
 def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None = None) -> Tensor:
     """Read a stack of frames from a file, or from several files one after another.
 
@@ -339,6 +343,7 @@ def _counted(pixels: NDArray[Any]) -> Iterator[NDArray[Any]]:
         advance()
 
 
+@checks_arguments
 def write_stack(
     path: PathLike,
     frames: FramesLike,

@@ -8,6 +8,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.motion.timing import SensorTiming
 
@@ -97,6 +98,7 @@ class Motion(Result, ABC):
         """Number of components of the displacement."""
         return self.largest_oscillation().shape[-1]
 
+    @checks_arguments
     def offset(self, starts: Tensor, later_starts: Tensor, exposure_time: float) -> Tensor:
         """Offset: mean displacement of the later exposure minus that of the earlier one, in px (Eq. 4).
 
@@ -112,6 +114,7 @@ class Motion(Result, ABC):
         """
         return self.mean_displacement(later_starts, exposure_time) - self.mean_displacement(starts, exposure_time)
 
+    @checks_arguments
     def largest_displacement(self, first: float, last: float) -> Tensor:
         """Bound on ``|D(t)|`` for ``first <= t <= last``, (..., axes), in px."""
         longest = max(abs(first), abs(last))
@@ -129,6 +132,7 @@ class Motion(Result, ABC):
         """
         return self.largest_displacement(-1.0, 1.0) > 0
 
+    @checks_arguments
     def to_row_order(self, timing: SensorTiming) -> Self:
         """The motion, given in image axes, as it appears in frames in row order.
 
@@ -137,6 +141,7 @@ class Motion(Result, ABC):
         order, signs = self._row_axes(timing)
         return self.with_axes(order, signs)
 
+    @checks_arguments
     def from_row_order(self, timing: SensorTiming) -> Self:
         """The motion, given in row order, in image axes: the inverse of ``to_row_order``."""
         order, signs = self._row_axes(timing)
@@ -154,10 +159,12 @@ class Motion(Result, ABC):
         """The same motion without gradients."""
         return self.mapped(Tensor.detach)
 
+    @checks_arguments
     def expanded(self, size: int) -> Self:
         """A batch of ``size`` copies of the motion; the new dimension is the first."""
         return self.mapped(lambda values: values.expand(size, *values.shape))
 
+    @checks_arguments
     def __getitem__(self, index: int) -> Self:
         """One motion of a batch."""
         if not self.batch_shape:

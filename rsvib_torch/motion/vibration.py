@@ -8,6 +8,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.motion.motion import Motion
@@ -109,6 +110,7 @@ class Vibration(Motion, units=_UNITS):
     image_motion: Tensor
     image_acceleration: Tensor
 
+    @checks_arguments
     def __init__(
         self,
         amplitude: TensorLike,
@@ -140,6 +142,7 @@ class Vibration(Motion, units=_UNITS):
         object.__setattr__(self, "image_acceleration", acceleration.expand(*batch, 2))
 
     @classmethod
+    @checks_arguments
     def still(cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None) -> Self:
         """No vibration and no image motion: the camera stands still."""
         zeros = torch.zeros(*batch_shape, 2, 1, dtype=torch.float64, device=device)
@@ -182,12 +185,14 @@ class Vibration(Motion, units=_UNITS):
         shape = (*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), 2)
         return self.image_motion.reshape(shape), self.image_acceleration.reshape(shape)
 
+    @checks_arguments
     def drift(self, times: Tensor) -> Tensor:
         """Displacement v t + a t^2 / 2 of the image motion alone in px; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)[..., None]
         velocity, acceleration = self._image_motion(times)
         return (velocity + 0.5 * acceleration * times) * times
 
+    @checks_arguments
     def displacement(self, times: Tensor) -> Tensor:
         """Displacement D(t) in px (Eq. 1).
 
@@ -201,6 +206,7 @@ class Vibration(Motion, units=_UNITS):
         angle, amplitude, _ = self._angle(times)
         return (amplitude * angle.sin()).sum(-1) + self.drift(times)
 
+    @checks_arguments
     def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
         """Mean displacement over exposures [start, start + T_e] in px (Eq. 2).
 
@@ -220,6 +226,7 @@ class Vibration(Motion, units=_UNITS):
         curvature = acceleration * (_with_trailing(exposure_time, 1) ** 2 / 24.0)
         return (amplitude * attenuation * angle.sin()).sum(-1) + self.drift(middle) + curvature
 
+    @checks_arguments
     def velocity(self, times: Tensor) -> Tensor:
         """Velocity dD/dt in px/s; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
@@ -228,6 +235,7 @@ class Vibration(Motion, units=_UNITS):
         oscillation = (2 * math.pi * frequency * amplitude * angle.cos()).sum(-1)
         return oscillation + velocity + acceleration * times[..., None]
 
+    @checks_arguments
     def gain(self, interval: float) -> Tensor:
         """Gain 2 sin(pi f m T_row) from displacement to offset over ``interval`` seconds (Eq. 7), (..., 2, K).
 
@@ -239,6 +247,7 @@ class Vibration(Motion, units=_UNITS):
         """Sum of the amplitudes of the tones, (..., 2), in px."""
         return self.amplitude.detach().sum(-1)
 
+    @checks_arguments
     def displacement_within(self, duration: float) -> Tensor:
         """Bound on the displacement between two times ``duration`` apart, (..., 2), in px (Eq. 24, sum of tones).
 
@@ -250,11 +259,13 @@ class Vibration(Motion, units=_UNITS):
         path = torch.where(cycles < 0.5, 2.0 * torch.sin(math.pi * cycles), 4.0 * cycles)
         return (self.amplitude.detach() * path).sum(-1) + self.image_motion.detach().abs() * duration
 
+    @checks_arguments
     def periods_within(self, duration: float) -> Tensor:
         """Periods of the fastest tone in ``duration`` seconds, (..., 2); tones below 1e-4 px do not count."""
         visible = self.amplitude.detach() > 1e-4
         return torch.where(visible, self.frequency.detach() * duration, 0.0).amax(-1)
 
+    @checks_arguments
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The vibration whose component k is ``signs[k]`` times component ``order[k]`` of this one.
 
@@ -310,6 +321,7 @@ class VibrationStd(Result, units=_UNITS | {"displacement": "px"}):
         values = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return VibrationStd(**{name: value[index] for name, value in values.items() if value is not None})
 
+    @checks_arguments
     def from_row_order(self, timing: SensorTiming) -> "VibrationStd":
         """The standard deviations, given in row order, in image axes: as ``Motion.from_row_order`` without signs."""
         if timing.scan_axis == -2:
@@ -375,6 +387,7 @@ def image_motion_line(vibration: Vibration, std: VibrationStd | None = None) -> 
     return [f"image motion {texts[0]} px/s along x, {texts[1]} px/s along y"]
 
 
+@checks_arguments
 def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
     """Frequencies up to ``highest`` Hz that cannot be measured from the frames.
 

@@ -13,6 +13,7 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
@@ -90,6 +91,7 @@ class OffsetCurve(Result, units={"times": "s", "later_times": "s", "offsets": "p
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
 
+@checks_arguments
 def register_bands(
     frames: FramesLike,
     timing: SensorTiming,

@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.presentation import FIGURES, Result
 from rsvib_torch.core.text import measured_text
@@ -83,6 +84,7 @@ def tones_text(result: DetectionResult, axis: int) -> list[str]:
     ]
 
 
+@checks_arguments
 def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150) -> None:
     """Write a figure as an image file, atomically.
 
@@ -155,6 +157,7 @@ def _finish_offsets(figure: Figure, panels: Any, points: Any) -> None:
     bar.outline.set_visible(False)
 
 
+@checks_arguments
 def offset_figure(result: DetectionResult) -> Figure:
     """Draw the offset curve of each axis with its fit, and the residuals (as Figure 6 of Liu et al. 2023).
 
@@ -186,6 +189,7 @@ def offset_figure(result: DetectionResult) -> Figure:
     return figure
 
 
+@checks_arguments
 def windows_figure(
     times: Sequence[float], detections: Sequence[Detection | None], *, time_label: str = "start of the window (s)"
 ) -> Figure:
@@ -249,6 +253,7 @@ def _batch_figure(results: DetectionResult) -> Figure:
     return windows_figure(range(len(parts)), parts, time_label="number of the stack")
 
 
+@checks_arguments
 def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None) -> Figure:
     """Draw the displacement of a motion along both axes over time.
 
@@ -349,6 +354,7 @@ def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
     return figure
 
 
+@checks_arguments
 def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     """Draw the gain of a pair of frames over frequency, and the detected tones with two standard deviations.
 
@@ -414,6 +420,7 @@ def motion_blur(vibration: Motion, starts: Tensor, timing: SensorTiming) -> Tens
     return path.amax(-2) - path.amin(-2)
 
 
+@checks_arguments
 def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure:
     """Draw mean displacement and motion blur of every row of frame 0.
 
@@ -444,6 +451,7 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figur
     return figure
 
 
+@checks_arguments
 def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure:
     """Draw point spread functions of 24 rows of frame 0 with the path of the image during their exposure.
 
@@ -486,6 +494,7 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
     return figure
 
 
+@checks_arguments
 def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]]) -> Figure:
     """Draw modulation transfer functions of slanted edges: thin lines for the edges, a bold line for their mean.
 
@@ -540,6 +549,7 @@ def detailed_places(image: Tensor, size: int, count: int, rim: int = 0) -> list[
     return places
 
 
+@checks_arguments
 def comparison_figure(
     raw: Tensor, restored: Tensor, *, count: int = 3, size: int = 160, names: tuple[str, str] = ("input", "restored")
 ) -> Figure:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
 from rsvib_torch.imaging.trajectory import rows_showing
@@ -72,6 +73,7 @@ def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows
     return FrameMotion(vibration, timing, starts, shift)
 
 
+@checks_arguments
 def visible_pixels(
     timing: SensorTiming, vibration: Motion, size: tuple[int, int], num_frames: int
 ) -> tuple[Tensor, Tensor]:

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import torch
 from pydantic import Field
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import measured_text, text_table, wrapped
 from rsvib_torch.core.validation import Section, read_json, validate
@@ -252,6 +253,7 @@ def write_manifest(
         os.fsync(file.fileno())
 
 
+@checks_arguments
 def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
     """Read the manifest of a complete run.
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Unpack
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.option_types import BadFrames
 from rsvib_torch.core.presentation import Summarised
@@ -76,6 +77,7 @@ class StackReport(Summarised):
         return "\n".join(lines)
 
 
+@checks_arguments
 def iterate_stack(source: PathLike, timing: SensorTiming, **options: Unpack[RestoreOptions]) -> Iterator[WindowResult]:
     """Restore a stack of any length window by window; each is available as soon as it is complete.
 
@@ -154,6 +156,7 @@ def detect_stack(
         write_manifest(part, manifest_header(job, None, None), records())
 
 
+@checks_arguments
 def process_stack(
     source: PathLike,
     sink: PathLike,

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.detection import detect_vibration
 from rsvib_torch.detection.start import constant_frame
 from rsvib_torch.frames.arrays import Channels, channel_axis
@@ -122,6 +123,7 @@ def frame_fault(
     return None
 
 
+@checks_arguments
 def restore_block(
     frames: NDArray[Any],
     timing: SensorTiming,

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.presentation import Result
@@ -94,6 +95,7 @@ class _Clock:
 @outside_graphs
 @full_precision
 @torch.no_grad()
+@checks_arguments
 def align_motion(
     frames: FramesOrFiles,
     timing: SensorTiming,

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.splines import gauss_legendre
@@ -58,6 +59,7 @@ class MotionCheck(Result, units={"before": "px", "after": "px"}):
 @outside_graphs
 @full_precision
 @torch.no_grad()
+@checks_arguments
 def check_motion(
     frames: FramesOrFiles,
     timing: SensorTiming,

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.presentation import Result, axis_rows, verdict_lines, verdict_table
@@ -105,6 +106,7 @@ class SweptTone(
 @outside_graphs
 @full_precision
 @torch.no_grad()
+@checks_arguments
 def detect_swept_tone(
     frames: FramesOrFiles,
     timing: SensorTiming,

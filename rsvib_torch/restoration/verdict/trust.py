@@ -1,11 +1,12 @@
 """The part of a detected vibration that is accurate enough to be undone, from its standard deviations."""
 
 import math
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
@@ -13,6 +14,7 @@ from rsvib_torch.motion.vibration import Vibration
 __all__ = ["Detected", "displacement_uncertainty", "trusted_vibration", "vibration_to_undo"]
 
 
+@runtime_checkable
 class Detected(Protocol):
     """A vibration with its standard deviations and a verdict, as ``detect_vibration`` returns it."""
 
@@ -68,6 +70,7 @@ def displacement_uncertainty(
     return error, (attenuation * amplitude.square()).sum(-1).sqrt()
 
 
+@checks_arguments
 def trusted_vibration(
     detected: Detected, timing: SensorTiming, num_frames: int, num_rows: int
 ) -> tuple[Vibration, tuple[str, ...]]:
