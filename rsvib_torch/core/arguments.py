@@ -31,7 +31,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import MAX_NUMBER, check_choice, check_number, check_whole_number, described
 
-__all__ = ["check_device", "check_fields", "check_tensor", "checks_arguments"]
+__all__ = ["as_numbers", "check_device", "check_fields", "check_shapes", "check_tensor", "checks_arguments"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -61,9 +61,70 @@ def check_tensor(name: str, value: object) -> Tensor:
         raise TypeError(f"{name} must not be quantised, got {value.dtype}; call {name}.dequantize()")
     if value.is_complex():
         raise TypeError(f"{name} must be real numbers, got {value.dtype}")
+    if value.is_floating_point() and value.dtype.itemsize == 1:
+        raise TypeError(f"{name} must have at least 16 bits, got {value.dtype}; call {name}.float()")
     if value.device.type == "meta":
         raise TypeError(f"{name} must be a tensor with data, got a meta tensor; load the data onto a device first")
     return value
+
+
+def as_numbers(name: str, value: object, device: torch.device | None = None) -> Tensor:
+    """Return a tensor, a number or a nested list of numbers as a float64 tensor; gradients are kept.
+
+    Args:
+        name: Name of the argument in error messages.
+        value: The value.
+        device: Device of the result; by default that of a tensor, and the CPU for other values.
+
+    Raises:
+        TypeError: If it does not consist of real numbers, or lists differ in length.
+
+    Example:
+        >>> as_numbers("amplitude", [3, 5]).dtype
+        torch.float64
+    """
+    if isinstance(value, Tensor):
+        return check_tensor(name, value).to(dtype=torch.float64, device=device)
+    if isinstance(value, np.ma.MaskedArray):
+        raise TypeError(f"{name} must not be a masked array; pass the values without the masked ones")
+    try:
+        return torch.as_tensor(value, dtype=torch.float64, device="cpu" if device is None else device)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise TypeError(
+            f"{name} must be a number, a tensor, or numbers in lists of equal lengths, got {described(value)}"
+        ) from error
+
+
+def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
+    """Raise a ``ValueError`` unless tensors have the stated shapes.
+
+    Args:
+        values: Tensors by name; None and names without a stated shape are omitted.
+        shapes: Axes of a tensor: a size, a name for a size of at least 1 that is the same in all tensors, and ``...``
+            for any leading dimensions.
+
+    Example:
+        >>> check_shapes({"scene": torch.zeros(3)}, {"scene": "... H W"})
+        Traceback (most recent call last):
+        ...
+        ValueError: scene must have shape (..., H, W), got (3,)
+    """
+    known: dict[str, int] = {}
+    for name, axes in shapes.items():
+        value = values.get(name)
+        if value is None:
+            continue
+        names = axes.removeprefix("...").split()
+        shape = tuple(value.shape)
+        sizes = shape[len(shape) - len(names) :] if len(shape) >= len(names) else ()
+        expected = [int(axis) if axis.isdecimal() else known.get(axis) for axis in names]
+        fits = all(size >= 1 if one is None else size == one for size, one in zip(sizes, expected, strict=False))
+        if len(sizes) != len(names) or not fits or ("..." not in axes and len(shape) > len(names)):
+            stated = ", ".join(["..."] * axes.startswith("...") + names) + "," * (axes.strip() == names[0])
+            sizes_known = [f"{axis} = {known[axis]}" for axis in names if axis in known]
+            where = f" with {', '.join(sizes_known)}" if sizes_known else ""
+            raise ValueError(f"{name} must have shape ({stated}){where}, got {shape}")
+        known |= {axis: size for axis, size in zip(names, sizes, strict=True) if not axis.isdecimal()}
 
 
 def check_device(name: str, value: object) -> torch.device:
@@ -149,7 +210,9 @@ def _field_checks(kind: type) -> list[tuple[str, _Check]]:
 def _checks_of(function: Callable[..., Any]) -> dict[str, _Check | None]:
     """Check of each parameter by name; ``**name`` for the keys of options, None for the parameter of the options."""
     checks: dict[str, _Check | None] = {}
-    hints = get_type_hints(function, localns={"Tensor": Tensor, "torch": torch})
+    given = {name: kind for name, kind in function.__annotations__.items() if name != "return"}
+    names = inspect.unwrap(function).__globals__
+    hints = get_type_hints(types.SimpleNamespace(__annotations__=given), names, {"Tensor": Tensor, "torch": torch})
     for parameter in inspect.signature(function).parameters.values():
         kind = hints.get(parameter.name, Any)
         if get_origin(kind) is Unpack:
@@ -167,10 +230,13 @@ def _check(kind: Any, *, finite: bool = True) -> _Check | None:  # noqa: PLR0911
     origin, arguments = get_origin(kind), get_args(kind)
     if kind is Any or isinstance(kind, TypeVar):
         return None
+    if torch.device in arguments and origin in (Union, types.UnionType):
+        return lambda name, value: None if value is None else void(check_device(name, value))
     if origin in (Union, types.UnionType):
         return _check_of_union(arguments, finite)
     if origin is Literal:
-        return lambda name, value: check_choice(name, value, arguments)
+        kinds = tuple({type(choice) for choice in arguments})  # the choices are keys of tables that users extend
+        return lambda name, value: None if isinstance(value, kinds) else check_choice(name, value, arguments)
     if kind is Tensor:
         return lambda name, value: void(check_tensor(name, value))
     if kind is torch.device:
@@ -191,6 +257,8 @@ def _check(kind: Any, *, finite: bool = True) -> _Check | None:  # noqa: PLR0911
         return _instance((str,), "text")
     if origin is tuple or (inspect.isclass(origin) and issubclass(origin, Sequence)):
         return _check_of_sequence(origin, arguments, finite)
+    if origin is np.ndarray:
+        return _instance((np.ndarray,), "a NumPy array")
     if inspect.isclass(origin) and issubclass(origin, Mapping):
         return _instance((Mapping,), "a dictionary")
     if origin is collections.abc.Callable:

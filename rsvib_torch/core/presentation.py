@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, Union, get_args, get_orig
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import check_fields, check_shapes, checks_arguments
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.text import text_table, wrapped, write_json
 from rsvib_torch.core.validation import read_json
@@ -199,17 +199,29 @@ class Result(Summarised):
     """Methods of a dataclass of tensors, numbers, texts and other results.
 
     The decorator of the class needs ``repr=False``, so that objects print as their summary. Arguments of the class:
-    ``units``, the units of its fields, which are written into files, and ``file_format``, the first entry of its files,
-    by default the name of the class.
+    ``units``, the units of its fields, which are written into files; ``shapes``, the axes of its tensors as in
+    ``check_shapes``; and ``file_format``, the first entry of its files, by default the name of the class.
     """
 
     units: ClassVar[Mapping[str, str]] = {}
+    shapes: ClassVar[Mapping[str, str]] = {}
     file_format: ClassVar[str] = ""
 
-    def __init_subclass__(cls, *, units: Mapping[str, str] | None = None, file_format: str | None = None) -> None:
+    def __init_subclass__(
+        cls,
+        *,
+        units: Mapping[str, str] | None = None,
+        shapes: Mapping[str, str] | None = None,
+        file_format: str | None = None,
+    ) -> None:
         super().__init_subclass__()
         cls.units = cls.units if units is None else units
+        cls.shapes = cls.shapes if shapes is None else shapes
         cls.file_format = f"rsvib {cls.__name__}" if file_format is None else file_format
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        check_shapes(vars(self), self.shapes)
 
     def summary(self) -> str:
         """The result in a few lines: here the shapes of its tensors and its other values."""

@@ -46,6 +46,9 @@ __all__ = ["DetectionMethod", "VibrationDetector", "VibrationModel", "detect_vib
 VibrationModel = Literal["tones", "free", "swept"]
 
 
+MAX_HARMONICS = 50  # the sensors of the paper sample a tone of 100 Hz up to its 120th harmonic
+
+
 class BandOptions(BandSettings, total=False):
     """Options of all models, see ``detect_vibration``."""
 
@@ -291,7 +294,7 @@ def detect_vibration(
         check_whole_number("tones", tones, at_least=1)
         if tones > MAX_TONES:
             raise ValueError(f"tones must be 'auto' or 1 to {MAX_TONES}, got {tones}")
-    check_whole_number("harmonics", harmonics, at_least=1)
+    check_whole_number("harmonics", harmonics, at_least=1, at_most=MAX_HARMONICS)
     if columns is not None:
         check_whole_number("columns", columns, at_least=64)  # px; narrower bands are often registered wrongly
     bands = RegistrationOptions(registration, band_rows, band_step, search)

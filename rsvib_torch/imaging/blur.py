@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.splines import bspline_coefficients, bspline_coefficients_adjoint, mirrored
 from rsvib_torch.imaging.psf import RowPSF
@@ -151,6 +151,7 @@ class RowVaryingBlur(nn.Module):
     @checks_arguments
     def forward(self, scene: Tensor) -> Tensor:
         """Form frames (..., R, W) from a scene (..., Hs, Ws)."""
+        check_shapes({"scene": scene}, {"scene": "... H W"})
         return blur_rows(scene, self.psf, frame_width=self.frame_width, origin=self.origin)
 
     @checks_arguments

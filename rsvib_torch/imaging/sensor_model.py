@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.checks import check_number, check_whole_number
 
 __all__ = ["Optics", "SensorNoise"]
@@ -60,6 +60,7 @@ class Optics:
         """
         if not isinstance(scene, Tensor) or not scene.dtype.is_floating_point:
             raise TypeError("scene must be a floating-point tensor (..., H, W)")
+        check_shapes({"scene": scene}, {"scene": "... H W"})
         height, width = scene.shape[-2:]
         mirrored = torch.cat([scene, scene.flip(-1)], dim=-1)
         mirrored = torch.cat([mirrored, mirrored.flip(-2)], dim=-2)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import check_fields, checks_arguments
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.frames.arrays import channels_appear_last
 from rsvib_torch.io.full_scale import known_full_scale
@@ -91,6 +91,9 @@ class StackInfo(Summarised):
     time_source: str = field(default="frame_times", compare=False)
     path: Path | None = field(default=None, compare=False)
     metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def summary(self) -> str:
         """The stack in one line."""

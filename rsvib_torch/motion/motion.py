@@ -155,6 +155,13 @@ class Motion(Result, ABC):
             signs[1] = -1.0
         return order, signs
 
+    def _check_axes(self, order: Sequence[int], signs: Sequence[float]) -> None:
+        """Raise a ``ValueError`` unless ``order`` is a permutation of the axes and ``signs`` are 1 or -1."""
+        if sorted(order) != list(range(self.num_axes)):
+            raise ValueError(f"order must be a permutation of {list(range(self.num_axes))}, got {list(order)}")
+        if len(signs) != self.num_axes or any(sign not in (1, -1) for sign in signs):
+            raise ValueError(f"signs must be {self.num_axes} values of 1 or -1, got {list(signs)}")
+
     def detached(self) -> Self:
         """The same motion without gradients."""
         return self.mapped(Tensor.detach)

@@ -9,15 +9,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import as_numbers, checks_arguments
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import axis_head, axis_rows
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, gauss_legendre
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME
 from rsvib_torch.motion.vibration import TensorLike, Vibration
 
 __all__ = ["FreeMotion"]
+
+MAX_DISPLACEMENT = 1e9  # px; image motion of 1e5 px/s for three hours
+MAX_EXPOSURE_NODES = 10_000  # times; an exposure of 1 s of a gyroscope with 5 kHz
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,19 +56,24 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
 
     @checks_arguments
     def __init__(self, coefficients: TensorLike, start: float, spacing: float, tones: Vibration | None = None) -> None:
-        values = torch.as_tensor(coefficients, dtype=torch.float64)
+        values = as_numbers("coefficients", coefficients)
         if values.ndim < 2 or values.shape[-2] != 2 or values.shape[-1] < 4:
             raise ValueError(f"coefficients must have shape (..., 2, N) with N >= 4, got {tuple(values.shape)}")
         if not bool(torch.isfinite(values).all()):
             raise ValueError("coefficients must be finite")
+        if float(values.detach().abs().max()) > MAX_DISPLACEMENT:
+            largest = float(values.detach().abs().max())
+            raise ValueError(f"coefficients must be at most {MAX_DISPLACEMENT:g} px, got {largest:g}")
         tones = Vibration.still(values.shape[:-2], values.device) if tones is None else tones.to(values.device)
         if tones.batch_shape != values.shape[:-2]:
             raise ValueError(
                 f"tones of batch shape {tuple(tones.batch_shape)} do not fit coefficients {tuple(values.shape)}"
             )
         object.__setattr__(self, "coefficients", values)
-        object.__setattr__(self, "start", check_number("start", start))
-        object.__setattr__(self, "spacing", check_number("spacing", spacing, above=0.0))
+        object.__setattr__(
+            self, "start", check_number("start", start, at_least=-MAX_START_TIME, at_most=MAX_START_TIME)
+        )
+        object.__setattr__(self, "spacing", check_number("spacing", spacing, at_least=MIN_ROW_TIME))
         object.__setattr__(self, "tones", tones)
 
     @classmethod
@@ -75,8 +84,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         Raises:
             ValueError: If times are not evenly spaced and increasing, or shapes do not fit.
         """
-        grid = torch.as_tensor(times, dtype=torch.float64)
-        values = torch.as_tensor(displacement, dtype=torch.float64)
+        grid, values = as_numbers("times", times), as_numbers("displacement", displacement)
         _check_samples(grid, values)
         steps = grid.diff()
         spacing = float(steps.mean())
@@ -108,8 +116,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         """
         from scipy.interpolate import CubicSpline  # noqa: PLC0415
 
-        grid = torch.as_tensor(times, dtype=torch.float64).cpu()
-        values = torch.as_tensor(displacement, dtype=torch.float64).cpu()
+        grid, values = as_numbers("times", times).cpu(), as_numbers("displacement", displacement).cpu()
         _check_samples(grid, values)
         steps = np.diff(grid.numpy())
         if (steps <= 0).any():
@@ -223,6 +230,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
     @checks_arguments
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The motion whose component k is ``signs[k]`` (1 or -1) times component ``order[k]`` of this motion."""
+        self._check_axes(order, signs)
         coefficients = self.coefficients[..., list(order), :] * self.coefficients.new_tensor(signs)[:, None]
         return type(self)(coefficients, self.start, self.spacing, self.tones.with_axes(order, signs))
 
@@ -267,7 +275,13 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         starts = starts.to(dtype=torch.float64, device=self.device)
         mean = self.tones.mean_displacement(starts, exposure_time)
         longest = float(exposure_time.amax()) if isinstance(exposure_time, Tensor) else exposure_time
-        nodes, weights = gauss_legendre(3 + math.ceil(2 * longest / self.spacing))
+        count = 3 + math.ceil(2 * longest / self.spacing)
+        if count > MAX_EXPOSURE_NODES:
+            raise ValueError(
+                f"exposure_time={longest:g} s contains {longest / self.spacing:.3g} knots of the motion, at most "
+                f"{MAX_EXPOSURE_NODES // 2} can be averaged; check its unit (seconds)"
+            )
+        nodes, weights = gauss_legendre(count)
         for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
             mean = mean + weight * self.rest(starts + node * exposure_time)
         return mean

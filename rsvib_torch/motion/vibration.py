@@ -3,12 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import as_numbers, checks_arguments
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.motion.motion import Motion
@@ -27,17 +28,20 @@ _UNITS = {
 _COLUMNS = {"amplitude": ("px", 1.0), "frequency": ("Hz", 1.0), "period": ("ms", 1e3), "phase": ("rad", 1.0)}
 _QUANTITIES = ("amplitude", "frequency", "phase")
 
-TensorLike = Tensor | float | Sequence[float] | Sequence[Sequence[float]]
+# Largest values: beyond the largest image, the fastest row, and what float64 angles and positions resolve.
+_LIMITS = {"amplitude": 1e6, "frequency": 1e9, "phase": 1e9, "image_motion": 1e9, "image_acceleration": 1e12}
+
+TensorLike = Tensor | NDArray[Any] | float | Sequence[float] | Sequence[Sequence[float]]
 
 
 def _per_tone(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
     """Convert a float, (2,), (2, K) or (..., 2, K) value to a (..., 2, K) float64 tensor."""
-    tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
+    tensor = as_numbers(name, value, device)
     if tensor.ndim == 0:
         tensor = tensor.expand(2)
     if tensor.ndim == 1:
         tensor = tensor[:, None]
-    if tensor.shape[-2] != 2:
+    if tensor.shape[-2] != 2 or tensor.shape[-1] == 0:
         raise ValueError(
             f"{name} must have shape (2,), (2, K) or (..., 2, K) for axes (x, y), got {tuple(tensor.shape)}"
         )
@@ -46,7 +50,7 @@ def _per_tone(name: str, value: TensorLike, device: torch.device | None) -> Tens
 
 def _per_axis(name: str, value: TensorLike, device: torch.device | None) -> Tensor:
     """Convert a float, (2,) or (..., 2) value to a (..., 2) float64 tensor."""
-    tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
+    tensor = as_numbers(name, value, device)
     tensor = tensor.expand(2) if tensor.ndim == 0 else tensor
     if tensor.shape[-1] != 2:
         raise ValueError(f"{name} must have shape (..., 2) for axes (x, y), got {tuple(tensor.shape)}")
@@ -59,15 +63,20 @@ def _with_trailing(value: float | Tensor, dimensions: int) -> float | Tensor:
 
 
 def _check_values(values: dict[str, Tensor]) -> None:
-    """Raise a ValueError for values that are not finite, and for negative amplitudes or frequencies."""
+    """Raise a ValueError for values that are not finite or too large, and for negative amplitudes or frequencies."""
     not_negative = ("amplitude", "frequency")
-    wrong = [~torch.isfinite(tensor).all() for tensor in values.values()]
+    wrong = [~(tensor.abs() <= _LIMITS[name]).all() for name, tensor in values.items()]
     wrong += [(values[name] < 0).any() for name in not_negative]
     if not bool(torch.stack(wrong).any()):  # synchronises the device only once
         return
     for name, tensor in values.items():
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{name} must be finite")
+        if bool((tensor.abs() > _LIMITS[name]).any()):
+            raise ValueError(
+                f"{name} must be at most {_LIMITS[name]:g} {_UNITS[name].partition(' at')[0]}, got "
+                f"{tensor.abs().max().item():g}"
+            )
     for name in not_negative:
         if bool((values[name] < 0).any()):
             raise ValueError(f"{name} must not be negative, got {values[name].min().item():g}")
@@ -271,6 +280,7 @@ class Vibration(Motion, units=_UNITS):
 
         A negative sign changes the phase by pi and returns it in [-pi, pi); amplitudes stay positive.
         """
+        self._check_axes(order, signs)
         sign = torch.tensor(signs, dtype=torch.float64, device=self.device)
         axes = list(order)
         phase = self.phase[..., axes, :]
@@ -285,7 +295,14 @@ class Vibration(Motion, units=_UNITS):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class VibrationStd(Result, units=_UNITS | {"displacement": "px"}):
+class VibrationStd(
+    Result,
+    units=_UNITS | {"displacement": "px"},
+    shapes={
+        **dict.fromkeys(("amplitude", "frequency", "period", "phase"), "... 2 K"),
+        **dict.fromkeys(("image_motion", "image_acceleration", "displacement"), "... 2"),
+    },
+):
     """Standard deviations in the layout of ``Vibration``: px, Hz, s, rad (..., 2, K), px/s and px/s^2 (..., 2).
 
     ``displacement`` (..., 2) in px is that of the displacement of the rows of the record, rms over the rows and without

@@ -28,7 +28,19 @@ __all__ = ["OffsetCurve", "check_frame_size", "register_bands", "register_rows"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OffsetCurve(Result, units={"times": "s", "later_times": "s", "offsets": "px", "std": "px"}):
+class OffsetCurve(
+    Result,
+    units={"times": "s", "later_times": "s", "offsets": "px", "std": "px"},
+    shapes={
+        "pairs": "P 2",
+        "rows": "N",
+        "times": "... P N",
+        "later_times": "... P N",
+        "offsets": "... P N 2",
+        "quality": "... P N",
+        "std": "... P N 2",
+    },
+):
     """Offsets of row bands between frames.
 
     The content of the band around row r of the earlier frame lies at r plus the offset in the later frame

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Unpack
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import check_fields, checks_arguments
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.option_types import BadFrames
 from rsvib_torch.core.presentation import Summarised
@@ -62,6 +62,9 @@ class StackReport(Summarised):
     first: WindowResult | None
     manifest: Path
     not_kept: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def summary(self) -> str:
         """Numbers of frames and windows, and the time."""

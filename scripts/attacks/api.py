@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from attacks.trial import Trial
+from attacks.warm import in_warm_child
 from torch import Tensor
 
 import rsvib_torch as rsv
-from attacks.trial import Trial
-from attacks.warm import in_warm_child
 
 __all__ = ["api_trials", "calls"]
 
@@ -90,7 +90,10 @@ def calls(folder: Path) -> dict[str, Call]:
     lines = [f"{t:.9g},{x:.9g},{y:.9g}" for t, (x, y) in zip(times.tolist(), path.tolist(), strict=True)]
     motion_file.write_text("\n".join(["time,x,y", *lines]))
     rsv.write_vibration(folder / "vibration.json", detected)
-    options: dict[str, Any] = {"detection": {"method": "bands", "tones": 1, **bands}, "restoration": {"method": "dewarp"}}
+    options: dict[str, Any] = {
+        "detection": {"method": "bands", "tones": 1, **bands},
+        "restoration": {"method": "dewarp"},
+    }
     options |= {"full_scale": None, "force": False, "device": "cpu"}
     windows = {"window": 3, "memory": "1GB", "workers": 1, **options}
     rsv.process_stack(stack, folder / "out.npy", timing, **windows)
@@ -120,115 +123,328 @@ def calls(folder: Path) -> dict[str, Call]:
     common |= {"frame": frames[0].numpy(), "x": scene, "y": frames[0], "scene_shape": (160, 128), "tones": None}
     frames_call = {"frames": frames, "timing": timing, "full_scale": None, "channels": None, "ignore": None}
     result = {
-        "align_motion": Call(rsv.align_motion, {"frames": frames, "timing": timing, "recorded": recorded,
-            "offsets": (-0.001, 0.001), "fit_scale": True, "fit_gain": True, **bands}),
+        "align_motion": Call(
+            rsv.align_motion,
+            {
+                "frames": frames,
+                "timing": timing,
+                "recorded": recorded,
+                "offsets": (-0.001, 0.001),
+                "fit_scale": True,
+                "fit_gain": True,
+                **bands,
+            },
+        ),
         "blind_frequencies": Call(rsv.blind_frequencies, {"timing": timing, "highest": 500.0}),
-        "calibrate_row_time": Call(rsv.calibrate_row_time, {"frames": stripes, "flicker_frequency": 1000.0,
-            "frame_rate": 30.0, "on_fraction": None, "light_contrast": None, "scan_axis": "y", "gamma": 1.0,
-            "full_scale": None, "channels": None}),
-        "calibrate_row_time_by_exposure": Call(rsv.calibrate_row_time_by_exposure, {"frames": stripes,
-            "exposure_times": [1e-3, 2.5e-4], "scan_axis": "y", "gamma": 1.0, "full_scale": None}),
+        "calibrate_row_time": Call(
+            rsv.calibrate_row_time,
+            {
+                "frames": stripes,
+                "flicker_frequency": 1000.0,
+                "frame_rate": 30.0,
+                "on_fraction": None,
+                "light_contrast": None,
+                "scan_axis": "y",
+                "gamma": 1.0,
+                "full_scale": None,
+                "channels": None,
+            },
+        ),
+        "calibrate_row_time_by_exposure": Call(
+            rsv.calibrate_row_time_by_exposure,
+            {"frames": stripes, "exposure_times": [1e-3, 2.5e-4], "scan_axis": "y", "gamma": 1.0, "full_scale": None},
+        ),
         "check_motion": Call(rsv.check_motion, {"frames": frames, "timing": timing, "motion": recorded, **bands}),
-        "comparison_figure": Call(rsv.comparison_figure, {"raw": frames[0], "restored": restored[0], "count": 2,
-            "size": 32, "names": ("input", "restored")}),
+        "comparison_figure": Call(
+            rsv.comparison_figure,
+            {"raw": frames[0], "restored": restored[0], "count": 2, "size": 32, "names": ("input", "restored")},
+        ),
         "detect_motion": Call(rsv.detect_motion, {**frames_call, "knot_rows": 24, "iterations": 1, **bands}),
         "detect_swept_tone": Call(rsv.detect_swept_tone, {**frames_call, "iterations": 1, **bands}),
-        "detect_vibration": Call(rsv.detect_vibration, {**frames_call, "model": "tones", "method": "bands",
-            "tones": 1, "harmonics": 1, "image_acceleration": False, "columns": None, "window": None,
-            "window_step": None, "registration": "ncc", **bands}),
+        "detect_vibration": Call(
+            rsv.detect_vibration,
+            {
+                **frames_call,
+                "model": "tones",
+                "method": "bands",
+                "tones": 1,
+                "harmonics": 1,
+                "image_acceleration": False,
+                "columns": None,
+                "window": None,
+                "window_step": None,
+                "registration": "ncc",
+                **bands,
+            },
+        ),
         "detect_vibration direct": Call(rsv.detect_vibration, {**frames_call, **bands}),
-        "find_slanted_edges": Call(rsv.find_slanted_edges, {"image": image, "min_length": 32, "max_length": 64,
-            "min_contrast": 0.1}),
+        "find_slanted_edges": Call(
+            rsv.find_slanted_edges, {"image": image, "min_length": 32, "max_length": 64, "min_contrast": 0.1}
+        ),
         "gain_figure": Call(rsv.gain_figure, {"result": detected, "timing": timing}),
-        "iterate_stack": Call(lambda **given: list(rsv.iterate_stack(**given)), {"source": stack, "timing": timing,
-            **windows}),
-        "judge_restoration": Call(rsv.judge_restoration, {"frames": frames, "restored": restored, "timing": timing,
-            "vibration": vibration}),
+        "iterate_stack": Call(
+            lambda **given: list(rsv.iterate_stack(**given)), {"source": stack, "timing": timing, **windows}
+        ),
+        "judge_restoration": Call(
+            rsv.judge_restoration, {"frames": frames, "restored": restored, "timing": timing, "vibration": vibration}
+        ),
         "motion_figure": Call(rsv.motion_figure, {"motion": vibration, "first": 0.0, "last": 0.1}),
         "mtf_figure": Call(rsv.mtf_figure, {"curves": {"raw": [curve], "restored": [curve]}}),
-        "offset_endpoint_error": Call(rsv.offset_endpoint_error, {"measured": path, "truth": path * 0.9,
-            "reduction": "mean"}),
+        "offset_endpoint_error": Call(
+            rsv.offset_endpoint_error, {"measured": path, "truth": path * 0.9, "reduction": "mean"}
+        ),
         "offset_figure": Call(rsv.offset_figure, {"result": detected}),
         "open_stack": Call(rsv.open_stack, {"path": stack}),
-        "predict_noise_gain": Call(rsv.predict_noise_gain, {"frames": frames, "timing": timing,
-            "vibration": vibration, "method": "dewarp"}),
-        "process_stack": Call(rsv.process_stack, {"source": stack, "sink": folder / "new.npy", "timing": timing,
-            "bad_frames": "pass", "compression": None, "resume": False, "manifest": None, "given": None,
-            "scheduler": None, "progress": None, **windows}),
+        "predict_noise_gain": Call(
+            rsv.predict_noise_gain, {"frames": frames, "timing": timing, "vibration": vibration, "method": "dewarp"}
+        ),
+        "process_stack": Call(
+            rsv.process_stack,
+            {
+                "source": stack,
+                "sink": folder / "new.npy",
+                "timing": timing,
+                "bad_frames": "pass",
+                "compression": None,
+                "resume": False,
+                "manifest": None,
+                "given": None,
+                "scheduler": None,
+                "progress": None,
+                **windows,
+            },
+        ),
         "psf_figure": Call(rsv.psf_figure, {"vibration": vibration, "timing": timing, "num_rows": 96}),
         "psnr": Call(rsv.psnr, {"image": restored, "reference": frames, "data_range": 1.0, "rim": 4}),
         "read_manifest": Call(rsv.read_manifest, {"path": folder / "out.npy.manifest.json"}),
-        "read_motion": Call(rsv.read_motion, {"path": motion_file, "unit": "rad", "focal_length": 100.0,
-            "time_unit": "s", "signs": (1.0, -1.0)}),
+        "read_motion": Call(
+            rsv.read_motion,
+            {"path": motion_file, "unit": "rad", "focal_length": 100.0, "time_unit": "s", "signs": (1.0, -1.0)},
+        ),
         "read_stack": Call(rsv.read_stack, {"path": stack, "full_scale": None}),
         "read_stack_info": Call(rsv.read_stack_info, {"path": stack}),
         "read_vibration": Call(rsv.read_vibration, {"path": folder / "vibration.json", "timing": timing}),
         "register_bands": Call(rsv.register_bands, {**frames_call, "method": "ncc", **bands}),
-        "register_bands phase": Call(rsv.register_bands, {"frames": frames, "timing": timing, "method": "phase", **bands}),
-        "register_bands projection": Call(rsv.register_bands, {"frames": frames, "timing": timing,
-            "method": "projection", **bands}),
-        "restore": Call(rsv.restore, {**frames_call, "vibration": vibration, "method": "exact", "saturation": "auto",
-            "check": True, "joint": False, "prior": "gaussian", "noise": "auto", "regularisation": 1.0,
-            "chunk_frequencies": None, "segments": None}),
-        "restore banded": Call(rsv.restore, {"frames": frames, "timing": timing, "vibration": vibration,
-            "method": "banded", "half_rows": 8, "stride": 8, "interpolation": "cubic", "noise_to_signal": "auto",
-            "chunk_rows": None, "check": False}),
-        "restore dewarp": Call(rsv.restore, {"frames": frames, "timing": timing, "vibration": detected,
-            "method": "dewarp", "chunk_rows": 64, "check": False}),
-        "restore richardson-lucy": Call(rsv.restore, {"frames": frames, "timing": timing, "vibration": vibration,
-            "method": "richardson-lucy", "joint": False, "iterations": 2, "check": False}),
-        "restore_block": Call(rsv.restore_block, {"frames": counts, "timing": timing, **options, "full_scale": 4095.0,
-            "channels": None}),
-        "row_psf": Call(rsv.row_psf, {"vibration": vibration, "starts": timing.row_starts(1, 96)[0],
-            "timing": timing, "interpolation": "linear", "quadrature": "midpoint", "num_nodes": 4}),
+        "register_bands phase": Call(
+            rsv.register_bands, {"frames": frames, "timing": timing, "method": "phase", **bands}
+        ),
+        "register_bands projection": Call(
+            rsv.register_bands, {"frames": frames, "timing": timing, "method": "projection", **bands}
+        ),
+        "restore": Call(
+            rsv.restore,
+            {
+                **frames_call,
+                "vibration": vibration,
+                "method": "exact",
+                "saturation": "auto",
+                "check": True,
+                "joint": False,
+                "prior": "gaussian",
+                "noise": "auto",
+                "regularisation": 1.0,
+                "chunk_frequencies": None,
+                "segments": None,
+            },
+        ),
+        "restore banded": Call(
+            rsv.restore,
+            {
+                "frames": frames,
+                "timing": timing,
+                "vibration": vibration,
+                "method": "banded",
+                "half_rows": 8,
+                "stride": 8,
+                "interpolation": "cubic",
+                "noise_to_signal": "auto",
+                "chunk_rows": None,
+                "check": False,
+            },
+        ),
+        "restore dewarp": Call(
+            rsv.restore,
+            {
+                "frames": frames,
+                "timing": timing,
+                "vibration": detected,
+                "method": "dewarp",
+                "chunk_rows": 64,
+                "check": False,
+            },
+        ),
+        "restore richardson-lucy": Call(
+            rsv.restore,
+            {
+                "frames": frames,
+                "timing": timing,
+                "vibration": vibration,
+                "method": "richardson-lucy",
+                "joint": False,
+                "iterations": 2,
+                "check": False,
+            },
+        ),
+        "restore_block": Call(
+            rsv.restore_block, {"frames": counts, "timing": timing, **options, "full_scale": 4095.0, "channels": None}
+        ),
+        "row_psf": Call(
+            rsv.row_psf,
+            {
+                "vibration": vibration,
+                "starts": timing.row_starts(1, 96)[0],
+                "timing": timing,
+                "interpolation": "linear",
+                "quadrature": "midpoint",
+                "num_nodes": 4,
+            },
+        ),
         "rows_figure": Call(rsv.rows_figure, {"vibration": vibration, "timing": timing, "num_rows": 96}),
         "save_figure": Call(rsv.save_figure, {"figure": figure, "path": folder / "figure.png", "dpi": 20}),
-        "simulate_frames": Call(rsv.simulate_frames, {"scene": scene, "timing": timing, "vibration": vibration,
-            "num_frames": 2, "frame_size": (64, 48), "noise": sensor_noise,
-            "generator": torch.Generator("cpu").manual_seed(1)}),
+        "simulate_frames": Call(
+            rsv.simulate_frames,
+            {
+                "scene": scene,
+                "timing": timing,
+                "vibration": vibration,
+                "num_frames": 2,
+                "frame_size": (64, 48),
+                "noise": sensor_noise,
+                "generator": torch.Generator("cpu").manual_seed(1),
+            },
+        ),
         "slanted_edge_mtf": Call(rsv.slanted_edge_mtf, {"roi": edge}),
         "ssim": Call(rsv.ssim, {"image": restored, "reference": frames, "data_range": 1.0, "rim": 4}),
         "timing_from_first_frame": Call(rsv.timing_from_first_frame, {"timing": timing, "info": info}),
-        "trusted_vibration": Call(rsv.trusted_vibration, {"detected": detected, "timing": timing, "num_frames": 3,
-            "num_rows": 96}),
-        "visible_pixels": Call(rsv.visible_pixels, {"timing": timing, "vibration": vibration, "size": (96, 64),
-            "num_frames": 3}),
-        "windows_figure": Call(rsv.windows_figure, {"times": [0.0], "detections": [detected],
-            "time_label": "start (s)"}),
+        "trusted_vibration": Call(
+            rsv.trusted_vibration, {"detected": detected, "timing": timing, "num_frames": 3, "num_rows": 96}
+        ),
+        "visible_pixels": Call(
+            rsv.visible_pixels, {"timing": timing, "vibration": vibration, "size": (96, 64), "num_frames": 3}
+        ),
+        "windows_figure": Call(
+            rsv.windows_figure, {"times": [0.0], "detections": [detected], "time_label": "start (s)"}
+        ),
         "write_offsets": Call(rsv.write_offsets, {"path": folder / "offsets.csv", "result": detected}),
-        "write_stack": Call(rsv.write_stack, {"path": folder / "written.tif", "frames": frames, "channels": None,
-            "dtype": "float32", "full_scale": None, "compression": None, "like": info}),
-        "write_vibration": Call(rsv.write_vibration, {"path": folder / "written.json", "result": detected,
-            "timing": timing}),
+        "write_stack": Call(
+            rsv.write_stack,
+            {
+                "path": folder / "written.tif",
+                "frames": frames,
+                "channels": None,
+                "dtype": "float32",
+                "full_scale": None,
+                "compression": None,
+                "like": info,
+            },
+        ),
+        "write_vibration": Call(
+            rsv.write_vibration, {"path": folder / "written.json", "result": detected, "timing": timing}
+        ),
         "write_windows": Call(rsv.write_windows, {"path": folder / "windows.csv", "manifest": manifest}),
-        "FreeMotion": Call(rsv.FreeMotion, {"coefficients": recorded.coefficients, "start": 0.0, "spacing": 5e-4,
-            "tones": vibration}),
-        "RollingShutterVibration": Call(rsv.RollingShutterVibration, {"timing": timing, "amplitude": (0.5, 2.0),
-            "frequency": (40.0, 200.0), "phase": (-3.0, 3.0), "image_motion": 0.0, "exposure_rows": (4.0, 8.0),
-            "tones": 1, "interpolation": "cubic", "p": 0.5, "same_on_batch": False, "keepdim": False}),
+        "FreeMotion": Call(
+            rsv.FreeMotion, {"coefficients": recorded.coefficients, "start": 0.0, "spacing": 5e-4, "tones": vibration}
+        ),
+        "RollingShutterVibration": Call(
+            rsv.RollingShutterVibration,
+            {
+                "timing": timing,
+                "amplitude": (0.5, 2.0),
+                "frequency": (40.0, 200.0),
+                "phase": (-3.0, 3.0),
+                "image_motion": 0.0,
+                "exposure_rows": (4.0, 8.0),
+                "tones": 1,
+                "interpolation": "cubic",
+                "p": 0.5,
+                "same_on_batch": False,
+                "keepdim": False,
+            },
+        ),
         "RollingShutterVibration.forward": Call(augmentation, {"input": frames[:, None]}),
         "RollingShutterVibration.drawn_vibration": Call(augmentation.drawn_vibration, {"params": None}),
-        "RowVaryingBlur": Call(rsv.RowVaryingBlur, {"psf": psf, "frame_width": 64, "origin": (4, 4),
-            "scene_size": (160, 128)}),
-        "SensorTiming": Call(rsv.SensorTiming, {"row_time": 1e-4, "exposure_rows": 6.0, "frame_rows": 104.0,
-            "scan_axis": "y", "readout_direction": "forward", "frame_start_times": (0.0, 0.0104, 0.021)}),
-        "Vibration": Call(rsv.Vibration, {"amplitude": vibration.amplitude, "frequency": [130.0, 170.0],
-            "phase": 0.3, "image_motion": (5.0, 3.0), "image_acceleration": (0.0, 0.0)}),
-        "VibrationDetector": Call(rsv.VibrationDetector, {"timing": timing, "model": "tones", "method": "bands",
-            "tones": 1, **bands}),
-        "VibrationRestorer": Call(rsv.VibrationRestorer, {"timing": timing, "method": "exact", "full_scale": None,
-            "channels": None, "saturation": "auto", "check": True, "joint": False}),
+        "RowVaryingBlur": Call(
+            rsv.RowVaryingBlur, {"psf": psf, "frame_width": 64, "origin": (4, 4), "scene_size": (160, 128)}
+        ),
+        "SensorTiming": Call(
+            rsv.SensorTiming,
+            {
+                "row_time": 1e-4,
+                "exposure_rows": 6.0,
+                "frame_rows": 104.0,
+                "scan_axis": "y",
+                "readout_direction": "forward",
+                "frame_start_times": (0.0, 0.0104, 0.021),
+            },
+        ),
+        "Vibration": Call(
+            rsv.Vibration,
+            {
+                "amplitude": vibration.amplitude,
+                "frequency": [130.0, 170.0],
+                "phase": 0.3,
+                "image_motion": (5.0, 3.0),
+                "image_acceleration": (0.0, 0.0),
+            },
+        ),
+        "VibrationDetector": Call(
+            rsv.VibrationDetector, {"timing": timing, "model": "tones", "method": "bands", "tones": 1, **bands}
+        ),
+        "VibrationRestorer": Call(
+            rsv.VibrationRestorer,
+            {
+                "timing": timing,
+                "method": "exact",
+                "full_scale": None,
+                "channels": None,
+                "saturation": "auto",
+                "check": True,
+                "joint": False,
+            },
+        ),
         "VibrationDetector.forward": Call(detector, {"frames": frames}),
         "VibrationRestorer.forward": Call(restorer, {"frames": frames, "vibration": vibration, "ignore": None}),
     }
     augmentation(frames[:, None])
-    for value in (alignment, detected, check, free, curve, detected.offsets, optics, verdict, calibration, sensor_noise,
-        slanted, info, swept, detected.std):
+    for value in (
+        alignment,
+        detected,
+        check,
+        free,
+        curve,
+        detected.offsets,
+        optics,
+        verdict,
+        calibration,
+        sensor_noise,
+        slanted,
+        info,
+        swept,
+        detected.std,
+    ):
         result[type(value).__name__] = _with_fields(value)
     report = rsv.process_stack(stack, folder / "again.npy", timing, **windows)
     result["StackReport"] = _with_fields(report)
-    for value in (vibration, recorded, timing, detected, detected.std, detected.offsets, free, swept, check, alignment,
-        curve, optics, sensor_noise, verdict, calibration, slanted, info, report):
+    for value in (
+        vibration,
+        recorded,
+        timing,
+        detected,
+        detected.std,
+        detected.offsets,
+        free,
+        swept,
+        check,
+        alignment,
+        curve,
+        optics,
+        sensor_noise,
+        verdict,
+        calibration,
+        slanted,
+        info,
+        report,
+    ):
         result |= _methods(value, **common)
     for method, value in (("forward", {"scene": scene}), ("adjoint", {"frames": frames[0], "scene_shape": (160, 128)})):
         result[f"RowVaryingBlur.{method}"] = Call(getattr(blur, method), value)
@@ -376,7 +592,7 @@ def attempt(folder: Path, item: Item | None) -> Trial:
     place.mkdir()
     arguments = {
         key: place / value.name
-        if isinstance(value, Path) and not value.exists() or key in ("sink", "manifest") and isinstance(value, Path)
+        if (isinstance(value, Path) and not value.exists()) or (key in ("sink", "manifest") and isinstance(value, Path))
         else value
         for key, value in call.arguments.items()
     }

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-
 from attacks.trial import Trial
 
 __all__ = ["in_warm_child"]

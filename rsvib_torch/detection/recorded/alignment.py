@@ -28,7 +28,11 @@ __all__ = ["ClockAlignment", "align_motion"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ClockAlignment(Result, units={"offset": "s", "offset_std": "s", "drift": "px/s", "unexplained": "px"}):
+class ClockAlignment(
+    Result,
+    units={"offset": "s", "offset_std": "s", "drift": "px/s", "unexplained": "px"},
+    shapes={"drift": "2", "unexplained": "2"},
+):
     """Time of the frames within a recorded motion: ``scale t + offset`` on its clock.
 
     Attributes:

@@ -30,7 +30,7 @@ _MIN_CHANGE = 0.05  # px, registration errors of bands
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MotionCheck(Result, units={"before": "px", "after": "px"}):
+class MotionCheck(Result, units={"before": "px", "after": "px"}, shapes={"before": "2", "after": "2"}):
     """Offsets of rows between frames, before and after a given motion is subtracted.
 
     Attributes:

@@ -48,6 +48,12 @@ __all__ = [
 class MotionDetection(
     Result,
     units={"times": "s", "displacement": "px", "std": "px", "std_seen": "px", "unseen": "px", "unexplained": "px"},
+    shapes={
+        "times": "T R",
+        "displacement": "... T R 2",
+        "std": "... T R 2",
+        **dict.fromkeys(("std_seen", "unseen", "unexplained", "reliable"), "... 2"),
+    },
 ):
     """A motion of any shape with its uncertainty. A batch of stacks leads all tensors but ``times``.
 

@@ -29,6 +29,11 @@ class MtfCurve(
         "position": "px",
         "lsf": "1/px",
     },
+    shapes={
+        **dict.fromkeys(("frequency", "mtf", "std"), "F"),
+        **dict.fromkeys(("position", "esf", "lsf"), "N"),
+        "levels": "2",
+    },
 ):
     """Modulation transfer function along the normal of an edge.
 

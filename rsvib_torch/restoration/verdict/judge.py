@@ -53,7 +53,9 @@ class RestorationWarning(UserWarning):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RestorationVerdict(
-    Result, units={"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"}
+    Result,
+    units={"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"},
+    shapes={"misfit_before": "... 2", "misfit_after": "... 2", "resolution": "... 2"},
 ):
     """Verdict on a restoration from P pairs of frames of one scene.
 
