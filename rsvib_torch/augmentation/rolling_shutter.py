@@ -336,7 +336,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         vibration = Vibration(**drawn).to_row_order(self.timing)
         self.timing.check_rows(self._num_rows(params))
         length = self._recording_length(params)
-        starts = self.timing.frame_starts(length) if length > 1 else torch.zeros(1, dtype=torch.float64)
+        starts = self.timing.frame_starts(length) if length > 1 else torch.zeros(1, dtype=torch.float64, device="cpu")
         return ImageMotion(
             vibration=vibration,
             starts=starts.repeat(len(exposure_rows) // length).to(like.device),

@@ -287,10 +287,14 @@ def _direction(
 def _turning(values: Tensor, turns: float) -> tuple[float, float]:
     """Misfit of ``d + a exp(2 pi j p turns)`` to values (T,) over their power with a penalty on d, and |a|."""
     count = len(values)
-    angle = 2 * math.pi * turns * torch.arange(count, dtype=torch.float64)
-    columns = torch.stack([torch.ones(count, dtype=values.dtype), torch.polar(torch.ones_like(angle), angle)], 1)
+    angle = 2 * math.pi * turns * torch.arange(count, dtype=torch.float64, device="cpu")
+    columns = torch.stack(
+        [torch.ones(count, dtype=values.dtype, device="cpu"), torch.polar(torch.ones_like(angle), angle)], 1
+    )
     penalty = 0.3 if count == 2 else 0.03  # two frames alone cannot separate d from a
-    gram = columns.mH @ columns + torch.diag(torch.tensor([penalty, 0.0])).to(values.dtype)
+    gram = columns.mH @ columns + torch.diag(torch.tensor([penalty, 0.0], dtype=torch.float32, device="cpu")).to(
+        values.dtype
+    )
     solution = torch.linalg.solve(gram, columns.mH @ values)
     cost = (values - columns @ solution).abs().square().sum() + penalty * solution[0].abs().square()
     return float(cost / values.abs().square().sum()), float(solution[1].abs())

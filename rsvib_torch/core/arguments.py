@@ -142,12 +142,10 @@ def check_device(name: str, value: object) -> torch.device:
         raise TypeError(f"{name} must be a device such as 'cpu' or 'cuda', got {described(value)}")
     try:
         device = torch.device(value)
-        torch.empty(0, device=device)
+        torch.empty(0, device=device, dtype=torch.float32)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).partition("\n")[0]
         raise ValueError(f"{name}={str(value)!r} is not available: {reason}; use 'cpu'") from error
-    if device.type == "meta":
-        raise ValueError(f"{name}='meta' has no data; use 'cpu' or 'cuda'")
     return device
 
 
@@ -330,4 +328,4 @@ def _numeric(name: str, value: Any) -> Tensor:
     """An array of numbers as a tensor that is not used."""
     if isinstance(value, np.ma.MaskedArray) or value.dtype.kind not in "biuf":
         _refuse(name, "an array of real numbers", value)
-    return torch.empty(0)
+    return torch.empty(0, dtype=torch.float32, device="cpu")

@@ -15,6 +15,7 @@ except ImportError:  # without it temporary folders of killed processes are not 
     fcntl = None  # type: ignore[assignment]
 
 __all__ = [
+    "check_name",
     "check_writable",
     "move_into_place",
     "nearest_folder",
@@ -24,6 +25,7 @@ __all__ = [
 ]
 
 _SUFFIX = ".part"
+_ADDED = len("..12345678.part")  # bytes that names of temporary files have in addition
 
 
 def nearest_folder(path: Path) -> Path:
@@ -87,6 +89,16 @@ def temporary_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
         if lock is not None:
             os.close(lock)
+
+
+def check_name(path: Path) -> None:
+    """Raise an ``OSError`` if the name of a file to be written is too long, with those that belong to it."""
+    longest = os.pathconf(nearest_folder(path), "PC_NAME_MAX") - _ADDED if hasattr(os, "pathconf") else 255 - _ADDED
+    if len(os.fsencode(path.name)) > longest:
+        raise OSError(
+            f"cannot write {path.name[:40]}...: its name has {len(os.fsencode(path.name))} bytes, but at most {longest} "
+            "are possible"
+        )
 
 
 def _check_file_target(path: Path, *, parent_exists: bool = True) -> None:

@@ -162,9 +162,9 @@ def _tensor(value: Any, path: str, missing: float) -> Tensor:
 
     values = filled(value)
     try:
-        tensor = torch.tensor(values)
+        tensor = torch.tensor(values, device="cpu")
         if tensor.is_floating_point() or not tensor.numel():
-            tensor = torch.tensor(values, dtype=torch.float64)
+            tensor = torch.tensor(values, dtype=torch.float64, device="cpu")
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected numbers in lists of equal lengths: {error}") from error
     return tensor

@@ -2,18 +2,30 @@
 
 import json
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
-__all__ = ["Section", "checked", "expected_text", "options_section", "read_json", "validate"]
+__all__ = ["MistakesError", "Section", "checked", "expected_text", "options_section", "read_json", "validate"]
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _Result = TypeVar("_Result")
 _TYPE_NAMES = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
 _LIST_NAMES: dict[Any, str] = {float: "numbers", int: "whole numbers", str: "texts", bool: "true or false"}
+
+
+class MistakesError(ValueError):
+    """Mistakes in one file.
+
+    Attributes:
+        lines: One line for each.
+    """
+
+    def __init__(self, lines: Iterable[str]) -> None:
+        self.lines = tuple(lines)
+        super().__init__("\n".join(self.lines))
 
 
 class Section(BaseModel):
@@ -65,7 +77,7 @@ def validate(model: type[_Model], data: Mapping[str, Any], source: str) -> _Mode
         for mistake in error.errors(include_url=False):
             path, message = _describe(model, data, mistake)
             lines.setdefault(path, f"{source}: {path}: {message}" if path else f"{source}: {message}")
-        raise ValueError("\n".join(lines.values())) from error
+        raise MistakesError(lines.values()) from error
 
 
 def _describe(model: type[BaseModel], data: Any, mistake: Any) -> tuple[str, str]:

@@ -120,9 +120,9 @@ class SensorNoise:
             height: Rows of the sensor.
             width: Columns of the sensor.
         """
-        generator = torch.Generator().manual_seed(self.pattern_seed)
+        generator = torch.Generator(device="cpu").manual_seed(self.pattern_seed)
         columns, rows, pixels = (
-            torch.randn(shape, generator=generator, dtype=torch.float64)
+            torch.randn(shape, generator=generator, dtype=torch.float64, device="cpu")
             for shape in ((1, width), (height, 1), (height, width))
         )
         return 1 + self.gain_spread * pixels, self.column_offset * columns + self.row_offset * rows

@@ -58,8 +58,8 @@ def exposure_nodes(
         nodes, weights = gauss_legendre(4 if num_nodes is None else num_nodes)
         return nodes * timing.exposure_time, weights
     count = math.ceil(timing.exposure_rows - 1e-9) if num_nodes is None else num_nodes
-    times = (torch.arange(count, dtype=torch.float64) + 0.5) / count * timing.exposure_time
-    return times, torch.full((count,), 1.0 / count, dtype=torch.float64)
+    times = (torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count * timing.exposure_time
+    return times, torch.full((count,), 1.0 / count, dtype=torch.float64, device="cpu")
 
 
 def exposure_trajectory(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.atomic import check_writable, move_into_place, temporary_folder
+from rsvib_torch.core.atomic import check_name, check_writable, move_into_place, temporary_folder
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
@@ -209,6 +209,7 @@ def check_info_target(
         compression: As in ``write_stack``.
         check_folder: Whether to check that the folder exists and is writable.
     """
+    check_name(path)
     form = target_format(path)
     if not form.writable:
         raise ValueError(

@@ -39,7 +39,7 @@ def _to_tensor(values: Any, missing: float) -> Tensor:
     def filled(value: Any) -> Any:
         return [filled(part) for part in value] if isinstance(value, list) else missing if value is None else value
 
-    return torch.tensor(filled(values), dtype=torch.float64)
+    return torch.tensor(filled(values), dtype=torch.float64, device="cpu")
 
 
 class TimingRecord(Section):
@@ -238,7 +238,7 @@ class DetectionRecord(Section):
             std,
             _to_tensor(self.gain, math.nan),
             _to_tensor(self.residual, math.nan),
-            torch.tensor(self.reliable),
+            torch.tensor(self.reliable, device="cpu"),
             tuple(tuple(axis) for axis in self.reasons),
             tuple(self.assumptions),
         )

@@ -119,7 +119,7 @@ class Motion(Result, ABC):
         """Bound on ``|D(t)|`` for ``first <= t <= last``, (..., axes), in px."""
         longest = max(abs(first), abs(last))
         # a quadratic without constant term is largest at one of the ends of a symmetric interval
-        ends = torch.tensor([-longest, longest], dtype=torch.float64).expand(*self.batch_shape, 2)
+        ends = torch.tensor([-longest, longest], dtype=torch.float64, device="cpu").expand(*self.batch_shape, 2)
         return self.largest_oscillation() + self.drift(ends).detach().abs().amax(-2)
 
     def moving_axes(self) -> Tensor:

@@ -424,7 +424,7 @@ def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
     intervals = starts[1:] - starts[0]
 
     def multiples(interval: float) -> Tensor:
-        return torch.arange(1, math.floor(highest * interval) + 1, dtype=torch.float64) / interval
+        return torch.arange(1, math.floor(highest * interval) + 1, dtype=torch.float64, device="cpu") / interval
 
     alike = multiples(float(intervals[0])) if len(intervals) else starts[:0]
     cycles = alike[:, None] * intervals

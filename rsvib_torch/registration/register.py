@@ -187,7 +187,8 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     check_frame_size(num_rows, width, options)
     # a Gaussian of 1 px band-limits the correlation, so that whole-pixel lags determine its peak, and damps noise;
     # contiguous images are filtered 14 times faster
-    grey = _without_row_means(gaussian_blur2d(grey.contiguous(), (7, 7), (1.0, 1.0)))
+    sigma = torch.ones(1, 2, dtype=grey.dtype, device="cpu")  # px; from numbers Kornia makes it on the default device
+    grey = _without_row_means(gaussian_blur2d(grey.contiguous(), (7, 7), sigma))
     tops = torch.arange(0, num_rows - band_rows + 1, options.band_step, device=grey.device)
     first, second = grey[:, :-1].flatten(0, 1), grey[:, 1:].flatten(0, 1)
     bytes_of_pair = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4

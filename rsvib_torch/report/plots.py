@@ -415,7 +415,7 @@ def motion_blur(vibration: Motion, starts: Tensor, timing: SensorTiming) -> Tens
         timing: The sensor.
     """
     nodes, _ = exposure_nodes(timing, "gauss", 16)
-    ends = torch.tensor([0.0, timing.exposure_time], dtype=torch.float64)
+    ends = torch.tensor([0.0, timing.exposure_time], dtype=torch.float64, device="cpu")
     path = vibration.displacement(starts[..., None] + torch.cat([ends, nodes.cpu()]).to(starts.device))
     return path.amax(-2) - path.amin(-2)
 
@@ -467,7 +467,7 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
     """
     _check_one(vibration)
     down, across = 3, 8
-    rows = torch.linspace(0, num_rows - 1, down * across).round()
+    rows = torch.linspace(0, num_rows - 1, down * across, dtype=torch.float32, device="cpu").round()
     starts = timing.row_starts(1, num_rows)[0][rows.long()]
     psf = row_psf(vibration, starts, timing)
     centre = psf.centroid().round()
@@ -475,7 +475,7 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
     path = (vibration.displacement(starts[:, None] + nodes) - centre[:, None]).numpy()
     first = psf.first_tap - centre
     height, width = psf.weights.shape[-2:]
-    last = first + torch.tensor([width - 1, height - 1])
+    last = first + torch.tensor([width - 1, height - 1], device="cpu")
     reach = max(2, int(torch.maximum(first.abs(), last.abs()).max()))  # px around the centre
     cells = np.zeros((len(rows), 2 * reach + 1, 2 * reach + 1))
     for index, (left, top) in enumerate((first.long() + reach).tolist()):
@@ -506,7 +506,7 @@ def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]]) -> Figure:
     """
     figure = _Drawing(figsize=(5.6, 3.9), layout="constrained")
     panel = figure.subplots()
-    frequency = torch.linspace(0, 0.5, 51, dtype=torch.float64)
+    frequency = torch.linspace(0, 0.5, 51, dtype=torch.float64, device="cpu")
     colours = (_GREY, _AXIS_COLOURS["x"])[-len(curves) :]
     for colour, (name, edges) in zip(colours, curves.items(), strict=True):
         values = [edge.at(frequency.to(edge.lsf.device)).cpu() for edge in edges]

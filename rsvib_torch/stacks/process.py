@@ -13,6 +13,7 @@ from rsvib_torch.core.arguments import check_fields, checks_arguments
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.option_types import BadFrames
 from rsvib_torch.core.presentation import Summarised
+from rsvib_torch.core.unexpected import unexpected_errors_in_one_line
 from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept
 from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.schema import DetectedVibration
@@ -159,6 +160,7 @@ def detect_stack(
         write_manifest(part, manifest_header(job, None, None), records())
 
 
+@unexpected_errors_in_one_line()
 @checks_arguments
 def process_stack(
     source: PathLike,

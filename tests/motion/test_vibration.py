@@ -154,7 +154,7 @@ def test_gradients_reach_the_parameters():
         ({"amplitude": math.nan, "frequency": 50.0}, "amplitude must be finite"),
         ({"amplitude": 1.0, "frequency": math.inf}, "frequency must be finite"),
         ({"amplitude": 1.0, "frequency": 50.0, "phase": math.nan}, "phase must be finite"),
-        ({"amplitude": 1.0, "frequency": 50.0, "image_motion": [math.inf, 0.0]}, r"image_motion\[0\] must be finite"),
+        ({"amplitude": 1.0, "frequency": 50.0, "image_motion": [math.inf, 0.0]}, "image_motion must be finite"),
         ({"amplitude": [1.0, 2.0, 3.0], "frequency": 50.0}, r"amplitude must have shape \(2,\)"),
         ({"amplitude": 1.0, "frequency": 50.0, "image_motion": [1.0, 2.0, 3.0]}, "image_motion must have shape"),
         ({"amplitude": [[1.0, 2.0], [1.0, 2.0]], "frequency": [[1.0, 2.0, 3.0]] * 2}, "do not fit together"),

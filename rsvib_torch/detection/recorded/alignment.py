@@ -199,7 +199,7 @@ def align_motion(
         scale=clock.scale,
         scale_std=float(std[1]),
         gain=in_image.gain,
-        drift=torch.tensor(in_image.drift, dtype=torch.float64),
+        drift=torch.tensor(in_image.drift, dtype=torch.float64, device="cpu"),
         unexplained=rest.flip(-1) if swap else rest,
         reliable=not reasons,
         reasons=tuple(reasons),

@@ -311,7 +311,10 @@ def _fit_spline(
     count = math.ceil((last - first) / spacing) + 3
     device = measurements.exposure_starts.device
     shape = _SplineFit(
-        torch.zeros(2, count, dtype=torch.float64, device=device), torch.zeros(2, 0, 0, device=device), first, spacing
+        torch.zeros(2, count, dtype=torch.float64, device=device),
+        torch.zeros(2, 0, 0, device=device, dtype=torch.float32),
+        first,
+        spacing,
     )
     values, covariances = zip(*(_fit_axis(measurements, shape, axis, learn) for axis in range(2)), strict=True)
     return replace(shape, coefficients=torch.stack(values), covariance=torch.stack(covariances))

@@ -255,7 +255,7 @@ def _start(measured: Measurements, axis: int, record: tuple[float, float], highe
     middle, span = 0.5 * (record[0] + record[1]), record[1] - record[0]
     device = measured.exposure_starts.device
     grid = []
-    for frequency in torch.arange(0.5 / span, highest, 0.5 / span).tolist():
+    for frequency in torch.arange(0.5 / span, highest, 0.5 / span, dtype=torch.float32, device="cpu").tolist():
         sweep = 1.5 * frequency / span  # Hz/s, at most
         steps = max(1, round(sweep * span**2 / 2.0))
         grid += [

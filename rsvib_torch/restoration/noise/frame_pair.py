@@ -98,7 +98,7 @@ def _residual_power(
     displacement = displacement - motion.shift[stack, members][:, None, None]
     kernels = row_kernels(displacement, node_weights, images.new_ones(2), num_rows, 4 * _MIN_SIDE)
     count = min(num_frequencies, width // 4)
-    chosen = torch.linspace(width // 4, width // 2, count, device=images.device).long()
+    chosen = torch.linspace(width // 4, width // 2, count, device=images.device, dtype=torch.float32).long()
     sample = sample_rows(images, kernels, chosen)
     explained = sample.explain([RowPrior.smooth(sample.u).precision(sample.u.new_ones(()), prior_weight)])
     power: Tensor = explained.power.sum() / (explained.count * len(chosen) - explained.freedom.sum())

@@ -63,7 +63,7 @@ def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> li
         pairs = [(middle, p) for p in range(count) if p != middle]
     if most is None or len(pairs) <= most:
         return pairs
-    chosen = torch.linspace(0, len(pairs) - 1, most).round().to(torch.int64).tolist()
+    chosen = torch.linspace(0, len(pairs) - 1, most, dtype=torch.float32, device="cpu").round().to(torch.int64).tolist()
     return [pairs[index] for index in chosen]
 
 
