@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from attacks.api import api_trials
+from attacks.mutated import mutated_trials
 from attacks.trial import FAILURES, OUTCOMES, Trial
 
 import rsvib_torch as rsv
@@ -43,7 +44,8 @@ class Attack:
 
 # A new attack is one module in scripts/attacks and one line here.
 ATTACKS: dict[str, Attack] = {
-    "api": Attack("hostile arguments of Python functions", api_trials, 3000),
+    "api": Attack("hostile arguments of Python functions", api_trials, 4000),
+    "mutated": Attack("randomly damaged files", mutated_trials, 2400),
 }
 
 

@@ -14,7 +14,7 @@ from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import check_tensor, checks_arguments
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.core.precision import full_precision
 from rsvib_torch.core.splines import gauss_legendre, mirrored
@@ -228,6 +228,13 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             "exposure_rows": exposures,
             "interpolation": interpolation,
         }
+
+    def forward(self, input: Tensor, params: Parameters | None = None, **kwargs: Any) -> Tensor:
+        """Record images (H, W), (C, H, W) or (B, C, H, W); the other arguments are those of Kornia's augmentations."""
+        if not torch.compiler.is_compiling():
+            check_tensor("input", input)
+        recorded: Tensor = super().forward(input, params, **kwargs)
+        return recorded
 
     @checks_arguments
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> Parameters:

@@ -222,6 +222,10 @@ class Result(Summarised):
     def __post_init__(self) -> None:
         check_fields(self)
         check_shapes(vars(self), self.shapes)
+        for name in self.units:  # quantities with a unit
+            value = getattr(self, name, None)
+            if isinstance(value, Tensor) and not value.is_floating_point():
+                raise TypeError(f"{name} must be a floating-point tensor, got {value.dtype}")
 
     def summary(self) -> str:
         """The result in a few lines: here the shapes of its tensors and its other values."""

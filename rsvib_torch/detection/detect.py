@@ -350,7 +350,9 @@ def _detect(
     found = method.fit(curve, frames, valid, row_timing, options)
     fit, other_motion, measured = found.fit, found.other_motion, found.offsets
     starts = row_timing.frame_starts(frames.shape[1], frames.device)[:, None]
-    starts = (starts + torch.arange(frames.shape[-2], device=frames.device)[::8] * row_timing.row_time).flatten()
+    starts = (
+        starts + torch.arange(frames.shape[-2], dtype=torch.float64, device=frames.device)[::8] * row_timing.row_time
+    ).flatten()
     own_std = displacement_std(fit, starts, row_timing.exposure_time)
     fit, total_std = with_further_tones(found.measurements, fit, starts, number_is_known=options.tones is not None)
     vibration, std = vibration_of_fit(fit)

@@ -134,6 +134,17 @@ class DetectionResult(
     assumptions: tuple[Any, ...]
     timing: SensorTiming | None = None
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        shape = tuple(self.batch_shape)
+        if (tuple(self.std.batch_shape), tuple(self.reliable.shape[:-1])) != (shape, shape):
+            raise ValueError(
+                f"vibration, std and reliable must have the same batch dimensions, got {shape}, "
+                f"{tuple(self.std.batch_shape)} and {tuple(self.reliable.shape[:-1])}"
+            )
+        if not shape and not all(isinstance(sentence, str) for sentence in self.assumptions):
+            raise TypeError("assumptions must be texts")
+
     @property
     def batch_shape(self) -> torch.Size:
         """Leading dimensions: empty for one result, (B,) for a batch of stacks or windows."""

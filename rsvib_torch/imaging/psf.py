@@ -106,6 +106,8 @@ def row_psf(
         >>> psf.weights.shape[:2]
         torch.Size([2, 512])
     """
+    if not bool(torch.isfinite(starts).all()):
+        raise ValueError("starts must be finite (seconds)")
     displacement, node_weights = exposure_trajectory(vibration, starts, timing, quadrature, num_nodes)
     return trajectory_psf(displacement, node_weights, interpolation=interpolation)
 

@@ -6,7 +6,7 @@ are ordered (x, y), with one list of tones for each axis; null stands for a valu
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Protocol, Self, runtime_checkable
 
 import torch
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
@@ -137,6 +137,7 @@ class StdRecord(Section):
         )
 
 
+@runtime_checkable
 class Detection(Protocol):
     """The attributes of ``DetectedVibration``; a ``DetectionResult`` that is not a batch has them as well."""
 

@@ -112,6 +112,11 @@ class Motion(Result, ABC):
         Returns:
             float64 tensor of shape (S, axes).
         """
+        try:
+            starts, later_starts = torch.broadcast_tensors(starts, later_starts)
+        except RuntimeError as error:
+            shapes = f"{tuple(starts.shape)} and {tuple(later_starts.shape)}"
+            raise ValueError(f"starts and later_starts do not fit together: {shapes}") from error
         return self.mean_displacement(later_starts, exposure_time) - self.mean_displacement(starts, exposure_time)
 
     @checks_arguments

@@ -133,8 +133,9 @@ class SensorTiming:
             [0.0, 0.04]
         """
         lines = check_whole_number("num_lines", num_lines, at_least=1)
-        if len(delays) < 2:
-            raise ValueError(f"delays must have at least two entries, got {list(delays)}")
+        check_number("exposure_lines", exposure_lines, above=0.0)
+        if not isinstance(delays, Sequence) or len(delays) < 2:
+            raise ValueError(f"delays must have at least two entries, got {described(delays)}")
         return cls(
             row_time=line_time,
             exposure_rows=exposure_lines,

@@ -17,8 +17,9 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.checks import check_whole_number, described
 from rsvib_torch.core.presentation import FIGURES, Result
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult, MotionDetection, SweptTone
@@ -207,6 +208,9 @@ def windows_figure(
         >>> starts = [window.start_time for window in manifest.windows]  # doctest: +SKIP
         >>> figure = windows_figure(starts, manifest.detections())  # doctest: +SKIP
     """
+    for index, found in enumerate(detections):
+        if found is not None and not isinstance(found, Detection):
+            raise TypeError(f"detections[{index}] must be a detection or None, got {described(found)}")
     figure = _Drawing(figsize=(11, 5.6), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, squeeze=False)
     for axis, name in enumerate("xy"):
@@ -466,6 +470,7 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
         >>> save_figure(psf_figure(detection.vibration, timing, num_rows=2048), "psf.png")  # doctest: +SKIP
     """
     _check_one(vibration)
+    check_whole_number("num_rows", num_rows, at_least=1)
     down, across = 3, 8
     rows = torch.linspace(0, num_rows - 1, down * across, dtype=torch.float32, device="cpu").round()
     starts = timing.row_starts(1, num_rows)[0][rows.long()]
@@ -567,6 +572,9 @@ def comparison_figure(
         >>> len(comparison_figure(frame, frame, count=2, size=32).axes)
         4
     """
+    check_shapes({"raw": raw, "restored": restored}, {"raw": "... H W", "restored": "... H W"})
+    check_whole_number("count", count, at_least=1)
+    check_whole_number("size", size, at_least=1)
     raw, restored = (picture(frame) for frame in (raw, restored))
     size = min(size, *raw.shape[:2])
     places = detailed_places(restored.mean(-1), size, count, rim=16)  # boundary extension changes the border

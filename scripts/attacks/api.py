@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 from attacks.trial import Trial
-from attacks.warm import in_warm_child
+from attacks.warm import in_warm_child, place_of
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -613,8 +613,7 @@ def attempt(folder: Path, item: Item | None) -> Trial:
     except MemoryError as error:
         return Trial(_name(item), "memory", str(error)[:300])
     except BaseException as error:
-        place_of = inspect.trace()[-1]
-        where = f"{Path(place_of.filename).name}:{place_of.lineno}"
+        where = place_of(error)
         if "allocate" in str(error):
             return Trial(_name(item), "memory", f"{where}: {error}"[:300])
         return Trial(_name(item), "traceback", f"{where}: {type(error).__name__}: {error}"[:300])

@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import resource
 import signal
+import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.connection import Connection
@@ -14,19 +15,25 @@ from typing import Any
 import torch
 from attacks.trial import Trial
 
-__all__ = ["in_warm_child"]
+__all__ = ["in_warm_child", "place_of"]
 
 Attempt = Callable[[Path, Any], Trial]
+
+
+def place_of(error: BaseException) -> str:
+    """File and line where an exception was raised."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{Path(last.filename).name}:{last.lineno}"
 
 
 def _serve(connection: Connection, attempt: Attempt, folder: Path, memory: int) -> None:
     """Run trials until the other end closes the connection; output of libraries is discarded."""
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
+    attempt(folder, None)  # prepares what all trials share
     with open(os.devnull, "wb") as nothing:
         os.dup2(nothing.fileno(), 1)
         os.dup2(nothing.fileno(), 2)
-    attempt(folder, None)  # prepares what all trials share
     used = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()  # data and stack
     resource.setrlimit(resource.RLIMIT_DATA, (used + memory, used + memory))
     resource.setrlimit(resource.RLIMIT_FSIZE, (memory, memory))
@@ -43,7 +50,7 @@ def in_warm_child(
     """Run one trial per item in a child process, which is replaced after a trial that ended or blocked it.
 
     Args:
-        attempt: ``attempt(folder, item)``, a function of a module; with ``item=None`` it prepares what all trials share.
+        attempt: ``attempt(folder, item)``, a function of a module; ``item=None`` prepares what all trials share.
         items: What is tried.
         name: Name of the trial of an item.
         folder: Folder for files.

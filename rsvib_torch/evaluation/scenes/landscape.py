@@ -95,7 +95,9 @@ def city_and_fields(height: int, width: int, seed: int, *, sigma: float = 0.6) -
 
 def _points(begin: int, end: int) -> Tensor:
     """Sample positions within the pixels ``begin ... end - 1``."""
-    return (torch.arange(begin * _OVERSAMPLING, end * _OVERSAMPLING, device="cpu") + 0.5) / _OVERSAMPLING - 0.5
+    return (
+        torch.arange(begin * _OVERSAMPLING, end * _OVERSAMPLING, dtype=torch.float32, device="cpu") + 0.5
+    ) / _OVERSAMPLING - 0.5
 
 
 def _lay_out_districts(height: int, width: int, generator: torch.Generator) -> _Districts:
@@ -106,11 +108,16 @@ def _lay_out_districts(height: int, width: int, generator: torch.Generator) -> _
         return torch.rand(*size, generator=generator, dtype=torch.float32, device="cpu")
 
     grid = torch.stack(
-        torch.meshgrid(torch.arange(columns, device="cpu"), torch.arange(rows, device="cpu"), indexing="xy"), dim=-1
+        torch.meshgrid(
+            *(torch.arange(count, dtype=torch.float32, device="cpu") for count in (columns, rows)), indexing="xy"
+        ),
+        dim=-1,
     )
     place = (grid - 1 + 0.15 + 0.7 * uniform(rows, columns, 2)) * pitch
     # about equal parts of fields and town, and a quarter of works and woods, mixed at any image size
-    draw = torch.remainder(torch.arange(rows * columns, device="cpu") * 0.618034 + uniform(1), 1.0).view(rows, columns)
+    draw = torch.remainder(
+        torch.arange(rows * columns, dtype=torch.float32, device="cpu") * 0.618034 + uniform(1), 1.0
+    ).view(rows, columns)
     kind = torch.bucketize(draw, torch.tensor([0.37, 0.75, 0.87], dtype=torch.float32, device="cpu"))
     sizes = torch.tensor([[110.0, 70.0], [104.0, 64.0], [150.0, 110.0], [1e4, 1e4]], dtype=torch.float32, device="cpu")
     parcel = sizes[kind] * (0.85 + 0.4 * uniform(rows, columns, 2))
@@ -224,7 +231,7 @@ def _lay_out_ground(
         distance = _distance_to_line(x, y, line)
         road = distance < line.half_width
         tone = torch.where(distance < line.half_width + 2.0, 0.36, tone)
-        tone = torch.where(road, torch.where(distance < 0.5, 0.82, 0.56), tone)
+        tone = torch.where(road, torch.where(distance < 0.5, tone.new_tensor(0.82), 0.56), tone)
         wildness = torch.where(road, 0.0, wildness)
     return torch.stack([tone, wildness])
 
@@ -269,7 +276,7 @@ def _plan_district(
         (
             torch.arange(-int(n), int(n), device="cpu")[:, None] * size
             + street
-            + (torch.arange(int(count), device="cpu") + 0.5) * step
+            + (torch.arange(int(count), dtype=torch.float32, device="cpu") + 0.5) * step
         ).flatten()
         for n, size, count, step in zip(reach, parcel, per_lot, lot, strict=True)
     ]

@@ -92,7 +92,7 @@ def _residual_power(
     prior of ``prior_weight``, relative to the data, fills in rows of the scene that neither frame contains.
     """
     num_rows, width = images.shape[-2:]
-    rows = first_rows[:, None] + torch.arange(num_rows, device=images.device)
+    rows = first_rows[:, None] + torch.arange(num_rows, dtype=torch.float64, device=images.device)
     starts = motion.frame_starts[members][:, None] + rows * motion.timing.row_time
     displacement, node_weights = exposure_trajectory(motion.vibration[stack], starts, motion.timing, "gauss")
     displacement = displacement - motion.shift[stack, members][:, None, None]

@@ -214,7 +214,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     v = torch.fft.fftfreq(size[0], dtype=torch.float64, device=frames.device)
 
     vibration = motion.vibration[stack]
-    times = motion.frame_starts[:, None] + rows.flatten() * motion.timing.row_time
+    times = motion.frame_starts[:, None] + rows.flatten().to(torch.float64) * motion.timing.row_time
     mean = vibration.mean_displacement(times, motion.timing.exposure_time)[..., 0]
     back = waves(mean, -u).to(frames.dtype.to_complex()).unflatten(1, rows.shape)  # (T, pieces, rows, U)
     back = back * tapers[0][:, None]
