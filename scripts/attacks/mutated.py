@@ -144,7 +144,8 @@ ORIGINALS = {
 @cache
 def write_originals(folder: Path) -> dict[str, bytes]:
     """Write the undamaged files, and return their content."""
-    folder.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)  # of a child process that ended
+    folder.mkdir(parents=True)
     noise = torch.randn(1, 1, 160, 128, generator=torch.Generator("cpu").manual_seed(0))
     scene = 0.5 + 0.3 * torch.nn.functional.avg_pool2d(noise, 3, 1, 1)[0, 0]
     vibration = rsv.Vibration([1.2, 0.8], [130.0, 170.0], [0.3, 0.9])
