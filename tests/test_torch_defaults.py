@@ -15,7 +15,7 @@ BANDS = {"band_rows": 16, "band_step": 8, "search": 6}
 def results():
     """Results of the main entry points by name; inputs that need no generator have explicit types."""
     found = {}
-    scene = torch.from_numpy(np.random.default_rng(0).random((160, 128)).astype(np.float32))
+    scene = torch.from_numpy(np.random.default_rng(0).random((160, 128)).astype(np.float32)).clone()
     scene = rsv.Optics(sigma=1.0).apply(scene)
     found["optics"] = scene
     noise = rsv.SensorNoise(full_well=5000.0, read_noise=0.01, bits=12, column_offset=0.01, gain_spread=0.01)
@@ -51,10 +51,11 @@ def results():
     found["ssim"] = rsv.ssim(found["restore exact"], frames, 1.0)
     rows, columns = np.mgrid[:64, :48]
     edge = (0.2 + 0.6 / (1 + np.exp(-(columns - 24 - 0.1 * (rows - 32)) / 0.7))).astype(np.float32)
+    edge = torch.from_numpy(edge).clone()  # aligned as all tensors are: sums depend on it
     found["mtf"] = rsv.slanted_edge_mtf(edge).to_dict()
-    found["edges"] = [str(one) for one in rsv.find_slanted_edges(np.tile(edge, (2, 3)))]
+    found["edges"] = [str(one) for one in rsv.find_slanted_edges(edge)]
     light = [0.5 + 0.3 * np.sin(rows * 0.6283 + phase) for phase in (0.3, 1.1)]
-    found["row time"] = rsv.calibrate_row_time(np.stack(light), 1000.0).to_dict()
+    found["row time"] = rsv.calibrate_row_time(torch.from_numpy(np.stack(light)).clone(), 1000.0).to_dict()
     psf = rsv.row_psf(VIBRATION, TIMING.row_starts(1, 96)[0], TIMING, interpolation="cubic", quadrature="gauss")
     blur = rsv.RowVaryingBlur(psf)
     found["blurred"] = blur(frames[0])

@@ -193,7 +193,7 @@ def check_fields(value: Any) -> None:
     Raises:
         TypeError: If a field has another type; numbers may be infinite or NaN.
     """
-    for name, check in _field_checks(type(value)):
+    for name, check in _field_checks(value.__class__):
         check(name, getattr(value, name))
 
 
