@@ -94,11 +94,9 @@ def temporary_folder(path: Path) -> Iterator[Path]:
 def check_name(path: Path) -> None:
     """Raise an ``OSError`` if the name of a file to be written is too long, with those that belong to it."""
     longest = os.pathconf(nearest_folder(path), "PC_NAME_MAX") - _ADDED if hasattr(os, "pathconf") else 255 - _ADDED
-    if len(os.fsencode(path.name)) > longest:
-        raise OSError(
-            f"cannot write {path.name[:40]}...: its name has {len(os.fsencode(path.name))} bytes, but at most {longest} "
-            "are possible"
-        )
+    size = len(os.fsencode(path.name))
+    if size > longest:
+        raise OSError(f"cannot write {path.name[:40]}...: its name has {size} bytes, at most {longest} are possible")
 
 
 def _check_file_target(path: Path, *, parent_exists: bool = True) -> None:

@@ -63,7 +63,7 @@ def check_number(
     try:
         number = float(value)
     except OverflowError:
-        number = math.inf if value > 0 else -math.inf  # a whole number beyond float64
+        number = math.inf if value == abs(value) else -math.inf  # a whole number beyond float64
     if not math.isfinite(number):
         raise ValueError(f"{name} must be finite, got {number}")
     if number <= above:

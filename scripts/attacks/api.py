@@ -62,7 +62,7 @@ def _methods(value: Any, **arguments: Any) -> dict[str, Call]:
 
 
 @cache
-def calls(folder: Path) -> dict[str, Call]:
+def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
     """Valid calls of everything in ``rsvib_torch.__all__``, by name."""
     folder.mkdir(parents=True, exist_ok=True)
     generator = torch.Generator("cpu").manual_seed(0)
@@ -492,7 +492,7 @@ _OTHERS: dict[str, Callable[[], Any]] = {
     "vibration batch": lambda: rsv.Vibration.still((4,)),
     "vibration of 1e5 px/s": lambda: rsv.Vibration(1.0, 50.0, image_motion=(1e5, 1e5)),
     "vibration with gradient": lambda: rsv.Vibration(torch.tensor([1.0, 1.0], requires_grad=True), 50.0),
-    "still": lambda: rsv.Vibration.still(),
+    "still": rsv.Vibration.still,
     "folder": lambda: "/",
     "device file": lambda: "/dev/zero",
     "long name": lambda: "/tmp/" + "x" * 5000,
@@ -523,7 +523,7 @@ _TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "1e300": lambda t: t.double() * 1e300,
     "1e-40": lambda t: t.float() * 1e-40,
     "1e-300": lambda t: t.double() * 1e-300,
-    "zeros": lambda t: torch.zeros_like(t),
+    "zeros": torch.zeros_like,
     "negative": lambda t: -t.float(),
     "no first": lambda t: t[:0],
     "no last": lambda t: t[..., :0],
@@ -543,7 +543,7 @@ _TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "long double array": lambda t: t.numpy().astype(np.longdouble),
     "big-endian array": lambda t: t.numpy().astype(">f8"),
     "read-only array": lambda t: np.broadcast_to(t.numpy()[:1], t.shape),
-    "list of tensors": lambda t: list(t),
+    "list of tensors": list,
     "list of unequal": lambda t: [t, t[:1]],
     "parameter": lambda t: torch.nn.Parameter(t.detach().clone().float()),
 }  # fmt: skip
@@ -580,7 +580,7 @@ def _name(item: Item) -> str:
     return f"{item[0]}({', '.join(f'{argument}={hostile}' for argument, hostile in item[1])})"
 
 
-def attempt(folder: Path, item: Item | None) -> Trial:
+def attempt(folder: Path, item: Item | None) -> Trial:  # noqa: PLR0911 - one for each outcome
     """One call with hostile arguments."""
     known = calls(folder / "valid")
     if item is None:

@@ -253,7 +253,7 @@ def _name(item: Item) -> str:
     return f"{item[1]}, seed {item[0]}{', rsvib run' if item[2] else ''}"
 
 
-def attempt(folder: Path, item: Item | None) -> Trial:
+def attempt(folder: Path, item: Item | None) -> Trial:  # noqa: PLR0911 - one for each outcome
     """Read one damaged file, or run the program on it."""
     contents = write_originals(folder)
     if item is None:

@@ -18,8 +18,11 @@ VIBRATION = rsv.Vibration([1.0, 0.5], [130.0, 170.0])
     ("make", "message"),
     [
         (lambda: FRAMES.to("meta"), "frames must be a tensor with data"),
-        (lambda: torch.nested.nested_tensor([FRAMES[0], FRAMES[0, :2]]), "frames must be a dense tensor, got a nested tensor"),
-        (lambda: FRAMES.to_sparse(), r"frames must be a dense tensor.*to_dense"),
+        (
+            lambda: torch.nested.nested_tensor([FRAMES[0], FRAMES[0, :2]]),
+            "frames must be a dense tensor, got a nested tensor",
+        ),
+        (FRAMES.to_sparse, r"frames must be a dense tensor.*to_dense"),
         (lambda: torch.quantize_per_tensor(FRAMES, 0.1, 0, torch.quint8), "frames must not be quantised"),
         (lambda: FRAMES.to(torch.complex64), "frames must be real numbers"),
         (lambda: FRAMES > 0.5, "frames must be real numbers"),
@@ -27,7 +30,7 @@ VIBRATION = rsv.Vibration([1.0, 0.5], [130.0, 170.0])
         (lambda: FRAMES.numpy().astype(object), "frames must be a tensor or array of numbers"),
         (lambda: np.ma.masked_invalid(FRAMES.numpy()), "frames must not be a masked array"),
         (lambda: None, "frames must be a tensor or array of numbers"),
-        (lambda: object(), "frames must be a tensor or array of numbers"),
+        (object, "frames must be a tensor or array of numbers"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*:UserWarning")  # PyTorch states that nested and quantised tensors may change
@@ -59,7 +62,10 @@ def test_pixels_beyond_all_scales(value):
         (lambda: rsv.Vibration(1e300, 50.0), "amplitude must be at most 1e"),
         (lambda: rsv.Vibration([[]], [[]]), "amplitude must have shape"),
         (lambda: rsv.Vibration("a", 50.0), "amplitude must be a number, a tensor"),
-        (lambda: rsv.FreeMotion(torch.full((2, 9), 1e300, dtype=torch.float64), 0.0, 1e-3), "coefficients must be at most"),
+        (
+            lambda: rsv.FreeMotion(torch.full((2, 9), 1e300, dtype=torch.float64), 0.0, 1e-3),
+            "coefficients must be at most",
+        ),
         (lambda: rsv.FreeMotion(torch.zeros(2, 9), 1e300, 1e-3), "start must be at most"),
         (lambda: VIBRATION.displacement("now"), r"times must be a tensor, got 'now' \(str\)"),
         (lambda: VIBRATION.with_axes([0, 5], [1.0, 1.0]), "order must be a permutation"),
