@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import resource
 import signal
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -12,6 +13,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 from attacks.trial import Trial
 
@@ -44,6 +46,22 @@ def _serve(connection: Connection, attempt: Attempt, folder: Path, memory: int) 
             connection.send(attempt(folder, connection.recv()))
 
 
+def _answers(connection: Connection, child: Any, limit: float) -> bool:
+    """Whether the child answers within the time limit, or ends."""
+
+    def used() -> float:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            times = psutil.Process(child.pid).cpu_times()
+            return times.user + times.system
+        return 0.0
+
+    before, begin = used(), time.perf_counter()
+    while not connection.poll(0.5):
+        if used() - before > limit or time.perf_counter() - begin > 10 * limit:
+            return False
+    return True
+
+
 def in_warm_child(
     attempt: Attempt, items: Iterable[Any], name: Callable[[Any], str], folder: Path, *, limit: float, memory: int
 ) -> Iterator[Trial]:
@@ -54,7 +72,7 @@ def in_warm_child(
         items: What is tried.
         name: Name of the trial of an item.
         folder: Folder for files.
-        limit: Time limit of a trial in s.
+        limit: Limit of the processor time of a trial in s; ten times as much may pass on a busy machine.
         memory: Bytes that the child may allocate in addition to what it uses at the start.
     """
     context = multiprocessing.get_context("spawn")
@@ -69,7 +87,7 @@ def in_warm_child(
                 connection.recv()
             assert connection is not None
             connection.send(item)
-            if connection.poll(limit):
+            if _answers(connection, child, limit):
                 try:
                     yield connection.recv()
                     continue
@@ -77,7 +95,7 @@ def in_warm_child(
                     child.join()
                     trial = Trial(name(item), "traceback", f"the process ended with exit code {child.exitcode}")
             else:
-                trial = Trial(name(item), "hang", f"not finished after {limit:g} s")
+                trial = Trial(name(item), "hang", f"not finished after {limit:g} s of processor time")
             child.kill()
             child.join()
             child = None
