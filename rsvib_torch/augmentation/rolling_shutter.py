@@ -195,7 +195,6 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         torch.Size([4, 2, 1])
     """
 
-    @checks_arguments
     def __init__(
         self,
         timing: SensorTiming,

@@ -162,7 +162,7 @@ def detect_motion(
         ValueError: at least 2 frames are needed, got 1
     """
     check_whole_number("knot_rows", knot_rows, at_least=4)
-    check_whole_number("iterations", iterations, at_least=1)
+    check_whole_number("iterations", iterations, at_least=1, at_most=100)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     results = [_detect(stacks.one(i), timing, bands, knot_rows, iterations) for i in range(len(stacks.images))]

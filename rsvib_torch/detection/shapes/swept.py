@@ -155,7 +155,7 @@ def detect_swept_tone(
         ...
         ValueError: at least 2 frames are needed, got 1
     """
-    check_whole_number("iterations", iterations, at_least=1)
+    check_whole_number("iterations", iterations, at_least=1, at_most=100)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     fitted = [_detect(stacks.one(index), timing, bands, iterations) for index in range(len(stacks.images))]
