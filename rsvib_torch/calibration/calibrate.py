@@ -60,6 +60,10 @@ class RowTimeCalibration(
     exposure_time_std: float | None
     notes: tuple[str, ...]
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_number("row_time", self.row_time, above=0.0)
+
     def summary(self) -> str:
         """The measured values of the sensor, and what is not determined."""
         lines = [

@@ -31,7 +31,15 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import MAX_NUMBER, check_choice, check_number, check_whole_number, described
 
-__all__ = ["as_numbers", "check_device", "check_fields", "check_shapes", "check_tensor", "checks_arguments"]
+__all__ = [
+    "as_numbers",
+    "check_broadcast",
+    "check_device",
+    "check_fields",
+    "check_shapes",
+    "check_tensor",
+    "checks_arguments",
+]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -125,6 +133,23 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
             where = f" with {', '.join(sizes_known)}" if sizes_known else ""
             raise ValueError(f"{name} must have shape ({stated}){where}, got {shape}")
         known |= {axis: size for axis, size in zip(names, sizes, strict=True) if not axis.isdecimal()}
+
+
+def check_broadcast(**tensors: Any) -> None:
+    """Raise a ``ValueError`` unless tensors broadcast; other values are omitted.
+
+    Example:
+        >>> check_broadcast(u=torch.zeros(3), v=torch.zeros(2))
+        Traceback (most recent call last):
+        ...
+        ValueError: u and v do not fit together: (3,), (2,)
+    """
+    given = {name: tuple(value.shape) for name, value in tensors.items() if isinstance(value, Tensor)}
+    try:
+        torch.broadcast_shapes(*given.values())
+    except RuntimeError as error:
+        shapes = ", ".join(map(str, given.values()))
+        raise ValueError(f"{' and '.join(given)} do not fit together: {shapes}") from error
 
 
 def check_device(name: str, value: object) -> torch.device:

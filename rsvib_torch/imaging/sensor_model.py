@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_shapes, checks_arguments
+from rsvib_torch.core.arguments import check_broadcast, check_shapes, checks_arguments
 from rsvib_torch.core.checks import check_number, check_whole_number
 
 __all__ = ["Optics", "SensorNoise"]
@@ -44,6 +44,7 @@ class Optics:
     @checks_arguments
     def transfer(self, u: Tensor, v: Tensor) -> Tensor:
         """Transfer function at horizontal and vertical frequencies in cycles/px, in their broadcast shape."""
+        check_broadcast(u=u, v=v)
         squared = u.square() + v.square()
         transfer = torch.exp(-2 * (math.pi * self.sigma) ** 2 * squared)
         if self.cutoff is not None:
@@ -120,6 +121,8 @@ class SensorNoise:
             height: Rows of the sensor.
             width: Columns of the sensor.
         """
+        for name, size in (("height", height), ("width", width)):
+            check_whole_number(name, size, at_least=1, at_most=10**6)
         generator = torch.Generator(device="cpu").manual_seed(self.pattern_seed)
         columns, rows, pixels = (
             torch.randn(shape, generator=generator, dtype=torch.float64, device="cpu")

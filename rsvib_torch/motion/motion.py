@@ -8,7 +8,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import check_broadcast, checks_arguments
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.motion.timing import SensorTiming
 
@@ -112,11 +112,7 @@ class Motion(Result, ABC):
         Returns:
             float64 tensor of shape (S, axes).
         """
-        try:
-            starts, later_starts = torch.broadcast_tensors(starts, later_starts)
-        except RuntimeError as error:
-            shapes = f"{tuple(starts.shape)} and {tuple(later_starts.shape)}"
-            raise ValueError(f"starts and later_starts do not fit together: {shapes}") from error
+        check_broadcast(starts=starts, later_starts=later_starts)
         return self.mean_displacement(later_starts, exposure_time) - self.mean_displacement(starts, exposure_time)
 
     @checks_arguments

@@ -239,7 +239,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         batch = self.batch_shape
         knots = self.coefficients.shape[-1]
         place = ((times - self.start) / self.spacing).clamp(0.0, knots - 3.0)
-        cell = place.detach().floor().clamp(max=knots - 4.0)
+        cell = place.detach().nan_to_num(0.0).floor().clamp(max=knots - 4.0)  # times that are NaN have NaN results
         index = cell.to(torch.int64)[..., None] + torch.arange(4, device=times.device)
         if not batch:
             return self.coefficients.movedim(-2, -1)[index].movedim(-1, -2), place - cell

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.arguments import as_numbers, checks_arguments
+from rsvib_torch.core.arguments import as_numbers, check_broadcast, checks_arguments
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.motion.motion import Motion
@@ -181,7 +181,8 @@ class Vibration(Motion, units=_UNITS):
     def _angle(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Angles (S, 2, K) of the tones at times S, with amplitude and frequency reshaped to broadcast with them."""
         steps = times.ndim - len(self.batch_shape)
-        if steps < 0:
+        sizes = zip(times.shape, self.batch_shape, strict=False)
+        if steps < 0 or any(size != 1 and count not in (1, size) for size, count in sizes):
             raise ValueError(
                 f"times must have the batch dimensions {tuple(self.batch_shape)} in front, got {tuple(times.shape)}"
             )
@@ -228,6 +229,7 @@ class Vibration(Motion, units=_UNITS):
         Returns:
             float64 tensor of shape (S, 2), axes (x, y).
         """
+        check_broadcast(starts=starts, exposure_time=exposure_time)
         middle = starts.to(dtype=torch.float64, device=self.device) + 0.5 * exposure_time
         angle, amplitude, frequency = self._angle(middle)
         attenuation = torch.sinc(frequency * _with_trailing(exposure_time, 2))
