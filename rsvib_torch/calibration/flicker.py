@@ -52,7 +52,7 @@ def row_profiles(
     """
     check_choice("scan_axis", scan_axis, (-2, "y", -1, "x"))
     check_number("gamma", gamma, above=0.0, at_most=4.0)
-    images = as_float_frames(frames, full_scale, channels=channels)
+    images = as_float_frames(frames, full_scale, channels=channels).detach()
     if images.ndim == 5:
         raise ValueError(f"calibration takes one stack, got a batch of shape {tuple(images.shape)}")
     images = images.mean(channel_axis("frames", images.shape, channels)) if images.ndim == 4 else images

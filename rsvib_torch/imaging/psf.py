@@ -106,8 +106,8 @@ def row_psf(
         >>> psf.weights.shape[:2]
         torch.Size([2, 512])
     """
-    if not bool(torch.isfinite(starts).all()):
-        raise ValueError("starts must be finite (seconds)")
+    if not starts.numel() or not bool(torch.isfinite(starts).all()):
+        raise ValueError(f"starts must be finite times of at least one row (seconds), got shape {tuple(starts.shape)}")
     displacement, node_weights = exposure_trajectory(vibration, starts, timing, quadrature, num_nodes)
     return trajectory_psf(displacement, node_weights, interpolation=interpolation)
 

@@ -75,7 +75,7 @@ def test_pixels_beyond_all_scales(value):
         (lambda: rsv.restore(FRAMES, TIMING, 3), "vibration must be a Motion or a Detected, got 3"),
         (lambda: rsv.restore(FRAMES, TIMING, VIBRATION, noise=1e308), "noise must be at most"),
         (lambda: rsv.row_psf(VIBRATION, TIMING.row_starts(1, 4)[0], TIMING, num_nodes=10**9), "num_nodes must be at"),
-        (lambda: rsv.row_psf(VIBRATION, torch.tensor([math.inf]), TIMING), "starts must be finite"),
+        (lambda: rsv.row_psf(VIBRATION, torch.tensor([math.inf]), TIMING), "starts must be finite times"),
         (lambda: rsv.psnr(FRAMES, FRAMES, 10**400), "data_range must be finite"),
         (lambda: rsv.comparison_figure(torch.tensor(1.0), FRAMES[0]), "raw must have shape"),
         (lambda: rsv.windows_figure([0.0], [math.nan]), r"detections\[0\] must be a Detection"),

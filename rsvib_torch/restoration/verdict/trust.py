@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
@@ -100,6 +101,8 @@ def trusted_vibration(
         >>> vibration.amplitude.flatten().tolist(), notes
         ([3.0, 0.0], ('y is not restored: its vibration is not reliable (blind)',))
     """
+    check_whole_number("num_frames", num_frames, at_least=1)
+    check_whole_number("num_rows", num_rows, at_least=1)
     vibration, std = detected.vibration, detected.std
     reliable = torch.as_tensor(detected.reliable, dtype=torch.bool, device=vibration.device)
     error, size = (
