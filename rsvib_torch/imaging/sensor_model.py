@@ -105,9 +105,8 @@ class SensorNoise:
         if self.full_well is not None:
             check_number("full_well", self.full_well, above=0.0)
         check_number("read_noise", self.read_noise, at_least=0.0)
-        if self.bits is not None:
-            if not check_number("bits", self.bits, at_least=1, at_most=32).is_integer():
-                raise TypeError(f"bits must be a whole number, got {self.bits!r}")
+        if self.bits is not None and not check_number("bits", self.bits, at_least=1, at_most=32).is_integer():
+            raise TypeError(f"bits must be a whole number, got {self.bits!r}")
         for name in ("gain_spread", "column_offset", "row_offset"):
             check_number(name, getattr(self, name), at_least=0.0, at_most=1.0)
         check_whole_number("pattern_seed", self.pattern_seed, at_least=0)
