@@ -29,6 +29,8 @@ from attacks import (
     power_losses,
     workers,
 )
+from attacks.api import api_trials
+from attacks.mutated import mutated_trials
 from attacks.trial import FAILURES, OUTCOMES, Trial
 
 import rsvib_torch as rsv
@@ -66,6 +68,8 @@ ATTACKS: dict[str, Attack] = {
     "memory": Attack("`--memory` in different layouts", memory.trials, 17),
     "crafted": Attack("crafted files", crafted.trials, 500),
     "workers": Attack("killed and missing Dask workers", workers.trials, 9),
+    "api": Attack("hostile arguments of Python functions", api_trials, 4000),
+    "mutated": Attack("randomly damaged files", mutated_trials, 2400),
 }
 
 

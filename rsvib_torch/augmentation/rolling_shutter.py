@@ -14,6 +14,7 @@ from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 
+from rsvib_torch.core.arguments import check_tensor, checks_arguments
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.core.precision import full_precision
 from rsvib_torch.core.splines import gauss_legendre, mirrored
@@ -228,6 +229,14 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             "interpolation": interpolation,
         }
 
+    def forward(self, input: Tensor, params: Parameters | None = None, **kwargs: Any) -> Tensor:
+        """Record images (H, W), (C, H, W) or (B, C, H, W); the other arguments are those of Kornia's augmentations."""
+        if not torch.compiler.is_compiling():
+            check_tensor("input", input)
+        recorded: Tensor = super().forward(input, params, **kwargs)
+        return recorded
+
+    @checks_arguments
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> Parameters:
         """Draw one motion per image: amplitude, frequency, phase (B, 2, K), image_motion (B, 2), exposure_rows (B,)."""
         draws = 1 if self.same_on_batch else batch_shape[0]
@@ -242,6 +251,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             for name, value in drawn.items()
         }
 
+    @checks_arguments
     def drawn_vibration(self, params: Parameters | None = None) -> Vibration:
         """The vibration of every image of the last call, in image axes: the ground truth for training.
 
@@ -341,7 +351,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         vibration = Vibration(**drawn).to_row_order(self.timing)
         self.timing.check_rows(self._num_rows(params))
         length = self._recording_length(params)
-        starts = self.timing.frame_starts(length) if length > 1 else torch.zeros(1, dtype=torch.float64)
+        starts = self.timing.frame_starts(length) if length > 1 else torch.zeros(1, dtype=torch.float64, device="cpu")
         return ImageMotion(
             vibration=vibration,
             starts=starts.repeat(len(exposure_rows) // length).to(like.device),

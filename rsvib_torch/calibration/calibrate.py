@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.calibration.flicker import BandFit, Profiles, find_bands, row_profiles
 from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text, wrapped
@@ -68,6 +69,10 @@ class RowTimeCalibration(
     exposure_time_std: float | None
     notes: tuple[str, ...]
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_number("row_time", self.row_time, above=0.0)
+
     def summary(self) -> str:
         """The measured values of the sensor, and what is not determined."""
         lines = [
@@ -86,6 +91,7 @@ class RowTimeCalibration(
         return "\n".join([*lines, *map(wrapped, self.notes)])
 
 
+@checks_arguments
 def calibrate_row_time(
     frames: FramesOrFiles,
     flicker_frequency: float,
@@ -177,6 +183,7 @@ def calibrate_row_time(
     )
 
 
+@checks_arguments
 def calibrate_row_time_by_exposure(
     frames: FramesOrFiles,
     exposure_times: Sequence[float],
@@ -293,10 +300,14 @@ def _direction(
 def _turning(values: Tensor, turns: float) -> tuple[float, float]:
     """Misfit of ``d + a exp(2 pi j p turns)`` to values (T,) over their power with a penalty on d, and |a|."""
     count = len(values)
-    angle = 2 * math.pi * turns * torch.arange(count, dtype=torch.float64)
-    columns = torch.stack([torch.ones(count, dtype=values.dtype), torch.polar(torch.ones_like(angle), angle)], 1)
+    angle = 2 * math.pi * turns * torch.arange(count, dtype=torch.float64, device="cpu")
+    columns = torch.stack(
+        [torch.ones(count, dtype=values.dtype, device="cpu"), torch.polar(torch.ones_like(angle), angle)], 1
+    )
     penalty = 0.3 if count == 2 else 0.03  # two frames alone cannot separate d from a
-    gram = columns.mH @ columns + torch.diag(torch.tensor([penalty, 0.0])).to(values.dtype)
+    gram = columns.mH @ columns + torch.diag(torch.tensor([penalty, 0.0], dtype=torch.float32, device="cpu")).to(
+        values.dtype
+    )
     solution = torch.linalg.solve(gram, columns.mH @ values)
     cost = (values - columns @ solution).abs().square().sum() + penalty * solution[0].abs().square()
     return float(cost / values.abs().square().sum()), float(solution[1].abs())

@@ -54,7 +54,7 @@ def row_profiles(
     check_choice("scan_axis", scan_axis, (-2, "y", -1, "x"))
     check_number("gamma", gamma, above=0.0, at_most=4.0)
     frames, full_scale = load_frames(frames, full_scale)
-    images = as_float_frames(frames, full_scale, channels=channels)
+    images = as_float_frames(frames, full_scale, channels=channels).detach()
     if images.ndim == 5:
         raise ValueError(f"calibration takes one stack, got a batch of shape {tuple(images.shape)}")
     images = images.mean(channel_axis("frames", images.shape, channels)) if images.ndim == 4 else images
@@ -99,7 +99,7 @@ class BandFit:
 
 def _harmonics(rows: Tensor, period: float, count: int) -> tuple[Tensor, Tensor]:
     """Cosines and sines (H, 2 K) of the first harmonics at the rows, and their derivatives with the period."""
-    order = torch.arange(1, count + 1, dtype=torch.float64)
+    order = torch.arange(1, count + 1, dtype=torch.float64, device="cpu")
     angle = 2 * math.pi * rows[:, None] * order / period
     basis = torch.cat([angle.cos(), angle.sin()], 1)
     slope = torch.cat([angle.sin() * angle, -angle.cos() * angle], 1) / period
@@ -122,8 +122,8 @@ def _residual(matrix: Tensor, values: Tensor) -> Tensor:
 def _polynomials(height: int, period: float) -> Tensor:
     """Chebyshev polynomials over the rows (H, N), at most one per period, up to degree 8."""
     degree = max(2, min(8, round(height / period)))
-    place = torch.linspace(-1, 1, height, dtype=torch.float64)
-    return torch.cos(torch.arange(degree + 1, dtype=torch.float64) * torch.acos(place)[:, None])
+    place = torch.linspace(-1, 1, height, dtype=torch.float64, device="cpu")
+    return torch.cos(torch.arange(degree + 1, dtype=torch.float64, device="cpu") * torch.acos(place)[:, None])
 
 
 def fit_period(brightness: Tensor, start: float, scene: SceneModel) -> BandFit | None:
@@ -158,12 +158,12 @@ def _fit(brightness: Tensor, period: float, scene: SceneModel, count: int, dark:
     """
     frames, height = brightness.shape
     centre = 0.5 * (height - 1)
-    rows = torch.arange(height, dtype=torch.float64) - centre
+    rows = torch.arange(height, dtype=torch.float64, device="cpu") - centre
     smooth = _polynomials(height, period)
     floor = dark * brightness.mean(1, keepdim=True)
-    texture = torch.ones(height, dtype=torch.float64)
+    texture = torch.ones(height, dtype=torch.float64, device="cpu")
     level = torch.maximum(_solve(smooth.expand(frames, -1, -1), brightness) @ smooth.T, floor)
-    waves = torch.zeros(frames, 2 * count, dtype=torch.float64)
+    waves = torch.zeros(frames, 2 * count, dtype=torch.float64, device="cpu")
     for turn in range(60):
         basis, slope = _harmonics(rows, period, count)
         pattern = 1 + waves @ basis.T
@@ -193,8 +193,8 @@ def _fit(brightness: Tensor, period: float, scene: SceneModel, count: int, dark:
         leverage = leverage - pattern * (pattern * leverage).sum(0) / pattern.square().sum(0).clamp(min=1e-300)
     leverage = _residual(torch.cat([basis.expand(frames, -1, -1), pattern[..., None] * smooth], -1), leverage)
     back = torch.polar(
-        torch.ones(count, dtype=torch.float64),
-        2 * math.pi * centre / period * torch.arange(1, count + 1, dtype=torch.float64),
+        torch.ones(count, dtype=torch.float64, device="cpu"),
+        2 * math.pi * centre / period * torch.arange(1, count + 1, dtype=torch.float64, device="cpu"),
     )
     coefficients = torch.complex(waves[:, :count], waves[:, count:]) * back
     certainty = _certainty(coefficients, residual, period)
@@ -231,7 +231,7 @@ def _period_std(leverage: Tensor, residual: Tensor, period: float) -> float:
     reach = min(max(8, math.ceil(period)), length - 1)
     power = torch.fft.rfft(score, n=2 * length).abs().square().sum(0)
     covariance = torch.fft.irfft(power)[: reach + 1]
-    window = 1 - torch.arange(reach + 1, dtype=torch.float64) / (reach + 1)
+    window = 1 - torch.arange(reach + 1, dtype=torch.float64, device="cpu") / (reach + 1)
     whole = covariance[0] + 2 * (window * covariance)[1:].sum()
     white = residual.square().mean() * leverage.square().sum()
     variance = torch.maximum(whole, torch.maximum(white, covariance[0]))
@@ -254,11 +254,11 @@ def _period_std_beside(leverage: Tensor, shift: Tensor, certainty: float, period
 def _certainty(coefficients: Tensor, residual: Tensor, period: float) -> float:
     """Power of the fundamental over the mean power of residuals at 24 frequencies around it."""
     height = residual.shape[1]
-    rows = torch.arange(height, dtype=torch.float64)
-    steps = torch.arange(-12, 13, dtype=torch.float64)
+    rows = torch.arange(height, dtype=torch.float64, device="cpu")
+    steps = torch.arange(-12, 13, dtype=torch.float64, device="cpu")
     frequencies = 1 / period + steps[steps.abs() >= 2] / (2 * height)
     frequencies = frequencies[(frequencies > 0.25 / height) & (frequencies < 0.5)]
-    wave = torch.polar(torch.ones(1, dtype=torch.float64), 2 * math.pi * rows[:, None] * frequencies)
+    wave = torch.polar(torch.ones(1, dtype=torch.float64, device="cpu"), 2 * math.pi * rows[:, None] * frequencies)
     beside = 2 / height * (residual.to(wave.dtype) @ wave)
     noise = beside.abs().square().mean(1)
     return float((coefficients[:, 0].abs().square() / noise.clamp(min=1e-300)).sum())
@@ -266,7 +266,7 @@ def _certainty(coefficients: Tensor, residual: Tensor, period: float) -> float:
 
 def _less_parabola(curves: Tensor) -> Tensor:
     """Curves (N, H) less the parabola that fits each of them."""
-    place = torch.linspace(-1, 1, curves.shape[-1], dtype=torch.float64)
+    place = torch.linspace(-1, 1, curves.shape[-1], dtype=torch.float64, device="cpu")
     smooth = torch.stack([torch.ones_like(place), place, place.square()], 1)
     weight: Tensor = torch.linalg.lstsq(smooth, curves.mT).solution
     return curves - (smooth @ weight).mT
@@ -279,9 +279,9 @@ def _starts(brightness: Tensor, min_periods: float, padding: int = 4) -> list[fl
     """
     height = brightness.shape[1]
     flat = _less_parabola(brightness) / brightness.mean(1, keepdim=True)
-    window = torch.hann_window(height, dtype=torch.float64)
+    window = torch.hann_window(height, dtype=torch.float64, device="cpu")
     power = torch.fft.rfft(flat * window, n=padding * height).abs().square().sum(0)
-    frequencies = torch.fft.rfftfreq(padding * height).double()
+    frequencies = torch.fft.rfftfreq(padding * height, dtype=torch.float32, device="cpu").double()
     usable = (frequencies >= 0.8 * min_periods / height) & (frequencies <= 0.45)
     usable[1:-1] &= (power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])
     reach = 8 * padding
@@ -369,8 +369,8 @@ def same_everywhere(profiles: Profiles, fit: BandFit, scene: SceneModel) -> bool
         parts = parts - parts.mean(0) * (parts.mean(-1) / parts.mean((0, -1)))[..., None]
     else:
         parts = _less_parabola(parts.flatten(0, 1)).view_as(parts)
-    angle = -2 * torch.pi * torch.arange(kept, dtype=torch.float64) / fit.period
-    wave = torch.polar(torch.hann_window(kept, dtype=torch.float64), angle)
+    angle = -2 * torch.pi * torch.arange(kept, dtype=torch.float64, device="cpu") / fit.period
+    wave = torch.polar(torch.hann_window(kept, dtype=torch.float64, device="cpu"), angle)
     amplitude = parts[..., :kept].to(wave.dtype) @ wave
     together, each = amplitude.sum(1).abs().sum(), amplitude.abs().sum()
     return bool(together > 0.7 * each)

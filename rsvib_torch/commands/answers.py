@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsvib_torch.core.text import wrapped
+from rsvib_torch.core.text import printable, wrapped
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
@@ -29,7 +29,19 @@ __all__ = [
 
 def command_text(*parts: str | Path) -> str:
     """A command line of the program that can be copied into a shell."""
-    return shlex.join(["rsvib", *map(str, parts)])
+    return " ".join(["rsvib", *map(_shell_word, map(str, parts))])
+
+
+def _shell_word(text: str) -> str:
+    r"""A word of a command line; ``$'...'`` where it contains characters that are not printed as they are.
+
+    Example:
+        >>> _shell_word("a b"), _shell_word("a\nb")
+        ("'a b'", "$'a\\nb'")
+    """
+    if printable(text) == text:
+        return shlex.quote(text)
+    return "$'" + printable(text.replace("\\", "\\\\").replace("'", "\\'")) + "'"
 
 
 def detection_data(result: DetectionResult) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from rsvib_torch.commands.terminal import Answer, error_line, note, working
 from rsvib_torch.config import presets, read_config
 from rsvib_torch.core.atomic import check_writable, whole_file
 from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.text import printable
 from rsvib_torch.motion.timing import SensorTiming
 
 __all__ = ["init", "sensor_toml"]
@@ -137,7 +138,7 @@ def _describe_camera(path: Path, given: Mapping[str, Any]) -> str:
     settings = read_config(None, sensor=values)
     _check_timing(settings.timing, rows)
     head = [
-        f"Camera of {path.name}: {size}. Written by rsvib init.",
+        f"Camera of {printable(path.name)}: {size}. Written by rsvib init.",
         "Values hold for one mode of the camera: resolution, cropping, binning and frame rate change the row time.",
     ]
     if info.frame_times is not None and not info.time_error:

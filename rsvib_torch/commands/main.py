@@ -1,8 +1,10 @@
 """The ``rsvib`` program: its commands, and one line for every error."""
 
 import inspect
+import io
 import logging
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, get_type_hints
 
@@ -11,7 +13,7 @@ import typer
 import rsvib_torch
 from rsvib_torch.commands import motion_commands, stack_commands
 from rsvib_torch.commands.init import init
-from rsvib_torch.commands.options import JsonOption, QuietOption
+from rsvib_torch.commands.options import DebugOption, JsonOption, QuietOption
 from rsvib_torch.commands.terminal import (
     Answer,
     error_line,
@@ -21,6 +23,8 @@ from rsvib_torch.commands.terminal import (
     show_answer,
     warnings_in_one_line,
 )
+from rsvib_torch.core.unexpected import in_one_line
+from rsvib_torch.core.validation import MistakesError
 
 __all__ = ["main", "run_command"]
 
@@ -117,16 +121,16 @@ _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 120}  #
 
 
 def _with_output(name: str, function: Callable[..., Answer]) -> Callable[..., None]:
-    """A command that prints its answer, with the options ``--json`` and ``--quiet``."""
+    """A command that prints its answer, with the options ``--json``, ``--quiet`` and ``--debug``."""
 
-    def command(*, as_json: bool = False, quiet: bool = False, **arguments: Any) -> None:
+    def command(*, as_json: bool = False, quiet: bool = False, debug: bool = False, **arguments: Any) -> None:
         with output_of(as_json=as_json, quiet=quiet):
             show_answer(name, function(**arguments))
 
     parameters = inspect.signature(function, eval_str=True).parameters.values()
     hints = get_type_hints(function, include_extras=True)
     own = inspect.signature(command).parameters
-    options = {"as_json": JsonOption, "quiet": QuietOption}
+    options = {"as_json": JsonOption, "quiet": QuietOption, "debug": DebugOption}
     added = [own[option].replace(annotation=kind) for option, kind in options.items()]
     command.__signature__ = inspect.Signature([*parameters, *added])  # type: ignore[attr-defined]
     command.__annotations__ = hints | options
@@ -166,8 +170,8 @@ def run_command(arguments: Sequence[str]) -> int:
     """Run ``rsvib`` with these arguments.
 
     Returns:
-        Exit code: 0; 2 after an error that the user can correct, which is one line on standard error; 130 after
-        Ctrl-C.
+        Exit code: 0; 2 after an error, which is one line on standard error (``--debug`` prints the traceback before
+        it); 130 after Ctrl-C.
     """
     logging.getLogger("tifffile").addHandler(logging.NullHandler())  # damaged files raise an error of this package
     command = typer.main.get_command(app)
@@ -181,23 +185,33 @@ def run_command(arguments: Sequence[str]) -> int:
             kept = "; the completed windows are kept, --resume continues" if "run" in arguments[:1] else ""
             error_line(f"stopped{kept}")
         return code if isinstance(code, int) else 0
-    except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        error_line(f"{place}{error.strerror}" if error.strerror else str(error) or type(error).__name__)
-    except (ValueError, TypeError, ModuleNotFoundError) as error:
-        error_line(str(error) or type(error).__name__)
     except Exception as error:
-        if hasattr(error, "format_message"):  # a usage error of click, or of the parser that typer bundles
-            message = error.format_message().replace("Value error, ", "")  # added by some versions of typer
-            several = "; give a sequence of files as their folder" if "unexpected extra argument" in message else ""
-            error_line(f"{message}{several}")
-        elif isinstance(error, MemoryError) or "allocate" in str(error):
-            error_line("not enough memory for a stack of this size: process fewer frames at a time")
-        else:
-            raise
+        if "--debug" in arguments:
+            traceback.print_exc()
+        for line in _lines_of(error):
+            error_line(line)
     return 2
+
+
+def _lines_of(error: Exception) -> Sequence[str]:
+    """What is printed about an error: one line, or one for each mistake in a file."""
+    if isinstance(error, MistakesError):
+        return error.lines
+    if isinstance(error, OSError) and error.strerror:
+        return [f"{error.filename}: {error.strerror}" if error.filename else error.strerror]
+    if isinstance(error, (OSError, ValueError, TypeError, ModuleNotFoundError)):
+        return [str(error) or type(error).__name__]
+    if hasattr(error, "format_message"):  # a usage error of click, or of the parser that typer bundles
+        message = error.format_message().replace("Value error, ", "")  # added by some versions of typer
+        several = "; give a sequence of files as their folder" if "unexpected extra argument" in message else ""
+        return [f"{message}{several}"]
+    line = in_one_line(error)
+    return [f"{line} (--debug prints the traceback)" if line.startswith("unexpected") else line]
 
 
 def main() -> None:
     """Entry point of the ``rsvib`` program."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a character shows its escape
+            stream.reconfigure(errors="backslashreplace")
     sys.exit(run_command(sys.argv[1:]))

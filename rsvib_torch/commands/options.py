@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = [
     "READOUT_HELP",
     "SCAN_AXIS_HELP",
+    "DebugOption",
     "DeviceName",
     "DeviceOption",
     "ExposureOption",
@@ -178,6 +179,7 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace resu
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print the answer as JSON on standard output, and nothing else there.")
 ]
+DebugOption = Annotated[bool, typer.Option("--debug", help="Print the traceback of an error.")]
 QuietOption = Annotated[
     bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors, and no progress.")
 ]

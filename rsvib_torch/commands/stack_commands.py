@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -47,10 +47,11 @@ from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable, whole_folder
 from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
 from rsvib_torch.core.reading import check_regular
-from rsvib_torch.core.text import write_json
+from rsvib_torch.core.text import printable, write_json
 from rsvib_torch.core.validation import validate
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from torch import Tensor
 
     from rsvib_torch.detection import DetectionResult
@@ -180,13 +181,23 @@ def _warn_of_restoration(result: RestoredFrames, output: str = "frames") -> None
         error_line(result.verdict.sentence + unchanged, "warning")
 
 
+def _draw(path: Path, draw: Callable[[], Figure]) -> list[str]:
+    """Draw a figure and return its name; a warning if that fails, because the results do not depend on figures."""
+    try:
+        reports.save_figure(draw(), path)
+    except Exception as error:
+        error_line(f"{path.name} is not drawn: {' '.join(str(error).split()) or type(error).__name__}", "warning")
+        return []
+    return [path.name]
+
+
 def _write_detection(folder: Path, result: DetectionResult, timing: SensorTiming) -> list[str]:
     """Write a detection as JSON, CSV and figure, and return the names of the files."""
     with working("drawing the offset curve"):
         reports.write_vibration(folder / "vibration.json", result, timing)
         reports.write_offsets(folder / "offsets.csv", result)
-        reports.save_figure(reports.offset_figure(result), folder / "offsets.png")
-    return ["offsets.png", "vibration.json", "offsets.csv"]
+        drawn = _draw(folder / "offsets.png", lambda: reports.offset_figure(result))
+    return [*drawn, "vibration.json", "offsets.csv"]
 
 
 def _write_windows(folder: Path, path: Path) -> list[str]:
@@ -196,8 +207,8 @@ def _write_windows(folder: Path, path: Path) -> list[str]:
         write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **manifest.totals()})
         reports.write_windows(folder / "windows.csv", manifest)
         starts = [record.start_time for record in manifest.windows]
-        reports.save_figure(reports.windows_figure(starts, manifest.detections()), folder / "windows.png")
-    return ["windows.png", "windows.json", "windows.csv"]
+        drawn = _draw(folder / "windows.png", lambda: reports.windows_figure(starts, manifest.detections()))
+    return [*drawn, "windows.json", "windows.csv"]
 
 
 def _check_folder(
@@ -558,12 +569,11 @@ def run(
     first = result.first
     if first is None:  # the run was complete before, or its first window was
         first = next(iter(stacks.iterate_stack(frames, settings.timing, **common)))
-    names = []
+    names: list[str] = []
     with whole_folder(out) as folder:
         if len(first.frames):
             with working("drawing the frames"):
-                _draw_comparison(folder / "before_after.png", frames, scale, first)
-            names.append("before_after.png")
+                names += _draw(folder / "before_after.png", lambda: _comparison(frames, scale, first))
         names += [output, "manifest.json"]
         if result.windows == 1:
             assert isinstance(first.detection, detection.DetectionResult)
@@ -614,7 +624,7 @@ def _video_name(frames: Path, output: str) -> str:
     return f"restored{ending if ending in ('.mp4', '.mov', '.m4v') else '.mkv'}"
 
 
-def _draw_comparison(path: Path, frames: Path, full_scale: float | None, first: WindowResult) -> None:
+def _comparison(frames: Path, full_scale: float | None, first: WindowResult) -> Figure:
     """Draw the first restored frame of a stack beside the frame of the input."""
     from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
 
@@ -623,7 +633,7 @@ def _draw_comparison(path: Path, frames: Path, full_scale: float | None, first: 
     raw = counts_to_frames(reader.frame(index)[None], full_scale or reader.info.full_scale, str(frames))[0]
     reader.close()
     names = ("input", "restored" if first.restored else "unchanged")
-    reports.save_figure(reports.comparison_figure(raw, first.frames[0].cpu(), names=names), path)
+    return reports.comparison_figure(raw, first.frames[0].cpu(), names=names)
 
 
 @camera_options
@@ -678,8 +688,8 @@ def report(
         steps = step_with_force("report", result, frames, out.with_name(f"{out.name}_forced"), settings)
     steps += steps_after_detection(detection, frames, settings)
     content = reports.Report(
-        title=f"Vibration in {frames.name}",
-        subtitle=f"{frames}, camera of {settings.source}",
+        title=printable(f"Vibration in {frames.name}"),
+        subtitle=printable(f"{frames}, camera of {settings.source}"),
         frames=stack.frames,
         restored=result.frames,
         was_restored=result.restored,

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Ta
 from rich.text import Text
 
 from rsvib_torch.core.progress import listening
-from rsvib_torch.core.text import json_text, wrapped
+from rsvib_torch.core.text import json_text, printable, wrapped
 
 __all__ = [
     "Answer",
@@ -94,8 +94,8 @@ def output_of(*, as_json: bool, quiet: bool) -> Iterator[None]:
 
 
 def print_line(message: str) -> None:
-    """Print a text to standard output; long lines are not wrapped, and brackets are not markup."""
-    Console(highlight=False).print(Text(message), soft_wrap=True)
+    """Print a text to standard output; long lines are not wrapped, and control codes are escaped."""
+    Console(highlight=False).print(Text(printable(message, lines=True)), soft_wrap=True)
 
 
 def show_answer(command: str, answer: Answer) -> None:
@@ -111,34 +111,32 @@ def show_answer(command: str, answer: Answer) -> None:
         return
     notes = {"Notes": output.notes} if output.notes else {}
     for title, lines in {**answer.results, **notes}.items():
-        print_line("\n".join([title, *(f"  {line}" for text in lines for line in text.splitlines())]) + "\n")
+        print_line("\n".join([printable(title), *(f"  {line}" for text in lines for line in text.splitlines())]) + "\n")
     if answer.files:
-        print_line(f"Files (open {answer.files[0].name} first)" if len(answer.files) > 1 else "File")
+        print_line(f"Files (open {printable(answer.files[0].name)} first)" if len(answer.files) > 1 else "File")
         for folder in dict.fromkeys(path.parent for path in answer.files):
             names = [path.name for path in answer.files if path.parent == folder]
             text = str(folder / names[0]) if len(names) == 1 else f"{folder}: {', '.join(names)}"
-            print_line(textwrap.indent(wrapped(text), "  "))
+            print_line(textwrap.indent(wrapped(printable(text)), "  "))
     if answer.next_steps:
         print_line("\n".join(["", "Next", *(textwrap.indent(step, "  ") for step in answer.next_steps)]))
 
 
 def note(message: str) -> None:
     """Print a sentence with the answer of the running command: what a file states, or what it does not contain."""
-    _outputs[-1].notes.append(message)
+    _outputs[-1].notes.append(printable(message))
 
 
 def error_line(message: str, kind: str = "error") -> None:
-    """Print a message to standard error, with the prefix ``rsvib: error:`` on each of its lines.
+    """Print a message to standard error, with the prefix ``rsvib: error:``; control codes are escaped.
 
     Lines are wrapped between words in a terminal, and not at all in a file or pipe.
     """
     if kind == "warning":
         _outputs[-1].warnings.append(message)
     console = Console(stderr=True, highlight=False)
-    for line in message.splitlines() or [""]:
-        console.print(
-            Text.assemble(("rsvib: ", "bold"), (f"{kind}: ", "bold red"), line), soft_wrap=not console.is_terminal
-        )
+    line = Text.assemble(("rsvib: ", "bold"), (f"{kind}: ", "bold red"), printable(message))
+    console.print(line, soft_wrap=not console.is_terminal)
 
 
 @contextmanager
@@ -190,7 +188,7 @@ def _progress() -> Progress:
 def working(description: str) -> Iterator[None]:
     """Show the elapsed time, and progress, rate and remaining time of the loops in the block that report them."""
     with _progress() as progress:
-        task = progress.add_task(description, total=None)
+        task = progress.add_task(printable(description), total=None)
 
         def show(done: int, total: int, unit: str) -> None:
             if done == 0:  # another loop begins
@@ -214,7 +212,7 @@ def counting(description: str) -> Iterator[Callable[[int, int], None]]:
         def show(done: int, total: int) -> None:
             nonlocal task
             if task is None:  # frames of a resumed run do not count for the rate
-                task = progress.add_task(description, total=total, completed=done, unit="frames", first=done)
+                task = progress.add_task(printable(description), total=total, completed=done, unit="frames", first=done)
             else:
                 progress.update(task, completed=done)
 

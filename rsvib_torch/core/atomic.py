@@ -16,6 +16,7 @@ except ImportError:  # without it temporary folders of killed processes are not 
     fcntl = None  # type: ignore[assignment]
 
 __all__ = [
+    "check_name",
     "check_writable",
     "make_folder",
     "move_into_place",
@@ -28,6 +29,7 @@ __all__ = [
 ]
 
 _SUFFIX = ".part"
+_ADDED = len("..12345678.part")  # bytes that names of temporary files have in addition
 
 
 def nearest_folder(path: Path) -> Path:
@@ -131,6 +133,14 @@ def temporary_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
         if lock is not None:
             os.close(lock)
+
+
+def check_name(path: Path) -> None:
+    """Raise an ``OSError`` if the name of a file to be written is too long, with those that belong to it."""
+    longest = os.pathconf(nearest_folder(path), "PC_NAME_MAX") - _ADDED if hasattr(os, "pathconf") else 255 - _ADDED
+    size = len(os.fsencode(path.name))
+    if size > longest:
+        raise OSError(f"cannot write {path.name[:40]}...: its name has {size} bytes, at most {longest} are possible")
 
 
 def _check_file_target(path: Path, *, parent_exists: bool = True) -> None:

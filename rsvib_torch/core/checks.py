@@ -3,7 +3,31 @@
 import math
 from numbers import Real
 
-__all__ = ["check_choice", "check_number", "check_whole_number"]
+__all__ = ["MAX_NUMBER", "check_choice", "check_number", "check_whole_number", "described"]
+
+# Largest magnitude of numbers and pixels of public functions: squares of float32 are finite up to 1.8e19, and sums of
+# squares over an image of 1e8 px up to 1.8e15. No quantity in px, s or Hz reaches it.
+MAX_NUMBER = 1e15
+
+
+def described(value: object) -> str:
+    """Type of a value, with the value if it is short, for error messages.
+
+    Example:
+        >>> described("3"), described(None), described([1, 2])
+        ("'3' (str)", 'None', 'list')
+    """
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    if shape is not None and dtype is not None:
+        size = "" if getattr(value, "is_nested", False) else f" of shape {tuple(shape)} and {dtype}"
+        return f"{type(value).__name__}{size}"
+    if value is None or isinstance(value, (bool, float, complex)):
+        return repr(value) if value is None else f"{value!r} ({type(value).__name__})"
+    if isinstance(value, int):
+        return f"{value} (int)" if abs(value) < 10**30 else "a very large int"
+    if isinstance(value, (str, bytes)):
+        return f"{value[:60]!r} ({type(value).__name__})"
+    return type(value).__name__
 
 
 def check_number(
@@ -35,8 +59,11 @@ def check_number(
         2e-05
     """
     if isinstance(value, bool) or not isinstance(value, Real):
-        raise TypeError(f"{name} must be a number, got {value!r} ({type(value).__name__})")
-    number = float(value)
+        raise TypeError(f"{name} must be a number, got {described(value)}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf if value == abs(value) else -math.inf  # a whole number beyond float64
     if not math.isfinite(number):
         raise ValueError(f"{name} must be finite, got {number}")
     if number <= above:
@@ -54,25 +81,26 @@ def check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:
     Example:
         >>> check_choice("method", "bands", ("bands",))
     """
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}; got {value!r}")
+    # only values of the same types are compared: a tensor has no truth value
+    if not isinstance(value, tuple(type(choice) for choice in choices)) or value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}; got {described(value)}")
 
 
-def check_whole_number(name: str, value: object, *, at_least: int, at_most: int | None = None) -> int:
-    """Return ``value`` as an int that is not smaller than ``at_least``, and not larger than ``at_most``.
+def check_whole_number(name: str, value: object, *, at_least: int, at_most: int = 2**63 - 1) -> int:
+    """Return ``value`` as an int from ``at_least`` to ``at_most``, by default the largest index of an array.
 
     Raises:
         TypeError: If the value is not a whole number.
-        ValueError: If it is too small or too large.
+        ValueError: If it is out of bounds.
 
     Example:
         >>> check_whole_number("band_rows", 32, at_least=4)
         32
     """
     if isinstance(value, bool) or not isinstance(value, int):
-        raise TypeError(f"{name} must be a whole number, got {value!r}")
+        raise TypeError(f"{name} must be a whole number, got {described(value)}")
     if value < at_least:
-        raise ValueError(f"{name} must be at least {at_least}, got {value}")
-    if at_most is not None and value > at_most:
-        raise ValueError(f"{name} must be at most {at_most}, got {value}")
+        raise ValueError(f"{name} must be at least {at_least}, got {described(value)}")
+    if value > at_most:
+        raise ValueError(f"{name} must be at most {at_most}, got {described(value)}")
     return value

@@ -66,7 +66,7 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def in_full_precision(*args: P.args, **kwargs: P.kwargs) -> R:
-        tensors = (value for value in (*args, *kwargs.values()) if isinstance(value, Tensor))
+        tensors = (value for value in (*args, *kwargs.values()) if isinstance(value, Tensor) and not value.is_meta)
         device = next((tensor.device.type for tensor in tensors), "cpu")
         with torch.autocast(device_type=device, enabled=False), _FLOAT32_PRODUCTS:
             return function(*args, **kwargs)

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, Union, get_args, get_orig
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import check_fields, check_shapes, checks_arguments
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.text import text_table, wrapped, write_json
 from rsvib_torch.core.validation import read_json
@@ -166,9 +167,9 @@ def _tensor(value: Any, path: str, missing: float) -> Tensor:
 
     values = filled(value)
     try:
-        tensor = torch.tensor(values)
+        tensor = torch.tensor(values, device="cpu")
         if tensor.is_floating_point() or not tensor.numel():
-            tensor = torch.tensor(values, dtype=torch.float64)
+            tensor = torch.tensor(values, dtype=torch.float64, device="cpu")
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected numbers in lists of equal lengths: {error}") from error
     return tensor
@@ -203,17 +204,33 @@ class Result(Summarised):
     """Methods of a dataclass of tensors, numbers, texts and other results.
 
     The decorator of the class needs ``repr=False``, so that objects print as their summary. Arguments of the class:
-    ``units``, the units of its fields, which are written into files, and ``file_format``, the first entry of its files,
-    by default the name of the class.
+    ``units``, the units of its fields, which are written into files; ``shapes``, the axes of its tensors as in
+    ``check_shapes``; and ``file_format``, the first entry of its files, by default the name of the class.
     """
 
     units: ClassVar[Mapping[str, str]] = {}
+    shapes: ClassVar[Mapping[str, str]] = {}
     file_format: ClassVar[str] = ""
 
-    def __init_subclass__(cls, *, units: Mapping[str, str] | None = None, file_format: str | None = None) -> None:
+    def __init_subclass__(
+        cls,
+        *,
+        units: Mapping[str, str] | None = None,
+        shapes: Mapping[str, str] | None = None,
+        file_format: str | None = None,
+    ) -> None:
         super().__init_subclass__()
         cls.units = cls.units if units is None else units
+        cls.shapes = cls.shapes if shapes is None else shapes
         cls.file_format = f"rsvib {cls.__name__}" if file_format is None else file_format
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        check_shapes(vars(self), self.shapes)
+        for name in self.units:  # quantities with a unit
+            value = getattr(self, name, None)
+            if isinstance(value, Tensor) and not value.is_floating_point():
+                raise TypeError(f"{name} must be a floating-point tensor, got {value.dtype}")
 
     def summary(self) -> str:
         """The result in a few lines: here the shapes of its tensors and its other values."""
@@ -230,6 +247,7 @@ class Result(Summarised):
         """All values as nested lists, numbers and texts, which JSON can store; None for numbers that are not finite."""
         return {field.name: plain_values(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
 
+    @checks_arguments
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as JSON, which ``load`` reads; an existing file is replaced.
 
@@ -242,6 +260,7 @@ class Result(Summarised):
         write_json(path, {"format": self.file_format, "version": 1, **self.to_dict(), "units": dict(self.units)})
 
     @classmethod
+    @checks_arguments
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read a file that ``save`` wrote.
 
@@ -280,10 +299,12 @@ class Result(Summarised):
                 object.__setattr__(result, name, {key: function(entry) for key, entry in value.items()})
         return result
 
+    @checks_arguments
     def to(self, device: torch.device | str) -> Self:
         """The same result with its tensors on another device."""
         return self.mapped(lambda values: values.to(device))
 
+    @checks_arguments
     def plot(self, path: str | os.PathLike[str] | None = None) -> "Figure":
         """Draw the result.
 

@@ -91,8 +91,8 @@ def _polynomials(degree: int) -> tuple[tuple[float, ...], ...]:
 def _prefilter_taps(degree: int, double: bool) -> tuple[float, ...]:
     """Taps 0, 1, 2 ... of the symmetric inverse filter of the sampled B-spline."""
     length = 1024
-    samples = bspline_weights(torch.zeros((), dtype=torch.float64), degree)[:-1]
-    kernel = torch.zeros(length, dtype=torch.float64)
+    samples = bspline_weights(torch.zeros((), dtype=torch.float64, device="cpu"), degree)[:-1]
+    kernel = torch.zeros(length, dtype=torch.float64, device="cpu")
     half = len(samples) // 2
     for tap, value in enumerate(samples.tolist()):
         kernel[(tap - half) % length] = value

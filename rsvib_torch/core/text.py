@@ -13,7 +13,40 @@ from rsvib_torch.core.atomic import whole_file
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["json_text", "measured_text", "one_line", "text_table", "wrapped", "write_json"]
+__all__ = ["json_text", "measured_text", "one_line", "printable", "text_table", "wrapped", "write_json"]
+
+
+# Marks that change the direction of the text after them, and separators of lines.
+_INVISIBLE = frozenset("\u061c\u200e\u200f\u2028\u2029\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
+
+
+def printable(text: str, *, lines: bool = False) -> str:
+    r"""Text with escapes instead of control characters, direction marks and bytes that are not UTF-8.
+
+    Names of files may contain them; a terminal would execute control characters.
+
+    Args:
+        text: The text.
+        lines: Whether line breaks are kept.
+
+    Example:
+        >>> printable("a\x1b[31m\n\u202eb\udcff")
+        'a\\x1b[31m\\n\\u202eb\\xff'
+    """
+
+    def shown(character: str) -> str:
+        code = ord(character)
+        if 0xDC80 <= code <= 0xDCFF:  # byte that is not UTF-8, as ``os.fsdecode`` represents it
+            return f"\\x{code - 0xDC00:02x}"
+        if code < 32 or 127 <= code < 160 or character in _INVISIBLE or 0xD800 <= code < 0xE000:
+            return (
+                character
+                if lines and character == "\n"
+                else character.encode("unicode_escape", "surrogatepass").decode()
+            )
+        return character
+
+    return text if text.isascii() and text.isprintable() else "".join(map(shown, text))
 
 
 def measured_text(value: "Tensor | float", std: "Tensor | float | None" = None, digits: int = 4) -> str:

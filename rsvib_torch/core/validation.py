@@ -2,7 +2,7 @@
 
 import json
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from rsvib_torch.core.reading import read_text
 
-__all__ = ["Section", "checked", "expected_text", "options_section", "read_json", "validate"]
+__all__ = ["MistakesError", "Section", "checked", "expected_text", "options_section", "read_json", "validate"]
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _Result = TypeVar("_Result")
@@ -18,6 +18,18 @@ _MAX_LINES = 20  # of an error message
 _MAX_JSON_BYTES = 10**9  # a manifest has about 2 KB per window
 _TYPE_NAMES = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
 _LIST_NAMES: dict[Any, str] = {float: "numbers", int: "whole numbers", str: "texts", bool: "true or false"}
+
+
+class MistakesError(ValueError):
+    """Mistakes in one file.
+
+    Attributes:
+        lines: One line for each.
+    """
+
+    def __init__(self, lines: Iterable[str]) -> None:
+        self.lines = tuple(lines)
+        super().__init__("\n".join(self.lines))
 
 
 class Section(BaseModel):
@@ -70,7 +82,7 @@ def validate(model: type[_Model], data: Mapping[str, Any], source: str) -> _Mode
             path, message = _describe(model, data, mistake)
             lines.setdefault(path, f"{source}: {path}: {message}" if path else f"{source}: {message}")
         more = [f"{source}: {len(lines) - _MAX_LINES} more mistakes"] if len(lines) > _MAX_LINES else []
-        raise ValueError("\n".join([*list(lines.values())[:_MAX_LINES], *more])) from error
+        raise MistakesError([*list(lines.values())[:_MAX_LINES], *more]) from error
 
 
 def _describe(model: type[BaseModel], data: Any, mistake: Any) -> tuple[str, str]:

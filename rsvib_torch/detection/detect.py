@@ -12,6 +12,7 @@ from typing import Literal, Unpack, overload
 import torch
 from torch import Tensor, nn
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.option_types import BandSettings, DetectionMethod, Registration, ToneSettings
 from rsvib_torch.core.precision import full_precision, outside_graphs
@@ -48,6 +49,9 @@ from rsvib_torch.registration import OffsetCurve, RegistrationOptions
 __all__ = ["DetectionMethod", "VibrationDetector", "VibrationModel", "detect_vibration"]
 
 VibrationModel = Literal["tones", "free", "swept"]
+
+
+MAX_HARMONICS = 50  # the sensors of the paper sample a tone of 100 Hz up to its 120th harmonic
 
 
 class BandOptions(BandSettings, total=False):
@@ -200,6 +204,7 @@ def detect_vibration(
 @outside_graphs
 @full_precision
 @torch.no_grad()
+@checks_arguments
 def detect_vibration(
     frames: FramesOrFiles,
     timing: SensorTiming,
@@ -330,7 +335,7 @@ def detect_vibration(
         check_whole_number("tones", tones, at_least=1)
         if tones > MAX_TONES:
             raise ValueError(f"tones must be 'auto' or 1 to {MAX_TONES}, got {tones}")
-    check_whole_number("harmonics", harmonics, at_least=1)
+    check_whole_number("harmonics", harmonics, at_least=1, at_most=MAX_HARMONICS)
     if columns is not None:
         check_whole_number("columns", columns, at_least=64)  # px; narrower bands are often registered wrongly
     bands = RegistrationOptions(registration, band_rows, band_step, search)
@@ -458,7 +463,9 @@ def _detect(
     found = method.fit(start, frames, valid, row_timing, options)
     fit, other_motion, measured = found.fit, found.other_motion, found.offsets
     starts = row_timing.frame_starts(frames.shape[1], frames.device)[:, None]
-    starts = (starts + torch.arange(frames.shape[-2], device=frames.device)[::8] * row_timing.row_time).flatten()
+    starts = (
+        starts + torch.arange(frames.shape[-2], dtype=torch.float64, device=frames.device)[::8] * row_timing.row_time
+    ).flatten()
     own_std = displacement_std(fit, starts, row_timing.exposure_time)
     fit, total_std = with_further_tones(found.measurements, fit, starts, number_is_known=options.tones is not None)
     vibration, std = vibration_of_fit(fit)
@@ -621,6 +628,7 @@ class VibrationDetector(nn.Module):
         [[111.0, 90.0], [111.0, 90.0]]
     """
 
+    @checks_arguments
     def __init__(
         self, timing: SensorTiming, *, model: Literal["tones"] = "tones", **options: Unpack[ToneOptions]
     ) -> None:
@@ -634,6 +642,7 @@ class VibrationDetector(nn.Module):
         self.timing = timing
         self.options = options
 
+    @checks_arguments
     def forward(self, frames: FramesOrFiles) -> DetectionResult:
         """Detect the vibration in a stack of frames."""
         return detect_vibration(frames, self.timing, **self.options)

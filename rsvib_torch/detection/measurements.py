@@ -262,6 +262,6 @@ def cholesky_root(information: Tensor) -> Tensor:
 def trimmed_mean(values: Tensor, *, fraction: float = 0.7) -> Tensor:
     """Mean (B, A) of the smallest ``fraction`` of values (B, N, A) without NaN; clouds may cover the other rows."""
     ordered = values.sort(dim=1).values  # NaN come last
-    count = ((~torch.isnan(values)).sum(1, keepdim=True) * fraction).ceil()
+    count = ((~torch.isnan(values)).sum(1, keepdim=True).to(torch.float32) * fraction).ceil()
     counted = torch.arange(values.shape[1], device=values.device)[None, :, None] < count
     return torch.where(counted, ordered, 0.0).sum(1) / count[:, 0].clamp(min=1)

@@ -44,10 +44,13 @@ class OtherMotion:
 
 
 _TONE_VALUES = ("amplitude", "frequency")
+_SENSITIVITY_SHAPES = {
+    f"{value}_by_{time}": "... 2 K" for time in ("row_time", "frame_rows", "exposure_rows") for value in _TONE_VALUES
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TimingSensitivity(Result):
+class TimingSensitivity(Result, shapes=_SENSITIVITY_SHAPES):
     """Relative change of amplitudes and frequencies over the relative change of a stated time.
 
     ``d ln A / d ln frame_rows = 3`` means that an amplitude becomes 3 % larger if ``frame_rows`` is stated 1 % larger
@@ -94,6 +97,7 @@ class TimingSensitivity(Result):
 class DetectionResult(
     Result,
     units={**Vibration.units, "residual": "px", "gain": "px of offset per px of displacement", "offsets": "s and px"},
+    shapes={"gain": "... 2 K", "residual": "... 2", "reliable": "... 2", "fitted": "... P N 2"},
     file_format="rsvib vibration",
 ):
     """A detected vibration with its uncertainty and verdict. Batches of stacks or windows lead all tensors.
@@ -141,6 +145,17 @@ class DetectionResult(
     sensitivity: TimingSensitivity
     assumptions: tuple[Any, ...]
     timing: SensorTiming | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        shape = tuple(self.batch_shape)
+        if (tuple(self.std.batch_shape), tuple(self.reliable.shape[:-1])) != (shape, shape):
+            raise ValueError(
+                f"vibration, std and reliable must have the same batch dimensions, got {shape}, "
+                f"{tuple(self.std.batch_shape)} and {tuple(self.reliable.shape[:-1])}"
+            )
+        if not shape and not all(isinstance(sentence, str) for sentence in self.assumptions):
+            raise TypeError("assumptions must be texts")
 
     @property
     def batch_shape(self) -> torch.Size:

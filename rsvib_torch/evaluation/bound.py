@@ -180,7 +180,8 @@ def _unexplained(place: _Places, spectra: Tensor, u: Tensor) -> Tensor:
     band[:, 0] += _RIDGE * band[:, 0].real.amax()
     solution = solve_banded(band, right)
     explained = sum(
-        (kernels[:, i, None] * solution[base + i] for i in range(reach)), start=torch.zeros((), dtype=rows.dtype)
+        (kernels[:, i, None] * solution[base + i] for i in range(reach)),
+        start=torch.zeros((), dtype=rows.dtype, device="cpu"),
     )
     residual: Tensor = (rows - explained).transpose(0, 1).unflatten(1, place.first.shape)
     return residual
@@ -235,7 +236,9 @@ def gradient_information(recording: Recording, noise: float | None = None) -> Te
     products = _gradient_products(recording.scene, window.double(), noise, count)  # (S, 2, 2)
     times, weights = (value.to(begin.device) for value in exposure_nodes(timing, "gauss", 8))
     means = recording.sensitivity(moments[..., None] + times) @ weights  # over the exposures, (P, S, T)
-    sensitivity = means[..., None] * functional.one_hot(torch.tensor(recording.axes), 2).to(means)[:, None, None]
+    sensitivity = (
+        means[..., None] * functional.one_hot(torch.tensor(recording.axes, device="cpu"), 2).to(means)[:, None, None]
+    )
     mean = (seen[..., None] * sensitivity).sum(2, keepdim=True) / seen.sum(1).clamp(min=1e-300)[:, None, None]
     shared = seen * ((seen > 0).sum(1, keepdim=True) > 1)
     relative = sensitivity - mean

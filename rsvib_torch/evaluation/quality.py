@@ -6,6 +6,7 @@ import torch
 from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.frames.arrays import FramesLike, as_tensor
 
@@ -50,6 +51,7 @@ def _per_image(values: Tensor, image: FramesLike) -> Tensor:
     return values.reshape(shape[: -3 if len(shape) >= 4 else -2])
 
 
+@checks_arguments
 def psnr(image: FramesLike, reference: FramesLike, data_range: float, *, rim: int = 0) -> Tensor:
     """Peak signal-to-noise ratio of each image.
 
@@ -79,6 +81,7 @@ def psnr(image: FramesLike, reference: FramesLike, data_range: float, *, rim: in
     return _per_image(10.0 * torch.log10(data_range**2 / error), image)
 
 
+@checks_arguments
 def ssim(image: FramesLike, reference: FramesLike, data_range: float, *, rim: int = 0) -> Tensor:
     """Structural similarity of each image (Wang et al. 2004).
 
@@ -118,6 +121,7 @@ def ssim(image: FramesLike, reference: FramesLike, data_range: float, *, rim: in
     return _per_image(similarity[0].unflatten(0, first.shape[:2]).flatten(1).mean(1, dtype=torch.float64), image)
 
 
+@checks_arguments
 def offset_endpoint_error(
     measured: Tensor, truth: Tensor, *, reduction: Literal["mean", "rms", "none"] = "mean"
 ) -> Tensor:

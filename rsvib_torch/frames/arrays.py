@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rsvib_torch.core.arguments import check_tensor
 from rsvib_torch.core.checks import check_choice
 
 __all__ = ["ArrayLike", "Channels", "FramesLike", "as_tensor", "channel_axis", "channels_appear_last"]
@@ -29,7 +30,8 @@ def as_tensor(name: str, value: object) -> Tensor:
         value: The value.
 
     Raises:
-        TypeError: If the value is a masked array, a sparse tensor or does not consist of numbers.
+        TypeError: If the value is a masked array, a sparse, nested, quantised, complex or meta tensor, or does not
+            consist of numbers.
         ValueError: If the tensors or arrays of a list differ in shape, dtype or device.
 
     Example:
@@ -39,9 +41,7 @@ def as_tensor(name: str, value: object) -> Tensor:
         torch.Size([2, 4, 5])
     """
     if isinstance(value, Tensor):
-        if value.layout != torch.strided:
-            raise TypeError(f"{name} must be a dense tensor, got one of layout {value.layout}; pass {name}.to_dense()")
-        return value
+        return check_tensor(name, value)
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError(f"{name} must not be a masked array; pass its data, and the mask as ignore=")
     if isinstance(value, (list, tuple)) and any(isinstance(item, (list, tuple)) or _is_array(item) for item in value):
@@ -52,7 +52,7 @@ def as_tensor(name: str, value: object) -> Tensor:
             native = array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
             unsupported = any(stride < 0 or stride % native.itemsize for stride in native.strides)
             return torch.from_numpy(native.copy() if unsupported or not native.flags.writeable else native)
-        return torch.as_tensor(value)
+        return check_tensor(name, torch.as_tensor(value, device="cpu"))
     except (TypeError, ValueError, RuntimeError) as error:
         kind = f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
         files = isinstance(value, (str, os.PathLike)) or (

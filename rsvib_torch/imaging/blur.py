@@ -8,6 +8,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.splines import bspline_coefficients, bspline_coefficients_adjoint, mirrored
 from rsvib_torch.imaging.psf import RowPSF
@@ -126,6 +127,7 @@ class RowVaryingBlur(nn.Module):
     first_tap: Tensor
     weights: Tensor
 
+    @checks_arguments
     def __init__(
         self,
         psf: RowPSF,
@@ -148,18 +150,23 @@ class RowVaryingBlur(nn.Module):
         """The kernels."""
         return RowPSF(self.first_tap, self.weights, self.degree)
 
+    @checks_arguments
     def forward(self, scene: Tensor) -> Tensor:
         """Form frames (..., R, W) from a scene (..., Hs, Ws)."""
+        check_shapes({"scene": scene}, {"scene": "... H W"})
         return blur_rows(scene, self.psf, frame_width=self.frame_width, origin=self.origin)
 
+    @checks_arguments
     def adjoint(self, frames: Tensor, scene_shape: tuple[int, ...]) -> Tensor:
         """Apply the exact adjoint to frames (..., R, W)."""
         return blur_rows_adjoint(frames, self.psf, scene_shape, origin=self.origin)
 
+    @checks_arguments
     def A(self, x: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
         """``forward`` under the name that solvers use; their further keywords are ignored."""
         return self(x)  # type: ignore[no-any-return]
 
+    @checks_arguments
     def A_adjoint(self, y: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
         """``adjoint`` for scenes with the leading dimensions of the frames and ``scene_size``."""
         size = (y.shape[-2], y.shape[-1]) if self.scene_size is None else self.scene_size

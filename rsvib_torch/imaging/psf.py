@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.splines import bspline_weights, spread_taps
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
@@ -71,6 +72,7 @@ def _axis_weights(displacement: Tensor, degree: int) -> tuple[Tensor, Tensor]:
     return first - degree // 2, weights
 
 
+@checks_arguments
 def row_psf(
     vibration: Motion,
     starts: Tensor,
@@ -104,6 +106,8 @@ def row_psf(
         >>> psf.weights.shape[:2]
         torch.Size([2, 512])
     """
+    if not starts.numel() or not bool(torch.isfinite(starts).all()):
+        raise ValueError(f"starts must be finite times of at least one row (seconds), got shape {tuple(starts.shape)}")
     displacement, node_weights = exposure_trajectory(vibration, starts, timing, quadrature, num_nodes)
     return trajectory_psf(displacement, node_weights, interpolation=interpolation)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import check_broadcast, check_shapes, checks_arguments
 from rsvib_torch.core.checks import check_number, check_whole_number
 
 __all__ = ["Optics", "SensorNoise"]
@@ -40,8 +41,10 @@ class Optics:
             check_number("cutoff", self.cutoff, above=0.0)
         check_number("pixel", self.pixel, at_least=0.0)
 
+    @checks_arguments
     def transfer(self, u: Tensor, v: Tensor) -> Tensor:
         """Transfer function at horizontal and vertical frequencies in cycles/px, in their broadcast shape."""
+        check_broadcast(u=u, v=v)
         squared = u.square() + v.square()
         transfer = torch.exp(-2 * (math.pi * self.sigma) ** 2 * squared)
         if self.cutoff is not None:
@@ -49,6 +52,7 @@ class Optics:
             transfer = transfer * (2 / math.pi) * (s.arccos() - s * (1 - s.square()).sqrt())
         return transfer * torch.sinc(self.pixel * u) * torch.sinc(self.pixel * v)
 
+    @checks_arguments
     def apply(self, scene: Tensor) -> Tensor:
         """Scene (..., H, W) as imaged by the optics, with mirrored boundaries; same shape and dtype.
 
@@ -57,6 +61,7 @@ class Optics:
         """
         if not isinstance(scene, Tensor) or not scene.dtype.is_floating_point:
             raise TypeError("scene must be a floating-point tensor (..., H, W)")
+        check_shapes({"scene": scene}, {"scene": "... H W"})
         height, width = scene.shape[-2:]
         mirrored = torch.cat([scene, scene.flip(-1)], dim=-1)
         mirrored = torch.cat([mirrored, mirrored.flip(-2)], dim=-2)
@@ -100,14 +105,13 @@ class SensorNoise:
         if self.full_well is not None:
             check_number("full_well", self.full_well, above=0.0)
         check_number("read_noise", self.read_noise, at_least=0.0)
-        if self.bits is not None:
-            if isinstance(self.bits, bool) or self.bits != math.floor(self.bits):
-                raise TypeError(f"bits must be a whole number, got {self.bits!r}")
-            check_number("bits", self.bits, at_least=1, at_most=32)
+        if self.bits is not None and not check_number("bits", self.bits, at_least=1, at_most=32).is_integer():
+            raise TypeError(f"bits must be a whole number, got {self.bits!r}")
         for name in ("gain_spread", "column_offset", "row_offset"):
             check_number(name, getattr(self, name), at_least=0.0, at_most=1.0)
         check_whole_number("pattern_seed", self.pattern_seed, at_least=0)
 
+    @checks_arguments
     def fixed_pattern(self, height: int, width: int) -> tuple[Tensor, Tensor]:
         """Gain and offset of every pixel, float64 (height, width), the same in every call.
 
@@ -115,13 +119,16 @@ class SensorNoise:
             height: Rows of the sensor.
             width: Columns of the sensor.
         """
-        generator = torch.Generator().manual_seed(self.pattern_seed)
+        for name, size in (("height", height), ("width", width)):
+            check_whole_number(name, size, at_least=1, at_most=10**6)
+        generator = torch.Generator(device="cpu").manual_seed(self.pattern_seed)
         columns, rows, pixels = (
-            torch.randn(shape, generator=generator, dtype=torch.float64)
+            torch.randn(shape, generator=generator, dtype=torch.float64, device="cpu")
             for shape in ((1, width), (height, 1), (height, width))
         )
         return 1 + self.gain_spread * pixels, self.column_offset * columns + self.row_offset * rows
 
+    @checks_arguments
     def apply(self, frames: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return noisy frames of the same shape and dtype.
 

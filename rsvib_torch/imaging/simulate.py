@@ -8,6 +8,7 @@ import math
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
@@ -28,6 +29,7 @@ _MARGIN = 16
 _CHUNK_ROWS = 64  # rows of all frames that are formed at once
 
 
+@checks_arguments
 def simulate_frames(
     scene: ArrayLike,
     timing: SensorTiming,

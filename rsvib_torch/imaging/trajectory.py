@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_choice
+from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
@@ -53,12 +53,14 @@ def exposure_nodes(
         Times in seconds and weights that sum to 1, both float64 of shape (N,).
     """
     check_choice("quadrature", quadrature, ("midpoint", "gauss"))
+    if num_nodes is not None:
+        check_whole_number("num_nodes", num_nodes, at_least=1, at_most=10_000)  # as many rows as an exposure has
     if quadrature == "gauss":
         nodes, weights = gauss_legendre(4 if num_nodes is None else num_nodes)
         return nodes * timing.exposure_time, weights
     count = math.ceil(timing.exposure_rows - 1e-9) if num_nodes is None else num_nodes
-    times = (torch.arange(count, dtype=torch.float64) + 0.5) / count * timing.exposure_time
-    return times, torch.full((count,), 1.0 / count, dtype=torch.float64)
+    times = (torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count * timing.exposure_time
+    return times, torch.full((count,), 1.0 / count, dtype=torch.float64, device="cpu")
 
 
 def exposure_trajectory(

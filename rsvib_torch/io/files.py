@@ -12,7 +12,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.atomic import check_writable, make_folder, move_into_place, sync_tree, temporary_folder
+from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.atomic import (
+    check_name,
+    check_writable,
+    make_folder,
+    move_into_place,
+    sync_tree,
+    temporary_folder,
+)
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.outputs import check_outputs
@@ -71,6 +79,7 @@ for _form in (
     register_format(_form)
 
 
+@checks_arguments
 def open_stack(path: PathLike) -> FrameReader:
     """Open a stack to read its frames one at a time; call ``close`` on the result.
 
@@ -109,6 +118,7 @@ def open_stack(path: PathLike) -> FrameReader:
     return reader
 
 
+@checks_arguments
 def read_stack_info(path: PathLike) -> StackInfo:
     """Read shape, data type and full scale of a stack without its pixels.
 
@@ -139,6 +149,7 @@ def read_stack_info(path: PathLike) -> StackInfo:
     return reader.info
 
 
+@checks_arguments
 def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None = None) -> Tensor:
     """Read a stack of frames from a file, or from several files one after another.
 
@@ -295,6 +306,7 @@ def check_info_target(
         compression: As in ``write_stack``.
         check_folder: Whether to check that the folder exists and is writable.
     """
+    check_name(path)
     form = target_format(path)
     if not form.writable:
         raise ValueError(
@@ -430,6 +442,7 @@ def _counted(pixels: NDArray[Any]) -> Iterator[NDArray[Any]]:
         advance()
 
 
+@checks_arguments
 def write_stack(
     path: PathLike,
     frames: FramesLike,

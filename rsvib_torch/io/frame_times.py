@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.motion.timing import SensorTiming
 
@@ -177,6 +178,7 @@ def timing_of_stack(timing: SensorTiming, info: StackInfo) -> SensorTiming:
     return replace(timing, frame_start_times=times)
 
 
+@checks_arguments
 def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTiming:
     """The timing of a stack: the sensor, with the frame times of the file relative to the first frame.
 

@@ -1,5 +1,6 @@
 """Frames in PNG files: decoding, encoding, and what the file states."""
 
+import math
 import struct
 import zlib
 from dataclasses import replace
@@ -86,10 +87,70 @@ def png_info(path: Path) -> StackInfo:
     return replace(_info(chunks, path.stat().st_size, path), **exif_fields(chunks.get(b"eXIf", b"")))
 
 
+# Bit depths of each colour type.
+_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
+# First column, first row and steps of the passes of an interlaced image (Adam7).
+_PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+
+
+def _checked_pixels(data: bytes, chunks: dict[bytes, bytes], path: Path) -> bytes:
+    """The file with the chunks that decoding needs; a ``ValueError`` where libpng would print a message.
+
+    OpenCV decodes with libpng, which prints warnings and errors to the terminal.
+    """
+    width, height, bits, colour, compression, filtering, interlaced = struct.unpack(">IIBBBBB", chunks[b"IHDR"])
+    palette, transparent = chunks.get(b"PLTE", b""), chunks.get(b"tRNS")
+    sizes = {0: range(2, 3), 2: range(6, 7), 3: range(1, len(palette) // 3 + 1)}  # of tRNS
+    if bits not in _DEPTHS.get(colour, ()) or compression or filtering or interlaced > 1:
+        raise ValueError(f"{path}: damaged PNG file (header)")
+    if len(palette) % 3 or (colour == 3 and not 3 <= len(palette) <= 3 << bits):
+        raise ValueError(f"{path}: damaged PNG file (palette)")
+    if transparent is not None and len(transparent) not in sizes.get(colour, ()):
+        raise ValueError(f"{path}: damaged PNG file (transparency)")
+    passes = _PASSES if interlaced else ((0, 0, 1, 1),)
+    samples = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}[colour]
+    rows = [
+        (math.ceil((height - top) / down), 1 + math.ceil(math.ceil((width - left) / right) * bits * samples / 8))
+        for left, top, right, down in passes
+        if left < width and top < height
+    ]
+    unpacking, size = zlib.decompressobj(), sum(count * stride for count, stride in rows)
+    pixels = _bodies(data, b"IDAT")
+    try:
+        filtered = np.frombuffer(unpacking.decompress(pixels, size + 1), np.uint8)
+    except zlib.error as error:
+        raise ValueError(f"{path}: damaged PNG file (pixels: {error})") from error
+    if len(filtered) != size or not unpacking.eof:
+        raise ValueError(f"{path}: damaged PNG file (the pixels do not fill {width} x {height} px)")
+    for count, stride in rows:
+        if filtered[: count * stride : stride].max() > 4:
+            raise ValueError(f"{path}: damaged PNG file (unknown filter of a row)")
+        filtered = filtered[count * stride :]
+    parts = [_chunk(b"IHDR", chunks[b"IHDR"])]
+    parts += [_chunk(b"PLTE", palette)] if colour == 3 else []
+    parts += [] if transparent is None else [_chunk(b"tRNS", transparent)]
+    return b"".join([data[:8], *parts, _chunk(b"IDAT", pixels), _chunk(b"IEND", b"")])
+
+
+def _bodies(data: bytes, kind: bytes) -> bytes:
+    """The bodies of all chunks of a type in a file whose chunks were verified."""
+    bodies, start = [], 8
+    while start < len(data):
+        length = struct.unpack(">I", data[start : start + 4])[0]
+        if data[start + 4 : start + 8] == kind:
+            bodies.append(data[start + 8 : start + 8 + length])
+        start += 12 + length
+        if data[start - 8 - length : start - 4 - length] == b"IEND":
+            break
+    return b"".join(bodies)
+
+
 def decode_png(path: Path) -> NDArray[Any]:
     """Pixels of a PNG file, (H, W) or (C, H, W) with channels RGB or RGBA."""
     data = path.read_bytes()
-    _info(_chunks(data, path, b"IEND"), len(data), path)
+    chunks = _chunks(data, path, b"IEND")
+    _info(chunks, len(data), path)
+    data = _checked_pixels(data, chunks, path)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:

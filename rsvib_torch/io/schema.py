@@ -7,7 +7,7 @@ stands for a value that is unknown or not finite.
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Protocol, Self, runtime_checkable
 
 import torch
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
@@ -40,7 +40,7 @@ def _to_tensor(values: Any, missing: float) -> Tensor:
     def filled(value: Any) -> Any:
         return [filled(part) for part in value] if isinstance(value, list) else missing if value is None else value
 
-    return torch.tensor(filled(values), dtype=torch.float64)
+    return torch.tensor(filled(values), dtype=torch.float64, device="cpu")
 
 
 class TimingRecord(Section):
@@ -141,6 +141,7 @@ class StdRecord(Section):
         )
 
 
+@runtime_checkable
 class Detection(Protocol):
     """The attributes of ``DetectedVibration``; a ``DetectionResult`` that is not a batch has them as well."""
 
@@ -245,7 +246,7 @@ class DetectionRecord(Section):
             std,
             _to_tensor(self.gain, math.nan),
             _to_tensor(self.residual, math.nan),
-            torch.tensor(self.reliable),
+            torch.tensor(self.reliable, device="cpu"),
             tuple(tuple(axis) for axis in self.reasons),
             tuple(self.assumptions),
         )

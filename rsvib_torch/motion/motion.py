@@ -8,6 +8,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import check_broadcast, checks_arguments
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.motion.timing import SensorTiming
 
@@ -110,6 +111,7 @@ class Motion(Result, ABC):
         """
         return self.displacement(starts.to(dtype=torch.float64, device=self.device)[..., None] + delays)
 
+    @checks_arguments
     def offset(self, starts: Tensor, later_starts: Tensor, exposure_time: float) -> Tensor:
         """Offset: mean displacement of the later exposure minus that of the earlier one, in px (Eq. 4).
 
@@ -123,13 +125,15 @@ class Motion(Result, ABC):
         Returns:
             float64 tensor of shape (S, axes).
         """
+        check_broadcast(starts=starts, later_starts=later_starts)
         return self.mean_displacement(later_starts, exposure_time) - self.mean_displacement(starts, exposure_time)
 
+    @checks_arguments
     def largest_displacement(self, first: float, last: float) -> Tensor:
         """Bound on ``|D(t)|`` for ``first <= t <= last``, (..., axes), in px."""
         longest = max(abs(first), abs(last))
         # a quadratic without constant term is largest at one of the ends of a symmetric interval
-        ends = torch.tensor([-longest, longest], dtype=torch.float64).expand(*self.batch_shape, 2)
+        ends = torch.tensor([-longest, longest], dtype=torch.float64, device="cpu").expand(*self.batch_shape, 2)
         return self.largest_oscillation() + self.drift(ends).detach().abs().amax(-2)
 
     def moving_axes(self) -> Tensor:
@@ -142,6 +146,7 @@ class Motion(Result, ABC):
         """
         return self.largest_displacement(-1.0, 1.0) > 0
 
+    @checks_arguments
     def to_row_order(self, timing: SensorTiming) -> Self:
         """The motion, given in image axes, as it appears in frames in row order.
 
@@ -151,6 +156,7 @@ class Motion(Result, ABC):
         order, signs = self._row_axes(timing)
         return self.with_axes(order, signs)
 
+    @checks_arguments
     def from_row_order(self, timing: SensorTiming) -> Self:
         """The motion, given in row order, in image axes: the inverse of ``to_row_order``."""
         order, signs = self._row_axes(timing)
@@ -169,14 +175,23 @@ class Motion(Result, ABC):
             signs[2] = (-1.0) ** reflections
         return order, signs
 
+    def _check_axes(self, order: Sequence[int], signs: Sequence[float]) -> None:
+        """Raise a ``ValueError`` unless ``order`` is a permutation of the axes and ``signs`` are 1 or -1."""
+        if sorted(order) != list(range(self.num_axes)):
+            raise ValueError(f"order must be a permutation of {list(range(self.num_axes))}, got {list(order)}")
+        if len(signs) != self.num_axes or any(sign not in (1, -1) for sign in signs):
+            raise ValueError(f"signs must be {self.num_axes} values of 1 or -1, got {list(signs)}")
+
     def detached(self) -> Self:
         """The same motion without gradients."""
         return self.mapped(Tensor.detach)
 
+    @checks_arguments
     def expanded(self, size: int) -> Self:
         """A batch of ``size`` copies of the motion; the new dimension is the first."""
         return self.mapped(lambda values: values.expand(size, *values.shape))
 
+    @checks_arguments
     def __getitem__(self, index: int) -> Self:
         """One motion of a batch."""
         if not self.batch_shape:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.option_types import MotionUnit, TimeUnit
 from rsvib_torch.core.reading import check_regular
@@ -33,6 +34,7 @@ _COLUMNS = ("time", "x", "y")
 Array = NDArray[np.float64]
 
 
+@checks_arguments
 def read_motion(
     path: str | os.PathLike[str],
     *,

@@ -9,14 +9,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import as_numbers, checks_arguments
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import axis_head, axis_rows
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, gauss_legendre
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME
 from rsvib_torch.motion.vibration import TensorLike, Vibration
 
 __all__ = ["FreeMotion"]
+
+MAX_DISPLACEMENT = 1e9  # px; image motion of 1e5 px/s for three hours
+MAX_EXPOSURE_NODES = 10_000  # times; an exposure of 1 s of a gyroscope with 5 kHz
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,8 +55,9 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
     spacing: float
     tones: Vibration
 
+    @checks_arguments
     def __init__(self, coefficients: TensorLike, start: float, spacing: float, tones: Vibration | None = None) -> None:
-        values = torch.as_tensor(coefficients, dtype=torch.float64)
+        values = as_numbers("coefficients", coefficients)
         if values.ndim < 2 or not 2 <= values.shape[-2] <= 4 or values.shape[-1] < 4:
             raise ValueError(
                 "coefficients must have shape (..., 2, N) with N >= 4 (3 for x, y, roll; 4 for x, y, roll, zoom), got "
@@ -59,6 +65,9 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
             )
         if not bool(torch.isfinite(values).all()):
             raise ValueError("coefficients must be finite")
+        if float(values.detach().abs().max()) > MAX_DISPLACEMENT:
+            largest = float(values.detach().abs().max())
+            raise ValueError(f"coefficients must be at most {MAX_DISPLACEMENT:g} px, got {largest:g}")
         axes = values.shape[-2]
         tones = (
             Vibration.still(values.shape[:-2], values.device, axes=axes) if tones is None else tones.to(values.device)
@@ -69,19 +78,21 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
                 f"{tuple(values.shape)}"
             )
         object.__setattr__(self, "coefficients", values)
-        object.__setattr__(self, "start", check_number("start", start))
-        object.__setattr__(self, "spacing", check_number("spacing", spacing, above=0.0))
+        object.__setattr__(
+            self, "start", check_number("start", start, at_least=-MAX_START_TIME, at_most=MAX_START_TIME)
+        )
+        object.__setattr__(self, "spacing", check_number("spacing", spacing, at_least=MIN_ROW_TIME))
         object.__setattr__(self, "tones", tones)
 
     @classmethod
+    @checks_arguments
     def through(cls, times: TensorLike, displacement: TensorLike, tones: Vibration | None = None) -> "FreeMotion":
         """The motion that passes through displacements (N, A) in px at evenly spaced times (N,) in seconds.
 
         Raises:
             ValueError: If times are not evenly spaced and increasing, or shapes do not fit.
         """
-        grid = torch.as_tensor(times, dtype=torch.float64)
-        values = torch.as_tensor(displacement, dtype=torch.float64)
+        grid, values = as_numbers("times", times), as_numbers("displacement", displacement)
         _check_samples(grid, values)
         steps = grid.diff()
         spacing = float(steps.mean())
@@ -94,6 +105,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         return cls(coefficients[:, len(grid) - 2 : 2 * len(grid)], float(grid[0]), spacing, tones)
 
     @classmethod
+    @checks_arguments
     def from_samples(
         cls,
         times: TensorLike,
@@ -112,8 +124,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         """
         from scipy.interpolate import CubicSpline  # noqa: PLC0415
 
-        grid = torch.as_tensor(times, dtype=torch.float64).cpu()
-        values = torch.as_tensor(displacement, dtype=torch.float64).cpu()
+        grid, values = as_numbers("times", times).cpu(), as_numbers("displacement", displacement).cpu()
         _check_samples(grid, values)
         steps = np.diff(grid.numpy())
         if (steps <= 0).any():
@@ -125,6 +136,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         return cls.through(torch.from_numpy(even), torch.from_numpy(interpolated), tones)
 
     @classmethod
+    @checks_arguments
     def stacked(cls, motions: Sequence["FreeMotion"]) -> "FreeMotion":
         """Motions with the same knots and number of tones as a batch; the new dimension is the first."""
         first = motions[0]
@@ -202,6 +214,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         count = self.coefficients.shape[-1]
         return self.start + self.spacing * (torch.arange(count, dtype=torch.float64, device=self.device) - 1.0)
 
+    @checks_arguments
     def retimed(self, offset: float, scale: float = 1.0, gain: tuple[float, float] = (1.0, 1.0)) -> "FreeMotion":
         """The motion on another clock: ``gain D(scale t + offset)`` at time t.
 
@@ -224,8 +237,10 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         rest = (self.coefficients + moved[..., None]) * size[:, None]
         return FreeMotion(rest, (self.start - offset) / scale, self.spacing / scale, tones)
 
+    @checks_arguments
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The motion whose component k is ``signs[k]`` (1 or -1) times component ``order[k]`` of this motion."""
+        self._check_axes(order, signs)
         coefficients = self.coefficients[..., list(order), :] * self.coefficients.new_tensor(signs)[:, None]
         return type(self)(coefficients, self.start, self.spacing, self.tones.with_axes(order, signs))
 
@@ -234,7 +249,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         batch = self.batch_shape
         knots = self.coefficients.shape[-1]
         place = ((times - self.start) / self.spacing).clamp(0.0, knots - 3.0)
-        cell = place.detach().floor().clamp(max=knots - 4.0)
+        cell = place.detach().nan_to_num(0.0).floor().clamp(max=knots - 4.0)  # times that are NaN have NaN results
         index = cell.to(torch.int64)[..., None] + torch.arange(4, device=times.device)
         if not batch:
             return self.coefficients.movedim(-2, -1)[index].movedim(-1, -2), place - cell
@@ -243,6 +258,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         picked = self.coefficients.gather(-1, flat).unflatten(-1, index.shape[len(batch) :])
         return picked.movedim(len(batch), -2), (place - cell).expand(index.shape[:-1])
 
+    @checks_arguments
     def rest(self, times: Tensor) -> Tensor:
         """R(t) alone in px; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
@@ -250,14 +266,17 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         value: Tensor = (taps * bspline_weights(fraction, 3)[..., None, :]).sum(-1)
         return value
 
+    @checks_arguments
     def drift(self, times: Tensor) -> Tensor:
         """Displacement of the image motion alone in px; arguments and shapes as in ``displacement``."""
         return self.tones.drift(times)
 
+    @checks_arguments
     def displacement(self, times: Tensor) -> Tensor:
         """Displacement D(t) in px; arguments and shapes as in ``Vibration.displacement``."""
         return self.tones.displacement(times) + self.rest(times)
 
+    @checks_arguments
     def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
         """Mean displacement over exposures in px; arguments and shapes as in ``Vibration.mean_displacement``.
 
@@ -266,11 +285,18 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         starts = starts.to(dtype=torch.float64, device=self.device)
         mean = self.tones.mean_displacement(starts, exposure_time)
         longest = float(exposure_time.amax()) if isinstance(exposure_time, Tensor) else exposure_time
-        nodes, weights = gauss_legendre(3 + math.ceil(2 * longest / self.spacing))
+        count = 3 + math.ceil(2 * longest / self.spacing)
+        if count > MAX_EXPOSURE_NODES:
+            raise ValueError(
+                f"exposure_time={longest:g} s contains {longest / self.spacing:.3g} knots of the motion, at most "
+                f"{MAX_EXPOSURE_NODES // 2} can be averaged; check its unit (seconds)"
+            )
+        nodes, weights = gauss_legendre(count)
         for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
             mean = mean + weight * self.rest(starts + node * exposure_time)
         return mean
 
+    @checks_arguments
     def velocity(self, times: Tensor) -> Tensor:
         """Velocity dD/dt in px/s; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
@@ -287,11 +313,13 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         """Bound on the tones and the spline, (..., 2), in px: the sum of amplitudes and the largest coefficient."""
         return self.tones.largest_oscillation() + self.coefficients.detach().abs().amax(-1)
 
+    @checks_arguments
     def displacement_within(self, duration: float) -> Tensor:
         """Bound on the displacement between two times ``duration`` seconds apart, (..., 2), in px."""
         speed = self.coefficients.detach().diff(dim=-1).abs().amax(-1) / self.spacing
         return self.tones.displacement_within(duration) + speed * duration
 
+    @checks_arguments
     def periods_within(self, duration: float) -> Tensor:
         """Periods of the fastest tone in ``duration`` seconds, (..., 2)."""
         return self.tones.periods_within(duration)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.core.checks import check_choice, check_number, check_whole_number, described
 
 if TYPE_CHECKING:
     import torch
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["RowTiming", "SensorTiming", "check_timing"]
 
+MIN_ROW_TIME = 1e-9  # s; the fastest sensors read a row in 0.1 us
+MAX_FRAMES, MAX_ROWS = 10**8, 10**6  # 40 days of a camera with 30 frames/s; the largest sensors have 3e4 rows
+MAX_START_TIME = 1e10  # s; clocks that count from 1970 read 1.8e9 s, to 2e-7 s in float64
 _SCAN_AXES: dict[object, int] = {-2: -2, "y": -2, -1: -1, "x": -1}
 
 
@@ -67,6 +70,8 @@ class SensorTiming:
 
     def __post_init__(self) -> None:
         row_time = check_number("row_time", self.row_time, above=0.0)
+        if row_time < MIN_ROW_TIME:
+            raise ValueError(f"row_time={row_time:g} s is shorter than 1 ns; row_time is in seconds")
         if row_time > 10e-3:
             raise ValueError(
                 f"row_time={row_time:g} s is longer than 10 ms; row_time is in seconds "
@@ -84,18 +89,22 @@ class SensorTiming:
                 f"exposure_rows={exposure_rows:g} exceeds the frame period of frame_rows={frame_rows:g} row times: "
                 f"exposure {exposure_rows * row_time:.4g} s, frame period {frame_rows * row_time:.4g} s"
             )
-        if isinstance(self.scan_axis, bool) or self.scan_axis not in _SCAN_AXES:
-            raise ValueError(f"scan_axis must be -2 ('y') or -1 ('x'), got {self.scan_axis!r}")
+        if type(self.scan_axis) not in (int, str) or self.scan_axis not in _SCAN_AXES:
+            raise ValueError(f"scan_axis must be -2 ('y') or -1 ('x'), got {described(self.scan_axis)}")
         check_choice("readout_direction", self.readout_direction, ("forward", "reverse"))
         object.__setattr__(self, "row_time", row_time)
         object.__setattr__(self, "exposure_rows", exposure_rows)
         object.__setattr__(self, "frame_rows", frame_rows)
         object.__setattr__(self, "scan_axis", _SCAN_AXES[self.scan_axis])
         if self.frame_start_times is not None:
-            import torch  # noqa: PLC0415
+            from rsvib_torch.core.arguments import as_numbers  # noqa: PLC0415
 
-            times = torch.as_tensor(self.frame_start_times, dtype=torch.float64).flatten().tolist()
+            times = as_numbers("frame_start_times", self.frame_start_times).flatten().tolist()
             starts = tuple(check_number("frame_start_times", start) for start in times)
+            if starts and max(abs(starts[0]), abs(starts[-1])) > MAX_START_TIME:
+                raise ValueError(
+                    f"frame_start_times must be at most {MAX_START_TIME:g} s, got {starts[0]:g} ... {starts[-1]:g} s"
+                )
             if any(later <= earlier for earlier, later in itertools.pairwise(starts)):
                 raise ValueError("frame_start_times must be strictly increasing (seconds)")
             object.__setattr__(self, "frame_start_times", starts)
@@ -124,8 +133,9 @@ class SensorTiming:
             [0.0, 0.04]
         """
         lines = check_whole_number("num_lines", num_lines, at_least=1)
-        if len(delays) < 2:
-            raise ValueError(f"delays must have at least two entries, got {list(delays)}")
+        check_number("exposure_lines", exposure_lines, above=0.0)
+        if not isinstance(delays, Sequence) or len(delays) < 2:
+            raise ValueError(f"delays must have at least two entries, got {described(delays)}")
         return cls(
             row_time=line_time,
             exposure_rows=exposure_lines,
@@ -159,8 +169,12 @@ class SensorTiming:
         """
         import torch  # noqa: PLC0415
 
+        from rsvib_torch.core.arguments import check_device  # noqa: PLC0415
+
+        count = check_whole_number("num_frames", num_frames, at_least=0, at_most=MAX_FRAMES)
+        device = check_device("device", "cpu" if device is None else device)
         if self.frame_start_times is None:
-            return torch.arange(num_frames, dtype=torch.float64, device=device) * self.frame_period
+            return torch.arange(count, dtype=torch.float64, device=device) * self.frame_period
         if len(self.frame_start_times) < num_frames:
             raise ValueError(f"frame_start_times has {len(self.frame_start_times)} entries for {num_frames} frames")
         return torch.tensor(self.frame_start_times[:num_frames], dtype=torch.float64, device=device)
@@ -173,11 +187,14 @@ class SensorTiming:
         """
         import torch  # noqa: PLC0415
 
-        rows = torch.arange(num_rows, dtype=torch.float64, device=device)
-        return self.frame_starts(num_frames, device)[:, None] + rows * self.row_time
+        starts = self.frame_starts(num_frames, device)
+        count = check_whole_number("num_rows", num_rows, at_least=0, at_most=MAX_ROWS)
+        rows = torch.arange(count, dtype=torch.float64, device=starts.device)
+        return starts[:, None] + rows * self.row_time
 
     def check_rows(self, num_rows: int) -> None:
         """Raise a ``ValueError`` if a frame of this sensor has fewer row times than ``num_rows``."""
+        check_whole_number("num_rows", num_rows, at_least=0, at_most=MAX_ROWS)
         if self.frame_rows < num_rows:
             raise ValueError(
                 f"frame_rows={self.frame_rows:g} is less than the {num_rows} rows of the frames; it is the number of "

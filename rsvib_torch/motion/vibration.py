@@ -3,12 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.arguments import as_numbers, check_broadcast, checks_arguments
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.motion.motion import Motion
@@ -27,19 +29,22 @@ _UNITS = {
 _COLUMNS = {"amplitude": ("px", 1.0), "frequency": ("Hz", 1.0), "period": ("ms", 1e3), "phase": ("rad", 1.0)}
 _QUANTITIES = ("amplitude", "frequency", "phase")
 
-TensorLike = Tensor | float | Sequence[float] | Sequence[Sequence[float]]
+# Largest values: beyond the largest image, the fastest row, and what float64 angles and positions resolve.
+_LIMITS = {"amplitude": 1e6, "frequency": 1e9, "phase": 1e9, "image_motion": 1e9, "image_acceleration": 1e12}
+
+TensorLike = Tensor | NDArray[Any] | float | Sequence[float] | Sequence[Sequence[float]]
 
 
 def _per_tone(values: dict[str, TensorLike], device: torch.device | None) -> list[Tensor]:
     """Convert floats, (A,), (A, K) or (..., A, K) values to (..., A, K) float64 tensors with the same number A."""
     tensors, axes = {}, 0
     for name, value in values.items():
-        tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
+        tensor = as_numbers(name, value, device)
         tensors[name] = tensor if tensor.ndim == 0 else tensor[:, None] if tensor.ndim == 1 else tensor
         if tensor.ndim == 0:
             continue
         count = tensors[name].shape[-2]
-        if not 2 <= count <= 4 or axes not in (0, count):
+        if not 2 <= count <= 4 or tensors[name].shape[-1] == 0 or axes not in (0, count):
             others = "" if axes in (0, count) else f"; the other values have {axes} axes"
             raise ValueError(
                 f"{name} must have shape (2,), (2, K) or (..., 2, K) for axes (x, y), with 3 for (x, y, roll) and 4 "
@@ -51,7 +56,7 @@ def _per_tone(values: dict[str, TensorLike], device: torch.device | None) -> lis
 
 def _per_axis(name: str, value: TensorLike, axes: int, device: torch.device | None) -> Tensor:
     """Convert a float, (2,) or (..., 2) value, or one with all axes, to a (..., A) float64 tensor."""
-    tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
+    tensor = as_numbers(name, value, device)
     tensor = tensor.expand(2) if tensor.ndim == 0 else tensor
     if tensor.shape[-1] not in (2, axes):
         raise ValueError(
@@ -66,15 +71,20 @@ def _with_trailing(value: float | Tensor, dimensions: int) -> float | Tensor:
 
 
 def _check_values(values: dict[str, Tensor]) -> None:
-    """Raise a ValueError for values that are not finite, and for negative amplitudes or frequencies."""
+    """Raise a ValueError for values that are not finite or too large, and for negative amplitudes or frequencies."""
     not_negative = ("amplitude", "frequency")
-    wrong = [~torch.isfinite(tensor).all() for tensor in values.values()]
+    wrong = [~(tensor.abs() <= _LIMITS[name]).all() for name, tensor in values.items()]
     wrong += [(values[name] < 0).any() for name in not_negative]
     if not bool(torch.stack(wrong).any()):  # synchronises the device only once
         return
     for name, tensor in values.items():
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{name} must be finite")
+        if bool((tensor.abs() > _LIMITS[name]).any()):
+            raise ValueError(
+                f"{name} must be at most {_LIMITS[name]:g} {_UNITS[name].partition(' at')[0]}, got "
+                f"{tensor.abs().max().item():g}"
+            )
     for name in not_negative:
         if bool((values[name] < 0).any()):
             raise ValueError(f"{name} must not be negative, got {values[name].min().item():g}")
@@ -123,6 +133,7 @@ class Vibration(Motion, units=_UNITS):
     image_motion: Tensor
     image_acceleration: Tensor
 
+    @checks_arguments
     def __init__(
         self,
         amplitude: TensorLike,
@@ -152,6 +163,7 @@ class Vibration(Motion, units=_UNITS):
         object.__setattr__(self, "image_acceleration", acceleration.expand(*batch, axes))
 
     @classmethod
+    @checks_arguments
     def still(cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None, *, axes: int = 2) -> Self:
         """No vibration and no image motion: the camera stands still."""
         zeros = torch.zeros(*batch_shape, axes, 1, dtype=torch.float64, device=device)
@@ -181,7 +193,8 @@ class Vibration(Motion, units=_UNITS):
     def _angle(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Angles (S, 2, K) of the tones at times S, with amplitude and frequency reshaped to broadcast with them."""
         steps = times.ndim - len(self.batch_shape)
-        if steps < 0:
+        sizes = zip(times.shape, self.batch_shape, strict=False)
+        if steps < 0 or any(size != 1 and count not in (1, size) for size, count in sizes):
             raise ValueError(
                 f"times must have the batch dimensions {tuple(self.batch_shape)} in front, got {tuple(times.shape)}"
             )
@@ -194,12 +207,14 @@ class Vibration(Motion, units=_UNITS):
         shape = (*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), self.amplitude.shape[-2])
         return self.image_motion.reshape(shape), self.image_acceleration.reshape(shape)
 
+    @checks_arguments
     def drift(self, times: Tensor) -> Tensor:
         """Displacement v t + a t^2 / 2 of the image motion alone in px; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)[..., None]
         velocity, acceleration = self._image_motion(times)
         return (velocity + 0.5 * acceleration * times) * times
 
+    @checks_arguments
     def displacement(self, times: Tensor) -> Tensor:
         """Displacement D(t) in px (Eq. 1).
 
@@ -213,6 +228,7 @@ class Vibration(Motion, units=_UNITS):
         angle, amplitude, _ = self._angle(times)
         return (amplitude * angle.sin()).sum(-1) + self.drift(times)
 
+    @checks_arguments
     def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
         """Mean displacement over exposures [start, start + T_e] in px (Eq. 2).
 
@@ -225,6 +241,7 @@ class Vibration(Motion, units=_UNITS):
         Returns:
             float64 tensor of shape (S, 2), axes (x, y).
         """
+        check_broadcast(starts=starts, exposure_time=exposure_time)
         middle = starts.to(dtype=torch.float64, device=self.device) + 0.5 * exposure_time
         angle, amplitude, frequency = self._angle(middle)
         attenuation = torch.sinc(frequency * _with_trailing(exposure_time, 2))
@@ -232,6 +249,7 @@ class Vibration(Motion, units=_UNITS):
         curvature = acceleration * (_with_trailing(exposure_time, 1) ** 2 / 24.0)
         return (amplitude * attenuation * angle.sin()).sum(-1) + self.drift(middle) + curvature
 
+    @checks_arguments
     def velocity(self, times: Tensor) -> Tensor:
         """Velocity dD/dt in px/s; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
@@ -240,6 +258,7 @@ class Vibration(Motion, units=_UNITS):
         oscillation = (2 * math.pi * frequency * amplitude * angle.cos()).sum(-1)
         return oscillation + velocity + acceleration * times[..., None]
 
+    @checks_arguments
     def gain(self, interval: float) -> Tensor:
         """Gain 2 sin(pi f m T_row) from displacement to offset over ``interval`` seconds (Eq. 7), (..., 2, K).
 
@@ -251,6 +270,7 @@ class Vibration(Motion, units=_UNITS):
         """Sum of the amplitudes of the tones, (..., 2), in px."""
         return self.amplitude.detach().sum(-1)
 
+    @checks_arguments
     def displacement_within(self, duration: float) -> Tensor:
         """Bound on the displacement between two times ``duration`` apart, (..., 2), in px (Eq. 24, sum of tones).
 
@@ -262,6 +282,7 @@ class Vibration(Motion, units=_UNITS):
         path = torch.where(cycles < 0.5, 2.0 * torch.sin(math.pi * cycles), 4.0 * cycles)
         return (self.amplitude.detach() * path).sum(-1) + self.image_motion.detach().abs() * duration
 
+    @checks_arguments
     def periods_within(self, duration: float) -> Tensor:
         """Periods of the fastest tone in ``duration`` seconds, (..., 2); tones below 1e-4 px do not count.
 
@@ -271,11 +292,13 @@ class Vibration(Motion, units=_UNITS):
         visible = self.amplitude.detach() > smallest[:, None]
         return torch.where(visible, self.frequency.detach() * duration, 0.0).amax(-1)
 
+    @checks_arguments
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The vibration whose component k is ``signs[k]`` times component ``order[k]`` of this one.
 
         A negative sign changes the phase by pi and returns it in [-pi, pi); amplitudes stay positive.
         """
+        self._check_axes(order, signs)
         sign = torch.tensor(signs, dtype=torch.float64, device=self.device)
         axes = list(order)
         phase = self.phase[..., axes, :]
@@ -290,7 +313,14 @@ class Vibration(Motion, units=_UNITS):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class VibrationStd(Result, units=_UNITS | {"displacement": "px"}):
+class VibrationStd(
+    Result,
+    units=_UNITS | {"displacement": "px"},
+    shapes={
+        **dict.fromkeys(("amplitude", "frequency", "period", "phase"), "... 2 K"),
+        **dict.fromkeys(("image_motion", "image_acceleration", "displacement"), "... 2"),
+    },
+):
     """Standard deviations in the layout of ``Vibration``: px, Hz, s, rad (..., 2, K), px/s and px/s^2 (..., 2).
 
     ``displacement`` (..., 2) in px is that of the displacement of the rows of the record, rms over the rows and without
@@ -337,6 +367,7 @@ class VibrationStd(Result, units=_UNITS | {"displacement": "px"}):
         values = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return VibrationStd(**{name: value[index] for name, value in values.items() if value is not None})
 
+    @checks_arguments
     def from_row_order(self, timing: SensorTiming) -> "VibrationStd":
         """The standard deviations, given in row order, in image axes: as ``Motion.from_row_order`` without signs."""
         if timing.scan_axis == -2:
@@ -406,6 +437,7 @@ def image_motion_line(vibration: Vibration, std: VibrationStd | None = None) -> 
     return [f"image motion {texts[0]} px/s along x, {texts[1]} px/s along y"]
 
 
+@checks_arguments
 def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
     """Frequencies up to ``highest`` Hz that cannot be measured from the frames.
 
@@ -425,7 +457,7 @@ def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
     intervals = starts[1:] - starts[0]
 
     def multiples(interval: float) -> Tensor:
-        return torch.arange(1, math.floor(highest * interval) + 1, dtype=torch.float64) / interval
+        return torch.arange(1, math.floor(highest * interval) + 1, dtype=torch.float64, device="cpu") / interval
 
     alike = multiples(float(intervals[0])) if len(intervals) else starts[:0]
     cycles = alike[:, None] * intervals

@@ -156,7 +156,7 @@ def fine_offsets(task: BandTask, shift: Tensor, surface: Tensor, valid: Tensor) 
 @cache
 def _polynomial_fit(size: int) -> Tensor:
     """Matrix (size, size) from samples at -(size // 2) ... size // 2 to the coefficients of the polynomial."""
-    places = torch.arange(size, dtype=torch.float64) - size // 2
+    places = torch.arange(size, dtype=torch.float64, device="cpu") - size // 2
     matrix: Tensor = torch.linalg.inv(torch.vander(places, increasing=True))
     return matrix
 

@@ -254,7 +254,10 @@ def _solve(products: Tensor, right: Tensor) -> Tensor:
     usable = (diagonal > 0).all(-1)[..., None]
     scale = torch.where(usable, diagonal.clamp(min=1e-300).rsqrt(), 0.0)
     eye = torch.eye(4, dtype=scale.dtype, device=scale.device)
-    unit = products * scale[..., :, None] * scale[..., None, :] + torch.where(usable, 1e-6, 1.0)[..., None] * eye
+    unit = (
+        products * scale[..., :, None] * scale[..., None, :]
+        + torch.where(usable, scale.new_tensor(1e-6), 1.0)[..., None] * eye
+    )
     solution = torch.linalg.solve(unit, (right * scale[..., None, :]).transpose(-2, -1)).transpose(-2, -1)
     factors: Tensor = solution * scale[..., None, :]
     return factors

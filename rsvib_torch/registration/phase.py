@@ -83,7 +83,12 @@ def _phase_surface(
     full = (magnitude * weight).sum((-2, -1))
     transforms = []
     for size, frequency in ((reach[0], v), (reach[1], u)):
-        angle = 2 * torch.pi * torch.arange(-size, size + 1, device=first.device)[:, None] * frequency
+        angle = (
+            2
+            * torch.pi
+            * torch.arange(-size, size + 1, dtype=frequency.dtype, device=first.device)[:, None]
+            * frequency
+        )
         transforms.append(torch.polar(torch.ones_like(angle), angle))
     surface: Tensor = (transforms[0] @ ((cross * weight) @ transforms[1].T)).real
     surface = surface / full.clamp(min=torch.finfo(first.dtype).tiny)[:, None, None]

@@ -13,6 +13,7 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
@@ -28,7 +29,19 @@ __all__ = ["OffsetCurve", "check_frame_size", "register_bands", "register_rows"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OffsetCurve(Result, units={"times": "s", "later_times": "s", "offsets": "px", "std": "px"}):
+class OffsetCurve(
+    Result,
+    units={"times": "s", "later_times": "s", "offsets": "px", "std": "px"},
+    shapes={
+        "pairs": "P 2",
+        "rows": "N",
+        "times": "... P N",
+        "later_times": "... P N",
+        "offsets": "... P N 2",
+        "quality": "... P N",
+        "std": "... P N 2",
+    },
+):
     """Offsets of row bands between frames.
 
     The content of the band around row r of the earlier frame lies at r plus the offset in the later frame
@@ -101,6 +114,7 @@ class OffsetCurve(Result, units={"times": "s", "later_times": "s", "offsets": "p
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
 
+@checks_arguments
 def register_bands(
     frames: FramesOrFiles,
     timing: SensorTiming,
@@ -187,7 +201,8 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     check_frame_size(num_rows, width, options)
     # a Gaussian of 1 px band-limits the correlation, so that whole-pixel lags determine its peak, and damps noise;
     # contiguous images are filtered 14 times faster
-    grey = _without_row_means(gaussian_blur2d(grey.contiguous(), (7, 7), (1.0, 1.0)))
+    sigma = torch.ones(1, 2, dtype=grey.dtype, device="cpu")  # px; from numbers Kornia makes it on the default device
+    grey = _without_row_means(gaussian_blur2d(grey.contiguous(), (7, 7), sigma))
     tops = torch.arange(0, num_rows - band_rows + 1, options.band_step, device=grey.device)
     first, second = grey[:, :-1].flatten(0, 1), grey[:, 1:].flatten(0, 1)
     bytes_of_pair = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4

@@ -195,7 +195,7 @@ def column_pattern(groups: list[_Group]) -> Tensor | None:
 
 def _pattern_of(groups: list[_Group], step: int) -> Tensor | None:
     """``column_pattern`` from every ``step``-th row."""
-    correlation, power, energy, count = (torch.zeros(()) for _ in range(4))
+    correlation, power, energy, count = (torch.zeros((), dtype=torch.float32, device="cpu") for _ in range(4))
     for spectra, *places in groups:
         rows, shift, visible, variance = (values[..., ::step] for values in places)
         typical = torch.where(variance > 0, variance, torch.nan).nanmedian(dim=-1, keepdim=True).values

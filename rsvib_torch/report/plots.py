@@ -17,7 +17,9 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.checks import check_whole_number, described
 from rsvib_torch.core.presentation import FIGURES, Result
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult, MotionDetection, SweptTone
@@ -84,6 +86,7 @@ def tones_text(result: DetectionResult, axis: int) -> list[str]:
     ]
 
 
+@checks_arguments
 def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150) -> None:
     """Write a figure as an image file, atomically.
 
@@ -162,6 +165,7 @@ def _finish_offsets(figure: Figure, panels: Any, points: Any) -> None:
     bar.outline.set_visible(False)
 
 
+@checks_arguments
 def offset_figure(result: DetectionResult) -> Figure:
     """Draw the offset curve of each axis with its fit, and the residuals (as Figure 6 of Liu et al. 2023).
 
@@ -200,6 +204,7 @@ def offset_figure(result: DetectionResult) -> Figure:
     return figure
 
 
+@checks_arguments
 def windows_figure(
     times: Sequence[float], detections: Sequence[Detection | None], *, time_label: str = "start of the window (s)"
 ) -> Figure:
@@ -235,6 +240,9 @@ def windows_figure(
         >>> [panel.get_ylabel() for panel in figure.axes]
         ['amplitude (px)', 'amplitude (px)', 'frequency (Hz)', 'frequency (Hz)']
     """
+    for index, found in enumerate(detections):
+        if found is not None and not isinstance(found, Detection):
+            raise TypeError(f"detections[{index}] must be a detection or None, got {described(found)}")
     figure = _Drawing(figsize=(11, 5.6), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, squeeze=False)
     for axis, name in enumerate("xy"):
@@ -281,6 +289,7 @@ def _batch_figure(results: DetectionResult) -> Figure:
     return windows_figure(range(len(parts)), parts, time_label="number of the stack")
 
 
+@checks_arguments
 def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None) -> Figure:
     """Draw the displacement of a motion along both axes over time.
 
@@ -381,6 +390,7 @@ def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
     return figure
 
 
+@checks_arguments
 def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     """Draw the offset gain of a pair of frames over frequency, and the detected tones with two standard deviations.
 
@@ -448,11 +458,12 @@ def motion_blur(vibration: Motion, starts: Tensor, timing: SensorTiming) -> Tens
         timing: The sensor.
     """
     nodes, _ = exposure_nodes(timing, "gauss", 16)
-    ends = torch.tensor([0.0, timing.exposure_time], dtype=torch.float64)
+    ends = torch.tensor([0.0, timing.exposure_time], dtype=torch.float64, device="cpu")
     path = vibration.displacement(starts[..., None] + torch.cat([ends, nodes.cpu()]).to(starts.device))
     return path.amax(-2) - path.amin(-2)
 
 
+@checks_arguments
 def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure:
     """Draw mean displacement and motion blur of every row of frame 0.
 
@@ -483,6 +494,7 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figur
     return figure
 
 
+@checks_arguments
 def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure:
     """Draw point spread functions of 24 rows of frame 0 with the path of the image during their exposure.
 
@@ -502,8 +514,9 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
         24
     """
     _check_one(vibration)
+    check_whole_number("num_rows", num_rows, at_least=1)
     down, across = 3, 8
-    rows = torch.linspace(0, num_rows - 1, down * across).round()
+    rows = torch.linspace(0, num_rows - 1, down * across, dtype=torch.float32, device="cpu").round()
     starts = timing.row_starts(1, num_rows)[0][rows.long()]
     psf = row_psf(vibration, starts, timing)
     centre = psf.centroid().round()
@@ -511,7 +524,7 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
     path = (vibration.displacement(starts[:, None] + nodes) - centre[:, None]).numpy()
     first = psf.first_tap - centre
     height, width = psf.weights.shape[-2:]
-    last = first + torch.tensor([width - 1, height - 1])
+    last = first + torch.tensor([width - 1, height - 1], device="cpu")
     reach = max(2, int(torch.maximum(first.abs(), last.abs()).max()))  # px around the centre
     cells = np.zeros((len(rows), 2 * reach + 1, 2 * reach + 1))
     for index, (left, top) in enumerate((first.long() + reach).tolist()):
@@ -530,6 +543,7 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
     return figure
 
 
+@checks_arguments
 def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]]) -> Figure:
     """Draw modulation transfer functions of slanted edges: thin lines for the edges, a bold line for their mean.
 
@@ -541,7 +555,7 @@ def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]]) -> Figure:
     """
     figure = _Drawing(figsize=(5.6, 3.9), layout="constrained")
     panel = figure.subplots()
-    frequency = torch.linspace(0, 0.5, 51, dtype=torch.float64)
+    frequency = torch.linspace(0, 0.5, 51, dtype=torch.float64, device="cpu")
     colours = (_GREY, _AXIS_COLOURS["x"])[-len(curves) :]
     for colour, (name, edges) in zip(colours, curves.items(), strict=True):
         values = [edge.at(frequency.to(edge.lsf.device)).cpu() for edge in edges]
@@ -584,6 +598,7 @@ def detailed_places(image: Tensor, size: int, count: int, rim: int = 0) -> list[
     return places
 
 
+@checks_arguments
 def comparison_figure(
     raw: Tensor, restored: Tensor, *, count: int = 3, size: int = 160, names: tuple[str, str] = ("input", "restored")
 ) -> Figure:
@@ -601,6 +616,9 @@ def comparison_figure(
         >>> len(comparison_figure(frame, frame, count=2, size=32).axes)
         4
     """
+    check_shapes({"raw": raw, "restored": restored}, {"raw": "... H W", "restored": "... H W"})
+    check_whole_number("count", count, at_least=1)
+    check_whole_number("size", size, at_least=1)
     raw, restored = (picture(frame) for frame in (raw, restored))
     size = min(size, *raw.shape[:2])
     places = detailed_places(restored.mean(-1), size, count, rim=16)  # boundary extension changes the border

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.presentation import plain_values
 from rsvib_torch.core.text import write_json
@@ -34,6 +35,7 @@ class VibrationFile(DetectionRecord):
     sensitivity: Any = None
 
 
+@checks_arguments
 def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timing: SensorTiming | None = None) -> None:
     """Write a detection as ``vibration.json``: vibration, standard deviations, verdict, offset curve and timing.
 
@@ -69,6 +71,7 @@ def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timin
     replace(result, timing=timing).save(path)
 
 
+@checks_arguments
 def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = None) -> DetectedVibration:
     """Read a ``vibration.json``, as ``restore`` needs it; ``DetectionResult.load`` also reads its offset curve.
 
@@ -112,6 +115,7 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
         raise ValueError(f"{path}: {error}") from error
 
 
+@checks_arguments
 def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None:
     """Write the measured and the fitted offset curve as CSV; offsets that were not measured are empty.
 
@@ -162,6 +166,7 @@ def _write_csv(path: str | os.PathLike[str], head: Iterable[str], lines: Iterabl
         writer.writerows(lines)
 
 
+@checks_arguments
 def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None:
     """Write a table of the windows of a stack as CSV: the strongest tone of each axis, and the verdict.
 

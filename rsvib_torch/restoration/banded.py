@@ -172,7 +172,7 @@ def restore_banded(
     image = torch.arange(B * T, device=frames.device).repeat_interleave(len(centres))
     weight = weights.repeat_interleave(T * len(centres))
 
-    lags = torch.fft.fftfreq(size, d=1.0 / size, device=frames.device).round().to(torch.int64)
+    lags = torch.fft.fftfreq(size, d=1.0 / size, device=frames.device, dtype=torch.float32).round().to(torch.int64)
     kept = torch.arange(stride, device=frames.device) - (stride - 1) // 2
     spectra = torch.view_as_real(_aligned_spectra(frames, motion, u, length)).movedim(-1, 0).contiguous()
     restored = frames.new_empty(B * T * len(centres), stride, C, W)

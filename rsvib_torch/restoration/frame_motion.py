@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
@@ -97,6 +98,7 @@ def _of_column(motion: Motion, column: Tensor, timing: RowTiming, num_frames: in
     return ColumnMotion.of_columns(motion, column[None], timing, num_frames, num_rows)
 
 
+@checks_arguments
 def visible_pixels(
     timing: SensorTiming, vibration: Motion, size: tuple[int, int], num_frames: int
 ) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.frames.arrays import Channels
 from rsvib_torch.frames.prepare import prepare_frames
@@ -18,6 +19,7 @@ from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 __all__ = ["predict_noise_gain"]
 
 
+@checks_arguments
 def predict_noise_gain(
     frames: FramesOrFiles,
     timing: SensorTiming,

@@ -8,6 +8,7 @@ from typing import Any, Literal, Required, TypedDict, Unpack, overload
 
 from torch import Tensor, nn
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.option_types import (
     BandedSettings,
     DewarpSettings,
@@ -132,6 +133,7 @@ def restore(
 ) -> Tensor: ...
 @outside_graphs
 @full_precision
+@checks_arguments
 def restore(
     frames: FramesOrFiles,
     timing: SensorTiming,
@@ -213,7 +215,7 @@ def restore(
     _, count, _, height, _ = prepared.images.shape
     vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
     for note in left_alone:
-        warnings.warn(note, RestorationWarning, stacklevel=4)  # the caller, above two decorators
+        warnings.warn(note, RestorationWarning, stacklevel=5)  # the caller, above three decorators
     if left_alone and not bool(vibration.moving_axes().any()):
         return unchanged_frames(prepared, options.get("joint", False))
     restored = restore_prepared(prepared, vibration, method, options)
@@ -302,7 +304,7 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Motion, 
         if verdict.overall in ("partly", "worse"):
             where = f"stack {stack}: " if len(raw) > 1 else ""
             summary = verdict.in_image_axes(frames.image_timing).sentence
-            warnings.warn(f"{where}{summary}", RestorationWarning, stacklevel=5)  # the caller of ``restore``
+            warnings.warn(f"{where}{summary}", RestorationWarning, stacklevel=6)  # the caller of ``restore``
 
 
 class VibrationRestorer(nn.Module):
@@ -345,6 +347,7 @@ class VibrationRestorer(nn.Module):
     def __init__(self, timing: SensorTiming, **options: Unpack[RichardsonLucyOptions]) -> None: ...
     @overload
     def __init__(self, timing: SensorTiming, *, method: str, **options: Any) -> None: ...
+    @checks_arguments
     def __init__(
         self,
         timing: SensorTiming,
@@ -362,6 +365,7 @@ class VibrationRestorer(nn.Module):
         common = {"full_scale": full_scale, "channels": channels, "saturation": saturation, "check": check}
         self.options = {"method": method, **common, **options}
 
+    @checks_arguments
     def forward(self, frames: FramesOrFiles, vibration: Motion | Detected, ignore: Tensor | None = None) -> Tensor:
         """Restore a stack of frames."""
         return restore(frames, self.timing, vibration, ignore=ignore, **self.options)

@@ -148,7 +148,7 @@ class StackJob:
                 faults[index] = fault
             elif not isinstance(frame, str):
                 usable[index] = frame
-        frames = torch.empty((0, *self.info.shape[1:]))
+        frames = torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
         if usable:
             stored = np.stack(list(usable.values()))
             frames = counts_to_frames(stored, self.full_scale, str(self.source)).to(self.device)

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import torch
 from pydantic import Field
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import measured_text, text_table, wrapped
 from rsvib_torch.core.validation import Section, read_json, validate
@@ -153,7 +154,9 @@ def _tone_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> 
     reliable = [one.vibration for one in found if one is not None and bool(one.reliable[axis])]
     data: dict[str, Any] = {"reliable_windows": len(reliable)}
     for name in ("amplitude", "frequency"):
-        values = torch.tensor([float(getattr(one, name)[axis, 0]) for one in reliable], dtype=torch.float64)
+        values = torch.tensor(
+            [float(getattr(one, name)[axis, 0]) for one in reliable], dtype=torch.float64, device="cpu"
+        )
         data[name] = float(values.median()) if len(values) else None
         data[f"{name}_spread"] = float(values.std()) if len(values) > 1 else None
     return data
@@ -187,7 +190,7 @@ def fingerprint(path: Path, *, block: int = 1 << 16, blocks: int = 32, files: in
     sizes = [file.stat().st_size for file in members]
     digest = hashlib.sha256()
     for file, size in zip(members, sizes, strict=True):
-        digest.update(f"{file.relative_to(path.parent)}\0{size}\0".encode())
+        digest.update(os.fsencode(file.relative_to(path.parent)) + f"\0{size}\0".encode())
     for number in spread(len(members), files):
         with members[number].open("rb") as opened:
             for index in spread(-(-sizes[number] // block), blocks):
@@ -256,6 +259,7 @@ def write_manifest(
         file.write(f'\n  ],\n  "bad_frames": {json.dumps(bad)},\n  "not_kept": {json.dumps(list(not_kept))}\n}}\n')
 
 
+@checks_arguments
 def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
     """Read the manifest of a complete run.
 

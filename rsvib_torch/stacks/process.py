@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Unpack
 
+from rsvib_torch.core.arguments import check_fields, checks_arguments
 from rsvib_torch.core.atomic import make_folder, sync, whole_file
 from rsvib_torch.core.option_types import BadFrames
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.presentation import Summarised
+from rsvib_torch.core.unexpected import unexpected_errors_in_one_line
 from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.schema import DetectedVibration
@@ -83,6 +85,9 @@ class StackReport(Summarised):
     manifest: Path
     not_kept: tuple[str, ...]
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
     def summary(self) -> str:
         """Numbers of frames and windows, and the time."""
         lines = [f"{self.frames} frames in {self.windows} windows, {self.restored} windows restored"]
@@ -97,6 +102,7 @@ class StackReport(Summarised):
         return "\n".join(lines)
 
 
+@checks_arguments
 def iterate_stack(source: PathLike, timing: SensorTiming, **options: Unpack[RestoreOptions]) -> Iterator[WindowResult]:
     """Restore a stack of any length window by window; each is available as soon as it is complete.
 
@@ -188,6 +194,8 @@ def detect_stack(
         write_manifest(part, manifest_header(job, None, None), records())
 
 
+@unexpected_errors_in_one_line()
+@checks_arguments
 def process_stack(
     source: PathLike,
     sink: PathLike,

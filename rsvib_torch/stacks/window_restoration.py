@@ -10,6 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.checks import MAX_NUMBER
 from rsvib_torch.detection import detect_vibration
 from rsvib_torch.detection.start import constant_frame
 from rsvib_torch.frames.arrays import Channels, channel_axis
@@ -116,12 +118,15 @@ def frame_fault(
         if valid < valid_fraction:
             return f"frame {index} has only {valid:.1%} of pixels that count"
         low, high = np.nanmin(frame), np.nanmax(frame)
+    if max(abs(float(high)), abs(float(low))) > MAX_NUMBER:
+        return f"frame {index} reaches {max(abs(float(high)), abs(float(low))):.3g}, at most {MAX_NUMBER:g} is possible"
     rounding = 1e-7  # of float32, relative
     if float(high) - float(low) <= rounding * max(abs(float(high)), abs(float(low))):
         return constant_frame(index)
     return None
 
 
+@checks_arguments
 def restore_block(
     frames: NDArray[Any],
     timing: SensorTiming,

@@ -82,4 +82,4 @@ def window_timing(timing: SensorTiming, window: Window, frames: list[int]) -> Se
     if timing.frame_start_times is None and frames == list(window.frames):
         return timing
     starts = timing.frame_starts(window.last + 1)
-    return replace(timing, frame_start_times=starts[torch.tensor(frames)] - starts[window.first])
+    return replace(timing, frame_start_times=starts[torch.tensor(frames, device="cpu")] - starts[window.first])

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.presentation import Result
@@ -27,7 +28,11 @@ __all__ = ["ClockAlignment", "align_motion"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ClockAlignment(Result, units={"offset": "s", "offset_std": "s", "drift": "px/s", "unexplained": "px"}):
+class ClockAlignment(
+    Result,
+    units={"offset": "s", "offset_std": "s", "drift": "px/s", "unexplained": "px"},
+    shapes={"drift": "2", "unexplained": "2"},
+):
     """Time of the frames within a recorded motion: ``scale t + offset`` on its clock.
 
     Attributes:
@@ -108,6 +113,7 @@ class _Clock:
 @outside_graphs
 @full_precision
 @torch.no_grad()
+@checks_arguments
 def align_motion(
     frames: FramesOrFiles,
     timing: SensorTiming,
@@ -218,7 +224,7 @@ def align_motion(
         scale=clock.scale,
         scale_std=float(std[1]),
         gain=in_image.gain,
-        drift=torch.tensor(in_image.drift, dtype=torch.float64),
+        drift=torch.tensor(in_image.drift, dtype=torch.float64, device="cpu"),
         unexplained=rest.flip(-1) if swap else rest,
         reliable=not reasons,
         reasons=tuple(reasons),

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.splines import gauss_legendre
@@ -29,7 +30,7 @@ _MIN_CHANGE = 0.05  # px, registration errors of bands
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MotionCheck(Result, units={"before": "px", "after": "px"}):
+class MotionCheck(Result, units={"before": "px", "after": "px"}, shapes={"before": "2", "after": "2"}):
     """Offsets of rows between frames, before and after a given motion is subtracted.
 
     Attributes:
@@ -70,6 +71,7 @@ class MotionCheck(Result, units={"before": "px", "after": "px"}):
 @outside_graphs
 @full_precision
 @torch.no_grad()
+@checks_arguments
 def check_motion(
     frames: FramesOrFiles,
     timing: SensorTiming,

@@ -279,7 +279,9 @@ def _accelerated(measurements: Measurements, steps: list[_Step], where: Tensor) 
     change = torch.stack([after.change - before.change for before, after in pairs], -1).flatten(1, -2)  # (B, n, M)
     gram, right = change.mT @ change, change.mT @ steps[-1].change.flatten(1)[..., None]
     ridge = 1e-3 * gram.diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=1e-30)
-    share = torch.linalg.solve(gram + ridge[:, None, None] * torch.eye(len(pairs)).to(gram), right)[..., 0]
+    share = torch.linalg.solve(
+        gram + ridge[:, None, None] * torch.eye(len(pairs), dtype=torch.float32, device="cpu").to(gram), right
+    )[..., 0]
     share = share.clamp(-4.0, 4.0) * where[:, None]  # no extrapolation over more than four steps
     correction = (fitted * share[:, None, None, None]).sum(-1)
     return replace(measurements, displacements=measurements.displacements - correction)

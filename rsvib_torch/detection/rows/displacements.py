@@ -380,7 +380,10 @@ def blur_ratio(
         sums.append((weighted @ columns, right, (weight * values.square()).sum(1), weight.sum(1)))
     normal, right, square, count = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
     scale = normal.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).sqrt()
-    inverse = torch.linalg.inv(normal / (scale[:, :, None] * scale[:, None]) + 1e-9 * torch.eye(2).to(normal))
+    inverse = torch.linalg.inv(
+        normal / (scale[:, :, None] * scale[:, None])
+        + 1e-9 * torch.eye(2, dtype=torch.float32, device="cpu").to(normal)
+    )
     inverse = inverse / (scale[:, :, None] * scale[:, None])
     solution = (inverse @ right[..., None])[..., 0]
     variance = (square - (solution * right).sum(-1)).clamp(min=0.0) / count.clamp(min=1.0)

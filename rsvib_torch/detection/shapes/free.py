@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.presentation import Result, axis_rows, verdict_table
@@ -47,6 +48,12 @@ __all__ = [
 class MotionDetection(
     Result,
     units={"times": "s", "displacement": "px", "std": "px", "std_seen": "px", "unseen": "px", "unexplained": "px"},
+    shapes={
+        "times": "T R",
+        "displacement": "... T R 2",
+        "std": "... T R 2",
+        **dict.fromkeys(("std_seen", "unseen", "unexplained", "reliable"), "... 2"),
+    },
 ):
     """A motion of any shape with its uncertainty. A batch of stacks leads all tensors but ``times``.
 
@@ -116,6 +123,7 @@ class MotionDetection(
 @outside_graphs
 @full_precision
 @torch.no_grad()
+@checks_arguments
 def detect_motion(
     frames: FramesOrFiles,
     timing: SensorTiming,
@@ -179,7 +187,7 @@ def detect_motion(
         [True, True]
     """
     check_whole_number("knot_rows", knot_rows, at_least=4)
-    check_whole_number("iterations", iterations, at_least=1)
+    check_whole_number("iterations", iterations, at_least=1, at_most=100)
     timing = timing_of_files(frames, timing)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     bands = RegistrationOptions(registration, band_rows, band_step, search)
@@ -329,7 +337,10 @@ def _fit_spline(
     count = math.ceil((last - first) / spacing) + 3
     device = measurements.exposure_starts.device
     shape = _SplineFit(
-        torch.zeros(2, count, dtype=torch.float64, device=device), torch.zeros(2, 0, 0, device=device), first, spacing
+        torch.zeros(2, count, dtype=torch.float64, device=device),
+        torch.zeros(2, 0, 0, device=device, dtype=torch.float32),
+        first,
+        spacing,
     )
     values, covariances = zip(*(_fit_axis(measurements, shape, axis, learn) for axis in range(2)), strict=True)
     return replace(shape, coefficients=torch.stack(values), covariance=torch.stack(covariances))

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.presentation import Result, axis_rows, verdict_lines, verdict_table
@@ -46,6 +47,9 @@ class SweptTone(
         "image_motion": "px/s",
         "unexplained": "px",
     },
+    shapes=dict.fromkeys(
+        ("amplitude", "frequency", "decay", "chirp", "phase", "image_motion", "unexplained", "reliable"), "... 2"
+    ),
 ):
     """One tone an axis that decays and sweeps: ``A exp(-g t) sin(2 pi (f t + c t^2 / 2) + phi) + v t``.
 
@@ -117,6 +121,7 @@ class SweptTone(
 @outside_graphs
 @full_precision
 @torch.no_grad()
+@checks_arguments
 def detect_swept_tone(
     frames: FramesOrFiles,
     timing: SensorTiming,
@@ -168,7 +173,7 @@ def detect_swept_tone(
         >>> [round(value, 0) for value in (found.frequency[0].item(), found.decay[0].item())]
         [105.0, 20.0]
     """
-    check_whole_number("iterations", iterations, at_least=1)
+    check_whole_number("iterations", iterations, at_least=1, at_most=100)
     timing = timing_of_files(frames, timing)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     bands = RegistrationOptions(registration, band_rows, band_step, search)
@@ -269,7 +274,7 @@ def _start(measured: Measurements, axis: int, record: tuple[float, float], highe
     middle, span = 0.5 * (record[0] + record[1]), record[1] - record[0]
     device = measured.exposure_starts.device
     grid = []
-    for frequency in torch.arange(0.5 / span, highest, 0.5 / span).tolist():
+    for frequency in torch.arange(0.5 / span, highest, 0.5 / span, dtype=torch.float32, device="cpu").tolist():
         sweep = 1.5 * frequency / span  # Hz/s, at most
         steps = max(1, round(sweep * span**2 / 2.0))
         grid += [

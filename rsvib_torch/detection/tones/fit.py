@@ -186,7 +186,9 @@ def _sinc(x: Tensor) -> tuple[Tensor, Tensor]:
 def _constraints(model: MotionModel, tones: int, device: torch.device) -> Tensor:
     """Matrix (3 K + J, M) from the free parameters of an axis to all: harmonics share a frequency."""
     families = tones // model.harmonics
-    matrix = torch.zeros(3 * tones + model.drift_order, 2 * tones + families + model.drift_order, dtype=torch.float64)
+    matrix = torch.zeros(
+        3 * tones + model.drift_order, 2 * tones + families + model.drift_order, dtype=torch.float64, device="cpu"
+    )
     for tone in range(tones):
         family, harmonic = divmod(tone, model.harmonics)
         matrix[3 * tone, 2 * tone] = matrix[3 * tone + 1, 2 * tone + 1] = 1.0

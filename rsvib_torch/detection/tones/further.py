@@ -118,7 +118,7 @@ def _added(
     evidence, second, back, moved = (torch.cat(values, 1) for values in zip(*parts, strict=True))
     # equal prior probabilities of one tone more, of any frequency, and of none
     counted = counted & (size > 0)[:, None]
-    prior = torch.where(counted, -counted.sum(1, keepdim=True).log(), -math.inf)
+    prior = torch.where(counted, -counted.sum(1, keepdim=True).to(evidence.dtype).log(), -math.inf)
     probability = functional.pad(evidence + prior, (1, 0)).softmax(-1)[:, 1:]
     if number_is_known:
         probability = torch.zeros_like(probability)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text
@@ -27,6 +28,11 @@ class MtfCurve(
         "angle": "degrees",
         "position": "px",
         "lsf": "1/px",
+    },
+    shapes={
+        **dict.fromkeys(("frequency", "mtf", "std"), "F"),
+        **dict.fromkeys(("position", "esf", "lsf"), "N"),
+        "levels": "2",
     },
 ):
     """Modulation transfer function along the normal of an edge.
@@ -88,6 +94,7 @@ class MtfCurve(
             ]
         )
 
+    @checks_arguments
     def at(self, frequency: float | Tensor) -> Tensor:
         """MTF at frequencies of any shape, cycles/px, computed from the line spread function.
 
@@ -108,6 +115,7 @@ class MtfCurve(
         return self.tail.transfer(self.position, self.lsf, self.far, wanted.flatten()).abs().view(wanted.shape)
 
 
+@checks_arguments
 def slanted_edge_mtf(roi: ArrayLike) -> MtfCurve:
     """Measure the MTF across a slanted edge (ISO 12233, e-SFR).
 

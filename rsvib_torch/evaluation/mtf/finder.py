@@ -8,6 +8,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from rsvib_torch.core.arguments import check_fields, check_shapes, checks_arguments
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.evaluation.mtf.edge import (
     EdgeFit,
@@ -59,11 +60,18 @@ class SlantedEdge:
     bright_side: _Side
     contrast: float
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @checks_arguments
     def crop(self, image: ArrayLike) -> Tensor:
         """The ROI (..., height, width) of an image of the same size, or of a stack of them."""
-        return as_tensor("image", image)[..., self.top : self.top + self.height, self.left : self.left + self.width]
+        pixels = as_tensor("image", image)
+        check_shapes({"image": pixels}, {"image": "... H W"})
+        return pixels[..., self.top : self.top + self.height, self.left : self.left + self.width]
 
 
+@checks_arguments
 def find_slanted_edges(
     image: ArrayLike, *, min_length: int = 32, max_length: int = 160, min_contrast: float = 0.1
 ) -> list[SlantedEdge]:

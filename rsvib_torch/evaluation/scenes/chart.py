@@ -54,16 +54,16 @@ def resolution_chart(height: int, width: int, *, sigma: float = 0.6, seed: int =
     width = check_whole_number("width", width, at_least=64)
     sigma = check_number("sigma", sigma, at_least=0.4)
     field = check_number("field", field, at_least=32.0)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator(device="cpu").manual_seed(seed)
     grain = fractal_texture(height, width, generator, exponent=0.5, longest=64.0, sigma=sigma)
     texture = fractal_texture(height, width, generator, exponent=1.2, longest=40.0, sigma=sigma)
-    canvas = Canvas(torch.full((height, width), _PAPER), sigma)
+    canvas = Canvas(torch.full((height, width), _PAPER, dtype=torch.float32, device="cpu"), sigma)
 
     rim = max(10.0, 0.014 * min(height, width))
     rows, columns = (max(3, 2 * round((size - 4 * rim) / (2 * field) - 0.5) + 1) for size in (height, width))
     pitch = ((width - 4 * rim) / columns, (height - 4 * rim) / rows)
     size = min(pitch)
-    relief = torch.full((2, height, width), 0.02)  # amplitude of grain and texture
+    relief = torch.full((2, height, width), 0.02, dtype=torch.float32, device="cpu")  # amplitude of grain and texture
     relief[1] = 0.012
     for i in range(rows):
         for j in range(columns):

@@ -85,9 +85,9 @@ def fractal_texture(
     Returns:
         float32 tensor (height, width).
     """
-    white = torch.randn(height, width, generator=generator)
-    v = torch.fft.fftfreq(height)[:, None]
-    u = torch.fft.rfftfreq(width)
+    white = torch.randn(height, width, generator=generator, dtype=torch.float32, device="cpu")
+    v = torch.fft.fftfreq(height, dtype=torch.float32, device="cpu")[:, None]
+    u = torch.fft.rfftfreq(width, dtype=torch.float32, device="cpu")
     squared = v.square() + u.square()
     shape = (squared + longest**-2) ** (-0.5 * exponent) * torch.exp(-2 * (math.pi * sigma) ** 2 * squared)
     shape[0, 0] = 0.0
@@ -131,7 +131,9 @@ class Canvas:
             centre, reach if isinstance(reach, tuple) else (reach, reach), reversed(self.image.shape), strict=True
         ):
             pad = half + 5 * self.sigma
-            places.append(torch.arange(max(math.floor(middle - pad), 0), min(math.ceil(middle + pad) + 1, size)))
+            places.append(
+                torch.arange(max(math.floor(middle - pad), 0), min(math.ceil(middle + pad) + 1, size), device="cpu")
+            )
         columns, rows = places
         window = self.image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         window += coverage(columns[None] - centre[0], rows[:, None] - centre[1]) * (tone - window)

@@ -75,10 +75,10 @@ def city_and_fields(height: int, width: int, seed: int, *, sigma: float = 0.6) -
     width = check_whole_number("width", width, at_least=64)
     seed = check_whole_number("seed", seed, at_least=0)
     sigma = check_number("sigma", sigma, at_least=0.4)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator(device="cpu").manual_seed(seed)
     districts = _lay_out_districts(height, width, generator)
     lines = _lay_out_lines(height, width, generator)
-    table = torch.rand(4096, 4, generator=generator)  # for parcels
+    table = torch.rand(4096, 4, generator=generator, dtype=torch.float32, device="cpu")  # for parcels
     relief = fractal_texture(height, width, generator, exponent=1.3, longest=500.0, sigma=sigma)
     detail = fractal_texture(height, width, generator, exponent=2.0, longest=7.0, sigma=sigma)
 
@@ -95,7 +95,9 @@ def city_and_fields(height: int, width: int, seed: int, *, sigma: float = 0.6) -
 
 def _points(begin: int, end: int) -> Tensor:
     """Sample positions within the pixels ``begin ... end - 1``."""
-    return (torch.arange(begin * _OVERSAMPLING, end * _OVERSAMPLING) + 0.5) / _OVERSAMPLING - 0.5
+    return (
+        torch.arange(begin * _OVERSAMPLING, end * _OVERSAMPLING, dtype=torch.float32, device="cpu") + 0.5
+    ) / _OVERSAMPLING - 0.5
 
 
 def _lay_out_districts(height: int, width: int, generator: torch.Generator) -> _Districts:
@@ -103,14 +105,21 @@ def _lay_out_districts(height: int, width: int, generator: torch.Generator) -> _
     rows, columns = (math.ceil(size / pitch) + 2 for size in (height, width))
 
     def uniform(*size: int) -> Tensor:
-        return torch.rand(*size, generator=generator)
+        return torch.rand(*size, generator=generator, dtype=torch.float32, device="cpu")
 
-    grid = torch.stack(torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy"), dim=-1)
+    grid = torch.stack(
+        torch.meshgrid(
+            *(torch.arange(count, dtype=torch.float32, device="cpu") for count in (columns, rows)), indexing="xy"
+        ),
+        dim=-1,
+    )
     place = (grid - 1 + 0.15 + 0.7 * uniform(rows, columns, 2)) * pitch
     # about equal parts of fields and town, and a quarter of works and woods, mixed at any image size
-    draw = torch.remainder(torch.arange(rows * columns) * 0.618034 + uniform(1), 1.0).view(rows, columns)
-    kind = torch.bucketize(draw, torch.tensor([0.37, 0.75, 0.87]))
-    sizes = torch.tensor([[110.0, 70.0], [104.0, 64.0], [150.0, 110.0], [1e4, 1e4]])
+    draw = torch.remainder(
+        torch.arange(rows * columns, dtype=torch.float32, device="cpu") * 0.618034 + uniform(1), 1.0
+    ).view(rows, columns)
+    kind = torch.bucketize(draw, torch.tensor([0.37, 0.75, 0.87], dtype=torch.float32, device="cpu"))
+    sizes = torch.tensor([[110.0, 70.0], [104.0, 64.0], [150.0, 110.0], [1e4, 1e4]], dtype=torch.float32, device="cpu")
     parcel = sizes[kind] * (0.85 + 0.4 * uniform(rows, columns, 2))
     return _Districts(place, math.pi * uniform(rows, columns), kind, parcel, pitch)
 
@@ -118,12 +127,21 @@ def _lay_out_districts(height: int, width: int, generator: torch.Generator) -> _
 def _lay_out_lines(height: int, width: int, generator: torch.Generator) -> list[_Line]:
     """Main roads, and a river as the last line."""
     count = 4
-    angle = math.pi * (torch.arange(count) + 0.8 * torch.rand(count, generator=generator)) / count
-    through = torch.tensor([width, height]) * (0.2 + 0.6 * torch.rand(count, 2, generator=generator))
+    angle = (
+        math.pi
+        * (
+            torch.arange(count, device="cpu")
+            + 0.8 * torch.rand(count, generator=generator, dtype=torch.float32, device="cpu")
+        )
+        / count
+    )
+    through = torch.tensor([width, height], device="cpu") * (
+        0.2 + 0.6 * torch.rand(count, 2, generator=generator, dtype=torch.float32, device="cpu")
+    )
     level = through[:, 0] * angle.cos() + through[:, 1] * angle.sin()
     size = float(max(height, width))
-    random = torch.rand(3, count, generator=generator)
-    half_width = torch.tensor([6.0, 5.0, 5.0, 15.0])
+    random = torch.rand(3, count, generator=generator, dtype=torch.float32, device="cpu")
+    half_width = torch.tensor([6.0, 5.0, 5.0, 15.0], dtype=torch.float32, device="cpu")
     swing = size * (0.02 + 0.02 * random[0])
     lines = torch.stack([angle, level, swing, size * (0.5 + 0.4 * random[1]), 2 * math.pi * random[2], half_width], 1)
     return [_Line(*line) for line in lines.tolist()]
@@ -164,7 +182,7 @@ def _borders(strip: tuple[int, int], width: int, districts: _Districts) -> tuple
 
     The two nearest districts are those of the pixel; which of the two is nearer is computed for each point.
     """
-    rows, columns = (torch.arange(*limits, dtype=torch.float32) for limits in (strip, (0, width)))
+    rows, columns = (torch.arange(*limits, dtype=torch.float32, device="cpu") for limits in (strip, (0, width)))
     pair = _two_nearest_districts(columns[None], rows[:, None], districts)
     y, x = (_points(*limits) for limits in (strip, (0, width)))
     x, y = x[None], y[:, None]
@@ -199,7 +217,7 @@ def _lay_out_ground(
     yard = torch.where(edge_of_lot < 5.5, 0.5, 0.4 + 0.12 * draw[0])
     tone = torch.where(kind == _FIELDS, field, torch.where(kind == _TOWN, block, yard))
     tone = torch.where(kind == _WOOD, 0.25, tone)
-    wildness = torch.tensor([0.08, 0.45, 0.05, 1.0])[kind]
+    wildness = torch.tensor([0.08, 0.45, 0.05, 1.0], dtype=torch.float32, device="cpu")[kind]
     wildness = torch.where((kind == _TOWN) & (edge_of_lot < 4.5), 0.0, wildness)
 
     *roads, river = lines
@@ -213,7 +231,7 @@ def _lay_out_ground(
         distance = _distance_to_line(x, y, line)
         road = distance < line.half_width
         tone = torch.where(distance < line.half_width + 2.0, 0.36, tone)
-        tone = torch.where(road, torch.where(distance < 0.5, 0.82, 0.56), tone)
+        tone = torch.where(road, torch.where(distance < 0.5, tone.new_tensor(0.82), 0.56), tone)
         wildness = torch.where(road, 0.0, wildness)
     return torch.stack([tone, wildness])
 
@@ -231,7 +249,7 @@ def _plan_buildings(
         rad, tone of the roof, length of the shadow, all lengths in px, and 1 where the two sides of the roof differ
         in tone, 0 where it is flat.
     """
-    plans = [torch.zeros(0, 8)]
+    plans = [torch.zeros(0, 8, dtype=torch.float32, device="cpu")]
     for index, kind in enumerate(districts.kind.view(-1).tolist()):
         if kind != _WOOD:
             plans.append(_plan_district(index, kind, districts, lines, generator))
@@ -246,18 +264,26 @@ def _plan_district(
     parcel = districts.parcel.view(-1, 2)[index]
     place, angle = districts.place.view(-1, 2)[index], float(districts.angle.view(-1)[index])
     street, share = {_FIELDS: (12.0, 0.12), _TOWN: (7.5, 0.93), _WORKS: (10.0, 0.85)}[kind]
-    wanted = {_FIELDS: parcel, _TOWN: torch.tensor([23.0, 27.0]), _WORKS: torch.tensor([62.0, 44.0])}[kind]
+    wanted = {
+        _FIELDS: parcel,
+        _TOWN: torch.tensor([23.0, 27.0], dtype=torch.float32, device="cpu"),
+        _WORKS: torch.tensor([62.0, 44.0], dtype=torch.float32, device="cpu"),
+    }[kind]
     per_lot = ((parcel - 2 * street) / wanted).round().clamp(min=1.0)
     lot = (parcel - 2 * street) / per_lot
     reach = (1.5 * districts.pitch / parcel).ceil()
     steps = [
-        (torch.arange(-int(n), int(n))[:, None] * size + street + (torch.arange(int(count)) + 0.5) * step).flatten()
+        (
+            torch.arange(-int(n), int(n), device="cpu")[:, None] * size
+            + street
+            + (torch.arange(int(count), dtype=torch.float32, device="cpu") + 0.5) * step
+        ).flatten()
         for n, size, count, step in zip(reach, parcel, per_lot, lot, strict=True)
     ]
     u, v = (t.flatten() for t in torch.meshgrid(*steps, indexing="xy"))
     count = len(u)
-    random = torch.rand(count, 8, generator=generator)
-    largest = torch.minimum(0.5 * lot - 2.0, torch.tensor([24.0, 18.0]))
+    random = torch.rand(count, 8, generator=generator, dtype=torch.float32, device="cpu")
+    largest = torch.minimum(0.5 * lot - 2.0, torch.tensor([24.0, 18.0], dtype=torch.float32, device="cpu"))
     half = largest * (0.62 + 0.38 * random[:, :2])
     slack = 0.5 * lot - 1.5 - half
     u = u + slack[:, 0] * (2 * random[:, 2] - 1)
@@ -273,7 +299,7 @@ def _plan_district(
     tone = 0.3 + 0.5 * random[:, 5]
     tone = torch.where(random[:, 6] < 0.12, 0.82, tone)
     rise = (3.0 + 5.0 * random[:, 7]) * (1.0 if kind == _TOWN else 1.3)
-    gabled = torch.full((count,), float(kind != _WORKS))
+    gabled = torch.full((count,), float(kind != _WORKS), dtype=torch.float32, device="cpu")
     return torch.cat([centre, half, torch.stack([torch.full_like(tone, angle), tone, rise, gabled], 1)], 1)[keep]
 
 
@@ -285,11 +311,11 @@ def _draw_buildings(image: Tensor, plan: Tensor, sigma: float, chunk: int = 256)
     plan = plan[order]
     pad = int(room.max()) + 64 if len(room) else 0
     # logarithm of the light, tone and coverage of the roofs
-    layers = torch.zeros(3, height + 2 * pad, width + 2 * pad)
+    layers = torch.zeros(3, height + 2 * pad, width + 2 * pad, dtype=torch.float32, device="cpu")
     for begin in range(0, len(room), chunk):
         part = plan[begin : begin + chunk]
         reach = math.ceil(float(room[begin : begin + chunk].max()))
-        steps = torch.arange(-reach, reach + 1)
+        steps = torch.arange(-reach, reach + 1, device="cpu")
         corner = part[:, :2].round().long()
         fraction = corner - part[:, :2]
         x = (steps + fraction[:, :1])[:, None, :]
@@ -308,7 +334,7 @@ def _draw_windows(x: Tensor, y: Tensor, plan: Tensor, sigma: float) -> Tensor:
     """Light, tone and coverage (3, N, h, w) of each building in its own window."""
     half_u, half_v, angle, tone, rise, gabled = plan[:, 2:, None, None].unbind(1)
     sun = math.radians(215.0)  # direction in which shadows fall
-    shadow = torch.zeros(())
+    shadow = torch.zeros((), dtype=torch.float32, device="cpu")
     for share in (0.25, 0.5, 0.75, 1.0):  # copies of the outline
         u, v = rotated(x - share * rise * math.cos(sun), y - share * rise * math.sin(sun), angle)
         shadow = torch.maximum(shadow, rectangle(u, v, half_u, half_v, sigma))

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.core.checks import MAX_NUMBER, check_choice, check_number, check_whole_number
 from rsvib_torch.core.fourier import extend_rows, extended_length
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.core.progress import steps
@@ -239,7 +239,7 @@ def _without_empty_frames(groups: list[tuple[list[int], int]], missing: Tensor) 
 def _noise_levels(frames: Tensor, motion: FrameMotion, noise: float | Literal["auto"], ignore: Tensor | None) -> Tensor:
     """Noise level of each frame, (B, T)."""
     if noise != "auto":
-        level = check_number("noise", noise, at_least=0.0)
+        level = check_number("noise", noise, at_least=0.0, at_most=MAX_NUMBER)
         return torch.full(frames.shape[:2], max(level, _MIN_LEVEL), dtype=frames.dtype, device=frames.device)
     levels = [
         noise_levels(stack.detach(), motion, index, None if ignore is None else ignore[index])

@@ -76,7 +76,7 @@ PRIORS: dict[str, Prior] = {"gaussian": gaussian, "edges": edges}
 
 def _cosines(like: Tensor) -> Tensor:
     """Orthonormal cosines (n n, 1, n, n) of a patch; the first is constant."""
-    order = torch.arange(_PATCH, dtype=torch.float64)
+    order = torch.arange(_PATCH, dtype=torch.float64, device="cpu")
     waves = torch.cos(torch.pi * order[:, None] * (order + 0.5) / _PATCH) * math.sqrt(2.0 / _PATCH)
     waves[0] /= math.sqrt(2.0)
     patches = torch.einsum("ai,bj->abij", waves, waves).flatten(0, 1)[:, None]

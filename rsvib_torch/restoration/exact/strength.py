@@ -58,8 +58,10 @@ def prior_strength(
     top = (height - count) // 2
     part = kernels.rows(top, count)
     # 24 frequencies from 0.02 cycles per px, below which the taper mixes them
-    chosen = torch.linspace(0.02 * width, width // 2, min(24, width // 4), device=images.device).long()
-    place = (chosen / width * 2 * (prior.power.shape[-1] - 1)).round().long()
+    chosen = torch.linspace(
+        0.02 * width, width // 2, min(24, width // 4), device=images.device, dtype=torch.float32
+    ).long()
+    place = (chosen.to(torch.float32) / width * 2 * (prior.power.shape[-1] - 1)).round().long()
     sample = sample_rows(images[..., top : top + count, :], part, chosen)
     # less noise than 200 times the interpolation error of the kernel cannot be distinguished from it
     certain = certain and bool(noise_power > 200.0 * prior.interpolation_power.mean())

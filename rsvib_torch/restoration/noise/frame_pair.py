@@ -92,13 +92,13 @@ def _residual_power(
     prior of ``prior_weight``, relative to the data, fills in rows of the scene that neither frame contains.
     """
     num_rows, width = images.shape[-2:]
-    rows = first_rows[:, None] + torch.arange(num_rows, device=images.device)
+    rows = first_rows[:, None] + torch.arange(num_rows, dtype=torch.float64, device=images.device)
     starts = motion.frame_starts[members][:, None] + rows * motion.timing.row_time
     displacement, node_weights = exposure_trajectory(motion.vibration[stack], starts, motion.timing, "gauss")
     displacement = displacement - motion.shift[stack, members][:, None, None]
     kernels = row_kernels(displacement, node_weights, images.new_ones(2), num_rows, 4 * _MIN_SIDE)
     count = min(num_frequencies, width // 4)
-    chosen = torch.linspace(width // 4, width // 2, count, device=images.device).long()
+    chosen = torch.linspace(width // 4, width // 2, count, device=images.device, dtype=torch.float32).long()
     sample = sample_rows(images, kernels, chosen)
     explained = sample.explain([RowPrior.smooth(sample.u).precision(sample.u.new_ones(()), prior_weight)])
     power: Tensor = explained.power.sum() / (explained.count * len(chosen) - explained.freedom.sum())

@@ -14,7 +14,8 @@ def spread_squares(shape: Sequence[int], counts: Sequence[int], device: torch.de
     """Rows (n, SIDE) and columns (m, SIDE) of n x m squares spread evenly over an image of that shape."""
     inside = torch.arange(SIDE, device=device)
     rows, columns = (
-        torch.linspace(0, extent - SIDE, count, device=device).round().to(torch.int64)[:, None] + inside
+        torch.linspace(0, extent - SIDE, count, device=device, dtype=torch.float32).round().to(torch.int64)[:, None]
+        + inside
         for extent, count in zip(shape, counts, strict=True)
     )
     return rows, columns

@@ -79,7 +79,7 @@ def kernel_weights(fraction: Tensor) -> Tensor:
 
 def kernel_samples() -> tuple[float, ...]:
     """The kernel at the rows -2 ... 2."""
-    return tuple(_kernel(torch.arange(1 - REACH, REACH, dtype=torch.float64)).tolist())
+    return tuple(_kernel(torch.arange(1 - REACH, REACH, dtype=torch.float64, device="cpu")).tolist())
 
 
 def kernel_spectrum(frequencies: Tensor) -> Tensor:
@@ -99,10 +99,10 @@ def scene_weights() -> tuple[float, ...]:
     interpolation without aliases: the least-squares fit of these weights to ``kernel_spectrum`` up to 0.46 cycles per
     row, for amplitude spectra like frequency^-1 behind Gaussian optics of sigma 0.6 px.
     """
-    v = torch.linspace(0, 0.46, 369, dtype=torch.float64)
+    v = torch.linspace(0, 0.46, 369, dtype=torch.float64, device="cpu")
     spectrum = kernel_spectrum(v)
-    order = torch.arange(SCENE_REACH + 1, dtype=torch.float64)
-    cosines = torch.cos(2 * torch.pi * v[:, None] * order) * torch.where(order > 0, 2.0, 1.0)
+    order = torch.arange(SCENE_REACH + 1, dtype=torch.float64, device="cpu")
+    cosines = torch.cos(2 * torch.pi * v[:, None] * order) * torch.where(order > 0, v.new_tensor(2.0), 1.0)
     count = torch.exp(-0.5 * (2 * torch.pi * 0.6 * v).square()) / ((v + 0.02) * spectrum)
     half = torch.linalg.lstsq(cosines * count[:, None], (spectrum * count)[:, None]).solution[:, 0]
     return tuple(torch.cat([half.flip(0), half[1:]]).tolist())
@@ -118,7 +118,13 @@ def interpolation_error(frequencies: Tensor, cycles: Sequence[int] = (-3, -2, -1
     Returns:
         Power of the same shape.
     """
-    return kernel_spectrum(frequencies[..., None] + torch.tensor(cycles).to(frequencies)).square().sum(-1)
+    return (
+        kernel_spectrum(
+            frequencies[..., None] + torch.tensor(cycles, dtype=torch.float64, device="cpu").to(frequencies)
+        )
+        .square()
+        .sum(-1)
+    )
 
 
 @dataclass(frozen=True, eq=False)

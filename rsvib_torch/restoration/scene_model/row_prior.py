@@ -205,7 +205,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     size = [min(piece, whole) for piece, whole in zip((64, 256), frames.shape[-2:], strict=True)]
     starts = _spread_pieces(frames.shape[-2:], size)  # rows, columns
     tops, lefts = (begin.tolist() for begin in starts)
-    rows = (starts[0][:, None] + torch.arange(size[0])).to(frames.device)
+    rows = (starts[0][:, None] + torch.arange(size[0], device="cpu")).to(frames.device)
     tapers = [
         torch.hann_window(extent + 2, periodic=False, dtype=frames.dtype, device=frames.device)[1:-1] for extent in size
     ]
@@ -214,7 +214,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
     v = torch.fft.fftfreq(size[0], dtype=torch.float64, device=frames.device)
 
     vibration = motion.vibration[stack]
-    times = motion.frame_starts[:, None] + rows.flatten() * motion.timing.row_time
+    times = motion.frame_starts[:, None] + rows.flatten().to(torch.float64) * motion.timing.row_time
     mean = vibration.mean_displacement(times, motion.timing.exposure_time)[..., 0]
     back = waves(mean, -u).to(frames.dtype.to_complex()).unflatten(1, rows.shape)  # (T, pieces, rows, U)
     back = back * tapers[0][:, None]
@@ -228,7 +228,11 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
         spectra = torch.fft.rfft(pieces.sub_(bright[..., None]).mul_(tapers[1])).mul_(back[:, None, chosen, None])
         powers.append(squared_modulus(torch.fft.fft(spectra, dim=-2)).mean((1, 3)).transpose(-2, -1))
     power = torch.cat(powers, dim=1).to(torch.float64) * length  # (T, pieces, U, V)
-    few = torch.linspace(0, len(tops) - 1, min(4, len(tops)), device=rows.device).round().to(torch.int64)
+    few = (
+        torch.linspace(0, len(tops) - 1, min(4, len(tops)), device=rows.device, dtype=torch.float32)
+        .round()
+        .to(torch.int64)
+    )
     strips_of_rows = (frames[..., rows[few], :] - bright) * tapers[0][:, None]  # (T, C, n, rows, W)
     whole = _power_of_rows(strips_of_rows, length, len(u))
 
@@ -284,6 +288,6 @@ def _spread_pieces(shape: torch.Size, size: list[int]) -> list[Tensor]:
     excess = max(1.0, math.sqrt(counts[0] * counts[1] / 128))
     counts = [max(1, round(count / excess)) for count in counts]
     return [
-        torch.linspace(0, whole - extent, count).round().to(torch.int64)
+        torch.linspace(0, whole - extent, count, dtype=torch.float32, device="cpu").round().to(torch.int64)
         for whole, extent, count in zip(shape, size, counts, strict=True)
     ]

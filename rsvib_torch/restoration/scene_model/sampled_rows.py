@@ -106,8 +106,9 @@ def sample_rows(images: Tensor, kernels: RowKernels, chosen: Tensor) -> SampledR
     count = slabs * height
     images, kernels = images[..., :count, :], kernels.rows(0, count)
     taper = torch.hann_window(width + 2, periodic=False, dtype=images.dtype, device=images.device)[1:-1]
-    u = chosen / width
-    angle = (-2 * torch.pi) * (torch.arange(width, device=u.device)[:, None] * chosen % width) / width
+    u = chosen.to(torch.float32) / width
+    cycles = torch.arange(width, device=u.device)[:, None] * chosen % width
+    angle = (-2 * torch.pi) * cycles.to(torch.float32) / width
     angle = angle.to(torch.float64)
     tapered = (taper[:, None] * torch.cat([angle.cos(), angle.sin()], dim=-1)).to(images.dtype)
     mean = images.mean((-2, -1), keepdim=True)

@@ -12,6 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
@@ -68,7 +69,9 @@ class RestorationWarning(UserWarning):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RestorationVerdict(
-    Result, units={"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"}
+    Result,
+    units={"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"},
+    shapes={"misfit_before": "... 2", "misfit_after": "... 2", "resolution": "... 2"},
 ):
     """Verdict on a restoration from P pairs of frames of one scene.
 
@@ -147,6 +150,7 @@ class RestorationVerdict(
         }
         return sentences[self.overall]
 
+    @checks_arguments
     def in_image_axes(self, timing: SensorTiming) -> "RestorationVerdict":
         """The verdict on frames in row order, with axes named as in the image."""
         if timing.scan_axis == -2:
@@ -302,6 +306,7 @@ def judge_frames(
     return RestorationVerdict(**joined, outcome=outcome, reasons=tuple(verdict.reasons[0] for verdict in verdicts))
 
 
+@checks_arguments
 def judge_restoration(
     frames: FramesOrFiles,
     restored: FramesOrFiles,

@@ -63,7 +63,7 @@ def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> li
         pairs = [(middle, p) for p in range(count) if p != middle]
     if most is None or len(pairs) <= most:
         return pairs
-    chosen = torch.linspace(0, len(pairs) - 1, most).round().to(torch.int64).tolist()
+    chosen = torch.linspace(0, len(pairs) - 1, most, dtype=torch.float32, device="cpu").round().to(torch.int64).tolist()
     return [pairs[index] for index in chosen]
 
 
@@ -175,7 +175,7 @@ def misfit(first: Tensor, second: Tensor, *, step: int = 4) -> tuple[Tensor, Ten
         Misfit (2,) and its resolution (2,) in px, axes (x, y), float64; a misfit below the resolution cannot be
         distinguished from zero. For images without contrast 0 and infinity.
     """
-    place = torch.arange(-_RIM, _RIM + 1, device=first.device)
+    place = torch.arange(-_RIM, _RIM + 1, dtype=torch.float32, device=first.device)
     gaussian = torch.where(place.abs() < _RIM, torch.exp(-0.5 * (place / _SMOOTHING).double().square()), 0.0)
     gaussian = gaussian / gaussian.sum()
     kernels = torch.stack([gaussian, 0.5 * (gaussian.roll(1) - gaussian.roll(-1))]).to(first.dtype)

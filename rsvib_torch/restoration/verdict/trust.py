@@ -1,11 +1,13 @@
 """The part of a detected vibration that is accurate enough to be undone, from its standard deviations."""
 
 import math
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
@@ -14,6 +16,7 @@ from rsvib_torch.motion.vibration import Vibration
 __all__ = ["Detected", "displacement_uncertainty", "trusted_vibration", "vibration_to_undo"]
 
 
+@runtime_checkable
 class Detected(Protocol):
     """A vibration with its standard deviations and a verdict, as ``detect_vibration`` returns it."""
 
@@ -69,6 +72,7 @@ def displacement_uncertainty(
     return error, (attenuation * amplitude.square()).sum(-1).sqrt()
 
 
+@checks_arguments
 def trusted_vibration(
     detected: Detected, timing: SensorTiming, num_frames: int, num_rows: int
 ) -> tuple[Vibration, tuple[str, ...]]:
@@ -98,6 +102,8 @@ def trusted_vibration(
         >>> vibration.amplitude.flatten().tolist(), notes
         ([3.0, 0.0], ('y is not restored: its vibration is not reliable (blind)',))
     """
+    check_whole_number("num_frames", num_frames, at_least=1)
+    check_whole_number("num_rows", num_rows, at_least=1)
     vibration, std = detected.vibration, detected.std
     reliable = torch.as_tensor(detected.reliable, dtype=torch.bool, device=vibration.device)
     error, size = (

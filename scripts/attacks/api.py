@@ -1,0 +1,653 @@
+"""Calls of the Python interface with hostile arguments.
+
+Every public function, class, module and method has a valid call here. Each trial replaces one or two arguments by
+values of other types, extreme numbers, or damaged tensors, and must end with a result or with an exception that names
+the argument. A name of ``rsvib_torch.__all__`` without a valid call raises an error.
+"""
+
+import copy
+import dataclasses
+import inspect
+import math
+import random
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from attacks.trial import Trial
+from attacks.warm import in_warm_child, place_of
+from torch import Tensor
+
+import rsvib_torch as rsv
+
+__all__ = ["api_trials", "calls"]
+
+SECONDS, MEMORY = 10.0, 2 << 30  # limits of one trial; bytes in addition to those of the valid calls
+_REFUSED = (ValueError, TypeError, OSError)
+_NOT_CALLED = {"RestorationWarning", "TimingWarning"}  # categories of warnings
+
+
+@dataclass(frozen=True)
+class Call:
+    """A valid call: ``of(**arguments)``; methods of the result are called without further arguments."""
+
+    of: Callable[..., Any]
+    arguments: Mapping[str, Any]
+
+
+def _with_fields(value: Any) -> Call:
+    """The constructor of a dataclass with the values of an object."""
+    names = [field.name for field in dataclasses.fields(value) if field.init]
+    return Call(type(value), {name: getattr(value, name) for name in names})
+
+
+def _methods(value: Any, **arguments: Any) -> dict[str, Call]:
+    """All public methods of an object whose arguments are known by name."""
+    calls = {}
+    for name, method in inspect.getmembers(value, callable):
+        if name.startswith("_") or name == "mapped" or not getattr(method, "__module__", "").startswith("rsvib_torch"):
+            continue
+        parameters = inspect.signature(method).parameters
+        known = {key: arguments[key] for key in parameters if key in arguments}
+        needed = [key for key, one in parameters.items() if one.default is one.empty and one.kind < one.VAR_KEYWORD]
+        if any(key not in known for key in needed if parameters[key].kind is not parameters[key].VAR_POSITIONAL):
+            raise LookupError(f"{type(value).__name__}.{name}: no value for {set(needed) - set(known)}")
+        calls[f"{type(value).__name__}.{name}"] = Call(method, known)
+    return calls
+
+
+@cache
+def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
+    """Valid calls of everything in ``rsvib_torch.__all__``, by name."""
+    folder.mkdir(parents=True, exist_ok=True)
+    generator = torch.Generator("cpu").manual_seed(0)
+    timing = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104, frame_start_times=(0.0, 0.0104, 0.021))
+    vibration = rsv.Vibration([1.2, 0.8], [130.0, 170.0], [0.3, 0.9], image_motion=(5.0, 3.0))
+    noise = torch.randn(1, 1, 160, 128, generator=generator, dtype=torch.float64)
+    scene = 0.5 + 0.2 * torch.nn.functional.avg_pool2d(noise, 3, 1, 1)[0, 0].to(torch.float32)
+    frames = rsv.simulate_frames(scene, timing, vibration, 3, frame_size=(96, 64))
+    bands: dict[str, Any] = {"band_rows": 16, "band_step": 8, "search": 6}
+    detected = rsv.detect_vibration(frames, timing, method="bands", tones=1, **bands)
+    free = rsv.detect_motion(frames, timing, **bands)
+    swept = rsv.detect_swept_tone(frames, timing, **bands)
+    restored = rsv.restore(frames, timing, vibration, method="dewarp", check=False)
+    rows, columns = torch.meshgrid(torch.arange(64.0), torch.arange(48.0), indexing="ij")
+    edge = torch.sigmoid((columns - 24 - 0.1 * (rows - 32)) / 0.7) * 0.6 + 0.2
+    image = edge.repeat(2, 3)
+    curve = rsv.slanted_edge_mtf(edge)
+    times = torch.linspace(-0.01, 0.05, 121, dtype=torch.float64)
+    path = torch.stack([0.5 * torch.sin(800 * times), 0.3 * torch.cos(700 * times)], -1)
+    recorded = rsv.FreeMotion.through(times, path)
+    stripes = torch.stack([0.5 + 0.3 * torch.sin(rows[:, :1] * 0.5 + phase).expand(-1, 32) for phase in (0.0, 1.0)])
+    counts = (frames * 4095).round().clamp(0, 4095).numpy().astype(np.uint16)
+    stack, motion_file = folder / "frames.npy", folder / "motion.csv"
+    rsv.write_stack(stack, frames, dtype="float32")
+    lines = [f"{t:.9g},{x:.9g},{y:.9g}" for t, (x, y) in zip(times.tolist(), path.tolist(), strict=True)]
+    motion_file.write_text("\n".join(["time,x,y", *lines]))
+    rsv.write_vibration(folder / "vibration.json", detected)
+    options: dict[str, Any] = {
+        "detection": {"method": "bands", "tones": 1, **bands},
+        "restoration": {"method": "dewarp"},
+    }
+    options |= {"full_scale": None, "force": False, "device": "cpu"}
+    windows = {"window": 3, "memory": "1GB", "workers": 1, **options}
+    rsv.process_stack(stack, folder / "out.npy", timing, **windows)
+    manifest = rsv.read_manifest(folder / "out.npy.manifest.json")
+    psf = rsv.row_psf(vibration, timing.row_starts(1, 96)[0], timing)
+    blur = rsv.RowVaryingBlur(psf, frame_width=64)
+    augmentation = rsv.RollingShutterVibration(timing, amplitude=(0.5, 2.0), frequency=(40.0, 200.0))
+    detector = rsv.VibrationDetector(timing, method="bands", tones=1, **bands)
+    restorer = rsv.VibrationRestorer(timing, method="dewarp", check=False)
+    check = rsv.check_motion(frames, timing, recorded, **bands)
+    alignment = rsv.align_motion(frames, timing, recorded, offsets=(-0.001, 0.001), **bands)
+    verdict = rsv.judge_restoration(frames, restored, timing, vibration)
+    optics, sensor_noise = rsv.Optics(0.5, 0.4, 1.0), rsv.SensorNoise(5000.0, 0.01, 12, 0.01, 0.01, 0.01, 3)
+    calibration = rsv.RowTimeCalibration(1e-4, 1e-6, 12.0, 0.3, 1000.0, 104.0, "forward", 1e-3, 1e-5, ())
+    slanted = rsv.SlantedEdge(0, 0, 64, 48, 5.0, True, "right", 0.6)
+    info = rsv.read_stack_info(stack)
+    figure = rsv.motion_figure(vibration)
+    common: dict[str, Any] = {"times": times, "starts": times, "later_starts": times + 0.01, "exposure_time": 6e-4}
+    common |= {"duration": 6e-4, "interval": 0.0104, "first": 0.0, "last": 0.03, "timing": timing, "order": [1, 0]}
+    common |= {"signs": [1.0, -1.0], "size": 2, "device": "cpu", "path": folder / "out.json", "offset": 0.001}
+    common |= {"scale": 1.0, "gain": (1.0, 1.0), "displacement": path, "spacing": 5e-4, "motions": [recorded, recorded]}
+    common |= {"batch_shape": (2,), "frequency": torch.tensor([0.1, 0.2], dtype=torch.float64), "num_rows": 96}
+    common |= {"num_frames": 3, "line_time": 1e-4, "delays": [0.0, 0.04], "num_lines": 100, "exposure_lines": 2.0}
+    common |= {"height": 24, "width": 16, "frames": frames, "generator": torch.Generator("cpu").manual_seed(1)}
+    common |= {"scene": scene, "u": times * 10, "v": times * 10, "input": frames[:, None], "image": image}
+    common |= {"vibration": vibration, "index": 0, "count": 3, "shape": (3, 96, 64), "dtype": "float32"}
+    common |= {"frame": frames[0].numpy(), "x": scene, "y": frames[0], "scene_shape": (160, 128), "tones": None}
+    frames_call = {"frames": frames, "timing": timing, "full_scale": None, "channels": None, "ignore": None}
+    result = {
+        "align_motion": Call(
+            rsv.align_motion,
+            {
+                "frames": frames,
+                "timing": timing,
+                "recorded": recorded,
+                "offsets": (-0.001, 0.001),
+                "fit_scale": True,
+                "fit_gain": True,
+                **bands,
+            },
+        ),
+        "blind_frequencies": Call(rsv.blind_frequencies, {"timing": timing, "highest": 500.0}),
+        "calibrate_row_time": Call(
+            rsv.calibrate_row_time,
+            {
+                "frames": stripes,
+                "flicker_frequency": 1000.0,
+                "frame_rate": 30.0,
+                "on_fraction": None,
+                "light_contrast": None,
+                "scan_axis": "y",
+                "gamma": 1.0,
+                "full_scale": None,
+                "channels": None,
+            },
+        ),
+        "calibrate_row_time_by_exposure": Call(
+            rsv.calibrate_row_time_by_exposure,
+            {"frames": stripes, "exposure_times": [1e-3, 2.5e-4], "scan_axis": "y", "gamma": 1.0, "full_scale": None},
+        ),
+        "check_motion": Call(rsv.check_motion, {"frames": frames, "timing": timing, "motion": recorded, **bands}),
+        "comparison_figure": Call(
+            rsv.comparison_figure,
+            {"raw": frames[0], "restored": restored[0], "count": 2, "size": 32, "names": ("input", "restored")},
+        ),
+        "detect_motion": Call(rsv.detect_motion, {**frames_call, "knot_rows": 24, "iterations": 1, **bands}),
+        "detect_swept_tone": Call(rsv.detect_swept_tone, {**frames_call, "iterations": 1, **bands}),
+        "detect_vibration": Call(
+            rsv.detect_vibration,
+            {
+                **frames_call,
+                "model": "tones",
+                "method": "bands",
+                "tones": 1,
+                "harmonics": 1,
+                "image_acceleration": False,
+                "columns": None,
+                "window": None,
+                "window_step": None,
+                "registration": "ncc",
+                **bands,
+            },
+        ),
+        "detect_vibration direct": Call(rsv.detect_vibration, {**frames_call, **bands}),
+        "find_slanted_edges": Call(
+            rsv.find_slanted_edges, {"image": image, "min_length": 32, "max_length": 64, "min_contrast": 0.1}
+        ),
+        "gain_figure": Call(rsv.gain_figure, {"result": detected, "timing": timing}),
+        "iterate_stack": Call(
+            lambda **given: list(rsv.iterate_stack(**given)), {"source": stack, "timing": timing, **windows}
+        ),
+        "judge_restoration": Call(
+            rsv.judge_restoration, {"frames": frames, "restored": restored, "timing": timing, "vibration": vibration}
+        ),
+        "motion_figure": Call(rsv.motion_figure, {"motion": vibration, "first": 0.0, "last": 0.1}),
+        "mtf_figure": Call(rsv.mtf_figure, {"curves": {"raw": [curve], "restored": [curve]}}),
+        "offset_endpoint_error": Call(
+            rsv.offset_endpoint_error, {"measured": path, "truth": path * 0.9, "reduction": "mean"}
+        ),
+        "offset_figure": Call(rsv.offset_figure, {"result": detected}),
+        "open_stack": Call(rsv.open_stack, {"path": stack}),
+        "predict_noise_gain": Call(
+            rsv.predict_noise_gain, {"frames": frames, "timing": timing, "vibration": vibration, "method": "dewarp"}
+        ),
+        "process_stack": Call(
+            rsv.process_stack,
+            {
+                "source": stack,
+                "sink": folder / "new.npy",
+                "timing": timing,
+                "bad_frames": "pass",
+                "compression": None,
+                "resume": False,
+                "manifest": None,
+                "given": None,
+                "scheduler": None,
+                "progress": None,
+                **windows,
+            },
+        ),
+        "psf_figure": Call(rsv.psf_figure, {"vibration": vibration, "timing": timing, "num_rows": 96}),
+        "psnr": Call(rsv.psnr, {"image": restored, "reference": frames, "data_range": 1.0, "rim": 4}),
+        "read_manifest": Call(rsv.read_manifest, {"path": folder / "out.npy.manifest.json"}),
+        "read_motion": Call(
+            rsv.read_motion,
+            {"path": motion_file, "unit": "rad", "focal_length": 100.0, "time_unit": "s", "signs": (1.0, -1.0)},
+        ),
+        "read_stack": Call(rsv.read_stack, {"path": stack, "full_scale": None}),
+        "read_stack_info": Call(rsv.read_stack_info, {"path": stack}),
+        "read_vibration": Call(rsv.read_vibration, {"path": folder / "vibration.json", "timing": timing}),
+        "register_bands": Call(rsv.register_bands, {**frames_call, "method": "ncc", **bands}),
+        "register_bands phase": Call(
+            rsv.register_bands, {"frames": frames, "timing": timing, "method": "phase", **bands}
+        ),
+        "register_bands projection": Call(
+            rsv.register_bands, {"frames": frames, "timing": timing, "method": "projection", **bands}
+        ),
+        "restore": Call(
+            rsv.restore,
+            {
+                **frames_call,
+                "vibration": vibration,
+                "method": "exact",
+                "saturation": "auto",
+                "check": True,
+                "joint": False,
+                "prior": "gaussian",
+                "noise": "auto",
+                "regularisation": 1.0,
+                "chunk_frequencies": None,
+                "segments": None,
+            },
+        ),
+        "restore banded": Call(
+            rsv.restore,
+            {
+                "frames": frames,
+                "timing": timing,
+                "vibration": vibration,
+                "method": "banded",
+                "half_rows": 8,
+                "stride": 8,
+                "interpolation": "cubic",
+                "noise_to_signal": "auto",
+                "chunk_rows": None,
+                "check": False,
+            },
+        ),
+        "restore dewarp": Call(
+            rsv.restore,
+            {
+                "frames": frames,
+                "timing": timing,
+                "vibration": detected,
+                "method": "dewarp",
+                "chunk_rows": 64,
+                "check": False,
+            },
+        ),
+        "restore richardson-lucy": Call(
+            rsv.restore,
+            {
+                "frames": frames,
+                "timing": timing,
+                "vibration": vibration,
+                "method": "richardson-lucy",
+                "joint": False,
+                "iterations": 2,
+                "check": False,
+            },
+        ),
+        "restore_block": Call(
+            rsv.restore_block, {"frames": counts, "timing": timing, **options, "full_scale": 4095.0, "channels": None}
+        ),
+        "row_psf": Call(
+            rsv.row_psf,
+            {
+                "vibration": vibration,
+                "starts": timing.row_starts(1, 96)[0],
+                "timing": timing,
+                "interpolation": "linear",
+                "quadrature": "midpoint",
+                "num_nodes": 4,
+            },
+        ),
+        "rows_figure": Call(rsv.rows_figure, {"vibration": vibration, "timing": timing, "num_rows": 96}),
+        "save_figure": Call(rsv.save_figure, {"figure": figure, "path": folder / "figure.png", "dpi": 20}),
+        "simulate_frames": Call(
+            rsv.simulate_frames,
+            {
+                "scene": scene,
+                "timing": timing,
+                "vibration": vibration,
+                "num_frames": 2,
+                "frame_size": (64, 48),
+                "noise": sensor_noise,
+                "generator": torch.Generator("cpu").manual_seed(1),
+            },
+        ),
+        "slanted_edge_mtf": Call(rsv.slanted_edge_mtf, {"roi": edge}),
+        "ssim": Call(rsv.ssim, {"image": restored, "reference": frames, "data_range": 1.0, "rim": 4}),
+        "timing_from_first_frame": Call(rsv.timing_from_first_frame, {"timing": timing, "info": info}),
+        "trusted_vibration": Call(
+            rsv.trusted_vibration, {"detected": detected, "timing": timing, "num_frames": 3, "num_rows": 96}
+        ),
+        "visible_pixels": Call(
+            rsv.visible_pixels, {"timing": timing, "vibration": vibration, "size": (96, 64), "num_frames": 3}
+        ),
+        "windows_figure": Call(
+            rsv.windows_figure, {"times": [0.0], "detections": [detected], "time_label": "start (s)"}
+        ),
+        "write_offsets": Call(rsv.write_offsets, {"path": folder / "offsets.csv", "result": detected}),
+        "write_stack": Call(
+            rsv.write_stack,
+            {
+                "path": folder / "written.tif",
+                "frames": frames,
+                "channels": None,
+                "dtype": "float32",
+                "full_scale": None,
+                "compression": None,
+                "like": info,
+            },
+        ),
+        "write_vibration": Call(
+            rsv.write_vibration, {"path": folder / "written.json", "result": detected, "timing": timing}
+        ),
+        "write_windows": Call(rsv.write_windows, {"path": folder / "windows.csv", "manifest": manifest}),
+        "FreeMotion": Call(
+            rsv.FreeMotion, {"coefficients": recorded.coefficients, "start": 0.0, "spacing": 5e-4, "tones": vibration}
+        ),
+        "RollingShutterVibration": Call(
+            rsv.RollingShutterVibration,
+            {
+                "timing": timing,
+                "amplitude": (0.5, 2.0),
+                "frequency": (40.0, 200.0),
+                "phase": (-3.0, 3.0),
+                "image_motion": 0.0,
+                "exposure_rows": (4.0, 8.0),
+                "tones": 1,
+                "interpolation": "cubic",
+                "p": 0.5,
+                "same_on_batch": False,
+                "keepdim": False,
+            },
+        ),
+        "RollingShutterVibration.forward": Call(augmentation, {"input": frames[:, None]}),
+        "RollingShutterVibration.drawn_vibration": Call(augmentation.drawn_vibration, {"params": None}),
+        "RowVaryingBlur": Call(
+            rsv.RowVaryingBlur, {"psf": psf, "frame_width": 64, "origin": (4, 4), "scene_size": (160, 128)}
+        ),
+        "SensorTiming": Call(
+            rsv.SensorTiming,
+            {
+                "row_time": 1e-4,
+                "exposure_rows": 6.0,
+                "frame_rows": 104.0,
+                "scan_axis": "y",
+                "readout_direction": "forward",
+                "frame_start_times": (0.0, 0.0104, 0.021),
+            },
+        ),
+        "Vibration": Call(
+            rsv.Vibration,
+            {
+                "amplitude": vibration.amplitude,
+                "frequency": [130.0, 170.0],
+                "phase": 0.3,
+                "image_motion": (5.0, 3.0),
+                "image_acceleration": (0.0, 0.0),
+            },
+        ),
+        "VibrationDetector": Call(
+            rsv.VibrationDetector, {"timing": timing, "model": "tones", "method": "bands", "tones": 1, **bands}
+        ),
+        "VibrationRestorer": Call(
+            rsv.VibrationRestorer,
+            {
+                "timing": timing,
+                "method": "exact",
+                "full_scale": None,
+                "channels": None,
+                "saturation": "auto",
+                "check": True,
+                "joint": False,
+            },
+        ),
+        "VibrationDetector.forward": Call(detector, {"frames": frames}),
+        "VibrationRestorer.forward": Call(restorer, {"frames": frames, "vibration": vibration, "ignore": None}),
+    }
+    augmentation(frames[:, None])
+    for value in (
+        alignment,
+        detected,
+        check,
+        free,
+        curve,
+        detected.offsets,
+        optics,
+        verdict,
+        calibration,
+        sensor_noise,
+        slanted,
+        info,
+        swept,
+        detected.std,
+    ):
+        result[type(value).__name__] = _with_fields(value)
+    report = rsv.process_stack(stack, folder / "again.npy", timing, **windows)
+    result["StackReport"] = _with_fields(report)
+    for value in (
+        vibration,
+        recorded,
+        timing,
+        detected,
+        detected.std,
+        detected.offsets,
+        free,
+        swept,
+        check,
+        alignment,
+        curve,
+        optics,
+        sensor_noise,
+        verdict,
+        calibration,
+        slanted,
+        info,
+        report,
+    ):
+        result |= _methods(value, **common)
+    for method, value in (("forward", {"scene": scene}), ("adjoint", {"frames": frames[0], "scene_shape": (160, 128)})):
+        result[f"RowVaryingBlur.{method}"] = Call(getattr(blur, method), value)
+    missing = set(rsv.__all__) - _NOT_CALLED - {name.partition(" ")[0] for name in result}
+    if missing:
+        raise LookupError(f"no valid call of {', '.join(sorted(missing))}")
+    return result
+
+
+_NUMBERS: dict[str, Any] = {
+    "0": 0, "-1": -1, "nan": math.nan, "inf": math.inf, "-inf": -math.inf, "1e300": 1e300, "-1e300": -1e300,
+    "5e-324": 5e-324, "1e-40": 1e-40, "1e308": 1e308, "1e9": 1e9, "10**9": 10**9, "10**30": 10**30, "2**63": 2**63,
+    "-10**30": -(10**30), "0.5": 0.5, "True": True, "numpy int": np.int64(3), "numpy nan": np.float32(np.nan),
+}  # fmt: skip
+_OTHERS: dict[str, Callable[[], Any]] = {
+    "None": lambda: None,
+    "text": lambda: "nonsense",
+    "empty text": lambda: "",
+    "NUL": lambda: "a\0b",
+    "long text": lambda: "x" * 100_000,
+    "bytes": lambda: b"\xff\x00",
+    "complex": lambda: 1 + 2j,
+    "object": object,
+    "list": lambda: [],
+    "nested list": lambda: [[1, [2, 3]], "x"],
+    "dict": lambda: {"a": 1},
+    "set": lambda: {1, 2},
+    "function": lambda: len,
+    "class": lambda: rsv.Vibration,
+    "ragged": lambda: [[1.0], [1.0, 2.0]],
+    "list of None": lambda: [None, None],
+    "list of nan": lambda: [math.nan, math.nan],
+    "list of 1e300": lambda: [1e300, 1e300],
+    "generator": lambda: (number for number in (1.0, 2.0)),
+    "empty tensor": lambda: torch.zeros(0),
+    "scalar tensor": lambda: torch.tensor(2.0),
+    "meta scalar": lambda: torch.zeros((), device="meta"),
+    "timing of 1e-9 s": lambda: rsv.SensorTiming(1e-9, 1.0, 104.0),
+    "timing of few rows": lambda: rsv.SensorTiming(1e-4, 1.0, 10.0),
+    "timing with one start": lambda: rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0]),
+    "timing of 1e9 s": lambda: rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[1e9, 1e9 + 1, 1e9 + 2]),
+    "timing along columns": lambda: rsv.SensorTiming(1e-4, 6, 104, scan_axis="x", readout_direction="reverse"),
+    "vibration of 1e5 px": lambda: rsv.Vibration(1e5, 50.0),
+    "vibration of 1e8 Hz": lambda: rsv.Vibration(1.0, 1e8),
+    "vibration batch": lambda: rsv.Vibration.still((4,)),
+    "vibration of 1e5 px/s": lambda: rsv.Vibration(1.0, 50.0, image_motion=(1e5, 1e5)),
+    "vibration with gradient": lambda: rsv.Vibration(torch.tensor([1.0, 1.0], requires_grad=True), 50.0),
+    "still": rsv.Vibration.still,
+    "folder": lambda: "/",
+    "device file": lambda: "/dev/zero",
+    "long name": lambda: "/tmp/" + "x" * 5000,
+    "bytes of a name": lambda: b"/tmp/x",
+}  # fmt: skip
+_TENSORS: dict[str, Callable[[Tensor], Any]] = {
+    "meta": lambda t: t.to("meta"),
+    "sparse": lambda t: t.to_sparse(),
+    "csr": lambda t: t.flatten(0, -2).to_sparse_csr() if t.ndim > 1 else t.to_sparse(),
+    "nested": lambda t: torch.nested.nested_tensor([t.float(), t.float()[:1]]),
+    "jagged": lambda t: torch.nested.nested_tensor([t.float(), t.float()[:1]], layout=torch.jagged),
+    "quantised": lambda t: torch.quantize_per_tensor(t.float(), 0.01, 0, torch.quint8),
+    "complex": lambda t: t.to(torch.complex64),
+    "bool": lambda t: t > 0.5,
+    "int64": lambda t: (100 * t).nan_to_num().to(torch.int64),
+    "uint16": lambda t: (100 * t.abs()).nan_to_num().to(torch.uint16),
+    "half": lambda t: t.half(),
+    "bfloat16": lambda t: t.bfloat16(),
+    "float8": lambda t: t.float().to(torch.float8_e4m3fn),
+    "float64": lambda t: t.double(),
+    "gradient": lambda t: t.detach().clone().float().requires_grad_(),
+    "inf": lambda t: torch.full_like(t, math.inf, dtype=torch.float32),
+    "nan": lambda t: torch.full_like(t, math.nan, dtype=torch.float32),
+    "one nan": lambda t: t.float().flatten().index_fill(0, torch.tensor([t.numel() // 2]), math.nan).reshape(t.shape),
+    "one inf": lambda t: t.float().flatten().index_fill(0, torch.tensor([t.numel() // 2]), math.inf).reshape(t.shape),
+    "1e38": lambda t: t.float() * 1e38,
+    "3e38": lambda t: torch.full_like(t, 3e38, dtype=torch.float32),
+    "1e300": lambda t: t.double() * 1e300,
+    "1e-40": lambda t: t.float() * 1e-40,
+    "1e-300": lambda t: t.double() * 1e-300,
+    "zeros": torch.zeros_like,
+    "negative": lambda t: -t.float(),
+    "no first": lambda t: t[:0],
+    "no last": lambda t: t[..., :0],
+    "one": lambda t: t[:1],
+    "narrow": lambda t: t[..., :1],
+    "more axes": lambda t: t[None, None, None],
+    "fewer axes": lambda t: t[0] if t.ndim else t,
+    "transposed": lambda t: t.transpose(0, -1) if t.ndim else t,
+    "expanded": lambda t: t[:1].expand(t.shape),
+    "flipped array": lambda t: t.numpy()[..., ::-1],
+    "object array": lambda t: t.numpy().astype(object),
+    "masked array": lambda t: np.ma.masked_invalid(t.numpy()),
+    "text array": lambda t: t.numpy().astype(str),
+    "date array": lambda t: (1000 * t.numpy()).astype("datetime64[s]"),
+    "record array": lambda t: np.zeros(tuple(t.shape), dtype=[("a", "f4"), ("b", "f4")]),
+    "half array": lambda t: t.numpy().astype(np.float16),
+    "long double array": lambda t: t.numpy().astype(np.longdouble),
+    "big-endian array": lambda t: t.numpy().astype(">f8"),
+    "read-only array": lambda t: np.broadcast_to(t.numpy()[:1], t.shape),
+    "list of tensors": list,
+    "list of unequal": lambda t: [t, t[:1]],
+    "parameter": lambda t: torch.nn.Parameter(t.detach().clone().float()),
+}  # fmt: skip
+
+
+def _candidates(value: Any) -> list[str]:
+    """Names of the hostile values for an argument with this valid value."""
+    names = list(_OTHERS) + list(_NUMBERS)
+    if isinstance(value, (Tensor, np.ndarray)):
+        names += [f"as {name}" for name in _TENSORS] * 2  # most likely to pass the first checks
+    return names
+
+
+def _hostile(name: str, value: Any) -> Any:
+    if name.startswith("as "):
+        return _TENSORS[name[3:]](torch.as_tensor(value).detach().clone())
+    return _OTHERS[name]() if name in _OTHERS else _NUMBERS[name]
+
+
+def _nan_without_reason(result: Any) -> bool:
+    """Whether a result that claims to be reliable is not finite."""
+    reliable = getattr(result, "reliable", None)
+    vibration = getattr(result, "vibration", None)
+    if not isinstance(reliable, Tensor) or vibration is None:
+        return False
+    values = torch.cat([vibration.amplitude, vibration.frequency, vibration.phase], -1)
+    return bool((reliable & ~torch.isfinite(values).all(-1)).any())
+
+
+Item = tuple[str, tuple[tuple[str, str], ...]]
+
+
+def _name(item: Item) -> str:
+    return f"{item[0]}({', '.join(f'{argument}={hostile}' for argument, hostile in item[1])})"
+
+
+def attempt(folder: Path, item: Item | None) -> Trial:  # noqa: PLR0911 - one for each outcome
+    """One call with hostile arguments."""
+    known = calls(folder / "valid")
+    if item is None:
+        return Trial("", "completed")
+    name, changes = item
+    call = known[name]
+    place = folder / "trial"
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir()
+    arguments = {
+        key: place / value.name
+        if (isinstance(value, Path) and not value.exists()) or (key in ("sink", "manifest") and isinstance(value, Path))
+        else value
+        for key, value in call.arguments.items()
+    }
+    try:
+        arguments |= {argument: _hostile(kind, call.arguments[argument]) for argument, kind in changes}
+    except Exception as error:  # PyTorch or the package cannot make this value
+        return Trial(_name(item), "refused", f"not made: {error}")
+    torch.manual_seed(0)
+    before = {key: copy.deepcopy(value) for key, value in arguments.items() if isinstance(value, np.ndarray)}
+    try:
+        result = call.of(**arguments)
+        str(result) if type(result).__module__.startswith("rsvib_torch") else None
+    except _REFUSED as error:
+        text = str(error)
+        if not text.strip():
+            return Trial(_name(item), "wrong", f"{type(error).__name__} without a message")
+        return Trial(_name(item), "refused", text[:300])
+    except MemoryError as error:
+        return Trial(_name(item), "memory", str(error)[:300])
+    except BaseException as error:
+        where = place_of(error)
+        if "allocate" in str(error):
+            return Trial(_name(item), "memory", f"{where}: {error}"[:300])
+        return Trial(_name(item), "traceback", f"{where}: {type(error).__name__}: {error}"[:300])
+    if _nan_without_reason(result):
+        return Trial(_name(item), "wrong", "reliable, but not finite")
+    for key, value in before.items():
+        if value.dtype.kind in "biuf" and not np.array_equal(value, arguments[key], equal_nan=value.dtype.kind == "f"):
+            return Trial(_name(item), "wrong", f"{key} was changed")
+    return Trial(_name(item), "completed")
+
+
+def items(known: Mapping[str, Call], count: int, seed: int) -> list[Item]:
+    """Trials: every argument in turn with the next of its hostile values, then two arguments at a time."""
+    choice = random.Random(seed)
+    queues = {
+        (name, argument): choice.sample(names := list(dict.fromkeys(_candidates(value))), len(names))
+        for name, call in known.items()
+        for argument, value in call.arguments.items()
+    }
+    singles: list[Item] = []
+    while any(queues.values()):
+        singles += [(name, ((argument, queue.pop()),)) for (name, argument), queue in queues.items() if queue]
+    pairs: list[Item] = []
+    wide = [name for name, call in known.items() if len(call.arguments) > 1]
+    for _ in range(count):
+        name = choice.choice(wide)
+        two = choice.sample(list(known[name].arguments.items()), 2)
+        pairs.append((name, tuple((argument, choice.choice(_candidates(value))) for argument, value in two)))
+    part = min(len(singles), -(-3 * count // 4))
+    return (singles[:part] + pairs)[:count]
+
+
+def api_trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
+    """Trials of hostile calls, three quarters of them with one hostile argument."""
+    torch.set_num_threads(1)
+    chosen = items(calls(folder / "listed" / "valid"), count, seed)
+    yield from in_warm_child(attempt, chosen, _name, folder / "child", limit=SECONDS, memory=MEMORY)

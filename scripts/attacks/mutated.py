@@ -1,0 +1,294 @@
+"""Randomly damaged files of all formats: frames are read, or a one-line error is raised."""
+
+import contextlib
+import io
+import json
+import random
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import tifffile
+import torch
+import zarr
+from attacks.trial import Trial
+from attacks.warm import in_warm_child, place_of
+
+import rsvib_torch as rsv
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.config import read_config
+from rsvib_torch.io import open_stack
+from rsvib_torch.report.results import read_vibration
+
+__all__ = ["ORIGINALS", "attempt", "damage", "mutated_trials", "write_originals"]
+
+SECONDS, MEMORY = 10.0, 1 << 30  # limits of one trial
+TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
+CONFIG = """
+[sensor]
+row_time = 1e-4
+exposure_rows = 6
+frame_rows = 104
+full_scale = 4095
+frame_start_times = [0.0, 0.0104, 0.0208]
+
+[detection]
+method = "bands"
+tones = 1
+band_rows = 16
+band_step = 8
+search = 6
+
+[restoration]
+method = "banded"
+half_rows = 8
+
+[simulation]
+num_frames = 3
+seed = 1
+
+[simulation.vibration]
+amplitude = [3.1, 5.2]
+frequency = [[50.0, 60.0], [30.0, 20.0]]
+
+[simulation.noise]
+read_noise = 0.003
+
+[stack]
+window = 4
+bad_frames = "skip"
+"""
+_TOKENS = (
+    b"-1",
+    b"0",
+    b"99999999999999999999",
+    b"1e999",
+    b"nan",
+    b"null",
+    b"[]",
+    b"{}",
+    b'""',
+    b"true",
+    b"\xff",
+    b"[" * 60,
+)
+
+
+@dataclass(frozen=True)
+class Original:
+    """A file to damage.
+
+    Attributes:
+        target: What is read, the file or the folder it belongs to.
+        read: How it is read.
+        text: Whether it is text.
+    """
+
+    target: str
+    read: Callable[[Path], Any]
+    text: bool = False
+
+
+def _read_stack(path: Path, most: int = 50) -> None:
+    reader = open_stack(path)
+    try:
+        for index in range(min(reader.info.shape[0], most)):
+            frame = reader.frame(index)
+            if (frame.shape, frame.dtype.name) != (reader.info.shape[1:], reader.info.dtype):
+                raise AssertionError(f"frame {index} is {frame.shape} {frame.dtype}, expected {reader.info}")
+    finally:
+        reader.close()
+
+
+def _read_manifest(path: Path) -> None:
+    manifest = rsv.read_manifest(path)
+    manifest.detections()
+    str(manifest)
+
+
+# Files to damage, by the name of the file.
+ORIGINALS = {
+    "pages.tif": Original("pages.tif", _read_stack),
+    "packed.tif": Original("packed.tif", _read_stack),
+    "tiles.tif": Original("tiles.tif", _read_stack),
+    "own.tif": Original("own.tif", _read_stack),
+    "frames.npy": Original("frames.npy", _read_stack),
+    "frames.png": Original("frames.png", _read_stack),
+    "colour.png": Original("colour.png", _read_stack),
+    "pngs/frame_0001.png": Original("pngs", _read_stack),
+    "frames.jpg": Original("frames.jpg", _read_stack),
+    "plain.h5": Original("plain.h5", _read_stack),
+    "packed.h5": Original("packed.h5", _read_stack),
+    "frames.raw": Original("frames.raw", _read_stack),
+    "frames.raw.json": Original("frames.raw", _read_stack, text=True),
+    "frames.zarr/zarr.json": Original("frames.zarr", _read_stack, text=True),
+    "frames.zarr/c/1/0/0": Original("frames.zarr", _read_stack),
+    "frames.mkv": Original("frames.mkv", _read_stack),
+    "frames.mp4": Original("frames.mp4", _read_stack),
+    "camera.toml": Original("camera.toml", read_config, text=True),
+    "motion.csv": Original("motion.csv", lambda path: str(rsv.read_motion(path, unit="px")), text=True),
+    "out.npy.manifest.json": Original("out.npy.manifest.json", _read_manifest, text=True),
+    "vibration.json": Original("vibration.json", lambda path: str(read_vibration(path, TIMING)), text=True),
+    "detection.json": Original("detection.json", lambda path: str(rsv.DetectionResult.load(path)), text=True),
+    "free.json": Original("free.json", lambda path: str(rsv.FreeMotion.load(path)), text=True),
+    "swept.json": Original("swept.json", lambda path: str(rsv.SweptTone.load(path)), text=True),
+}
+
+
+@cache
+def write_originals(folder: Path) -> dict[str, bytes]:
+    """Write the undamaged files, and return their content."""
+    shutil.rmtree(folder, ignore_errors=True)  # of a child process that ended
+    folder.mkdir(parents=True)
+    noise = torch.randn(1, 1, 160, 128, generator=torch.Generator("cpu").manual_seed(0))
+    scene = 0.5 + 0.3 * torch.nn.functional.avg_pool2d(noise, 3, 1, 1)[0, 0]
+    vibration = rsv.Vibration([1.2, 0.8], [130.0, 170.0], [0.3, 0.9])
+    frames = rsv.simulate_frames(scene, TIMING, vibration, 4, frame_size=(96, 64)).clamp(0, 1)
+    counts = (frames * 4095).round().numpy().astype(np.uint16)
+    tifffile.imwrite(folder / "pages.tif", counts, photometric="minisblack", metadata=None)
+    tifffile.imwrite(folder / "packed.tif", counts, photometric="minisblack", compression="zlib", bigtiff=True)
+    tifffile.imwrite(folder / "tiles.tif", counts, photometric="minisblack", tile=(32, 32), compression="lzw")
+    for name in ("own.tif", "frames.npy", "pngs"):
+        rsv.write_stack(folder / name, frames, dtype="uint16", full_scale=4095)
+    for name in ("frames.mkv", "frames.mp4"):
+        info = rsv.StackInfo(tuple(frames.shape), "uint8", 255.0, frame_rate=96.0)
+        rsv.write_stack(folder / name, frames, dtype="uint8", like=info)
+    rsv.write_stack(folder / "frames.png", frames[:1], dtype="uint16", full_scale=4095)
+    colour = np.repeat((counts[0] >> 4).astype(np.uint8)[..., None], 3, axis=-1)
+    cv2.imwrite(str(folder / "colour.png"), colour)
+    cv2.imwrite(str(folder / "frames.jpg"), colour)
+    for name, options in (("plain.h5", {}), ("packed.h5", {"chunks": (1, 96, 64), "compression": "gzip"})):
+        with h5py.File(folder / name, "w") as file:
+            file.create_dataset("frames", data=counts, **options)
+            file["frames"].attrs["full_scale"] = 4095.0
+    counts.tofile(folder / "frames.raw")
+    content = {"format": "rsvib raw", "version": 1, "shape": list(counts.shape), "axes": "THW", "dtype": "uint16"}
+    content |= {"offset": 0, "full_scale": 4095, "frame_times": [0.0, 0.1, 0.2, 0.3]}
+    (folder / "frames.raw.json").write_text(json.dumps(content))
+    array = zarr.create_array(folder / "frames.zarr", shape=counts.shape, chunks=(1, 96, 64), dtype="u2")
+    array.attrs["full_scale"] = 4095.0
+    array[:] = counts
+    (folder / "camera.toml").write_text(CONFIG)
+    bands: dict[str, Any] = {"band_rows": 16, "band_step": 8, "search": 6}
+    rsv.process_stack(
+        folder / "own.tif",
+        folder / "out.npy",
+        TIMING,
+        window=3,
+        detection={"method": "bands", "tones": 1, **bands},
+        restoration={"method": "dewarp"},
+        workers=1,
+    )
+    detected = rsv.detect_vibration(frames, TIMING, method="bands", tones=1, **bands)
+    rsv.write_vibration(folder / "vibration.json", detected)
+    detected.save(folder / "detection.json")
+    rsv.detect_motion(frames, TIMING, **bands).motion.save(folder / "free.json")
+    rsv.detect_swept_tone(frames, TIMING, **bands).save(folder / "swept.json")
+    lines = [f"{0.001 * i:.3f},{0.1 * i:.2f},{-0.1 * i:.2f}" for i in range(40)]
+    (folder / "motion.csv").write_text("\n".join(["time,x,y", *lines]))
+    return {name: (folder / name).read_bytes() for name in ORIGINALS}
+
+
+def damage(content: bytes, seed: int, text: bool) -> bytes:
+    """The bytes with a few changes: some of them near the start, where headers are."""
+    choice = random.Random(seed)
+    data = bytearray(content)
+    for _ in range(choice.choice((1, 1, 2, 5))):
+        end = len(data) if choice.random() < 0.4 else min(len(data), 2000)
+        place = choice.randrange(max(1, end))
+        kind = choice.choice(("flip", "byte", "cut", "insert", "copy", "number", *("number",) * (9 if text else 1)))
+        if kind == "flip":
+            data[place : place + 1] = bytes([data[place] ^ (1 << choice.randrange(8))])
+        elif kind == "byte":
+            data[place : place + 1] = bytes([choice.choice((0, 1, 127, 128, 255))])
+        elif kind == "cut":
+            del data[place : place + choice.choice((1, 4, 200, len(data)))]
+        elif kind == "insert":
+            data[place:place] = choice.choice(_TOKENS) if text else choice.randbytes(choice.choice((1, 4, 30)))
+        elif kind == "copy":
+            other = choice.randrange(len(data))
+            data[place : place + 8] = data[other : other + 8]
+        elif text:  # replace a number
+            digits = [i for i, byte in enumerate(data) if chr(byte).isdigit()] or [0]
+            start = choice.choice(digits)
+            data[start : start + 1] = choice.choice(_TOKENS)
+        else:
+            size = choice.choice((2, 4, 8))
+            value = choice.choice((0, 1, 2**15, 2**31 - 1, 2**32 - 1, 2**63 - 1))
+            data[place : place + size] = (value % 2 ** (8 * size)).to_bytes(size, "little")
+        if not data:
+            break
+    return bytes(data)
+
+
+def _run(folder: Path, target: Path) -> str | None:
+    """Run the program on a damaged stack; returns why that is a failure, None if it is not."""
+    (folder / "good.toml").write_text(CONFIG.replace("frame_start_times = [0.0, 0.0104, 0.0208]", ""))
+    out = folder / "results"
+    errors = io.StringIO()
+    with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
+        code = run_command(["run", str(target), str(out), "--config", str(folder / "good.toml"), "--workers", "1"])
+    shown = errors.getvalue()
+    lines = [line for line in shown.splitlines() if not line.startswith("rsvib: warning: ")]
+    if code not in (0, 2) or "unexpected" in shown or "Traceback" in shown:
+        return f"exit code {code}: {shown[-300:]}"
+    if code == 2 and (len(lines) != 1 or out.exists()):
+        return f"{len(lines)} lines of errors, results {'exist' if out.exists() else 'do not exist'}: {shown[:300]}"
+    if code == 0 and not all((out / name).is_file() for name in ("restored.tif", "manifest.json")):
+        return "exit code 0 without results"
+    shutil.rmtree(out, ignore_errors=True)
+    return None
+
+
+Item = tuple[int, str, bool]  # seed, name of the file, whether the program is run on it
+
+
+def _name(item: Item) -> str:
+    return f"{item[1]}, seed {item[0]}{', rsvib run' if item[2] else ''}"
+
+
+def attempt(folder: Path, item: Item | None) -> Trial:  # noqa: PLR0911 - one for each outcome
+    """Read one damaged file, or run the program on it."""
+    contents = write_originals(folder)
+    if item is None:
+        return Trial("", "completed")
+    seed, name, runs = item
+    original, path = ORIGINALS[name], folder / name
+    path.write_bytes(damage(contents[name], seed, original.text))
+    try:
+        if runs:
+            failure = _run(folder, folder / original.target)
+            return Trial(_name(item), "completed" if failure is None else "wrong", failure or "")
+        original.read(folder / original.target)
+    except (ValueError, TypeError, OSError) as error:
+        lines = str(error).splitlines()
+        # a configuration has one line per mistake
+        if not lines or (len(lines) > 1 and not all(str(folder) in line for line in lines)):
+            return Trial(_name(item), "wrong", f"message {error!s}")
+        return Trial(_name(item), "refused", lines[0])
+    except MemoryError as error:
+        return Trial(_name(item), "memory", str(error))
+    except Exception as error:
+        return Trial(_name(item), "traceback", f"{place_of(error)}: {type(error).__name__}: {error}")
+    finally:
+        shutil.rmtree(folder / "results", ignore_errors=True)
+        path.write_bytes(contents[name])
+    return Trial(_name(item), "completed")
+
+
+def mutated_trials(folder: Path, count: int, seed: int, run_every: int = 12) -> Iterator[Trial]:
+    """Damaged files in turn; the program is run on every twelfth stack, the other files are read."""
+    names = list(ORIGINALS)
+    stacks = [name for name, original in ORIGINALS.items() if original.read is _read_stack]
+    items = []
+    for index in range(count):
+        runs = index % run_every == 0
+        chosen = stacks[index // run_every % len(stacks)] if runs else names[index % len(names)]
+        items.append((1_000_003 * seed + index, chosen, runs))
+    yield from in_warm_child(attempt, items, _name, folder / "files", limit=SECONDS, memory=MEMORY)

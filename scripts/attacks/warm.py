@@ -1,0 +1,106 @@
+"""Trials in a warm child process, which has imported the package: one trial takes milliseconds instead of seconds."""
+
+import contextlib
+import multiprocessing
+import os
+import resource
+import signal
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import psutil
+import torch
+from attacks.trial import Trial
+
+__all__ = ["in_warm_child", "place_of"]
+
+Attempt = Callable[[Path, Any], Trial]
+
+
+def place_of(error: BaseException) -> str:
+    """File and line where an exception was raised."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{Path(last.filename).name}:{last.lineno}"
+
+
+def _serve(connection: Connection, attempt: Attempt, folder: Path, memory: int) -> None:
+    """Run trials until the other end closes the connection; output of libraries is discarded."""
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
+    attempt(folder, None)  # prepares what all trials share
+    with open(os.devnull, "wb") as nothing:
+        os.dup2(nothing.fileno(), 1)
+        os.dup2(nothing.fileno(), 2)
+    used = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()  # data and stack
+    resource.setrlimit(resource.RLIMIT_DATA, (used + memory, used + memory))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (memory, memory))
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    connection.send(None)
+    with contextlib.suppress(EOFError):
+        while True:
+            connection.send(attempt(folder, connection.recv()))
+
+
+def _answers(connection: Connection, child: Any, limit: float) -> bool:
+    """Whether the child answers within the time limit, or ends."""
+
+    def used() -> float:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            times = psutil.Process(child.pid).cpu_times()
+            return times.user + times.system
+        return 0.0
+
+    before, begin = used(), time.perf_counter()
+    while not connection.poll(0.5):
+        if used() - before > limit or time.perf_counter() - begin > 10 * limit:
+            return False
+    return True
+
+
+def in_warm_child(
+    attempt: Attempt, items: Iterable[Any], name: Callable[[Any], str], folder: Path, *, limit: float, memory: int
+) -> Iterator[Trial]:
+    """Run one trial per item in a child process, which is replaced after a trial that ended or blocked it.
+
+    Args:
+        attempt: ``attempt(folder, item)``, a function of a module; ``item=None`` prepares what all trials share.
+        items: What is tried.
+        name: Name of the trial of an item.
+        folder: Folder for files.
+        limit: Limit of the processor time of a trial in s; ten times as much may pass on a busy machine.
+        memory: Bytes that the child may allocate in addition to what it uses at the start.
+    """
+    context = multiprocessing.get_context("spawn")
+    child, connection = None, None
+    try:
+        for item in items:
+            if child is None:
+                connection, other = context.Pipe()
+                child = context.Process(target=_serve, args=(other, attempt, folder, memory), daemon=True)
+                child.start()
+                other.close()
+                connection.recv()
+            assert connection is not None
+            connection.send(item)
+            if _answers(connection, child, limit):
+                try:
+                    yield connection.recv()
+                    continue
+                except EOFError:
+                    child.join()
+                    trial = Trial(name(item), "traceback", f"the process ended with exit code {child.exitcode}")
+            else:
+                trial = Trial(name(item), "hang", f"not finished after {limit:g} s of processor time")
+            child.kill()
+            child.join()
+            child = None
+            yield trial
+    finally:
+        if child is not None:
+            child.kill()
+            child.join()

@@ -1,0 +1,181 @@
+"""Errors of the program that no check foresaw, names of files with control characters, and figures that fail."""
+
+import json
+import os
+import struct
+import threading
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_stack import CONFIG, TIMING, write_small
+
+from rsvib_torch import process_stack
+from rsvib_torch.commands import stack_commands
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.core.text import printable
+from rsvib_torch.io import open_stack
+from rsvib_torch.io.png import decode_png
+
+ONE_WINDOW = CONFIG.partition("[stack]")[0]
+
+
+@pytest.fixture
+def camera(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "camera.toml").write_text(ONE_WINDOW)
+    write_small(tmp_path / "frames.tif", 3)
+    return ["--config", "camera.toml"]
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (ZeroDivisionError("division by zero"), "unexpected ZeroDivisionError: division by zero"),
+        (KeyError("row"), "unexpected KeyError: 'row'"),
+        (RecursionError("maximum recursion depth exceeded"), "the input is nested too deeply"),
+        (RuntimeError("can't start new thread"), "the system cannot start another thread: use fewer workers"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "not enough memory"),
+        (AttributeError("no attribute"), "unexpected AttributeError: no attribute"),
+    ],
+)
+def test_unforeseen_errors_are_one_line(error, line, camera, monkeypatch, capsys):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(stack_commands, "load", fail)
+    assert run_command(["detect", "frames.tif", "--out", "found", *camera]) == 2
+    shown = capsys.readouterr().err
+    assert shown.startswith(f"rsvib: error: {line}")
+    assert shown.count("\n") == 1
+    assert run_command(["detect", "frames.tif", "--out", "found", "--debug", *camera]) == 2
+    shown = capsys.readouterr().err
+    assert "Traceback (most recent call last)" in shown
+    assert shown.splitlines()[-1].startswith(f"rsvib: error: {line}")
+
+
+@pytest.mark.parametrize(
+    ("error", "kind"), [(KeyError("x"), ValueError), (MemoryError(), OSError), (ZeroDivisionError(), ValueError)]
+)
+def test_process_stack_raises_what_it_documents(error, kind, tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr("rsvib_torch.stacks.process.plan_job", fail)
+    with pytest.raises(kind) as raised:
+        process_stack(tmp_path / "a.npy", tmp_path / "b.npy", TIMING)
+    assert raised.value.__cause__ is error
+
+
+def test_threads_that_cannot_be_started(camera, monkeypatch, capsys):
+    def fail(_):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", fail)
+    assert run_command(["run", "frames.tif", "results", *camera]) == 2
+    assert capsys.readouterr().err.startswith("rsvib: error: the system cannot start another thread")
+
+
+def test_figures_that_cannot_be_drawn_are_a_warning(camera, monkeypatch, capsys):
+    def fail(*_, **__):
+        raise OverflowError("the figure is too large")
+
+    monkeypatch.setattr("rsvib_torch.report.save_figure", fail)
+    assert run_command(["run", "frames.tif", "results", *camera]) == 0
+    shown = capsys.readouterr().err
+    for name in ("before_after.png", "offsets.png"):
+        assert f"rsvib: warning: {name} is not drawn: the figure is too large\n" in shown
+    names = set(os.listdir("results"))
+    assert {"restored.tif", "manifest.json", "vibration.json", "offsets.csv"} <= names
+    assert not any(name.endswith(".png") for name in names)
+
+
+def test_frames_beyond_all_scales_are_written_unchanged(camera):
+    frames = np.linspace(0.0, 1.0, 4 * 96 * 64, dtype=np.float32).reshape(4, 96, 64)
+    frames[:3] = np.stack([frame / 4095.0 for frame in read("frames.tif")])
+    frames[3, 4, 5] = 3e38
+    np.save("floats.npy", frames)
+    config = ONE_WINDOW.replace("full_scale = 4095\n", "")
+    Path("floats.toml").write_text(config)
+    arguments = ["run", "floats.npy", "results", "--config", "floats.toml", "--output", "out.npy"]
+    assert run_command(arguments) == 0
+    assert np.load("results/out.npy")[3, 4, 5] == np.float32(3e38)
+    record = json.loads(Path("results/manifest.json").read_text())["windows"][0]
+    assert list(record["bad_frames"]) == ["3"]
+    assert "reaches 3e+38" in record["bad_frames"]["3"]
+
+
+def read(path):
+    reader = open_stack(path)
+    try:
+        return [reader.frame(index).astype(np.float32) for index in range(reader.info.shape[0])]
+    finally:
+        reader.close()
+
+
+NAMES = [b"a\xff\xfe it's $HOME", "red\x1b[31m line\nbreak \u202etxt".encode()]
+
+
+@pytest.mark.parametrize("raw", NAMES)
+def test_names_of_files_are_escaped_and_kept(raw, camera, capsysbinary):
+    name = os.fsdecode(raw)
+    os.rename("frames.tif", f"{name}.tif")
+    assert run_command(["run", f"{name}.tif", f"{name} results", "--output", f"{name} new.tif", *camera]) == 0
+    text, errors = capsysbinary.readouterr()
+    assert os.path.isfile(os.path.join(f"{name} results", f"{name} new.tif"))
+    for shown in (text, errors):
+        lines = shown.decode()  # UTF-8
+        assert printable(lines, lines=True) == lines
+    assert printable(name) in text.decode().splitlines()[0]
+    assert run_command(["detect", f"{name}.tif", "--out", "found", "--json", *camera]) == 0
+    answer = json.loads(capsysbinary.readouterr().out)
+    assert answer["open_first"] == "found/offsets.png"
+    assert all(printable(step, lines=True) == step for step in answer["next_steps"])
+    assert run_command(["detect", f"{name}.missing.tif", "--out", "other", *camera]) == 2
+    assert capsysbinary.readouterr().err.count(b"\n") == 1
+
+
+def test_a_too_long_name_leaves_nothing(camera, capsys):
+    before = sorted(os.listdir())
+    for output in ("x" * 245 + ".tif", "x" * 400 + ".tif"):
+        assert run_command(["run", "frames.tif", "results", "--output", output, *camera]) == 2
+        assert "its name has" in capsys.readouterr().err
+    assert sorted(os.listdir()) == before
+
+
+def png(pixels, bits=8, colour=0, extra=b"", size=(8, 8)):
+    def chunk(kind, body):
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = struct.pack(">IIBBBBB", *size, bits, colour, 0, 0, 0)
+    parts = [chunk(b"IHDR", header), extra, chunk(b"IDAT", pixels), chunk(b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+ROWS = bytes(8 * 9)
+BAD_SRGB = struct.pack(">I", 1) + b"sRGB\x09" + struct.pack(">I", zlib.crc32(b"sRGB\x09"))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (png(zlib.compress(ROWS)), None),
+        (png(zlib.compress(ROWS), extra=BAD_SRGB), None),  # the chunk is not used
+        (png(b"not deflate" * 9), "damaged PNG file .pixels"),
+        (png(zlib.compress(ROWS)[:-6]), "do not fill"),
+        (png(zlib.compress(ROWS + b"more")), "do not fill"),
+        (png(zlib.compress(b"\x09" + ROWS[1:])), "unknown filter"),
+        (png(zlib.compress(ROWS), colour=3), "palette"),
+        (png(zlib.compress(ROWS), bits=7), "header"),
+    ],
+)
+def test_damaged_png_files_print_nothing(content, message, tmp_path, capfd):
+    path = tmp_path / "frame.png"
+    path.write_bytes(content)
+    if message is None:
+        assert decode_png(path).shape == (8, 8)
+    else:
+        with pytest.raises(ValueError, match=message):
+            decode_png(path)
+    assert capfd.readouterr() == ("", "")
