@@ -11,7 +11,8 @@ for argument in "$@"; do
 done
 bash scripts/setup.sh
 export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive} # busy-waiting threads are slow on shared cores
+export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}       # one process per core instead of threads
 .venv/bin/python -m ruff format --check .
 .venv/bin/python -m ruff check .
 .venv/bin/python -m mypy
-.venv/bin/python -m pytest -m "$marker"
+.venv/bin/python -m pytest -m "$marker" -n auto --dist loadfile

@@ -421,7 +421,7 @@ def _detect_field(
     find_cause: bool = False,
 ) -> DetectionResult:
     """``_detect`` with as many components as were requested or, with ``"auto"``, as the frames require."""
-    cause = "unless rotating" if find_cause and field.most_axes > 2 else find_cause
+    cause: bool | Literal["unless rotating"] = "unless rotating" if find_cause and field.most_axes > 2 else find_cause
     found, fit, rotates = _detect(frames, valid, timing, method, options, find_cause=cause)
     if field.most_axes == 2 or (field.least_axes == 2 and not rotates):
         return found

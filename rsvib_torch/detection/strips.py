@@ -89,7 +89,8 @@ def combined_strips(measured: Measurements, factors: Tensor) -> tuple[Measuremen
     strips, axes = factors.shape[1], factors.shape[-1]
 
     def of_strips(values: Tensor) -> Tensor:
-        return values.unflatten(0, (-1, strips))
+        each: Tensor = values.unflatten(0, (-1, strips))
+        return each
 
     visible = of_strips(measured.visible).amin(1)
     everywhere = replace(measured, visible=visible.repeat_interleave(strips, 0))
