@@ -51,7 +51,7 @@ def detection_data(result: DetectionResult) -> dict[str, Any]:
 
 def restored_axes(left_alone: Iterable[str]) -> str:
     """The axes that were restored, from the sentences about the others."""
-    unchanged = {note[0] for note in left_alone}
+    unchanged = {note.split()[0] for note in left_alone}
     return " and ".join(name for name in "xy" if name not in unchanged)
 
 
@@ -75,7 +75,7 @@ def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
         lines.append("there is no vibration to remove")
     refused = "its vibration is not reliable"  # for the reasons of the detection, which are printed before
     lines += [
-        f"{note[0]} unchanged: {refused}, see the reasons above" if refused in note else note
+        f"{note.split()[0]} unchanged: {refused}, see the reasons above" if refused in note else note
         for note in result.left_alone
     ]
     return [wrapped(line) for line in lines]

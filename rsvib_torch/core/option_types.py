@@ -55,6 +55,8 @@ class ToneSettings(TypedDict, total=False):
     harmonics: int
     image_acceleration: bool
     columns: int | None
+    roll: bool | Literal["auto"]
+    zoom: bool | Literal["auto"]
 
 
 class DetectionSettings(BandSettings, ToneSettings, total=False):

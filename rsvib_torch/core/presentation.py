@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AXIS_NAMES",
+    "AXIS_UNITS",
     "FIGURES",
     "Result",
     "Summarised",
@@ -51,6 +52,7 @@ _PLOTS = "rsvib_torch.report.plots"
 
 
 AXIS_NAMES = ("x", "y", "roll", "zoom")
+AXIS_UNITS = ("px", "px", "rad", "of the scale")
 
 
 def axis_rows(batch_shape: Sequence[int], axes: int = 2) -> list[tuple[tuple[int, ...], list[str]]]:

@@ -45,7 +45,7 @@ class OtherMotion:
 
 _TONE_VALUES = ("amplitude", "frequency")
 _SENSITIVITY_SHAPES = {
-    f"{value}_by_{time}": "... 2 K" for time in ("row_time", "frame_rows", "exposure_rows") for value in _TONE_VALUES
+    f"{value}_by_{time}": "... A K" for time in ("row_time", "frame_rows", "exposure_rows") for value in _TONE_VALUES
 }
 
 
@@ -97,7 +97,7 @@ class TimingSensitivity(Result, shapes=_SENSITIVITY_SHAPES):
 class DetectionResult(
     Result,
     units={**Vibration.units, "residual": "px", "gain": "px of offset per px of displacement", "offsets": "s and px"},
-    shapes={"gain": "... 2 K", "residual": "... 2", "reliable": "... 2", "fitted": "... P N 2"},
+    shapes={"gain": "... A K", "residual": "... A", "reliable": "... A", "fitted": "... P N A"},
     file_format="rsvib vibration",
 ):
     """A detected vibration with its uncertainty and verdict. Batches of stacks or windows lead all tensors.

@@ -169,6 +169,16 @@ class Vibration(Motion, units=_UNITS):
         zeros = torch.zeros(*batch_shape, axes, 1, dtype=torch.float64, device=device)
         return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0])
 
+    def translation(self) -> "Vibration":
+        """The components x and y: the motion of the centre of the frame, without roll and zoom.
+
+        Example:
+            >>> Vibration((3.1, 5.2, 1e-3), (90.0, 61.0, 70.0)).translation().amplitude.flatten().tolist()
+            [3.1, 5.2]
+        """
+        tones = (values[..., :2, :] for values in (self.amplitude, self.frequency, self.phase))
+        return Vibration(*tones, self.image_motion[..., :2], self.image_acceleration[..., :2])
+
     def summary(self) -> str:
         """The tones of each axis as a table; of a batch, the strongest tone of each axis."""
         rows = [cells for _, cells in tone_rows(self)]
@@ -317,8 +327,8 @@ class VibrationStd(
     Result,
     units=_UNITS | {"displacement": "px"},
     shapes={
-        **dict.fromkeys(("amplitude", "frequency", "period", "phase"), "... 2 K"),
-        **dict.fromkeys(("image_motion", "image_acceleration", "displacement"), "... 2"),
+        **dict.fromkeys(("amplitude", "frequency", "period", "phase"), "... A K"),
+        **dict.fromkeys(("image_motion", "image_acceleration", "displacement"), "... A"),
     },
 ):
     """Standard deviations in the layout of ``Vibration``: px, Hz, s, rad (..., 2, K), px/s and px/s^2 (..., 2).

@@ -37,9 +37,9 @@ class OffsetCurve(
         "rows": "N",
         "times": "... P N",
         "later_times": "... P N",
-        "offsets": "... P N 2",
+        "offsets": "... P N A",
         "quality": "... P N",
-        "std": "... P N 2",
+        "std": "... P N A",
     },
 ):
     """Offsets of row bands between frames.

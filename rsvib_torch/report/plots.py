@@ -20,7 +20,7 @@ from torch.nn import functional
 from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.checks import check_whole_number, described
-from rsvib_torch.core.presentation import FIGURES, Result
+from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES, Result
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult, MotionDetection, SweptTone
 from rsvib_torch.evaluation import MtfCurve
@@ -79,7 +79,7 @@ def tones_text(result: DetectionResult, axis: int) -> list[str]:
     """Amplitude and frequency of every tone of an axis, one text each."""
     vibration, std = result.vibration, result.std
     return [
-        f"{measured_text(vibration.amplitude[axis, tone], std.amplitude[axis, tone])} px at "
+        f"{measured_text(vibration.amplitude[axis, tone], std.amplitude[axis, tone])} {AXIS_UNITS[axis]} at "
         f"{measured_text(vibration.frequency[axis, tone], std.frequency[axis, tone])} Hz"
         for tone in range(vibration.amplitude.shape[-1])
         if float(vibration.amplitude[axis, tone]) > 0
@@ -142,11 +142,13 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
         lower.errorbar(times[good], residual, std, fmt="none", ecolor=_GRID, elinewidth=0.8, zorder=1)
     lower.axhline(0.0, color=_FIT_COLOUR, linewidth=1.0, zorder=3)
     spread = 1.15 * float(np.quantile(np.abs(residual), 0.99)) if residual.size else 1.0
-    lower.set_ylim(-max(spread, 1e-3), max(spread, 1e-3))
-    lower.set_title(f"mean |residual| {float(result.residual[axis]):.4f} px", loc="left", fontsize=9.5, color=_INK)
+    smallest = 1e-3 if axis < 2 else 1e-6
+    lower.set_ylim(-max(spread, smallest), max(spread, smallest))
+    unit, mean = AXIS_UNITS[axis], float(result.residual[axis])
+    lower.set_title(f"mean |residual| {mean:.3g} {unit}", loc="left", fontsize=9.5, color=_INK)
     lower.set_xlabel("exposure start of the rows in the earlier frame (ms)", color=_INK)
-    upper.set_ylabel("offset (px)", color=_INK)
-    lower.set_ylabel("residual (px)", color=_INK)
+    upper.set_ylabel(f"offset ({unit})", color=_INK)
+    lower.set_ylabel(f"residual ({unit})", color=_INK)
     plain_axes(upper)
     plain_axes(lower)
     return points
@@ -187,13 +189,21 @@ def offset_figure(result: DetectionResult) -> Figure:
         ['offset (px)', 'offset (px)', 'residual (px)', 'residual (px)', 'quality (0: outlier)']
     """
     _check_one(result)
-    figure = _Drawing(figsize=(13, 6.4), layout="constrained")
-    panels = figure.subplots(2, 2, sharex=True, height_ratios=(3, 1), squeeze=False)
+    axes = result.vibration.num_axes
+    figure = _Drawing(figsize=(6.5 * axes, 6.4), layout="constrained")
+    panels = figure.subplots(2, axes, sharex=True, height_ratios=(3, 1), squeeze=False)
     points: Any = None
-    for axis, name in enumerate("xy"):
+    for axis, name in enumerate(AXIS_NAMES[:axes]):
         upper, lower = panels[0, axis], panels[1, axis]
         points = _draw_offsets(upper, lower, result, axis)
-        upper.set_title(f"Offset along {name}", loc="left", fontsize=12, fontweight="bold", color=_INK, pad=36)
+        upper.set_title(
+            f"Offset along {name}" if axis < 2 else f"Offset of {name}",
+            loc="left",
+            fontsize=12,
+            fontweight="bold",
+            color=_INK,
+            pad=36,
+        )
         text = ",  ".join(tones_text(result, axis))
         if not bool(result.reliable[axis]):
             text = "not reliable: " + "; ".join(str(reason) for reason in result.reasons[axis])
@@ -312,8 +322,15 @@ def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None)
         last = first + 4.0 / slowest
     times = torch.linspace(first, last, 2000, dtype=torch.float64, device=motion.device)
     displacement = motion.displacement(times).detach().cpu()
-    figure = _Drawing(figsize=(8, 3.6), layout="constrained")
-    _draw_displacement(figure.subplots(), times.cpu(), displacement)
+    further = motion.num_axes - 2
+    figure = _Drawing(figsize=(8, 3.6 + 2.0 * further), layout="constrained")
+    panels = figure.subplots(1 + further, 1, sharex=True, squeeze=False)[:, 0]
+    _draw_displacement(panels[0], times.cpu(), displacement)
+    for axis, panel in enumerate(panels[1:], start=2):
+        panel.plot(1e3 * times.cpu(), displacement[:, axis], color=_INK, linewidth=1.3)
+        panel.set_xlabel("time (ms)")
+        panel.set_ylabel(f"{AXIS_NAMES[axis]} ({AXIS_UNITS[axis]})")
+        plain_axes(panel)
     return figure
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.presentation import plain_values
+from rsvib_torch.core.presentation import AXIS_NAMES, plain_values
 from rsvib_torch.core.text import write_json
 from rsvib_torch.core.validation import read_json, validate
 from rsvib_torch.detection import DetectionResult
@@ -146,14 +146,13 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
         "later_frame": curve.pairs[:, 1:].expand(-1, count),
         "row": curve.rows.expand_as(curve.times),
         "time_s": curve.times,
-        "offset_x_px": curve.offsets[..., 0],
-        "offset_y_px": curve.offsets[..., 1],
-        "fitted_x_px": result.fitted[..., 0],
-        "fitted_y_px": result.fitted[..., 1],
-        "quality": curve.quality,
     }
+    axes = ("x_px", "y_px", "roll_rad", "zoom")[: result.vibration.num_axes]
+    columns |= {f"offset_{name}": curve.offsets[..., axis] for axis, name in enumerate(axes)}
+    columns |= {f"fitted_{name}": result.fitted[..., axis] for axis, name in enumerate(axes)}
+    columns["quality"] = curve.quality
     if curve.std is not None:
-        columns |= {"std_x_px": curve.std[..., 0], "std_y_px": curve.std[..., 1]}
+        columns |= {f"std_{name}": curve.std[..., axis] for axis, name in enumerate(axes)}
     values = [plain_values(column.flatten()) for column in columns.values()]
     _write_csv(path, columns, zip(*values, strict=True))
 
@@ -201,21 +200,23 @@ def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None
     """
     quantities = ("amplitude", "frequency", "phase")
     head = ["window", "first_frame", "last_frame", "start_s"]
-    for letter in "xy":
-        head += [f"{name}_{letter}{end}" for name in quantities for end in ("", "_std")]
-        head += [f"image_motion_{letter}", f"reliable_{letter}"]
+    found = (record.detection for record in manifest.windows)
+    axes = max((len(one.reliable) for one in found if one is not None), default=2)
+    for axis in AXIS_NAMES[:axes]:
+        head += [f"{name}_{axis}{end}" for name in quantities for end in ("", "_std")]
+        head += [f"image_motion_{axis}", f"reliable_{axis}"]
     lines = []
     for record in manifest.windows:
         line: list[Any] = [record.window, record.first, record.last, record.start_time]
         detection = record.detection
-        for axis in (0, 1):
-            if detection is None:
+        for number in range(axes):
+            if detection is None or number >= len(detection.reliable):
                 line += [None] * (2 * len(quantities) + 2)
                 continue
             vibration, std = detection.vibration, detection.std
             for name in quantities:
-                line += [getattr(vibration, name)[axis][0], getattr(std, name)[axis][0]]
-            line += [vibration.image_motion[axis], detection.reliable[axis]]
+                line += [getattr(vibration, name)[number][0], getattr(std, name)[number][0]]
+            line += [vibration.image_motion[number], detection.reliable[number]]
         note = record.error or "; ".join(record.left_alone)
         lines.append([*line, record.frames, record.outcome, len(record.bad_frames), note])
     _write_csv(path, [*head, "frames", "outcome", "bad_frames", "note"], lines)

@@ -13,7 +13,7 @@ import torch
 from pydantic import Field
 
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.presentation import Summarised
+from rsvib_torch.core.presentation import AXIS_NAMES, Summarised
 from rsvib_torch.core.text import measured_text, text_table, wrapped
 from rsvib_torch.core.validation import Section, read_json, validate
 from rsvib_torch.io.schema import DetectedVibration, DetectionRecord, TimingRecord, detection_to_json
@@ -100,13 +100,14 @@ class StackManifest(Summarised, Section):
         windows, found = self.windows, self.detections()
         gains = [record.predicted_gain for record in windows if record.predicted_gain is not None]
         notes = [(str(record.window), note) for record in windows for note in record.left_alone]
-        unchanged = {name: {window: note for window, note in notes if note.startswith(name)} for name in "xy"}
+        names = AXIS_NAMES[: max((one.vibration.num_axes for one in found if one is not None), default=2)]
+        unchanged = {name: {window: note for window, note in notes if note.startswith(name)} for name in names}
         return {
             "windows": len(windows),
             "restored": sum(record.frames == "restored" for record in windows),
             "outcomes": dict(Counter(record.outcome for record in windows if record.outcome is not None)),
             "predicted_gain_db": {"lowest": min(gains), "highest": max(gains)} if gains else None,
-            "tones": {name: _tone_over_windows(found, axis) for axis, name in enumerate("xy")},
+            "tones": {name: _tone_over_windows(found, axis) for axis, name in enumerate(names)},
             "left_alone": unchanged,
             "errors": {str(record.window): record.error for record in windows if record.error is not None},
             "bad_frames": self.bad_frames,
@@ -151,7 +152,9 @@ class StackManifest(Summarised, Section):
 
 def _tone_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> dict[str, Any]:
     """Number of windows in which an axis is reliable, and median and spread of its strongest tone over them."""
-    reliable = [one.vibration for one in found if one is not None and bool(one.reliable[axis])]
+    reliable = [
+        one.vibration for one in found if one is not None and axis < one.vibration.num_axes and bool(one.reliable[axis])
+    ]
     data: dict[str, Any] = {"reliable_windows": len(reliable)}
     for name in ("amplitude", "frequency"):
         values = torch.tensor(

@@ -8,6 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
+from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.evaluation import MtfCurve, find_slanted_edges, slanted_edge_mtf
@@ -300,6 +301,8 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     result, timing = report.detection, report.timing
     num_rows = report.frames.shape[int(timing.scan_axis)]
     removed = trusted_vibration(result, timing, len(report.frames), num_rows)[0].to("cpu")
+    centre = removed.translation()
+    where = " at the centre of the frame" if removed.num_axes > 2 else ""
     index = len(report.frames) // 2 if len(report.restored) < len(report.frames) else 0
     before = report.frames[index]
     after = report.restored[min(index, len(report.restored) - 1)] if report.was_restored else None
@@ -307,11 +310,11 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         drawing(
             plots.axis_offset_figure(result, axis),
             f"offsets_{name}",
-            f"Offsets along {name}",
+            f"Offsets along {name}" if axis < 2 else f"Offsets of {name}",
             "Top: measured offset of the rows, and the offset curve of the detected vibration. Bottom: residual, "
-            f"{float(result.residual[axis]):.4f} px on average.",
+            f"{float(result.residual[axis]):.3g} {AXIS_UNITS[axis]} on average.",
         )
-        for axis, name in enumerate("xy")
+        for axis, name in enumerate(AXIS_NAMES[: result.vibration.num_axes])
     ]
     tone_figures = [
         drawing(
@@ -323,19 +326,19 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
             "of two standard deviations.",
         )
     ]
-    if bool(removed.moving_axes().any()):
+    if bool(centre.moving_axes().any()):
         tone_figures += [
             drawing(
-                plots.rows_figure(removed, timing, num_rows),
+                plots.rows_figure(centre, timing, num_rows),
                 "rows",
-                "Displacement and motion blur",
+                f"Displacement and motion blur{where}",
                 "Top: mean displacement of each row of frame 0. Bottom: range of the displacement during the exposure "
                 "of the row.",
             ),
             drawing(
-                plots.psf_figure(removed, timing, num_rows),
+                plots.psf_figure(centre, timing, num_rows),
                 "psf",
-                "Point spread functions",
+                f"Point spread functions{where}",
                 "Kernels of rows of frame 0 from first to last, one square per px, each centred on the mean "
                 "displacement of its row. Line: path of the image during the exposure.",
             ),

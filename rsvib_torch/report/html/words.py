@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Any, Literal
 
+from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.timing import SensorTiming
@@ -86,14 +87,18 @@ def _first_sentence(mark: Mark, restored: bool, verdict: RestorationVerdict | No
 
 def _axis_sentences(result: DetectionResult, axis: int) -> list[str]:
     """Vibration and uniform motion along an axis."""
-    name, tones = "xy"[axis], tones_text(result, axis)
+    name, tones = AXIS_NAMES[axis], tones_text(result, axis)
     if not bool(result.reliable[axis]):
         reasons = "; ".join(str(reason) for reason in result.reasons[axis])
         sentences = [f"The vibration along {name} is not reliable: {reasons}."]
+    elif axis >= 2:
+        sentences = [f"{name.capitalize()} vibrates by {' and '.join(tones)}."]
     elif tones:
         sentences = [f"Along {name} the image vibrates by {' and '.join(tones)}."]
     else:
         sentences = [f"No vibration was detected along {name}."]
+    if axis >= 2:
+        return sentences
     speed, std = float(result.vibration.image_motion[axis]), float(result.std.image_motion[axis])
     if math.isfinite(std) and abs(speed) > max(4 * std, 1.0):  # px/s; significant, and not negligible
         sentences.append(f"Along {name} the image also moves uniformly, by {measured_text(speed, std)} px/s.")
@@ -103,7 +108,7 @@ def _axis_sentences(result: DetectionResult, axis: int) -> list[str]:
 def _blind_sentences(result: DetectionResult, timing: SensorTiming, within: float = 3.0) -> list[str]:
     """A sentence for every tone that is less than ``within`` Hz away from a blind frequency."""
     sentences = []
-    for axis, name in enumerate("xy"):
+    for axis, name in enumerate(AXIS_NAMES[: result.vibration.num_axes]):
         for tone in range(result.vibration.amplitude.shape[-1]):
             frequency = float(result.vibration.frequency[axis, tone])
             if float(result.vibration.amplitude[axis, tone]) <= 0:
@@ -141,7 +146,9 @@ def verdict_sentences(
         verdict: Comparison of pairs of frames; None if they could not be compared.
     """
     sentences = [_first_sentence(mark_of(result, verdict, restored), restored, verdict)]
-    sentences += _axis_sentences(result, 0) + _axis_sentences(result, 1)
+    for axis in range(result.vibration.num_axes):
+        sentences += _axis_sentences(result, axis)
+    removed = removed.translation()  # at the centre of the frame
     if bool(removed.moving_axes().any()):
         size = removed.amplitude.sum(-1)
         blur = motion_blur(removed, timing.row_starts(1, num_rows)[0], timing).amax(0)
