@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,12 +48,6 @@ def detection_data(result: DetectionResult) -> dict[str, Any]:
     return {name: value for name, value in result.to_dict().items() if name not in ("offsets", "fitted")}
 
 
-def restored_axes(left_alone: Iterable[str]) -> str:
-    """The axes that were restored, from the sentences about the others."""
-    unchanged = {note.split()[0] for note in left_alone}
-    return " and ".join(name for name in "xy" if name not in unchanged)
-
-
 def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
     """What was restored and its gain, and which axes were left unchanged and why.
 
@@ -66,7 +59,8 @@ def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
     if not result.restored:
         lines = [f"{count} frames unchanged"]
     else:
-        lines = [f"{frames} restored along {restored_axes(result.left_alone)}"]
+        *most, last = result.restored_axes()
+        lines = [f"{frames} restored along {', '.join(most)}{' and ' * bool(most)}{last}"]
     if result.verdict is not None:
         lines.append(result.verdict.sentence)
     elif result.restored:
@@ -85,7 +79,7 @@ def restoration_data(result: RestoredFrames) -> dict[str, Any]:
     """The same as ``restoration_lines`` for JSON."""
     return {
         "frames": "restored" if result.restored else "as taken",
-        "axes": restored_axes(result.left_alone).split(" and ") if result.restored else [],
+        "axes": result.restored_axes(),
         "left_alone": list(result.left_alone),
         **verdict_data(result.verdict),
     }

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import MAX_NUMBER
+from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.detection import detect_vibration
 from rsvib_torch.detection.start import constant_frame
 from rsvib_torch.frames.arrays import Channels, channel_axis
@@ -43,6 +44,7 @@ class RestoredFrames:
         left_alone: A sentence for each axis that was not restored.
         verdict: Whether restoration helps; None if frames could not be compared.
         moves: Whether there was a vibration to remove.
+        axes: Number of components of the motion: 2, 3 with roll, 4 with roll and zoom.
     """
 
     frames: Tensor
@@ -50,6 +52,12 @@ class RestoredFrames:
     left_alone: tuple[str, ...]
     verdict: RestorationVerdict | None
     moves: bool
+    axes: int = 2
+
+    def restored_axes(self) -> list[str]:
+        """Names of the axes that were restored."""
+        unchanged = {note.split()[0] for note in self.left_alone}
+        return [name for name in AXIS_NAMES[: self.axes] if self.restored and name not in unchanged]
 
 
 def restore_trusted(
@@ -91,7 +99,7 @@ def restore_trusted(
             verdict = judge_prepared(prepared, restored, vibration, joint=joint, most_pairs=most_pairs)
     keep = verdict is None or verdict.overall != "worse" or force
     result = prepared.from_row_order(restored) if keep else unchanged_frames(prepared, joint)
-    return RestoredFrames(result, keep, left_alone, verdict, True)
+    return RestoredFrames(result, keep, left_alone, verdict, True, vibration.num_axes)
 
 
 def frame_fault(

@@ -114,7 +114,11 @@ def find_tones(
         return seen if accepted.shape[-1] > 0 else torch.ones_like(seen)
 
     open_axes = torch.ones_like(none[..., 0])  # (B, 2), those that may need a further tone
-    for _ in range(accepted.shape[-1] // model.harmonics, MAX_TONES if tones is None else tones):
+    for _ in range(MAX_TONES):
+        if tones is None and accepted.shape[-1] // model.harmonics >= MAX_TONES:
+            break
+        if tones is not None:  # roll and zoom may have fewer tones than x and y to start with
+            open_axes = accepted.sum(-1) < tones * model.harmonics
         residual = residual_of(measurements, fit)
         if accuracy and accepted.shape[-1] > 0:
             most = measurements.distances(residual).nanquantile(0.9, dim=1).nan_to_num(torch.inf)
