@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import OtherMotion
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces, fit_row_time, rows_of_frames
 from rsvib_torch.detection.row_time.row_tones import (
@@ -24,7 +23,7 @@ from rsvib_torch.detection.rows.direct import refine_directly
 from rsvib_torch.detection.rows.displacements import stack_spectra
 from rsvib_torch.detection.start import GreyFrames, band_curve, measurements_of_curve
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, residual_of
-from rsvib_torch.detection.tones.selection import robust_fit
+from rsvib_torch.detection.tones.selection import MAX_TONES, robust_fit
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
 
@@ -184,6 +183,8 @@ class _Direct:
                 reasons.append(
                     f"rows move by {float(unexplained[axis]):.2g} px along {'xy'[axis]} that no tone explains"
                 )
+            if int(self.fit.active[0, axis].sum()) >= MAX_TONES:
+                reasons.append(f"{MAX_TONES} tones along {'xy'[axis]}: the motion is not a sum of few tones")
         others = tuple(
             one
             for one in (_as_good_as_the_first(possible) if possible else [])
