@@ -78,10 +78,14 @@ def row_time_of_splines(
     while spacing > max(0.7 * blank, 0.1 * period):
         costs = [problem.evaluate(tried, spacing).chi_square for tried in grid]
         minima = [i for i, cost in enumerate(costs) if cost <= min(costs[max(i - 1, 0) : i + 2])]
-        lowest = sorted(minima, key=lambda i: costs[i])[:6]
+        lowest = sorted(minima, key=costs.__getitem__)[:6]
         found = sorted((problem.refined(grid[i], spacing, low, high) for i in lowest), key=lambda one: one.chi_square)
-        degrees = problem.known - problem.evaluate(found[0].row_time, spacing).parameters
-        if found[0].chi_square < degrees + 3.0 * math.sqrt(2.0 * degrees):  # noise alone stays below
+        # knots twice as close explain noise only
+        closer = problem.refined(found[0].row_time, 0.5 * spacing, low, high)
+        coarse, fine = (problem.evaluate(found[0].row_time, step).parameters for step in (spacing, 0.5 * spacing))
+        noise = closer.chi_square / max(1.0, problem.known - fine)
+        added = fine - coarse
+        if found[0].chi_square - closer.chi_square < noise * (added + 3.0 * math.sqrt(2.0 * added)):
             break
         spacing /= 2**0.25
     else:
@@ -91,13 +95,14 @@ def row_time_of_splines(
     # with knots that are a little closer, the errors of the spline are below the noise
     finer = spacing / 2**0.25
     best = problem.refined(found[0].row_time, finer, low, high)
+    std = best.std * math.sqrt(noise)
     others = tuple(
         one
         for one in found[1:]
-        if one.chi_square < found[0].chi_square + MAX_CHI_SQUARE
-        and abs(one.row_time - best.row_time) > 5 * (best.std + one.std)
+        if one.chi_square < found[0].chi_square + noise * MAX_CHI_SQUARE
+        and abs(one.row_time - best.row_time) > 5 * (std + one.std * math.sqrt(noise))
     )
-    return SplineRowTime(best.row_time, best.std, others, finer)
+    return SplineRowTime(best.row_time, std, others, finer)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,20 +111,18 @@ class _Problem:
 
     Attributes:
         records: Of x and y.
-        noise: Variance of a measurement of unit weight of each axis.
         period: Frame period in s.
         known: Number of independent measurements.
     """
 
     records: tuple[RowRecord, RowRecord]
-    noise: tuple[float, float]
     period: float
     known: float
 
     @classmethod
     def of(cls, places: FramePlaces, num_rows: int, row_time: float) -> "_Problem":
         x, y = (places.of_axis(axis, num_rows, row_time) for axis in range(2))
-        return cls((x, y), (_noise(x), _noise(y)), places.period, x.num_measurements + y.num_measurements)
+        return cls((x, y), places.period, x.num_measurements + y.num_measurements)
 
     def evaluate(self, row_time: float, spacing: float) -> _Evaluation:
         """Splines of both axes at a row time, with knots about ``spacing`` apart."""
@@ -130,8 +133,8 @@ class _Problem:
         basis, slope = _basis(times, first, (last - first) / cells, cells)
         basis = first_record.relative(basis)
         cost, step, information = 0.0, 0.0, 0.0
-        for record, noise in zip(self.records, self.noise, strict=True):
-            root = (record.weights / noise).sqrt()[:, None]
+        for record in self.records:
+            root = record.weights.sqrt()[:, None]
             columns = (root[..., None] * basis).flatten(0, 1)
             values = (root * record.values).flatten()
             gram = columns.mT @ columns
@@ -158,18 +161,6 @@ class _Problem:
                 break
         found = self.evaluate(sign * size, spacing)
         return Candidate(sign * size, found.information**-0.5, found.chi_square)
-
-
-def _noise(record: RowRecord) -> float:
-    """Variance of measurements of unit weight, from third differences between neighbouring rows."""
-    count = len(record.weights) - 3
-    together = [slice(i, count + i) for i in range(4)]
-    weight = torch.stack([record.weights[part] for part in together]).amin(0)
-    weight = weight * torch.stack([record.visible[part] for part in together]).amin((0, 2))
-    third = record.values.diff(n=3, dim=0)
-    differences = ((weight > 0) * (record.visible[:count].sum(1) - 1)).sum()
-    # a third difference has the coefficients 1, 3, 3, 1 and 20 times the variance of a value
-    return max(float((weight[:, None] * third.square()).sum() / (20.0 * differences.clamp(min=1.0))), 1e-300)
 
 
 def _basis(times: Tensor, first: float, width: float, cells: int) -> tuple[Tensor, Tensor]:
