@@ -93,8 +93,8 @@ class RowTimeCalibration(
             ]
         if self.exposure_time is not None:
             std = None if self.exposure_time_std is None else 1e6 * self.exposure_time_std
-            rows = self.exposure_time / self.row_time
-            lines.append(f"exposure {measured_text(1e6 * self.exposure_time, std)} us, {rows:.2f} row times")
+            rows = f", {self.exposure_time / self.row_time:.2f} row times" if math.isfinite(self.row_time) else ""
+            lines.append(f"exposure {measured_text(1e6 * self.exposure_time, std or None)} us{rows}")
         if self.frame_rows is not None:
             lines.append(f"frame period {self.frame_rows:.2f} row times")
         if self.readout_direction is not None:

@@ -45,12 +45,14 @@ def row_time_of_recording(
     low, high = offset_range(recorded, -reach, end, offsets)
     middle = 0.5 * (end - reach)
     found: list[tuple[float, Candidate, FittedClock]] = []
-    offset, other = best_offset(places.timed(0.5 * clock.high), recorded, low, high, clock.timing(clock.high))
-    start = FittedClock(offset + middle, 1.0, (1.0, 1.0), (0.0, 0.0), middle)
+    timing = clock.timing(clock.high)
     count = max(1, math.ceil(math.log(clock.high / clock.low) / 0.1))  # Gauss-Newton converges over this step
     for direction in clock.directions:
         for index in range(count + 1):
             row_time = direction * clock.low * (clock.high / clock.low) ** (index / count)
+            if index % 4 == 0:  # the offset of the middle row hardly depends on the row time
+                offset, _ = best_offset(places.timed(row_time), recorded, low, high, timing)
+                start = FittedClock(offset + middle, 1.0, (1.0, 1.0), (0.0, 0.0), middle)
             if found and any(abs(row_time - one.row_time) < 0.05 * abs(row_time) for _, one, _ in found):
                 continue
             fitted = start
@@ -76,6 +78,7 @@ def row_time_of_recording(
         if known * (cost / size - 1.0) < MAX_CHI_SQUARE and abs(one.row_time - best.row_time) > 5 * (one.std + best.std)
     )
     measured = places.timed(best.row_time)
+    _, other = best_offset(measured, recorded, low, high, timing)
     aligned = fitted.motion(recorded)
     rest, moved = measured.unexplained(residual_of_motion(measured, aligned))[0], rms_motion(measured, aligned)
     reasons = [

@@ -126,6 +126,8 @@ def row_time_of_tones(
     best = max(_as_good_as_the_first(possible), key=lambda one: abs(one.row_time)).row_time
     for _ in range(3):
         found = _measured_with(best, turned(stack, best), clock, options, tones)
+        if found is None:
+            return None
         possible = _possible(found.tones, clock, math.copysign(1.0, best))
         mine = min(possible, key=lambda one: abs(one.row_time - found.row_time), default=None)
         if mine is None or any(mine is one for one in _as_good_as_the_first(possible)):
@@ -196,7 +198,7 @@ class _Direct:
 
 def _measured_with(
     row_time: float, stack: GreyFrames, clock: CameraClock, options: RegistrationOptions, tones: list[RowTones]
-) -> _Direct:
+) -> _Direct | None:
     """Direct measurement, and the fit of tones and row time, repeated until the row time is the one assumed."""
     direction, size = math.copysign(1.0, row_time), abs(row_time)
     frequencies, active = _tones_at(tones, row_time, clock.period)
@@ -207,6 +209,8 @@ def _measured_with(
     exposure = None
     for _ in range(4):
         found, _, _ = refine_directly(spectra, timing, start, None)
+        if found.measurements.independent <= 0:  # too few rows agree with each other
+            return None
         places = rows_of_frames(found.measurements, clock.period, size, clock.num_rows)
         previous = size
         size, std, start = fit_row_time(places, size, found.fit)

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rsvib_torch.detection.tones.fit import MIN_GAIN
+
 __all__ = ["MAX_CHI_SQUARE", "Candidate", "RowRecord", "RowTones", "candidates", "find_row_tones", "fit_row_tones"]
 
 F_THRESHOLD = 14.0  # decrease of chi-square per parameter, as for tones of known timing (tones/selection.py)
@@ -180,9 +182,13 @@ def find_row_tones(record: RowRecord, highest: float, *, max_tones: int = 4) -> 
             fit_row_tones(record, _linear(record, found.values, nu, phi), iterations=40)
             for nu, phi in _peaks(record, found.residual, highest, 4)
         ]
+        # nearly blind tones have arbitrary amplitudes, and explain nothing that others do not
+        tried = [fit for fit in tried if bool((2 * (math.pi * fit.tones[:, 3]).sin().abs() > MIN_GAIN).all())]
+        if not tried:
+            break
         trial = min(tried, key=lambda fit: fit.cost)
-        spare = max(1.0, record.num_measurements - len(trial.values))
-        if found.cost - trial.cost <= max(F_THRESHOLD * 4 * trial.cost / spare, MIN_SHARE * found.cost):
+        spare = record.num_measurements - len(trial.values)
+        if spare < len(trial.values) or found.cost - trial.cost <= max(F_THRESHOLD * 4 * trial.cost / spare, MIN_SHARE * found.cost):
             break
         found = trial
     return found
