@@ -269,8 +269,8 @@ def calibrate(
         typer.Option(
             parser=seconds,
             metavar="TIME",
-            help="Exposure time, e.g. 1/1000, given once per frame, for a strobe of unknown frequency; with --by-motion "
-            "once, if known.",
+            help="Exposure time, e.g. 1/1000, given once per frame, for a strobe of unknown frequency; with "
+            "--by-motion once, if known.",
         ),
     ] = None,
     by_motion: Annotated[
@@ -313,15 +313,11 @@ def calibrate(
     """
     import torch  # noqa: PLC0415
 
+    limits = row_time or []
     if by_motion:
-        _check_by_motion(frequency, exposure, row_time, frame_rate, on_fraction, light_contrast)
-    elif row_time or readout_direction is not None:
-        raise ValueError("--row-time and --readout-direction of calibrate are limits for --by-motion")
-    elif (frequency is None) == (not exposure):
-        raise ValueError(
-            "give --frequency of the flicker, --exposure once per frame for a strobe of unknown frequency, or "
-            "--by-motion and --frame-rate for frames of a vibrating camera"
-        )
+        _check_by_motion(frequency, exposure, limits, frame_rate, on_fraction, light_contrast)
+    else:
+        _check_by_light(frequency, exposure, limits, readout_direction)
     if out is not None:
         check_new([out], overwrite, [file for path in frames for file in io.stack_files(path)])
         check_writable(out)
@@ -341,13 +337,11 @@ def calibrate(
             result = detection.calibrate_row_time_by_motion(
                 stack,
                 frame_rate=frame_rate or 0.0,
-                row_time=(row_time[0], row_time[1]) if row_time else None,
+                row_time=(limits[0], limits[1]) if limits else None,
                 exposure_time=exposure[0] if exposure else None,
                 scan_axis=axis,
                 readout_direction=readout_direction,
             )
-            if not result.reliable:
-                raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")
         elif frequency is None:
             result = calibration.calibrate_row_time_by_exposure(stack, exposure or [], scan_axis=axis, gamma=gamma)
         else:
@@ -360,6 +354,8 @@ def calibrate(
                 scan_axis=axis,
                 gamma=gamma,
             )
+    if not result.reliable:
+        raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")
     table = _calibrated_toml(result, scan_axis)
     rows = stack.shape[axis]
     readout = measured_text(1e3 * result.row_time * rows, 1e3 * result.row_time_std * rows)
@@ -381,7 +377,7 @@ def calibrate(
 def _check_by_motion(
     frequency: float | None,
     exposure: list[float] | None,
-    row_time: list[float] | None,
+    row_time: list[float],
     frame_rate: float | None,
     on_fraction: float | None,
     light_contrast: float | None,
@@ -397,6 +393,19 @@ def _check_by_motion(
         raise ValueError("--by-motion takes one --exposure, that of all frames")
     if row_time and len(row_time) != 2:
         raise ValueError("give --row-time twice: the shortest and the longest possible row time")
+
+
+def _check_by_light(
+    frequency: float | None, exposure: list[float] | None, row_time: list[float], readout_direction: str | None
+) -> None:
+    """Raise an error for options of ``calibrate`` that do not fit a flickering light."""
+    if row_time or readout_direction is not None:
+        raise ValueError("--row-time and --readout-direction of calibrate are limits for --by-motion")
+    if (frequency is None) == (not exposure):
+        raise ValueError(
+            "give --frequency of the flicker, --exposure once per frame for a strobe of unknown frequency, or "
+            "--by-motion and --frame-rate for frames of a vibrating camera"
+        )
 
 
 def _calibrated_toml(result: RowTimeCalibration, scan_axis: str) -> str:

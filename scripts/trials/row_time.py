@@ -40,7 +40,9 @@ class Case:
 
 
 CASES = {
-    "one": Case("3 px 83 Hz along x, row time known to 12 %", ((3.0,), (0.0,)), ((83.0,), (1.0,)), (0.88, 1.12), "forward"),
+    "one": Case(
+        "3 px 83 Hz along x, row time known to 12 %", ((3.0,), (0.0,)), ((83.0,), (1.0,)), (0.88, 1.12), "forward"
+    ),
     "two": Case("3.1 px 83 Hz, 2.2 px 67 Hz", ((3.1,), (2.2,)), ((83.0,), (67.0,))),
     "slow": Case("3.1 px 10 Hz, 2.2 px 17 Hz", ((3.1,), (2.2,)), ((10.0,), (17.0,))),
     "four": Case("two tones per axis", ((1.5, 0.5), (1.1, 0.4)), ((41.0, 133.0), (67.0, 185.0))),
@@ -108,9 +110,7 @@ def bound(scene: Array, shake: Shake, size: int, num_frames: int) -> float:
         return torch.stack(columns)
 
     sensitivity(torch.zeros(1, 1, dtype=torch.float64))
-    recording = Recording(
-        torch.from_numpy(scene), timing, motion, num_frames, (size, size), tuple(axes), sensitivity
-    )
+    recording = Recording(torch.from_numpy(scene), timing, motion, num_frames, (size, size), tuple(axes), sensitivity)
     each = projected_information(recording)
     merge = torch.eye(len(axes), dtype=torch.float64)[:, :-1]
     merge[-1, -1] = 1.0
@@ -153,7 +153,8 @@ def run(case: Case, options: argparse.Namespace) -> None:
         ratio = errors / stated
         line += (
             f"; rms error {100 * np.sqrt(np.mean(errors**2)):.5f} %, largest {100 * np.abs(errors).max():.5f} %, "
-            f"over stated std {np.sqrt(np.mean(ratio**2)):.2f}, 95 % intervals cover {np.mean(np.abs(ratio) < 1.96):.0%}"
+            f"over stated std {np.sqrt(np.mean(ratio**2)):.2f}, "
+            f"95 % intervals cover {np.mean(np.abs(ratio) < 1.96):.0%}"
         )
     if options.bound and case is not CASES["free"] and scene is not None:
         line += f"; bound {100 * bound(scene, shake, options.size, options.frames) / row_time:.5f} %"

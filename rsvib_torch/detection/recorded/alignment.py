@@ -100,6 +100,7 @@ class FittedClock:
 
     @property
     def offset(self) -> float:
+        """Reading of the recording's clock at time 0 of the frames, in seconds."""
         return self.at - self.scale * self.middle
 
     def motion(self, recorded: FreeMotion) -> FreeMotion:

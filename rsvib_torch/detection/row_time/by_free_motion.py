@@ -138,7 +138,7 @@ class _Problem:
             columns = (root[..., None] * basis).flatten(0, 1)
             values = (root * record.values).flatten()
             gram = columns.mT @ columns
-            gram = gram + 1e-10 * gram.diagonal().mean() * torch.eye(len(gram)).to(gram)
+            gram = gram + (1e-10 * gram.diagonal().mean() + 1e-300) * torch.eye(len(gram)).to(gram)
             factor = torch.linalg.cholesky(gram)
             solution = torch.cholesky_solve((columns.mT @ values)[:, None], factor)[:, 0]
             residual = values - columns @ solution

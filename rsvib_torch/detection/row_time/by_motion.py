@@ -121,8 +121,8 @@ def calibrate_row_time_by_motion(
     notes = []
     if row_time is None:
         notes.append(
-            f"row times of {1e6 * low:.3f} to {1e6 * high:.3f} us were considered, a readout within a tenth to the whole "
-            "of the frame period; pass row_time=(low, high) for other ones"
+            f"row times of {1e6 * low:.3f} to {1e6 * high:.3f} us were considered, a readout within a tenth to the "
+            "whole of the frame period; pass row_time=(low, high) for other ones"
         )
     if exposure is not None:
         notes.append("the exposure time is the given one")

@@ -16,7 +16,7 @@ from rsvib_torch.detection.row_time.row_tones import RowRecord
 from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, fit_tones, motion_of_fit, residual_of
 from rsvib_torch.motion.motion import Motion
 
-__all__ = ["FramePlaces", "fit_row_time", "rows_of_frames", "row_time_columns"]
+__all__ = ["FramePlaces", "fit_row_time", "row_time_columns", "rows_of_frames"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,9 @@ def row_time_columns(measured: Measurements, rows: Tensor, motion: Motion) -> Te
     return measured.relative(velocity * rows[..., None])
 
 
-def fit_row_time(places: FramePlaces, row_time: float, fit: ToneFit, *, iterations: int = 12) -> tuple[float, float, ToneFit]:
+def fit_row_time(
+    places: FramePlaces, row_time: float, fit: ToneFit, *, iterations: int = 12
+) -> tuple[float, float, ToneFit]:
     """Gauss-Newton on the row time, with all tones fitted again in every step.
 
     Args:

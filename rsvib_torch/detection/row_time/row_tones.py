@@ -75,7 +75,8 @@ class RowTones:
     @property
     def tones(self) -> Tensor:
         """(K, 4) parameters of the tones."""
-        return self.values[:-1].unflatten(0, (-1, 4))
+        tones: Tensor = self.values[:-1].unflatten(0, (-1, 4))
+        return tones
 
     def frequencies(self) -> tuple[Tensor, Tensor]:
         """(K, 2) cycles per row and per frame, and their covariances (K, 2, 2)."""
@@ -188,7 +189,9 @@ def find_row_tones(record: RowRecord, highest: float, *, max_tones: int = 4) -> 
             break
         trial = min(tried, key=lambda fit: fit.cost)
         spare = record.num_measurements - len(trial.values)
-        if spare < len(trial.values) or found.cost - trial.cost <= max(F_THRESHOLD * 4 * trial.cost / spare, MIN_SHARE * found.cost):
+        if spare < len(trial.values) or found.cost - trial.cost <= max(
+            F_THRESHOLD * 4 * trial.cost / spare, MIN_SHARE * found.cost
+        ):
             break
         found = trial
     return found
@@ -231,9 +234,7 @@ def candidates(
     def misfit(inverse: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (K,) from a whole number in cycles and its variance, for ``P / T_row`` (..., 1)."""
         value = nu * inverse - phi
-        variance = (
-            inverse.square() * covariances[:, 0, 0] - 2 * inverse * covariances[:, 0, 1] + covariances[:, 1, 1]
-        )
+        variance = inverse.square() * covariances[:, 0, 0] - 2 * inverse * covariances[:, 0, 1] + covariances[:, 1, 1]
         return value - value.round(), variance + floor**2
 
     found: list[Candidate] = []
