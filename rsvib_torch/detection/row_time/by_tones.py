@@ -20,9 +20,10 @@ from rsvib_torch.detection.row_time.row_tones import (
     fit_row_tones,
 )
 from rsvib_torch.detection.rows.direct import refine_directly
-from rsvib_torch.detection.rows.displacements import stack_spectra
+from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
+from rsvib_torch.detection.rows.measured_rows import whole_rows
 from rsvib_torch.detection.start import GreyFrames, band_curve, measurements_of_curve
-from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, residual_of
+from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, residual_of, shrunk_motion
 from rsvib_torch.detection.tones.selection import MAX_TONES, robust_fit
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
@@ -216,10 +217,11 @@ def _measured_with(
     timing = clock.timing(size)
     curve = band_curve(stack.images, stack.valid, timing, options, mere_start=True)
     start, _ = robust_fit(measurements_of_curve(curve, timing, options.band_step), frequencies, active, MotionModel())
-    spectra = stack_spectra(stack.images, stack.valid)
+    intervals = compared_intervals(timing, stack.images.shape[1], MAX_GROUP_FRAMES, stack.images.device)
     exposure = None
     for _ in range(4):
-        found, _, _ = refine_directly(spectra, timing, start, None)
+        rows = whole_rows(stack.images, stack.valid, timing, shrunk_motion(start, intervals))
+        found, _, _ = refine_directly(rows, intervals, start, None)
         if found.measurements.independent <= 0:  # too few rows agree with each other
             return None
         places = rows_of_frames(found.measurements, clock.period, size, clock.num_rows)
