@@ -39,7 +39,7 @@ class RowTimeCalibration(
     """Result of a calibration; undetermined values are None, with the reason in ``notes``.
 
     Attributes:
-        row_time: T_row in seconds; NaN if it is not determined.
+        row_time: T_row in seconds; None if it is not determined.
         row_time_std: Its standard deviation, without that of the flicker frequency or frame rate.
         period_rows: Period of the bands in rows; None without flickering light.
         contrast: Amplitude of the bands' fundamental over their mean, at most 2; None without flickering light.
@@ -63,8 +63,8 @@ class RowTimeCalibration(
         '15.625 us per row'
     """
 
-    row_time: float
-    row_time_std: float
+    row_time: float | None
+    row_time_std: float | None
     period_rows: float | None
     contrast: float | None
     flicker_frequency: float | None
@@ -79,12 +79,13 @@ class RowTimeCalibration(
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_number("row_time", self.row_time, above=0.0)
+        if self.row_time is not None:
+            check_number("row_time", self.row_time, above=0.0)
 
     def summary(self) -> str:
         """The measured values of the sensor, and what is not determined."""
         lines = ["row time unknown"]
-        if math.isfinite(self.row_time):
+        if self.row_time is not None and self.row_time_std is not None:
             lines = [f"row time {measured_text(1e6 * self.row_time, 1e6 * self.row_time_std)} us"]
         if self.flicker_frequency is not None:
             lines += [
@@ -93,7 +94,7 @@ class RowTimeCalibration(
             ]
         if self.exposure_time is not None:
             std = None if self.exposure_time_std is None else 1e6 * self.exposure_time_std
-            rows = f", {self.exposure_time / self.row_time:.2f} row times" if math.isfinite(self.row_time) else ""
+            rows = "" if self.row_time is None else f", {self.exposure_time / self.row_time:.2f} row times"
             lines.append(f"exposure {measured_text(1e6 * self.exposure_time, std or None)} us{rows}")
         if self.frame_rows is not None:
             lines.append(f"frame period {self.frame_rows:.2f} row times")

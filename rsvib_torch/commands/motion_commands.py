@@ -354,7 +354,7 @@ def calibrate(
                 scan_axis=axis,
                 gamma=gamma,
             )
-    if not result.reliable:
+    if result.row_time is None or result.row_time_std is None or not result.reliable:
         raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")
     table = _calibrated_toml(result, scan_axis)
     rows = stack.shape[axis]

@@ -138,8 +138,6 @@ def _restored(kind: Any, value: Any, path: str, missing: float) -> Any:
         kind = next(member for member in get_args(kind) if member is not types.NoneType)
     if kind is Tensor:
         return _tensor(value, path, missing)
-    if kind is float and value is None:  # of a number that is not finite
-        return math.nan
     if get_origin(kind) is dict:
         if not isinstance(value, dict):
             raise ValueError(f"{path}: expected a table, got {value!r}")

@@ -137,20 +137,21 @@ def run(case: Case, options: argparse.Namespace) -> None:
             readout_direction=case.direction,
             exposure_time=EXPOSURE,
         )
-        error = found.row_time / row_time - 1
+        error = (found.row_time or math.nan) / row_time - 1
+        stated = (found.row_time_std or math.nan) / row_time
         off = not abs(error) < 0.01 or found.readout_direction != "forward"
         wrong += found.reliable and off
         reliable += found.reliable
         if found.reliable and not off:
             rows.append(error)
-            stds.append(found.row_time_std / row_time)
+            stds.append(stated)
         if options.verbose:
             why = "" if found.reliable else f" ({found.reasons[0][:90]})"
-            print(f"  {seed}: {100 * error:+.5f} ± {100 * found.row_time_std / row_time:.5f} %{why}", flush=True)
+            print(f"  {seed}: {100 * error:+.5f} ± {100 * stated:.5f} %{why}", flush=True)
     line = f"{case.name}: {options.seeds} results, {reliable} reliable, {wrong} of them wrong"
     if rows:
-        errors, stated = np.array(rows), np.array(stds)
-        ratio = errors / stated
+        errors = np.array(rows)
+        ratio = errors / np.array(stds)
         line += (
             f"; rms error {100 * np.sqrt(np.mean(errors**2)):.5f} %, largest {100 * np.abs(errors).max():.5f} %, "
             f"over stated std {np.sqrt(np.mean(ratio**2)):.2f}, "

@@ -48,7 +48,7 @@ def phone(folder: Path, window: int, windows: int, model: str) -> None:
             frames, frame_rate=rate, row_time=(5e-6, 1 / (rate * 600)), exposure_time=5.248e-3, **options
         )
         print(f"phone, {model}, frames {first} to {first + window - 1}:\n{result}\n", flush=True)
-        if result.row_time == result.row_time:
+        if result.row_time is not None:
             found.append(1e6 * result.row_time * (1 if result.readout_direction != "reverse" else -1))
     if len(found) > 1:
         print(

@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 
 from rsvib_torch.calibration import RowTimeCalibration
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.detection.row_time.by_free_motion import row_time_of_splines
@@ -33,6 +34,7 @@ SHORTEST_READOUT = 0.1  # of the frame period, if no row times are given
 @outside_graphs
 @full_precision
 @torch.no_grad()
+@checks_arguments
 def calibrate_row_time_by_motion(
     frames: FramesOrFiles,
     *,
@@ -86,16 +88,24 @@ def calibrate_row_time_by_motion(
 
     Returns:
         Row time with its standard deviation, readout direction, and the exposure where it is known. ``reliable`` is
-        False, with ``reasons``, if the row time is not determined; it is NaN if nothing is known about it.
+        False, with ``reasons``, if the row time is not determined; it is None if nothing is known about it.
 
     Raises:
         TypeError: If an argument is not a number, or frames are not.
         ValueError: If frames cannot be registered, or an option is out of range.
 
     Example:
-        >>> scene = torch.rand(120, 140, generator=torch.Generator().manual_seed(0))
-        >>> found = calibrate_row_time_by_motion(scene.expand(2, -1, -1), frame_rate=30)
-        >>> found.reliable, found.reasons[0]
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=60e-6, exposure_rows=8, frame_rows=240)
+        >>> vibration = rsv.Vibration(amplitude=[3.1, 2.2], frequency=[131.0, 97.0], phase=[0.4, 2.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(220, 190, seed=3), timing, vibration, num_frames=5)
+        >>> found = rsv.calibrate_row_time_by_motion(frames, frame_rate=timing.frame_rate, row_time=(30e-6, 70e-6))
+        >>> f"{1e6 * found.row_time:.2f} us, {found.readout_direction}"
+        '60.00 us, forward'
+        >>> two = rsv.calibrate_row_time_by_motion(frames[:2], frame_rate=timing.frame_rate)
+        >>> two.reliable, two.reasons[0]
         (False, 'two frames determine the product of row time and frequency only: use three or more')
     """
     period = 1 / check_number("frame_rate", frame_rate, above=0.0)
@@ -160,8 +170,6 @@ def _limits(row_time: tuple[float, float] | None, period: float, num_rows: int) 
     longest = period / num_rows
     if row_time is None:
         return SHORTEST_READOUT * longest, longest
-    if not isinstance(row_time, (tuple, list)) or len(row_time) != 2:
-        raise ValueError(f"row_time must be the shortest and the longest possible row time in s, got {row_time!r}")
     low, high = (check_number("row_time", value, above=0.0) for value in row_time)
     if low >= high:
         raise ValueError(f"row_time=({low:g}, {high:g}): the first must be smaller")
@@ -221,8 +229,8 @@ def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeC
     directions: tuple[Literal["forward", "reverse"], ...] = ("forward", "reverse")
     signs = {one.row_time > 0 for one in found.others} | {found.row_time > 0}
     return RowTimeCalibration(
-        row_time=abs(found.row_time),
-        row_time_std=found.std,
+        row_time=abs(found.row_time) if known else None,
+        row_time_std=found.std if known else None,
         period_rows=None,
         contrast=None,
         flicker_frequency=None,
