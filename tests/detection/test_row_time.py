@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 import torch
+from simulated_gpu import SIMULATED_GPU, simulated_gpu
 from truth import MARGIN, Motion, draw_scene, take_frames
 
 import rsvib_torch as rsv
@@ -56,6 +57,15 @@ def test_row_time_of_two_tones(two_tones):
     assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std
     assert found.candidates == (found.row_time,)
     assert abs(found.frame_rows - FRAME_ROWS) < 4 * FRAME_ROWS * found.row_time_std / ROW_TIME
+
+
+def test_frames_on_another_device(two_tones):
+    limits = {"frame_rate": RATE, "row_time": (3e-5, 7e-5)}
+    here = rsv.calibrate_row_time_by_motion(two_tones, **limits)
+    with simulated_gpu():
+        there = rsv.calibrate_row_time_by_motion(two_tones.to(SIMULATED_GPU), **limits)
+    assert there.reliable
+    assert abs(here.row_time - there.row_time) < 0.05 * here.row_time_std
 
 
 def test_reverse_readout_along_x(two_tones):

@@ -187,7 +187,7 @@ def _measured_freely(
     """Displacements of rows, measured around a motion of any shape, which any assumed row time allows."""
     # the blanking time, over which the spline continues, is half of the period
     timing = clock.timing(0.5 * clock.period / clock.num_rows)
-    starts = timing.frame_starts(stack.images.shape[1])
+    starts = timing.frame_starts(stack.images.shape[1], stack.images.device)
     record = (0.0, float(starts[-1]) + clock.num_rows * timing.row_time + timing.exposure_time)
     timed = replace(
         curve,
