@@ -34,7 +34,7 @@ INNER_LAYERS = {
         {"rows", "other_timing", "reliability", "sensitivity"},
         {"shapes"},
         {"recorded"},
-        {"detect"},
+        {"detect", "row_time"},
     ),
     "evaluation": ({"quality", "mtf", "bound", "scenes"},),
     "report": ({"results", "plots"}, {"html"}),

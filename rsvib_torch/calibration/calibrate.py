@@ -33,21 +33,26 @@ class RowTimeCalibration(
         "frame_rows": "row times",
         "exposure_time": "s",
         "exposure_time_std": "s",
+        "candidates": "s",
     },
 ):
-    """Result of a calibration with flickering light; undetermined values are None, with the reason in ``notes``.
+    """Result of a calibration; undetermined values are None, with the reason in ``notes``.
 
     Attributes:
-        row_time: T_row in seconds.
-        row_time_std: Its standard deviation, without that of the flicker frequency.
-        period_rows: Period of the bands in rows.
-        contrast: Amplitude of the bands' fundamental over their mean, at most 2.
-        flicker_frequency: In Hz, as given or found.
+        row_time: T_row in seconds; None if it is not determined.
+        row_time_std: Its standard deviation, without that of the flicker frequency or frame rate.
+        period_rows: Period of the bands in rows; None without flickering light.
+        contrast: Amplitude of the bands' fundamental over their mean, at most 2; None without flickering light.
+        flicker_frequency: In Hz, as given or found; None without flickering light.
         frame_rows: Row times from one frame to the next, where the frame rate is known.
         readout_direction: ``"forward"`` or ``"reverse"``, from bands that move between frames.
         exposure_time: T_e in seconds.
         exposure_time_std: Its standard deviation.
         notes: Reasons for undetermined values, and warnings.
+        candidates: Row times in seconds that explain the motion of the frames, negative for a reverse readout; empty
+            for a calibration with flickering light.
+        reliable: Whether a single row time explains the frames.
+        reasons: Why not.
 
     Example:
         >>> import torch
@@ -58,36 +63,45 @@ class RowTimeCalibration(
         '15.625 us per row'
     """
 
-    row_time: float
-    row_time_std: float
-    period_rows: float
-    contrast: float
-    flicker_frequency: float
+    row_time: float | None
+    row_time_std: float | None
+    period_rows: float | None
+    contrast: float | None
+    flicker_frequency: float | None
     frame_rows: float | None
     readout_direction: Literal["forward", "reverse"] | None
     exposure_time: float | None
     exposure_time_std: float | None
     notes: tuple[str, ...]
+    candidates: tuple[float, ...] = ()
+    reliable: bool = True
+    reasons: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_number("row_time", self.row_time, above=0.0)
+        if self.row_time is not None:
+            check_number("row_time", self.row_time, above=0.0)
 
     def summary(self) -> str:
         """The measured values of the sensor, and what is not determined."""
-        lines = [
-            f"row time {measured_text(1e6 * self.row_time, 1e6 * self.row_time_std)} us",
-            f"flicker {self.flicker_frequency:.6g} Hz",
-            f"bands of {self.period_rows:.3f} rows, contrast {self.contrast:.3g}",
-        ]
+        lines = ["row time unknown"]
+        if self.row_time is not None and self.row_time_std is not None:
+            lines = [f"row time {measured_text(1e6 * self.row_time, 1e6 * self.row_time_std)} us"]
+        if self.flicker_frequency is not None:
+            lines += [
+                f"flicker {self.flicker_frequency:.6g} Hz",
+                f"bands of {self.period_rows:.3f} rows, contrast {self.contrast:.3g}",
+            ]
         if self.exposure_time is not None:
             std = None if self.exposure_time_std is None else 1e6 * self.exposure_time_std
-            rows = self.exposure_time / self.row_time
-            lines.append(f"exposure {measured_text(1e6 * self.exposure_time, std)} us, {rows:.2f} row times")
+            rows = "" if self.row_time is None else f", {self.exposure_time / self.row_time:.2f} row times"
+            lines.append(f"exposure {measured_text(1e6 * self.exposure_time, std or None)} us{rows}")
         if self.frame_rows is not None:
             lines.append(f"frame period {self.frame_rows:.2f} row times")
         if self.readout_direction is not None:
             lines.append(f"readout direction {self.readout_direction}")
+        if not self.reliable:
+            lines += ["not reliable:", *(wrapped(f" - {reason}") for reason in self.reasons)]
         return "\n".join([*lines, *map(wrapped, self.notes)])
 
 

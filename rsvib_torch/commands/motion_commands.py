@@ -14,6 +14,7 @@ from rsvib_torch import calibration, detection, io
 from rsvib_torch.commands.answers import command_text, restoration_data, restoration_lines
 from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.options import (
+    READOUT_HELP,
     DeviceOption,
     FrameRateOption,
     FramesArgument,
@@ -268,8 +269,26 @@ def calibrate(
         typer.Option(
             parser=seconds,
             metavar="TIME",
-            help="Exposure time, e.g. 1/1000, given once per frame, for a strobe of unknown frequency.",
+            help="Exposure time, e.g. 1/1000, given once per frame, for a strobe of unknown frequency; with "
+            "--by-motion once, if known.",
         ),
+    ] = None,
+    by_motion: Annotated[
+        bool,
+        typer.Option("--by-motion", help="Use the motion of the camera instead of a light; needs --frame-rate."),
+    ] = False,
+    row_time: Annotated[
+        list[float] | None,
+        typer.Option(
+            parser=seconds,
+            metavar="TIME",
+            help="With --by-motion: given twice, the shortest and the longest possible row time, e.g. 10us.",
+            show_default="a readout within a tenth to the whole of the frame period",
+        ),
+    ] = None,
+    readout_direction: Annotated[
+        Literal["forward", "reverse"] | None,
+        typer.Option(help=f"With --by-motion, if known. {READOUT_HELP}", show_default="determined from the frames"),
     ] = None,
     frame_rate: FrameRateOption = None,
     on_fraction: Annotated[
@@ -288,13 +307,17 @@ def calibrate(
     out: Annotated[Path | None, typer.Option(help="Configuration file to write, with the table [sensor].")] = None,
     overwrite: OverwriteOption = False,
 ) -> Answer:
-    """Measure row time, readout direction and exposure of a camera from frames of a flickering light."""
+    """Measure row time, readout direction and exposure of a camera from a flickering light or from its motion.
+
+    With --by-motion, a row time that is not certain is refused with the reason.
+    """
     import torch  # noqa: PLC0415
 
-    if (frequency is None) == (not exposure):
-        raise ValueError(
-            "give --frequency of the flicker, or --exposure once per frame for a strobe of unknown frequency"
-        )
+    limits = row_time or []
+    if by_motion:
+        _check_by_motion(frequency, exposure, limits, frame_rate, on_fraction, light_contrast)
+    else:
+        _check_by_light(frequency, exposure, limits, readout_direction)
     if out is not None:
         check_new([out], overwrite, [file for path in frames for file in io.stack_files(path)])
         check_writable(out)
@@ -309,8 +332,17 @@ def calibrate(
     with working("reading the frames"):
         stack = torch.cat([io.read_stack(path, full_scale=full_scale) for path in frames])
     axis: Literal[-2, -1] = -1 if scan_axis == "x" else -2
-    with working("measuring the flicker"):
-        if frequency is None:
+    with working("measuring the motion" if by_motion else "measuring the flicker"):
+        if by_motion:
+            result = detection.calibrate_row_time_by_motion(
+                stack,
+                frame_rate=frame_rate or 0.0,
+                row_time=(limits[0], limits[1]) if limits else None,
+                exposure_time=exposure[0] if exposure else None,
+                scan_axis=axis,
+                readout_direction=readout_direction,
+            )
+        elif frequency is None:
             result = calibration.calibrate_row_time_by_exposure(stack, exposure or [], scan_axis=axis, gamma=gamma)
         else:
             result = calibration.calibrate_row_time(
@@ -322,6 +354,8 @@ def calibrate(
                 scan_axis=axis,
                 gamma=gamma,
             )
+    if result.row_time is None or result.row_time_std is None or not result.reliable:
+        raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")
     table = _calibrated_toml(result, scan_axis)
     rows = stack.shape[axis]
     readout = measured_text(1e3 * result.row_time * rows, 1e3 * result.row_time_std * rows)
@@ -338,6 +372,40 @@ def calibrate(
         [] if out is None else [out],
         steps,
     )
+
+
+def _check_by_motion(
+    frequency: float | None,
+    exposure: list[float] | None,
+    row_time: list[float],
+    frame_rate: float | None,
+    on_fraction: float | None,
+    light_contrast: float | None,
+) -> None:
+    """Raise an error for options of ``calibrate`` that do not fit ``--by-motion``."""
+    of_light = {"--frequency": frequency, "--on-fraction": on_fraction, "--light-contrast": light_contrast}
+    for name, value in of_light.items():
+        if value is not None:
+            raise ValueError(f"{name} describes a flickering light; leave it out with --by-motion")
+    if frame_rate is None:
+        raise ValueError("--by-motion needs --frame-rate of the sensor: the row time is found relative to it")
+    if exposure and len(exposure) > 1:
+        raise ValueError("--by-motion takes one --exposure, that of all frames")
+    if row_time and len(row_time) != 2:
+        raise ValueError("give --row-time twice: the shortest and the longest possible row time")
+
+
+def _check_by_light(
+    frequency: float | None, exposure: list[float] | None, row_time: list[float], readout_direction: str | None
+) -> None:
+    """Raise an error for options of ``calibrate`` that do not fit a flickering light."""
+    if row_time or readout_direction is not None:
+        raise ValueError("--row-time and --readout-direction of calibrate are limits for --by-motion")
+    if (frequency is None) == (not exposure):
+        raise ValueError(
+            "give --frequency of the flicker, --exposure once per frame for a strobe of unknown frequency, or "
+            "--by-motion and --frame-rate for frames of a vibrating camera"
+        )
 
 
 def _calibrated_toml(result: RowTimeCalibration, scan_axis: str) -> str:

@@ -2,6 +2,7 @@ from .detect import DetectionMethod, VibrationDetector, detect_vibration
 from .recorded.alignment import ClockAlignment, align_motion
 from .recorded.motion_check import MotionCheck, check_motion
 from .result import DetectionResult
+from .row_time.by_motion import calibrate_row_time_by_motion
 from .shapes.free import MotionDetection, detect_motion
 from .shapes.swept import SweptTone, detect_swept_tone
 
@@ -14,6 +15,7 @@ __all__ = [
     "SweptTone",
     "VibrationDetector",
     "align_motion",
+    "calibrate_row_time_by_motion",
     "check_motion",
     "detect_motion",
     "detect_swept_tone",

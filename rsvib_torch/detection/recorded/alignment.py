@@ -24,7 +24,7 @@ from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
 
-__all__ = ["ClockAlignment", "align_motion"]
+__all__ = ["ClockAlignment", "FittedClock", "align_motion", "best_offset", "fit_clock", "offset_range"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -89,7 +89,7 @@ class ClockAlignment(
 
 
 @dataclass(frozen=True)
-class _Clock:
+class FittedClock:
     """Parameters of the fit; ``at`` is the reading of the recording's clock at time ``middle`` of the frames."""
 
     at: float
@@ -100,6 +100,7 @@ class _Clock:
 
     @property
     def offset(self) -> float:
+        """Reading of the recording's clock at time 0 of the frames, in seconds."""
         return self.at - self.scale * self.middle
 
     def motion(self, recorded: FreeMotion) -> FreeMotion:
@@ -188,18 +189,18 @@ def align_motion(
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     rowwise, curve, (first, last) = start_curve(stack, timing, bands)
     turned = recorded.to_row_order(timing).to(grey.device)
-    low, high = _offsets(turned, first, last, offsets)
+    low, high = offset_range(turned, first, last, offsets)
     measured = measurements_of_curve(curve, rowwise, bands.band_step)
-    offset, other = _best_offset(measured, turned, low, high, rowwise)
-    clock = _Clock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
-    clock, covariance = _refine(measured, turned, clock, False, fit_gain)
+    offset, other = best_offset(measured, turned, low, high, rowwise)
+    clock = FittedClock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
+    clock, _, _ = fit_clock(measured, turned, clock, False, fit_gain)
     weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
-    clock, covariance = _refine(weighed, turned, clock, fit_scale, fit_gain)
+    clock, covariance, _ = fit_clock(weighed, turned, clock, fit_scale, fit_gain)
     groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, clock.motion(turned).expanded(1))
     for _ in range(3):
         measured, _ = measure_groups(groups, rowwise, clock.motion(turned).expanded(1))
         weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
-        clock, covariance = _refine(weighed, turned, clock, fit_scale, fit_gain)
+        clock, covariance, _ = fit_clock(weighed, turned, clock, fit_scale, fit_gain)
     aligned = clock.motion(turned)
     residual = residual_of_motion(measured, aligned)
     independent = measured.independent_fraction(residual)
@@ -231,7 +232,7 @@ def align_motion(
     )
 
 
-def _offsets(
+def offset_range(
     recorded: FreeMotion, first: float, last: float, limits: tuple[float, float] | None
 ) -> tuple[float, float]:
     """Range of offsets for which the recording covers the frames, within ``limits``."""
@@ -252,7 +253,7 @@ def _offsets(
     return low, high
 
 
-def _best_offset(
+def best_offset(
     measured: Measurements, recorded: FreeMotion, low: float, high: float, timing: SensorTiming
 ) -> tuple[float, float | None]:
     """The offset of the least residual, with a free drift, and another local minimum below twice the least square."""
@@ -291,19 +292,44 @@ def _best_offset(
     return float(grid[best]), other
 
 
-def _refine(
-    measured: Measurements, recorded: FreeMotion, clock: _Clock, fit_scale: bool, fit_gain: bool
-) -> tuple[_Clock, Tensor]:
-    """Gauss-Newton on clock reading, scale, gain and drift (6 parameters), with their covariance (6, 6)."""
+def fit_clock(
+    measured: Measurements,
+    recorded: FreeMotion,
+    clock: FittedClock,
+    fit_scale: bool,
+    fit_gain: bool,
+    rows: Tensor | None = None,
+) -> tuple[FittedClock, Tensor, float]:
+    """Gauss-Newton on clock reading, scale, gain and drift, and on the row time.
+
+    Args:
+        measured: The displacements.
+        recorded: The motion on its own clock.
+        clock: Start values.
+        fit_scale: Whether to fit the scale.
+        fit_gain: Whether to fit the gain.
+        rows: (1, N, G) frame rows, to fit the row time as well; the exposure of row r starts r row times after a time
+            that is known. None if the row time is known.
+
+    Returns:
+        The fitted values, the covariance (7, 7) of clock reading, scale, gain and drift of x and y, and row time, and
+        the change of the row time in s.
+    """
+    row_time = 0.0
     exposure_starts = measured.exposure_starts
-    middle = exposure_starts + 0.5 * measured.exposure_time - clock.middle
-    free = torch.tensor([True, fit_scale, fit_gain, fit_gain, True, True], device=exposure_starts.device)
-    covariance = torch.zeros(6, 6, dtype=torch.float64, device=exposure_starts.device)
+    free = torch.tensor(
+        [True, fit_scale, fit_gain, fit_gain, True, True, rows is not None], device=exposure_starts.device
+    )
+    places = torch.zeros_like(exposure_starts) if rows is None else rows
+    covariance = torch.zeros(7, 7, dtype=torch.float64, device=exposure_starts.device)
     for _ in range(12):
+        measured = replace(measured, exposure_starts=exposure_starts + places * row_time)
+        starts = measured.exposure_starts
+        middle = starts + 0.5 * measured.exposure_time - clock.middle
         own = recorded.retimed(clock.offset, clock.scale)
         gain = exposure_starts.new_tensor(clock.gain)
-        speed = own.velocity(exposure_starts + 0.5 * measured.exposure_time) * gain / clock.scale
-        value = own.mean_displacement(exposure_starts, measured.exposure_time)
+        speed = own.velocity(starts + 0.5 * measured.exposure_time) * gain / clock.scale
+        value = own.mean_displacement(starts, measured.exposure_time)
         zero = torch.zeros_like(value[..., 0])
         columns = torch.stack(
             [
@@ -313,6 +339,7 @@ def _refine(
                 torch.stack([zero, value[..., 1]], -1),
                 torch.stack([middle, zero], -1),
                 torch.stack([zero, middle], -1),
+                clock.scale * speed * places[..., None],
             ],
             -1,
         )
@@ -323,10 +350,11 @@ def _refine(
         scale = torch.where(gram.diagonal() > 0, gram.diagonal(), 1.0).sqrt()
         inverse = torch.linalg.pinv(gram / scale / scale[:, None], rtol=1e-10, hermitian=True) / scale / scale[:, None]
         change = inverse @ right
-        known = measured.num_measurements.sum().clamp(min=7.0) - free.sum()
+        known = measured.num_measurements.sum().clamp(min=8.0) - free.sum()
         covariance = inverse * (measured.square(residual).sum() / known)
-        at, speedup, gain_x, gain_y, drift_x, drift_y = change.tolist()
-        clock = _Clock(
+        at, speedup, gain_x, gain_y, drift_x, drift_y, later = change.tolist()
+        row_time += later
+        clock = FittedClock(
             clock.at + at,
             max(clock.scale + speedup, 0.1 * clock.scale),
             (clock.gain[0] + gain_x, clock.gain[1] + gain_y),
@@ -335,7 +363,7 @@ def _refine(
         )
         if bool((change.abs() <= 1e-3 * covariance.diagonal().sqrt()).all()):
             break
-    return clock, covariance
+    return clock, covariance, row_time
 
 
 def _reasons(unexplained: Tensor, size: Tensor, other: float | None) -> list[str]:

@@ -36,6 +36,7 @@ from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOpti
 __all__ = [
     "MotionDetection",
     "detect_motion",
+    "measure_freely",
     "precision_of_axis",
     "residual_of_motion",
     "rms_motion",
@@ -207,28 +208,56 @@ def _detect(
     stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions, knot_rows: int, iterations: int
 ) -> MotionDetection:
     """``detect_motion`` of one stack."""
-    grey = stack.images
     rowwise, curve, record = start_curve(stack, timing, bands)
-    spacing = max(knot_rows * rowwise.row_time, (record[1] - record[0]) / 3000)  # the cost grows with knots^3
-    size = (grey.shape[-2], grey.shape[-1])
-    measured = measurements_of_curve(curve, rowwise, bands.band_step)
-    fit = _fit_spline(measured, max(spacing, 0.5 * bands.band_rows * rowwise.row_time), record)
-    # while iterating, any drift is an image motion, which the scene rows of the groups follow
-    motion = _motion(fit, size, 0.0)
-    groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, motion)
-    for step in range(iterations):
-        measured, _ = measure_groups(groups, rowwise, motion)
-        if step:  # objects that move by themselves get less weight
-            measured = measured.reweighted(residual_of_motion(measured, motion[0]))
-        fit = _fit_spline(measured, spacing, record)
-        motion = _motion(fit, size, 0.0)
+    measured, motion, spacing = measure_freely(stack, rowwise, curve, record, bands, knot_rows, iterations)
+    size = (stack.images.shape[-2], stack.images.shape[-1])
     residual = residual_of_motion(measured, motion[0])
     weighed = measured.reweighted(residual)
     share = weighed.independent_fraction(residual) * measured.share_counted(residual)
     fit = _fit_spline(replace(weighed, independent=share), spacing, record, learn=True)
     motion = _motion(fit, size, 0.25)
-    starts = rowwise.frame_starts(grey.shape[1], grey.device)
+    starts = rowwise.frame_starts(stack.images.shape[1], stack.images.device)
     return _report(motion[0], fit, measured, timing, starts, size[0])
+
+
+def measure_freely(
+    stack: GreyFrames,
+    timing: RowTiming,
+    curve: OffsetCurve,
+    record: tuple[float, float],
+    bands: RegistrationOptions,
+    knot_rows: int,
+    iterations: int,
+) -> tuple[Measurements, FreeMotion, float]:
+    """Displacements of the rows of one stack, measured around a spline that is fitted to them again in every round.
+
+    Args:
+        stack: The frames.
+        timing: The sensor, in row order.
+        curve: Offsets of the row bands.
+        record: Start and end of the record in seconds.
+        bands: Registration of the bands.
+        knot_rows: As in ``detect_motion``.
+        iterations: Rounds of measuring and fitting.
+
+    Returns:
+        The measurements, the motion (a batch of one) and its knot spacing in seconds.
+    """
+    grey = stack.images
+    spacing = max(knot_rows * timing.row_time, (record[1] - record[0]) / 3000)  # the cost grows with knots^3
+    size = (grey.shape[-2], grey.shape[-1])
+    measured = measurements_of_curve(curve, timing, bands.band_step)
+    fit = _fit_spline(measured, max(spacing, 0.5 * bands.band_rows * timing.row_time), record)
+    # while iterating, any drift is an image motion, which the scene rows of the groups follow
+    motion = _motion(fit, size, 0.0)
+    groups = frame_groups(stack_spectra(grey, stack.valid), timing, motion)
+    for step in range(iterations):
+        measured, _ = measure_groups(groups, timing, motion)
+        if step:  # objects that move by themselves get less weight
+            measured = measured.reweighted(residual_of_motion(measured, motion[0]))
+        fit = _fit_spline(measured, spacing, record)
+        motion = _motion(fit, size, 0.0)
+    return measured, motion, spacing
 
 
 def start_curve(

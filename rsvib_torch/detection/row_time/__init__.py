@@ -1,0 +1,1 @@
+"""Row time of a camera from the motion in its frames."""

@@ -1,0 +1,175 @@
+"""Row time from frames with a smooth motion of any shape.
+
+A motion that is smooth over the blanking time continues from the end of one frame to the begin of the next. A spline
+in time with as few knots as explain the displacements of the rows is fitted together with the row time: at a wrong row
+time, the continuation fails and more knots are needed.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.splines import bspline_weights
+from rsvib_torch.detection.row_time.joint_fit import FramePlaces
+from rsvib_torch.detection.row_time.row_tones import MAX_CHI_SQUARE, Candidate, RowRecord
+
+__all__ = ["SplineRowTime", "row_time_of_splines"]
+
+DEGREE = 7  # a simulated motion of 8 Hz bandwidth needs knots of 11 ms to its noise, and of 8 ms with degree 3
+GRID_STEP = 0.02  # of the row time; minima of the residual are 0.1 wide or wider for motions that are accepted
+
+
+@dataclass(frozen=True, eq=False)
+class SplineRowTime:
+    """Row time of a spline fit.
+
+    Attributes:
+        row_time: Seconds, negative for a reverse readout.
+        std: Its standard deviation.
+        others: Other row times at which a spline with as few knots explains the displacements.
+        spacing: Seconds between knots.
+    """
+
+    row_time: float
+    std: float
+    others: tuple[Candidate, ...]
+    spacing: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Evaluation:
+    """Weighted least squares of a spline at one row time.
+
+    Attributes:
+        chi_square: Weighted square of the residuals.
+        parameters: Number of coefficients of both axes.
+        step: Gauss-Newton step of the row time in s, with the coefficients fitted again.
+        information: Inverse variance of the row time, for measurements of unit variance.
+    """
+
+    chi_square: float
+    parameters: int
+    step: float
+    information: float
+
+
+def row_time_of_splines(
+    places: FramePlaces, num_rows: int, low: float, high: float, directions: tuple[float, ...]
+) -> SplineRowTime | None:
+    """Row time at which the fewest knots explain the displacements; None if no smooth motion does.
+
+    Args:
+        places: Displacements of rows, from the top of the image, and their frames.
+        num_rows: Rows of a frame.
+        low: Shortest row time in s.
+        high: Longest row time in s.
+        directions: Possible readout directions, 1.0 and -1.0.
+    """
+    problem = _Problem.of(places, num_rows, high)
+    count = max(1, math.ceil(math.log(high / low) / GRID_STEP))
+    sizes = [low * (high / low) ** (i / count) for i in range(count + 1)]
+    grid = sorted(direction * size for direction in directions for size in sizes)
+    period, spacing = places.period, places.period
+    blank = period - num_rows * high
+    while spacing > max(0.7 * blank, 0.1 * period):
+        costs = [problem.evaluate(tried, spacing).chi_square for tried in grid]
+        minima = [i for i, cost in enumerate(costs) if cost <= min(costs[max(i - 1, 0) : i + 2])]
+        lowest = sorted(minima, key=costs.__getitem__)[:6]
+        found = sorted((problem.refined(grid[i], spacing, low, high) for i in lowest), key=lambda one: one.chi_square)
+        # knots twice as close explain noise only
+        closer = problem.refined(found[0].row_time, 0.5 * spacing, low, high)
+        coarse, fine = (problem.evaluate(found[0].row_time, step).parameters for step in (spacing, 0.5 * spacing))
+        noise = closer.chi_square / max(1.0, problem.known - fine)
+        added = fine - coarse
+        if found[0].chi_square - closer.chi_square < noise * (added + 3.0 * math.sqrt(2.0 * added)):
+            break
+        spacing /= 2**0.25
+    else:
+        return None
+    if spacing < 0.7 * (period - num_rows * abs(found[0].row_time)):
+        return None
+    # with knots that are a little closer, the errors of the spline are below the noise
+    finer = spacing / 2**0.25
+    best = problem.refined(found[0].row_time, finer, low, high)
+    std = best.std * math.sqrt(noise)
+    others = tuple(
+        one
+        for one in found[1:]
+        if one.chi_square < found[0].chi_square + noise * MAX_CHI_SQUARE
+        and abs(one.row_time - best.row_time) > 5 * (std + one.std * math.sqrt(noise))
+    )
+    return SplineRowTime(best.row_time, std, others, finer)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Displacements of both axes.
+
+    Attributes:
+        records: Of x and y.
+        period: Frame period in s.
+        known: Number of independent measurements.
+    """
+
+    records: tuple[RowRecord, RowRecord]
+    period: float
+    known: float
+
+    @classmethod
+    def of(cls, places: FramePlaces, num_rows: int, row_time: float) -> "_Problem":
+        x, y = (places.of_axis(axis, num_rows, row_time) for axis in range(2))
+        return cls((x, y), places.period, x.num_measurements + y.num_measurements)
+
+    def evaluate(self, row_time: float, spacing: float) -> _Evaluation:
+        """Splines of both axes at a row time, with knots about ``spacing`` apart."""
+        first_record = self.records[0]
+        times = first_record.frames * self.period + first_record.rows * row_time
+        first, last = float(times.amin()), float(times.amax())
+        cells = max(1, math.ceil((last - first) / spacing))
+        basis, slope = _basis(times, first, (last - first) / cells, cells)
+        basis = first_record.relative(basis)
+        cost, step, information = 0.0, 0.0, 0.0
+        for record in self.records:
+            root = record.weights.sqrt()[:, None]
+            columns = (root[..., None] * basis).flatten(0, 1)
+            values = (root * record.values).flatten()
+            gram = columns.mT @ columns
+            gram = gram + (1e-10 * gram.diagonal().mean() + 1e-300) * torch.eye(len(gram)).to(gram)
+            factor = torch.linalg.cholesky(gram)
+            solution = torch.cholesky_solve((columns.mT @ values)[:, None], factor)[:, 0]
+            residual = values - columns @ solution
+            by_row_time = (root * record.relative((slope @ solution) * record.rows)).flatten()
+            own = by_row_time - columns @ torch.cholesky_solve((columns.mT @ by_row_time)[:, None], factor)[:, 0]
+            cost += float(residual.square().sum()) * record.independent
+            step += float(own @ residual) * record.independent
+            information += float(own @ own) * record.independent
+        information = max(information, 1e-300)
+        return _Evaluation(cost, 2 * (cells + DEGREE), step / information, information)
+
+    def refined(self, row_time: float, spacing: float, low: float, high: float) -> Candidate:
+        """Gauss-Newton on the row time from a start in s."""
+        size, sign = abs(row_time), math.copysign(1.0, row_time)
+        for _ in range(8):
+            found = self.evaluate(sign * size, spacing)
+            change = min(max(sign * found.step, -GRID_STEP * size), GRID_STEP * size)
+            size = min(max(size + change, low), high)
+            if abs(change) < 1e-2 * found.information**-0.5:
+                break
+        found = self.evaluate(sign * size, spacing)
+        return Candidate(sign * size, found.information**-0.5, found.chi_square)
+
+
+def _basis(times: Tensor, first: float, width: float, cells: int) -> tuple[Tensor, Tensor]:
+    """B-splines of degree ``DEGREE`` at times (...), (..., cells + DEGREE), and their derivatives."""
+    place = (times - first) / width
+    cell = place.floor().clamp(0.0, cells - 1.0)
+    index = cell.to(torch.int64)[..., None] + torch.arange(DEGREE + 1, device=times.device)
+    lower = bspline_weights(place - cell, DEGREE - 1)
+    pad = torch.nn.functional.pad
+    slopes = (pad(lower, (1, 0)) - pad(lower, (0, 1))) / width
+    empty = torch.zeros(*times.shape, cells + DEGREE, dtype=times.dtype, device=times.device)
+    return empty.scatter(-1, index, bspline_weights(place - cell, DEGREE)), empty.scatter(-1, index, slopes)

@@ -1,0 +1,93 @@
+"""Row time from frames and a motion that another instrument recorded.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
+
+import math
+from dataclasses import replace
+
+from rsvib_torch.detection.recorded.alignment import FittedClock, best_offset, fit_clock, offset_range
+from rsvib_torch.detection.row_time.by_tones import CameraClock, RowTimeFit
+from rsvib_torch.detection.row_time.joint_fit import FramePlaces
+from rsvib_torch.detection.row_time.row_tones import MAX_CHI_SQUARE, Candidate
+from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion
+from rsvib_torch.motion.spline import FreeMotion
+
+__all__ = ["row_time_of_recording"]
+
+
+def row_time_of_recording(
+    places: FramePlaces,
+    recorded: FreeMotion,
+    clock: CameraClock,
+    num_frames: int,
+    *,
+    offsets: tuple[float, float] | None,
+    fit_gain: bool,
+) -> RowTimeFit:
+    """Row time at which the recorded motion explains the displacements of the rows.
+
+    Offset and rate of the clock, drift and (on request) gain are fitted together with the row time, from starts at
+    many row times. Rows are counted from the middle one, whose time determines the offset whatever the row time is.
+
+    Args:
+        places: Displacements of rows, from the top of the image, and their frames.
+        recorded: The motion on its own clock, its axes in row order.
+        clock: What is known about the camera.
+        num_frames: Frames of the stack.
+        offsets: Smallest and largest offset in s, of the middle row of frame 0.
+        fit_gain: Whether to fit a factor of each axis.
+    """
+    half = 0.5 * (clock.num_rows - 1)
+    places = replace(places, rows=places.rows - half)
+    reach = half * clock.high
+    end = (num_frames - 1) * clock.period + reach + places.measurements.exposure_time
+    low, high = offset_range(recorded, -reach, end, offsets)
+    middle = 0.5 * (end - reach)
+    found: list[tuple[float, Candidate, FittedClock]] = []
+    timing = clock.timing(clock.high)
+    count = max(1, math.ceil(math.log(clock.high / clock.low) / 0.1))  # Gauss-Newton converges over this step
+    for direction in clock.directions:
+        for index in range(count + 1):
+            row_time = direction * clock.low * (clock.high / clock.low) ** (index / count)
+            if index % 4 == 0:  # the offset of the middle row hardly depends on the row time
+                offset, _ = best_offset(places.timed(row_time), recorded, low, high, timing)
+                start = FittedClock(offset + middle, 1.0, (1.0, 1.0), (0.0, 0.0), middle)
+            if found and any(abs(row_time - one.row_time) < 0.05 * abs(row_time) for _, one, _ in found):
+                continue
+            fitted = start
+            for _ in range(3):  # weights against outliers
+                measured = places.timed(row_time)
+                weighted = measured.reweighted(residual_of_motion(measured, fitted.motion(recorded)))
+                fitted, covariance, later = fit_clock(weighted, recorded, fitted, False, fit_gain, places.rows)
+                row_time += later
+            if not clock.allows(row_time):
+                continue
+            residual = residual_of_motion(places.timed(row_time), fitted.motion(recorded))
+            std = float(covariance[-1, -1].clamp(min=0.0) / places.measurements.independent_fraction(residual)) ** 0.5
+            size = float(weighted.square(residual).sum() / weighted.num_measurements.sum().clamp(min=1.0))
+            found.append((size, Candidate(row_time, std, 0.0), fitted))
+    if not found:
+        return RowTimeFit(math.nan, math.nan, (), None, None, ("the recording does not explain the frames",))
+    found.sort(key=lambda one: one[0])
+    size, best, fitted = found[0]
+    known = float(places.measurements.num_measurements.sum())
+    others = tuple(
+        Candidate(one.row_time, one.std, known * (cost / size - 1.0))
+        for cost, one, _ in found[1:]
+        if known * (cost / size - 1.0) < MAX_CHI_SQUARE and abs(one.row_time - best.row_time) > 5 * (one.std + best.std)
+    )
+    measured = places.timed(best.row_time)
+    _, other = best_offset(measured, recorded, low, high, timing)
+    aligned = fitted.motion(recorded)
+    rest, moved = measured.unexplained(residual_of_motion(measured, aligned))[0], rms_motion(measured, aligned)
+    reasons = [
+        f"rows move by {float(rest[axis]):.2g} px {name} that the recording does not explain"
+        for axis, name in enumerate(("along the rows", "across the rows"))
+        if float(rest[axis]) > max(0.25 * float(moved[axis]), 0.05)
+    ]
+    if float(moved.amax()) < 0.05:
+        reasons.append(f"the recorded motion moves rows by {float(moved.amax()):.2g} px between frames, too little")
+    if other is not None:
+        reasons.append(f"an offset of {other:.6g} s explains the frames as well: the motion repeats")
+    return RowTimeFit(best.row_time, best.std, others, None, None, tuple(reasons))

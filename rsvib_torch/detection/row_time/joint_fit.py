@@ -1,0 +1,120 @@
+"""Row time as a further parameter of the fit of tones to displacements of rows.
+
+The exposure of row r of frame g starts at ``g P + r T_row``. Displacements of rows that were measured in the frames do
+not depend on the row time; the times that belong to them do.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.row_time.row_tones import RowRecord
+from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, fit_tones, motion_of_fit, residual_of
+from rsvib_torch.motion.motion import Motion
+
+__all__ = ["FramePlaces", "fit_row_time", "row_time_columns", "rows_of_frames"]
+
+
+@dataclass(frozen=True, eq=False)
+class FramePlaces:
+    """Frame rows and frames of measurements of one stack, from which their times follow for any row time.
+
+    Attributes:
+        measurements: The displacements (B = 1); their times are replaced.
+        rows: (1, N, G) frame rows.
+        frames: (1, N, G) indices of the frames.
+        period: Frame period in s.
+    """
+
+    measurements: Measurements
+    rows: Tensor
+    frames: Tensor
+    period: float
+
+    def timed(self, row_time: float) -> Measurements:
+        """The measurements with the times of a row time in s."""
+        return replace(self.measurements, exposure_starts=self.frames * self.period + self.rows * row_time)
+
+    def of_axis(self, axis: int, num_rows: int, row_time: float) -> RowRecord:
+        """The displacements along one axis, for tones of independent frequencies."""
+        measured = self.measurements
+        return RowRecord(
+            self.rows[0] - 0.5 * (num_rows - 1),
+            self.frames[0] - 0.5 * (self.frames.amin() + self.frames.amax()),
+            measured.displacements[0, ..., axis],
+            measured.visible[0],
+            measured.inverse_variances[0, :, axis],
+            measured.independent,
+            row_time / self.period,
+        )
+
+
+def rows_of_frames(measured: Measurements, period: float, row_time: float, num_rows: int) -> FramePlaces:
+    """Frame rows of measurements that were timed with a row time.
+
+    Args:
+        measured: Of one stack.
+        period: Frame period in s.
+        row_time: The row time in s of these times.
+        num_rows: Rows of a frame.
+    """
+    blank = 0.5 * (period - num_rows * row_time)  # rows up to half of the blanking outside of a frame are its rows
+    frames = ((measured.exposure_starts + blank) / period).floor()
+    return FramePlaces(measured, (measured.exposure_starts - frames * period) / row_time, frames, period)
+
+
+def row_time_columns(measured: Measurements, rows: Tensor, motion: Motion) -> Tensor:
+    """Derivatives (1, N, G, 2) of the relative displacements by the row time: velocity times row."""
+    starts, exposure = measured.exposure_starts, measured.exposure_time
+    velocity = (motion.displacement(starts + exposure) - motion.displacement(starts)) / exposure
+    return measured.relative(velocity * rows[..., None])
+
+
+def fit_row_time(
+    places: FramePlaces, row_time: float, fit: ToneFit, *, iterations: int = 12
+) -> tuple[float, float, ToneFit]:
+    """Gauss-Newton on the row time, with all tones fitted again in every step.
+
+    Args:
+        places: The measurements, with the weights of a robust fit.
+        row_time: Start in s.
+        fit: Tones that were fitted with it.
+        iterations: At most.
+
+    Returns:
+        Row time in s, its standard deviation, and the tones.
+    """
+    std = 0.0
+    for _ in range(iterations):
+        measured = places.timed(row_time)
+        fit = fit_tones(measured, fit.frequencies, fit.active, fit.model)
+        residual = residual_of(measured, fit)
+        free = (fit.active.sum(-1) * 3 + fit.drift.shape[-1]).double()
+        variance = measured.square(residual) / (measured.num_measurements - free - 0.5).clamp(min=1.0)
+        weighted = measured.scaled(1 / variance.clamp(min=1e-300))
+        tones = [axis_jacobian(measured, fit, axis)[0][0] for axis in range(2)]  # (N, G, M)
+        zero = torch.zeros_like(tones[0])
+        columns = torch.cat(
+            [
+                torch.stack([tones[0], zero], 2),
+                torch.stack([zero, tones[1]], 2),
+                row_time_columns(measured, places.rows, motion_of_fit(fit))[0, ..., None],
+            ],
+            -1,
+        )  # (N, G, 2, P)
+        gram = torch.einsum("ngap,nac,ngcq->pq", columns, weighted.information[0], columns)
+        right = torch.einsum("ngap,nac,ngc->p", columns, weighted.information[0], residual[0])
+        scale = torch.where(gram.diagonal() > 0, gram.diagonal(), 1.0).rsqrt()
+        eye = torch.diag(1e-13 + (gram.diagonal() <= 0).double())
+        inverse = torch.linalg.inv(gram * scale * scale[:, None] + eye) * scale * scale[:, None]
+        step = float((inverse @ right)[-1])
+        std = float(inverse[-1, -1].clamp(min=0.0).sqrt()) / measured.independent**0.5
+        row_time = row_time + min(max(step, -0.02 * row_time), 0.02 * row_time)
+        if abs(step) < 1e-2 * std:
+            break
+    measured = places.timed(row_time)
+    return row_time, std, fit_tones(measured, fit.frequencies, fit.active, fit.model)
