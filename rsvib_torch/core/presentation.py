@@ -13,7 +13,7 @@ import os
 import types
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, Union, get_args, get_origin, get_type_hints
@@ -156,9 +156,11 @@ def _dataclass(kind: type[Any], value: Any, path: str = "") -> Any:
         raise ValueError(f"{path}: expected a table, got {value!r}")
     # SensorTiming does not import torch, whose Tensor its annotations name
     hints, start = get_type_hints(kind, localns={"Tensor": torch.Tensor}), f"{path}." if path else ""
-    names = [field.name for field in fields(kind)]
-    if absent := [name for name in names if name not in value]:
+    # files of earlier versions lack fields that were added later with a default
+    needed = [field.name for field in fields(kind) if field.default is MISSING and field.default_factory is MISSING]
+    if absent := [name for name in needed if name not in value]:
         raise ValueError(f"{start}{absent[0]}: missing key")
+    names = [field.name for field in fields(kind) if field.name in value]
     missing = getattr(kind, "_MISSING", math.nan)
     return kind(**{name: _restored(hints[name], value[name], start + name, missing) for name in names})
 

@@ -294,3 +294,17 @@ def test_other_result_types_print_their_shapes():
         name: str
 
     assert str(Other(torch.zeros(2, 3), "one")) == "Other\n  values: tensor (2, 3)\n  name: one"
+
+
+def test_files_of_earlier_versions_lack_fields_with_a_default(tmp_path):
+    found = rsv.RowTimeCalibration(
+        1.5e-5, 1e-8, 66.0, 0.4, 1000.0, None, None, None, None, ("a note",), candidates=(1.5e-5,)
+    )
+    path = tmp_path / "calibration.json"
+    found.save(path)
+    content = json.loads(path.read_text())
+    for name in ("candidates", "reliable", "reasons"):
+        del content[name]
+    path.write_text(json.dumps(content))
+    again = rsv.RowTimeCalibration.load(path)
+    assert (again.row_time, again.candidates, again.reliable) == (1.5e-5, (), True)
