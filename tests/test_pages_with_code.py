@@ -94,3 +94,11 @@ def test_recipes_of_the_architecture_page(tmp_path, monkeypatch):
     ):
         with pytest.raises(ValueError, match=name):
             call()
+
+
+def test_page_on_roll_and_zoom():
+    page = run_page("roll_and_zoom.md", 1)
+    detection, truth = page["detection"], page["truth"]
+    assert detection.reliable.tolist() == [True, True, True]
+    torch.testing.assert_close(detection.vibration.amplitude[2], truth.amplitude[2], rtol=0.03, atol=0)
+    assert page["restored"].shape == page["frames"].shape
