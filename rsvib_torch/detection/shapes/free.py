@@ -34,6 +34,7 @@ from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOpti
 
 __all__ = [
     "MotionDetection",
+    "bands_reasons",
     "detect_motion",
     "precision_of_axis",
     "residual_of_motion",
@@ -177,7 +178,7 @@ def _detect(
     rowwise, curve, record = start_curve(stack, timing, bands)
     spacing = max(knot_rows * rowwise.row_time, (record[1] - record[0]) / 3000)  # the cost grows with knots^3
     size = (grey.shape[-2], grey.shape[-1])
-    measured = measurements_of_curve(curve, rowwise, bands.band_step)
+    measured = banded = measurements_of_curve(curve, rowwise, bands.band_step)
     fit = _fit_spline(measured, max(spacing, 0.5 * bands.band_rows * rowwise.row_time), record)
     # while iterating, any drift is an image motion, which the scene rows of the groups follow
     motion = _motion(fit, size, 0.0)
@@ -194,7 +195,7 @@ def _detect(
     fit = _fit_spline(replace(weighed, independent=share), spacing, record, learn=True)
     motion = _motion(fit, size, 0.25)
     starts = rowwise.frame_starts(grey.shape[1], grey.device)
-    return _report(motion[0], fit, measured, timing, starts, size[0])
+    return _report(motion[0], fit, measured, timing, starts, size[0], bands_reasons(banded, motion[0]))
 
 
 def start_curve(
@@ -230,6 +231,31 @@ def rms_motion(measured: Measurements, motion: Motion) -> Tensor:
     """(2,) px, rms displacement of scene rows about their mean over the frames, by a motion (not a batch)."""
     moved = measured.relative(motion.mean_displacement(measured.exposure_starts, measured.exposure_time))[0]
     return moved.square().sum(1).div(measured.num_differences[0].clamp(min=1.0)[:, None]).mean(0).sqrt()
+
+
+def bands_reasons(banded: Measurements, motion: Motion, *, counted: float = 0.75) -> tuple[list[str], list[str]]:
+    """Reasons against a motion of each axis in row order that the offsets of row bands contradict.
+
+    Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it.
+
+    Args:
+        banded: Offsets of the bands of one stack, from ``measurements_of_curve``.
+        motion: The motion (not a batch).
+        counted: Fraction of the bands that count, the best ones: clouds may cover the others.
+    """
+    used = banded.weights[0].amin(-1) > 0
+    values, rest = (x[0, used, 1] - x[0, used, 0] for x in (banded.displacements, residual_of_motion(banded, motion)))
+    size = (values - values.mean(0)).abs().mean(0).tolist()
+    count = math.ceil(counted * len(rest))
+    residual = rest.abs().sort(dim=0).values[:count].mean(0).tolist()
+    allowed = [max(0.1, 0.3 * axis) for axis in size]  # px; smaller ones are errors of registration, as for tones
+    first, second = (
+        [f"the offsets of row bands differ by {rest:.3g} px from it, {most:.3g} px are allowed: noise hides the scene"]
+        if rest > most
+        else []
+        for rest, most in zip(residual, allowed, strict=True)
+    )
+    return first, second
 
 
 def unexplained_reason(residual: Tensor, moved: Tensor, model: str) -> list[str]:
@@ -422,7 +448,13 @@ def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: fl
 
 
 def _report(
-    motion: FreeMotion, fit: _SplineFit, measured: Measurements, timing: SensorTiming, starts: Tensor, num_rows: int
+    motion: FreeMotion,
+    fit: _SplineFit,
+    measured: Measurements,
+    timing: SensorTiming,
+    starts: Tensor,
+    num_rows: int,
+    of_bands: tuple[list[str], list[str]],
 ) -> MotionDetection:
     """The motion in image axes, and its uncertainty at up to 32 rows of every frame."""
     rows = torch.linspace(0, num_rows - 1, min(32, num_rows), dtype=torch.float64, device=starts.device)
@@ -444,7 +476,7 @@ def _report(
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     reasons = []
     for axis in range(2):
-        against = unexplained_reason(rest[axis], moved[axis], "smooth motion")
+        against = unexplained_reason(rest[axis], moved[axis], "smooth motion") + of_bands[axis]
         if float(std_seen[axis]) > 0.3:
             against.append(
                 f"the motion is determined to {float(std_seen[axis]):.3g} px only: the frames may show different scenes"
