@@ -21,7 +21,7 @@ __all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_ex
 ScanAxis = Literal[-2, -1, "y", "x"]
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RowTimeCalibration(
     Result,
     units={
@@ -47,6 +47,8 @@ class RowTimeCalibration(
         exposure_time: T_e in seconds.
         exposure_time_std: Its standard deviation.
         notes: Reasons for undetermined values, and warnings.
+        light: (T, H) light of the rows of each frame over its mean, without the brightness of the scene.
+        fitted_light: (T, H) the bands that were fitted to it.
     """
 
     row_time: float
@@ -59,6 +61,8 @@ class RowTimeCalibration(
     exposure_time: float | None
     exposure_time_std: float | None
     notes: tuple[str, ...]
+    light: Tensor
+    fitted_light: Tensor
 
     def summary(self) -> str:
         """The measured values of the sensor, and what is not determined."""
@@ -166,6 +170,8 @@ def calibrate_row_time(
         exposure_time=exposure,
         exposure_time_std=exposure_std,
         notes=tuple(notes),
+        light=bands.fitted + bands.residual,
+        fitted_light=bands.fitted,
     )
 
 
@@ -227,6 +233,8 @@ def calibrate_row_time_by_exposure(
         exposure_time=exposures[shortest],
         exposure_time_std=0.0,
         notes=("readout direction unknown: it requires the flicker frequency and the frame rate",),
+        light=torch.cat([s.fitted + s.residual for s in singles]),
+        fitted_light=torch.cat([s.fitted for s in singles]),
     )
 
 

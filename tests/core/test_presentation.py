@@ -24,6 +24,12 @@ def make_frames():
     return torch.from_numpy(take_frames(draw_scene(336, 336, 4), TIMING, MOTION, 4, noise=0.005)).float()
 
 
+def recording():
+    """The motion as a recording whose clock is 0.3 s ahead of that of the frames."""
+    times = torch.linspace(0.28, 0.38, 1001, dtype=torch.float64)
+    return rsv.FreeMotion.through(times, torch.from_numpy(MOTION.displacement(times.numpy() - 0.3)))
+
+
 @pytest.fixture(scope="module", name="detection")
 def make_detection(frames):
     return rsv.detect_vibration(frames, TIMING)
@@ -54,6 +60,7 @@ def make_results(frames, detection, windows):
         rsv.detect_swept_tone(frames, TIMING),
         rsv.judge_restoration(frames, restored, TIMING, detection),
         rsv.check_motion(frames, TIMING, detection.vibration),
+        rsv.align_motion(frames, TIMING, recording(), fit_scale=False),
         rsv.calibrate_row_time(light[None, :, None].expand(1, 512, 16), 1000.0),
         rsv.slanted_edge_mtf(torch.special.ndtr(edge / 0.8)),
     )
@@ -181,12 +188,15 @@ def test_results_move_between_devices(results):
 
 
 DRAWN = {
+    "ClockAlignment",
     "DetectionResult",
     "FreeMotion",
+    "MotionCheck",
     "MotionDetection",
     "MtfCurve",
     "OffsetCurve",
     "RestorationVerdict",
+    "RowTimeCalibration",
     "SweptTone",
     "Vibration",
 }
@@ -196,7 +206,9 @@ def test_results_are_drawn(results, tmp_path):
     for number, (name, result) in enumerate(results):
         path = tmp_path / f"{number}.png"
         if name not in DRAWN:
-            with pytest.raises(TypeError, match=r"has no figure; these have one: DetectionResult, FreeMotion, Mot"):
+            with pytest.raises(
+                TypeError, match=r"has no figure; these have one: ClockAlignment, DetectionResult, FreeMotion, Mot"
+            ):
                 result.plot(path)
         elif name in ("OffsetCurve", "Vibration") and result.batch_shape:
             with pytest.raises(ValueError, match=r"a batch of shape \(3,\) has no figure: select one, result\[0\]"):
