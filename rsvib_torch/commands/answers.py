@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsvib_torch.core.text import wrapped
+from rsvib_torch.core.text import number_of, wrapped
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
@@ -50,9 +50,9 @@ def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
         result: Restored frames with their verdict.
         count: Number of frames of the stack.
     """
-    frames = f"{count} frames" if len(result.frames) == count else f"1 image of {count} frames"
+    frames = number_of(count, "frame") if len(result.frames) == count else f"1 image of {number_of(count, 'frame')}"
     if not result.restored:
-        lines = [f"{count} frames unchanged"]
+        lines = [f"{number_of(count, 'frame')} unchanged"]
     else:
         lines = [f"{frames} restored along {restored_axes(result.left_alone)}"]
     if result.verdict is not None:

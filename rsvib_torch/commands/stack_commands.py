@@ -46,7 +46,7 @@ from rsvib_torch.commands.terminal import Answer, counting, error_line, note, ru
 from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable, whole_folder
 from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
-from rsvib_torch.core.text import write_json
+from rsvib_torch.core.text import number_of, write_json
 from rsvib_torch.core.validation import validate
 
 if TYPE_CHECKING:
@@ -319,7 +319,7 @@ def detect(
 
 def _warn_of_failures(windows: int) -> None:
     if windows:
-        error_line(f"detection failed in {windows} windows: see manifest.json", "warning")
+        error_line(f"detection failed in {number_of(windows, 'window')}: see manifest.json", "warning")
 
 
 @camera_options
@@ -542,7 +542,7 @@ def run(
     if overwrite:
         _remove_old(out, results, names)
     if result.bad_frames:
-        error_line(f"{result.bad_frames} frames could not be used: see manifest.json", "warning")
+        error_line(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json", "warning")
     _note_lost(out / output, result.not_kept)
     windows = ["--manifest", str(out / "manifest.json")] if result.windows > 1 else []
     page = command_text("report", frames, out / "report", *settings.arguments, *windows)

@@ -292,6 +292,23 @@ def _draw_displacement(panel: Axes, times: Tensor, displacement: Tensor, std: Te
     plain_axes(panel)
 
 
+def _title_refusal(panel: Axes, result: MotionDetection | SweptTone) -> None:
+    """State above a figure which axes are not reliable, with the first reason."""
+    refused = [
+        f"{name}: not reliable: {reasons[0]}"
+        for name, good, reasons in zip("xy", result.reliable, result.reasons, strict=True)
+        if not bool(good)
+    ]
+    lines = [line for text in refused for line in textwrap.wrap(text, 100, max_lines=1, placeholder=" …")]
+    panel.set_title("\n".join(lines), loc="left", fontsize=9.5, color=_INK)
+
+
+def _swept_figure(result: SweptTone) -> Figure:
+    figure = motion_figure(result.motion)
+    _title_refusal(figure.axes[0], result)
+    return figure
+
+
 def free_motion_figure(result: MotionDetection) -> Figure:
     """Draw a detected motion at the rows of the frames, with a band of two standard deviations.
 
@@ -304,6 +321,7 @@ def free_motion_figure(result: MotionDetection) -> Figure:
         parts = (values[frame].cpu() for values in (result.times, result.displacement, result.std))
         _draw_displacement(panel, *parts)
     panel.legend(panel.lines[:2], "xy", fontsize=9, frameon=False, ncols=2)
+    _title_refusal(panel, result)
     return figure
 
 
@@ -641,7 +659,7 @@ def _check_figure(result: MotionCheck) -> Figure:
         panel.set_title(f"Offset along {name}", loc="left", fontsize=12, fontweight="bold", color=_INK)
         panel.set_xlabel("exposure start of the rows in the earlier frame (ms)", color=_INK)
         panel.set_ylabel("offset (px)", color=_INK)
-        panel.legend(fontsize=9, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0))
+        panel.legend(fontsize=9)
         plain_axes(panel)
     return figure
 
@@ -651,7 +669,7 @@ FIGURES.update(
         (DetectionResult, 0): offset_figure,
         (DetectionResult, 1): _batch_figure,
         (MotionDetection, 0): free_motion_figure,
-        (SweptTone, 0): lambda result: motion_figure(result.motion),
+        (SweptTone, 0): _swept_figure,
         (RowTimeCalibration, 0): _calibration_figure,
         (ClockAlignment, 0): lambda result: motion_figure(result.motion),
         (MotionCheck, 0): _check_figure,

@@ -15,8 +15,9 @@ import pytest
 import tifffile
 import torch
 from kornia.filters import gaussian_blur2d
+from truth import MARGIN, Motion, draw_scene, take_frames
 
-from rsvib_torch import __version__
+from rsvib_torch import SensorTiming, __version__
 from rsvib_torch.commands.main import run_command
 from rsvib_torch.io import read_stack, read_stack_info, write_stack
 
@@ -218,6 +219,44 @@ def test_a_wrong_vibration_leaves_the_frames_unchanged_unless_forced(place, tmp_
     assert "restored is no better than raw" in capsys.readouterr().err
     assert (tifffile.imread(tmp_path / "r.tif") != tifffile.imread(place / "frames.tif")).any()
     assert json.loads((tmp_path / "report.json").read_text())["frames"] == "restored"
+
+
+def test_known_motion_that_makes_frames_worse_leaves_them_unchanged_unless_forced(tmp_path, capsys):
+    """The motion is right in the first pair of frames, which moves most, and wrong in the others."""
+
+    class Transient(Motion):
+        def displacement(self, times):
+            return np.stack([12 * np.exp(-times / 0.006) * np.cos(400 * times), 0 * times], -1)
+
+    timing = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=210)
+    scene = draw_scene(200 + 2 * MARGIN, 128 + 2 * MARGIN, 3)
+    frames = np.clip(4095 * take_frames(scene, timing, Transient(), 5, 0.003, samples=8), 0, 4095).astype(np.uint16)
+    tags = [(33550, "d", 3, (0.5, 0.5, 0.0), False), (42113, "s", 0, "0", False)]
+    options = {"photometric": "minisblack", "metadata": None, "extratags": tags}
+    tifffile.imwrite(tmp_path / "frames.tif", frames, **options)
+    times = np.arange(-0.001, 0.06, 2e-5)
+    x, y = Transient().displacement(times).T
+    wrong = 0.25 * np.sin(2 * np.pi * 173 * times)
+    table = np.column_stack([times, x + wrong, y + wrong])
+    np.savetxt(tmp_path / "motion.csv", table, delimiter=",", header="time,x,y", comments="")
+    text = "[sensor]\nrow_time = 4e-5\nexposure_rows = 12\nframe_rows = 210\nfull_scale = 4095\n"
+    (tmp_path / "camera.toml").write_text(text)
+    known = ("known", tmp_path / "frames.tif", tmp_path / "k.tif", "--config", tmp_path / "camera.toml")
+    known += ("--motion", tmp_path / "motion.csv", "--unit", "px", "--offset", "0")
+    assert run(*known) == 0
+    shown = capsys.readouterr()
+    assert "the motion reduces the offsets" in shown.out
+    assert "5 frames unchanged" in shown.out
+    assert "restored is no better than raw" in shown.err
+    assert "--force writes the restored ones" in shown.err
+    assert (tifffile.imread(tmp_path / "k.tif") == frames).all()
+    assert run(*known, "--force", "--overwrite") == 0
+    assert "5 frames restored" in capsys.readouterr().out
+    assert (tifffile.imread(tmp_path / "k.tif") != frames).any()
+    with tifffile.TiffFile(tmp_path / "k.tif") as tif:
+        assert [tif.pages[1].tags[code].value for code in (33550, 42113)] == [(0.5, 0.5, 0.0), "0"]
+    assert run(*known[:2], tmp_path / "k.npy", *known[3:]) == 0
+    assert "k.npy: not kept from the input: ModelPixelScaleTag, GDAL_NODATA\n" in capsys.readouterr().out
 
 
 def test_half_of_the_vibration_is_restored_with_a_warning(place, tmp_path, capsys):
