@@ -142,7 +142,8 @@ def restore_and_save(
 ) -> RestoredFrames:
     """Restore frames, and write them; the input unchanged if it is no worse, unless ``force``."""
     result = _restore(stack, motion, options, force)
-    not_kept = _save(path, result.frames, stack)
+    keeps = stack.info.nodata is not None
+    not_kept = _save(path, stacks.without_data(result.frames, stack.frames) if keeps else result.frames, stack)
     if report is not None:
         reports.write_restoration(report, result, options, not_kept)
     return result
@@ -586,10 +587,11 @@ def _draw_comparison(path: Path, frames: Path, full_scale: float | None, first: 
 
     index = first.indices[0] if first.indices else (first.window.first + first.window.last + 1) // 2
     reader = io.open_stack(frames)
-    raw = counts_to_frames(reader.frame(index)[None], full_scale or reader.info.full_scale, str(frames))[0]
+    scale, nodata = full_scale or reader.info.full_scale, reader.info.nodata
+    raw = counts_to_frames(reader.frame(index)[None], scale, str(frames), nodata)[0].nan_to_num(0.0)
     reader.close()
     names = ("input", "restored" if first.restored else "unchanged")
-    reports.save_figure(reports.comparison_figure(raw, first.frames[0].cpu(), names=names), path)
+    reports.save_figure(reports.comparison_figure(raw, first.frames[0].cpu().nan_to_num(0.0), names=names), path)
 
 
 @camera_options

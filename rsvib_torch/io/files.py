@@ -133,7 +133,7 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
         full_scale: Count that corresponds to 1.0.
 
     Returns:
-        float32 frames, (T, H, W) or (T, C, H, W).
+        float32 frames, (T, H, W) or (T, C, H, W); NaN at pixels that have the value of the tag GDAL_NODATA.
 
     Raises:
         OSError: If the file cannot be opened.
@@ -144,12 +144,12 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
         >>> frames = read_stack("frames.tif", full_scale=4095)  # doctest: +SKIP
     """
     paths = [path] if isinstance(path, (str, os.PathLike)) else list(path)
-    pixels, stated = _read_pixels(paths)
-    return counts_to_frames(pixels, stated if full_scale is None else full_scale, str(paths[0]))
+    pixels, info = _read_pixels(paths)
+    return counts_to_frames(pixels, info.full_scale if full_scale is None else full_scale, str(paths[0]), info.nodata)
 
 
-def _read_pixels(paths: Sequence[PathLike]) -> tuple[NDArray[Any], float | None]:
-    """Pixels as stored of the frames of all files, (T, H, W) or (T, C, H, W), and the full scale that they state."""
+def _read_pixels(paths: Sequence[PathLike]) -> tuple[NDArray[Any], StackInfo]:
+    """Pixels as stored of the frames of all files, (T, H, W) or (T, C, H, W), and what the first one states."""
     if not paths:
         raise ValueError("path must contain at least one file, got an empty list")
     parts: list[NDArray[Any]] = []
@@ -169,7 +169,7 @@ def _read_pixels(paths: Sequence[PathLike]) -> tuple[NDArray[Any], float | None]
         finally:
             reader.close()
         parts.append(pixels)
-    return parts[0] if len(parts) == 1 else np.concatenate(parts), infos[0].full_scale
+    return parts[0] if len(parts) == 1 else np.concatenate(parts), infos[0]
 
 
 def _warn_of_unused_times(path: PathLike, timing: SensorTiming) -> None:
@@ -195,7 +195,7 @@ def load_frames(
         timing: The sensor; None if times are not used.
 
     Returns:
-        The frames, integers as stored, and their full scale.
+        The frames, integers as stored unless pixels have no data (NaN), and their full scale.
 
     Warns:
         TimingWarning: If a file states times or a frame rate that are not those of ``timing``.
@@ -210,12 +210,12 @@ def load_frames(
         paths = list(frames)
     else:
         return cast(FramesLike, frames), full_scale
-    pixels, stated = _read_pixels(paths)
+    pixels, info = _read_pixels(paths)
     if timing is not None and len(paths) == 1:
         _warn_of_unused_times(paths[0], timing)
-    full_scale = stated if full_scale is None else full_scale
-    if pixels.dtype.kind == "f":
-        return counts_to_frames(pixels, full_scale, str(paths[0])), None
+    full_scale = info.full_scale if full_scale is None else full_scale
+    if pixels.dtype.kind == "f" or (info.nodata is not None and (pixels == pixels.dtype.type(info.nodata)).any()):
+        return counts_to_frames(pixels, full_scale, str(paths[0]), info.nodata), None
     return pixels, full_scale_of_counts(pixels, full_scale, str(paths[0]))
 
 
@@ -392,9 +392,9 @@ def write_stack(
             keep their values.
         compression: ``"zlib"`` or ``"lzma"`` for TIFF files; None for no compression.
         like: The stack from which the frames were computed: its resolution, orientation, frame rate, channel order,
-            metadata and, if the number of frames is the same, frame times are stored if the format supports them;
-            ``metadata_not_kept`` lists those that are not. If both files are videos, the presentation times of the
-            frames and the audio are copied.
+            metadata and, if the number of frames is the same, frame times are stored if the format supports them, and
+            NaN as its nodata value; ``metadata_not_kept`` lists those that are not. If both files are videos, the
+            presentation times of the frames and the audio are copied.
 
     Raises:
         OSError: If the file cannot be written.
@@ -415,7 +415,8 @@ def write_stack(
     axis = channel_axis("frames", frames.shape, channels)
     frames = frames.movedim(axis, -3) if frames.ndim > 3 else frames
     full_scale = check_stack_target(path, tuple(frames.shape), dtype=dtype, full_scale=full_scale)
-    pixels = frames_to_counts(frames, np.dtype(dtype or np.float32), full_scale)
+    nodata = None if like is None or dtype != like.dtype else like.nodata
+    pixels = frames_to_counts(frames, np.dtype(dtype or np.float32), full_scale, nodata)
     info = _info_to_write(StackInfo(tuple(pixels.shape), pixels.dtype.name, full_scale), like)
     form = check_info_target(path, info, compression)
     with temporary_folder(path) as folder:

@@ -28,7 +28,7 @@ from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
 from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
-__all__ = ["RestoredFrames", "frame_fault", "restore_block", "restore_trusted"]
+__all__ = ["RestoredFrames", "frame_fault", "restore_block", "restore_trusted", "without_data"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +92,19 @@ def restore_trusted(
     return RestoredFrames(result, keep, left_alone, verdict, True)
 
 
+def without_data(frames: Tensor, taken: Tensor) -> Tensor:
+    """Restored frames with NaN at the pixels without data of the frames as taken; of one image, without data in all."""
+    missing = torch.isnan(taken)
+    return frames.masked_fill(missing if len(frames) == len(taken) else missing.all(0), torch.nan)
+
+
 def frame_fault(
-    frame: NDArray[Any], index: int, full_scale: float | None, *, valid_fraction: float = 0.1
+    frame: NDArray[Any],
+    index: int,
+    full_scale: float | None,
+    *,
+    nodata: float | None = None,
+    valid_fraction: float = 0.1,
 ) -> str | None:
     """Why a frame cannot be used, or None.
 
@@ -101,8 +112,14 @@ def frame_fault(
         frame: Pixels as stored.
         index: Index of the frame in the stack, for the message.
         full_scale: Count that corresponds to 1.0; not used for floats.
-        valid_fraction: Smallest fraction of pixels that must not be NaN.
+        nodata: Value of pixels without data.
+        valid_fraction: Smallest fraction of pixels that must have data, which are not NaN.
     """
+    if nodata is not None:
+        valued = frame[frame != frame.dtype.type(nodata)]
+        if len(valued) < valid_fraction * frame.size:
+            return f"frame {index} has only {len(valued) / frame.size:.1%} of pixels that count"
+        frame = valued
     low, high = frame.min(), frame.max()
     if frame.dtype.kind != "f":
         if full_scale is not None and high > full_scale:
