@@ -126,8 +126,8 @@ def _detect_swept_tone(frames: Tensor, timing: SensorTiming, search: int) -> tup
 
 def _without_curve(result: Result) -> dict[str, Any]:
     """The values of a result without its curves, which have a value for every row or knot."""
-    curve = ("motion", "times", "displacement", "offsets", "residual", "light", "fitted_light")
-    curve += ("std",) * isinstance(result, detection.MotionDetection)
+    curve = {"motion", "times", "displacement", "offsets", "residual", "light", "fitted_light"}
+    curve |= {"std"} if isinstance(result, detection.MotionDetection) else set()
     return {name: value for name, value in result.to_dict().items() if name not in curve}
 
 

@@ -121,8 +121,9 @@ def frames_to_counts(
     if nodata is not None:
         missing = torch.isnan(pixels)
         if bool(missing.any()):
-            counts = frames_to_counts(pixels.masked_fill(missing, 0.0), dtype, full_scale)
-            return np.where(missing.numpy(), dtype.type(nodata), counts)
+            stored = frames_to_counts(pixels.masked_fill(missing, 0.0), dtype, full_scale)
+            stored[missing.numpy()] = nodata
+            return stored
     if dtype.kind == "f":
         return pixels.to(torch.float64 if dtype.itemsize == 8 else torch.float32).numpy().astype(dtype, copy=False)
     full_scale = required_full_scale(full_scale, dtype, "frames")
