@@ -209,7 +209,11 @@ def test_lists_are_stacked(grey, colour):
         ([np.ma.masked_array(np.zeros((5, 7)))], TypeError, r"frames\[0\] must not be a masked array"),
         ([], ValueError, r"frames must have shape .* got \(0,\)"),
         ((frame for frame in torch.zeros(2, 5, 7)), TypeError, "got generator; pass a list"),
-        (torch.zeros(2, 5, 7).to_sparse(), TypeError, r"layout torch.sparse_coo; pass frames.to_dense\(\)"),
+        (
+            torch.zeros(2, 5, 7).to_sparse(),
+            TypeError,
+            r"a dense tensor, got torch.sparse_coo; call frames.to_dense\(\)",
+        ),
         (torch.zeros(2, 5, 7) > 0, TypeError, r"got torch.bool; pass frames.float\(\)"),
         (torch.zeros(5, 7), ValueError, r"got \(5, 7\); one grey image is frames\[None\]"),
         (torch.full((2, 5, 7), torch.nan), ValueError, "no pixel with data: all are NaN or in ignore"),
@@ -292,12 +296,15 @@ def test_frames_on_another_axis_are_refused_with_the_order_of_the_axes(shape, or
     with pytest.raises(ValueError, match=rf"frames.permute{re.escape(str(order))}"):
         rsv.restore(frames, TIMING, VIBRATION)
     assert rsv.restore(frames.permute(order), TIMING, VIBRATION).shape == frames.permute(order).shape
-    assert rsv.restore(frames, TIMING, VIBRATION, channels="first").shape == shape
+    assert rsv.restore(frames, TIMING, rsv.Vibration.still(), channels="first").shape == shape
 
 
 def test_one_frame_of_several_channels_is_explained():
     """A stack of three or four grey frames that tifffile.imwrite has written is one colour image."""
-    with pytest.raises(ValueError, match=r"at least 2 frames are needed, got 1 of 4 channels; store grey frames"):
+    with pytest.raises(
+        ValueError,
+        match=r"at least 2 frames are needed, got 1 of 4 channels; store grey.*grey stacks is \(B, T, 1, H, W\)",
+    ):
         rsv.detect_vibration(torch.rand(1, 4, 96, 96), TIMING)
 
 

@@ -22,7 +22,7 @@ __all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_ex
 ScanAxis = Literal[-2, -1, "y", "x"]
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RowTimeCalibration(
     Result,
     units={
@@ -53,6 +53,9 @@ class RowTimeCalibration(
             for a calibration with flickering light.
         reliable: Whether a single row time explains the frames.
         reasons: Why not.
+        light: (T, H) light of the rows of each frame over its mean, without the brightness of the scene; None without
+            flickering light.
+        fitted_light: (T, H) the bands that were fitted to it.
 
     Example:
         >>> import torch
@@ -76,6 +79,8 @@ class RowTimeCalibration(
     candidates: tuple[float, ...] = ()
     reliable: bool = True
     reasons: tuple[str, ...] = ()
+    light: Tensor | None = None
+    fitted_light: Tensor | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -194,6 +199,8 @@ def calibrate_row_time(
         exposure_time=exposure,
         exposure_time_std=exposure_std,
         notes=tuple(notes),
+        light=bands.fitted + bands.residual,
+        fitted_light=bands.fitted,
     )
 
 
@@ -256,6 +263,8 @@ def calibrate_row_time_by_exposure(
         exposure_time=exposures[shortest],
         exposure_time_std=0.0,
         notes=("readout direction unknown: it requires the flicker frequency and the frame rate",),
+        light=torch.cat([s.fitted + s.residual for s in singles]),
+        fitted_light=torch.cat([s.fitted for s in singles]),
     )
 
 

@@ -83,6 +83,7 @@ class BandFit:
         period_std: Its standard deviation in rows, from the residuals with their correlation.
         coefficients: (T, K) complex128, waveform of each frame over its mean.
         scene: (T, H) float64, brightness of the rows without flicker.
+        fitted: (T, H) float64, light of the rows over its mean: ``1 + sum_k Re[c_pk exp(-2 pi j k i / P)]``.
         residual: (T, H) float64, residual brightness over that of the scene.
         certainty: Power of the fundamental over that of residuals at frequencies beside it, all frames together.
         evidence: Gaussian log-likelihood less half the number of parameters times log N (BIC).
@@ -92,6 +93,7 @@ class BandFit:
     period_std: float
     coefficients: Tensor
     scene: Tensor
+    fitted: Tensor
     residual: Tensor
     certainty: float
     evidence: float
@@ -207,6 +209,7 @@ def _fit(brightness: Tensor, period: float, scene: SceneModel, count: int, dark:
         ),
         coefficients=coefficients,
         scene=level * texture,
+        fitted=pattern,
         residual=residual,
         certainty=certainty,
         evidence=evidence - 0.5 * 2 * count * frames * math.log(values),

@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsvib_torch.core.text import printable, wrapped
+from rsvib_torch.core.text import number_of, printable, wrapped
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
@@ -55,9 +55,9 @@ def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
         result: Restored frames with their verdict.
         count: Number of frames of the stack.
     """
-    frames = f"{count} frames" if len(result.frames) == count else f"1 image of {count} frames"
+    frames = number_of(count, "frame") if len(result.frames) == count else f"1 image of {number_of(count, 'frame')}"
     if not result.restored:
-        lines = [f"{count} frames unchanged"]
+        lines = [f"{number_of(count, 'frame')} unchanged"]
     else:
         *most, last = result.restored_axes()
         lines = [f"{frames} restored along {', '.join(most)}{' and ' * bool(most)}{last}"]

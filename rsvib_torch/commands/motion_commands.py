@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from rsvib_torch.calibration import RowTimeCalibration
+    from rsvib_torch.core.presentation import Result
     from rsvib_torch.detection import MotionCheck, MotionDetection, SweptTone
     from rsvib_torch.motion.spline import FreeMotion
     from rsvib_torch.motion.timing import SensorTiming
@@ -124,9 +125,10 @@ def _detect_swept_tone(frames: Tensor, timing: SensorTiming, search: int) -> tup
     return result, ("time", "x", "y"), np.column_stack([times, samples])
 
 
-def _without_curve(result: MotionDetection | SweptTone) -> dict[str, Any]:
-    """A detection without its displacements, which are in the CSV file."""
-    curve = ("motion", "times", "displacement") + ("std",) * isinstance(result, detection.MotionDetection)
+def _without_curve(result: Result) -> dict[str, Any]:
+    """The values of a result without its curves, which have a value for every row or knot."""
+    curve = {"motion", "times", "displacement", "offsets", "residual", "light", "fitted_light"}
+    curve |= {"std"} if isinstance(result, detection.MotionDetection) else set()
     return {name: value for name, value in result.to_dict().items() if name not in curve}
 
 
@@ -201,7 +203,7 @@ def known(
         with working("aligning the recording"):
             found = detection.align_motion(stack.frames, stack.timing, recorded, fit_gain=fit_gain)
         results["Recording on the clock of the frames"] = [found.summary()]
-        data["alignment"] = found.to_dict()
+        data["alignment"] = _without_curve(found)
         _refuse(motion, found.reasons, force)
         placed = found.motion
     else:
@@ -216,7 +218,7 @@ def known(
     check = _check_motion(motion, stack.frames, stack.timing, placed, force, required=offset is None)
     if check is not None:
         results["Motion of the frames"] = [check.summary()]
-        data["check"] = check.to_dict()
+        data["check"] = _without_curve(check)
     result = restore_and_save(restored, stack, placed, options, force)
     results["Restoration"] = restoration_lines(result, len(stack.frames))
     data["restoration"] = restoration_data(result)
@@ -368,7 +370,7 @@ def calibrate(
         steps.append(f"detect a vibration:\n  {command_text('detect', 'FRAMES', '--config', out, '--out', 'FOLDER')}")
     return Answer(
         {"Camera": [result.summary(), f"{rows} rows are read in {readout} ms"], "Configuration": [table]},
-        {"calibration": result.to_dict()},
+        {"calibration": _without_curve(result)},
         [] if out is None else [out],
         steps,
     )

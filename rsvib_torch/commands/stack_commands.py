@@ -47,7 +47,7 @@ from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable, whole_folder
 from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
 from rsvib_torch.core.reading import check_regular
-from rsvib_torch.core.text import printable, write_json
+from rsvib_torch.core.text import number_of, printable, write_json
 from rsvib_torch.core.validation import validate
 
 if TYPE_CHECKING:
@@ -164,7 +164,8 @@ def restore_and_save(
 ) -> RestoredFrames:
     """Restore frames, and write them; the input unchanged if it is no worse, unless ``force``."""
     result = _restore(stack, motion, options, force)
-    not_kept = _save(path, result.frames, stack)
+    keeps = stack.info.nodata is not None
+    not_kept = _save(path, stacks.without_data(result.frames, stack.frames) if keeps else result.frames, stack)
     if report is not None:
         reports.write_restoration(report, result, options, not_kept)
     return result
@@ -362,7 +363,7 @@ def detect(
 
 def _warn_of_failures(windows: int) -> None:
     if windows:
-        error_line(f"detection failed in {windows} windows: see manifest.json", "warning")
+        error_line(f"detection failed in {number_of(windows, 'window')}: see manifest.json", "warning")
 
 
 @camera_options
@@ -586,7 +587,7 @@ def run(
     if overwrite:
         _remove_old(out, results, names)
     if result.bad_frames:
-        error_line(f"{result.bad_frames} frames could not be used: see manifest.json", "warning")
+        error_line(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json", "warning")
     _note_lost(out / output, result.not_kept)
     windows = ["--manifest", str(out / "manifest.json")] if result.windows > 1 else []
     page = command_text("report", frames, out / "report", *settings.arguments, *windows)
@@ -630,10 +631,11 @@ def _comparison(frames: Path, full_scale: float | None, first: WindowResult) -> 
 
     index = first.indices[0] if first.indices else (first.window.first + first.window.last + 1) // 2
     reader = io.open_stack(frames)
-    raw = counts_to_frames(reader.frame(index)[None], full_scale or reader.info.full_scale, str(frames))[0]
+    scale, nodata = full_scale or reader.info.full_scale, reader.info.nodata
+    raw = counts_to_frames(reader.frame(index)[None], scale, str(frames), nodata)[0].nan_to_num(0.0)
     reader.close()
     names = ("input", "restored" if first.restored else "unchanged")
-    return reports.comparison_figure(raw, first.frames[0].cpu(), names=names)
+    return reports.comparison_figure(raw, first.frames[0].cpu().nan_to_num(0.0), names=names)
 
 
 @camera_options

@@ -289,8 +289,8 @@ def _check(kind: Any, *, finite: bool = True) -> _Check | None:  # noqa: PLR0911
     if inspect.isclass(kind) and origin is None and not is_typeddict(kind) and kind is not object:
         if getattr(kind, "_is_protocol", False) and not getattr(kind, "_is_runtime_protocol", False):
             return None
-        article = "an" if kind.__name__[0] in "AEIOU" else "a"
-        return _instance((kind,), f"{article} {kind.__name__}")
+        article, source = "an" if kind.__name__[0] in "AEIOU" else "a", getattr(kind, "_MADE_BY", "")
+        return _instance((kind,), f"{article} {kind.__name__}{source and f' ({source})'}")
     return None
 
 
@@ -306,10 +306,20 @@ def _instance(kinds: tuple[type, ...], expected: str) -> _Check:
     return lambda name, value: None if isinstance(value, kinds) else _refuse(name, expected, value)
 
 
+def _instance_of_choice(choices: tuple[Any, ...]) -> _Check:
+    """Check of the type only, among other types: the function checks the value."""
+    return _instance(tuple({type(choice) for choice in choices}), " or ".join(map(repr, choices)))
+
+
 def _check_of_union(members: tuple[Any, ...], finite: bool) -> _Check | None:
-    checks = [_check(member, finite=finite) for member in members]
+    checks = [
+        _instance_of_choice(get_args(member)) if get_origin(member) is Literal else _check(member, finite=finite)
+        for member in members
+    ]
     if any(get_origin(member) is np.ndarray or check is None for member, check in zip(members, checks, strict=True)):
         return None  # as_tensor checks arrays
+    if any(getattr(member, "_is_protocol", False) for member in members):
+        return None  # the function names what it accepts, and the remedy
 
     def check(name: str, value: Any) -> None:
         errors = []

@@ -14,8 +14,8 @@ def described(value: object) -> str:
     """Type of a value, with the value if it is short, for error messages.
 
     Example:
-        >>> described("3"), described(None), described([1, 2])
-        ("'3' (str)", 'None', 'list')
+        >>> described("3"), described(None), described([1, 2]), described([0.5] * 99)
+        ("'3' (str)", 'None', '[1, 2]', 'list')
     """
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if shape is not None and dtype is not None:
@@ -27,6 +27,8 @@ def described(value: object) -> str:
         return f"{value} (int)" if abs(value) < 10**30 else "a very large int"
     if isinstance(value, (str, bytes)):
         return f"{value[:60]!r} ({type(value).__name__})"
+    if isinstance(value, (list, tuple)) and len(value) < 10 and all(isinstance(item, (int, float)) for item in value):
+        return repr(value)
     return type(value).__name__
 
 

@@ -109,6 +109,16 @@ def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, most: int 
     return "\n".join(line.rstrip() for line in lines)
 
 
+def number_of(count: int, noun: str) -> str:
+    """A number and its noun.
+
+    Example:
+        >>> number_of(1, "frame"), number_of(2, "frame")
+        ('1 frame', '2 frames')
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def wrapped(text: str) -> str:
     """Text in lines of the width of the terminal, at most 100 characters; all but the first are indented."""
     width = min(100, shutil.get_terminal_size((100, 24)).columns) - 2  # an answer of the program is indented by 2

@@ -95,10 +95,7 @@ def assumptions(
         return ()
     sentences = []
     if timing.frame_start_times is None:
-        sentences.append(
-            f"row_time={timing.row_time:g} s: the frames cannot contradict it, and all frequencies are inversely "
-            "proportional to it"
-        )
+        sentences.append(f"row_time={timing.row_time:g} s; all frequencies are inversely proportional to it")
     if timing.frame_start_times is None and timing.frame_rows == num_rows:
         sentences.append(
             f"frame_rows={num_rows} is the number of rows of the frames: there are no blanking rows, which is rare; "

@@ -178,7 +178,10 @@ def as_float_frames(
     count = frames.shape[1 if frames.ndim == 5 else 0]
     if count < minimum_frames:
         images = frames.shape[axis] if frames.ndim == 4 else 1
-        grey = f" of {images} channels; store grey frames without channels (T, H, W), in TIFF as pages"
+        grey = (
+            f" of {images} channels; store grey frames without channels (T, H, W), in TIFF as pages; a batch of grey "
+            "stacks is (B, T, 1, H, W)"
+        )
         remedy = grey if images > 1 else ""
         raise ValueError(f"at least {minimum_frames} frames are needed, got {count}{remedy}")
     if min(frames.shape) == 0:

@@ -169,7 +169,7 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
         full_scale: Count that corresponds to 1.0.
 
     Returns:
-        float32 frames, (T, H, W) or (T, C, H, W).
+        float32 frames, (T, H, W) or (T, C, H, W); NaN at pixels that have the value of the tag GDAL_NODATA.
 
     Raises:
         OSError: If the file cannot be opened.
@@ -199,7 +199,8 @@ def _read_pixels(
     Args:
         paths: The files.
         full_scale: As in ``read_stack``.
-        as_counts: Whether integers are returned as stored instead of as float32.
+        as_counts: Whether integers are returned as stored instead of as float32; those of files with a nodata value
+            are always float32, with NaN where pixels have no data.
     """
     if not paths:
         raise ValueError("path must contain at least one file, got an empty list")
@@ -214,7 +215,7 @@ def _read_pixels(
             if info.kind != first.kind:
                 raise ValueError(f"frames of different size or kind: {paths[0]} is {first.kind}, {path} is {info.kind}")
             stated = first.full_scale if full_scale is None else full_scale
-            stored = as_counts and info.is_integer
+            stored = as_counts and info.is_integer and first.nodata is None
             dtype = np.dtype(info.dtype if stored else np.float32)
             count += info.shape[0]
             joined = count if len(paths) > 1 else 0  # the frames of all files are copied into one array
@@ -230,7 +231,7 @@ def _read_pixels(
             advance = steps(len(pixels), "frames")
             for index in range(len(pixels)):
                 frame = reader.frame(index)
-                pixels[index] = frame if stored else counts_to_frames(frame, stated, str(path))
+                pixels[index] = frame if stored else counts_to_frames(frame, stated, str(path), first.nodata)
                 advance()
         finally:
             reader.close()
@@ -246,7 +247,7 @@ def load_frames(frames: FramesOrFiles, full_scale: float | None) -> tuple[Frames
         full_scale: Count that corresponds to 1.0, as in ``read_stack``.
 
     Returns:
-        The frames, integers as stored, and their full scale.
+        The frames, integers as stored unless the file has a nodata value, and their full scale.
 
     Example:
         >>> load_frames([[[0.5]]], None)
@@ -471,9 +472,9 @@ def write_stack(
             keep their values.
         compression: ``"zlib"`` or ``"lzma"`` for TIFF files; None for no compression.
         like: The stack from which the frames were computed: its resolution, orientation, frame rate, channel order,
-            metadata and, if the number of frames is the same, frame times are stored if the format supports them;
-            ``metadata_not_kept`` lists those that are not. If both files are videos, the presentation times of the
-            frames and the audio are copied. Its file must not be ``path``.
+            metadata and, if the number of frames is the same, frame times are stored if the format supports them, and
+            NaN as its nodata value; ``metadata_not_kept`` lists those that are not. If both files are videos, the
+            presentation times of the frames and the audio are copied. Its file must not be ``path``.
 
     Raises:
         OSError: If the file cannot be written.
@@ -503,7 +504,8 @@ def write_stack(
     axis = channel_axis("frames", frames.shape, channels)
     frames = frames.movedim(axis, -3) if frames.ndim > 3 else frames
     full_scale = check_stack_target(path, tuple(frames.shape), dtype=dtype, full_scale=full_scale)
-    pixels = frames_to_counts(frames, np.dtype(dtype or np.float32), full_scale)
+    nodata = None if like is None or dtype != like.dtype else like.nodata
+    pixels = frames_to_counts(frames, np.dtype(dtype or np.float32), full_scale, nodata)
     info = _info_to_write(StackInfo(tuple(pixels.shape), pixels.dtype.name, full_scale), like)
     form = check_info_target(path, info, compression)
     with temporary_folder(path) as folder:

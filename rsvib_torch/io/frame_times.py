@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.text import number_of
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.motion.timing import SensorTiming
 
@@ -210,6 +211,10 @@ def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:
         info: What the file states.
         timing: The sensor, without the times of the file; None if it is not known.
     """
+
+    def missing_frames(count: int) -> str:
+        return f"{number_of(count, 'frame')} {'is' if count == 1 else 'are'} missing"
+
     name, notes = info.path or "the file", []
     if info.orientation in _ORIENTATIONS:
         notes.append(
@@ -219,7 +224,7 @@ def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:
         return notes
     if info.frame_times is None and info.frame_numbers is not None:
         missing = info.frame_numbers[-1] + 1 - info.shape[0]
-        notes.append(f"{name}: {missing} frames are missing according to the numbers in the file names, which are used")
+        notes.append(f"{name}: {missing_frames(missing)} according to the numbers in the file names, which are used")
     times, spacing = exposure_times(info, timing), _spacing(info)
     if times is not None and spacing is not None and len(spacing.numbers):
         missing = round(float(spacing.numbers[-1])) + 1 - len(times)
@@ -230,5 +235,5 @@ def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:
                 f"is up to {1e3 * info.time_error:.2g} ms"
             )
         elif missing:
-            notes.append(f"{name}: {missing} frames are missing according to its {info.time_source}, which are used")
+            notes.append(f"{name}: {missing_frames(missing)} according to its {info.time_source}, which are used")
     return notes

@@ -78,17 +78,23 @@ def full_scale_of_counts(counts: NDArray[Any], full_scale: float | None, name: s
     return full_scale
 
 
-def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str) -> Tensor:
+def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str, nodata: float | None = None) -> Tensor:
     """Convert pixels as stored to float32 frames; floats keep their values.
 
     Args:
         counts: Pixels as stored.
         full_scale: Count that corresponds to 1.0; not used for floats.
         name: File or argument, for messages.
+        nodata: Value of pixels without data, which become NaN.
 
     Raises:
         ValueError: If the full scale of integers is unknown or exceeded.
     """
+    if nodata is not None:
+        missing = counts == counts.dtype.type(nodata)
+        if missing.any():
+            frames = counts_to_frames(np.where(missing, counts.dtype.type(0), counts), full_scale, name)
+            return frames.masked_fill_(torch.from_numpy(missing), torch.nan)
     if counts.dtype.kind == "f":
         return torch.from_numpy(np.ascontiguousarray(counts, dtype=np.float32))
     full_scale = full_scale_of_counts(counts, full_scale, name)
@@ -98,18 +104,27 @@ def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str) 
     return floats.div_(full_scale).to(torch.float32)
 
 
-def frames_to_counts(frames: Tensor, dtype: np.dtype[Any], full_scale: float | None) -> NDArray[Any]:
+def frames_to_counts(
+    frames: Tensor, dtype: np.dtype[Any], full_scale: float | None, nodata: float | None = None
+) -> NDArray[Any]:
     """Convert frames to pixels to store: integers are scaled, rounded and clipped; floats keep their values.
 
     Args:
         frames: Frames whose full scale is 1.
         dtype: Data type to store.
         full_scale: Count that corresponds to 1.0; not used for floats.
+        nodata: Value to store for NaN; None to store NaN, which integers cannot.
 
     Raises:
         ValueError: If integers are requested without a full scale, or of frames that are not finite.
     """
     pixels = frames.detach().cpu()
+    if nodata is not None:
+        missing = torch.isnan(pixels)
+        if bool(missing.any()):
+            stored = frames_to_counts(pixels.masked_fill(missing, 0.0), dtype, full_scale)
+            stored[missing.numpy()] = nodata
+            return stored
     if dtype.kind == "f":
         return pixels.to(torch.float64 if dtype.itemsize == 8 else torch.float32).numpy().astype(dtype, copy=False)
     full_scale = required_full_scale(full_scale, dtype, "frames")

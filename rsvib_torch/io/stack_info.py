@@ -1,5 +1,6 @@
 """What a file states about a stack: shape, data type, full scale, times, orientation; errors of unreadable files."""
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -121,6 +122,20 @@ class StackInfo(Summarised):
             parts.append(f"frame times {self.frame_times[0]:.6g} … {self.frame_times[-1]:.6g} s")
         parts += [] if self.resolution is None else ["{:g} x {:g} px per {}".format(*self.resolution)]
         return ", ".join(parts)
+
+    @property
+    def nodata(self) -> float | None:
+        """Value of pixels without data that the tag GDAL_NODATA states, if the data type can hold it."""
+        tag = self.metadata.get("GDAL_NODATA")
+        try:
+            value = math.nan if tag is None else float(str(tag.value).strip("\0 "))
+        except ValueError:
+            return None
+        if math.isnan(value):
+            return None
+        limits = np.iinfo(self.dtype) if self.is_integer else np.finfo(self.dtype)
+        fits = limits.min <= value <= limits.max and (value.is_integer() or not self.is_integer)
+        return value if fits else None
 
     @property
     def axes(self) -> str:

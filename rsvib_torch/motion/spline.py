@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -49,6 +49,8 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         >>> [round(value, 3) for value in motion.displacement(torch.tensor(0.05)).tolist()]
         [1.0, 0.223]
     """
+
+    _MADE_BY: ClassVar[str] = "read_motion, FreeMotion.from_samples"  # for errors about arguments
 
     coefficients: Tensor
     start: float

@@ -176,8 +176,13 @@ class Vibration(Motion, units=_UNITS):
             >>> Vibration((3.1, 5.2, 1e-3), (90.0, 61.0, 70.0)).translation().amplitude.flatten().tolist()
             [3.1, 5.2]
         """
-        tones = (values[..., :2, :] for values in (self.amplitude, self.frequency, self.phase))
-        return Vibration(*tones, self.image_motion[..., :2], self.image_acceleration[..., :2])
+        return Vibration(
+            self.amplitude[..., :2, :],
+            self.frequency[..., :2, :],
+            self.phase[..., :2, :],
+            self.image_motion[..., :2],
+            self.image_acceleration[..., :2],
+        )
 
     def summary(self) -> str:
         """The tones of each axis as a table; of a batch, the strongest tone of each axis."""

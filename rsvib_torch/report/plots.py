@@ -17,12 +17,13 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.calibration import RowTimeCalibration
 from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.checks import check_whole_number, described
 from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES, Result
 from rsvib_torch.core.text import measured_text
-from rsvib_torch.detection import DetectionResult, MotionDetection, SweptTone
+from rsvib_torch.detection import ClockAlignment, DetectionResult, MotionCheck, MotionDetection, SweptTone
 from rsvib_torch.evaluation import MtfCurve
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
@@ -348,6 +349,23 @@ def _draw_displacement(panel: Axes, times: Tensor, displacement: Tensor, std: Te
     plain_axes(panel)
 
 
+def _title_refusal(panel: Axes, result: MotionDetection | SweptTone) -> None:
+    """State above a figure which axes are not reliable, with the first reason."""
+    refused = [
+        f"{name}: not reliable: {reasons[0]}"
+        for name, good, reasons in zip("xy", result.reliable, result.reasons, strict=True)
+        if not bool(good)
+    ]
+    lines = [line for text in refused for line in textwrap.wrap(text, 100, max_lines=1, placeholder=" …")]
+    panel.set_title("\n".join(lines), loc="left", fontsize=9.5, color=_INK)
+
+
+def _swept_figure(result: SweptTone) -> Figure:
+    figure = motion_figure(result.motion)
+    _title_refusal(figure.axes[0], result)
+    return figure
+
+
 def free_motion_figure(result: MotionDetection) -> Figure:
     """Draw a detected motion at the rows of the frames, with a band of two standard deviations.
 
@@ -360,6 +378,7 @@ def free_motion_figure(result: MotionDetection) -> Figure:
         parts = (values[frame].cpu() for values in (result.times, result.displacement, result.std))
         _draw_displacement(panel, *parts)
     panel.legend(panel.lines[:2], "xy", fontsize=9, frameon=False, ncols=2)
+    _title_refusal(panel, result)
     return figure
 
 
@@ -686,12 +705,54 @@ def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
     return figure
 
 
+def _calibration_figure(result: RowTimeCalibration) -> Figure:
+    """Draw the light of the rows of up to four frames, and the bands that were fitted to it."""
+    if result.light is None or result.fitted_light is None:
+        raise ValueError("a calibration by motion has no figure; that of a flickering light has")
+    shown = min(4, len(result.light))
+    figure = _Drawing(figsize=(8, 0.9 + 1.7 * shown), layout="constrained")
+    panels = figure.subplots(shown, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    for frame, panel in enumerate(panels):
+        panel.plot(result.light[frame].cpu(), ".", color=_GREY, markersize=2.5, label="measured rows")
+        panel.plot(result.fitted_light[frame].cpu(), color=_FIT_COLOUR, linewidth=1.3, label="fitted bands")
+        panel.set_title(f"frame {frame}", loc="left", fontsize=9.5, color=_INK)
+        panel.set_ylabel("light / mean", color=_INK)
+        plain_axes(panel)
+    panels[-1].set_xlabel("row", color=_INK)
+    panels[0].legend(fontsize=9, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def _check_figure(result: MotionCheck) -> Figure:
+    """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
+    figure = _Drawing(figsize=(13, 4.2), layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True, squeeze=False)
+    times = 1e3 * result.times.cpu()
+    for axis, (name, panel) in enumerate(zip("xy", panels[0], strict=True)):
+        before, after = (
+            f"{label} {measured_text(values[axis], digits=3)} px rms"
+            for label, values in (("offsets", result.before), ("without the motion", result.after))
+        )
+        panel.plot(times, result.offsets[:, axis].cpu(), ".", color=_GREY, label=before)
+        panel.plot(times, result.residual[:, axis].cpu(), ".", color=_AXIS_COLOURS[name], label=after)
+        panel.axhline(0.0, color=_INK, linewidth=0.8)
+        panel.set_title(f"Offset along {name}", loc="left", fontsize=12, fontweight="bold", color=_INK)
+        panel.set_xlabel("exposure start of the rows in the earlier frame (ms)", color=_INK)
+        panel.set_ylabel("offset (px)", color=_INK)
+        panel.legend(fontsize=9)
+        plain_axes(panel)
+    return figure
+
+
 FIGURES.update(
     {
         (DetectionResult, 0): offset_figure,
         (DetectionResult, 1): _batch_figure,
         (MotionDetection, 0): free_motion_figure,
-        (SweptTone, 0): lambda result: motion_figure(result.motion),
+        (SweptTone, 0): _swept_figure,
+        (RowTimeCalibration, 0): _calibration_figure,
+        (ClockAlignment, 0): lambda result: motion_figure(result.motion),
+        (MotionCheck, 0): _check_figure,
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,
         (MtfCurve, 0): _curve_figure,

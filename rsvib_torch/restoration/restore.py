@@ -17,7 +17,7 @@ from rsvib_torch.core.option_types import (
     method_options,
 )
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.frames.arrays import Channels
+from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
 from rsvib_torch.io.files import FramesOrFiles, load_frames, timing_of_files
 from rsvib_torch.motion.motion import Motion
@@ -39,7 +39,7 @@ class CommonOptions(TypedDict, total=False):
 
     full_scale: float | None
     channels: Channels
-    ignore: Tensor | None
+    ignore: ArrayLike | None
     saturation: Saturation
     check: bool
 
@@ -142,7 +142,7 @@ def restore(
     method: str = "exact",
     full_scale: float | None = None,
     channels: Channels = None,
-    ignore: Tensor | None = None,
+    ignore: ArrayLike | None = None,
     saturation: Saturation = "auto",
     check: bool = True,
     **options: Any,
@@ -366,6 +366,6 @@ class VibrationRestorer(nn.Module):
         self.options = {"method": method, **common, **options}
 
     @checks_arguments
-    def forward(self, frames: FramesOrFiles, vibration: Motion | Detected, ignore: Tensor | None = None) -> Tensor:
+    def forward(self, frames: FramesOrFiles, vibration: Motion | Detected, ignore: ArrayLike | None = None) -> Tensor:
         """Restore a stack of frames."""
         return restore(frames, self.timing, vibration, ignore=ignore, **self.options)

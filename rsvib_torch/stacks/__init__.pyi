@@ -1,7 +1,7 @@
 from .job import WindowResult
 from .manifest import StackManifest, read_manifest
 from .process import StackReport, detect_stack, iterate_stack, process_stack
-from .window_restoration import RestoredFrames, restore_block, restore_trusted
+from .window_restoration import RestoredFrames, restore_block, restore_trusted, without_data
 from .windows import Window, cut_windows
 
 __all__ = [
@@ -17,4 +17,5 @@ __all__ = [
     "read_manifest",
     "restore_block",
     "restore_trusted",
+    "without_data",
 ]

@@ -23,7 +23,7 @@ from rsvib_torch.io.schema import DetectedVibration, detection_to_json
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.memory import windows_at_once
-from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted
+from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted, without_data
 from rsvib_torch.stacks.windows import Window, cut_windows, window_timing
 
 __all__ = ["StackJob", "StoredWindow", "WindowFrames", "WindowReader", "WindowResult", "plan_job"]
@@ -141,9 +141,10 @@ class StackJob:
             pixels: Its frames, or why they cannot be read.
         """
         faults: dict[int, str] = {}
+        nodata = self.info.nodata
         usable: dict[int, NDArray[Any]] = {}
         for index, frame in zip(window.frames, pixels, strict=True):
-            fault = frame if isinstance(frame, str) else frame_fault(frame, index, self.full_scale)
+            fault = frame if isinstance(frame, str) else frame_fault(frame, index, self.full_scale, nodata=nodata)
             if fault is not None:
                 faults[index] = fault
             elif not isinstance(frame, str):
@@ -151,7 +152,7 @@ class StackJob:
         frames = torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
         if usable:
             stored = np.stack(list(usable.values()))
-            frames = counts_to_frames(stored, self.full_scale, str(self.source)).to(self.device)
+            frames = counts_to_frames(stored, self.full_scale, str(self.source), nodata).to(self.device)
         kept = tuple(index for index in usable if index in window.written)
         bad = {index: fault for index, fault in faults.items() if index in window.written}
         as_taken = WindowResult(window, kept, frames[: len(kept)], False, None, None, None, bad)
@@ -182,6 +183,8 @@ class StackJob:
             return replace(as_taken, detection=detection, error=" ".join(str(error).split()))
         one_image = self.joined and restoration.restored
         restored = restoration.frames if one_image else restoration.frames[: len(kept)]
+        if nodata is not None:
+            restored = without_data(restored, frames if one_image else frames[: len(kept)])
         return replace(
             as_taken,
             indices=() if one_image else kept,
@@ -198,14 +201,14 @@ class StackJob:
         """
         dtype = np.dtype(self.info.dtype)
         if result.restored and not result.indices:
-            frames = list(frames_to_counts(result.frames, dtype, self.full_scale))
+            frames = list(frames_to_counts(result.frames, dtype, self.full_scale, self.info.nodata))
             return StoredWindow(frames, self.record(result, len(frames)))
         written = list(result.window.written)
         restored = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
         frames = []
         for index in [written[len(written) // 2]] if self.joined else written:
             if index in restored:
-                frames.append(frames_to_counts(restored[index], dtype, self.full_scale))
+                frames.append(frames_to_counts(restored[index], dtype, self.full_scale, self.info.nodata))
             elif self.bad_frames == "pass" or index not in result.bad_frames:
                 frame = pixels[index - result.window.first]
                 if isinstance(frame, str):

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.presentation import AXIS_NAMES, Summarised
-from rsvib_torch.core.text import measured_text, text_table, wrapped
+from rsvib_torch.core.text import measured_text, number_of, text_table, wrapped
 from rsvib_torch.core.validation import Section, read_json, validate
 from rsvib_torch.io.schema import DetectedVibration, DetectionRecord, TimingRecord, detection_to_json
 from rsvib_torch.stacks.job import StackJob
@@ -131,17 +131,19 @@ class StackManifest(Summarised, Section):
             text_table(*self.tone_table()),
             "strongest tone: median ± standard deviation over the windows",
         ]
-        restoration = [f"{data['restored']} of {data['windows']} windows restored"]
+        restoration = [f"{data['restored']} of {number_of(data['windows'], 'window')} restored"]
         if data["predicted_gain_db"] is not None:
             low, high = data["predicted_gain_db"].values()
             restoration.append(f"estimated improvement {low:+.1f} … {high:+.1f} dB")
         for name, notes in data["left_alone"].items():
             if notes:
                 window, note = next(iter(notes.items()))
-                restoration.append(wrapped(f"{name} unchanged in {len(notes)} windows; in window {window}: {note}"))
+                restoration.append(
+                    wrapped(f"{name} unchanged in {number_of(len(notes), 'window')}; in window {window}: {note}")
+                )
         if data["errors"]:
             window, error = next(iter(data["errors"].items()))
-            failed = f"detection or restoration failed in {len(data['errors'])} windows"
+            failed = f"detection or restoration failed in {number_of(len(data['errors']), 'window')}"
             vibration.append(wrapped(f"{failed}; in window {window}: {error}"))
         return vibration, restoration
 

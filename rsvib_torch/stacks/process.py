@@ -13,6 +13,7 @@ from rsvib_torch.core.atomic import make_folder, sync, whole_file
 from rsvib_torch.core.option_types import BadFrames
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.presentation import Summarised
+from rsvib_torch.core.text import number_of
 from rsvib_torch.core.unexpected import unexpected_errors_in_one_line
 from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.io.frame_times import exposure_times
@@ -90,15 +91,17 @@ class StackReport(Summarised):
 
     def summary(self) -> str:
         """Numbers of frames and windows, and the time."""
-        lines = [f"{self.frames} frames in {self.windows} windows, {self.restored} windows restored"]
+        lines = [f"{number_of(self.frames, 'frame')} in {number_of(self.windows, 'window')}, {self.restored} restored"]
         if self.frames and not self.resumed:
             lines[0] += f", {self.seconds / self.frames:.2g} s per frame"
         if self.resumed:
-            lines.append(f"{self.resumed} windows were complete before this run")
+            lines.append(f"windows complete before this run: {self.resumed}")
         if self.failed:
-            lines.append(f"detection or restoration failed in {self.failed} windows: see {self.manifest.name}")
+            lines.append(
+                f"detection or restoration failed in {number_of(self.failed, 'window')}: see {self.manifest.name}"
+            )
         if self.bad_frames:
-            lines.append(f"{self.bad_frames} frames could not be used: see {self.manifest.name}")
+            lines.append(f"{number_of(self.bad_frames, 'frame')} could not be used: see {self.manifest.name}")
         return "\n".join(lines)
 
 

@@ -31,7 +31,7 @@ from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
 from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
-__all__ = ["RestoredFrames", "frame_fault", "restore_block", "restore_trusted"]
+__all__ = ["RestoredFrames", "frame_fault", "restore_block", "restore_trusted", "without_data"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +102,19 @@ def restore_trusted(
     return RestoredFrames(result, keep, left_alone, verdict, True, vibration.num_axes)
 
 
+def without_data(frames: Tensor, taken: Tensor) -> Tensor:
+    """Restored frames with NaN at the pixels without data of the frames as taken; of one image, without data in all."""
+    missing = torch.isnan(taken)
+    return frames.masked_fill(missing if len(frames) == len(taken) else missing.all(0), torch.nan)
+
+
 def frame_fault(
-    frame: NDArray[Any], index: int, full_scale: float | None, *, valid_fraction: float = 0.1
+    frame: NDArray[Any],
+    index: int,
+    full_scale: float | None,
+    *,
+    nodata: float | None = None,
+    valid_fraction: float = 0.1,
 ) -> str | None:
     """Why a frame cannot be used, or None.
 
@@ -111,27 +122,25 @@ def frame_fault(
         frame: Pixels as stored.
         index: Index of the frame in the stack, for the message.
         full_scale: Count that corresponds to 1.0; not used for floats.
-        valid_fraction: Smallest fraction of pixels that must not be NaN.
+        nodata: Value of pixels without data.
+        valid_fraction: Smallest fraction of pixels that must have data, which are not NaN.
     """
-    low, high = frame.min(), frame.max()
-    if frame.dtype.kind != "f":
-        if full_scale is not None and high > full_scale:
-            return f"{beyond_full_scale(high, full_scale)} (frame {index})"
-    elif not np.isfinite(low) or not np.isfinite(high):
-        infinite = np.argwhere(np.isinf(frame))
-        if len(infinite):
-            place = tuple(int(i) for i in infinite[0])
-            return f"frames must be finite, but pixel {(index, *place)} is {float(frame[place])}"
-        valid = 1.0 - float(np.isnan(frame).mean())
-        if valid < valid_fraction:
-            return f"frame {index} has only {valid:.1%} of pixels that count"
-        low, high = np.nanmin(frame), np.nanmax(frame)
-    if max(abs(float(high)), abs(float(low))) > MAX_NUMBER:
-        return f"frame {index} reaches {max(abs(float(high)), abs(float(low))):.3g}, at most {MAX_NUMBER:g} is possible"
+    is_float = frame.dtype.kind == "f"
+    valued = frame if nodata is None else frame[frame != frame.dtype.type(nodata)]
+    valid = (valued.size - (int(np.isnan(valued).sum()) if is_float else 0)) / frame.size
+    if valid < valid_fraction:
+        return f"frame {index} has only {valid:.1%} of pixels that count"
+    if is_float and len(infinite := np.argwhere(np.isinf(frame))):
+        place = tuple(int(i) for i in infinite[0])
+        return f"frames must be finite, but pixel {(index, *place)} is {float(frame[place])}"
+    low, high = float(np.nanmin(valued)), float(np.nanmax(valued))
+    if not is_float and full_scale is not None and high > full_scale:
+        return f"{beyond_full_scale(round(high), full_scale)} (frame {index})"
+    largest = max(abs(high), abs(low))
+    if largest > MAX_NUMBER:
+        return f"frame {index} reaches {largest:.3g}, at most {MAX_NUMBER:g} is possible"
     rounding = 1e-7  # of float32, relative
-    if float(high) - float(low) <= rounding * max(abs(float(high)), abs(float(low))):
-        return constant_frame(index)
-    return None
+    return constant_frame(index) if high - low <= rounding * largest else None
 
 
 @checks_arguments

@@ -15,8 +15,9 @@ import pytest
 import tifffile
 import torch
 from kornia.filters import gaussian_blur2d
+from truth import MARGIN, Motion, crop, draw_scene, take_frames
 
-from rsvib_torch import __version__
+from rsvib_torch import SensorTiming, __version__, detect_vibration
 from rsvib_torch.commands.main import run_command
 from rsvib_torch.io import read_stack, read_stack_info, write_stack
 
@@ -190,6 +191,42 @@ def test_metadata_are_kept_or_listed(place, tmp_path, capsys):
         assert json.loads((tmp_path / "report.json").read_text())["not_kept"] == lost
 
 
+def test_pixels_without_data_are_neither_used_nor_changed(tmp_path, capsys):
+    timing = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=210)
+    scene = draw_scene(200 + 2 * MARGIN, 160 + 2 * MARGIN, 3)
+    motion = Motion(AMPLITUDE, FREQUENCY, PHASE)
+    frames = np.clip(4095 * take_frames(scene, timing, motion, 5, 0.003, samples=8), 1, 4095).astype(np.uint16)
+    border = np.arange(160) < 50 - 0.2 * np.arange(200)[:, None]
+    frames[:, border] = 65535
+    tags = [(42113, "s", 0, "65535", False)]
+    tifffile.imwrite(tmp_path / "f.tif", frames, photometric="minisblack", metadata=None, extratags=tags)
+    text = "[sensor]\nrow_time = 4e-5\nexposure_rows = 12\nframe_rows = 210\nfull_scale = 4095\n"
+    (tmp_path / "camera.toml").write_text(text)
+    config = ("--config", tmp_path / "camera.toml")
+    sharp = crop(scene)[24:-24, 24:-24]
+
+    def check(path):
+        restored = tifffile.imread(path)
+        assert (restored[:, border] == 65535).all()
+        assert (restored[:, ~border] <= 4095).all()
+        inside = ~border[24:-24, 24:-24]
+        before, after = (f[:, 24:-24, 24:-24][:, inside] / 4095 - sharp[inside] for f in (frames, restored))
+        assert np.square(after).mean() < np.square(before).mean() / 100  # 20 dB
+
+    assert run("run", tmp_path / "f.tif", tmp_path / "whole", *config) == 0
+    assert run("run", tmp_path / "f.tif", tmp_path / "windows", *config, "--window", "3") == 0
+    found = ("--vibration", tmp_path / "whole" / "vibration.json")
+    assert run("restore", tmp_path / "f.tif", tmp_path / "r.tif", *config, *found) == 0
+    for path in (tmp_path / "whole" / "restored.tif", tmp_path / "windows" / "restored.tif", tmp_path / "r.tif"):
+        check(path)
+    assert "not kept" not in capsys.readouterr().out
+    joint = ("--joint", "all", "--overwrite")
+    assert run("restore", tmp_path / "f.tif", tmp_path / "r.tif", *config, *found, *joint) == 0
+    assert (tifffile.imread(tmp_path / "r.tif") == 65535)[..., border].all()
+    detected = detect_vibration(tmp_path / "f.tif", timing, full_scale=4095)
+    assert detected.vibration.amplitude[:, 0].tolist() == pytest.approx(AMPLITUDE, rel=0.01)
+
+
 def change_vibration(place, folder, change):
     """A vibration.json that differs from the detection."""
     assert run("detect", place / "frames.tif", "--config", place / "camera.toml", "--out", folder / "detected") == 0
@@ -218,6 +255,44 @@ def test_a_wrong_vibration_leaves_the_frames_unchanged_unless_forced(place, tmp_
     assert "restored is no better than raw" in capsys.readouterr().err
     assert (tifffile.imread(tmp_path / "r.tif") != tifffile.imread(place / "frames.tif")).any()
     assert json.loads((tmp_path / "report.json").read_text())["frames"] == "restored"
+
+
+def test_known_motion_that_makes_frames_worse_leaves_them_unchanged_unless_forced(tmp_path, capsys):
+    """The motion is right in the first pair of frames, which moves most, and wrong in the others."""
+
+    class Transient(Motion):
+        def displacement(self, times):
+            return np.stack([12 * np.exp(-times / 0.006) * np.cos(400 * times), 0 * times], -1)
+
+    timing = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=210)
+    scene = draw_scene(200 + 2 * MARGIN, 128 + 2 * MARGIN, 3)
+    frames = np.clip(4095 * take_frames(scene, timing, Transient(), 5, 0.003, samples=8), 0, 4095).astype(np.uint16)
+    tags = [(33550, "d", 3, (0.5, 0.5, 0.0), False), (42113, "s", 0, "0", False)]
+    options = {"photometric": "minisblack", "metadata": None, "extratags": tags}
+    tifffile.imwrite(tmp_path / "frames.tif", frames, **options)
+    times = np.arange(-0.001, 0.06, 2e-5)
+    x, y = Transient().displacement(times).T
+    wrong = 0.25 * np.sin(2 * np.pi * 173 * times)
+    table = np.column_stack([times, x + wrong, y + wrong])
+    np.savetxt(tmp_path / "motion.csv", table, delimiter=",", header="time,x,y", comments="")
+    text = "[sensor]\nrow_time = 4e-5\nexposure_rows = 12\nframe_rows = 210\nfull_scale = 4095\n"
+    (tmp_path / "camera.toml").write_text(text)
+    known = ("known", tmp_path / "frames.tif", tmp_path / "k.tif", "--config", tmp_path / "camera.toml")
+    known += ("--motion", tmp_path / "motion.csv", "--unit", "px", "--offset", "0")
+    assert run(*known) == 0
+    shown = capsys.readouterr()
+    assert "the motion reduces the offsets" in shown.out
+    assert "5 frames unchanged" in shown.out
+    assert "restored is no better than raw" in shown.err
+    assert "--force writes the restored ones" in shown.err
+    assert (tifffile.imread(tmp_path / "k.tif") == frames).all()
+    assert run(*known, "--force", "--overwrite") == 0
+    assert "5 frames restored" in capsys.readouterr().out
+    assert (tifffile.imread(tmp_path / "k.tif") != frames).any()
+    with tifffile.TiffFile(tmp_path / "k.tif") as tif:
+        assert [tif.pages[1].tags[code].value for code in (33550, 42113)] == [(0.5, 0.5, 0.0), "0"]
+    assert run(*known[:2], tmp_path / "k.npy", *known[3:]) == 0
+    assert "k.npy: not kept from the input: ModelPixelScaleTag, GDAL_NODATA\n" in capsys.readouterr().out
 
 
 def test_half_of_the_vibration_is_restored_with_a_warning(place, tmp_path, capsys):

@@ -54,7 +54,7 @@ def test_run_of_a_long_stack(place, tmp_path, capsys):
     assert run(*command(place, tmp_path / "out", "--output", "clear.zarr")) == 0
     shown = capsys.readouterr()
     assert shown.err == ""
-    assert "13 frames in 4 windows, 4 windows restored, " in shown.out
+    assert "13 frames in 4 windows, 4 restored, " in shown.out
     names = ["before_after.png", "clear.zarr", "manifest.json", "windows.csv", "windows.json", "windows.png"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
     assert read_stack_info(tmp_path / "out" / "clear.zarr").full_scale == 4095
@@ -123,7 +123,7 @@ def test_interrupted_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypa
     assert "cannot resume: settings.window was 4, now it is 5" in capsys.readouterr().err
     for _ in range(2):  # the second time it is complete
         assert run(*command(place, out, "--resume")) == 0
-        assert "4 windows were complete before this run" in capsys.readouterr().out
+        assert "windows complete before this run: 4" in capsys.readouterr().out
     assert (out / "restored.tif").read_bytes() == (place / "out" / "restored.tif").read_bytes()
     assert (out / "manifest.json").read_bytes() == (place / "out" / "manifest.json").read_bytes()
 
@@ -134,7 +134,7 @@ def test_bad_frames_are_reported(place, tmp_path, capsys):
     np.save(tmp_path / "frames.npy", counts)
     arguments = ("run", tmp_path / "frames.npy", tmp_path / "out", "--config", place / "camera.toml")
     assert run(*arguments, "--bad-frames", "skip") == 0
-    assert "warning: 1 frames could not be used: see manifest.json" in capsys.readouterr().err
+    assert "warning: 1 frame could not be used: see manifest.json" in capsys.readouterr().err
     assert read_stack_info(tmp_path / "out" / "restored.tif").shape == (FRAMES - 1, HEIGHT, WIDTH)
     assert list(json.loads((tmp_path / "out" / "manifest.json").read_text())["bad_frames"]) == ["4"]
 

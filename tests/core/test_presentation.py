@@ -24,6 +24,12 @@ def make_frames():
     return torch.from_numpy(take_frames(draw_scene(336, 336, 4), TIMING, MOTION, 4, noise=0.005)).float()
 
 
+def recording():
+    """The motion as a recording whose clock is 0.3 s ahead of that of the frames."""
+    times = torch.linspace(0.28, 0.38, 1001, dtype=torch.float64)
+    return rsv.FreeMotion.through(times, torch.from_numpy(MOTION.displacement(times.numpy() - 0.3)))
+
+
 @pytest.fixture(scope="module", name="detection")
 def make_detection(frames):
     return rsv.detect_vibration(frames, TIMING)
@@ -54,6 +60,7 @@ def make_results(frames, detection, windows):
         rsv.detect_swept_tone(frames, TIMING),
         rsv.judge_restoration(frames, restored, TIMING, detection),
         rsv.check_motion(frames, TIMING, detection.vibration),
+        rsv.align_motion(frames, TIMING, recording(), fit_scale=False),
         rsv.calibrate_row_time(light[None, :, None].expand(1, 512, 16), 1000.0),
         rsv.slanted_edge_mtf(torch.special.ndtr(edge / 0.8)),
     )
@@ -83,10 +90,10 @@ def test_values_have_the_digits_of_their_standard_deviation(value, std, text):
     assert measured_text(torch.tensor(value, dtype=torch.float64), std) == text
 
 
-def test_a_detection_prints_in_five_lines(detection):
+def test_a_detection_prints_in_six_lines(detection):
     lines = str(detection).splitlines()
     assert repr(detection) == detection.summary() == str(detection)
-    assert len(lines) == 5
+    assert len(lines) == 6
     assert lines[0].split() == ["axis", "amplitude", "(px)", "frequency", "(Hz)", "phase", "(rad)"]
     for line, letter, amplitude, frequency, phase in zip(
         lines[1:3], "xy", MOTION.amplitude, MOTION.frequency, MOTION.phase, strict=True
@@ -95,7 +102,8 @@ def test_a_detection_prints_in_five_lines(detection):
         numbers = [float(number) for number in re.findall(r"-?[\d.]+", line)]
         for value, std, true in zip(numbers[::2], numbers[1::2], (amplitude, frequency, phase), strict=True):
             assert abs(value - true) < 5 * std < 0.5
-    assert lines[3:] == ["x: reliable", "y: reliable"]
+    assert lines[3:5] == ["x: reliable", "y: reliable"]
+    assert lines[5] == "assumed: row_time=4e-05 s; all frequencies are inversely proportional to it"
 
 
 def test_reasons_tones_and_image_motion_are_printed(detection):
@@ -116,7 +124,7 @@ def test_reasons_tones_and_image_motion_are_printed(detection):
     assert lines[6] == "y: not reliable:"
     assert lines[7].startswith(" - no significant tone")
     assert lines[8].startswith("   ")
-    assert lines[-1] == " - blind"
+    assert lines[-2] == " - blind"
     assert max(map(len, lines)) <= 100
 
 
@@ -181,12 +189,15 @@ def test_results_move_between_devices(results):
 
 
 DRAWN = {
+    "ClockAlignment",
     "DetectionResult",
     "FreeMotion",
+    "MotionCheck",
     "MotionDetection",
     "MtfCurve",
     "OffsetCurve",
     "RestorationVerdict",
+    "RowTimeCalibration",
     "SweptTone",
     "Vibration",
 }
@@ -196,7 +207,9 @@ def test_results_are_drawn(results, tmp_path):
     for number, (name, result) in enumerate(results):
         path = tmp_path / f"{number}.png"
         if name not in DRAWN:
-            with pytest.raises(TypeError, match=r"has no figure; these have one: DetectionResult, FreeMotion, Mot"):
+            with pytest.raises(
+                TypeError, match=r"has no figure; these have one: ClockAlignment, DetectionResult, FreeMotion, Mot"
+            ):
                 result.plot(path)
         elif name in ("OffsetCurve", "Vibration") and result.batch_shape:
             with pytest.raises(ValueError, match=r"a batch of shape \(3,\) has no figure: select one, result\[0\]"):

@@ -414,14 +414,14 @@ def with_pixel(value):
         (detail(2, 256, 128), {"tones": 0}, ValueError, "tones must be at least 1, got 0"),
         (detail(2, 256, 128), {"tones": 9}, ValueError, "tones must be 'auto' or 1 to 4, got 9"),
         (detail(2, 256, 128), {"tones": "many"}, TypeError, "tones must be a whole number, got 'many'"),
-        (detail(2, 256, 128), {"tones": 1.5}, TypeError, "tones must be a whole number, got 1.5"),
+        (detail(2, 256, 128), {"tones": 1.5}, TypeError, "tones must be 'auto' or a whole number, got 1.5"),
         (detail(2, 256, 128), {"method": "magic"}, ValueError, "method must be one of .*got 'magic'"),
         (detail(2, 256, 128), {"registration": "orb"}, ValueError, "registration must be one of .*got 'orb'"),
         (detail(2, 256, 128), {"band_rows": 2}, ValueError, "band_rows must be at least 4, got 2"),
         (detail(2, 256, 128), {"band_step": 0}, ValueError, "band_step must be at least 1, got 0"),
         (detail(2, 256, 128), {"search": 1}, ValueError, "search must be at least 2, got 1"),
         (detail(2, 256, 128), {"columns": 20}, ValueError, "columns must be at least 64, got 20"),
-        (detail(2, 256, 128), {"columns": 70.5}, TypeError, "columns must be a whole number, got 70.5"),
+        (detail(2, 256, 128), {"columns": 70.5}, TypeError, "columns must be a whole number or None, got 70.5"),
     ],
 )
 def test_bad_input(paper_camera, frames, options, error, message):

@@ -197,7 +197,7 @@ def test_command(scene, frames, tmp_path, capsys):
     ("frames", "options", "message"),
     [
         (torch.rand(1, 64, 64), {}, "at least 2 frames"),
-        (torch.full((2, 64, 64), torch.nan), {}, "frame 0 has only 0.0% of pixels"),
+        (torch.full((2, 64, 64), torch.nan), {}, "frames have no pixel with data"),
         (torch.rand(2, 64, 64), {"ignore": torch.zeros(3, 64, 64, dtype=torch.bool)}, "ignore"),
         (torch.rand(2, 64, 64), {"knot_rows": 1}, "knot_rows"),
         (torch.rand(2, 64, 64), {"iterations": 0}, "iterations"),

@@ -224,5 +224,6 @@ def test_missing_numbers_in_file_names_are_missing_frames(tmp_path, names, numbe
     else:
         assert starts == pytest.approx([0.01 * number for number in numbers])
         missing = numbers[-1] + 1 - len(numbers)
-        assert f"{missing} frames are missing according to the numbers in the file names" in notes[0]
+        stated = "1 frame is missing" if missing == 1 else f"{missing} frames are missing"
+        assert f"{stated} according to the numbers in the file names" in notes[0]
         assert timing_of_files(tmp_path, timing).frame_start_times == starts

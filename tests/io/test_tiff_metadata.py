@@ -91,6 +91,34 @@ def test_georeference_and_other_tags_are_kept(tmp_path, compression, file_option
     assert read_stack_info(tmp_path / "out.tif").resolution == (300.0, 200.0, "inch")
 
 
+@pytest.mark.parametrize(
+    ("dtype", "text", "value"),
+    [
+        ("uint16", "0", 0.0),
+        ("uint16", "-9999", None),  # cannot be stored
+        ("uint16", "65535", 65535.0),
+        ("uint16", "1.5", None),
+        ("float32", "-9999", -9999.0),
+        ("float32", "nan", None),
+        ("float32", "none", None),
+    ],
+)
+def test_nodata_pixels_are_missing(tmp_path, dtype, text, value):
+    stored = (GREY % 4000 + 50).astype(dtype)
+    stored[:, 3:9, 20:] = 4090 if value is None else value
+    tags = [(42113, "s", 0, text, False)]
+    tifffile.imwrite(tmp_path / "in.tif", stored, photometric="minisblack", metadata=None, extratags=tags)
+    info = read_stack_info(tmp_path / "in.tif")
+    assert info.nodata == value
+    scale = None if dtype == "float32" else 4095
+    frames = read_stack(tmp_path / "in.tif", full_scale=scale)
+    missing = np.zeros(stored.shape, bool)
+    missing[:, 3:9, 20:] = value is not None
+    assert (torch.isnan(frames).numpy() == missing).all()
+    write_stack(tmp_path / "out.tif", frames, dtype=dtype, full_scale=scale, like=info)
+    assert (tifffile.imread(tmp_path / "out.tif") == stored).all()
+
+
 def test_tags_of_pages_written_one_by_one(tmp_path):
     def options(number):
         own = {"65001": (65001, "I", 1, number), "40000": (40000, "I", 1, 9)}

@@ -301,7 +301,7 @@ def test_methods_without_saturation_use_the_saturated_values(lamps, method):
         ({"ignore": torch.zeros(2, 16, 8, dtype=torch.bool)}, ValueError, "ignore must be a boolean mask of shape"),
         ({"frames": {"a": 1}}, TypeError, "frames must be a tensor or array of numbers, got dict"),
         ({"clipped": True}, TypeError, "method='exact' has no option 'clipped'"),
-        ({"timing": None}, TypeError, "timing must be a SensorTiming, got NoneType"),
+        ({"timing": None}, TypeError, "timing must be a SensorTiming, got None"),
         ({"frames": torch.ones(2, 16, 16).short(), "full_scale": -1}, ValueError, "full_scale must be larger than 0"),
         ({"frames": np.ma.masked_array(np.ones((2, 16, 16)))}, TypeError, "frames must not be a masked array"),
         ({"frames": np.ones((2, 16, 16), object)}, TypeError, "got ndarray of object"),

@@ -30,7 +30,11 @@ _MIN_CHANGE = 0.05  # px, registration errors of bands
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MotionCheck(Result, units={"before": "px", "after": "px"}, shapes={"before": "2", "after": "2"}):
+class MotionCheck(
+    Result,
+    units={"before": "px", "after": "px", "times": "s", "offsets": "px", "residual": "px"},
+    shapes={"before": "2", "after": "2", "times": "N", "offsets": "N 2", "residual": "N 2"},
+):
     """Offsets of rows between frames, before and after a given motion is subtracted.
 
     Attributes:
@@ -39,6 +43,9 @@ class MotionCheck(Result, units={"before": "px", "after": "px"}, shapes={"before
         after: (2,) px, the same of the offsets less those of the motion.
         helps: Whether the motion reduces the offsets, both axes together.
         reasons: Reasons against the motion.
+        times: (N,) s, exposure starts of the registered row bands in the earlier frame of their pair.
+        offsets: (N, 2) px, offsets of these bands, axes (x, y).
+        residual: (N, 2) px, these offsets less those of the motion.
 
     Example:
         >>> import rsvib_torch as rsv
@@ -57,6 +64,9 @@ class MotionCheck(Result, units={"before": "px", "after": "px"}, shapes={"before
     after: Tensor
     helps: bool
     reasons: tuple[str, ...]
+    times: Tensor
+    offsets: Tensor
+    residual: Tensor
 
     def summary(self) -> str:
         """Offsets before and after the motion is subtracted, and the verdict."""
@@ -140,7 +150,9 @@ def check_motion(
             )
         elif rest > max(0.5 * moved, _MIN_CHANGE) and moved > 2 * _MIN_CHANGE:
             reasons.append(f"the motion leaves {rest:.3g} px of the {moved:.3g} px that rows move along {name}")
-    return MotionCheck(before, after, float(after.norm()) < float(before.norm()), tuple(reasons))
+    of_bands = (offsets_from_row_order(values[used], timing) for values in (offsets, residual))
+    helps = float(after.norm()) < float(before.norm())
+    return MotionCheck(before, after, helps, tuple(reasons), measured.exposure_starts[0, used, 0], *of_bands)
 
 
 def _offsets(displacements: Tensor) -> Tensor:

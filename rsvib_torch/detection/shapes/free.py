@@ -35,6 +35,7 @@ from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOpti
 
 __all__ = [
     "MotionDetection",
+    "bands_reasons",
     "detect_motion",
     "measure_freely",
     "precision_of_axis",
@@ -217,7 +218,8 @@ def _detect(
     fit = _fit_spline(replace(weighed, independent=share), spacing, record, learn=True)
     motion = _motion(fit, size, 0.25)
     starts = rowwise.frame_starts(stack.images.shape[1], stack.images.device)
-    return _report(motion[0], fit, measured, timing, starts, size[0])
+    banded = measurements_of_curve(curve, rowwise, bands.band_step)
+    return _report(motion[0], fit, measured, timing, starts, size[0], bands_reasons(banded, motion[0]))
 
 
 def measure_freely(
@@ -293,6 +295,31 @@ def rms_motion(measured: Measurements, motion: Motion) -> Tensor:
     """(2,) px, rms displacement of scene rows about their mean over the frames, by a motion (not a batch)."""
     moved = measured.relative(motion.mean_displacement(measured.exposure_starts, measured.exposure_time))[0]
     return moved.square().sum(1).div(measured.num_differences[0].clamp(min=1.0)[:, None]).mean(0).sqrt()
+
+
+def bands_reasons(banded: Measurements, motion: Motion, *, counted: float = 0.75) -> tuple[list[str], list[str]]:
+    """Reasons against a motion of each axis in row order that the offsets of row bands contradict.
+
+    Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it.
+
+    Args:
+        banded: Offsets of the bands of one stack, from ``measurements_of_curve``.
+        motion: The motion (not a batch).
+        counted: Fraction of the bands that count, the best ones: clouds may cover the others.
+    """
+    used = banded.weights[0].amin(-1) > 0
+    values, rest = (x[0, used, 1] - x[0, used, 0] for x in (banded.displacements, residual_of_motion(banded, motion)))
+    size = (values - values.mean(0)).abs().mean(0).tolist()
+    count = math.ceil(counted * len(rest))
+    residual = rest.abs().sort(dim=0).values[:count].mean(0).tolist()
+    allowed = [max(0.1, 0.3 * axis) for axis in size]  # px; smaller ones are errors of registration, as for tones
+    first, second = (
+        [f"the offsets of row bands differ by {rest:.3g} px from it, {most:.3g} px are allowed: noise hides the scene"]
+        if rest > most
+        else []
+        for rest, most in zip(residual, allowed, strict=True)
+    )
+    return first, second
 
 
 def unexplained_reason(residual: Tensor, moved: Tensor, model: str) -> list[str]:
@@ -488,7 +515,13 @@ def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: fl
 
 
 def _report(
-    motion: FreeMotion, fit: _SplineFit, measured: Measurements, timing: SensorTiming, starts: Tensor, num_rows: int
+    motion: FreeMotion,
+    fit: _SplineFit,
+    measured: Measurements,
+    timing: SensorTiming,
+    starts: Tensor,
+    num_rows: int,
+    of_bands: tuple[list[str], list[str]],
 ) -> MotionDetection:
     """The motion in image axes, and its uncertainty at up to 32 rows of every frame."""
     rows = torch.linspace(0, num_rows - 1, min(32, num_rows), dtype=torch.float64, device=starts.device)
@@ -510,7 +543,7 @@ def _report(
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     reasons = []
     for axis in range(2):
-        against = unexplained_reason(rest[axis], moved[axis], "smooth motion")
+        against = unexplained_reason(rest[axis], moved[axis], "smooth motion") + of_bands[axis]
         if float(std_seen[axis]) > 0.3:
             against.append(
                 f"the motion is determined to {float(std_seen[axis]):.3g} px only: the frames may show different scenes"

@@ -17,7 +17,7 @@ from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
 from rsvib_torch.core.text import measured_text, text_table, wrapped
-from rsvib_torch.frames.arrays import Channels, as_tensor
+from rsvib_torch.frames.arrays import ArrayLike, Channels, as_tensor
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.io.files import FramesOrFiles, load_frames, timing_of_files
 from rsvib_torch.motion.motion import Motion
@@ -316,7 +316,7 @@ def judge_restoration(
     joint: bool | int = False,
     full_scale: float | None = None,
     channels: Channels = None,
-    ignore: Tensor | None = None,
+    ignore: ArrayLike | None = None,
     most_pairs: int | None = None,
 ) -> RestorationVerdict:
     """Judge whether restored frames are better than raw ones, without the true scene.
