@@ -26,6 +26,7 @@ from rsvib_torch.config import presets, read_config
 from rsvib_torch.core.atomic import check_writable, whole_file
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.text import printable
+from rsvib_torch.core.validation import MistakesError
 from rsvib_torch.motion.timing import SensorTiming
 
 __all__ = ["init", "sensor_toml"]
@@ -170,7 +171,7 @@ def _complete(values: dict[str, Any], rows: int, likely: float | None) -> None:
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         lines = [f"{option} is missing. {_hint(name, values, rows, likely)}" for name, (option, _) in missing.items()]
         if lines:
-            raise ValueError("\n".join(lines))
+            raise MistakesError(lines)
     for name, (option, convert) in missing.items():
         typer.echo(f"\n{_hint(name, values, rows, likely)}", err=True)
         limits = {"row_time": 1.0 / rows, "exposure_time": 1.0}  # frame periods

@@ -4,7 +4,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -34,6 +34,8 @@ class RowPSF:
         weights: (..., R, KH, KW) float64, sums to 1 over the last two axes.
         degree: Degree of the interpolating spline, 1 (linear) or 3 (cubic).
     """
+
+    _MADE_BY: ClassVar[str] = "row_psf"  # for errors about arguments
 
     first_tap: Tensor
     weights: Tensor

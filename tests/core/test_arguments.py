@@ -10,6 +10,7 @@ import rsvib_torch as rsv
 from rsvib_torch.core.arguments import as_numbers, check_device, check_shapes, check_tensor, checks_arguments
 
 TIMING = rsv.SensorTiming(1e-4, 6, 104)
+CURVES = (torch.zeros(1), torch.zeros(1, 2), torch.zeros(1, 2))  # times, offsets, residual of a MotionCheck
 FRAMES = torch.rand(2, 96, 64, generator=torch.Generator().manual_seed(0))
 VIBRATION = rsv.Vibration([1.0, 0.5], [130.0, 170.0])
 
@@ -72,15 +73,15 @@ def test_pixels_beyond_all_scales(value):
         (lambda: rsv.FreeMotion(torch.zeros(2, 9), 0.0, 1e-3).mean_displacement(torch.zeros(3), 1e9), "exposure_time"),
         (lambda: rsv.detect_vibration(FRAMES, TIMING, harmonics=10**9), "harmonics must be at most"),
         (lambda: rsv.restore(FRAMES, "timing", VIBRATION), "timing must be a SensorTiming"),
-        (lambda: rsv.restore(FRAMES, TIMING, 3), "vibration must be a Motion or a Detected, got 3"),
+        (lambda: rsv.restore(FRAMES, TIMING, 3), "vibration must be a Vibration or a detection, got int"),
         (lambda: rsv.restore(FRAMES, TIMING, VIBRATION, noise=1e308), "noise must be at most"),
         (lambda: rsv.row_psf(VIBRATION, TIMING.row_starts(1, 4)[0], TIMING, num_nodes=10**9), "num_nodes must be at"),
         (lambda: rsv.row_psf(VIBRATION, torch.tensor([math.inf]), TIMING), "starts must be finite times"),
         (lambda: rsv.psnr(FRAMES, FRAMES, 10**400), "data_range must be finite"),
         (lambda: rsv.comparison_figure(torch.tensor(1.0), FRAMES[0]), "raw must have shape"),
-        (lambda: rsv.windows_figure([0.0], [math.nan]), r"detections\[0\] must be a Detection"),
-        (lambda: rsv.MotionCheck("x", torch.zeros(2), True, ()), "before must be a tensor"),
-        (lambda: rsv.MotionCheck(torch.zeros(3), torch.zeros(2), True, ()), r"before must have shape \(2,\)"),
+        (lambda: rsv.windows_figure([0.0], [math.nan]), r"detections\[0\] must be a detection or None"),
+        (lambda: rsv.MotionCheck("x", torch.zeros(2), True, (), *CURVES), "before must be a tensor"),
+        (lambda: rsv.MotionCheck(torch.zeros(3), torch.zeros(2), True, (), *CURVES), r"before must have shape \(2,\)"),
     ],
 )
 def test_values_beyond_the_limits_of_an_argument(build, message):

@@ -198,11 +198,6 @@ def test_frames_that_the_format_does_not_support(tmp_path, name, frames, options
     assert list(tmp_path.iterdir()) == []
 
 
-def test_integer_tensors_are_refused_on_writing(tmp_path):
-    with pytest.raises(TypeError, match=r"floating-point tensor .* got torch\.uint8"):
-        write_stack(tmp_path / "a.tif", torch.zeros(1, 4, 4, dtype=torch.uint8))
-
-
 def test_png_folder_with_other_frames_is_not_written(tmp_path):
     write_stack(tmp_path / "frames", FRAMES, dtype="uint8")
     write_stack(tmp_path / "frames", 1 - FRAMES, dtype="uint8")  # the same names again

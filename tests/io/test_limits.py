@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 import zarr
-from mutations import at_most
+from time_limit import at_most
 
 import rsvib_torch as rsv
 from rsvib_torch.config import read_config
