@@ -96,7 +96,7 @@ def test_the_answer_of_run_names_everything(place, config, tmp_path, capsys, mon
     vibration = answer["Vibration in frames.tif"]
     assert vibration == rsv.DetectionResult.load("out/vibration.json").summary().splitlines()
     assert re.match(r"x     1\.(59|60)\d* ± 0\.0\d+  +7[01]\.", vibration[1])
-    assumed = " ".join(line for line in vibration if not re.match("[xy]:", line))
+    assumed = " ".join(" ".join(line for line in vibration if not re.match("[xy]:", line)).split())
     assert "assumed: frame_rows, readout direction, scan axis and order of the frames: two frames cannot" in assumed
     assert "assumed: frame_rows=200: if it is stated 1 % too large, this changes x amplitude" in assumed
     assert answer["Restoration"][0] == "2 frames restored along x and y"
