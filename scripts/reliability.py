@@ -2,12 +2,13 @@
 """Attack the package: kills, power losses, damaged and crafted files, API misuse, memory limits.
 
 Each attack is a module of scripts/attacks. Its trials are counted by outcome (see attacks/trial.py). The program prints
-a table and all failures, and its exit code is 1 if a trial failed. With --store the table is written to
-docs/reliability.md.
+a table and all failures, and its exit code is 1 if a trial failed. With --store the results of these attacks replace
+their earlier ones in scripts/attacks/results.json, and the table of all is written to docs/reliability.md.
 """
 
 import argparse
 import datetime
+import json
 import sys
 import tempfile
 import time
@@ -15,6 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from attacks import (
     concurrent,
@@ -36,6 +38,7 @@ from attacks.trial import FAILURES, OUTCOMES, Trial
 import rsvib_torch as rsv
 
 PAGE = Path(__file__).parents[1] / "docs" / "reliability.md"
+RESULTS = Path(__file__).parent / "attacks" / "results.json"
 BEGIN, END = "<!-- begin of the generated table -->", "<!-- end of the generated table -->"
 
 
@@ -73,46 +76,68 @@ ATTACKS: dict[str, Attack] = {
 }
 
 
-def table(results: dict[str, list[Trial]]) -> list[str]:
-    """Markdown table: one row per attack, one column per outcome."""
-    lines = ["| attack | trials | " + " | ".join(OUTCOMES) + " |", "|---" * (2 + len(OUTCOMES)) + "|"]
-    for name, trials in results.items():
-        counts = Counter(trial.outcome for trial in trials)
-        cells = [ATTACKS[name].title, str(len(trials)), *(str(counts[outcome]) for outcome in OUTCOMES)]
-        lines.append("| " + " | ".join(cells) + " |")
+def summary(trials: list[Trial], seeds: list[int]) -> dict[str, Any]:
+    """What is stored of an attack."""
+    counts = Counter(trial.outcome for trial in trials)
+    return {
+        "date": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
+        "version": rsv.__version__,
+        "seeds": seeds,
+        "counts": {outcome: counts[outcome] for outcome in OUTCOMES},
+    }
+
+
+def table(results: dict[str, Any]) -> list[str]:
+    """Markdown table of results of ``summary`` by attack: one row per attack, one column per outcome."""
+    lines = ["| attack | date | trials | " + " | ".join(OUTCOMES) + " |", "|---" * (3 + len(OUTCOMES)) + "|"]
+    for name, result in results.items():
+        counts = result["counts"]
+        numbers = [sum(counts.values()), *(counts[outcome] for outcome in OUTCOMES)]
+        lines.append(
+            "| " + " | ".join([f"{ATTACKS[name].title} (`{name}`)", result["date"], *map(str, numbers)]) + " |"
+        )
     return lines
 
 
-def store(lines: list[str]) -> None:
-    """Replace the generated part of the page."""
+def store(results: dict[str, Any]) -> None:
+    """Replace the stored results and the generated part of the page."""
     before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
     after = rest.split(END)[1]
-    date = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
-    origin = f"Measured by `python scripts/reliability.py --store` with rsvib_torch {rsv.__version__} on {date}."
-    PAGE.write_text("\n".join([before + BEGIN, origin, "", *lines, END + after]), encoding="utf-8")
+    version = rsv.__version__
+    origin = f"Measured by `python scripts/reliability.py --store` (all results at their dates; rsvib_torch {version})."
+    RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    PAGE.write_text("\n".join([before + BEGIN, origin, "", *table(results), END + after]), encoding="utf-8")
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", choices=ATTACKS, nargs="+", default=list(ATTACKS), help="attacks (default: all)")
-    parser.add_argument("--count", type=int, help="trials of each attack (default: the number of docs/reliability.md)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of everything that is drawn at random (default: 0)")
-    parser.add_argument("--store", action="store_true", help="write the table to docs/reliability.md")
+    parser.add_argument("--count", type=int, help="trials of each attack and seed (default: as in docs/reliability.md)")
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[0], help="each attack runs once per seed of its random numbers"
+    )
+    parser.add_argument("--store", action="store_true", help="put the results into docs/reliability.md")
     options = parser.parse_args()
-    results: dict[str, list[Trial]] = {}
+    failed = False
+    stored: dict[str, Any] = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+    latest: dict[str, Any] = {}
     for name in options.only:
         attack, begin = ATTACKS[name], time.perf_counter()
-        with tempfile.TemporaryDirectory(prefix="reliability-") as folder:
-            results[name] = list(attack.trials(Path(folder), options.count or attack.count, options.seed))
-        for trial in results[name]:
-            if trial.outcome in FAILURES:
-                print(f"{name}: {trial.outcome}: {trial.name}: {trial.detail}", flush=True)
-        print(f"{name}: {len(results[name])} trials in {time.perf_counter() - begin:.0f} s", flush=True)
-    lines = table(results)
-    print("\n".join(lines))
-    if options.store:
-        store(lines)
-    return int(any(trial.outcome in FAILURES for trials in results.values() for trial in trials))
+        trials: list[Trial] = []
+        for seed in options.seeds:
+            with tempfile.TemporaryDirectory(prefix="reliability-") as folder:
+                trials += attack.trials(Path(folder), options.count or attack.count, seed)
+        failures = [trial for trial in trials if trial.outcome in FAILURES]
+        for trial in failures:
+            print(f"{name}: {trial.outcome}: {trial.name}: {trial.detail}", flush=True)
+        print(f"{name}: {len(trials)} trials in {time.perf_counter() - begin:.0f} s", flush=True)
+        failed |= bool(failures)
+        latest[name] = summary(trials, options.seeds)
+        if options.store:  # after each attack: an interrupted run keeps the finished ones
+            stored |= latest
+            store({name: stored[name] for name in ATTACKS if name in stored})
+    print("\n".join(table(latest)))
+    return int(failed)
 
 
 if __name__ == "__main__":
