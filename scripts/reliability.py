@@ -2,12 +2,13 @@
 """Attack the package: kills, power losses, damaged and crafted files, API misuse, memory limits.
 
 Each attack is a module of scripts/attacks. Its trials are counted by outcome (see attacks/trial.py). The program prints
-a table and all failures, and its exit code is 1 if a trial failed. With --store the results of these attacks replace
-their earlier ones in scripts/attacks/results.json, and the table of all is written to docs/reliability.md.
+a table and all failures, and its exit code is 1 if a trial failed. With --store the results replace earlier ones
+of the same attacks and seeds in scripts/attacks/results.json, and the table of all is written to docs/reliability.md.
 """
 
 import argparse
 import datetime
+import itertools
 import json
 import sys
 import tempfile
@@ -76,35 +77,29 @@ ATTACKS: dict[str, Attack] = {
 }
 
 
-def summary(trials: list[Trial], seeds: list[int]) -> dict[str, Any]:
-    """What is stored of an attack."""
+def summary(trials: list[Trial]) -> dict[str, Any]:
+    """What is stored of the trials of one attack and seed."""
     counts = Counter(trial.outcome for trial in trials)
-    return {
-        "date": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
-        "version": rsv.__version__,
-        "seeds": seeds,
-        "counts": {outcome: counts[outcome] for outcome in OUTCOMES},
-    }
+    date = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
+    return {"date": date, "version": rsv.__version__, "counts": {outcome: counts[outcome] for outcome in OUTCOMES}}
 
 
-def table(results: dict[str, Any]) -> list[str]:
-    """Markdown table of results of ``summary`` by attack: one row per attack, one column per outcome."""
+def table(results: dict[str, dict[str, Any]]) -> list[str]:
+    """Markdown table of the summaries by attack and seed: one row per attack, one column per outcome."""
     lines = ["| attack | date | trials | " + " | ".join(OUTCOMES) + " |", "|---" * (3 + len(OUTCOMES)) + "|"]
-    for name, result in results.items():
-        counts = result["counts"]
-        numbers = [sum(counts.values()), *(counts[outcome] for outcome in OUTCOMES)]
-        lines.append(
-            "| " + " | ".join([f"{ATTACKS[name].title} (`{name}`)", result["date"], *map(str, numbers)]) + " |"
-        )
+    for name, seeds in results.items():
+        counts = [sum(one["counts"][outcome] for one in seeds.values()) for outcome in OUTCOMES]
+        oldest = min(one["date"] for one in seeds.values())
+        cells = [f"{ATTACKS[name].title} (`{name}`)", oldest, str(sum(counts)), *map(str, counts)]
+        lines.append("| " + " | ".join(cells) + " |")
     return lines
 
 
-def store(results: dict[str, Any]) -> None:
+def store(results: dict[str, dict[str, Any]]) -> None:
     """Replace the stored results and the generated part of the page."""
     before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
     after = rest.split(END)[1]
-    version = rsv.__version__
-    origin = f"Measured by `python scripts/reliability.py --store` (all results at their dates; rsvib_torch {version})."
+    origin = f"Measured by `python scripts/reliability.py --store` with rsvib_torch {rsv.__version__}."
     RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     PAGE.write_text("\n".join([before + BEGIN, origin, "", *table(results), END + after]), encoding="utf-8")
 
@@ -121,21 +116,19 @@ def main() -> int:
     failed = False
     stored: dict[str, Any] = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
     latest: dict[str, Any] = {}
-    for name in options.only:
-        attack, begin = ATTACKS[name], time.perf_counter()
-        trials: list[Trial] = []
-        for seed in options.seeds:
-            with tempfile.TemporaryDirectory(prefix="reliability-") as folder:
-                trials += attack.trials(Path(folder), options.count or attack.count, seed)
-        failures = [trial for trial in trials if trial.outcome in FAILURES]
-        for trial in failures:
-            print(f"{name}: {trial.outcome}: {trial.name}: {trial.detail}", flush=True)
-        print(f"{name}: {len(trials)} trials in {time.perf_counter() - begin:.0f} s", flush=True)
-        failed |= bool(failures)
-        latest[name] = summary(trials, options.seeds)
+    for name, seed in itertools.product(options.only, options.seeds):
+        attack, begin, trials = ATTACKS[name], time.perf_counter(), []
+        with tempfile.TemporaryDirectory(prefix="reliability-") as folder:
+            for trial in attack.trials(Path(folder), options.count or attack.count, seed):
+                trials.append(trial)
+                if trial.outcome in FAILURES:
+                    failed = True
+                    print(f"{name}: {trial.outcome}: {trial.name}: {trial.detail}", flush=True)
+        print(f"{name}, seed {seed}: {len(trials)} trials in {time.perf_counter() - begin:.0f} s", flush=True)
+        latest.setdefault(name, {})[str(seed)] = summary(trials)
         if options.store:  # after each attack: an interrupted run keeps the finished ones
-            stored |= latest
-            store({name: stored[name] for name in ATTACKS if name in stored})
+            stored[name] = stored.get(name, {}) | latest[name]
+            store({one: stored[one] for one in ATTACKS if one in stored})
     print("\n".join(table(latest)))
     return int(failed)
 

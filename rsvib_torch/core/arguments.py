@@ -329,13 +329,20 @@ def _check_of_union(members: tuple[Any, ...], finite: bool) -> _Check | None:
     return check
 
 
+def _holds_numbers(kind: Any) -> bool:
+    return kind in (int, float, bool, Any) or any(map(_holds_numbers, get_args(kind)))
+
+
 def _check_of_sequence(origin: Any, arguments: tuple[Any, ...], finite: bool) -> _Check:
     length = len(arguments) if origin is tuple and arguments[-1:] != (...,) else None
     parts = [_check(argument, finite=finite) for argument in arguments if argument is not ...]
+    numbers = not arguments or any(map(_holds_numbers, arguments))
 
     def check(name: str, value: Any) -> None:
-        if isinstance(value, _ARRAYS):
+        if numbers and isinstance(value, _ARRAYS):
             check_tensor(name, value if isinstance(value, Tensor) else _numeric(name, value))
+            if value.ndim == 0:
+                _refuse(name, "a sequence" if length is None else f"{length} values", value)
         elif not isinstance(value, Sequence) or isinstance(value, (str, bytes)):
             _refuse(name, "a sequence" if length is None else f"{length} values", value)
         if length is not None and len(value) != length:

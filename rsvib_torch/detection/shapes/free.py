@@ -209,7 +209,11 @@ def _detect(
     """``detect_motion`` of one stack."""
     grey = stack.images
     rowwise, curve, record = start_curve(stack, timing, bands)
-    spacing = max(knot_rows * rowwise.row_time, (record[1] - record[0]) / 3000)  # the cost grows with knots^3
+    duration = record[1] - record[0]
+    if knot_rows * rowwise.row_time > duration:
+        longest = math.floor(duration / rowwise.row_time)
+        raise ValueError(f"knot_rows must be at most {longest}, the row times of the stack, got {knot_rows}")
+    spacing = max(knot_rows * rowwise.row_time, duration / 3000)  # the cost grows with knots^3
     size = (grey.shape[-2], grey.shape[-1])
     measured = measurements_of_curve(curve, rowwise, bands.band_step)
     fit = _fit_spline(measured, max(spacing, 0.5 * bands.band_rows * rowwise.row_time), record)
