@@ -41,9 +41,9 @@ class Attack:
     count: int
 
 
-# A new attack is one module in scripts/attacks and one line here. Its function ``trials(folder, count, seed)`` runs up to
+# A new attack is one module in scripts/attacks and one line here. Its ``trials(folder, count, seed)`` runs up to
 # ``count`` trials with files in ``folder`` and yields their results; what is drawn at random depends on ``seed`` only.
-# The module is imported when it is used: child processes of the attacks import this file, 1 s faster without the others.
+# Modules are imported when they are used: child processes of the attacks on storage import this file for every trial.
 ATTACKS: dict[str, Attack] = {
     "kills": Attack("runs killed and resumed", 270),
     "power_losses": Attack("power losses, resumed", 450),

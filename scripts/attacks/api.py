@@ -25,7 +25,7 @@ from torch import Tensor
 
 import rsvib_torch as rsv
 
-__all__ = ["trials", "calls"]
+__all__ = ["calls", "trials"]
 
 SECONDS, MEMORY = 10.0, 2 << 30  # limits of one trial; bytes in addition to those of the valid calls
 _REFUSED = (ValueError, TypeError, OSError)

@@ -138,3 +138,21 @@ def test_verdicts_of_contradicting_sizes(name, value):
     assert "pair" in rsv.RestorationVerdict(**values).summary()
     with pytest.raises(ValueError, match=f"{name} must have"):
         rsv.RestorationVerdict(**values | {name: value})
+
+
+def test_knots_further_apart_than_the_stack_is_long():
+    with pytest.raises(ValueError, match="knot_rows must be at most"):
+        rsv.detect_motion(FRAMES, TIMING, knot_rows=10**9)
+
+
+def test_optics_of_frames_of_16_bits():
+    optics = rsv.Optics(0.5, 0.4, 1.0)
+    image = optics.apply(FRAMES.to(torch.bfloat16))
+    assert image.dtype == torch.bfloat16
+    torch.testing.assert_close(image.float(), optics.apply(FRAMES), atol=0.01, rtol=0)
+
+
+def test_samples_with_gradient_are_refused():
+    times = torch.linspace(0, 0.1, 11, dtype=torch.float64)
+    with pytest.raises(ValueError, match="from_samples has no gradient: pass displacement.detach()"):
+        rsv.FreeMotion.from_samples(times, torch.zeros(11, 2, requires_grad=True))
