@@ -2,40 +2,29 @@
 """Attack the package: kills, power losses, damaged and crafted files, API misuse, memory limits.
 
 Each attack is a module of scripts/attacks. Its trials are counted by outcome (see attacks/trial.py). The program prints
-a table and all failures, and its exit code is 1 if a trial failed. With --store the table is written to
-docs/reliability.md.
+a table and all failures, and its exit code is 1 if a trial failed. With --store the results replace earlier ones
+of the same attacks and seeds in scripts/attacks/results.json, and the table of all is written to docs/reliability.md.
 """
 
 import argparse
 import datetime
+import importlib
+import itertools
+import json
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from attacks import (
-    concurrent,
-    crafted,
-    damaged_parts,
-    disks,
-    inputs,
-    journals,
-    kills,
-    links,
-    memory,
-    power_losses,
-    workers,
-)
-from attacks.api import api_trials
-from attacks.mutated import mutated_trials
 from attacks.trial import FAILURES, OUTCOMES, Trial
 
 import rsvib_torch as rsv
 
 PAGE = Path(__file__).parents[1] / "docs" / "reliability.md"
+RESULTS = Path(__file__).parent / "attacks" / "results.json"
 BEGIN, END = "<!-- begin of the generated table -->", "<!-- end of the generated table -->"
 
 
@@ -45,74 +34,89 @@ class Attack:
 
     Attributes:
         title: First column of the table.
-        trials: ``trials(folder, count, seed)`` runs up to ``count`` trials with files in ``folder`` and yields their
-            results; what is drawn at random depends on ``seed`` only.
         count: Number of trials for the table of the page.
     """
 
     title: str
-    trials: Callable[[Path, int, int], Iterator[Trial]]
     count: int
 
 
-# A new attack is one module in scripts/attacks and one line here.
+# A new attack is one module in scripts/attacks and one line here. Its ``trials(folder, count, seed)`` runs up to
+# ``count`` trials with files in ``folder`` and yields their results; what is drawn at random depends on ``seed`` only.
+# Modules are imported when they are used: child processes of the attacks on storage import this file for every trial.
 ATTACKS: dict[str, Attack] = {
-    "kills": Attack("runs killed and resumed", kills.trials, 270),
-    "power_losses": Attack("power losses, resumed", power_losses.trials, 450),
-    "damaged_parts": Attack("damaged parts of interrupted runs, resumed", damaged_parts.trials, 126),
-    "journals": Attack("damaged journals", journals.trials, 250),
-    "links": Attack("links and foreign files as work folders", links.trials, 110),
-    "inputs": Attack("outputs that are or contain inputs", inputs.trials, 250),
-    "concurrent": Attack("several runs with one output", concurrent.trials, 45),
-    "disks": Attack("full and read-only disks", disks.trials, 69),
-    "memory": Attack("`--memory` in different layouts", memory.trials, 17),
-    "crafted": Attack("crafted files", crafted.trials, 500),
-    "workers": Attack("killed and missing Dask workers", workers.trials, 9),
-    "api": Attack("hostile arguments of Python functions", api_trials, 4000),
-    "mutated": Attack("randomly damaged files", mutated_trials, 2400),
+    "kills": Attack("runs killed and resumed", 270),
+    "power_losses": Attack("power losses, resumed", 450),
+    "damaged_parts": Attack("damaged parts of interrupted runs, resumed", 126),
+    "journals": Attack("damaged journals", 250),
+    "links": Attack("links and foreign files as work folders", 110),
+    "inputs": Attack("outputs that are or contain inputs", 250),
+    "concurrent": Attack("several runs with one output", 45),
+    "disks": Attack("full and read-only disks", 69),
+    "memory": Attack("`--memory` in different layouts", 17),
+    "crafted": Attack("crafted files", 500),
+    "workers": Attack("killed and missing Dask workers", 9),
+    "api": Attack("hostile arguments of Python functions", 4000),
+    "mutated": Attack("randomly damaged files", 2400),
 }
 
 
-def table(results: dict[str, list[Trial]]) -> list[str]:
-    """Markdown table: one row per attack, one column per outcome."""
-    lines = ["| attack | trials | " + " | ".join(OUTCOMES) + " |", "|---" * (2 + len(OUTCOMES)) + "|"]
-    for name, trials in results.items():
-        counts = Counter(trial.outcome for trial in trials)
-        cells = [ATTACKS[name].title, str(len(trials)), *(str(counts[outcome]) for outcome in OUTCOMES)]
+def summary(trials: list[Trial]) -> dict[str, Any]:
+    """What is stored of the trials of one attack and seed."""
+    counts = Counter(trial.outcome for trial in trials)
+    date = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
+    return {"date": date, "version": rsv.__version__, "counts": {outcome: counts[outcome] for outcome in OUTCOMES}}
+
+
+def table(results: dict[str, dict[str, Any]]) -> list[str]:
+    """Markdown table of the summaries by attack and seed: one row per attack, one column per outcome."""
+    lines = ["| attack | date | trials | " + " | ".join(OUTCOMES) + " |", "|---" * (3 + len(OUTCOMES)) + "|"]
+    for name, seeds in results.items():
+        counts = [sum(one["counts"][outcome] for one in seeds.values()) for outcome in OUTCOMES]
+        oldest = min(one["date"] for one in seeds.values())
+        cells = [f"{ATTACKS[name].title} (`{name}`)", oldest, str(sum(counts)), *map(str, counts)]
         lines.append("| " + " | ".join(cells) + " |")
     return lines
 
 
-def store(lines: list[str]) -> None:
-    """Replace the generated part of the page."""
+def store(results: dict[str, dict[str, Any]]) -> None:
+    """Replace the stored results and the generated part of the page."""
     before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
     after = rest.split(END)[1]
-    date = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
-    origin = f"Measured by `python scripts/reliability.py --store` with rsvib_torch {rsv.__version__} on {date}."
-    PAGE.write_text("\n".join([before + BEGIN, origin, "", *lines, END + after]), encoding="utf-8")
+    origin = f"Measured by `python scripts/reliability.py --store` with rsvib_torch {rsv.__version__}."
+    RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    PAGE.write_text("\n".join([before + BEGIN, origin, "", *table(results), END + after]), encoding="utf-8")
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", choices=ATTACKS, nargs="+", default=list(ATTACKS), help="attacks (default: all)")
-    parser.add_argument("--count", type=int, help="trials of each attack (default: the number of docs/reliability.md)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of everything that is drawn at random (default: 0)")
-    parser.add_argument("--store", action="store_true", help="write the table to docs/reliability.md")
+    parser.add_argument("--count", type=int, help="trials of each attack and seed (default: as in docs/reliability.md)")
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[0], help="each attack runs once per seed of its random numbers"
+    )
+    parser.add_argument("--store", action="store_true", help="put the results into docs/reliability.md")
     options = parser.parse_args()
-    results: dict[str, list[Trial]] = {}
-    for name in options.only:
-        attack, begin = ATTACKS[name], time.perf_counter()
+    failed = False
+    stored: dict[str, Any] = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+    latest: dict[str, Any] = {}
+    for name, seed in itertools.product(options.only, options.seeds):
+        attack, begin, trials = ATTACKS[name], time.perf_counter(), []
         with tempfile.TemporaryDirectory(prefix="reliability-") as folder:
-            results[name] = list(attack.trials(Path(folder), options.count or attack.count, options.seed))
-        for trial in results[name]:
-            if trial.outcome in FAILURES:
-                print(f"{name}: {trial.outcome}: {trial.name}: {trial.detail}", flush=True)
-        print(f"{name}: {len(results[name])} trials in {time.perf_counter() - begin:.0f} s", flush=True)
-    lines = table(results)
-    print("\n".join(lines))
-    if options.store:
-        store(lines)
-    return int(any(trial.outcome in FAILURES for trials in results.values() for trial in trials))
+            for trial in importlib.import_module(f"attacks.{name}").trials(
+                Path(folder), options.count or attack.count, seed
+            ):
+                trials.append(trial)
+                if trial.outcome in FAILURES:
+                    failed = True
+                    print(f"{name}: {trial.outcome}: {trial.name}: {trial.detail}", flush=True)
+        print(f"{name}, seed {seed}: {len(trials)} trials in {time.perf_counter() - begin:.0f} s", flush=True)
+        latest.setdefault(name, {})[str(seed)] = summary(trials)
+        if options.store:  # after each attack: an interrupted run keeps the finished ones
+            stored[name] = stored.get(name, {}) | latest[name]
+            store({one: stored[one] for one in ATTACKS if one in stored})
+    print("\n".join(table(latest)))
+    return int(failed)
 
 
 if __name__ == "__main__":

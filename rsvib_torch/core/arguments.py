@@ -189,24 +189,18 @@ def checks_arguments(function: Callable[P, R]) -> Callable[P, R]:
         ...
         TypeError: count must be a whole number, got '3' (str)
     """
-    signature = inspect.signature(function)
+    parameters = inspect.signature(function).parameters.values()
+    # inspect.Signature.bind would take longer than the checks; calls that it refuses are refused by the function
+    names = [parameter.name for parameter in parameters if parameter.kind is parameter.POSITIONAL_OR_KEYWORD]
 
     @wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling():
             return function(*args, **kwargs)
-        try:
-            given = signature.bind(*args, **kwargs).arguments
-        except TypeError:
-            return function(*args, **kwargs)  # raises the usual message about missing and unknown arguments
         checks = _checks_of(function)
-        for name, value in given.items():
+        for name, value in (*zip(names, args, strict=False), *kwargs.items()):
             if check := checks.get(name):
                 check(name, value)
-            elif name in checks:  # further keyword arguments
-                for key in value:
-                    if inner := checks.get(f"**{key}"):
-                        inner(key, value[key])
         return function(*args, **kwargs)
 
     return checked
@@ -230,8 +224,8 @@ def _field_checks(kind: type) -> list[tuple[str, _Check]]:
 
 
 @cache
-def _checks_of(function: Callable[..., Any]) -> dict[str, _Check | None]:
-    """Check of each parameter by name; ``**name`` for the keys of options, None for the parameter of the options."""
+def _checks_of(function: Callable[..., Any]) -> dict[str, _Check]:
+    """Check of each parameter and option by name."""
     checks: dict[str, _Check | None] = {}
     given = {name: kind for name, kind in function.__annotations__.items() if name != "return"}
     names = inspect.unwrap(function).__globals__
@@ -239,13 +233,10 @@ def _checks_of(function: Callable[..., Any]) -> dict[str, _Check | None]:
     for parameter in inspect.signature(function).parameters.values():
         kind = hints.get(parameter.name, Any)
         if get_origin(kind) is Unpack:
-            checks[parameter.name] = None
-            checks |= {f"**{key}": _check(hint) for key, hint in get_type_hints(get_args(kind)[0]).items()}
+            checks |= {key: _check(hint) for key, hint in get_type_hints(get_args(kind)[0]).items()}
         elif parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
-            check = _check(kind)
-            if check is not None:
-                checks[parameter.name] = check
-    return checks
+            checks[parameter.name] = _check(kind)
+    return {name: check for name, check in checks.items() if check is not None}
 
 
 def _check(kind: Any, *, finite: bool = True) -> _Check | None:  # noqa: PLR0911, PLR0912
@@ -339,13 +330,20 @@ def _check_of_union(members: tuple[Any, ...], finite: bool) -> _Check | None:
     return check
 
 
+def _holds_numbers(kind: Any) -> bool:
+    return kind in (int, float, bool, Any) or any(map(_holds_numbers, get_args(kind)))
+
+
 def _check_of_sequence(origin: Any, arguments: tuple[Any, ...], finite: bool) -> _Check:
     length = len(arguments) if origin is tuple and arguments[-1:] != (...,) else None
     parts = [_check(argument, finite=finite) for argument in arguments if argument is not ...]
+    numbers = not arguments or any(map(_holds_numbers, arguments))
 
     def check(name: str, value: Any) -> None:
-        if isinstance(value, _ARRAYS):
+        if numbers and isinstance(value, _ARRAYS):
             check_tensor(name, value if isinstance(value, Tensor) else _numeric(name, value))
+            if value.ndim == 0:
+                _refuse(name, "a sequence" if length is None else f"{length} values", value)
         elif not isinstance(value, Sequence) or isinstance(value, (str, bytes)):
             _refuse(name, "a sequence" if length is None else f"{length} values", value)
         if length is not None and len(value) != length:

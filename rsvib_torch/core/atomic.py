@@ -16,7 +16,9 @@ except ImportError:  # without it temporary folders of killed processes are not 
     fcntl = None  # type: ignore[assignment]
 
 __all__ = [
+    "check_kind",
     "check_name",
+    "check_not_special",
     "check_writable",
     "make_folder",
     "move_into_place",
@@ -143,16 +145,36 @@ def check_name(path: Path) -> None:
         raise OSError(f"cannot write {path.name[:40]}...: its name has {size} bytes, at most {longest} are possible")
 
 
-def _check_file_target(path: Path, *, parent_exists: bool = True) -> None:
-    if path.is_dir():
+def check_not_special(path: str | os.PathLike[str]) -> None:
+    """Raise an ``OSError`` if a path exists and is neither a regular file nor a folder: it would be replaced by one.
+
+    Example:
+        >>> check_not_special(os.devnull)
+        Traceback (most recent call last):
+        ...
+        FileExistsError: cannot write /dev/null: it is a device, pipe or socket; choose another name
+    """
+    if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
+        raise FileExistsError(f"cannot write {os.fspath(path)}: it is a device, pipe or socket; choose another name")
+
+
+def check_kind(path: Path, *, folder: bool = False) -> None:
+    """Raise an ``OSError`` if something exists at ``path`` that a file, or a folder, must not replace."""
+    check_not_special(path)
+    if folder and path.exists() and not path.is_dir():
+        raise NotADirectoryError(f"cannot write folder {path}: a file of that name exists")
+    if not folder and path.is_dir():
         raise IsADirectoryError(f"cannot write {path}: it is a folder")
+
+
+def _check_file_target(path: Path, *, parent_exists: bool = True) -> None:
+    check_kind(path)
     if parent_exists and not path.absolute().parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: folder {path.absolute().parent} does not exist")
 
 
 def _check_folder_target(path: Path) -> None:
-    if path.exists() and not path.is_dir():
-        raise NotADirectoryError(f"cannot write folder {path}: a file of that name exists")
+    check_kind(path, folder=True)
     if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
         raise PermissionError(f"cannot write into folder {path}: it is not writable")
 
@@ -236,6 +258,8 @@ def move_into_place(
     file or tree is replaced, an existing folder keeps its other files; ``kind`` and ``companions`` are those of
     ``StackFormat``.
     """
+    for name in (target, *(target.with_name(target.name + ending) for ending in companions)):
+        check_not_special(name)
     for ending in companions:
         companion = part.with_name(part.name + ending)
         if companion.exists():

@@ -5,6 +5,8 @@ from collections.abc import Iterable, Iterator
 from itertools import combinations
 from pathlib import Path
 
+from rsvib_torch.core.atomic import check_not_special
+
 __all__ = ["check_outputs"]
 
 _Path = str | os.PathLike[str]
@@ -58,7 +60,7 @@ def _conflict(output: _Path, source: _Path) -> str | None:
 
 
 def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: _Path | None = None) -> None:
-    """Raise a ``ValueError`` if an output would replace or change an input, or another output.
+    """Raise an error if an output would replace or change an input, another output, or a device.
 
     An output must not be an input under any name (another path, a link, a hard link), lie inside an input folder, or
     contain an input.
@@ -68,6 +70,10 @@ def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: 
         inputs: Files and folders that are read.
         folder: Folder of the outputs, which may contain an input file, but not an input folder.
 
+    Raises:
+        ValueError: If an output is, contains or lies in an input, or two outputs are the same.
+        OSError: If an output exists and is neither a regular file nor a folder.
+
     Example:
         >>> check_outputs(["restored.tif"], ["frames.tif"])
         >>> check_outputs(["frames.tif"], ["frames.tif"])
@@ -76,6 +82,8 @@ def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: 
         ValueError: cannot write frames.tif: it is the same file as the input frames.tif; choose another name
     """
     outputs, inputs = list(outputs), list(inputs)
+    for output in outputs:
+        check_not_special(output)
     for source in inputs:
         for output in outputs:
             reason = _conflict(output, source)

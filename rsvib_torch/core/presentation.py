@@ -231,6 +231,9 @@ class Result(Summarised):
     def __post_init__(self) -> None:
         check_fields(self)
         check_shapes(vars(self), self.shapes)
+        reliable = getattr(self, "reliable", None)
+        if isinstance(reliable, Tensor) and reliable.dtype != torch.bool:
+            raise TypeError(f"reliable must be a tensor of booleans, got {reliable.dtype}")
         for name in self.units:  # quantities with a unit
             value = getattr(self, name, None)
             if isinstance(value, Tensor) and not value.is_floating_point():

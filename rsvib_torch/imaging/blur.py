@@ -87,9 +87,13 @@ def blur_rows_adjoint(
     Returns:
         Tensor of shape ``scene_shape``.
     """
+    if len(scene_shape) < 2:
+        raise ValueError(f"scene_shape must have at least 2 sizes (..., height, width), got {len(scene_shape)}")
     size = (scene_shape[-2], scene_shape[-1])
     width, origin = _frame_size(psf, size, frames.shape[-1], origin)
     weights = psf.weights.to(frames.dtype)
+    if frames.shape[-2] != weights.shape[-3]:
+        raise ValueError(f"frames must have the {weights.shape[-3]} rows of the kernels, got {frames.shape[-2]}")
     lead = torch.broadcast_shapes(frames.shape[:-2], weights.shape[:-3])
     flat = frames.new_zeros(*lead, math.prod(size))
     num_rows, kernel_height, kernel_width = weights.shape[-3:]

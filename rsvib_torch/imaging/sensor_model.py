@@ -63,12 +63,13 @@ class Optics:
             raise TypeError("scene must be a floating-point tensor (..., H, W)")
         check_shapes({"scene": scene}, {"scene": "... H W"})
         height, width = scene.shape[-2:]
-        mirrored = torch.cat([scene, scene.flip(-1)], dim=-1)
+        wide = scene.to(torch.promote_types(scene.dtype, torch.float32))  # there is no FFT of 16 bits on the CPU
+        mirrored = torch.cat([wide, wide.flip(-1)], dim=-1)
         mirrored = torch.cat([mirrored, mirrored.flip(-2)], dim=-2)
-        u = torch.fft.rfftfreq(2 * width, dtype=scene.dtype, device=scene.device)
-        v = torch.fft.fftfreq(2 * height, dtype=scene.dtype, device=scene.device)[:, None]
+        u = torch.fft.rfftfreq(2 * width, dtype=wide.dtype, device=scene.device)
+        v = torch.fft.fftfreq(2 * height, dtype=wide.dtype, device=scene.device)[:, None]
         image: Tensor = torch.fft.irfft2(torch.fft.rfft2(mirrored) * self.transfer(u, v), s=(2 * height, 2 * width))
-        return image[..., :height, :width].contiguous()
+        return image[..., :height, :width].to(scene.dtype).contiguous()
 
 
 @dataclass(frozen=True)

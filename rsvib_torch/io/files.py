@@ -14,7 +14,9 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import (
+    check_kind,
     check_name,
+    check_not_special,
     check_writable,
     make_folder,
     move_into_place,
@@ -308,6 +310,7 @@ def check_info_target(
         check_folder: Whether to check that the folder exists and is writable.
     """
     check_name(path)
+    check_not_special(path)
     form = target_format(path)
     if not form.writable:
         raise ValueError(
@@ -327,8 +330,8 @@ def check_info_target(
         raise FileExistsError(f"cannot write {path}: it exists and is not a {form.name} stack; choose another name")
     if check_folder:
         check_writable(path, folder=form.kind != "file")
-    elif form.kind == "file" and path.is_dir():
-        raise IsADirectoryError(f"cannot write {path}: it is a folder")
+    else:
+        check_kind(path, folder=form.kind != "file")
     return form
 
 

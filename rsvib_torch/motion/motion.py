@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_broadcast, checks_arguments
+from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.motion.timing import SensorTiming
 
@@ -99,6 +100,7 @@ class Motion(Result, ABC):
         """Number of components of the displacement."""
         return self.largest_oscillation().shape[-1]
 
+    @checks_arguments
     def path(self, starts: Tensor, delays: Tensor) -> Tensor:
         """Displacement during exposures in px.
 
@@ -189,6 +191,7 @@ class Motion(Result, ABC):
     @checks_arguments
     def expanded(self, size: int) -> Self:
         """A batch of ``size`` copies of the motion; the new dimension is the first."""
+        check_whole_number("size", size, at_least=1)
         return self.mapped(lambda values: values.expand(size, *values.shape))
 
     @checks_arguments

@@ -127,6 +127,11 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         from scipy.interpolate import CubicSpline  # noqa: PLC0415
 
         grid, values = as_numbers("times", times).cpu(), as_numbers("displacement", displacement).cpu()
+        for name, given in (("times", grid), ("displacement", values)):
+            if given.requires_grad:
+                raise ValueError(
+                    f"from_samples has no gradient: pass {name}.detach(), or evenly spaced times to through"
+                )
         _check_samples(grid, values)
         steps = np.diff(grid.numpy())
         if (steps <= 0).any():
@@ -141,6 +146,8 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
     @checks_arguments
     def stacked(cls, motions: Sequence["FreeMotion"]) -> "FreeMotion":
         """Motions with the same knots and number of tones as a batch; the new dimension is the first."""
+        if len(motions) == 0:
+            raise ValueError("motions must contain at least one motion")
         first = motions[0]
         knots = {(m.start, m.spacing, m.coefficients.shape) for m in motions}
         if len(knots) > 1:

@@ -377,9 +377,9 @@ class Sink:
             moved_there = self._open(self._path)
         places = [(writer, _digest_on_disk(writer, None)) for writer in (self._writer, moved_there)]
         self._head = places[0][1]
-        damaged, count = [], 0
+        damaged, entered = [], []
         for entry in entries:
-            count += 1
+            entered.append(entry["window"])
             for index, digest in enumerate(entry["digests"], start=entry["position"]):
                 held = (head == entry["head"] and _digest_on_disk(writer, index) == digest for writer, head in places)
                 if digest is None or not any(held):
@@ -388,10 +388,10 @@ class Sink:
         if moved_there is not None:
             moved_there.close()
         self._moved = complete and self._writer is None and not damaged
-        if not self._moved and (self._writer is None or len(damaged) == count):
+        if not self._moved and (self._writer is None or len(damaged) == len(entered)):
             self.close()
             self.begin()
-            return list(range(count)) if self._form.kind != "folder" else damaged
+            return entered if self._form.kind != "folder" else damaged
         return damaged
 
     def _open(self, path: Path) -> FrameWriter | None:

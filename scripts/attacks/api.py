@@ -25,7 +25,7 @@ from torch import Tensor
 
 import rsvib_torch as rsv
 
-__all__ = ["api_trials", "calls"]
+__all__ = ["calls", "trials"]
 
 SECONDS, MEMORY = 10.0, 2 << 30  # limits of one trial; bytes in addition to those of the valid calls
 _REFUSED = (ValueError, TypeError, OSError)
@@ -646,7 +646,7 @@ def items(known: Mapping[str, Call], count: int, seed: int) -> list[Item]:
     return (singles[:part] + pairs)[:count]
 
 
-def api_trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
+def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Trials of hostile calls, three quarters of them with one hostile argument."""
     torch.set_num_threads(1)
     chosen = items(calls(folder / "listed" / "valid"), count, seed)

@@ -26,7 +26,7 @@ from rsvib_torch.config import read_config
 from rsvib_torch.io import open_stack
 from rsvib_torch.report.results import read_vibration
 
-__all__ = ["ORIGINALS", "attempt", "damage", "mutated_trials", "write_originals"]
+__all__ = ["ORIGINALS", "attempt", "damage", "trials", "write_originals"]
 
 SECONDS, MEMORY = 10.0, 1 << 30  # limits of one trial
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
@@ -282,7 +282,7 @@ def attempt(folder: Path, item: Item | None) -> Trial:  # noqa: PLR0911 - one fo
     return Trial(_name(item), "completed")
 
 
-def mutated_trials(folder: Path, count: int, seed: int, run_every: int = 12) -> Iterator[Trial]:
+def trials(folder: Path, count: int, seed: int, run_every: int = 12) -> Iterator[Trial]:
     """Damaged files in turn; the program is run on every twelfth stack, the other files are read."""
     names = list(ORIGINALS)
     stacks = [name for name, original in ORIGINALS.items() if original.read is _read_stack]

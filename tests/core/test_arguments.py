@@ -57,6 +57,7 @@ def test_pixels_beyond_all_scales(value):
         (lambda: rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 1e300]), "frame_start_times must be at most"),
         (lambda: rsv.SensorTiming(1e-4, 6, 104, frame_start_times="abc"), "frame_start_times must be a number"),
         (lambda: rsv.SensorTiming(1e-4, 6, 104, scan_axis=torch.zeros(2)), "scan_axis must be -2"),
+        (lambda: rsv.FreeMotion.stacked([]), "motions must contain at least one motion"),
         (lambda: TIMING.row_starts(10**9, 10), "num_frames must be at most"),
         (lambda: TIMING.row_starts(2, 2**63), "num_rows must be at most"),
         (lambda: TIMING.frame_starts(2, "nowhere"), "device='nowhere' is not available"),
@@ -115,3 +116,44 @@ def test_helpers_return_the_values():
     check_shapes({"a": tensor, "b": torch.ones(5, 3), "c": None}, {"a": "2 N", "b": "... N", "c": "N"})
     with pytest.raises(ValueError, match=r"b must have shape \(\.\.\., N\) with N = 3, got \(4,\)"):
         check_shapes({"a": tensor, "b": torch.ones(4)}, {"a": "2 N", "b": "... N"})
+
+
+@pytest.mark.parametrize("motions", [torch.tensor(1.0), torch.zeros(0), np.zeros(3)])
+def test_arrays_are_no_sequences_of_objects(motions):
+    with pytest.raises(TypeError, match="motions must be a sequence, got"):
+        rsv.FreeMotion.stacked(motions)
+
+
+@pytest.mark.parametrize("starts", [None, "0.1", 0, TIMING, [None]])
+def test_path_of_starts_that_are_no_tensor(starts):
+    with pytest.raises(TypeError, match="starts must be a tensor"):
+        VIBRATION.path(starts, torch.zeros(2))
+
+
+@pytest.mark.parametrize(("name", "value"), [("misfit_after", torch.zeros(2)), ("reasons", ())])
+def test_verdicts_of_contradicting_sizes(name, value):
+    pair, axes = torch.ones(1), torch.ones(1, 2)
+    values = dict.fromkeys(("before", "after", "noise", "chi_square", "predicted_gain"), pair)
+    values |= dict.fromkeys(("misfit_before", "misfit_after", "resolution"), axes)
+    values |= {"outcome": ("unknown",), "reasons": ("no contrast",)}
+    assert "pair" in rsv.RestorationVerdict(**values).summary()
+    with pytest.raises(ValueError, match=f"{name} must have"):
+        rsv.RestorationVerdict(**values | {name: value})
+
+
+def test_knots_further_apart_than_the_stack_is_long():
+    with pytest.raises(ValueError, match="knot_rows must be at most"):
+        rsv.detect_motion(FRAMES, TIMING, knot_rows=10**9)
+
+
+def test_optics_of_frames_of_16_bits():
+    optics = rsv.Optics(0.5, 0.4, 1.0)
+    image = optics.apply(FRAMES.to(torch.bfloat16))
+    assert image.dtype == torch.bfloat16
+    torch.testing.assert_close(image.float(), optics.apply(FRAMES), atol=0.01, rtol=0)
+
+
+def test_samples_with_gradient_are_refused():
+    times = torch.linspace(0, 0.1, 11, dtype=torch.float64)
+    with pytest.raises(ValueError, match="from_samples has no gradient: pass displacement.detach()"):
+        rsv.FreeMotion.from_samples(times, torch.zeros(11, 2, requires_grad=True))

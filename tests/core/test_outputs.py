@@ -1,11 +1,16 @@
 """Outputs that are, contain or lie in an input are refused under every name."""
 
 import os
+import stat
 from pathlib import Path
 
 import pytest
+import torch
+from small_stack import TIMING, process_small, write_small
 
+import rsvib_torch as rsv
 from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.stacks.process import detect_stack
 
 
 @pytest.fixture(name="place")
@@ -75,3 +80,28 @@ def test_outputs_must_differ(place):
     for one, other in (("new.tif", "pngs/../new.tif"), ("frames.tif", "hard.tif"), ("out.zarr", "out.zarr/a.json")):
         with pytest.raises(ValueError, match=r"cannot write .* and .*; choose two names"):
             check_outputs([one, other], [])
+
+
+@pytest.mark.parametrize("name", ["out.tif", "out.zarr", "out", "out.raw"])
+@pytest.mark.parametrize("linked", [False, True])
+def test_pipes_are_not_replaced(tmp_path, name, linked):
+    """A device or pipe in the place of an output stays as it is, and nothing is added to its folder."""
+    source, pipe, output = tmp_path / "frames.tif", tmp_path / "pipe", tmp_path / "place" / name
+    write_small(source)
+    output.parent.mkdir()
+    os.mkfifo(pipe)
+    output.symlink_to(pipe) if linked else os.mkfifo(output)
+    for write in (
+        lambda: process_small(source, output),
+        lambda: process_small(source, output, resume=True),
+        lambda: process_small(source, tmp_path / "new.tif", manifest=output),
+        lambda: rsv.write_stack(output, torch.rand(2, 8, 8)),
+        lambda: detect_stack(source, output, TIMING, full_scale=4095),
+    ):
+        with pytest.raises(OSError, match="device, pipe or socket; choose another name") as raised:
+            write()
+        assert "\n" not in str(raised.value)
+    assert os.listdir(output.parent) == [name]
+    assert output.is_symlink() == linked
+    assert stat.S_ISFIFO(output.stat().st_mode)
+    assert not (tmp_path / "new.tif").exists()

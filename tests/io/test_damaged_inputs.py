@@ -5,8 +5,8 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from attacks.api import api_trials
-from attacks.mutated import CONFIG, ORIGINALS, damage, mutated_trials, write_originals
+from attacks import api, mutated
+from attacks.mutated import CONFIG, ORIGINALS, damage, write_originals
 from attacks.trial import FAILURES
 from small_stack import process_small
 
@@ -19,7 +19,7 @@ from rsvib_torch.io import read_stack_info
     [(144, 0, 1000), pytest.param(2400, 1, 12, marks=pytest.mark.slow)],
 )
 def test_damaged_files_are_read_or_refused_with_a_one_line_error(tmp_path, count, seed, run_every):
-    trials = list(mutated_trials(tmp_path, count, seed, run_every))
+    trials = list(mutated.trials(tmp_path, count, seed, run_every))
     assert [trial for trial in trials if trial.outcome in FAILURES] == []
     outcomes = Counter(trial.outcome for trial in trials)
     assert outcomes.total() == count
@@ -29,7 +29,7 @@ def test_damaged_files_are_read_or_refused_with_a_one_line_error(tmp_path, count
 
 @pytest.mark.slow
 def test_functions_refuse_hostile_arguments(tmp_path):
-    trials = list(api_trials(tmp_path, 4000, 5))
+    trials = list(api.trials(tmp_path, 4000, 5))
     assert [trial for trial in trials if trial.outcome in FAILURES] == []
     assert Counter(trial.outcome for trial in trials)["completed"] > 100
 

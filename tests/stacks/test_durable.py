@@ -260,3 +260,13 @@ def test_run_that_stopped_after_its_output_was_moved_is_completed(whole, interru
                 process_small(whole / "frames.tif", tmp_path / name, resume=True)
         assert content(tmp_path / name) == whole_output(whole, name)
         assert resume(whole, tmp_path, name) == WINDOWS
+
+
+def test_windows_are_computed_again_where_the_first_ones_and_the_output_are_missing(whole, interrupted, tmp_path):
+    """The windows that are entered are not the first ones if damaged windows were computed again before."""
+    work = interrupted("out.tif", tmp_path)
+    lines = (work / "journal.jsonl").read_bytes().splitlines(keepends=True)
+    (work / "journal.jsonl").write_bytes(b"".join(lines[1:]))
+    (work / "out.tif").unlink()
+    process_small(whole / "frames.tif", tmp_path / "out.tif", resume=True)
+    assert content(tmp_path / "out.tif") == whole_output(whole, "out.tif")

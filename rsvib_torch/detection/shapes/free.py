@@ -210,6 +210,9 @@ def _detect(
 ) -> MotionDetection:
     """``detect_motion`` of one stack."""
     rowwise, curve, record = start_curve(stack, timing, bands)
+    longest = math.floor((record[1] - record[0]) / rowwise.row_time)
+    if knot_rows > longest:
+        raise ValueError(f"knot_rows must be at most {longest}, the row times of the stack, got {knot_rows}")
     measured, motion, spacing = measure_freely(stack, rowwise, curve, record, bands, knot_rows, iterations)
     size = (stack.images.shape[-2], stack.images.shape[-1])
     residual = residual_of_motion(measured, motion[0])

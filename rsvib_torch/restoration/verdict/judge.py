@@ -71,7 +71,10 @@ class RestorationWarning(UserWarning):
 class RestorationVerdict(
     Result,
     units={"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"},
-    shapes={"misfit_before": "... 2", "misfit_after": "... 2", "resolution": "... 2"},
+    shapes={
+        **dict.fromkeys(("before", "after", "noise", "chi_square", "predicted_gain"), "P"),
+        **dict.fromkeys(("misfit_before", "misfit_after", "resolution"), "P 2"),
+    },
 ):
     """Verdict on a restoration from P pairs of frames of one scene.
 
@@ -116,6 +119,12 @@ class RestorationVerdict(
     predicted_gain: Tensor
     outcome: tuple[Outcome, ...]
     reasons: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("outcome", "reasons"):
+            if len(getattr(self, name)) != len(self.before):
+                raise ValueError(f"{name} must have {len(self.before)} entries, one for each pair of frames")
 
     @property
     def helped(self) -> Tensor:
@@ -254,14 +263,14 @@ def _judge_pair(pair: FramePair, moves: list[bool], shared: int, *, max_missing:
     if missing > max_missing:
         outcome, why = "unknown", f"{100 * missing:.0f} % of the pixels are missing"
     return RestorationVerdict(
-        before=_mean_square(pair.later - pair.earlier).sqrt(),
-        after=after.sqrt(),
-        misfit_before=misfit_before,
-        misfit_after=misfit_after,
-        resolution=resolution,
-        noise=noise.sqrt(),
-        chi_square=unexplained / noise,
-        predicted_gain=gain,
+        before=_mean_square(pair.later - pair.earlier).sqrt()[None],
+        after=after.sqrt()[None],
+        misfit_before=misfit_before[None],
+        misfit_after=misfit_after[None],
+        resolution=resolution[None],
+        noise=noise.sqrt()[None],
+        chi_square=(unexplained / noise)[None],
+        predicted_gain=gain[None],
         outcome=(outcome,),
         reasons=(why,),
     )
@@ -298,7 +307,7 @@ def judge_frames(
         verdicts.append(_judge_pair(shared_part(raw, restored, motion, frames, columns, hidden), moves, shared))
         advance()
     joined = {
-        field.name: torch.stack([getattr(verdict, field.name) for verdict in verdicts])
+        field.name: torch.cat([getattr(verdict, field.name) for verdict in verdicts])
         for field in fields(RestorationVerdict)
         if field.name not in ("outcome", "reasons")
     }
