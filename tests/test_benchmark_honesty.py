@@ -139,7 +139,9 @@ def test_outcomes_of_an_axis_follow_the_criteria():
     taken = recording("plain", 0, 128)
     true = [torch.tensor(np.stack([tones[:, i] for tones in taken.case.tones])) for i in range(3)]
     found = rsv.detect_vibration(torch.from_numpy(taken.frames).float(), taken.timing)
-    std = replace(found.std, **{name: torch.full_like(true[0], 1e-4) for name in ("amplitude", "frequency", "period", "phase")})
+    std = replace(
+        found.std, **{name: torch.full_like(true[0], 1e-4) for name in ("amplitude", "frequency", "period", "phase")}
+    )
 
     def outcome(vibration, *reliable):
         claimed = replace(found, vibration=vibration, std=std, reliable=torch.tensor(reliable))
