@@ -372,7 +372,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         "blink": frames_in_turn(report, index, removed),
         "details": [] if after is None else _details(before, after, names),
         "offsets": offsets,
-        "tones_head": words.TONE_HEAD,
+        "tones_head": words.detected_tones_head(result),
         "tones": words.detected_tones(result),
         "tone_figures": tone_figures,
         "windows": windows,

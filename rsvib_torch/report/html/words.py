@@ -15,11 +15,11 @@ from rsvib_torch.restoration import RestorationVerdict
 
 __all__ = [
     "TERMS",
-    "TONE_HEAD",
     "Mark",
     "about_rows",
     "camera_rows",
     "detected_tones",
+    "detected_tones_head",
     "mark_of",
     "tried_sentences",
     "verdict_sentences",
@@ -27,7 +27,6 @@ __all__ = [
 
 Mark = Literal["good", "doubt", "bad"]
 _QUANTITIES = ("amplitude", "frequency", "period", "phase")
-TONE_HEAD = ("axis", *tone_head(_QUANTITIES), "offset gain", "verdict")
 # Terms that the page explains, in the order of its list; a head or first cell of a table with this text, up to a
 # parenthesis, has the explanation as a tooltip.
 TERMS = {
@@ -205,8 +204,13 @@ def _sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
+def detected_tones_head(result: DetectionResult) -> tuple[str, ...]:
+    """Heads of the columns of the table of tones."""
+    return ("axis", *tone_head(_QUANTITIES, result.vibration.num_axes), "offset gain", "verdict")
+
+
 def detected_tones(result: DetectionResult) -> list[list[str]]:
-    """Lines of the table of tones, in the order of ``TONE_HEAD``."""
+    """Lines of the table of tones, in the order of ``detected_tones_head``."""
     return [
         [*cells, f"{float(result.gain[at]):+.2f}", "reliable" if bool(result.reliable[at[0]]) else "not reliable"]
         for at, cells in tone_rows(result.vibration, result.std, _QUANTITIES)
