@@ -9,6 +9,7 @@ import copy
 import dataclasses
 import inspect
 import math
+import os
 import random
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -582,6 +583,7 @@ def _name(item: Item) -> str:
 
 def attempt(folder: Path, item: Item | None) -> Trial:  # noqa: PLR0911 - one for each outcome
     """One call with hostile arguments."""
+    os.chdir(folder)  # hostile relative paths must not reach the working directory of the program
     known = calls(folder / "valid")
     if item is None:
         return Trial("", "completed")
