@@ -154,5 +154,5 @@ def test_optics_of_frames_of_16_bits():
 
 def test_samples_with_gradient_are_refused():
     times = torch.linspace(0, 0.1, 11, dtype=torch.float64)
-    with pytest.raises(ValueError, match="from_samples has no gradient: pass displacement.detach()"):
+    with pytest.raises(ValueError, match=r"from_samples has no gradient: pass displacement.detach\(\)"):
         rsv.FreeMotion.from_samples(times, torch.zeros(11, 2, requires_grad=True))
