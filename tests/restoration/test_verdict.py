@@ -326,7 +326,7 @@ def test_dtypes_and_detections_of_restore_are_accepted(scene):
     ("change", "error", "message"),
     [
         ({"most_pairs": 0}, ValueError, "most_pairs must be at least 1, got 0"),
-        ({"most_pairs": 1.5}, TypeError, "most_pairs must be a whole number, got 1.5"),
+        ({"most_pairs": 1.5}, TypeError, "most_pairs must be a whole number or None, got 1.5"),
         ({"joint": 2.7}, TypeError, "joint must be a whole number, got 2.7"),
         ({"joint": "all"}, TypeError, "joint must be a whole number, got 'all'"),
         ({"vibration": 3.0}, TypeError, "vibration must be a Vibration or a detection, got float"),
