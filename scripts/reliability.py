@@ -45,9 +45,9 @@ class Attack:
 # ``count`` trials with files in ``folder`` and yields their results; what is drawn at random depends on ``seed`` only.
 # Modules are imported when they are used: child processes of the attacks on storage import this file for every trial.
 ATTACKS: dict[str, Attack] = {
-    "kills": Attack("runs killed and resumed", 270),
+    "kills": Attack("runs killed and resumed", 207),
     "power_losses": Attack("power losses, resumed", 450),
-    "damaged_parts": Attack("damaged parts of interrupted runs, resumed", 126),
+    "damaged_parts": Attack("damaged parts of interrupted runs, resumed", 63),
     "journals": Attack("damaged journals", 250),
     "links": Attack("links and foreign files as work folders", 110),
     "inputs": Attack("outputs that are or contain inputs", 250),

@@ -143,7 +143,7 @@ def test_verdicts_of_contradicting_sizes(name, value):
 
 def test_knots_further_apart_than_the_stack_is_long():
     with pytest.raises(ValueError, match="knot_rows must be at most"):
-        rsv.detect_motion(FRAMES, TIMING, knot_rows=10**9)
+        rsv.detect_motion(FRAMES, TIMING, knot_rows=10**9, band_rows=16, band_step=8, search=6)
 
 
 def test_optics_of_frames_of_16_bits():
