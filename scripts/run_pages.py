@@ -115,7 +115,8 @@ def pictures(page: str) -> list[str]:
 def run_notebook(notebook: Path) -> nbformat.NotebookNode:
     """Execute a notebook; returns it with its outputs."""
     cells = nbformat.read(notebook, as_version=4)
-    return nbclient.NotebookClient(cells, timeout=300, record_timing=False).execute()
+    environment = os.environ | {"COLUMNS": "100"}  # the width of printed results
+    return nbclient.NotebookClient(cells, timeout=300, record_timing=False).execute(env=environment)
 
 
 def notebook_text(cells: nbformat.NotebookNode) -> str:
