@@ -77,9 +77,11 @@ def _grid(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Tensor, 
     starts = measurements.exposure_starts
     duration = (starts.amax((1, 2)) - starts.amin((1, 2)))[:, None]
     tones = torch.where(fit.active, fit.frequencies, 0.0)[:, axis]  # (B, K)
-    count = math.ceil(float(((tones + _REACH / duration) * duration).amax() * _POINTS))
-    frequencies = torch.arange(1, count + 1, dtype=torch.float64, device=starts.device) / (_POINTS * duration)
     centres = torch.cat([torch.zeros_like(tones[:, :1]), tones], 1)
+    # only places near a tone: fits of frames with a wrong timing may have frequencies of any size
+    reach = torch.arange(-_REACH * _POINTS - 1, _REACH * _POINTS + 2, dtype=torch.float64, device=starts.device)
+    places = ((centres * duration * _POINTS).round()[..., None] + reach).unique()
+    frequencies = places[places >= 1] / (_POINTS * duration)
     near = ((frequencies[..., None] - centres[:, None]).abs() * duration[..., None] <= _REACH).any(-1)
     used = near.any(0)
     return frequencies[:, used], near[:, used]
