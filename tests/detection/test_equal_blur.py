@@ -63,3 +63,13 @@ def test_frames_with_equal_blur_are_only_warped(paper_camera, pairs):
     frames, _ = pairs
     spectra, positions, warp = prepared(frames, paper_camera)
     torch.testing.assert_close(warp(slice(None)), spectra.warped(positions.rows, positions.shift))
+
+
+def test_rows_far_outside_the_frames_do_not_lengthen_the_record():
+    """A fit of frames with a wrong timing may displace them by any distance; the frequency grid must stay bounded."""
+    camera = SensorTiming(row_time=1e-4, exposure_rows=10, frame_rows=80).in_row_order()
+    frames = torch.rand(1, 2, 64, 96, generator=torch.Generator().manual_seed(0))
+    far = Vibration([0.0, 1e4], [1.0, 0.5], 1.5).expanded(1)
+    measured, _ = measure_groups(frame_groups(stack_spectra(frames, None), camera, far), camera, far)
+    assert float(measured.duration) <= 3 * 64 * camera.row_time
+    assert not bool(measured.visible.any())

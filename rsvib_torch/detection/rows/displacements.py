@@ -202,6 +202,10 @@ def measure_group(
     residual = torch.linalg.solve(regular[:, None], gradient[..., None])[..., 0]
     residual = torch.where(measured[:, None, :, None], residual, 0.0)
     exposure_starts = _in_blocks(positions.exposure_starts).mean(3)
+    # a fit of frames with a wrong timing may place rows at any distance; they are invisible, but their times would make
+    # the record, and with it the frequency grid, as long (18 GB)
+    first, height_time = group.starts[..., None], group.spectra.height * timing.row_time
+    exposure_starts = exposure_starts.clamp(first - height_time, first + 2 * height_time)
     around = motion.mean_displacement(exposure_starts, timing.exposure_time)
     measurements = Measurements(
         exposure_starts=exposure_starts.transpose(1, 2),
