@@ -4,7 +4,7 @@ import pytest
 import torch
 from truth import Motion, draw_scene, take_frames
 
-from rsvib_torch import Vibration
+from rsvib_torch import SensorTiming, Vibration
 from rsvib_torch.detection.rows import displacements
 from rsvib_torch.detection.rows.displacements import FrameGroup, frame_groups, measure_groups, stack_spectra
 from rsvib_torch.registration.row_spectra import RowSpectra
