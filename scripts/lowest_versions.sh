@@ -11,6 +11,7 @@ uv venv --quiet "$folder/venv"
 uv pip install --quiet --python "$folder/venv/bin/python" --resolution lowest-direct '.[formats,distributed,video]' \
   'pytest>=8.3' 'hypothesis>=6.100' 'scikit-image>=0.25'
 export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive}
+export PYTHONWARNINGS=ignore::DeprecationWarning # of the programs that tests start
 # old packages use names that newer ones of their dependencies deprecate
 "$folder/venv/bin/python" -m pytest -W ignore::DeprecationWarning -W ignore::PendingDeprecationWarning -m "$marker" \
   tests/test_config.py tests/test_start.py tests/commands tests/io tests/report tests/registration tests/augmentation \
