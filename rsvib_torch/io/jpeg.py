@@ -1,5 +1,6 @@
 """Frames in JPEG files, which can only be read."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,9 @@ def _open(path: Path) -> Image.Image:
     with path.open("rb"):
         pass  # a file that cannot be opened is an OSError
     try:
-        image = Image.open(path, formats=("JPEG",))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the memory is checked before reading
+            image = Image.open(path, formats=("JPEG",))
     except (OSError, ValueError, Image.DecompressionBombError) as error:
         raise ValueError(f"{path}: not a JPEG file") from error
     if image.mode not in ("L", "RGB"):

@@ -155,6 +155,10 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
             rsv.calibrate_row_time_by_exposure,
             {"frames": stripes, "exposure_times": [1e-3, 2.5e-4], "scan_axis": "y", "gamma": 1.0, "full_scale": None},
         ),
+        "calibrate_row_time_by_motion": Call(
+            rsv.calibrate_row_time_by_motion,
+            {"frames": frames, "frame_rate": 30.0, "row_time": (5e-5, 2e-4), "scan_axis": "y", "full_scale": None},
+        ),
         "check_motion": Call(rsv.check_motion, {"frames": frames, "timing": timing, "motion": recorded, **bands}),
         "comparison_figure": Call(
             rsv.comparison_figure,
@@ -583,6 +587,7 @@ def _name(item: Item) -> str:
 
 def attempt(folder: Path, item: Item | None) -> Trial:  # noqa: PLR0911 - one for each outcome
     """One call with hostile arguments."""
+    folder.mkdir(parents=True, exist_ok=True)
     os.chdir(folder)  # hostile relative paths must not reach the working directory of the program
     known = calls(folder / "valid")
     if item is None:
