@@ -137,7 +137,7 @@ def _form_frames(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motio
     """``_form_rows``, in strips of columns if the motion has roll or zoom.
 
     Strips of 16 px differ in their displacement by 0.03 px for a roll of 2 mrad; the linear interpolation between them
-    is then accurate to 1e-4 of full scale.
+    has then errors of up to 2e-4 of full scale (rms).
     """
     if motion.num_axes == 2:
         return _form_rows(scene, starts, timing, motion, width)
