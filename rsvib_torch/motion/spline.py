@@ -21,6 +21,7 @@ from rsvib_torch.motion.vibration import TensorLike, Vibration
 __all__ = ["FreeMotion"]
 
 MAX_DISPLACEMENT = 1e9  # px; image motion of 1e5 px/s for three hours
+MAX_KNOTS = 100_000_000  # 1.6 GB of coefficients; a gyroscope with 8 kHz for three hours
 MAX_EXPOSURE_NODES = 10_000  # times; an exposure of 1 s of a gyroscope with 5 kHz
 
 
@@ -138,6 +139,8 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
             raise ValueError("times must be strictly increasing")
         step = 0.5 * float(np.median(steps)) if spacing is None else check_number("spacing", spacing, above=0.0)
         first, last = float(grid[0]), float(grid[-1])
+        if (last - first) / step > MAX_KNOTS:
+            raise ValueError(f"spacing must give at most {MAX_KNOTS:,} knots, got {step:g} s for {last - first:g} s")
         even = np.linspace(first, last, max(4, math.ceil((last - first) / step) + 1))
         interpolated = CubicSpline(grid.numpy(), values.numpy())(even)
         return cls.through(torch.from_numpy(even), torch.from_numpy(interpolated), tones)

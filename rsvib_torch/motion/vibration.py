@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.arguments import as_numbers, check_broadcast, checks_arguments
+from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.motion.motion import Motion
@@ -31,6 +32,7 @@ _QUANTITIES = ("amplitude", "frequency", "phase")
 
 # Largest values: beyond the largest image, the fastest row, and what float64 angles and positions resolve.
 _LIMITS = {"amplitude": 1e6, "frequency": 1e9, "phase": 1e9, "image_motion": 1e9, "image_acceleration": 1e12}
+_MAX_BLIND = 10_000_000  # blind frequencies; 80 MB
 
 TensorLike = Tensor | NDArray[Any] | float | Sequence[float] | Sequence[Sequence[float]]
 
@@ -470,6 +472,8 @@ def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
     """
     starts = timing.frame_starts(len(timing.frame_start_times) if timing.frame_start_times else 2)
     intervals = starts[1:] - starts[0]
+    longest = max([timing.exposure_time, *intervals[:1].tolist()])
+    check_number("highest", highest, at_least=0.0, at_most=_MAX_BLIND / longest)
 
     def multiples(interval: float) -> Tensor:
         return torch.arange(1, math.floor(highest * interval) + 1, dtype=torch.float64, device="cpu") / interval

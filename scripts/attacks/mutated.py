@@ -236,7 +236,7 @@ def _run(folder: Path, target: Path) -> str | None:
         code = run_command(["run", str(target), str(out), "--config", str(folder / "good.toml"), "--workers", "1"])
     shown = errors.getvalue()
     lines = [line for line in shown.splitlines() if not line.startswith("rsvib: warning: ")]
-    if code not in (0, 2) or "unexpected" in shown or "Traceback" in shown:
+    if code not in (0, 2) or "error: unexpected " in shown or "Traceback" in shown:
         return f"exit code {code}: {shown[-300:]}"
     if code == 2 and (len(lines) != 1 or out.exists()):
         return f"{len(lines)} lines of errors, results {'exist' if out.exists() else 'do not exist'}: {shown[:300]}"

@@ -84,7 +84,7 @@ class MtfCurve(
         """MTF50, MTF at the Nyquist frequency, the edge, and the noise."""
         nyquist = int((self.frequency - 0.5).abs().argmin())
         edge = "vertical" if self.near_vertical else "horizontal"
-        contrast = float(self.levels[1] - self.levels[0])
+        contrast = float(self.levels[1]) - float(self.levels[0])
         return "\n".join(
             [
                 f"MTF50 {measured_text(self.mtf50, self.mtf50_std)} cycles/px",
