@@ -44,6 +44,7 @@ from .io import (
     timing_from_first_frame,
     write_stack,
 )
+from .motion.camera import Camera
 from .motion.recorded import read_motion
 from .motion.spline import FreeMotion
 from .motion.timing import SensorTiming
@@ -77,6 +78,7 @@ from .restoration import (
 from .stacks import StackReport, iterate_stack, process_stack, read_manifest, restore_block
 
 __all__ = [
+    "Camera",
     "ClockAlignment",
     "DetectionResult",
     "FreeMotion",

@@ -239,14 +239,20 @@ def stacked(results: list[DetectionResult]) -> DetectionResult:
         return joined([functional.pad(value, (0, tones - value.shape[-1])) for value in values])
 
     def parameters(parts: list[Any], kind: type[Any]) -> dict[str, Tensor]:
-        values = {field.name: [getattr(part, field.name) for part in parts] for field in fields(kind)}
+        values = {
+            field.name: [getattr(part, field.name) for part in parts]
+            for field in fields(kind)
+            if field.name != "camera"
+        }
         of_axes = ("image_motion", "image_acceleration", "displacement")  # the others have an entry for each tone
         return {name: joined(v) if name in of_axes else padded(v) for name, v in values.items()}
 
     curves = [result.offsets for result in results]
     batch = curves[0].offsets.shape[0]
     return DetectionResult(
-        vibration=Vibration(**parameters([result.vibration for result in results], Vibration)),
+        vibration=Vibration(
+            **parameters([result.vibration for result in results], Vibration), camera=results[0].vibration.camera
+        ),
         std=VibrationStd(**parameters([result.std for result in results], VibrationStd)),
         offsets=OffsetCurve(
             curves[0].pairs,

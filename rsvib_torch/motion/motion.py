@@ -11,6 +11,7 @@ from torch import Tensor
 from rsvib_torch.core.arguments import check_broadcast, checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import Result
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming
 
 __all__ = ["Motion"]
@@ -99,6 +100,36 @@ class Motion(Result, ABC):
     def num_axes(self) -> int:
         """Number of components of the displacement."""
         return self.largest_oscillation().shape[-1]
+
+    @property
+    def camera(self) -> Camera | None:
+        """Focal length and lens that the displacement follows; None for an infinite focal length."""
+        return None
+
+    @property
+    def same_for_all_columns(self) -> bool:
+        """Whether all columns of a row are displaced alike: no roll, no zoom, no finite focal length."""
+        return self.num_axes == 2 and self.camera is None
+
+    @checks_arguments
+    def attitude(self, times: Tensor) -> Tensor:
+        """Rotation of the camera in rad, see ``Camera``; times as in ``displacement``.
+
+        Returns:
+            (S, 3) float64: pitch, yaw and roll, right-handed about x (right), y (down) and z (forward).
+
+        Raises:
+            ValueError: If the motion has no camera.
+
+        Example:
+            >>> from rsvib_torch import Camera, Vibration
+            >>> motion = Vibration((2.0, 1.0), (50.0, 50.0), (1.5, 0.0), camera=Camera(focal_length=1000.0))
+            >>> motion.attitude(torch.tensor(0.005)).round(decimals=6).tolist()  # pitch and yaw in rad
+            [0.001, -0.000141, -0.0]
+        """
+        if self.camera is None:
+            raise ValueError("the attitude requires a motion with a camera: pass focal_length or camera=Camera(...)")
+        return self.camera.attitude(self.displacement(times))
 
     @checks_arguments
     def path(self, starts: Tensor, delays: Tensor) -> Tensor:

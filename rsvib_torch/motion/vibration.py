@@ -14,6 +14,7 @@ from rsvib_torch.core.arguments import as_numbers, check_broadcast, checks_argum
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows
 from rsvib_torch.core.text import measured_text, text_table
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 
@@ -113,6 +114,8 @@ class Vibration(Motion, units=_UNITS):
         image_motion: v in px/s at the time origin, ``(2,)`` or ``(..., 2)``; with roll and zoom also one value for
             each axis, in rad/s and 1/s.
         image_acceleration: a in px/s^2, same shape.
+        camera: Focal length and lens, for displacements that follow a rotation of the camera exactly; X and Y are then
+            those at the principal point.
 
     Raises:
         ValueError: If shapes do not fit, a value is not finite, or an amplitude or frequency is negative.
@@ -134,6 +137,7 @@ class Vibration(Motion, units=_UNITS):
     phase: Tensor
     image_motion: Tensor
     image_acceleration: Tensor
+    camera: Camera | None = None
 
     @checks_arguments
     def __init__(
@@ -143,6 +147,7 @@ class Vibration(Motion, units=_UNITS):
         phase: TensorLike = 0.0,
         image_motion: TensorLike = (0.0, 0.0),
         image_acceleration: TensorLike = (0.0, 0.0),
+        camera: Camera | None = None,
     ) -> None:
         given = (amplitude, frequency, phase, image_motion, image_acceleration)
         device = next((value.device for value in given if isinstance(value, Tensor)), None)
@@ -156,13 +161,14 @@ class Vibration(Motion, units=_UNITS):
         except RuntimeError as error:
             shapes = ", ".join(str(tuple(t.shape)) for t in (*tones, motion, acceleration))
             raise ValueError(f"amplitude, frequency, phase and image_motion do not fit together: {shapes}") from error
-        _check_values(dict(zip(Vibration.__dataclass_fields__, (*tones, motion, acceleration), strict=True)))
+        _check_values(dict(zip(_LIMITS, (*tones, motion, acceleration), strict=True)))
         tones = [tensor.expand(*batch, *tensor.shape[-2:]) for tensor in tones]
         order = tones[0].detach().argsort(dim=-1, descending=True, stable=True)
         for name, tensor in zip(("amplitude", "frequency", "phase"), tones, strict=True):
             object.__setattr__(self, name, tensor.take_along_dim(order, dim=-1))
         object.__setattr__(self, "image_motion", motion.expand(*batch, axes))
         object.__setattr__(self, "image_acceleration", acceleration.expand(*batch, axes))
+        object.__setattr__(self, "camera", camera)
 
     @classmethod
     @checks_arguments
@@ -326,6 +332,7 @@ class Vibration(Motion, units=_UNITS):
             torch.where(sign[:, None] < 0, opposite, phase),
             self.image_motion[..., axes] * sign,
             self.image_acceleration[..., axes] * sign,
+            None if self.camera is None else self.camera.with_axes(order, signs),
         )
 
 

@@ -93,7 +93,7 @@ def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows
 
 def _of_column(motion: Motion, column: Tensor, timing: RowTiming, num_frames: int, num_rows: int) -> Motion:
     """Displacement (B) of a column in px from the centre of the frame, by a motion (B) in row order."""
-    if motion.num_axes == 2:
+    if motion.same_for_all_columns:
         return motion
     return ColumnMotion.of_columns(motion, column[None], timing, num_frames, num_rows)
 
@@ -128,7 +128,7 @@ def visible_pixels(
     batch = vibration.batch_shape
     rowwise, row_timing = vibration.to_row_order(timing), timing.in_row_order()
     rowwise = rowwise if batch else rowwise.expanded(1)
-    strips = ColumnStrips.of(width, max_pitch=width if rowwise.num_axes == 2 else 16, margin=0)
+    strips = ColumnStrips.of(width, max_pitch=width if rowwise.same_for_all_columns else 16, margin=0)
     parts = []
     for first, last, column in zip(strips.edges[:-1], strips.edges[1:], strips.columns, strict=True):
         motion = frame_motion(
