@@ -81,8 +81,8 @@ class CameraRecord(Section):
     """Fields of ``Camera``, which checks their values."""
 
     focal_length: float
-    principal_point: tuple[float, float] = (0.0, 0.0)
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    principal_point: list[float] = Field(default_factory=lambda: [0.0] * 2, min_length=2, max_length=2)
+    distortion: list[float] = Field(default_factory=lambda: [0.0] * 5, min_length=5, max_length=5)
 
 
 class VibrationRecord(Section):
