@@ -57,6 +57,9 @@ class ToneSettings(TypedDict, total=False):
     columns: int | None
     roll: bool | Literal["auto"]
     zoom: bool | Literal["auto"]
+    focal_length: float | None
+    principal_point: tuple[float, float] | None
+    distortion: tuple[float, float, float, float, float] | None
 
 
 class DetectionSettings(BandSettings, ToneSettings, total=False):

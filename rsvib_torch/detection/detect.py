@@ -42,6 +42,7 @@ from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.io.files import FramesOrFiles, timing_of_files
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
@@ -164,7 +165,7 @@ def _fit_direct(
     fit = _fit_bands(start, frames, valid, timing, options, accuracy=0.15).fit
     intervals = compared_intervals(timing, frames.shape[1], MAX_GROUP_FRAMES, frames.device)
     motion, scale = shrunk_motion(fit, intervals), options.scale
-    if scale.axes == 2:
+    if scale.same_for_all_columns:
         rows = whole_rows(frames, valid, timing, motion)
     else:
         rows = strip_rows(frames, valid, timing, motion, scale)
@@ -226,6 +227,9 @@ def detect_vibration(
     channels: Channels = None,
     roll: bool | Literal["auto"] = False,
     zoom: bool | Literal["auto"] = False,
+    focal_length: float | None = None,
+    principal_point: tuple[float, float] | None = None,
+    distortion: tuple[float, float, float, float, float] | None = None,
 ) -> DetectionResult | MotionDetection | SweptTone:
     """Detect the vibration of the camera from consecutive frames (Sec. 2 of Liu et al. 2023).
 
@@ -266,6 +270,12 @@ def detect_vibration(
             ``"auto"``: if the halves of the rows move apart. Results then have three axes instead of two, see
             ``Vibration``.
         zoom: The same for the change of scale, as a fourth component; includes roll.
+        focal_length: Focal length in px, for a motion that is a rotation of the camera: displacements then follow from
+            the projection (see ``Camera``), which matters for fields of view above about 20 degrees, and the result
+            has an ``attitude``. None: the displacement by translation is the same in the whole frame.
+        principal_point: px along x and y from the centre of the first pixel, as in OpenCV; by default the centre of the
+            frame.
+        distortion: Lens distortion (k1, k2, p1, p2, k3) as in OpenCV; by default none.
 
     Returns:
         The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve: a
@@ -312,6 +322,11 @@ def detect_vibration(
             ("columns", columns, None),
             ("window", window, None),
             ("window_step", window_step, None),
+            ("roll", roll, False),
+            ("zoom", zoom, False),
+            ("focal_length", focal_length, None),
+            ("principal_point", principal_point, None),
+            ("distortion", distortion, None),
         )
         for name, value, default in tone_options:
             if value != default:
@@ -343,7 +358,14 @@ def detect_vibration(
         if value not in (True, False, "auto"):
             raise ValueError(f"{name} must be True, False or 'auto', got {value!r}")
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
-    field = _Field(roll, zoom, stacks.images.shape[-1], stacks.images.shape[-2])
+    height, width = stacks.images.shape[-2:]
+    camera = _camera(focal_length, principal_point, distortion, (height, width), timing)
+    if columns is not None and (camera is not None or roll is True or zoom is True):
+        raise ValueError(
+            f"columns={columns} goes with roll=False, zoom=False and focal_length=None: roll, zoom and perspective are "
+            "measured from all columns"
+        )
+    field = _Field(columns is None and roll, columns is None and zoom, width, height, camera)
     model_of_tones = MotionModel(harmonics, 2 if image_acceleration else 1)
     options = _FitOptions(None if tones == "auto" else tones, model_of_tones, bands, field.scale(2))
     if columns is not None:
@@ -369,6 +391,28 @@ def detect_vibration(
     return found if stacks.batched else found[0]
 
 
+def _camera(
+    focal_length: float | None,
+    principal_point: tuple[float, float] | None,
+    distortion: tuple[float, float, float, float, float] | None,
+    size: tuple[int, int],
+    timing: SensorTiming,
+) -> Camera | None:
+    """The camera of frames of ``size`` (rows, columns) in row order, from values in image axes."""
+    if focal_length is None:
+        for name, value in (("principal_point", principal_point), ("distortion", distortion)):
+            if value is not None:
+                raise ValueError(f"{name}={value!r} requires focal_length, in px")
+        return None
+    height, width = size if timing.scan_axis == -2 else size[::-1]
+    centre = (0.5 * (width - 1), 0.5 * (height - 1))
+    camera = Camera(focal_length, centre if principal_point is None else principal_point, distortion or (0.0,) * 5)
+    x, y = camera.principal_point
+    camera = replace(camera, principal_point=(x - centre[0], y - centre[1]))
+    camera.check_size(width, height)
+    return Vibration.still(axes=2).with_camera(camera).to_row_order(timing).camera
+
+
 def _windows(num_frames: int, window: int, step: int | None, timing: SensorTiming) -> list[tuple[slice, SensorTiming]]:
     """Windows of frames, the last one flush with the end, each with the start times of its frames."""
     check_whole_number("window", window, at_least=2)
@@ -388,16 +432,17 @@ def _windows(num_frames: int, window: int, step: int | None, timing: SensorTimin
 
 @dataclass(frozen=True)
 class _Field:
-    """Whether roll and zoom are measured (True, False or ``"auto"``), and the size of the frames."""
+    """Whether roll and zoom are measured (True, False or ``"auto"``), the size of the frames, and the camera."""
 
     roll: bool | Literal["auto"]
     zoom: bool | Literal["auto"]
     width: int
     height: int
+    camera: Camera | None
 
-    def scale(self, axes: int) -> FieldScale:
+    def scale(self, axes: int, camera: Camera | None = None) -> FieldScale:
         """Lengths for a motion of so many components."""
-        return FieldScale(axes, self.width, self.height)
+        return FieldScale(axes, self.width, self.height, camera)
 
     @property
     def most_axes(self) -> int:
@@ -421,14 +466,16 @@ def _detect_field(
     find_cause: bool = False,
 ) -> DetectionResult:
     """``_detect`` with as many components as were requested or, with ``"auto"``, as the frames require."""
-    cause: bool | Literal["unless rotating"] = "unless rotating" if find_cause and field.most_axes > 2 else find_cause
+    further = field.most_axes > 2 or field.camera is not None
+    cause: bool | Literal["unless rotating"] = "unless rotating" if find_cause and further else find_cause
     found, fit, rotates = _detect(frames, valid, timing, method, options, find_cause=cause)
-    if field.most_axes == 2 or (field.least_axes == 2 and not rotates):
+    if field.camera is None and (field.most_axes == 2 or (field.least_axes == 2 and not rotates)):
         return found
-    other, _, _ = _detect(frames, valid, timing, method, replace(options, scale=field.scale(field.most_axes)), fit)
+    scale = field.scale(field.most_axes, field.camera)
+    other, _, _ = _detect(frames, valid, timing, method, replace(options, scale=scale), fit)
     moving = (other.vibration.amplitude > 0).flatten(0, -3).any(0).any(-1).tolist()
     axes = max([field.least_axes, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
-    return found if axes == 2 else other.with_axes(axes)
+    return found if axes == 2 and field.camera is None else other.with_axes(axes)
 
 
 def _detect(
@@ -456,7 +503,7 @@ def _detect(
         A batch of results in image axes, their fit, and whether the halves of the rows of any stack move apart.
     """
     row_timing, bands, scale = timing.in_row_order(), options.bands, options.scale
-    if scale.axes == 2:
+    if scale.same_for_all_columns:
         start = band_start(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve)
     else:
         start = field_start(frames, valid, row_timing, bands, scale, translation)

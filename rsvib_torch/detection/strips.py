@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.field import displacement_factors
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration.row_spectra import MARGIN
@@ -33,11 +34,18 @@ class FieldScale:
         axes: Number of components of the motion, 2 to 4.
         width: Columns of a frame.
         height: Rows of a frame.
+        camera: Focal length and lens, in row order.
     """
 
     axes: int
     width: int
     height: int
+    camera: Camera | None = None
+
+    @property
+    def same_for_all_columns(self) -> bool:
+        """Whether the motion displaces all columns of a row alike."""
+        return self.axes == 2 and self.camera is None
 
     @property
     def radius(self) -> float:
@@ -57,6 +65,7 @@ class FieldScale:
             fitted.phase,
             fitted.image_motion * factor,
             fitted.image_acceleration * factor,
+            self.camera,
         )
 
     def std(self, fitted: VibrationStd) -> VibrationStd:
@@ -72,7 +81,7 @@ class FieldScale:
 
     def factors(self, x: Tensor, y: Tensor) -> Tensor:
         """Displacement (S, 2, A) at positions (S) in px from the centre by unit components in px."""
-        factors: Tensor = displacement_factors(x, y, self.axes) * self.units(x)
+        factors: Tensor = displacement_factors(x, y, self.axes, self.camera) * self.units(x)
         return factors
 
 

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Self
 
@@ -214,6 +215,12 @@ class Motion(Result, ABC):
             raise ValueError(f"order must be a permutation of {list(range(self.num_axes))}, got {list(order)}")
         if len(signs) != self.num_axes or any(sign not in (1, -1) for sign in signs):
             raise ValueError(f"signs must be {self.num_axes} values of 1 or -1, got {list(signs)}")
+
+    def with_camera(self, camera: Camera | None) -> Self:
+        """The same components with another camera."""
+        result = copy(self)
+        object.__setattr__(result, "camera", camera)
+        return result
 
     def detached(self) -> Self:
         """The same motion without gradients."""

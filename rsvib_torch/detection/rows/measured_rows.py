@@ -22,7 +22,7 @@ from rsvib_torch.detection.rows.displacements import (
     stack_spectra,
 )
 from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
-from rsvib_torch.motion.field import ColumnMotion
+from rsvib_torch.motion.field import ColumnMotion, largest_slope
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
@@ -104,6 +104,8 @@ def whole_rows(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: 
 
 # Strips
 
+_MAX_SLIDE_OF_BLUR = 0.15  # px
+
 
 @dataclass(frozen=True, eq=False)
 class StripRows(MeasuredRows):
@@ -113,11 +115,13 @@ class StripRows(MeasuredRows):
         scale: Components of the motion.
         columns: (S,) px from the centre of the frame, middles of the strips.
         num_frames: Frames of a stack.
+        slide: px, difference of the displacements of the middle of a strip and its ends.
     """
 
     scale: FieldScale
     columns: Tensor
     num_frames: int
+    slide: float
 
     def measure(self, motion: Vibration, gradients: list[RowGradients] | None = None) -> RowRecord:
         """Components of the motion of every row (B, N, G, A), from the displacements in the strips.
@@ -126,11 +130,16 @@ class StripRows(MeasuredRows):
         times. The displacements are converted to the mean time of the row by the motion.
         """
         record = super().measure(motion, gradients)
-        measured, factors = record.measurements, self._factors(motion, record.gradients)
+        measured, (middles, factors) = record.measurements, self._factors(motion, record.gradients)
         starts = measured.exposure_starts.unflatten(0, (-1, len(self.columns)))  # (B, S, N, G)
         mean = starts.mean(1, keepdim=True).expand_as(starts)
         components = (motion.mean_displacement(when, self.timing.exposure_time) for when in (mean, starts))
-        moved = torch.einsum("bsnia,bsnga->bsngi", factors, next(components) - next(components)).flatten(0, 1)
+        of_row, of_strips = components
+        moved = torch.einsum("bsnia,bsnga->bsngi", factors, of_row - of_strips).flatten(0, 1)
+        if self.scale.camera is not None:  # the displacement is not linear in the components
+            linear = torch.einsum("bsnia,bsnga->bsngi", middles, of_strips).flatten(0, 1)
+            exact = self.view(motion).mean_displacement(starts.flatten(0, 1), self.timing.exposure_time)
+            moved = moved + linear - exact
         measured = replace(measured, displacements=measured.displacements + measured.relative(moved))
         measurements, apart = combined_strips(measured, factors)
         return RowRecord(measurements, record.gradients, apart)
@@ -140,8 +149,8 @@ class StripRows(MeasuredRows):
         field = self.scale.motion(motion)
         return ColumnMotion.of_columns(field, self.columns, self.timing, self.num_frames, self.scale.height)
 
-    def _factors(self, motion: Vibration, gradients: list[RowGradients]) -> Tensor:
-        """Displacements (B, S, N, 2, A) that are measured in the strips of all groups, for unit components in px.
+    def _factors(self, motion: Vibration, gradients: list[RowGradients]) -> tuple[Tensor, Tensor]:
+        """Displacements (B, S, N, 2, A) by unit components in px: of the middles of strips, and those measured.
 
         Gradients g measure the weighted mean of a displacement that changes along the row,
         ``(sum_x g g^T)^-1 sum_x g g^T D(x)``, which is not that of the middle of the strip.
@@ -164,16 +173,21 @@ class StripRows(MeasuredRows):
             x = self.columns.repeat(len(y) // strips)[:, None].expand_as(y)
             factors = self.scale.factors(x, y)
             along = self.scale.factors(x + 1, y) - factors  # change of the displacement per column
-            each.append(factors + mean_place @ along)
-        of_groups: Tensor = torch.cat(each, 1).unflatten(0, (-1, strips))
-        return of_groups
+            each.append(torch.stack([factors, factors + mean_place @ along]))
+        of_middles, of_gradients = torch.cat(each, 2).unflatten(1, (-1, strips))
+        return of_middles, of_gradients
 
     def blur_ratio(self, motion: Vibration) -> Tensor:
-        """(B, 3), the weighted mean over the strips."""
+        """(B, 3), the weighted mean over the strips.
+
+        A displacement that changes within a strip acts like blur: with a focal length of 400 px and 5 px, where the
+        ends of strips slide by 0.3 px, the ratio was 0 instead of 1. Its size, which counts as evidence, is then 0.
+        """
         ratio, std, size = super().blur_ratio(motion).unflatten(0, (-1, len(self.columns))).unbind(-1)
         weight = torch.where(std > 0, std.square().reciprocal(), 0.0)
         total = weight.sum(1).clamp(min=1e-300)
-        return torch.stack([(weight * ratio).sum(1) / total, total.rsqrt(), size.mean(1)], -1)
+        size = size.mean(1) if self.slide < _MAX_SLIDE_OF_BLUR else torch.zeros_like(total)
+        return torch.stack([(weight * ratio).sum(1) / total, total.rsqrt(), size], -1)
 
 
 def strip_rows(
@@ -194,7 +208,7 @@ def strip_rows(
         timing: The sensor, in row order.
         motion: A first estimate of the motion, all components in px.
         scale: Components of the motion.
-        max_slide: px, displacement by roll and zoom between the middle of a strip and its ends; gradients measure
+        max_slide: px, difference of the displacements of the middle of a strip and its ends; gradients measure
             such displacements without bias.
         min_pitch: Columns of a strip that count; narrower strips consist of their margins mostly.
     """
@@ -205,12 +219,14 @@ def strip_rows(
     times = starts.expand(*of_ends.batch_shape, -1)
     along = of_ends.mean_displacement(times, timing.exposure_time)[..., 0] - of_ends.drift(times)[..., 0]
     edge = math.ceil(float(along.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
-    turned = float(field.largest_displacement(float(starts[0]), float(starts[-1]))[..., 2:].amax())
-    pitch = max(min_pitch, 2 * max_slide / max(turned, 1e-9))
+    reached = field.largest_displacement(float(starts[0]), float(starts[-1]))
+    slope = float(largest_slope(reached, scale.width, scale.height, scale.camera).amax())
+    pitch = max(min_pitch, 2 * max_slide / max(slope, 1e-9))
     number = max(2, math.ceil((scale.width - 2 * edge - MARGIN) / pitch))
     strips, columns = cut_into_strips(frames, number, edge)
     of_valid = None if valid is None else cut_into_strips(valid, number, edge)[0]
     spectra = stack_spectra(strips, of_valid)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)
     groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=True)
-    return StripRows(groups, timing, scale, columns, count)
+    slide = 0.5 * slope * (scale.width - 2 * edge - MARGIN) / number
+    return StripRows(groups, timing, scale, columns, count, slide)
