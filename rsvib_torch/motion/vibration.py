@@ -177,6 +177,31 @@ class Vibration(Motion, units=_UNITS):
         zeros = torch.zeros(*batch_shape, axes, 1, dtype=torch.float64, device=device)
         return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0])
 
+    @classmethod
+    @checks_arguments
+    def stacked(cls, vibrations: Sequence["Vibration"]) -> "Vibration":
+        """Vibrations with the same shape and camera as a batch; the new dimension is the first.
+
+        Example:
+            >>> Vibration.stacked([Vibration(2.0, 50.0), Vibration(3.0, 40.0)]).amplitude.shape
+            torch.Size([2, 2, 1])
+        """
+        if len(vibrations) == 0:
+            raise ValueError("vibrations must contain at least one vibration")
+        first = vibrations[0]
+        if any(one.camera != first.camera for one in vibrations):
+            raise ValueError("motions of different cameras cannot be stacked")
+        if len({one.amplitude.shape for one in vibrations}) > 1:
+            raise ValueError(f"vibrations differ in shape: {sorted({tuple(v.amplitude.shape) for v in vibrations})}")
+        return cls(
+            torch.stack([one.amplitude for one in vibrations]),
+            torch.stack([one.frequency for one in vibrations]),
+            torch.stack([one.phase for one in vibrations]),
+            torch.stack([one.image_motion for one in vibrations]),
+            torch.stack([one.image_acceleration for one in vibrations]),
+            first.camera,
+        )
+
     def translation(self) -> "Vibration":
         """The components x and y: the motion of the centre of the frame, without roll and zoom.
 
