@@ -183,8 +183,8 @@ def strip_rows(
     motion: Vibration,
     scale: FieldScale,
     *,
-    max_slide: float = 0.1,
-    min_pitch: int = 48,
+    max_slide: float = 0.025,
+    min_pitch: int = 24,
 ) -> StripRows:
     """Frames (B, T, H, W) in strips of columns.
 
