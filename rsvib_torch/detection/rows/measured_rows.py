@@ -5,6 +5,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md), in e
 
 import math
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -19,6 +20,7 @@ from rsvib_torch.detection.rows.displacements import (
     frame_groups,
     measure_groups,
     remove_column_pattern,
+    slope_response,
     stack_spectra,
 )
 from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
@@ -65,10 +67,11 @@ class MeasuredRows:
 
     groups: list[FrameGroup]
     timing: RowTiming
+    slopes: ClassVar[bool] = False  # whether displacements change along the rows
 
     def measure(self, motion: Vibration, gradients: list[RowGradients] | None = None) -> RowRecord:
         """Measurements around a motion, see ``measure_groups``."""
-        return RowRecord(*measure_groups(self.groups, self.timing, self.view(motion), gradients))
+        return RowRecord(*measure_groups(self.groups, self.timing, self.view(motion), gradients, slopes=self.slopes))
 
     def view(self, motion: Vibration) -> Motion:
         """The motion of the stacks that are measured, with two components."""
@@ -118,6 +121,7 @@ class StripRows(MeasuredRows):
     scale: FieldScale
     columns: Tensor
     num_frames: int
+    slopes: ClassVar[bool] = True
 
     def measure(self, motion: Vibration, gradients: list[RowGradients] | None = None) -> RowRecord:
         """Components of the motion of every row (B, N, G, A), from the displacements in the strips.
@@ -143,28 +147,21 @@ class StripRows(MeasuredRows):
     def _factors(self, motion: Vibration, gradients: list[RowGradients]) -> Tensor:
         """Displacements (B, S, N, 2, A) that are measured in the strips of all groups, for unit components in px.
 
-        Gradients g measure the weighted mean of a displacement that changes along the row,
-        ``(sum_x g g^T)^-1 sum_x g g^T D(x)``, which is not that of the middle of the strip.
+        Gradients measure a weighted mean of a displacement that changes along the row, which is not that of the middle
+        of the strip (``slope_response``).
         """
         strips, view, each = len(self.columns), self.view(motion), []
         for group, own in zip(self.groups, gradients, strict=True):
-            images = own.images[..., : group.spectra.width]  # gradients along x and y, detail
-            blocks = images.shape[1] // BLOCK_ROWS
-            images = images[:, : blocks * BLOCK_ROWS].unflatten(1, (blocks, BLOCK_ROWS)).transpose(2, 3).flatten(3)
-            place = torch.arange(group.spectra.width, device=images.device) - 0.5 * (group.spectra.width - 1)
-            energy = (images @ images.mT).double()  # (B S, N, 3, 3)
-            moment = ((images * place.to(images).repeat(BLOCK_ROWS)) @ images[:, :, :2].mT).double()
-            size = energy.diagonal(dim1=-2, dim2=-1)
-            regular = energy + torch.diag_embed(1e-9 * size + (size == 0))
-            mean_place = torch.linalg.solve(regular, moment)[..., :2, :]
+            response = slope_response(own)  # (B S, N, 2, 2)
             middle = group.starts.mean(-1, keepdim=True) + 0.5 * self.scale.height * self.timing.row_time
             travelled = view.drift(middle).round()[..., 0, 1]  # as the scene rows of the group
-            rows = BLOCK_ROWS * (torch.arange(blocks, device=place.device) + 0.5) - 0.5 * self.scale.height
+            blocks = torch.arange(response.shape[1], device=response.device)
+            rows = BLOCK_ROWS * (blocks + 0.5) - 0.5 * self.scale.height
             y = rows - travelled[:, None]
             x = self.columns.repeat(len(y) // strips)[:, None].expand_as(y)
             factors = self.scale.factors(x, y)
             along = self.scale.factors(x + 1, y) - factors  # change of the displacement per column
-            each.append(factors + mean_place @ along)
+            each.append(factors + response @ along)
         of_groups: Tensor = torch.cat(each, 1).unflatten(0, (-1, strips))
         return of_groups
 
