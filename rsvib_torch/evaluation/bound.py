@@ -286,9 +286,7 @@ def gradient_information(recording: Recording, noise: float | None = None) -> Te
     return information
 
 
-def _gradient_products(
-    scene: Tensor, factors: Tensor, window: Tensor, noise: float | None, num_frames: int
-) -> Tensor:
+def _gradient_products(scene: Tensor, factors: Tensor, window: Tensor, noise: float | None, num_frames: int) -> Tensor:
     """Sums (S, A, A) of the products of the derivatives by the A components over the columns in the window.
 
     Args:
