@@ -180,8 +180,8 @@ def strip_rows(
     motion: Vibration,
     scale: FieldScale,
     *,
-    max_slide: float = 0.025,
-    min_pitch: int = 24,
+    max_slide: float = 0.05,
+    min_pitch: int = 48,
 ) -> StripRows:
     """Frames (B, T, H, W) in strips of columns.
 
