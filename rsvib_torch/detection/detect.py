@@ -243,7 +243,7 @@ def detect_vibration(
         model: ``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape; ``"swept"``: one tone per
             axis whose amplitude decays or grows and whose frequency sweeps. The last two take the options from
             ``registration`` to ``search``, ``ignore``, ``full_scale`` and ``channels``; ``detect_motion`` and
-            ``detect_swept_tone`` have further ones.
+            ``detect_swept_tone`` have further ones. ``"free"`` also takes ``roll`` and ``zoom``, True or False.
         method: ``"direct"``, or ``"bands"`` (the paper's method), in half the time with ten times larger errors.
         registration: Method of the band registration, as in ``register_bands``.
         tones: Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance; the standard deviations
@@ -319,6 +319,10 @@ def detect_vibration(
                 raise ValueError(
                     f"{name}={value!r} goes with model='tones', not with model={model!r}, which takes {valid}"
                 )
+        field_options = {name: value for name, value in (("roll", roll), ("zoom", zoom)) if value is not False}
+        if field_options and model == "swept":
+            name, value = next(iter(field_options.items()))
+            raise ValueError(f"{name}={value!r} goes with model='tones' or 'free', not with model='swept'")
         return _OTHER_MODELS[model](
             frames,
             timing,
@@ -329,6 +333,7 @@ def detect_vibration(
             ignore=ignore,
             full_scale=full_scale,
             channels=channels,
+            **field_options,
         )
     check_choice("method", method, tuple(_METHODS))
     if tones != "auto":

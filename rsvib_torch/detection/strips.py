@@ -19,6 +19,7 @@ from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.field import displacement_factors
+from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration.row_spectra import MARGIN
 
@@ -49,7 +50,7 @@ class FieldScale:
         return like.new_tensor([1.0, 1.0, 1 / self.radius, 1 / self.radius][: self.axes])
 
     def motion(self, fitted: Vibration) -> Vibration:
-        """The motion with roll in rad and relative zoom, of one whose components are all in px."""
+        """The vibration with roll in rad and relative zoom, of one whose components are all in px."""
         factor = self.units(fitted.amplitude)
         return Vibration(
             fitted.amplitude * factor[:, None],
@@ -58,6 +59,11 @@ class FieldScale:
             fitted.image_motion * factor,
             fitted.image_acceleration * factor,
         )
+
+    def free_motion(self, fitted: FreeMotion) -> FreeMotion:
+        """The same for a free motion."""
+        coefficients = fitted.coefficients * self.units(fitted.coefficients)[:, None]
+        return FreeMotion(coefficients, fitted.start, fitted.spacing, self.motion(fitted.tones))
 
     def std(self, fitted: VibrationStd) -> VibrationStd:
         """The same for standard deviations."""

@@ -25,7 +25,7 @@ import rsvib_torch as rsv
 from rsvib_torch.evaluation import cramer_rao_bound
 
 NOISE, FRAMES = 0.005, 4
-READOUT, FRAME_PERIOD, EXPOSURE = 24.6e-3, 25.6e-3, 4.8e-4  # s
+READOUT, FRAME_PERIOD, EXPOSURE = 24.6e-3, 25.6e-3, 2e-4  # s
 OPTICS = 0.7  # px, standard deviation
 RIM = 32  # px of the scene of the bound beyond the frame
 NAMES = ("x", "y", "roll", "zoom")
@@ -55,6 +55,8 @@ CASES = {
     "zoom": Case("four axes, zoom 5e-4", (3.0, 5.0, 1e-3, 5e-4), (90.0, 61.0, 70.0, 53.0)),
     "none": Case("no roll", (3.0, 5.0), (90.0, 61.0)),
 }
+
+FREE = {"free": 3, "free zoom": 4, "free none": 2}  # random motions with so many axes
 
 
 def timing_of(size: int) -> rsv.SensorTiming:
@@ -128,9 +130,66 @@ def run(case: Case, options: argparse.Namespace) -> None:
         print(text)
 
 
+def free_components(seed: int, axes: int) -> Motion:
+    """Random motion below about 100 Hz: 1.5 px rms along x and y, roll of 1 mrad, zoom of 1e-3."""
+    generator, frequency = np.random.default_rng(seed), np.linspace(1.0, 120.0, 100)
+    spectrum = np.exp(-0.5 * (frequency / 40.0) ** 2)
+    amplitude = spectrum * np.sqrt(-np.log(generator.uniform(size=(4, 100))))
+    rms = np.array([1.5, 1.5, 1e-3, 1e-3]) * (np.arange(4) < axes)
+    amplitude *= np.sqrt(2) * rms[:, None] / np.linalg.norm(amplitude, axis=1, keepdims=True)
+    phase = generator.uniform(-np.pi, np.pi, (4, 100))
+
+    def components(times: Array) -> Array:
+        angle = 2 * np.pi * frequency * times[..., None] + phase[(slice(None), *(None,) * times.ndim)]
+        return np.asarray((amplitude[(slice(None), *(None,) * times.ndim)] * np.sin(angle)).sum(-1))
+
+    return components
+
+
+def run_free(axes: int, options: argparse.Namespace) -> None:
+    """Print the table of random motions, a new one for every seed."""
+    size, timing = options.size, timing_of(options.size)
+    layer, _ = scene_of(size, 3, options.optics)
+    starts = timing.row_starts(FRAMES, size).numpy()
+    whole, between, seconds, refused = [], [], [], []
+    for seed in range(options.first, options.first + options.seeds):
+        motion = free_components(seed, axes)
+        frames = take_frames([layer], motion, starts, EXPOSURE, size)
+        noisy = frames + NOISE * np.random.default_rng(seed).standard_normal(frames.shape)
+        begin = time.perf_counter()
+        found = rsv.detect_motion(torch.from_numpy(noisy).float(), timing, roll=axes > 2, zoom=axes > 3)
+        seconds.append(time.perf_counter() - begin)
+        refused += [f"{seed}: {NAMES[axis]} {'; '.join(why)}" for axis, why in enumerate(found.reasons) if why]
+        true = motion(found.times.numpy())[:axes].transpose(1, 2, 0)
+        error = found.displacement.numpy() - (true - true.mean((0, 1)))
+        ratio = error / found.std.numpy()
+        # of the rows that show one scene row, less the mean over the frames
+        rows = np.arange(0.1 * size, 0.9 * size)
+        times = FRAME_PERIOD * np.arange(FRAMES)[:, None] + READOUT / size * rows
+        for _ in range(20):
+            times = FRAME_PERIOD * np.arange(FRAMES)[:, None] + READOUT / size * (rows + motion(times)[1])
+        times += 0.5 * EXPOSURE
+        seen = found.motion.displacement(torch.from_numpy(times)).numpy() - motion(times)[:axes].transpose(1, 2, 0)
+        seen -= seen.mean(0)
+        whole.append([np.sqrt(np.mean(part**2, (0, 1))) for part in (true, error, ratio)] + [np.mean(np.abs(ratio) < 1.96, (0, 1))])
+        between.append([np.sqrt(np.mean(seen**2, (0, 1))), found.std_seen.numpy()])
+    table, parts = np.array(whole), np.array(between)
+    print(f"\nfree motion, {axes} axes: {size} px, {options.seeds} seeds, {np.mean(seconds):.1f} s each, {len(refused)} axes refused\n")
+    print("| axis | rms motion | rms error | error / std | coverage | rms error between frames | over its std |\n" + "|---" * 7 + "|")
+    for axis in range(axes):
+        motion_, error_, ratio_ = (np.sqrt(np.mean(table[:, i, axis] ** 2)) for i in range(3))
+        seen_, std_ = (np.sqrt(np.mean(parts[:, i, axis] ** 2)) for i in range(2))
+        print(
+            f"| {NAMES[axis]} | {motion_:.3g} | {error_:.2g} | {ratio_:.2f} | {table[:, 3, axis].mean():.0%} "
+            f"| {seen_:.2g} | {seen_ / std_:.2f} |", flush=True
+        )
+    for text in refused:
+        print(text)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
+    parser.add_argument("--cases", nargs="+", choices=[*CASES, *FREE], default=[*CASES, *FREE])
     parser.add_argument("--size", type=int, default=512, help="rows and columns")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=0, help="first seed")
@@ -141,7 +200,10 @@ def main() -> int:
     parser.add_argument("--optics", type=float, default=OPTICS, help="px, standard deviation")
     options = parser.parse_args()
     for name in options.cases:
-        run(CASES[name], options)
+        if name in FREE:
+            run_free(FREE[name], options)
+        else:
+            run(CASES[name], options)
     return 0
 
 

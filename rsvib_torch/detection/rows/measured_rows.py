@@ -26,6 +26,7 @@ from rsvib_torch.detection.rows.displacements import (
 from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
 from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration.gradients import RowGradients
@@ -69,15 +70,15 @@ class MeasuredRows:
     timing: RowTiming
     slopes: ClassVar[bool] = False  # whether displacements change along the rows
 
-    def measure(self, motion: Vibration, gradients: list[RowGradients] | None = None) -> RowRecord:
+    def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
         """Measurements around a motion, see ``measure_groups``."""
         return RowRecord(*measure_groups(self.groups, self.timing, self.view(motion), gradients, slopes=self.slopes))
 
-    def view(self, motion: Vibration) -> Motion:
+    def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motion of the stacks that are measured, with two components."""
         return motion
 
-    def remove_column_pattern(self, motion: Vibration, gradients: list[RowGradients]) -> bool:
+    def remove_column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> bool:
         """Subtract a pattern of columns that is fixed to the sensor; False if there is none."""
         return remove_column_pattern(self.groups, self.timing, self.view(motion), gradients)
 
@@ -108,6 +109,11 @@ def whole_rows(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: 
 # Strips
 
 
+def _in_rad(motion: Vibration | FreeMotion, scale: FieldScale) -> Vibration | FreeMotion:
+    """The motion with roll in rad and relative zoom."""
+    return scale.free_motion(motion) if isinstance(motion, FreeMotion) else scale.motion(motion)
+
+
 @dataclass(frozen=True, eq=False)
 class StripRows(MeasuredRows):
     """Frames whose strips of columns are measured.
@@ -123,7 +129,7 @@ class StripRows(MeasuredRows):
     num_frames: int
     slopes: ClassVar[bool] = True
 
-    def measure(self, motion: Vibration, gradients: list[RowGradients] | None = None) -> RowRecord:
+    def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
         """Components of the motion of every row (B, N, G, A), from the displacements in the strips.
 
         Roll moves the content of a scene row to different frame rows along the row, which are exposed at different
@@ -139,12 +145,12 @@ class StripRows(MeasuredRows):
         measurements, apart = combined_strips(measured, factors)
         return RowRecord(measurements, record.gradients, apart)
 
-    def view(self, motion: Vibration) -> Motion:
+    def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motions of the strips (B S)."""
-        field = self.scale.motion(motion)
+        field = _in_rad(motion, self.scale)
         return ColumnMotion.of_columns(field, self.columns, self.timing, self.num_frames, self.scale.height)
 
-    def _factors(self, motion: Vibration, gradients: list[RowGradients]) -> Tensor:
+    def _factors(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> Tensor:
         """Displacements (B, S, N, 2, A) that are measured in the strips of all groups, for unit components in px.
 
         Gradients measure a weighted mean of a displacement that changes along the row, which is not that of the middle
@@ -177,9 +183,10 @@ def strip_rows(
     frames: Tensor,
     valid: Tensor | None,
     timing: RowTiming,
-    motion: Vibration,
+    motion: Vibration | FreeMotion,
     scale: FieldScale,
     *,
+    pairs_if_blurred_differently: bool = True,
     max_slide: float = 0.05,
     min_pitch: int = 48,
 ) -> StripRows:
@@ -191,11 +198,12 @@ def strip_rows(
         timing: The sensor, in row order.
         motion: A first estimate of the motion, all components in px.
         scale: Components of the motion.
+        pairs_if_blurred_differently: As in ``frame_groups``.
         max_slide: px, displacement by roll and zoom between the middle of a strip and its ends; gradients measure
             such displacements without bias.
         min_pitch: Columns of a strip that count; narrower strips consist of their margins mostly.
     """
-    field, count = scale.motion(motion), frames.shape[1]
+    field, count = _in_rad(motion, scale), frames.shape[1]
     starts = timing.row_starts(count, scale.height, frames.device)[:, :: max(1, scale.height // 64)].flatten()
     ends = 0.5 * scale.width * torch.tensor([-1.0, 1.0], dtype=torch.float64, device=frames.device)
     of_ends = ColumnMotion.of_columns(field, ends, timing, count, scale.height)
@@ -209,5 +217,5 @@ def strip_rows(
     of_valid = None if valid is None else cut_into_strips(valid, number, edge)[0]
     spectra = stack_spectra(strips, of_valid)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)
-    groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=True)
+    groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=pairs_if_blurred_differently)
     return StripRows(groups, timing, scale, columns, count)
