@@ -27,7 +27,7 @@ from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
 from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
 from rsvib_torch.detection.start import BandStart, band_start, field_start, grey_frames
-from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.detection.tones.fit import (
     MotionModel,
     ToneFit,
@@ -247,7 +247,7 @@ def detect_vibration(
         model: ``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape; ``"swept"``: one tone per
             axis whose amplitude decays or grows and whose frequency sweeps. The last two take the options from
             ``registration`` to ``search``, ``ignore``, ``full_scale`` and ``channels``; ``detect_motion`` and
-            ``detect_swept_tone`` have further ones.
+            ``detect_swept_tone`` have further ones. ``"free"`` also takes ``roll`` and ``zoom``, True or False.
         method: ``"direct"``, or ``"bands"`` (the paper's method), in half the time with ten times larger errors.
         registration: Method of the band registration, as in ``register_bands``.
         tones: Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance; the standard deviations
@@ -322,11 +322,6 @@ def detect_vibration(
             ("columns", columns, None),
             ("window", window, None),
             ("window_step", window_step, None),
-            ("roll", roll, False),
-            ("zoom", zoom, False),
-            ("focal_length", focal_length, None),
-            ("principal_point", principal_point, None),
-            ("distortion", distortion, None),
         )
         for name, value, default in tone_options:
             if value != default:
@@ -334,6 +329,17 @@ def detect_vibration(
                 raise ValueError(
                     f"{name}={value!r} goes with model='tones', not with model={model!r}, which takes {valid}"
                 )
+        of_field = {
+            "roll": roll or None,
+            "zoom": zoom or None,
+            "focal_length": focal_length,
+            "principal_point": principal_point,
+            "distortion": distortion,
+        }
+        field_options = {name: value for name, value in of_field.items() if value is not None}
+        if field_options and model == "swept":
+            given = next(f"{name}={value!r}" for name, value in field_options.items())
+            raise ValueError(f"{given} goes with model='tones' or 'free', not with model='swept'")
         return _OTHER_MODELS[model](
             frames,
             timing,
@@ -344,6 +350,7 @@ def detect_vibration(
             ignore=ignore,
             full_scale=full_scale,
             channels=channels,
+            **field_options,
         )
     check_choice("method", method, tuple(_METHODS))
     if tones != "auto":
@@ -354,18 +361,10 @@ def detect_vibration(
     if columns is not None:
         check_whole_number("columns", columns, at_least=64)  # px; narrower bands are often registered wrongly
     bands = RegistrationOptions(registration, band_rows, band_step, search)
-    for name, value in (("roll", roll), ("zoom", zoom)):
-        if value not in (True, False, "auto"):
-            raise ValueError(f"{name} must be True, False or 'auto', got {value!r}")
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     height, width = stacks.images.shape[-2:]
-    camera = _camera(focal_length, principal_point, distortion, (height, width), timing)
-    if columns is not None and (camera is not None or roll is True or zoom is True):
-        raise ValueError(
-            f"columns={columns} goes with roll=False, zoom=False and focal_length=None: roll, zoom and perspective are "
-            "measured from all columns"
-        )
-    field = _Field(columns is None and roll, columns is None and zoom, width, height, camera)
+    camera = camera_in_row_order(focal_length, principal_point, distortion, (height, width), timing)
+    field = _Field.of(roll, zoom, columns, width, height, camera)
     model_of_tones = MotionModel(harmonics, 2 if image_acceleration else 1)
     options = _FitOptions(None if tones == "auto" else tones, model_of_tones, bands, field.scale(2))
     if columns is not None:
@@ -389,28 +388,6 @@ def detect_vibration(
         )
     found = replace(found, timing=timing)  # of the stack, not of a window
     return found if stacks.batched else found[0]
-
-
-def _camera(
-    focal_length: float | None,
-    principal_point: tuple[float, float] | None,
-    distortion: tuple[float, float, float, float, float] | None,
-    size: tuple[int, int],
-    timing: SensorTiming,
-) -> Camera | None:
-    """The camera of frames of ``size`` (rows, columns) in row order, from values in image axes."""
-    if focal_length is None:
-        for name, value in (("principal_point", principal_point), ("distortion", distortion)):
-            if value is not None:
-                raise ValueError(f"{name}={value!r} requires focal_length, in px")
-        return None
-    height, width = size if timing.scan_axis == -2 else size[::-1]
-    centre = (0.5 * (width - 1), 0.5 * (height - 1))
-    camera = Camera(focal_length, centre if principal_point is None else principal_point, distortion or (0.0,) * 5)
-    x, y = camera.principal_point
-    camera = replace(camera, principal_point=(x - centre[0], y - centre[1]))
-    camera.check_size(width, height)
-    return Vibration.still(axes=2).with_camera(camera).to_row_order(timing).camera
 
 
 def _windows(num_frames: int, window: int, step: int | None, timing: SensorTiming) -> list[tuple[slice, SensorTiming]]:
@@ -439,6 +416,27 @@ class _Field:
     width: int
     height: int
     camera: Camera | None
+
+    @classmethod
+    def of(
+        cls,
+        roll: bool | Literal["auto"],
+        zoom: bool | Literal["auto"],
+        columns: int | None,
+        width: int,
+        height: int,
+        camera: Camera | None,
+    ) -> "_Field":
+        """The field of checked options; of a part of the columns, roll and zoom are not measured."""
+        for name, value in (("roll", roll), ("zoom", zoom)):
+            if value not in (True, False, "auto"):
+                raise ValueError(f"{name} must be True, False or 'auto', got {value!r}")
+        if columns is not None and (camera is not None or roll is True or zoom is True):
+            raise ValueError(
+                f"columns={columns} goes with roll=False, zoom=False and focal_length=None: roll, zoom and perspective "
+                "are measured from all columns"
+            )
+        return cls(columns is None and roll, columns is None and zoom, width, height, camera)
 
     def scale(self, axes: int, camera: Camera | None = None) -> FieldScale:
         """Lengths for a motion of so many components."""

@@ -20,10 +20,12 @@ from torch import Tensor
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.field import displacement_factors
+from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration.row_spectra import MARGIN
 
-__all__ = ["FieldScale", "combined_strips", "cut_into_strips"]
+__all__ = ["FieldScale", "camera_in_row_order", "combined_strips", "cut_into_strips"]
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class FieldScale:
         return like.new_tensor([1.0, 1.0, 1 / self.radius, 1 / self.radius][: self.axes])
 
     def motion(self, fitted: Vibration) -> Vibration:
-        """The motion with roll in rad and relative zoom, of one whose components are all in px."""
+        """The vibration with roll in rad and relative zoom, of one whose components are all in px."""
         factor = self.units(fitted.amplitude)
         return Vibration(
             fitted.amplitude * factor[:, None],
@@ -67,6 +69,11 @@ class FieldScale:
             fitted.image_acceleration * factor,
             self.camera,
         )
+
+    def free_motion(self, fitted: FreeMotion) -> FreeMotion:
+        """The same for a free motion."""
+        coefficients = fitted.coefficients * self.units(fitted.coefficients)[:, None]
+        return FreeMotion(coefficients, fitted.start, fitted.spacing, self.motion(fitted.tones))
 
     def std(self, fitted: VibrationStd) -> VibrationStd:
         """The same for standard deviations."""
@@ -83,6 +90,28 @@ class FieldScale:
         """Displacement (S, 2, A) at positions (S) in px from the centre by unit components in px."""
         factors: Tensor = displacement_factors(x, y, self.axes, self.camera) * self.units(x)
         return factors
+
+
+def camera_in_row_order(
+    focal_length: float | None,
+    principal_point: tuple[float, float] | None,
+    distortion: tuple[float, float, float, float, float] | None,
+    size: tuple[int, int],
+    timing: SensorTiming,
+) -> Camera | None:
+    """Camera of frames of ``size`` (rows, columns) in row order, from the options of ``detect_vibration``."""
+    if focal_length is None:
+        for name, value in (("principal_point", principal_point), ("distortion", distortion)):
+            if value is not None:
+                raise ValueError(f"{name}={value!r} requires focal_length, in px")
+        return None
+    height, width = size if timing.scan_axis == -2 else size[::-1]
+    centre = (0.5 * (width - 1), 0.5 * (height - 1))
+    camera = Camera(focal_length, centre if principal_point is None else principal_point, distortion or (0.0,) * 5)
+    x, y = camera.principal_point
+    camera = replace(camera, principal_point=(x - centre[0], y - centre[1]))
+    camera.check_size(width, height)
+    return Vibration.still(axes=2).with_camera(camera).to_row_order(timing).camera
 
 
 def combined_strips(measured: Measurements, factors: Tensor) -> tuple[Measurements, Tensor]:

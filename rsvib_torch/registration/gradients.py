@@ -34,7 +34,16 @@ from rsvib_torch.registration.row_spectra import (
     mean_over_frames,
 )
 
-__all__ = ["FrameComparison", "RowGradients", "residual_products", "row_equations", "row_gradients", "scene_detail"]
+__all__ = [
+    "FrameComparison",
+    "RowGradients",
+    "residual_products",
+    "right_sides",
+    "row_equations",
+    "row_gradients",
+    "row_information",
+    "scene_detail",
+]
 
 _BLOCK = 16  # px, side of the blocks of pixels that share a weight
 _SMOOTH = 16  # spectral values averaged along each axis for the power of scene and noise
@@ -54,6 +63,8 @@ class RowGradients:
         halves: (B, S, 2, 5) float64, sums gx gx, gx gy, gy gy, gx e and gy e over the left and the right half of each
             row, with e the residual difference between the last and the first frame. A displacement that depends on
             the row only is equal in both halves.
+        slopes: (B, S, 3, 2) float64 sums of their products with the gradients (x, y) of the unfiltered scene times the
+            column from the middle, for displacements that change along the row; None if not requested.
     """
 
     images: Tensor
@@ -61,10 +72,17 @@ class RowGradients:
     residual_products: Tensor
     variance: Tensor
     halves: Tensor
+    slopes: Tensor | None = None
 
 
 def row_gradients(
-    spectra: RowSpectra, warped: Iterable[tuple[slice, Tensor]], rows: Tensor, shift: Tensor, visible: Tensor
+    spectra: RowSpectra,
+    warped: Iterable[tuple[slice, Tensor]],
+    rows: Tensor,
+    shift: Tensor,
+    visible: Tensor,
+    *,
+    slopes: bool = False,
 ) -> RowGradients:
     """Gradients of the scene, noise, and the weight of every pixel, from frames warped by a motion.
 
@@ -74,6 +92,7 @@ def row_gradients(
         rows: (B, G, S) frame rows of the S scene rows in each frame.
         shift: (B, G, S) px, displacement along the rows by which each was moved back.
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
+        slopes: Whether to compute ``RowGradients.slopes``.
 
     Returns:
         The gradients.
@@ -121,7 +140,27 @@ def row_gradients(
         residual_products=right[..., :3, :] - means * right[..., 3:, :],
         variance=square / (products[..., 3, 3] - 4).clamp(min=1.0),
         halves=_halves(sums, solution, visible),
+        slopes=_slopes(images, compared, spectra) if slopes else None,
     )
+
+
+def _slopes(images: Tensor, compared: "FrameComparison", spectra: RowSpectra) -> Tensor:
+    """``RowGradients.slopes``: products with the displacement by 1 px per column.
+
+    The gradients that weight the differences are filtered, those that cause them are not. A displacement that is equal
+    along the row is measured without error after some rounds, because its residual disappears; one that changes along
+    the row remains in the frames, and its effect must be known to first order.
+    """
+    mean = compared.mean
+    v = torch.fft.fftfreq(mean.shape[-2], dtype=torch.float64, device=mean.device)
+    by_y = (2j * math.pi * v * _low_pass(v, 0.40, 0.48)).to(mean.dtype)  # no ringing at the first and last row
+    across = torch.fft.ifft(torch.fft.fft(mean, dim=-2) * by_y[:, None], dim=-2)
+    along = mean * (2j * math.pi * spectra.frequencies).to(mean.dtype)
+    place = torch.arange(images.shape[-1], dtype=images.dtype, device=images.device) - 0.5 * (spectra.width - 1)
+    count = images.shape[1]
+    moved = torch.stack([torch.fft.irfft(one[:, :count], n=images.shape[-1]) for one in (along, across)], -1)
+    sums: Tensor = images @ (moved * place[:, None])
+    return sums.double()
 
 
 def residual_products(warped: Iterable[tuple[slice, Tensor]], gradients: RowGradients, visible: Tensor) -> Tensor:
@@ -155,15 +194,30 @@ def row_equations(products: Tensor, gradients: RowGradients, visible: Tensor) ->
         relative to the mean over the group, and H its information matrix in one frame. Both are 0 for rows that are
         visible in fewer than two frames or have no detail.
     """
-    right = -(torch.cat([products, -products], -1) if visible.shape[1] == 2 else products).permute(0, 3, 1, 2)
-    own = gradients.products
-    detail = own[..., 2, 2]
-    safe = detail.clamp(min=1e-300)
-    usable = (detail > 0) & (gradients.variance > 0)
-    matrix = own[..., :2, :2] - own[..., :2, 2:] * own[..., 2:, :2] / safe[..., None, None]
-    right = right[..., :2] - own[:, None, :, :2, 2] * (right[..., 2:] / safe[:, None, :, None])
-    factor = torch.where(usable, 1 / torch.where(usable, gradients.variance, 1.0), 0.0)
-    return matrix * factor[..., None, None], right * factor[:, None, :, None]
+    right = -(torch.cat([products, -products], -1) if visible.shape[1] == 2 else products)
+    return row_information(gradients), right_sides(right, gradients)
+
+
+def row_information(gradients: RowGradients) -> Tensor:
+    """Matrix H (B, S, 2, 2) of ``row_equations``."""
+    own, detail = gradients.products, gradients.products[..., 2, 2].clamp(min=1e-300)
+    matrix = own[..., :2, :2] - own[..., :2, 2:] * own[..., 2:, :2] / detail[..., None, None]
+    information: Tensor = matrix * _inverse_variance(gradients)[..., None, None]
+    return information
+
+
+def right_sides(products: Tensor, gradients: RowGradients) -> Tensor:
+    """Right-hand sides (B, G, S, 2) of ``row_equations`` for products (B, S, 3, G) with ``g . d`` of displacements."""
+    own, detail = gradients.products, gradients.products[..., 2, 2].clamp(min=1e-300)
+    right = products.permute(0, 3, 1, 2)
+    right = right[..., :2] - own[:, None, :, :2, 2] * (right[..., 2:] / detail[:, None, :, None])
+    return right * _inverse_variance(gradients)[:, None, :, None]
+
+
+def _inverse_variance(gradients: RowGradients) -> Tensor:
+    """(B, S) inverse noise variance of the rows, 0 without detail."""
+    usable = (gradients.products[..., 2, 2] > 0) & (gradients.variance > 0)
+    return torch.where(usable, 1 / torch.where(usable, gradients.variance, 1.0), 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from rsvib_torch import (
     Camera,
     DetectionResult,
     SensorTiming,
+    detect_motion,
     detect_vibration,
     judge_restoration,
     restore,
@@ -87,6 +88,48 @@ def test_frames_are_restored(rolling, detection, method, least_gain):
 def _later(timing, frame):
     starts = timing.frame_starts(frame + 2)[frame:]
     return SensorTiming(timing.row_time, timing.exposure_rows, timing.frame_rows, frame_start_times=starts)
+
+
+def between_frames(components):
+    """Components (A, T, R) of the same rows less their mean over the frames, (T, R, A)."""
+    values = np.moveaxis(np.asarray(components), 0, -1)
+    return values - values.mean(0)
+
+
+def test_free_motion_with_roll(rolling):
+    """The differences between frames of the rows that show one scene row, which are what is measured."""
+    found = detect_motion(rolling[1], TIMING, roll=True)
+    assert found.motion.num_axes == 3
+    assert found.reliable.tolist() == [True, True, True]
+    rows, starts = np.arange(20.0, 200.0), TIMING.frame_starts(4).numpy()[:, None]
+    times = starts + TIMING.row_time * rows
+    for _ in range(30):
+        times = starts + TIMING.row_time * (rows + TRUTH.components(times)[1])
+    times += 0.5 * TIMING.exposure_time
+    true = between_frames(TRUTH.components(times)[:3])
+    error = between_frames(found.motion.displacement(torch.from_numpy(times)).permute(2, 0, 1).numpy()) - true
+    rms = np.sqrt((error**2).mean((0, 1)))
+    assert (rms < 2.5 * found.std_seen.numpy()).all()
+    assert rms[2] < 0.03 * np.sqrt((true[..., 2] ** 2).mean())  # of the roll itself: no roll is 100 %
+    assert "rad" in str(found)
+    through = detect_vibration(rolling[1], TIMING, model="free", roll=True)
+    torch.testing.assert_close(through.motion.coefficients, found.motion.coefficients)
+
+
+def test_free_motion_with_roll_in_other_orientation(rolling):
+    """Transposed frames of a camera that is read along x from the right."""
+    turned = SensorTiming(8e-5, 12, 280, scan_axis="x", readout_direction="reverse")
+    frames = rolling[1].flip(-2).mT.contiguous()
+    found = detect_motion(frames, turned, roll=True)
+    expected = detect_motion(rolling[1], TIMING, roll=True).motion.from_row_order(turned)
+    torch.testing.assert_close(found.motion.coefficients, expected.coefficients, atol=1e-3, rtol=1e-3)
+
+
+def test_swept_tone_refuses_roll(rolling):
+    with pytest.raises(ValueError, match="roll=True goes with model='tones' or 'free'"):
+        detect_vibration(rolling[1], TIMING, model="swept", roll=True)
+    with pytest.raises(ValueError, match="zoom of a free motion must be True or False, got 'auto'"):
+        detect_motion(rolling[1], TIMING, zoom="auto")
 
 
 def test_wrong_values(rolling):

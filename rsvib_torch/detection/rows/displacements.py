@@ -22,7 +22,14 @@ from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.registration.gradients import RowGradients, residual_products, row_equations, row_gradients
+from rsvib_torch.registration.gradients import (
+    RowGradients,
+    residual_products,
+    right_sides,
+    row_equations,
+    row_gradients,
+    row_information,
+)
 from rsvib_torch.registration.row_spectra import EVERY, MARGIN, RowSpectra, column_pattern
 
 __all__ = [
@@ -37,6 +44,7 @@ __all__ = [
     "measure_group",
     "measure_groups",
     "remove_column_pattern",
+    "slope_response",
     "stack_spectra",
 ]
 
@@ -165,7 +173,12 @@ def frame_groups(
 
 
 def measure_group(
-    group: FrameGroup, timing: RowTiming, motion: Motion, gradients: RowGradients | None = None
+    group: FrameGroup,
+    timing: RowTiming,
+    motion: Motion,
+    gradients: RowGradients | None = None,
+    *,
+    slopes: bool = False,
 ) -> tuple[Measurements, RowGradients]:
     """Displacements of blocks of scene rows in the frames of a group, measured around a motion.
 
@@ -177,6 +190,7 @@ def measure_group(
         timing: The sensor, in row order.
         motion: Motion of each stack (B) that the frames are warped by.
         gradients: Gradients of the scene from a motion that differs by much less than a pixel; None to compute them.
+        slopes: Whether to compute ``RowGradients.slopes``.
 
     Returns:
         The measurements, and the gradients for the next call.
@@ -186,21 +200,11 @@ def measure_group(
     warp = _warp_to_scene(group.spectra, positions, timing, motion)
     warped = ((run, warp(run)) for run in group.spectra.runs(positions.rows.shape[-1], 2))
     if gradients is None:
-        gradients = row_gradients(group.spectra, warped, positions.rows, positions.shift, visible)
+        gradients = row_gradients(group.spectra, warped, positions.rows, positions.shift, visible, slopes=slopes)
         products = gradients.residual_products
     else:
         products = residual_products(warped, gradients, visible)
-    information, gradient = row_equations(products, gradients, visible)
-    information = _in_blocks(information[:, None]).sum(3)[:, 0]  # (B, N, 2, 2)
-    gradient = _in_blocks(gradient).sum(3)  # (B, G, N, 2)
-    xx, yy = information[..., 0, 0], information[..., 1, 1]
-    determinant = xx * yy - information[..., 0, 1].square()
-    # blocks with structure along one direction only have a singular matrix
-    measured = (determinant > 1e-4 * xx * yy) & (determinant > 0)
-    eye = torch.eye(2, dtype=information.dtype, device=information.device)
-    regular = torch.where(measured[..., None, None], information, eye)
-    residual = torch.linalg.solve(regular[:, None], gradient[..., None])[..., 0]
-    residual = torch.where(measured[:, None, :, None], residual, 0.0)
+    residual, information = _solved(*row_equations(products, gradients, visible))
     exposure_starts = _in_blocks(positions.exposure_starts).mean(3)
     # a fit of frames with a wrong timing may place rows at any distance; they are invisible, but their times would make
     # the record, and with it the frequency grid, as long (18 GB)
@@ -211,10 +215,38 @@ def measure_group(
         exposure_starts=exposure_starts.transpose(1, 2),
         displacements=(around + residual).transpose(1, 2),
         visible=_in_blocks(visible)[..., 0].transpose(1, 2),
-        information=torch.where(measured[..., None, None], information, 0.0),
+        information=information,
         exposure_time=timing.exposure_time,
     )
     return replace(measurements, displacements=measurements.relative(measurements.displacements)), gradients
+
+
+def _solved(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
+    """Displacements (B, G, N, 2) of blocks and their information (B, N, 2, 2), from the equations of rows.
+
+    Blocks with structure along one direction only have a singular matrix; both are 0 then.
+    """
+    information = _in_blocks(information[:, None]).sum(3)[:, 0]
+    right = _in_blocks(right).sum(3)
+    xx, yy = information[..., 0, 0], information[..., 1, 1]
+    determinant = xx * yy - information[..., 0, 1].square()
+    measured = (determinant > 1e-4 * xx * yy) & (determinant > 0)
+    eye = torch.eye(2, dtype=information.dtype, device=information.device)
+    regular = torch.where(measured[..., None, None], information, eye)
+    solution = torch.linalg.solve(regular[:, None], right[..., None])[..., 0]
+    solution = torch.where(measured[:, None, :, None], solution, 0.0)
+    return solution, torch.where(measured[..., None, None], information, 0.0)
+
+
+def slope_response(gradients: RowGradients) -> Tensor:
+    """(B, N, 2, 2) px, displacements (x, y) that blocks measure if that along x or y grows by 1 px per column.
+
+    Args:
+        gradients: With ``slopes``; the displacement is 0 in the middle column.
+    """
+    assert gradients.slopes is not None
+    response, _ = _solved(row_information(gradients), right_sides(gradients.slopes, gradients))
+    return response.movedim(1, -1)
 
 
 def _in_blocks(values: Tensor) -> Tensor:
@@ -229,12 +261,14 @@ def measure_groups(
     timing: RowTiming,
     motion: Motion,
     gradients: list[RowGradients] | None = None,
+    *,
+    slopes: bool = False,
 ) -> tuple[Measurements, list[RowGradients]]:
     """``measure_group`` of all groups, the measurements as one record."""
     each = [None] * len(groups) if gradients is None else gradients
     measured, advance = [], steps(len(groups), "groups")
     for group, own in zip(groups, each, strict=True):
-        measured.append(measure_group(group, timing, motion, own))
+        measured.append(measure_group(group, timing, motion, own, slopes=slopes))
         advance()
     return _joined([part for part, _ in measured]), [own for _, own in measured]
 

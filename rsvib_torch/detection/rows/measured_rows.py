@@ -5,6 +5,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md), in e
 
 import math
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -19,11 +20,13 @@ from rsvib_torch.detection.rows.displacements import (
     frame_groups,
     measure_groups,
     remove_column_pattern,
+    slope_response,
     stack_spectra,
 )
 from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
 from rsvib_torch.motion.field import ColumnMotion, largest_slope
 from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration.gradients import RowGradients
@@ -65,16 +68,17 @@ class MeasuredRows:
 
     groups: list[FrameGroup]
     timing: RowTiming
+    slopes: ClassVar[bool] = False  # whether displacements change along the rows
 
-    def measure(self, motion: Vibration, gradients: list[RowGradients] | None = None) -> RowRecord:
+    def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
         """Measurements around a motion, see ``measure_groups``."""
-        return RowRecord(*measure_groups(self.groups, self.timing, self.view(motion), gradients))
+        return RowRecord(*measure_groups(self.groups, self.timing, self.view(motion), gradients, slopes=self.slopes))
 
-    def view(self, motion: Vibration) -> Motion:
+    def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motion of the stacks that are measured, with two components."""
         return motion
 
-    def remove_column_pattern(self, motion: Vibration, gradients: list[RowGradients]) -> bool:
+    def remove_column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> bool:
         """Subtract a pattern of columns that is fixed to the sensor; False if there is none."""
         return remove_column_pattern(self.groups, self.timing, self.view(motion), gradients)
 
@@ -107,6 +111,11 @@ def whole_rows(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: 
 _MAX_SLIDE_OF_BLUR = 0.15  # px
 
 
+def _in_rad(motion: Vibration | FreeMotion, scale: FieldScale) -> Vibration | FreeMotion:
+    """The motion with roll in rad and relative zoom."""
+    return scale.free_motion(motion) if isinstance(motion, FreeMotion) else scale.motion(motion)
+
+
 @dataclass(frozen=True, eq=False)
 class StripRows(MeasuredRows):
     """Frames whose strips of columns are measured.
@@ -122,8 +131,9 @@ class StripRows(MeasuredRows):
     columns: Tensor
     num_frames: int
     slide: float
+    slopes: ClassVar[bool] = True
 
-    def measure(self, motion: Vibration, gradients: list[RowGradients] | None = None) -> RowRecord:
+    def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
         """Components of the motion of every row (B, N, G, A), from the displacements in the strips.
 
         Roll moves the content of a scene row to different frame rows along the row, which are exposed at different
@@ -144,36 +154,29 @@ class StripRows(MeasuredRows):
         measurements, apart = combined_strips(measured, factors)
         return RowRecord(measurements, record.gradients, apart)
 
-    def view(self, motion: Vibration) -> Motion:
+    def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motions of the strips (B S)."""
-        field = self.scale.motion(motion)
+        field = _in_rad(motion, self.scale)
         return ColumnMotion.of_columns(field, self.columns, self.timing, self.num_frames, self.scale.height)
 
-    def _factors(self, motion: Vibration, gradients: list[RowGradients]) -> tuple[Tensor, Tensor]:
+    def _factors(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> tuple[Tensor, Tensor]:
         """Displacements (B, S, N, 2, A) by unit components in px: of the middles of strips, and those measured.
 
-        Gradients g measure the weighted mean of a displacement that changes along the row,
-        ``(sum_x g g^T)^-1 sum_x g g^T D(x)``, which is not that of the middle of the strip.
+        Gradients measure a weighted mean of a displacement that changes along the row, which is not that of the middle
+        of the strip (``slope_response``).
         """
         strips, view, each = len(self.columns), self.view(motion), []
         for group, own in zip(self.groups, gradients, strict=True):
-            images = own.images[..., : group.spectra.width]  # gradients along x and y, detail
-            blocks = images.shape[1] // BLOCK_ROWS
-            images = images[:, : blocks * BLOCK_ROWS].unflatten(1, (blocks, BLOCK_ROWS)).transpose(2, 3).flatten(3)
-            place = torch.arange(group.spectra.width, device=images.device) - 0.5 * (group.spectra.width - 1)
-            energy = (images @ images.mT).double()  # (B S, N, 3, 3)
-            moment = ((images * place.to(images).repeat(BLOCK_ROWS)) @ images[:, :, :2].mT).double()
-            size = energy.diagonal(dim1=-2, dim2=-1)
-            regular = energy + torch.diag_embed(1e-9 * size + (size == 0))
-            mean_place = torch.linalg.solve(regular, moment)[..., :2, :]
+            response = slope_response(own)  # (B S, N, 2, 2)
             middle = group.starts.mean(-1, keepdim=True) + 0.5 * self.scale.height * self.timing.row_time
             travelled = view.drift(middle).round()[..., 0, 1]  # as the scene rows of the group
-            rows = BLOCK_ROWS * (torch.arange(blocks, device=place.device) + 0.5) - 0.5 * self.scale.height
+            blocks = torch.arange(response.shape[1], device=response.device)
+            rows = BLOCK_ROWS * (blocks + 0.5) - 0.5 * self.scale.height
             y = rows - travelled[:, None]
             x = self.columns.repeat(len(y) // strips)[:, None].expand_as(y)
             factors = self.scale.factors(x, y)
             along = self.scale.factors(x + 1, y) - factors  # change of the displacement per column
-            each.append(torch.stack([factors, factors + mean_place @ along]))
+            each.append(torch.stack([factors, factors + response @ along]))
         of_middles, of_gradients = torch.cat(each, 2).unflatten(1, (-1, strips))
         return of_middles, of_gradients
 
@@ -194,10 +197,11 @@ def strip_rows(
     frames: Tensor,
     valid: Tensor | None,
     timing: RowTiming,
-    motion: Vibration,
+    motion: Vibration | FreeMotion,
     scale: FieldScale,
     *,
-    max_slide: float = 0.1,
+    pairs_if_blurred_differently: bool = True,
+    max_slide: float = 0.05,
     min_pitch: int = 48,
 ) -> StripRows:
     """Frames (B, T, H, W) in strips of columns.
@@ -208,11 +212,12 @@ def strip_rows(
         timing: The sensor, in row order.
         motion: A first estimate of the motion, all components in px.
         scale: Components of the motion.
+        pairs_if_blurred_differently: As in ``frame_groups``.
         max_slide: px, difference of the displacements of the middle of a strip and its ends; gradients measure
             such displacements without bias.
         min_pitch: Columns of a strip that count; narrower strips consist of their margins mostly.
     """
-    field, count = scale.motion(motion), frames.shape[1]
+    field, count = _in_rad(motion, scale), frames.shape[1]
     starts = timing.row_starts(count, scale.height, frames.device)[:, :: max(1, scale.height // 64)].flatten()
     ends = 0.5 * scale.width * torch.tensor([-1.0, 1.0], dtype=torch.float64, device=frames.device)
     of_ends = ColumnMotion.of_columns(field, ends, timing, count, scale.height)
@@ -227,6 +232,6 @@ def strip_rows(
     of_valid = None if valid is None else cut_into_strips(valid, number, edge)[0]
     spectra = stack_spectra(strips, of_valid)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)
-    groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=True)
+    groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=pairs_if_blurred_differently)
     slide = 0.5 * slope * (scale.width - 2 * edge - MARGIN) / number
     return StripRows(groups, timing, scale, columns, count, slide)
