@@ -330,6 +330,54 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
         "windows_figure": Call(
             rsv.windows_figure, {"times": [0.0], "detections": [detected], "time_label": "start (s)"}
         ),
+        "camera_isd": Call(
+            rsv.camera_isd,
+            {
+                "camera": rsv.Camera(2e6),
+                "size": (96, 64),
+                "position": (6878.0, 0.0, 0.0),
+                "look": (-1.0, 0.0, 0.0),
+                "radii": (6378.0, 6357.0),
+                "ephemeris_time": 0.0,
+            },
+        ),
+        "sampling_map": Call(
+            rsv.sampling_map, {"motion": vibration, "timing": timing, "size": (96, 64), "num_frames": 2}
+        ),
+        "write_gcsv": Call(
+            rsv.write_gcsv,
+            {
+                "path": folder / "rates.gcsv",
+                "motion": vibration.with_camera(rsv.Camera(900.0)),
+                "timing": timing,
+                "size": (96, 64),
+                "num_frames": 2,
+                "sample_rate": None,
+            },
+        ),
+        "write_isd": Call(
+            rsv.write_isd,
+            {
+                "path": folder / "isd.json",
+                "motion": vibration,
+                "timing": timing,
+                "isd": rsv.camera_isd(rsv.Camera(2e6), (96, 64), position=(6878.0, 0.0, 0.0), look=(-1.0, 0.0, 0.0)),
+                "frame": 1,
+                "model": "auto",
+                "tolerance": 0.005,
+            },
+        ),
+        "write_stmap": Call(
+            rsv.write_stmap,
+            {
+                "folder": folder / "maps",
+                "motion": vibration,
+                "timing": timing,
+                "size": (96, 64),
+                "num_frames": 2,
+                "convention": "nuke",
+            },
+        ),
         "write_offsets": Call(rsv.write_offsets, {"path": folder / "offsets.csv", "result": detected}),
         "write_stack": Call(
             rsv.write_stack,
