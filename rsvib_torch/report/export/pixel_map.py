@@ -167,7 +167,7 @@ def write_stmap(
     * ``"opencv"``: (x, y) themselves, the maps of ``cv2.remap``.
 
     The third channel is 1 where the position lies in the recorded frame, else 0. In float32 the positions are rounded
-    by at most 2.5e-4 px in frames of 8192 px; a TIFF of 16 bits would round them by 0.03 px.
+    by at most 2.5e-4 px in frames of 8192 px; a TIFF of 16 bits would round them by up to 0.06 px.
 
     Args:
         folder: Folder for ``stmap_0000.tif``, ``stmap_0001.tif`` ...; it is created, files of these names are replaced.
