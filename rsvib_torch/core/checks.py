@@ -17,10 +17,11 @@ def described(value: object) -> str:
         >>> described("3"), described(None), described([1, 2]), described([0.5] * 99)
         ("'3' (str)", 'None', '[1, 2]', 'list')
     """
+    if getattr(value, "is_nested", False):
+        return "a nested tensor"  # its shape raises an error
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if shape is not None and dtype is not None:
-        size = "" if getattr(value, "is_nested", False) else f" of shape {tuple(shape)} and {dtype}"
-        return f"{type(value).__name__}{size}"
+        return f"{type(value).__name__} of shape {tuple(shape)} and {dtype}"
     if value is None or isinstance(value, (bool, float, complex)):
         return repr(value) if value is None else f"{value!r} ({type(value).__name__})"
     if isinstance(value, int):

@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from rsvib_torch.core.arguments import check_shapes, checks_arguments
+from rsvib_torch.core.arguments import check_images, checks_arguments
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.splines import bspline_coefficients, bspline_coefficients_adjoint, mirrored
 from rsvib_torch.imaging.psf import RowPSF
@@ -157,12 +157,13 @@ class RowVaryingBlur(nn.Module):
     @checks_arguments
     def forward(self, scene: Tensor) -> Tensor:
         """Form frames (..., R, W) from a scene (..., Hs, Ws)."""
-        check_shapes({"scene": scene}, {"scene": "... H W"})
+        check_images({"scene": scene}, {"scene": "... H W"})
         return blur_rows(scene, self.psf, frame_width=self.frame_width, origin=self.origin)
 
     @checks_arguments
     def adjoint(self, frames: Tensor, scene_shape: tuple[int, ...]) -> Tensor:
         """Apply the exact adjoint to frames (..., R, W)."""
+        check_images({"frames": frames}, {"frames": "... R W"})
         return blur_rows_adjoint(frames, self.psf, scene_shape, origin=self.origin)
 
     @checks_arguments
@@ -173,6 +174,7 @@ class RowVaryingBlur(nn.Module):
     @checks_arguments
     def A_adjoint(self, y: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
         """``adjoint`` for scenes with the leading dimensions of the frames and ``scene_size``."""
+        check_images({"y": y}, {"y": "... R W"})
         size = (y.shape[-2], y.shape[-1]) if self.scene_size is None else self.scene_size
         return self.adjoint(y, (*y.shape[:-2], *size))
 

@@ -334,7 +334,7 @@ class VibrationStd(
     Result,
     units=_UNITS | {"displacement": "px"},
     shapes={
-        **dict.fromkeys(("amplitude", "frequency", "period", "phase"), "... A K"),
+        **dict.fromkeys(("amplitude", "frequency", "period", "phase"), "... A=2-4 K"),
         **dict.fromkeys(("image_motion", "image_acceleration", "displacement"), "... A"),
     },
 ):

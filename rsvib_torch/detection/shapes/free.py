@@ -52,8 +52,7 @@ class MotionDetection(
     units={"times": "s", "displacement": "px", "std": "px", "std_seen": "px", "unseen": "px", "unexplained": "px"},
     shapes={
         "times": "T R",
-        "displacement": "... T R 2",
-        "std": "... T R 2",
+        **dict.fromkeys(("displacement", "std"), "... T R 2"),
         **dict.fromkeys(("std_seen", "unseen", "unexplained", "reliable"), "... 2"),
     },
 ):
