@@ -139,8 +139,8 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
         if not fits or batch not in batches:
             names = [lead.strip("[]")] * bool(lead) + [axis for axis, _, _ in axes]
             limits = {axis: f"{low} to {high}" for axis, low, high in axes if math.isfinite(high) and low < high}
-            limits |= {axis: str(known[axis]) for axis in names if axis in known}
-            where = f" with {', '.join(f'{axis} = {text}' for axis, text in limits.items())}" if limits else ""
+            sizes_known = [f"{axis} = {(limits | known)[axis]}" for axis in names if axis in limits | known]
+            where = f" with {', '.join(sizes_known)}" if sizes_known else ""
             raise ValueError(f"{name} must have shape ({', '.join(names)}{',' * (len(names) == 1)}){where}, got {shape}")
         known |= {axis: size for (axis, low, high), size in zip(axes, sizes, strict=True) if low < high}
         if batch or lead == "...":
