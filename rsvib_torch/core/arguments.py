@@ -141,7 +141,9 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
             limits = {axis: f"{low} to {high}" for axis, low, high in axes if math.isfinite(high) and low < high}
             sizes_known = [f"{axis} = {(limits | known)[axis]}" for axis in names if axis in limits | known]
             where = f" with {', '.join(sizes_known)}" if sizes_known else ""
-            raise ValueError(f"{name} must have shape ({', '.join(names)}{',' * (len(names) == 1)}){where}, got {shape}")
+            raise ValueError(
+                f"{name} must have shape ({', '.join(names)}{',' * (len(names) == 1)}){where}, got {shape}"
+            )
         known |= {axis: size for (axis, low, high), size in zip(axes, sizes, strict=True) if low < high}
         if batch or lead == "...":
             known["..."] = batch

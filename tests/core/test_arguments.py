@@ -110,9 +110,7 @@ def test_pixels_beyond_all_scales(value):
         ),
         (lambda: rsv.psf_figure(rsv.Vibration(1e6, 50.0), TIMING, 96), "point spread functions of 24 rows"),
         (
-            lambda: rsv.detect_swept_tone(
-                FRAMES[:1].expand(2, 96, 64), LONG, band_rows=16, band_step=8, search=6
-            ),
+            lambda: rsv.detect_swept_tone(FRAMES[:1].expand(2, 96, 64), LONG, band_rows=16, band_step=8, search=6),
             "frames cover 2.01 s; starts of the swept model .* at most .* s: pass fewer frames",
         ),
         (lambda: rsv.restore(FRAMES, TIMING, VIBRATION, method="banded", half_rows=10**9), "half_rows must be at most"),
@@ -154,7 +152,11 @@ def test_nested_tensors_are_described():
 @pytest.mark.parametrize(
     ("result", "changes", "message"),
     [
-        ("std", {"amplitude": torch.zeros(4, 2, 1)}, r"frequency must have shape .* with \.\.\. = \(4,\), A = 2, K = 1"),
+        (
+            "std",
+            {"amplitude": torch.zeros(4, 2, 1)},
+            r"frequency must have shape .* with \.\.\. = \(4,\), A = 2, K = 1",
+        ),
         ("std", {"displacement": torch.zeros(1, 2)}, r"displacement must have shape \(\.\.\., A\) with \.\.\. = \(\)"),
         ("curve", {"offsets": torch.zeros(1, 3, 1)}, r"offsets must have shape .* A = 2 to 4, got \(1, 3, 1\)"),
         ("curve", {"times": torch.zeros(4, 1, 3)}, r"times must have shape .* with \.\.\. = \(\), P = 1, N = 3"),

@@ -55,9 +55,7 @@ class SweptTone(
         "image_motion": "px/s",
         "unexplained": "px",
     },
-    shapes=dict.fromkeys(
-        (*_TONE, "image_motion", "unexplained", "reliable"), "... 2"
-    ),
+    shapes=dict.fromkeys((*_TONE, "image_motion", "unexplained", "reliable"), "... 2"),
 ):
     """One tone an axis that decays and sweeps: ``A exp(-g t) sin(2 pi (f t + c t^2 / 2) + phi) + v t``.
 
