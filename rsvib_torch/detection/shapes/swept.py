@@ -170,7 +170,8 @@ def detect_swept_tone(
 
     Raises:
         TypeError: If frames are not numbers.
-        ValueError: If they cannot be registered, see ``detect_motion``, or an option is out of range.
+        ValueError: If they cannot be registered, see ``detect_motion``, an option is out of range, or the frames cover
+            more time than the grid of starts is searched in: 0.47 s for bands of 32 rows of 20 us.
 
     Note:
         A result of two frames is never reliable: decay, sweep and frequency replace each other there.
