@@ -13,7 +13,7 @@ from rsvib_torch.core.arguments import check_broadcast, checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming
 
 __all__ = ["Motion"]
 
@@ -229,7 +229,7 @@ class Motion(Result, ABC):
     @checks_arguments
     def expanded(self, size: int) -> Self:
         """A batch of ``size`` copies of the motion; the new dimension is the first."""
-        check_whole_number("size", size, at_least=1)
+        check_whole_number("size", size, at_least=1, at_most=MAX_BATCH)
         return self.mapped(lambda values: values.expand(size, *values.shape))
 
     @checks_arguments

@@ -11,12 +11,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.arguments import as_numbers, check_broadcast, checks_arguments
-from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming
 
 __all__ = ["Vibration", "VibrationStd", "blind_frequencies", "image_motion_line", "tone_head", "tone_rows"]
 
@@ -174,7 +174,10 @@ class Vibration(Motion, units=_UNITS):
     @checks_arguments
     def still(cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None, *, axes: int = 2) -> Self:
         """No vibration and no image motion: the camera stands still."""
-        zeros = torch.zeros(*batch_shape, axes, 1, dtype=torch.float64, device=device)
+        sizes = [check_whole_number("batch_shape", size, at_least=1, at_most=MAX_BATCH) for size in batch_shape]
+        if math.prod(sizes) > MAX_BATCH:
+            raise ValueError(f"batch_shape must have at most {MAX_BATCH} motions, got {tuple(sizes)}")
+        zeros = torch.zeros(*sizes, axes, 1, dtype=torch.float64, device=device)
         return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0])
 
     @classmethod
@@ -366,7 +369,7 @@ class VibrationStd(
     Result,
     units=_UNITS | {"displacement": "px"},
     shapes={
-        **dict.fromkeys(("amplitude", "frequency", "period", "phase"), "... A K"),
+        **dict.fromkeys(("amplitude", "frequency", "period", "phase"), "... A=2-4 K"),
         **dict.fromkeys(("image_motion", "image_acceleration", "displacement"), "... A"),
     },
 ):

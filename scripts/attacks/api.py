@@ -499,7 +499,9 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
         report,
     ):
         result |= _methods(value, **common)
-    for method, value in (("forward", {"scene": scene}), ("adjoint", {"frames": frames[0], "scene_shape": (160, 128)})):
+    images: dict[str, dict[str, Any]] = {"forward": {"scene": scene}, "A": {"x": scene}, "A_adjoint": {"y": frames[0]}}
+    images["adjoint"] = {"frames": frames[0], "scene_shape": (160, 128)}
+    for method, value in images.items():
         result[f"RowVaryingBlur.{method}"] = Call(getattr(blur, method), value)
     missing = set(rsv.__all__) - _NOT_CALLED - {name.partition(" ")[0] for name in result}
     if missing:
@@ -531,6 +533,11 @@ _OTHERS: dict[str, Callable[[], Any]] = {
     "list of None": lambda: [None, None],
     "list of nan": lambda: [math.nan, math.nan],
     "list of 1e300": lambda: [1e300, 1e300],
+    "list of 0": lambda: [0, 0],
+    "list of -1": lambda: [-1, -1],
+    "list of 10**9": lambda: [10**9, 10**9],
+    "three sizes": lambda: [2, 2, 2],
+    "five sizes": lambda: (2, 3, 4, 5, 6),
     "generator": lambda: (number for number in (1.0, 2.0)),
     "empty tensor": lambda: torch.zeros(0),
     "scalar tensor": lambda: torch.tensor(2.0),
@@ -561,6 +568,7 @@ _TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "complex": lambda t: t.to(torch.complex64),
     "bool": lambda t: t > 0.5,
     "int64": lambda t: (100 * t).nan_to_num().to(torch.int64),
+    "uint32": lambda t: (100 * t.abs()).nan_to_num().to(torch.uint32),
     "uint16": lambda t: (100 * t.abs()).nan_to_num().to(torch.uint16),
     "half": lambda t: t.half(),
     "bfloat16": lambda t: t.bfloat16(),

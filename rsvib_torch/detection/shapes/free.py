@@ -59,8 +59,7 @@ class MotionDetection(
     },
     shapes={
         "times": "T R",
-        "displacement": "... T R A",
-        "std": "... T R A",
+        **dict.fromkeys(("displacement", "std"), "... T R A"),
         **dict.fromkeys(("std_seen", "unseen", "unexplained", "reliable"), "... A"),
     },
 ):
