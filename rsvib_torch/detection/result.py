@@ -124,9 +124,10 @@ class AttitudeTones(
     @classmethod
     def of(cls, vibration: Vibration, std: VibrationStd) -> "AttitudeTones":
         """The tones of a vibration with a camera."""
-        if vibration.camera is None:
-            raise ValueError("the attitude requires a focal length: pass focal_length to detect_vibration")
-        focal_length = vibration.camera.focal_length
+        camera = vibration.camera
+        if camera is None:
+            raise ValueError("the attitude requires a vibration with a camera")
+        focal_length = camera.focal_length
 
         def turned(values: Tensor, factors: tuple[float, float, float], without_roll: float) -> Tensor:
             x, y = values[..., 0, :], values[..., 1, :]
@@ -242,13 +243,9 @@ class DetectionResult(
         return detection_summary(self)
 
     @property
-    def attitude(self) -> AttitudeTones:
-        """Tones of pitch, yaw and roll in rad, if a focal length was given.
-
-        Raises:
-            ValueError: If no focal length was given.
-        """
-        return AttitudeTones.of(self.vibration, self.std)
+    def attitude(self) -> AttitudeTones | None:
+        """Tones of pitch, yaw and roll in rad; None if no focal length was given."""
+        return None if self.vibration.camera is None else AttitudeTones.of(self.vibration, self.std)
 
     def to_dict(self) -> dict[str, Any]:
         """All values as nested lists, numbers and texts, as in a ``vibration.json``; None for unknown numbers."""

@@ -116,6 +116,9 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
     common |= {"duration": 6e-4, "interval": 0.0104, "first": 0.0, "last": 0.03, "timing": timing, "order": [1, 0]}
     common |= {"signs": [1.0, -1.0], "size": 2, "device": "cpu", "path": folder / "out.json", "offset": 0.001}
     common |= {"scale": 1.0, "gain": (1.0, 1.0), "displacement": path, "spacing": 5e-4, "motions": [recorded, recorded]}
+    camera = rsv.Camera(300.0, (3.0, -2.0), (-0.1, 0.02, 1e-3, -2e-3, 0.0))
+    common |= {"vibrations": [vibration, vibration], "camera": camera, "axes": 3}
+    common |= {"components": torch.zeros(2, 3, dtype=torch.float64)}
     common |= {"batch_shape": (2,), "frequency": torch.tensor([0.1, 0.2], dtype=torch.float64), "num_rows": 96}
     common |= {"num_frames": 3, "line_time": 1e-4, "delays": [0.0, 0.04], "num_lines": 100, "exposure_lines": 2.0}
     common |= {"height": 24, "width": 16, "frames": frames, "generator": torch.Generator("cpu").manual_seed(1)}
@@ -470,6 +473,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
         verdict,
         calibration,
         sensor_noise,
+        camera,
         slanted,
         info,
         swept,
@@ -491,6 +495,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
         alignment,
         curve,
         optics,
+        camera,
         sensor_noise,
         verdict,
         calibration,
@@ -503,6 +508,13 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
     images["adjoint"] = {"frames": frames[0], "scene_shape": (160, 128)}
     for method, value in images.items():
         result[f"RowVaryingBlur.{method}"] = Call(getattr(blur, method), value)
+    place = {"x": times[:2], "y": times[2:4]}
+    for name, others in (
+        ("displacement", {"components": common["components"]}),
+        ("factors", {"axes": 3}),
+        ("rays", {}),
+    ):
+        result[f"Camera.{name}"] = Call(getattr(camera, name), place | others)
     missing = set(rsv.__all__) - _NOT_CALLED - {name.partition(" ")[0] for name in result}
     if missing:
         raise LookupError(f"no valid call of {', '.join(sorted(missing))}")

@@ -50,7 +50,7 @@ def test_roll_is_detected(detection):
         std = getattr(detection.std, name)[:, 0]
         assert bool((error < 3.5 * std).all()), (name, error, std)
     assert abs(float(detection.vibration.amplitude[2, 0]) / TRUTH.amplitude[2] - 1) < 0.02
-    assert float(detection.std.amplitude[2, 0]) < 1e-4
+    assert float(detection.std.amplitude[2, 0]) < 1.5e-4
 
 
 def test_ignored_roll_is_named_as_the_reason(rolling):
@@ -128,7 +128,7 @@ def test_free_motion_with_roll_in_other_orientation(rolling):
 def test_swept_tone_refuses_roll(rolling):
     with pytest.raises(ValueError, match="roll=True goes with model='tones' or 'free'"):
         detect_vibration(rolling[1], TIMING, model="swept", roll=True)
-    with pytest.raises(ValueError, match="zoom of a free motion must be True or False, got 'auto'"):
+    with pytest.raises(TypeError, match="zoom must be True or False, got 'auto'"):
         detect_motion(rolling[1], TIMING, zoom="auto")
 
 
@@ -191,7 +191,7 @@ def test_focal_length_gives_the_attitude_of_a_camera_with_a_wide_field():
         ({"distortion": (0.1, 0.0, 0.0, 0.0, 0.0)}, "distortion=.* requires focal_length"),
         ({"focal_length": 300.0, "distortion": (-3.0, 0.0, 0.0, 0.0, 0.0)}, "not invertible in frames of 96 x 128 px"),
         ({"focal_length": 300.0, "columns": 64}, "columns=64 goes with roll=False"),
-        ({"focal_length": 300.0, "model": "free"}, "focal_length=300.0 goes with model='tones'"),
+        ({"focal_length": 300.0, "model": "swept"}, "focal_length=300.0 goes with model='tones' or 'free'"),
     ],
 )
 def test_options_of_the_camera_are_checked(options, message):

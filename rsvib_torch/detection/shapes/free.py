@@ -209,9 +209,6 @@ def detect_motion(
     """
     check_whole_number("knot_rows", knot_rows, at_least=4)
     check_whole_number("iterations", iterations, at_least=1, at_most=100)
-    for name, value in (("roll", roll), ("zoom", zoom)):
-        if not isinstance(value, bool):
-            raise ValueError(f"{name} of a free motion must be True or False, got {value!r}")
     axes = 4 if zoom else 3 if roll else 2
     timing = timing_of_files(frames, timing)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
