@@ -343,7 +343,8 @@ def _checks_of(function: Callable[..., Any]) -> dict[str, _Check]:
 
 def _check(kind: Any, *, finite: bool = True) -> _Check | None:  # noqa: PLR0911, PLR0912
     """The check of an annotation; None where every value is accepted or the function itself checks it."""
-    origin, arguments = get_origin(kind), get_args(kind)
+    kind = _without_alias(kind)
+    origin, arguments = get_origin(kind), tuple(map(_without_alias, get_args(kind)))
     if kind is Any or isinstance(kind, TypeVar):
         return None
     if torch.device in arguments and origin in (Union, types.UnionType):
@@ -385,6 +386,12 @@ def _check(kind: Any, *, finite: bool = True) -> _Check | None:  # noqa: PLR0911
         article, source = "an" if kind.__name__[0] in "AEIOU" else "a", getattr(kind, "_MADE_BY", "")
         return _instance((kind,), f"{article} {kind.__name__}{source and f' ({source})'}")
     return None
+
+
+def _without_alias(kind: Any) -> Any:
+    """What a ``type`` statement stands for, as numpy.typing.NDArray from NumPy 2.5 on; other annotations unchanged."""
+    alias = kind if get_origin(kind) is None else get_origin(kind)
+    return alias.__value__ if type(alias).__name__ == "TypeAliasType" else kind
 
 
 def void(_: object) -> None:
