@@ -81,6 +81,7 @@ class ExactSettings(TypedDict, total=False):
     regularisation: float
     chunk_frequencies: int | None
     segments: int | None
+    scale: int
 
 
 class BandedSettings(TypedDict, total=False):

@@ -21,7 +21,9 @@ from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem
 from rsvib_torch.restoration.exact.strength import Strengths, prior_strength
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise.policy import noise_levels
+from rsvib_torch.restoration.scene_model.finer_rows import SCALE, FinerObservation, finer_kernels
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels, row_kernels
+from rsvib_torch.restoration.scene_model.polynomial_prior import PolynomialPrior, fit_polynomial_prior
 from rsvib_torch.restoration.scene_model.row_prior import RowPrior, brightness, fit_prior
 
 __all__ = ["restore_exact", "scene_period"]
@@ -42,6 +44,7 @@ def restore_exact(
     clipped: Tensor | None = None,
     chunk_frequencies: int | None = None,
     segments: int | None = None,
+    scale: int = 1,
 ) -> Tensor:
     """Restore frames with all rows coupled: the most probable scene for its frames and a prior.
 
@@ -78,9 +81,12 @@ def restore_exact(
     Returns:
         Restored frames of the same shape, or (B, 1, C, H, W).
     """
-    B, T, _, H, W = frames.shape
+    B, T, C, H, W = frames.shape
     factor = check_number("regularisation", regularisation, above=0.0)
     check_choice("prior", prior, tuple(PRIORS))
+    check_choice("scale", scale, (1, SCALE))
+    if scale != 1 and prior != "gaussian":
+        raise ValueError(f"scale={scale} has prior='gaussian' only, got {prior!r}")
     groups = joint_groups(T, joint)
     chunk, split = (
         None if value is None else check_whole_number(name, value, at_least=1)
@@ -108,8 +114,11 @@ def restore_exact(
             weights=weights * typical,
             level=typical.sqrt(),
             mean=mean[index],
-            prior=fit_prior(frames[index], motion, index, levels[index], length),
+            prior=(fit_prior if scale == 1 else fit_polynomial_prior)(
+                frames[index], motion, index, levels[index], length
+            ),
             length=length,
+            scale=scale,
             missing=None if missing is None else missing[index],
             clipped=None if clipped is None else clipped[index],
         )
@@ -120,14 +129,14 @@ def restore_exact(
     def restored(number: int, partition: Partition) -> Tensor:
         stack, members, reference, strength = scenes[number]
         scene = PRIORS[prior](stack.problem(members, reference, strength, partition), PriorOptions(factor))
-        return scene[..., :W] + stack.mean
+        return scene[..., : scale * W] + stack.mean
 
     count = len(scenes)
     if torch.is_grad_enabled() and (frames.requires_grad or displacement.requires_grad):
         partition = Partition(chunk, split)
         images = torch.stack([restored(number, partition) for number in range(count)])
         return images.view(B, -1, *images.shape[1:])
-    images = frames.new_empty(count, *frames.shape[2:])
+    images = frames.new_empty(count, C, scale * H, scale * W)
     threads = min(Partition.threads(frames.device), count)
     advance = steps(count, "frames")
 
@@ -154,7 +163,8 @@ class _Stack:
         level: Standard deviation of the noise of a frame of weight 1.
         mean: (C, 1, 1) brightness; the prior is for deviations from it.
         prior: Of all frames.
-        length: L, the period of the restored scenes.
+        length: L, the period of the restored scenes in px.
+        scale: Points of the restored scenes per px.
         missing: (T, C, H, W) bool, missing and saturated pixels; None for none.
         clipped: Likewise, the saturated ones.
     """
@@ -166,8 +176,9 @@ class _Stack:
     weights: Tensor
     level: Tensor
     mean: Tensor
-    prior: RowPrior
+    prior: RowPrior | PolynomialPrior
     length: int
+    scale: int
     missing: Tensor | None
     clipped: Tensor | None
 
@@ -180,10 +191,13 @@ class _Stack:
         """Kernels of some frames, in the coordinates of one of them."""
         moved = self.displacement[members] - self.shift[reference]
         # a scene extends up to 16 rows beyond the frame; rows displaced further have weight 0
-        return row_kernels(moved, self.node_weights, self.weights[members], self.frames.shape[-2], 16)
+        make = row_kernels if self.scale == 1 else finer_kernels
+        return make(moved, self.node_weights, self.weights[members], self.frames.shape[-2], 16)
 
     def strength(self, members: list[int], reference: int, strengths: Strengths, *, certain: bool) -> float:
         """Factor on the prior, estimated from those frames whose columns are the same as in the restored one."""
+        if isinstance(self.prior, PolynomialPrior):
+            return 1.0
         alike = [frame for frame in members if torch.equal(self.shift[frame], self.shift[reference])]
         prior, power = self.prior.of(members), self.noise_power
 
@@ -197,12 +211,16 @@ class _Stack:
         """The problem of one scene, with all missing values and boundary extensions filled."""
         height, width = self.frames.shape[-2:]
         kernels = self.kernels(members, reference)
-        precision = self.prior.of(members).precision(self.noise_power, strength, kernels.reach)
+        if isinstance(self.prior, PolynomialPrior):
+            precision = self.prior.precision(self.level.square(), strength, self.length, kernels.reach)
+        else:
+            precision = self.prior.of(members).precision(self.noise_power, strength, kernels.reach)
         along = self.shift[members, 0] - self.shift[reference, 0]
         neighbours = members == list(range(members[0], members[-1] + 1))  # a view instead of a copy
         frames = self.frames[members[0] : members[-1] + 1] if neighbours else self.frames[members]
         data = extend_rows(frames, self.length).sub_(self.mean)
-        problem = SceneProblem(data, Observation(kernels, height, data.dtype), precision, self.level, partition)
+        observe = Observation if self.scale == 1 else FinerObservation
+        problem = SceneProblem(data, observe(kernels, height, data.dtype), precision, self.level, partition)
         missing = None if self.missing is None else self.missing[members]
         ends = kernels.reach > _FILLED_REACH
         if missing is None and ends and not bool(along.any()):

@@ -22,8 +22,7 @@ from rsvib_torch.core.banded_solver import BandedFactor, factor_banded, solve_sk
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.interpolated_factors import InterpolatedFactors, node_frequencies
 from rsvib_torch.core.parallel import in_parallel
-from rsvib_torch.core.splines import correlated
-from rsvib_torch.restoration.scene_model.observation import SCENE_REACH, Observation, scene_weights
+from rsvib_torch.restoration.scene_model.observation import Observation
 
 __all__ = ["Partition", "SceneProblem", "SceneSolver", "join_windows", "row_windows"]
 
@@ -214,14 +213,8 @@ class SceneSolver:
         return images
 
     def scene(self, coefficients: Tensor) -> Tensor:
-        """Rows of the scene where the frame at rest would observe them, (C, R, L)."""
-        first = -SCENE_REACH - self.observation.top
-        near = coefficients[first : first + self.observation.num_rows + 2 * SCENE_REACH]
-        weights = torch.tensor([scene_weights()], dtype=near.real.dtype, device=near.device)
-        sampled = correlated(torch.view_as_real(near).flatten(1), weights, 0)[0]
-        spectra = torch.view_as_complex(sampled.unflatten(1, (*near.shape[1:], 2)))
-        scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=self.length)
-        return scene
+        """Rows of the scene where the frame at rest would observe them, (C, R, L); twice as many on the finer grid."""
+        return self.observation.scene(coefficients, self.length)
 
 
 @dataclass(frozen=True, eq=False)

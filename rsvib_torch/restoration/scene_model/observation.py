@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.fourier import shift_phases
-from rsvib_torch.core.splines import gauss_legendre, spread_taps
+from rsvib_torch.core.splines import correlated, gauss_legendre, spread_taps
 
 __all__ = [
     "REACH",
@@ -29,9 +29,11 @@ __all__ = [
     "RowKernels",
     "SmoothBand",
     "interpolation_error",
+    "interpolation_matrix",
     "kernel_samples",
     "kernel_spectrum",
     "kernel_weights",
+    "normal_matrices",
     "row_kernels",
     "scene_weights",
     "smooth_band",
@@ -150,10 +152,16 @@ class RowKernels:
         """Largest distance along the row from the middle in px."""
         return float(self.along.detach().abs().amax())
 
+    symmetric = True  # kernels at -u are the conjugates of those at u
+
     @property
     def blurred(self) -> bool:
         """Whether the displacement changes by more than 1 px during an exposure."""
         return max(2.0 * self.reach, float(self.taps.shape[-2] - TAPS)) > 1.0
+
+    def needed(self, num_rows: int) -> tuple[int, int]:
+        """First coefficient, and the one after the last, that the scene on the rows of a frame depends on."""
+        return -SCENE_REACH, num_rows + SCENE_REACH
 
     def rows(self, top: int, count: int) -> "RowKernels":
         """Kernels of ``count`` rows from row ``top`` on, counted from there."""
@@ -185,17 +193,26 @@ def row_kernels(displacement: Tensor, node_weights: Tensor, weight: Tensor, num_
     return RowKernels(first, taps, middle, x - middle[..., None], weight[:, None].to(torch.float64) * near)
 
 
-def _interpolation(reach: float, u: Tensor, precision: float) -> tuple[Tensor, Tensor]:
+def interpolation_matrix(reach: float, u: Tensor, dtype: torch.dtype, *, symmetric: bool) -> tuple[Tensor, Tensor]:
     """Nodes (Q,) in 0 ... 1/2 cycles per px, and the matrix (2 Q, 2 U) to frequencies ``u``.
 
-    Functions ``f(-u) = conj f(u)`` that are sums of waves of up to ``reach`` px are interpolated from real and
-    imaginary parts at the nodes to interleaved real and imaginary parts at ``u``: even and odd Chebyshev series.
+    Sums of waves of up to ``reach`` px are interpolated from real and imaginary parts at the nodes to interleaved real
+    and imaginary parts at ``u`` by Chebyshev series: with ``f(-u) = conj f(u)`` even and odd ones, else in 0 ... 1/2.
     """
-    half = math.pi * reach
+    precision = 1e-5 if dtype == torch.float32 else 1e-15
+    half = math.pi * reach * (1.0 if symmetric else 0.5)
     degree, bound = 1, half
     while bound > precision or degree < half:
         degree += 1
         bound *= 0.5 * half / degree if half else 0.0
+    if not symmetric:
+        order = torch.arange(degree + 1, dtype=torch.float64, device=u.device)
+        angles = math.pi * (order + 0.5) / len(order)
+        series = torch.cos(angles[:, None] * order) * torch.where(order > 0, 2.0, 1.0) / len(order)
+        values = series @ torch.cos(order[:, None] * torch.acos((4 * u - 1).clamp(-1, 1)))
+        matrix = u.new_zeros(2, len(order), len(u), 2)
+        matrix[0, ..., 0] = matrix[1, ..., 1] = values
+        return 0.25 * (1 + torch.cos(angles)), matrix.flatten(0, 1).flatten(1)
     count = degree // 2 + 1
     k = torch.arange(count, dtype=torch.float64, device=u.device)
     angles = math.pi * (2 * k + 1) / (4 * count)
@@ -210,10 +227,6 @@ def _interpolation(reach: float, u: Tensor, precision: float) -> tuple[Tensor, T
     return 0.5 * torch.cos(angles), matrix.flatten(1)
 
 
-def _precision(dtype: torch.dtype) -> float:
-    return 1e-5 if dtype == torch.float32 else 1e-15
-
-
 def _stacked(values: Tensor) -> Tensor:
     return torch.cat([values.real, values.imag], dim=-1)
 
@@ -225,24 +238,27 @@ class SmoothKernels:
     Attributes:
         left: (J, M R, 2 Q) real and imaginary parts at Q nodes of every tap of every row.
         reach: Largest distance along the rows in px from their middles.
+        symmetric: Whether kernels at -u are the conjugates of those at u.
     """
 
     left: Tensor
     reach: float
+    symmetric: bool = True
 
-    def taps(self, u: Tensor) -> Iterator[Tensor]:
-        """Kernels (M R, U), complex, without the phase of their middles, one tap after the other."""
-        right = _interpolation(self.reach, u, _precision(self.left.dtype))[1].to(self.left.dtype)
+    def taps(self, u: Tensor, *, conjugate: bool = False) -> Iterator[Tensor]:
+        """Kernels (M R, U), or their conjugates, without the phase of their middles, one tap after the other."""
+        right = interpolation_matrix(self.reach, u, self.left.dtype, symmetric=self.symmetric)[1].to(self.left.dtype)
+        if conjugate:
+            right[:, 1::2] *= -1
         for tap in self.left:
             yield torch.view_as_complex((tap @ right).unflatten(-1, (-1, 2)))
 
 
 def smooth_kernels(kernels: RowKernels, dtype: torch.dtype) -> SmoothKernels:
     """Kernels of all rows at the Chebyshev nodes."""
-    nodes, _ = _interpolation(kernels.reach, kernels.middle.new_zeros(1), _precision(dtype))
-    return SmoothKernels(
-        _stacked(kernels.at(nodes)).to(dtype).flatten(0, 1).transpose(0, 1).contiguous(), kernels.reach
-    )
+    nodes, _ = interpolation_matrix(kernels.reach, kernels.middle.new_zeros(1), dtype, symmetric=kernels.symmetric)
+    left = _stacked(kernels.at(nodes)).to(dtype).flatten(0, 1).transpose(0, 1).contiguous()
+    return SmoothKernels(left, kernels.reach, kernels.symmetric)
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,13 +304,7 @@ class SmoothBand:
             out: Memory for them; page faults in fresh memory take as long as the product that fills it.
         """
         lags = torch.stack([precision.sum(1), torch.zeros_like(precision[:, 0])], dim=-1).flatten(1)
-        right = torch.cat([_interpolation(self.reach, u, _precision(self.left.dtype))[1], lags]).to(self.left.dtype)
-        rows = self.left.flatten(0, 2)
-        if out is None:
-            product = rows @ right
-        else:
-            product = torch.mm(rows, right, out=torch.view_as_real(out).view(len(rows), -1))
-        bands = product.view(*self.left.shape[:3], -1, 2)
+        bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype, symmetric=True)[1], lags, out)
         width, real = self.width, bands[..., 0]
         count = len(self.left) - width
         first, last = (slice(None), slice(None)) if self.systems else (slice(1), slice(-1, None))
@@ -306,6 +316,16 @@ class SmoothBand:
                     bottom = count - max(0, side)
                     real[bottom - k : bottom, width + side, last] -= precision[d, k]
         return torch.view_as_complex(bands).flatten(2)
+
+    def _product(self, interpolation: Tensor, prior: Tensor, out: Tensor | None) -> Tensor:
+        """Bands (R + b, 2 b + 1, n, U, 2) of the matrices at the nodes and of those of the prior."""
+        right = torch.cat([interpolation, prior]).to(self.left.dtype)
+        rows = self.left.flatten(0, 2)
+        if out is None:
+            product = rows @ right
+        else:
+            product = torch.mm(rows, right, out=torch.view_as_real(out).view(len(rows), -1))
+        return product.view(*self.left.shape[:3], -1, 2)
 
 
 def smooth_band(kernels: RowKernels, top: int, count: int, order: int, dtype: torch.dtype) -> SmoothBand:
@@ -319,7 +339,27 @@ def smooth_band(kernels: RowKernels, top: int, count: int, order: int, dtype: to
         dtype: dtype of the frames.
     """
     width = max(kernels.taps.shape[-2] - 1, order)
-    nodes, _ = _interpolation(2 * kernels.reach, kernels.middle.new_zeros(1), _precision(dtype))
+    matrices = normal_matrices(kernels, top, count, width, dtype)
+    lags = kernels.middle.new_zeros(len(matrices), 2 * width + 1, order + 1)
+    for d in range(order + 1):
+        lags[: count - d, width + d, d] = 1
+        lags[d:count, width - d, d] = 1
+    matrix = torch.cat([matrices, lags], dim=-1)
+    return SmoothBand(matrix.to(dtype)[:, :, None], 2 * kernels.reach, order)
+
+
+def normal_matrices(kernels: RowKernels, top: int, count: int, width: int, dtype: torch.dtype) -> Tensor:
+    """Bands (K + b, 2 b + 1, 2 Q) of ``sum_m w_m K_m^H K_m`` at the Chebyshev nodes, float64.
+
+    Args:
+        kernels: Kernels of the frames.
+        top: First coefficient of the scene.
+        count: K.
+        width: Half-width b of the band.
+        dtype: dtype of the frames, which determines the number of nodes.
+    """
+    zero = kernels.middle.new_zeros(1)
+    nodes, _ = interpolation_matrix(2 * kernels.reach, zero, dtype, symmetric=kernels.symmetric)
     values = kernels.at(nodes)
     weighted = values * kernels.weight[..., None, None]
     base = (kernels.first - top).flatten()
@@ -333,12 +373,7 @@ def smooth_band(kernels: RowKernels, top: int, count: int, order: int, dtype: to
     absent = torch.zeros_like(sides[0])
     right = [sides[d] if d < len(sides) else absent for d in range(width + 1)]
     left = [torch.cat([absent[:d], right[d][: len(absent) - d].conj()]) for d in range(width, 0, -1)]
-    lags = kernels.middle.new_zeros(len(absent), 2 * width + 1, order + 1)
-    for d in range(order + 1):
-        lags[: count - d, width + d, d] = 1
-        lags[d:count, width - d, d] = 1
-    matrix = torch.cat([_stacked(torch.stack(left + right, dim=1)), lags], dim=-1)
-    return SmoothBand(matrix.to(dtype)[:, :, None], 2 * kernels.reach, order)
+    return _stacked(torch.stack(left + right, dim=1))
 
 
 class Observation:
@@ -354,8 +389,9 @@ class Observation:
 
     def __init__(self, kernels: RowKernels, num_rows: int, dtype: torch.dtype) -> None:
         self.kernels, self.num_rows, self.dtype = kernels, num_rows, dtype
-        self.top = min(int(kernels.first.amin()), -SCENE_REACH)
-        last = max(int(kernels.first.amax()) + kernels.taps.shape[-2], num_rows + SCENE_REACH)
+        first, last = kernels.needed(num_rows)
+        self.top = min(int(kernels.first.amin()), first)
+        last = max(int(kernels.first.amax()) + kernels.taps.shape[-2], last)
         self.count = last - self.top
         self._smooth = smooth_kernels(kernels, dtype)
         self._first = (kernels.first - self.top).flatten()
@@ -369,7 +405,7 @@ class Observation:
 
     def weighted(self, weight: Tensor) -> "Observation":
         """The same with other weights (M, R) of the rows."""
-        return Observation(replace(self.kernels, weight=weight), self.num_rows, self.dtype)
+        return type(self)(replace(self.kernels, weight=weight), self.num_rows, self.dtype)
 
     def adjoint(self, spectra: Tensor, u: Tensor, part: slice, length: int) -> Tensor:
         """``K^H W g``, (K, C, U).
@@ -384,7 +420,7 @@ class Observation:
         rows = (spectra * (phases * self.kernels.weight.to(self.dtype)[..., None])[:, None]).transpose(1, 2)
         rows = rows.flatten(0, 1)
         total = rows.new_zeros(self.count, *rows.shape[1:])
-        for tap, kernel in enumerate(self._smooth.taps(-u)):  # kernels at -u are the conjugates of those at u
+        for tap, kernel in enumerate(self._smooth.taps(u, conjugate=True)):
             total = total.index_add_(0, self._first + tap, kernel[:, None] * rows)
         return total
 
@@ -396,3 +432,13 @@ class Observation:
         phases = shift_phases(self.kernels.middle, length, part, coefficients.dtype).conj()
         observed: Tensor = (rows.unflatten(0, phases.shape[:2]) * phases[:, :, None]).transpose(1, 2)
         return observed
+
+    def scene(self, coefficients: Tensor, length: int) -> Tensor:
+        """Rows of the scene where the frame at rest would observe them, (C, R, L)."""
+        first = -SCENE_REACH - self.top
+        near = coefficients[first : first + self.num_rows + 2 * SCENE_REACH]
+        weights = torch.tensor([scene_weights()], dtype=near.real.dtype, device=near.device)
+        sampled = correlated(torch.view_as_real(near).flatten(1), weights, 0)[0]
+        spectra = torch.view_as_complex(sampled.unflatten(1, (*near.shape[1:], 2)))
+        scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=length)
+        return scene

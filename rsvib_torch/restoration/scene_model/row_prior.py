@@ -17,7 +17,16 @@ from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.observation import interpolation_error, kernel_spectrum
 
-__all__ = ["ORDER", "RowPrior", "autoregressive_prior", "brightness", "fit_prior"]
+__all__ = [
+    "ORDER",
+    "ObservedSpectrum",
+    "RowPrior",
+    "autoregressive_prior",
+    "brightness",
+    "fit_prior",
+    "observed_spectrum",
+    "smeared",
+]
 
 ORDER = 2  # rows that a row is predicted from
 
@@ -186,11 +195,53 @@ def brightness(frames: Tensor) -> Tensor:
     return frames[..., ::8, :].mean((-2, -1))
 
 
-def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, length: int) -> RowPrior:
-    """Fit the prior to the frames of a stack.
+@dataclass(frozen=True, eq=False)
+class ObservedSpectrum:
+    """Power spectra of pieces of the frames of a stack, whose rows were moved back by their displacement.
 
-    Rows are moved back by their displacement, so that neighbours correlate as in the scene. The power spectra of pieces
-    of 64 x 256 px are averaged, weighted by the transfer function of their blur and the noise of their frame.
+    Attributes:
+        u: (U,) horizontal frequencies, cycles per px.
+        v: (V,) vertical frequencies.
+        power: (T, pieces, U, V) power per pixel: white noise of variance 1 has power 1.
+        whole: (U, V) of whole rows with their boundary extension.
+        displacement: (T, pieces, N, 2) px during the exposure of the middle row of each piece.
+        node_weights: (N,).
+        levels: (T,) standard deviation of the noise of each frame.
+    """
+
+    u: Tensor
+    v: Tensor
+    power: Tensor
+    whole: Tensor
+    displacement: Tensor
+    node_weights: Tensor
+    levels: Tensor
+
+    def blur(self, alias_u: int = 0, alias_v: int = 0) -> Tensor:
+        """Squared transfer functions (T, pieces, U, V) of the exposures at ``(u - alias_u, v - alias_v)``."""
+        along = waves(self.displacement[..., 0], self.u - alias_u) * self.node_weights[:, None]
+        return squared_modulus(along.transpose(-2, -1) @ waves(self.displacement[..., 1], self.v - alias_v))
+
+    def weighted(self, transfer: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Observed power (U, V), weights (T, pieces, U, V) of sum 1, and power (U, V) of the noise.
+
+        Args:
+            transfer: Squared transfer function of each piece; pieces with a stronger one and less noise weigh more.
+        """
+        weight = transfer / self.levels.to(torch.float64).square()[:, None, None, None]
+        total = weight.sum((0, 1)).clamp(min=torch.finfo(torch.float32).tiny)
+        # power of whole rows above 25 times that of the pieces is due to the boundary extension and not to chance:
+        # without it, regular patterns are lost near the ends of the rows
+        observed = torch.maximum((weight * self.power).sum((0, 1)) / total, self.whole / 25.0)
+        return observed, weight / total, transfer.sum((0, 1)) / total
+
+
+def observed_spectrum(
+    frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, length: int
+) -> ObservedSpectrum:
+    """Power spectra of pieces of 64 x 256 px of the frames of a stack.
+
+    Rows are moved back by their displacement, so that neighbours correlate as in the scene.
 
     Args:
         frames: (T, C, H, W) in row order.
@@ -198,9 +249,6 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
         stack: Index of the stack in the batch.
         levels: (T,) standard deviation of the noise of each frame.
         length: Length of the Fourier transform along rows.
-
-    Returns:
-        The prior for transforms of that length.
     """
     size = [min(piece, whole) for piece, whole in zip((64, 256), frames.shape[-2:], strict=True)]
     starts = _spread_pieces(frames.shape[-2:], size)  # rows, columns
@@ -227,39 +275,40 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
         pieces = pieces.unflatten(2, (-1, len(lefts)))  # (T, C, n, n, rows, columns)
         spectra = torch.fft.rfft(pieces.sub_(bright[..., None]).mul_(tapers[1])).mul_(back[:, None, chosen, None])
         powers.append(squared_modulus(torch.fft.fft(spectra, dim=-2)).mean((1, 3)).transpose(-2, -1))
-    power = torch.cat(powers, dim=1).to(torch.float64) * length  # (T, pieces, U, V)
+    power = torch.cat(powers, dim=1).to(torch.float64)  # (T, pieces, U, V)
     few = (
         torch.linspace(0, len(tops) - 1, min(4, len(tops)), device=rows.device, dtype=torch.float32)
         .round()
         .to(torch.int64)
     )
     strips_of_rows = (frames[..., rows[few], :] - bright) * tapers[0][:, None]  # (T, C, n, rows, W)
-    whole = _power_of_rows(strips_of_rows, length, len(u))
+    whole = _power_of_rows(strips_of_rows, length, len(u)) / length
 
     displacement, weights = exposure_trajectory(
         vibration, times.unflatten(1, rows.shape)[..., size[0] // 2], motion.timing, "gauss"
     )
-    along = waves(displacement[..., 0], u) * weights[:, None]
-    across = waves(displacement[..., 1], v)
-    transfer = squared_modulus(along.transpose(-2, -1) @ across) * kernel_spectrum(v).square()
-    transfer = _smeared(transfer)
+    return ObservedSpectrum(u, v, power, whole, displacement, weights, levels)
+
+
+def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, length: int) -> RowPrior:
+    """Fit the prior to the frames of a stack: to their ``observed_spectrum``, whose arguments it has.
+
+    Returns:
+        The prior for transforms of that length.
+    """
+    spectrum = observed_spectrum(frames, motion, stack, levels, length)
+    v = spectrum.v
+    transfer = smeared(spectrum.blur() * kernel_spectrum(v).square())
     aliases = torch.zeros_like(transfer[:, 0])
     for cycle in (-1, 1):  # all others together have less than 4 % of their power
-        beyond = across * waves(displacement[..., 1], v.new_tensor([cycle]))
-        blurred = squared_modulus(along.transpose(-2, -1) @ beyond).mean(1)
-        aliases = aliases + blurred * interpolation_error(v, [cycle])
-    weight = transfer / levels.to(torch.float64).square()[:, None, None, None]
-    total = weight.sum((0, 1)).clamp(min=torch.finfo(torch.float32).tiny)
-    # power of whole rows above 25 times that of the pieces is due to the boundary extension and not to chance: without
-    # it, regular patterns are lost near the ends of the rows
-    observed = torch.maximum((weight * power).sum((0, 1)) / total, whole / 25.0)
-    noise_power = transfer.sum((0, 1)) / total * length
-    passed = (weight * transfer).sum((0, 1)) / total
-    prior = autoregressive_prior(observed, passed, aliases, noise_power)
+        aliases = aliases + spectrum.blur(alias_v=-cycle).mean(1) * interpolation_error(v, [cycle])
+    observed, weight, noise = spectrum.weighted(transfer)
+    passed = (weight * transfer).sum((0, 1))
+    prior = autoregressive_prior(observed * length, passed, aliases, noise * length)
     return prior.resampled(length // 2 + 1)
 
 
-def _smeared(transfer: Tensor) -> Tensor:
+def smeared(transfer: Tensor) -> Tensor:
     """Transfer function (..., U, V) of tapered pieces: the taper mixes neighbouring frequencies."""
     count = transfer.shape[-2]
     near = torch.arange(-1, count + 1, device=transfer.device)

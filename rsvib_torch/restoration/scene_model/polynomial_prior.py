@@ -1,0 +1,117 @@
+"""Gaussian prior of a scene on a grid of half pixels, whose precision is a polynomial in the Laplacians of the axes.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
+
+from dataclasses import dataclass
+from math import pi
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.restoration.frame_motion import FrameMotion
+from rsvib_torch.restoration.scene_model.finer_rows import SCALE, spline_samples
+from rsvib_torch.restoration.scene_model.row_prior import observed_spectrum, smeared
+
+__all__ = ["PolynomialPrior", "fit_polynomial_prior"]
+
+_DEGREE = 4
+_POWERS = [(m, n) for m in range(_DEGREE + 1) for n in range(_DEGREE + 1 - m)]  # of the Laplacians across and along
+_MAX_LAPLACIAN = 4.0  # of one axis, at half a cycle per grid point
+
+
+def _laplacian(frequencies: Tensor) -> Tensor:
+    """Discrete Laplacian on the grid, at frequencies in cycles per px."""
+    return 2 - 2 * torch.cos(2 * pi / SCALE * frequencies)
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialPrior:
+    """Power spectrum ``b(u)^2 b(v)^2 / sum_mn a_mn lambda(v)^m lambda(u)^n`` of the scene, a_mn >= 0.
+
+    lambda is the discrete Laplacian on the grid and b the transfer function of the cubic B-spline: 1 over the
+    polynomial is the spectrum of the coefficients of the scene.
+
+    Attributes:
+        coefficients: (5, 5) a_mn, in px^-2 over squared units of the frames, float64.
+    """
+
+    coefficients: Tensor
+
+    def precision(self, noise: Tensor, strength: float, length: int, reach: float = 0.0) -> Tensor:
+        """Factors q_m of ``sum_m q_m(u - a) T^m`` in units of the data's noise, (p + 1, 2, U), float64.
+
+        Args:
+            noise: Variance of the noise of data of weight 1.
+            strength: Factor on the precision.
+            length: L, period of the rows in px.
+            reach: Largest displacement along the row in px during an exposure, from its middle.
+        """
+        u = torch.fft.rfftfreq(length, dtype=torch.float64, device=noise.device)
+        u = torch.stack([u, u - 1])
+        # bounds as for ``RowPrior.precision``: the elimination in single precision loses digits beyond
+        m, n = torch.meshgrid(*(torch.arange(_DEGREE + 1, device=noise.device),) * 2, indexing="ij")
+        a = self.coefficients * (noise.to(torch.float64) * strength / SCALE)
+        a = a.minimum(1e3 / _MAX_LAPLACIAN ** (m + n))
+        a[0, 0] += 1e-5 / (1 + reach)
+        powers = _laplacian(u) ** torch.arange(_DEGREE + 1, device=noise.device)[:, None, None]
+        return torch.einsum("mn,nau->mau", a, powers) / spline_samples(u).square()
+
+
+@torch.no_grad()
+def fit_polynomial_prior(
+    frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, length: int, iterations: int = 60
+) -> PolynomialPrior:
+    """Fit the prior to the frames of a stack, whose spectrum is blurred and aliased.
+
+    The expected power of a frame at (u, v) is that of the noise plus that of the scene, through the blur of the
+    exposure, at (u - a, v - b) for all aliases within 1 cycle per px. Observed powers are distributed like chi-squared
+    around it (Whittle likelihood): scoring for the logarithms of a_mn.
+
+    Args:
+        frames: (T, C, H, W) in row order.
+        motion: Motion of the batch of stacks.
+        stack: Index of the stack in the batch.
+        levels: (T,) standard deviation of the noise of each frame.
+        length: Length of the Fourier transform along rows.
+        iterations: Largest number of steps.
+    """
+    spectrum = observed_spectrum(frames, motion, stack, levels, length)
+    u, v = spectrum.u[:, None], spectrum.v
+    observed, weight, noise = spectrum.weighted(smeared(spectrum.blur()))
+    gains, features = [], []
+    for alias_u in (0, 1):
+        for alias_v in (-1, 0, 1):
+            beyond = (v - alias_v).abs() > 1
+            along, across = u - alias_u, (v - alias_v).clamp(-1, 1)
+            blur = (weight * smeared(spectrum.blur(alias_u, alias_v))).sum((0, 1))
+            gains.append((blur * spline_samples(along).square() * spline_samples(across).square()).masked_fill(beyond, 0))
+            features.append(
+                torch.stack([(_laplacian(across) ** m * _laplacian(along) ** n) for m, n in _POWERS], dim=-1)
+            )
+    gain, feature = torch.stack(gains), torch.stack(features)  # (aliases, U, V), (aliases, U, V, 15)
+    # frequencies within the taper of zero contain the mean
+    used = (u > 1.5 * (u[1] - u[0])) | (v.abs() > 1.5 / len(v))
+    middle = (observed - noise).clamp(min=0.01 * noise)[used].log().mean().exp()
+    logs = torch.full((len(_POWERS),), -float(middle.log()), dtype=torch.float64, device=frames.device)
+    damping = 1e-3
+    cost = None
+    for _ in range(iterations):
+        terms = feature * logs.exp()
+        polynomial = terms.sum(-1)
+        scene = gain / polynomial
+        expected = scene.sum(0) + noise
+        new_cost = (expected.log() + observed / expected)[used].mean()
+        slope = -((scene / polynomial)[..., None] * terms).sum(0) / expected[..., None]
+        residual = observed / expected - 1
+        j, r = slope[used], residual[used]
+        normal = j.T @ j / len(j)
+        step = torch.linalg.solve(normal + (damping * normal.diagonal().mean()) * torch.eye(len(logs)).to(normal), j.T @ r / len(j))
+        logs = logs + step.clamp(-1, 1)
+        if step.abs().max() < 1e-2:
+            break
+    del cost, new_cost
+    coefficients = torch.zeros(_DEGREE + 1, _DEGREE + 1, dtype=torch.float64, device=frames.device)
+    for (m, n), log in zip(_POWERS, logs, strict=True):
+        coefficients[m, n] = log.exp()
+    return PolynomialPrior(coefficients)
