@@ -222,7 +222,7 @@ class _Stack:
         observe = Observation if self.scale == 1 else FinerObservation
         problem = SceneProblem(data, observe(kernels, height, data.dtype), precision, self.level, partition)
         missing = None if self.missing is None else self.missing[members]
-        ends = kernels.reach > _FILLED_REACH
+        ends = kernels.reach > _FILLED_REACH or self.scale > 1
         if missing is None and ends and not bool(along.any()):
             return replace(problem, data=fill_beyond_ends(problem, width, kernels.reach))
         measured = measured_values(along, missing, data.shape, width, ends=ends)
