@@ -25,6 +25,7 @@ from rsvib_torch.commands.options import (
     check_new,
     full_scale_of,
     restoration_options,
+    restored_shape,
     seconds,
 )
 from rsvib_torch.commands.stack_commands import load, restore_and_save
@@ -194,8 +195,7 @@ def known(
     info = io.read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
     options = restoration_options(info, scale, settings)
-    shape = (1, *info.shape[1:]) if options.get("joint") is True else info.shape
-    io.check_stack_target(restored, shape, dtype=info.dtype, full_scale=scale, like=info)
+    io.check_stack_target(restored, restored_shape(info, options), dtype=info.dtype, full_scale=scale, like=info)
     results: dict[str, list[str]] = {}
     data: dict[str, Any] = {"alignment": None, "check": None}
     stack = load(frames, settings, full_scale, device, options)

@@ -4,7 +4,7 @@ import functools
 import inspect
 import itertools
 import statistics
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -31,6 +31,7 @@ __all__ = [
     "DeviceName",
     "DeviceOption",
     "ExposureOption",
+    "FinerOption",
     "ForceOption",
     "FrameRateOption",
     "FramesArgument",
@@ -52,6 +53,7 @@ __all__ = [
     "full_scale_of",
     "rate",
     "restoration_options",
+    "restored_shape",
     "seconds",
     "stated_rate",
     "torch_device",
@@ -162,6 +164,12 @@ JointOption = Annotated[
     typer.Option(
         help="Number of neighbouring frames that are restored jointly, or 'all' for one image of all frames (of each "
         "window).",
+    ),
+]
+FinerOption = Annotated[
+    int | None,
+    typer.Option(
+        "--scale", help="Points of the restored frames per pixel along both axes: 1 or 2.", show_default="1", min=1
     ),
 ]
 PriorOption = Annotated[
@@ -280,12 +288,14 @@ class Overrides:
         joint: ``"all"``, or a number of frames.
         prior: Prior for the scene.
         saturation: Saturation level in the unit of the file.
+        scale: Points of the restored frames per pixel.
     """
 
     method: str | None
     joint: str | None
     prior: str | None
     saturation: float | None
+    scale: int | None = None
 
 
 NO_OVERRIDES = Overrides(None, None, None, None)
@@ -356,7 +366,7 @@ def restoration_options(
     if overrides.method is not None and overrides.method != options.get("method", "exact"):
         shared = ("saturation", *method_options(overrides.method))  # other options belong to the configured method
         options = {name: value for name, value in options.items() if name in shared}
-    for name in ("method", "prior", "saturation"):
+    for name in ("method", "prior", "saturation", "scale"):
         if getattr(overrides, name) is not None:
             options[name] = getattr(overrides, name)
     if overrides.joint is not None:
@@ -369,3 +379,9 @@ def restoration_options(
     elif info.is_integer and full_scale is not None:
         options["saturation"] = 1.0
     return options
+
+
+def restored_shape(info: "StackInfo", options: Mapping[str, Any]) -> tuple[int, ...]:
+    """Shape of the restored frames of a stack, with options as from ``restoration_options``."""
+    shape = info.enlarged(options.get("scale", 1)).shape
+    return (1, *shape[1:]) if options.get("joint") is True else shape

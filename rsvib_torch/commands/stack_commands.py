@@ -24,6 +24,7 @@ from rsvib_torch.commands.answers import (
 from rsvib_torch.commands.options import (
     DeviceName,
     DeviceOption,
+    FinerOption,
     ForceOption,
     FramesArgument,
     JointOption,
@@ -40,6 +41,7 @@ from rsvib_torch.commands.options import (
     check_new,
     full_scale_of,
     restoration_options,
+    restored_shape,
     torch_device,
 )
 from rsvib_torch.commands.terminal import Answer, counting, error_line, note, running_command, working
@@ -377,6 +379,7 @@ def restore_frames(
     ],
     method: MethodOption = None,
     joint: JointOption = None,
+    finer: FinerOption = None,
     prior: PriorOption = None,
     saturation: SaturationOption = None,
     force: ForceOption = False,
@@ -391,7 +394,7 @@ def restore_frames(
 
     If the restored frames are judged no better than the input, the input is written unchanged, unless --force is given.
     """
-    overrides = Overrides(method, joint, prior, saturation)
+    overrides = Overrides(method, joint, prior, saturation, finer)
     outputs, inputs = io.stack_files(restored), [*io.stack_files(frames), settings.path, vibration]
     check_new([*outputs, *([] if report is None else [report])], overwrite, inputs)
     check_regular(vibration)
@@ -406,8 +409,7 @@ def restore_frames(
     detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
     scale = full_scale_of(frames, info, settings, full_scale)
     options = restoration_options(info, scale, settings, overrides)
-    shape = (1, *info.shape[1:]) if options.get("joint") is True else info.shape
-    io.check_stack_target(restored, shape, dtype=info.dtype, full_scale=scale, like=info)
+    io.check_stack_target(restored, restored_shape(info, options), dtype=info.dtype, full_scale=scale, like=info)
     if report is not None:
         check_writable(report)
     stack = load(frames, settings, full_scale, device, options)
@@ -497,6 +499,7 @@ def run(
     compression: Annotated[str | None, typer.Option(help="Compression of a TIFF stack: zlib or lzma.")] = None,
     method: MethodOption = None,
     joint: JointOption = None,
+    finer: FinerOption = None,
     prior: PriorOption = None,
     saturation: SaturationOption = None,
     force: ForceOption = False,
@@ -541,7 +544,7 @@ def run(
     info = io.read_stack_info(frames)
     print_notes(info, settings)
     scale = full_scale_of(frames, info, settings, full_scale)
-    options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation))
+    options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation, finer))
     common: RestoreOptions = {
         "window": settings.stack.get("window", DEFAULT_WINDOW) if window is None else window,
         "detection": settings.detection,
@@ -660,6 +663,7 @@ def report(
     ] = None,
     method: MethodOption = None,
     joint: JointOption = None,
+    finer: FinerOption = None,
     prior: PriorOption = None,
     saturation: SaturationOption = None,
     force: Annotated[
@@ -679,7 +683,7 @@ def report(
     _check_folder(out, ["report.html"], overwrite, inputs)
     info = io.read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
-    options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation))
+    options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation, finer))
     stack = load(frames, settings, full_scale, device, options)
     detection = _detect(stack, settings)
     result = _restore(stack, detection, options, force, "page")

@@ -62,6 +62,15 @@ class ColumnStrips:
         """Strips (B S, ..., w) of images (B, ..., W)."""
         return torch.stack([images[..., first : first + self.width] for first in self.firsts], 1).flatten(0, 1)
 
+    def finer(self, scale: int) -> "ColumnStrips":
+        """The same strips on a grid of ``scale`` points per px; point 0 lies at column 0."""
+        return ColumnStrips(
+            scale * self.frame_width,
+            scale * self.width,
+            tuple(scale * first for first in self.firsts),
+            tuple(scale * middle for middle in self.middles),
+        )
+
     def joined(self, strips: Tensor) -> Tensor:
         """Images (B, ..., W) from strips (B S, ..., w)."""
         last = len(self.firsts) - 1

@@ -64,7 +64,13 @@ class PreparedFrames:
         return replace(self, images=images)
 
     def from_row_order(self, images: Tensor) -> Tensor:
-        """Images (B, T', C, H', W') in row order with the axes, orientation and dtype of the user's frames."""
+        """Images (B, T', C, H', W') in row order with the axes, orientation and dtype of the user's frames.
+
+        On a finer grid, the first row lies at the first row of the frames in both orders: the row beyond the other end
+        is repeated if the readout direction is reversed.
+        """
+        if images.shape[-2] > self.images.shape[-2] and self.image_timing.readout_direction == "reverse":
+            images = torch.cat([images[..., :1, :], images[..., :-1, :]], dim=-2)
         turned = frames_from_row_order(images, self.image_timing)
         turned = turned if self.batched else turned[0]
         return (turned[:, 0] if len(self.shape) == 3 else turned.movedim(-3, self.channel_axis)).to(self.dtype)

@@ -181,6 +181,13 @@ class StackInfo(Summarised):
             self, shape=shape, frame_times=None, frame_numbers=None, path=None, metadata=self.metadata_for(shape)
         )
 
+    def enlarged(self, scale: int) -> "StackInfo":
+        """The same kind of stack with ``scale`` times the rows and columns."""
+        if scale == 1:
+            return self
+        shape = (*self.shape[:-2], scale * self.shape[-2], scale * self.shape[-1])
+        return replace(self, shape=shape, path=None, metadata=self.metadata_for(shape))
+
     @checks_arguments
     def metadata_for(self, shape: tuple[int, ...], dtype: str | None = None) -> dict[str, Tag | None]:
         """The metadata of a stack of another shape or data type: None for those that are not valid for it."""

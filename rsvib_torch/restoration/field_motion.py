@@ -68,7 +68,8 @@ def restore_in_strips(
     }
     of_frames = frame_motion(of_strips, timing, count, height)
     of_frames.check_fits(height, width)
-    return strips.joined(method(strips.cut(images), of_frames, **cut))
+    restored = method(strips.cut(images), of_frames, **cut)
+    return strips.finer(restored.shape[-1] // strips.width).joined(restored)
 
 
 def judged_strip(
@@ -80,13 +81,15 @@ def judged_strip(
 
     Args:
         raw: (T, C, H, W) in row order.
-        restored: (T, C, H, W) or (1, C, H, W).
+        restored: (T, C, H, W) or (1, C, H, W); of a finer grid, the points at the pixels are judged.
         hidden: Mask shaped like ``raw`` of pixels that were not measured.
         motion: (1) in row order.
         timing: The sensor.
         columns: Width of the strip.
     """
     count, (height, width) = len(raw), raw.shape[-2:]
+    points = restored.shape[-1] // width
+    restored = restored[..., ::points, ::points]
     if motion.same_for_all_columns:
         of_frames = frame_motion(motion, timing, count, height)
         of_frames.check_fits(height, width)

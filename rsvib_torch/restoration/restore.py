@@ -19,6 +19,7 @@ from rsvib_torch.core.option_types import (
 )
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.frames.arrays import ArrayLike, Channels
+from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
 from rsvib_torch.io.files import FramesOrFiles, load_frames, timing_of_files
 from rsvib_torch.motion.motion import Motion
@@ -91,7 +92,7 @@ class RestorationMethod:
 #     ignore, clipped: bool tensors shaped like the frames, passed only if listed in ``masks`` and such pixels exist.
 #         Without ``"ignore"``, missing pixels hold local means; without ``"clipped"``, saturated ones count.
 #     returns: frames at rest, of the same shape and dtype, in the coordinates of ``motion.shift``; (B, 1, C, H, W) for
-#         option ``joint=True``.
+#         option ``joint=True``, and (..., S H, S W) for option ``scale=S``, with point (S i, S j) at pixel (i, j).
 #
 # Frames of one stack must not affect other stacks, ``frames`` must not be changed, and gradients must flow to frames
 # and motion. A new method is one module, its options in core/option_types.py, one line here, and one TypedDict
@@ -183,7 +184,8 @@ def restore(
 
     Returns:
         Restored frames of the same shape and floating-point dtype (float32 with full scale 1 for integer frames); with
-        ``joint=True`` the time axis has length 1.
+        ``joint=True`` the time axis has length 1. With ``scale=2`` they have twice the rows and columns: point
+        (2 i, 2 j) lies at pixel (i, j).
 
     Raises:
         TypeError: If an argument has the wrong type or the method does not know an option.
@@ -219,7 +221,7 @@ def restore(
     for note in left_alone:
         warnings.warn(note, RestorationWarning, stacklevel=5)  # the caller, above three decorators
     if left_alone and not bool(vibration.moving_axes().any()):
-        return unchanged_frames(prepared, options.get("joint", False))
+        return unchanged_frames(prepared, options.get("joint", False), options.get("scale", 1))
     restored = restore_prepared(prepared, vibration, method, options)
     if check:
         _warn_if_worse(prepared, restored.detach(), vibration, options.get("joint", False))
@@ -252,18 +254,19 @@ def restore_prepared(
     return restore_in_strips(chosen.function, images, motion, frames.timing, options)
 
 
-def unchanged_frames(frames: PreparedFrames, joint: bool | int) -> Tensor:
+def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) -> Tensor:
     """The frames as taken, instead of the result of ``restore``: NaN at missing pixels; with ``joint=True`` one frame.
 
     Args:
         frames: The frames.
         joint: As in ``restore_exact``; the middle frame replaces the image of all frames.
+        scale: As in ``restore_exact``; values between the pixels are interpolated.
     """
     images = frames.images
     if frames.missing is not None:
         images = images.masked_fill(frames.missing, math.nan)
     middle = images.shape[1] // 2
-    return frames.from_row_order(images[:, middle : middle + 1] if joint is True else images)
+    return frames.from_row_order(enlarged(images[:, middle : middle + 1] if joint is True else images, scale))
 
 
 def _motion_in_row_order(frames: PreparedFrames, vibration: Motion) -> Motion:

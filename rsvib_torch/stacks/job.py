@@ -15,6 +15,7 @@ from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
 from rsvib_torch.core.presentation import Summarised, plain_values
 from rsvib_torch.detection import DetectionResult, detect_vibration
+from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.io.files import PathLike, open_stack, read_stack_info
 from rsvib_torch.io.formats import FrameReader
 from rsvib_torch.io.frame_times import timing_of_stack
@@ -129,6 +130,11 @@ class StackJob:
         """Whether the frames of a window become one image."""
         return self.restoration is not None and self.restoration.get("joint", False) is True
 
+    @property
+    def scale(self) -> int:
+        """Points of the result per pixel."""
+        return 1 if self.restoration is None else int(self.restoration.get("scale", 1))
+
     def of_window(self, window: Window) -> "StackJob":
         """The job with only those given detections that ``window`` needs."""
         return self if self.given is None else replace(self, given={window.index: self.given[window.index]})
@@ -155,7 +161,8 @@ class StackJob:
             frames = counts_to_frames(stored, self.full_scale, str(self.source), nodata).to(self.device)
         kept = tuple(index for index in usable if index in window.written)
         bad = {index: fault for index, fault in faults.items() if index in window.written}
-        as_taken = WindowResult(window, kept, frames[: len(kept)], False, None, None, None, bad)
+        unchanged = enlarged(frames[: len(kept)], self.scale)
+        as_taken = WindowResult(window, kept, unchanged, False, None, None, None, bad)
         if faults and len(usable) < 2:
             return replace(as_taken, error=next(iter(faults.values())))
         timing = window_timing(self.timing, window, list(usable))
@@ -213,8 +220,13 @@ class StackJob:
                 frame = pixels[index - result.window.first]
                 if isinstance(frame, str):
                     frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
-                frames.append(frame)
+                frames.append(frame if self.scale == 1 else self._enlarged(frame))
         return StoredWindow(frames, self.record(result, len(frames)))
+
+    def _enlarged(self, frame: NDArray[Any]) -> NDArray[Any]:
+        """A frame as stored, on the finer grid."""
+        counts = counts_to_frames(frame[None], self.full_scale, str(self.source), self.info.nodata)
+        return frames_to_counts(enlarged(counts, self.scale)[0], frame.dtype, self.full_scale, self.info.nodata)
 
     def record(self, result: WindowResult, written: int) -> dict[str, Any]:
         """Content of the ``WindowRecord`` of a result of which ``written`` frames were written."""

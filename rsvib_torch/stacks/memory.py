@@ -62,6 +62,8 @@ def memory_needed(
         pixel_bytes = _PIXEL_BYTES["edges"]
     else:
         pixel_bytes = _PIXEL_BYTES.get(restoration.get("method", "exact"), max(_PIXEL_BYTES.values()))
+    scale = 1 if restoration is None else int(restoration.get("scale", 1))
+    pixel_bytes *= scale**2
     pixels = min(window, info.shape[0]) * int(np.prod(info.shape[1:], dtype=object))
     queued = 2 * pixels * np.dtype(info.dtype).itemsize  # frames read ahead, and frames to be written
     once = _PROCESS_BYTES + info.decoding_bytes + queued

@@ -87,10 +87,10 @@ def restore_trusted(
     rows = frames.shape[-1 if timing.scan_axis == -1 else -2]
     vibration, left_alone = vibration_to_undo(motion, timing, len(frames), rows)
     frames = frames if first_frames is None else frames[:first_frames]
-    joint = options.get("joint", False)
+    joint, scale = options.get("joint", False), options.get("scale", 1)
     prepared = prepare_frames(frames, timing, saturation=options.get("saturation", "auto"))
     if not bool(vibration.moving_axes().any()):
-        return RestoredFrames(unchanged_frames(prepared, joint), False, left_alone, None, False)
+        return RestoredFrames(unchanged_frames(prepared, joint, scale), False, left_alone, None, False)
     chosen = {name: value for name, value in options.items() if name not in ("method", "saturation")}
     restored = restore_prepared(prepared, vibration, options.get("method", "exact"), chosen)
     verdict = None
@@ -98,13 +98,14 @@ def restore_trusted(
         if len(frames) > 1:
             verdict = judge_prepared(prepared, restored, vibration, joint=joint, most_pairs=most_pairs)
     keep = verdict is None or verdict.overall != "worse" or force
-    result = prepared.from_row_order(restored) if keep else unchanged_frames(prepared, joint)
+    result = prepared.from_row_order(restored) if keep else unchanged_frames(prepared, joint, scale)
     return RestoredFrames(result, keep, left_alone, verdict, True, vibration.num_axes)
 
 
 def without_data(frames: Tensor, taken: Tensor) -> Tensor:
     """Restored frames with NaN at the pixels without data of the frames as taken; of one image, without data in all."""
-    missing = torch.isnan(taken)
+    points = frames.shape[-1] // taken.shape[-1]
+    missing = torch.isnan(taken).repeat_interleave(points, -2).repeat_interleave(points, -1)
     return frames.masked_fill(missing if len(frames) == len(taken) else missing.all(0), torch.nan)
 
 

@@ -78,8 +78,14 @@ def restore_exact(
             Always one where the displacement changes by more than a pixel during an exposure: rows then depend on
             distant rows.
 
+        scale: Points of the restored frames per pixel along both axes, 1 or 2. With 2, the unknown is the scene after
+            optics and pixel on a grid of half pixels, and aliasing is part of the model: several frames that sample
+            between each other's pixels contain detail beyond half a cycle per px, one frame does not. The prior is then
+            a polynomial in the Laplacians of both axes (``PolynomialPrior``).
+
     Returns:
-        Restored frames of the same shape, or (B, 1, C, H, W).
+        Restored frames of the same shape, or (B, 1, C, H, W); with ``scale=2``, of twice the rows and columns, point
+        (2 i, 2 j) at pixel (i, j).
     """
     B, T, C, H, W = frames.shape
     factor = check_number("regularisation", regularisation, above=0.0)

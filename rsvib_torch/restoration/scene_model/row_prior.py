@@ -236,9 +236,7 @@ class ObservedSpectrum:
         return observed, weight / total, transfer.sum((0, 1)) / total
 
 
-def observed_spectrum(
-    frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, length: int
-) -> ObservedSpectrum:
+def observed_spectrum(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, length: int) -> ObservedSpectrum:
     """Power spectra of pieces of 64 x 256 px of the frames of a stack.
 
     Rows are moved back by their displacement, so that neighbours correlate as in the scene.
