@@ -1,11 +1,11 @@
 """The observation operator of a scene on a grid of half pixels, in which frames alias.
 
-The scene after optics and pixel contains detail beyond half a cycle per pixel. Along the rows, the spectrum of a frame
-at u (0 ... 1/2 cycles per px) is the sum of the spectra of the scene at u and at its alias u - 1, which have different
-phases and kernels: ``K_a(u) = sum_n w_n h(. - 2 y_n) exp(-2 pi i (u - a) x_n)`` for a = 0, 1. Across the rows, the scene
-is a cubic B-spline h with a knot every half row. Unknowns are numbered 2 j + a for row j of the coefficients, so that
-the normal equations are one banded system per u. The phase ``exp(2 pi i a x)`` of the middle x of a row does not depend
-on u: kernels without the phase of the middle are smooth in u, as on the pixel grid.
+The scene after optics and pixel contains detail beyond half a cycle per pixel. Along the rows, the spectrum of a
+frame at u (0 ... 1/2 cycles per px) is the sum of the spectra of the scene at u and at its alias u - 1, which have
+different kernels: ``K_a(u) = sum_n w_n h(. - 2 y_n) exp(-2 pi i (u - a) x_n)`` for a = 0, 1. Across the rows, the
+scene is a cubic B-spline h with a knot every half row. Unknowns are numbered 2 j + a for row j of the coefficients, so
+that the normal equations are one banded system per u. Relative to the middle x of a row, the alias has the phase
+``exp(2 pi i x)``, which does not depend on u: kernels are smooth in u, as on the pixel grid.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -32,7 +32,7 @@ _DEGREE = 3
 
 
 class FinerKernels(RowKernels):
-    """Kernels on the grid of half pixels: ``first`` and ``taps`` count unknowns 2 j + a, two per row of coefficients."""
+    """Kernels on the grid of half pixels: ``first`` and ``taps`` count unknowns 2 j + a."""
 
     symmetric = False
 
@@ -52,7 +52,8 @@ class FinerKernels(RowKernels):
         alias = (2 * math.pi) * self.middle[..., None, None] * both.new_tensor([[0.0], [1.0]])
         waves = torch.polar(torch.ones_like(angle), angle + alias[..., None])  # (M, R, a, N, Q)
         taps = self.taps.unflatten(-2, (-1, SCALE)).transpose(-3, -2)  # (M, R, a, J, N)
-        return (taps.to(waves.dtype) @ waves).transpose(-3, -2).flatten(-3, -2)
+        kernels: Tensor = (taps.to(waves.dtype) @ waves).transpose(-3, -2).flatten(-3, -2)
+        return kernels
 
 
 def finer_kernels(
