@@ -39,7 +39,7 @@ INNER_LAYERS = {
     "evaluation": ({"quality", "mtf", "bound", "scenes"},),
     "report": ({"results", "plots", "export"}, {"html"}),
     "restoration": (
-        {"frame_motion"},
+        {"frame_motion", "restoration_warning"},
         {"field_motion"},
         {"scene_model"},
         {"noise"},

@@ -25,6 +25,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.field_motion import judged_strip
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise.high_pass import estimate_noise
+from rsvib_torch.restoration.restoration_warning import RestorationWarning
 from rsvib_torch.restoration.verdict.pairs import FramePair, equally_bright, misfit, pairs_to_judge, shared_part
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
@@ -46,25 +47,6 @@ _WORSE_RESIDUAL = 0.8  # of that displacement; above, the vibration was not undo
 _GAIN_ERROR = 2.0  # dB; error of the estimated gain, up to which its sign is not used
 
 _MIN_NOISE = 1e-5  # of full scale; noise level assumed at least, rounding of float32 images
-
-
-class RestorationWarning(UserWarning):
-    """A restored frame may be worse than the raw one, or a part of the vibration was not undone.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
-        >>> import warnings
-        >>> wrong = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[3.6, 4.1])  # opposite phase
-        >>> with warnings.catch_warnings(record=True) as caught:
-        ...     warnings.simplefilter("always")
-        ...     restored = rsv.restore(frames, timing, wrong)
-        >>> caught[0].category.__name__
-        'RestorationWarning'
-    """
 
 
 @dataclass(frozen=True, eq=False, repr=False)
