@@ -630,6 +630,7 @@ def _video_name(frames: Path, output: str) -> str:
 
 def _comparison(frames: Path, full_scale: float | None, first: WindowResult) -> Figure:
     """Draw the first restored frame of a stack beside the frame of the input."""
+    from rsvib_torch.frames.pixels import enlarged  # noqa: PLC0415
     from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
 
     index = first.indices[0] if first.indices else (first.window.first + first.window.last + 1) // 2
@@ -637,6 +638,7 @@ def _comparison(frames: Path, full_scale: float | None, first: WindowResult) -> 
     scale, nodata = full_scale or reader.info.full_scale, reader.info.nodata
     raw = counts_to_frames(reader.frame(index)[None], scale, str(frames), nodata)[0].nan_to_num(0.0)
     reader.close()
+    raw = enlarged(raw, first.frames.shape[-1] // raw.shape[-1])
     names = ("input", "restored" if first.restored else "unchanged")
     return reports.comparison_figure(raw, first.frames[0].cpu().nan_to_num(0.0), names=names)
 
@@ -687,6 +689,7 @@ def report(
     stack = load(frames, settings, full_scale, device, options)
     detection = _detect(stack, settings)
     result = _restore(stack, detection, options, force, "page")
+    points = options.get("scale", 1)
     if result.restored:
         run_it = command_text("run", frames, out, *settings.arguments)
         steps = [f"write the restored frames:\n  {run_it}"]
@@ -697,7 +700,7 @@ def report(
         title=printable(f"Vibration in {frames.name}"),
         subtitle=printable(f"{frames}, camera of {settings.source}"),
         frames=stack.frames,
-        restored=result.frames,
+        restored=result.frames[..., ::points, ::points],  # the page measures in pixels
         was_restored=result.restored,
         timing=stack.timing,
         detection=detection,

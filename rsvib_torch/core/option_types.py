@@ -81,7 +81,7 @@ class ExactSettings(TypedDict, total=False):
     regularisation: float
     chunk_frequencies: int | None
     segments: int | None
-    scale: int
+    scale: Literal[1, 2]
 
 
 class BandedSettings(TypedDict, total=False):

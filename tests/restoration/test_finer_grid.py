@@ -1,0 +1,187 @@
+"""Restoration on a grid of half pixels, against a camera that aliases and shares no code with the package."""
+
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from truth import decibel, draw_scene
+
+import rsvib_torch as rsv
+from rsvib_torch.frames.pixels import enlarged
+from rsvib_torch.restoration.exact import exact
+from rsvib_torch.restoration.scene_model.polynomial_prior import fit_polynomial_prior
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+from benchmarks.finer_camera import FINER, after_optics, still_image, take_frames
+from benchmarks.independent_camera import Shake, closed
+
+SIZE, MARGIN, NOISE = 96, 24, 0.002
+SHAKE = Shake(np.array([[3.1], [5.2]]), np.array([[90.0], [61.0]]), np.array([[0.4], [1.3]]), np.zeros(2))
+VIBRATION = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.4, 1.3])
+TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=571)
+
+
+def taken(scene, count, shake=SHAKE, seed=1):
+    clean = take_frames(
+        scene, shake, row_time=20.52e-6, exposure_rows=20, frame_rows=571, num_frames=count, size=(SIZE, SIZE)
+    )
+    return torch.from_numpy(clean + NOISE * np.random.default_rng(seed).standard_normal(clean.shape)).float()
+
+
+def restored(frames, vibration=VIBRATION, timing=TIMING, **options):
+    return rsv.restore(frames, timing, vibration, **{"joint": True, "scale": 2, "check": False, **options})
+
+
+@pytest.fixture(scope="module")
+def scene():
+    side = FINER * (SIZE + 2 * MARGIN)
+    return after_optics(closed(draw_scene(side, side, 5, blur=0.8), 60), 0.3)
+
+
+@pytest.fixture(scope="module")
+def truth(scene):
+    return still_image(scene, (SIZE, SIZE), 2)
+
+
+@pytest.fixture(scope="module")
+def frames(scene):
+    return taken(scene, 6)
+
+
+@pytest.fixture(scope="module")
+def image(frames):
+    return restored(frames)[0]
+
+
+def test_frames_contain_detail_beyond_those_of_a_still_camera(scene, truth, frames, image):
+    still = enlarged(torch.from_numpy(still_image(scene, (SIZE, SIZE)).copy())[None], 2)[0]  # without noise
+    today = enlarged(rsv.restore(frames, TIMING, VIBRATION, joint=True, check=False), 2)[0]
+    assert image.shape == truth.shape
+    assert decibel(image, truth, 16) > 6 + max(decibel(still, truth, 16), decibel(today, truth, 16))
+    pixels = still_image(scene, (SIZE, SIZE))
+    before = rsv.restore(frames, TIMING, VIBRATION, joint=True, check=False)[0]
+    assert decibel(image[::2, ::2], pixels, 8) > 4 + decibel(before, pixels, 8)
+
+
+def test_brightness_is_conserved_up_to_the_ends(truth, image):
+    assert abs(float(image[8:-8, 8:-8].mean()) / truth[8:-8, 8:-8].mean() - 1) < 1e-3
+    assert decibel(image[:, -40:], truth[:, -40:], 10) > decibel(image, truth, 16) - 3
+
+
+@pytest.mark.parametrize("cycles", [0.6, 0.75])
+def test_contrast_of_a_sine_beyond_the_nyquist_frequency(cycles):
+    side = FINER * (SIZE + 2 * MARGIN)
+    generator = np.random.default_rng(3)
+    whole = round(cycles * side / FINER)  # periodic
+    place = np.arange(side)
+    wave = np.cos(2 * np.pi * whole * place / side)[None, :] * np.ones((side, 1))
+    texture = draw_scene(side, side, 7, blur=0.8)
+    scene = after_optics(0.25 * closed(texture, 60) + 0.25 * wave + 0.3, 0.3)
+    target = np.exp(-2j * np.pi * whole / (2 * side / FINER) * np.arange(2 * SIZE))
+
+    def contrast(image):
+        part = np.asarray(image, dtype=float)[32:-32, 32:-32]
+        return abs(((part - part.mean()) * target[None, 32:-32] * np.hanning(part.shape[1])).mean())
+
+    still = still_image(scene, (SIZE, SIZE))
+    true = contrast(still_image(scene, (SIZE, SIZE), 2))
+    found = contrast(restored(taken(scene, 8, seed=int(generator.integers(9))))[0])
+    interpolated = contrast(enlarged(torch.from_numpy(still.copy())[None], 2)[0])
+    print(interpolated / true, found / true)
+    assert interpolated < 0.6 * true
+    assert found > (0.8 if cycles == 0.6 else 0.5) * true
+
+
+def test_double_precision_and_chunks_agree(frames):
+    half = frames[:3]
+    image = restored(half)[0]
+    assert torch.allclose(restored(half.double())[0].float(), image, atol=2e-4)
+    assert torch.allclose(restored(half, segments=1, chunk_frequencies=7)[0], image, atol=1e-5)
+
+
+def test_channels_batches_and_orientations(frames, image):
+    colour = torch.stack([frames[:2], 1 - frames[:2]], 1)[None].repeat(2, 1, 1, 1, 1)
+    one = restored(frames[:2])
+    both = restored(colour)
+    assert both.shape == (2, 1, 2, 2 * SIZE, 2 * SIZE)
+    assert torch.allclose(both[1, :, 0], one, atol=2e-5)
+    assert torch.allclose(both[0, :, 1], 1 - one, atol=2e-5)
+    reverse = rsv.SensorTiming(20.52e-6, 20, 571, readout_direction="reverse")
+    turned = restored(frames.flip(-2), rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.4, 1.3 + np.pi]), reverse)[0]
+    assert torch.allclose(turned[:-1], image.flip(0)[1:], atol=1e-5)  # pixel (i, j) is at point (2 i, 2 j) in both
+
+
+def test_missing_pixels(frames, truth, image):
+    holes = torch.rand(frames.shape, generator=torch.Generator().manual_seed(2)) < 0.03
+    holes[1, 30:40, 20:50] = True
+    repaired = restored(frames.masked_fill(holes, torch.nan))[0]
+    assert bool(repaired.isfinite().all())
+    assert decibel(repaired, truth, 16) > decibel(image, truth, 16) - 3
+    assert decibel(restored(frames.masked_fill(holes, 0.5))[0], truth, 16) < decibel(image, truth, 16) - 10
+
+
+def test_image_motion(scene):
+    moving = Shake(SHAKE.amplitude, SHAKE.frequency, SHAKE.phase, np.array([300.0, 0.0]))
+    vibration = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.4, 1.3], [300.0, 0.0])
+    _, shift = rsv.visible_pixels(TIMING, vibration, (SIZE, SIZE), 4)
+    truth = still_image(scene, (SIZE, SIZE), 2, offset=(0, FINER * int(shift[2, 0])))
+    single = still_image(scene, (SIZE, SIZE), offset=(0, FINER * int(shift[2, 0])))
+    still = enlarged(torch.from_numpy(single.copy())[None], 2)[0]
+    assert decibel(restored(taken(scene, 4, moving), vibration)[0], truth, 48) > decibel(still, truth, 48) + 3
+
+
+def test_gradients(frames, monkeypatch):
+    fitted = []  # the prior is a constant
+
+    def fit_once(*arguments):
+        if not fitted:
+            fitted.append(fit_polynomial_prior(*arguments))
+        return fitted[0]
+
+    monkeypatch.setattr(exact, "fit_polynomial_prior", fit_once)
+    part = frames[:2, :32, :40].double()
+
+    def energy(values):
+        return restored(values, noise=0.01).square().mean()
+
+    part.requires_grad_()
+    gradient = torch.autograd.grad(energy(part), part)[0]
+    step = torch.randn(part.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    with torch.no_grad():
+        change = (energy(part + 1e-4 * step) - energy(part - 1e-4 * step)) / 2e-4
+    assert float((gradient * step).sum()) == pytest.approx(float(change), rel=0.02)
+
+
+def test_frames_that_sample_the_same_points_are_reported(scene, truth):
+    still = taken(scene, 3, Shake(0 * SHAKE.amplitude, SHAKE.frequency, SHAKE.phase, SHAKE.image_motion))
+    with pytest.warns(rsv.RestorationWarning, match="sample the same points"):
+        image = restored(still, rsv.Vibration([1e-6, 1e-6], [90.0, 61.0], [0.4, 1.3]))[0]
+    mean = enlarged(still.mean(0, keepdim=True), 2)[0]
+    assert abs(decibel(image, truth, 16) - decibel(mean, truth, 16)) < 2.5  # no detail is invented
+
+
+def test_inaccurate_vibration_is_reported_and_no_worse_than_on_pixels(frames, truth):
+    wrong = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.45, 1.35])
+    with pytest.warns(rsv.RestorationWarning, match="not accurate enough for scale=2"):
+        image = restored(frames, wrong)[0]
+    pixels = enlarged(rsv.restore(frames, TIMING, wrong, joint=True, check=False), 2)[0]
+    assert decibel(image, truth, 16) > decibel(pixels, truth, 16)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        restored(frames)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"scale": 3}, "scale must be one of 1, 2; got 3"),
+        ({"scale": 2, "prior": "edges"}, "scale=2 has prior='gaussian' only"),
+        ({"scale": 2, "method": "dewarp"}, "method='dewarp' has no option 'scale'"),
+    ],
+)
+def test_errors(frames, options, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        rsv.restore(frames, TIMING, VIBRATION, **options)
