@@ -2,7 +2,7 @@
 """Speed and accuracy of the package and of other software, in one run on one machine.
 
 Sections (see benchmarks/sections.py): registration, cost, detection, restoration, pipeline, scaling, roofline,
-streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict, honesty, timing. Results are printed as
+finer, streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict, honesty, timing. Results are printed as
 Markdown tables and written to --out; with --store also to scripts/benchmarks/results, from which
 scripts/benchmark_page.py generates docs/benchmarks.md.
 """
@@ -18,6 +18,7 @@ from benchmarks import (
     detection,
     detection_report,
     difficulty,
+    finer,
     honesty,
     measure,
     pipeline,
@@ -70,6 +71,7 @@ def main() -> None:
         streaming_dask,
         regularisation,
         difficulty,
+        finer,
         slanted_edge,
         verdict_roc,
         honesty,
