@@ -65,6 +65,7 @@ SECTIONS = {
         "concepts.md",
         "your_own_camera.md",
         "roll_and_zoom.md",
+        "finer_grid.md",
         "stacks.md",
         "export.md",
         "reliability.md",

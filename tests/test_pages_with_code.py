@@ -104,6 +104,13 @@ def test_page_on_roll_and_zoom():
     assert page["restored"].shape == page["frames"].shape
 
 
+def test_page_on_the_finer_grid():
+    page = run_page("finer_grid.md", 1)
+    height, width = page["frames"].shape[-2:]
+    assert page["restored"].shape == (1, 2 * height, 2 * width)
+    assert page["pixels"].shape == (1, height, width)
+
+
 def test_page_on_export():
     page = run_page("export.md", 4)
     assert page["models"] == ["frame", "line-scan"]
