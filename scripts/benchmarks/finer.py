@@ -57,11 +57,11 @@ def cases(name: str, options: argparse.Namespace, sigma: float) -> list[dict[str
         generator = np.random.default_rng(SEED)
         taken = torch.from_numpy(clean + noise * generator.standard_normal(clean.shape)).float()
         still = pixels + noise * generator.standard_normal(clean.shape)
+        detection = rsv.detect_vibration(taken, timing)
         for count in FRAMES:
             frames = taken[:count]
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", rsv.RestorationWarning)
-                detection = rsv.detect_vibration(frames, timing)
                 joint = rsv.restore(frames, timing, detection, joint=True, check=False)[0].double().numpy()
                 finer = rsv.restore(frames, timing, detection, joint=True, check=False, scale=2)[0].double().numpy()
             found.append(
@@ -96,8 +96,8 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
     """A table of the figures."""
     text = [
         f"PSNR in dB against the noise-free scene after optics and pixel, without a border of {RIM} points; frames of "
-        f"{options.finer_size} x {options.finer_size} px, exposure of {EXPOSURE_ROWS} rows, vibration detected in the "
-        "same frames. Still frames are averaged and interpolated; in brackets, infinitely many of them.",
+        f"{options.finer_size} x {options.finer_size} px, exposure of {EXPOSURE_ROWS} rows, vibration detected in all "
+        f"{max(FRAMES)} frames. Still frames are averaged and interpolated; in brackets, infinitely many of them.",
         "",
         "| scene | σ of the optics (px) | noise | frames | half pixels: still frames | `joint=True`, interpolated | "
         "`joint=True, scale=2` | pixels: `joint=True` | `joint=True, scale=2` |",

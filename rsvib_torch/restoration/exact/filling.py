@@ -92,7 +92,9 @@ def fill_missing(
     return data
 
 
-def fill_beyond_ends(problem: SceneProblem, width: int, reach: float) -> Tensor:
+def fill_beyond_ends(
+    problem: SceneProblem, width: int, reach: float, *, near: int = 64, iterations: int = 40
+) -> Tensor:
     """Data whose boundary extension is replaced by the prediction of the scene near the ends of the rows.
 
     Only a strip of columns on either side is solved, by itself and joined at the extension.
@@ -101,9 +103,11 @@ def fill_beyond_ends(problem: SceneProblem, width: int, reach: float) -> Tensor:
         problem: The scene; the first ``width`` columns of its data were measured.
         width: Columns of the frames.
         reach: Largest displacement along the row in px during an exposure, from its middle.
+        near: Columns at either side that the prior relates to the extension, in px beyond the reach.
+        iterations: Largest number of iterations.
     """
     data = problem.data
-    near = min(64 + 2 * math.ceil(reach), width // 2)  # px; the prior relates the extension to that many columns
+    near = min(near + 2 * math.ceil(reach), width // 2)
     gap = slice(near, near + data.shape[-1] - width)
     strip = torch.cat([data[..., width - near :], data[..., :near]], dim=-1)
     length = fast_length(strip.shape[-1] + data.shape[-1] - width)
@@ -113,5 +117,5 @@ def fill_beyond_ends(problem: SceneProblem, width: int, reach: float) -> Tensor:
     precision = torch.nn.functional.interpolate(flat, length // 2 + 1, mode="linear", align_corners=True)
     precision = precision[0].unflatten(0, problem.precision.shape[:2])
     joined = replace(problem, data=extend_rows(strip, length), precision=precision)
-    filled = fill_missing(joined, measured.expand(*data.shape[:-1], length), iterations=40)
+    filled = fill_missing(joined, measured.expand(*data.shape[:-1], length), iterations=iterations)
     return torch.cat([data[..., :width], filled[..., gap]], dim=-1)
