@@ -103,10 +103,10 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         "`joint=True, scale=2` | pixels: `joint=True` | `joint=True, scale=2` |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
-    for row in results:
-        text.append(
-            f"| {row['scene']} | {row['sigma']} | {row['noise']} | {row['frames']} | {row['still']:.1f} "
-            f"({row['endless']:.1f}) | {row['joint']:.1f} | **{row['finer']:.1f}** | {row['joint_pixels']:.1f} | "
-            f"**{row['finer_pixels']:.1f}** |"
-        )
+    text += [
+        f"| {row['scene']} | {row['sigma']} | {row['noise']} | {row['frames']} | {row['still']:.1f} "
+        f"({row['endless']:.1f}) | {row['joint']:.1f} | **{row['finer']:.1f}** | {row['joint_pixels']:.1f} | "
+        f"**{row['finer_pixels']:.1f}** |"
+        for row in results
+    ]
     return text

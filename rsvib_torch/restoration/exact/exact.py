@@ -244,8 +244,8 @@ class _Stack:
         missing = None if self.missing is None else self.missing[members]
         ends = kernels.reach > _FILLED_REACH or self.scale > 1
         if missing is None and ends and not bool(along.any()):
-            # on the finer grid, extensions of different frames contradict each other beyond half a cycle per px: filled,
-            # 49.9 dB become 53.9 dB (8 frames of 256 x 256 px, noise 0.002); more columns and iterations gain 0.01 dB
+            # on the finer grid, extensions of different frames contradict each other beyond half a cycle per px:
+            # filled, 49.9 dB become 53.9 dB (8 frames of 256 px, noise 0.002); more columns and iterations gain 0.01 dB
             effort = {} if self.scale == 1 or kernels.reach > _FILLED_REACH else {"near": 24, "iterations": 6}
             return replace(problem, data=fill_beyond_ends(problem, width, kernels.reach, **effort))
         measured = measured_values(along, missing, data.shape, width, ends=ends)
