@@ -123,20 +123,25 @@ def compared_intervals(
     return torch.cat([starts[step:] - starts[:-step] for step in range(1, min(num_frames, max_group_frames))])
 
 
-def stack_spectra(frames: Tensor, valid: Tensor | None) -> RowSpectra:
+def stack_spectra(frames: Tensor, valid: Tensor | None, strips: ColumnStrips | None = None) -> RowSpectra:
     """Spectra of grey frames (B, T, H, W) in row order, each frame with mean 0 and standard deviation 1.
 
     Args:
         frames: The frames.
         valid: (B, T, H, W) bool, False for missing pixels; None if all are valid.
+        strips: Strips (B S) whose spectra are computed; None for whole rows.
     """
     if valid is None:
         variance, level = torch.var_mean(frames[..., ::4, :], (-2, -1), correction=0, keepdim=True)
-        return RowSpectra(frames, None, level, variance.sqrt())
-    weight = valid / valid.sum((-2, -1), keepdim=True)
-    level = (frames * weight).sum((-2, -1), keepdim=True)
-    variance = ((frames - level).square_() * weight).sum((-2, -1), keepdim=True)
-    return RowSpectra(frames, valid, level, variance.sqrt())
+    else:
+        weight = valid / valid.sum((-2, -1), keepdim=True)
+        level = (frames * weight).sum((-2, -1), keepdim=True)
+        variance = ((frames - level).square_() * weight).sum((-2, -1), keepdim=True)
+    contrast = variance.sqrt()
+    if strips is not None:  # all strips of a frame with the level and contrast of the frame, because they are joined
+        frames, valid = strips.cut(frames), None if valid is None else strips.cut(valid)
+        level, contrast = (values.repeat_interleave(len(strips.firsts), 0) for values in (level, contrast))
+    return RowSpectra(frames, valid, level, contrast)
 
 
 def frame_groups(

@@ -209,7 +209,7 @@ def strip_rows(
     margin = math.ceil(float(along.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
     turned = float(field.largest_displacement(float(starts[0]), float(starts[-1]))[..., 2:].amax())
     strips = ColumnStrips.between_ends(scale.width, max(min_pitch, max_slide / max(turned, 1e-9)), margin)
-    spectra = stack_spectra(strips.cut(frames), None if valid is None else strips.cut(valid))
+    spectra = stack_spectra(frames, valid, strips)
     columns = strips.columns.to(frames.device)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)
     groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=pairs_if_blurred_differently)
