@@ -20,6 +20,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -27,7 +28,6 @@ from torch.nn import functional
 
 from rsvib_torch.core.fourier import fast_length
 from rsvib_torch.registration.row_spectra import (
-    RowSpectra,
     chunks,
     combined,
     differences,
@@ -40,6 +40,21 @@ __all__ = ["FrameComparison", "RowGradients", "residual_products", "row_equation
 _BLOCK = 16  # px, side of the blocks of pixels that share a weight
 _SMOOTH = 16  # spectral values averaged along each axis for the power of scene and noise
 _NOISE_STEP = 4  # along the rows, every fourth frequency gives the noise power
+
+
+class WarpedRows(Protocol):
+    """What ``row_gradients`` requires of the frames: ``RowSpectra``, or rows that were joined from strips."""
+
+    @property
+    def width(self) -> int: ...  # columns of a frame
+
+    @property
+    def length(self) -> int: ...  # of the transforms along the rows
+
+    @property
+    def frequencies(self) -> Tensor: ...  # (U,) cycles/px
+
+    def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +81,7 @@ class RowGradients:
 
 
 def row_gradients(
-    spectra: RowSpectra,
+    spectra: WarpedRows,
     warped: Iterable[tuple[slice, Tensor]],
     rows: Tensor,
     shift: Tensor,
@@ -83,8 +98,9 @@ def row_gradients(
         rows: (B, G, S) frame rows of the S scene rows in each frame.
         shift: (B, G, S) px, displacement along the rows by which each was moved back.
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
-        more: Displacements (B, s, L, 2, A - 2) of the pixels of some rows by further unit components of the motion, whose
-            derivatives become regressors beside those by x and y; None if the displacement depends on the row only.
+        more: Displacements (B, s, L, 2, A - 2) of the pixels of some rows by further unit components of the motion.
+            Derivatives by them become regressors beside those by x and y. None if the displacement depends on the row
+            only.
         parts_of_rows: Number of parts of the rows for ``RowGradients.halves``.
 
     Returns:
@@ -213,8 +229,8 @@ def _fit_rows(rows: _Rows, edges: list[int], out: Tensor) -> tuple[tuple[Tensor,
         out: (B, s, A + 1, L), filled with the images of ``RowGradients``.
 
     Returns:
-        Products from ``_sums_of_parts``, the coefficients (B, s, G, A + 2) of the fit and the weighted sum (B, s) of its
-        squared residuals in one frame; and the arguments of ``_block_weight``.
+        Products from ``_sums_of_parts``, the coefficients (B, s, G, A + 2) of the fit and the weighted sum (B, s) of
+        its squared residuals in one frame; and the arguments of ``_block_weight``.
     """
     images, residual = rows.planes[:, :, : rows.regressors], rows.planes[:, :, rows.regressors :]
     weighted = torch.mul(images, rows.weight[:, :, None], out=out)
@@ -236,7 +252,7 @@ def _fit_rows(rows: _Rows, edges: list[int], out: Tensor) -> tuple[tuple[Tensor,
 
 
 def _products(sums: Tensor) -> tuple[Tensor, Tensor]:
-    """Products (B, s, A + 2, A + 2) of images and ones, and those (B, s, A + 2, G) with the differences of the frames."""
+    """Products (B, s, A + 2, A + 2) of images and ones, and (B, s, A + 2, G) with the differences, of whole rows."""
     images = sums.shape[-2] - 1
     return torch.cat([sums[..., :images], sums[..., -1:]], -1), sums[..., images:-1]
 

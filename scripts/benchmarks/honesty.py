@@ -115,13 +115,25 @@ def is_assumed(found: rsv.DetectionResult, taken: Recording, axis: int, tones: l
     return bool(names)
 
 
+def mean_of_columns(found: rsv.DetectionResult, starts: torch.Tensor, exposure: float) -> torch.Tensor:
+    """Displacement (T, R, 2) of the rows of a detected vibration, mean over the columns; roll moves them along x."""
+    components = found.vibration.mean_displacement(starts, exposure)
+    y = torch.arange(starts.shape[1], dtype=torch.float64) - 0.5 * (starts.shape[1] - 1) - components[..., 1]
+    x, down = components[..., 0], components[..., 1]
+    if components.shape[-1] > 2:
+        x = x - components[..., 2] * y
+    if components.shape[-1] > 3:
+        down = down + components[..., 3] * y
+    return torch.stack([x, down], -1)
+
+
 def judge_axis(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[str, Any]:
     """Outcome of one axis with its figures."""
     num_frames, height = taken.starts.shape
     stated = taken.timing.row_starts(num_frames, height)
     if taken.timing.readout_direction == "reverse":  # in the order of the image rows
         stated = stated.flip(1)
-    shown = found.vibration.mean_displacement(stated, taken.timing.exposure_time)[..., axis].numpy()
+    shown = mean_of_columns(found, stated, taken.timing.exposure_time)[..., axis].numpy()
     true = np.zeros((0, 3)) if taken.case.tones is None else observable_tones(taken, axis)
     truths = [without_trend(taken.displacement()[axis], taken.starts)]
     if taken.case.tones is not None:  # tones that are not observable may be found all the same

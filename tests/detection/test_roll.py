@@ -127,7 +127,7 @@ def test_free_motion_with_roll_in_other_orientation(rolling):
 def test_swept_tone_refuses_roll(rolling):
     with pytest.raises(ValueError, match="roll=True goes with model='tones' or 'free'"):
         detect_vibration(rolling[1], TIMING, model="swept", roll=True)
-    with pytest.raises(ValueError, match="zoom of a free motion must be True or False, got 'auto'"):
+    with pytest.raises(TypeError, match="zoom must be True or False, got 'auto'"):
         detect_motion(rolling[1], TIMING, zoom="auto")
 
 

@@ -41,8 +41,8 @@ __all__ = [
     "differential_motion",
     "differently_blurred",
     "frame_groups",
-    "measure_group",
     "joined_groups",
+    "measure_group",
     "measure_groups",
     "measure_strips",
     "remove_column_pattern",
@@ -269,7 +269,8 @@ def measure_strips(
 
     def joined(run: slice) -> Tensor:
         pixels = torch.fft.irfft(warp(run), n=spectra.length)[..., : spectra.width]
-        return torch.fft.rfft(extend_rows(strips.joined(pixels), length, hold=0.0))
+        spectrum: Tensor = torch.fft.rfft(extend_rows(strips.joined(pixels), length, hold=0.0))
+        return spectrum
 
     warped = ((run, joined(run)) for run in spectra.runs(positions.rows.shape[-1], 2))
     if gradients is None:

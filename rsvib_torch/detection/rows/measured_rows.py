@@ -134,9 +134,7 @@ class StripRows(MeasuredRows):
         each = [None] * len(self.groups) if gradients is None else gradients
         view, measured = self.view(motion), []
         for group, own in zip(self.groups, each, strict=True):
-            measured.append(
-                measure_strips(group, self.timing, motion, view, self.strips, self.scale.factors, own)
-            )
+            measured.append(measure_strips(group, self.timing, motion, view, self.strips, self.scale.factors, own))
         of_groups = [own for _, own in measured]
         return RowRecord(joined_groups([part for part, _ in measured]), of_groups, self._apart(of_groups))
 

@@ -204,9 +204,6 @@ def detect_motion(
     """
     check_whole_number("knot_rows", knot_rows, at_least=4)
     check_whole_number("iterations", iterations, at_least=1, at_most=100)
-    for name, value in (("roll", roll), ("zoom", zoom)):
-        if not isinstance(value, bool):
-            raise ValueError(f"{name} of a free motion must be True or False, got {value!r}")
     axes = 4 if zoom else 3 if roll else 2
     timing = timing_of_files(frames, timing)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
@@ -275,9 +272,7 @@ def _measure_field(
             tones = Vibration(torch.zeros(1, scale.axes, 1), 0.0, 0.0, drift)
             motion = FreeMotion(torch.cat([motion.coefficients, still], 1), motion.start, motion.spacing, tones)
         if number < 2:  # strips follow the size of roll and zoom, which are unknown in the first round
-            rows = strip_rows(
-                stack.images, stack.valid, timing, motion, scale, pairs_if_blurred_differently=False
-            )
+            rows = strip_rows(stack.images, stack.valid, timing, motion, scale, pairs_if_blurred_differently=False)
         rows_record = rows.measure(motion)
         measured = rows_record.measurements
         if number:
