@@ -170,6 +170,32 @@ def judge_axis(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[
     }
 
 
+def judge_turn(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[str, Any]:
+    """Outcome of roll (axis 2) or zoom (3), as displacements at half the width from the centre; 0 if there is none."""
+    num_frames, height = taken.starts.shape
+    arm = 0.5 * taken.frames.shape[-1]  # px
+    stated = taken.timing.row_starts(num_frames, height)
+    shown = arm * found.vibration.mean_displacement(stated, taken.timing.exposure_time)[..., axis].numpy()
+    truth = arm * without_trend(taken.case.motion(taken.starts + 0.5 * taken.exposure)[axis], taken.starts)
+    error, size = rms(without_trend(shown, stated.numpy()) - truth), rms(truth)
+    std = arm * float(displacement_uncertainty(found.vibration, found.std, taken.timing, num_frames, height)[0][axis])
+    reliable = bool(found.reliable[axis])
+    wrong = reliable and error > max(WRONG_DISPLACEMENT * size, WRONG_PX) and error > MANY_STD * std
+    return {
+        "outcome": "wrong" if wrong else "correct" if reliable else "refused",
+        "wrong_parameter": False,
+        "wrong_displacement": wrong,
+        "tones": [],
+        "true_tones": int(size > 0),
+        "found_tones": int((found.vibration.amplitude[axis] > 0).sum()),
+        "largest_z": 0.0,
+        "displacement_px": size,
+        "displacement_error": error / max(size, 1e-9),
+        "displacement_std": std / max(size, 1e-9),
+        "reasons": list(found.reasons[axis]),
+    }
+
+
 def best_constant(image: Array, still: Array, rim: int, steps: int = 4) -> Array:
     """Displacement (y, x) of a still frame with the smallest difference to an image."""
     inner = (slice(rim, -rim), slice(rim, -rim))
@@ -209,6 +235,7 @@ def judge_case(name: str, number: int, size: int) -> dict[str, Any]:
     except ValueError as error:
         return case | {"error": str(error), "axes": []}
     case["axes"] = [judge_axis(found, taken, axis) for axis in range(2)]
+    case["axes"] += [judge_turn(found, taken, axis) for axis in range(2, found.vibration.num_axes)]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", rsv.RestorationWarning)
         restored = rsv.restore(frames, taken.timing, found)
