@@ -127,7 +127,7 @@ class ImageMotion:
         return ColumnStrips.of(self.size[1], pitch, margin=math.ceil(farthest) + 4)  # 4 px: support of the kernel
 
     def _of_strips(self, components: Tensor, strips: ColumnStrips) -> Tensor:
-        """Displacements (B S, R, N, 2) of the middles of strips by components (B, R, N, A), in the rows of the frame."""
+        """Displacements (B S, R, N, 2) in the rows of the frame of the middles of strips, by components (B, R, N, A)."""
         components = components.repeat_interleave(len(strips.firsts), 0)
         x = strips.columns.to(components.device).repeat(len(self.starts))[:, None, None]
         rows = torch.arange(self.size[0], dtype=torch.float64, device=components.device)[:, None]
@@ -286,10 +286,10 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         for value in exposures:
             check_number("exposure_rows", value, above=0.0, at_most=timing.frame_rows)
         turns = []
-        for name, value in (("roll", roll), ("zoom", zoom)):
-            if any(isinstance(part, Sequence) for part in (value if isinstance(value, Sequence) else ())):
-                raise TypeError(f"{name} must be a number or (low, high), got {value!r}")
-            turns.append((0.0, 0.0) if value is None else _axis_ranges(name, value, at_least=0.0)[0])
+        for name, of_turn in (("roll", roll), ("zoom", zoom)):
+            if isinstance(of_turn, Sequence) and any(isinstance(part, Sequence) for part in of_turn):
+                raise TypeError(f"{name} must be a number or (low, high), got {of_turn!r}")
+            turns.append((0.0, 0.0) if of_turn is None else _axis_ranges(name, of_turn, at_least=0.0)[0])
         turns = turns if zoom is not None else turns[:1] if roll is not None else []
         frequencies, phases = _axis_ranges("frequency", frequency, at_least=0.0), _axis_ranges("phase", phase)
         self.flags = {

@@ -38,7 +38,7 @@ from rsvib_torch.detection.tones.fit import (
     vibration_of_fit,
 )
 from rsvib_torch.detection.tones.further import with_further_tones
-from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
+from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE, find_tones
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.io.files import FramesOrFiles, timing_of_files
@@ -224,8 +224,8 @@ def detect_vibration(
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
     channels: Channels = None,
-    roll: bool | Literal["auto"] = False,
-    zoom: bool | Literal["auto"] = False,
+    roll: bool | Literal["auto"] = "auto",
+    zoom: bool | Literal["auto"] = "auto",
 ) -> DetectionResult | MotionDetection | SweptTone:
     """Detect the vibration of the camera from consecutive frames (Sec. 2 of Liu et al. 2023).
 
@@ -243,7 +243,7 @@ def detect_vibration(
         model: ``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape; ``"swept"``: one tone per
             axis whose amplitude decays or grows and whose frequency sweeps. The last two take the options from
             ``registration`` to ``search``, ``ignore``, ``full_scale`` and ``channels``; ``detect_motion`` and
-            ``detect_swept_tone`` have further ones. ``"free"`` also takes ``roll`` and ``zoom``, True or False.
+            ``detect_swept_tone`` have further ones. ``"free"`` also measures ``roll`` and ``zoom``, if they are True.
         method: ``"direct"``, or ``"bands"`` (the paper's method), in half the time with ten times larger errors.
         registration: Method of the band registration, as in ``register_bands``.
         tones: Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance; the standard deviations
@@ -263,8 +263,8 @@ def detect_vibration(
         channels: ``"last"`` for frames (T, H, W, C) or (B, T, H, W, C). By default channels come before the image axes,
             and frames that appear to have them last are refused; ``"first"`` omits this check.
         roll: Measure the rotation about the optical axis as a third component of the motion, in rad: True, False, or
-            ``"auto"``: if the halves of the rows move apart. Results then have three axes instead of two, see
-            ``Vibration``.
+            ``"auto"``: if the halves of the rows move apart, and not with ``columns``. Results then have three axes
+            instead of two, see ``Vibration``.
         zoom: The same for the change of scale, as a fourth component; includes roll.
 
     Returns:
@@ -319,10 +319,6 @@ def detect_vibration(
                 raise ValueError(
                     f"{name}={value!r} goes with model='tones', not with model={model!r}, which takes {valid}"
                 )
-        field_options = {name: value for name, value in (("roll", roll), ("zoom", zoom)) if value is not False}
-        if field_options and model == "swept":
-            name, value = next(iter(field_options.items()))
-            raise ValueError(f"{name}={value!r} goes with model='tones' or 'free', not with model='swept'")
         return _OTHER_MODELS[model](
             frames,
             timing,
@@ -333,7 +329,7 @@ def detect_vibration(
             ignore=ignore,
             full_scale=full_scale,
             channels=channels,
-            **field_options,
+            **_turns_of_model(model, roll, zoom),
         )
     check_choice("method", method, tuple(_METHODS))
     if tones != "auto":
@@ -348,6 +344,9 @@ def detect_vibration(
         if value not in (True, False, "auto"):
             raise ValueError(f"{name} must be True, False or 'auto', got {value!r}")
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
+    if columns is not None and True in (roll, zoom):
+        raise ValueError(f"columns={columns} cannot be used with roll or zoom, which are measured in the whole width")
+    roll, zoom = (False, False) if columns is not None else (roll, zoom)
     field = _Field(roll, zoom, stacks.images.shape[-1], stacks.images.shape[-2])
     model_of_tones = MotionModel(harmonics, 2 if image_acceleration else 1)
     options = _FitOptions(None if tones == "auto" else tones, model_of_tones, bands, field.scale(2))
@@ -357,21 +356,18 @@ def detect_vibration(
     if window is None:
         found = _detect_field(grey, valid_pixels, timing, _METHODS[method], options, field, find_cause=True)
     else:
-        found = stacked(
-            [
-                _detect_field(
-                    grey[:, part],
-                    None if valid_pixels is None else valid_pixels[:, part],
-                    window_timing,
-                    _METHODS[method],
-                    options,
-                    field,
-                )
-                for part, window_timing in _windows(grey.shape[1], window, window_step, timing)
-            ]
-        )
+        windows = _windows(grey.shape[1], window, window_step, timing)
+        found = _detect_windows(grey, valid_pixels, windows, _METHODS[method], options, field)
     found = replace(found, timing=timing)  # of the stack, not of a window
     return found if stacks.batched else found[0]
+
+
+def _turns_of_model(model: str, roll: bool | str, zoom: bool | str) -> dict[str, bool]:
+    """Options of roll and zoom of the other models, which do not measure them unless they are requested."""
+    requested = {name: True for name, value in (("roll", roll), ("zoom", zoom)) if value is True}
+    if requested and model == "swept":
+        raise ValueError(f"{next(iter(requested))}=True goes with model='tones' or 'free', not with 'swept'")
+    return requested
 
 
 def _windows(num_frames: int, window: int, step: int | None, timing: SensorTiming) -> list[tuple[slice, SensorTiming]]:
@@ -389,6 +385,29 @@ def _windows(num_frames: int, window: int, step: int | None, timing: SensorTimin
         (slice(first, first + window), replace(timing, frame_start_times=starts[first : first + window]))
         for first in firsts
     ]
+
+
+def _detect_windows(
+    frames: Tensor,
+    valid: Tensor | None,
+    windows: list[tuple[slice, SensorTiming]],
+    method: "_Method",
+    options: _FitOptions,
+    field: "_Field",
+) -> DetectionResult:
+    """Results of all windows, with the same axes."""
+
+    def of_window(number: int, field: _Field) -> DetectionResult:
+        part, timing = windows[number]
+        of_pixels = None if valid is None else valid[:, part]
+        return _detect_field(frames[:, part], of_pixels, timing, method, options, field)
+
+    each = [of_window(number, field) for number in range(len(windows))]
+    axes = max(one.vibration.num_axes for one in each)
+    if axes > 2:
+        same = replace(field, roll=True, zoom=axes > 3)
+        each = [one if one.vibration.num_axes == axes else of_window(i, same) for i, one in enumerate(each)]
+    return stacked(each)
 
 
 @dataclass(frozen=True)
@@ -431,7 +450,9 @@ def _detect_field(
     if field.most_axes == 2 or (field.least_axes == 2 and not rotates):
         return found
     other, _, _ = _detect(frames, valid, timing, method, replace(options, scale=field.scale(field.most_axes)), fit)
-    moving = (other.vibration.amplitude > 0).flatten(0, -3).any(0).any(-1).tolist()
+    # a given number of tones is fitted to all axes, also to those that do not move
+    significant = other.vibration.amplitude > MIN_SIGNIFICANCE * other.std.amplitude
+    moving = significant.flatten(0, -3).any(0).any(-1).tolist()
     axes = max([field.least_axes, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
     return found if axes == 2 else other.with_axes(axes)
 
