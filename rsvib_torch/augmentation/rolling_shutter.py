@@ -127,7 +127,7 @@ class ImageMotion:
         return ColumnStrips.of(self.size[1], pitch, margin=math.ceil(farthest) + 4)  # 4 px: support of the kernel
 
     def _of_strips(self, components: Tensor, strips: ColumnStrips) -> Tensor:
-        """Displacements (B S, R, N, 2) in the rows of the frame of the middles of strips, by components (B, R, N, A)."""
+        """Displacements (B S, R, N, 2) of the middles of strips in the rows of the frame; components (B, R, N, A)."""
         components = components.repeat_interleave(len(strips.firsts), 0)
         x = strips.columns.to(components.device).repeat(len(self.starts))[:, None, None]
         rows = torch.arange(self.size[0], dtype=torch.float64, device=components.device)[:, None]

@@ -2,8 +2,8 @@
 
 Roll and zoom displace the content of a row by amounts that depend on the column (``motion.field``). For a start,
 strips of columns are registered like stacks of their own. With the displacement ``d_s`` of a row in strip s, its
-information ``W_s`` and the factors ``F_s`` from the components q of the motion to the displacement at the strip, the components of
-the row are the weighted least-squares solution
+information ``W_s`` and the factors ``F_s`` from the components q of the motion to the displacement at the strip, the
+components of the row are the weighted least-squares solution
 
     ``(sum_s F_s^T W_s F_s) q = sum_s F_s^T W_s d_s``,
 
