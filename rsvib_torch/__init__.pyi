@@ -44,12 +44,14 @@ from .io import (
     timing_from_first_frame,
     write_stack,
 )
+from .motion.camera import Camera
 from .motion.recorded import read_motion
 from .motion.spline import FreeMotion
 from .motion.timing import SensorTiming
 from .motion.vibration import Vibration, VibrationStd, blind_frequencies
 from .registration import OffsetCurve, register_bands
 from .report import (
+    camera_isd,
     comparison_figure,
     gain_figure,
     motion_figure,
@@ -58,9 +60,13 @@ from .report import (
     psf_figure,
     read_vibration,
     rows_figure,
+    sampling_map,
     save_figure,
     windows_figure,
+    write_gcsv,
+    write_isd,
     write_offsets,
+    write_stmap,
     write_vibration,
     write_windows,
 )
@@ -77,6 +83,7 @@ from .restoration import (
 from .stacks import StackReport, iterate_stack, process_stack, read_manifest, restore_block
 
 __all__ = [
+    "Camera",
     "ClockAlignment",
     "DetectionResult",
     "FreeMotion",
@@ -106,6 +113,7 @@ __all__ = [
     "calibrate_row_time",
     "calibrate_row_time_by_exposure",
     "calibrate_row_time_by_motion",
+    "camera_isd",
     "check_motion",
     "comparison_figure",
     "detect_motion",
@@ -134,6 +142,7 @@ __all__ = [
     "restore_block",
     "row_psf",
     "rows_figure",
+    "sampling_map",
     "save_figure",
     "simulate_frames",
     "slanted_edge_mtf",
@@ -142,8 +151,11 @@ __all__ = [
     "trusted_vibration",
     "visible_pixels",
     "windows_figure",
+    "write_gcsv",
+    "write_isd",
     "write_offsets",
     "write_stack",
+    "write_stmap",
     "write_vibration",
     "write_windows",
 ]

@@ -50,6 +50,7 @@ FIRST_NAMES = (
     *("process_stack", "StackReport", "iterate_stack", "restore_block", "read_manifest"),
     *("slanted_edge_mtf", "MtfCurve", "find_slanted_edges", "SlantedEdge", "psnr", "ssim"),
     *("read_vibration", "write_vibration", "write_offsets", "write_windows", "save_figure"),
+    *("sampling_map", "write_stmap", "write_gcsv", "write_isd", "camera_isd"),
 )
 # Sections of the site and the order of their pages; pages that are missing here are added to the last section.
 SECTIONS = {
@@ -65,6 +66,7 @@ SECTIONS = {
         "your_own_camera.md",
         "roll_and_zoom.md",
         "stacks.md",
+        "export.md",
         "reliability.md",
         "ml_pipeline.md",
         "measuring.md",

@@ -347,7 +347,8 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             params["image_motion"] * taken[:, None],
         )
         step = self._recording_length(params)
-        return Vibration(*(value[::step] for value in drawn))
+        amplitude, frequency, phase, image_motion = (value[::step] for value in drawn)
+        return Vibration(amplitude, frequency, phase, image_motion)
 
     def compute_transformation(self, input: Tensor, params: Parameters, flags: dict[str, Any]) -> Tensor:
         """Return identities (B, 3, 3): no matrix describes rows that move by different amounts."""
@@ -420,7 +421,8 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         """The drawn motion of a batch in row order."""
         drawn = {name: params[name].to(dtype=torch.float64, device=like.device) for name in _DRAWN}
         exposure_rows = drawn.pop("exposure_rows")
-        vibration = Vibration(**drawn).to_row_order(self.timing)
+        amplitude = drawn.pop("amplitude")
+        vibration = Vibration(amplitude, camera=None, **drawn).to_row_order(self.timing)
         self.timing.check_rows(self._size(params)[0])
         length = self._recording_length(params)
         starts = self.timing.frame_starts(length) if length > 1 else torch.zeros(1, dtype=torch.float64, device="cpu")

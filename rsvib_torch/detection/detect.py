@@ -27,7 +27,7 @@ from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
 from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
 from rsvib_torch.detection.start import BandStart, band_start, field_start, grey_frames
-from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.detection.tones.fit import (
     MotionModel,
     ToneFit,
@@ -42,6 +42,7 @@ from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE, f
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.io.files import FramesOrFiles, timing_of_files
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
@@ -164,7 +165,7 @@ def _fit_direct(
     fit = _fit_bands(start, frames, valid, timing, options, accuracy=0.15).fit
     intervals = compared_intervals(timing, frames.shape[1], MAX_GROUP_FRAMES, frames.device)
     motion, scale = shrunk_motion(fit, intervals), options.scale
-    if scale.axes == 2:
+    if scale.same_for_all_columns:
         rows = whole_rows(frames, valid, timing, motion)
     else:
         rows = strip_rows(frames, valid, timing, motion, scale)
@@ -226,6 +227,9 @@ def detect_vibration(
     channels: Channels = None,
     roll: bool | Literal["auto"] = "auto",
     zoom: bool | Literal["auto"] = "auto",
+    focal_length: float | None = None,
+    principal_point: tuple[float, float] | None = None,
+    distortion: tuple[float, float, float, float, float] | None = None,
 ) -> DetectionResult | MotionDetection | SweptTone:
     """Detect the vibration of the camera from consecutive frames (Sec. 2 of Liu et al. 2023).
 
@@ -266,6 +270,12 @@ def detect_vibration(
             ``"auto"``: if the halves of the rows move apart, and not with ``columns``. Results then have three axes
             instead of two, see ``Vibration``.
         zoom: The same for the change of scale, as a fourth component; includes roll.
+        focal_length: Focal length in px, for a motion that is a rotation of the camera: displacements then follow from
+            the projection (see ``Camera``), which matters for fields of view above about 20 degrees, and the result
+            has an ``attitude``. None: the displacement by translation is the same in the whole frame.
+        principal_point: px along x and y from the centre of the first pixel, as in OpenCV; by default the centre of the
+            frame.
+        distortion: Lens distortion (k1, k2, p1, p2, k3) as in OpenCV; by default none.
 
     Returns:
         The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve: a
@@ -329,7 +339,14 @@ def detect_vibration(
             ignore=ignore,
             full_scale=full_scale,
             channels=channels,
-            **_turns_of_model(model, roll, zoom),
+            **_options_of_field(
+                model,
+                roll=roll is True or None,  # "auto": not measured unless requested
+                zoom=zoom is True or None,
+                focal_length=focal_length,
+                principal_point=principal_point,
+                distortion=distortion,
+            ),
         )
     check_choice("method", method, tuple(_METHODS))
     if tones != "auto":
@@ -340,14 +357,10 @@ def detect_vibration(
     if columns is not None:
         check_whole_number("columns", columns, at_least=64)  # px; narrower bands are often registered wrongly
     bands = RegistrationOptions(registration, band_rows, band_step, search)
-    for name, value in (("roll", roll), ("zoom", zoom)):
-        if value not in (True, False, "auto"):
-            raise ValueError(f"{name} must be True, False or 'auto', got {value!r}")
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
-    if columns is not None and True in (roll, zoom):
-        raise ValueError(f"columns={columns} cannot be used with roll or zoom, which are measured in the whole width")
-    roll, zoom = (False, False) if columns is not None else (roll, zoom)
-    field = _Field(roll, zoom, stacks.images.shape[-1], stacks.images.shape[-2])
+    height, width = stacks.images.shape[-2:]
+    camera = camera_in_row_order(focal_length, principal_point, distortion, (height, width), timing)
+    field = _Field.of(roll, zoom, columns, width, height, camera)
     model_of_tones = MotionModel(harmonics, 2 if image_acceleration else 1)
     options = _FitOptions(None if tones == "auto" else tones, model_of_tones, bands, field.scale(2))
     if columns is not None:
@@ -362,12 +375,13 @@ def detect_vibration(
     return found if stacks.batched else found[0]
 
 
-def _turns_of_model(model: str, roll: bool | str, zoom: bool | str) -> dict[str, bool]:
-    """Options of roll and zoom of the other models, which do not measure them unless they are requested."""
-    requested = {name: True for name, value in (("roll", roll), ("zoom", zoom)) if value is True}
-    if requested and model == "swept":
-        raise ValueError(f"{next(iter(requested))}=True goes with model='tones' or 'free', not with 'swept'")
-    return requested
+def _options_of_field(model: str, **options: object) -> dict[str, object]:
+    """Options of roll, zoom and camera that were given for another model than tones."""
+    given = {name: value for name, value in options.items() if value is not None}
+    if given and model == "swept":
+        name, value = next(iter(given.items()))
+        raise ValueError(f"{name}={value!r} goes with model='tones' or 'free', not with model='swept'")
+    return given
 
 
 def _windows(num_frames: int, window: int, step: int | None, timing: SensorTiming) -> list[tuple[slice, SensorTiming]]:
@@ -412,16 +426,38 @@ def _detect_windows(
 
 @dataclass(frozen=True)
 class _Field:
-    """Whether roll and zoom are measured (True, False or ``"auto"``), and the size of the frames."""
+    """Whether roll and zoom are measured (True, False or ``"auto"``), the size of the frames, and the camera."""
 
     roll: bool | Literal["auto"]
     zoom: bool | Literal["auto"]
     width: int
     height: int
+    camera: Camera | None
 
-    def scale(self, axes: int) -> FieldScale:
+    @classmethod
+    def of(
+        cls,
+        roll: bool | Literal["auto"],
+        zoom: bool | Literal["auto"],
+        columns: int | None,
+        width: int,
+        height: int,
+        camera: Camera | None,
+    ) -> "_Field":
+        """The field of checked options; of a part of the columns, roll and zoom are not measured."""
+        for name, value in (("roll", roll), ("zoom", zoom)):
+            if value not in (True, False, "auto"):
+                raise ValueError(f"{name} must be True, False or 'auto', got {value!r}")
+        if columns is not None and (camera is not None or roll is True or zoom is True):
+            raise ValueError(
+                f"columns={columns} goes with roll=False, zoom=False and focal_length=None: roll, zoom and perspective "
+                "are measured from all columns"
+            )
+        return cls(columns is None and roll, columns is None and zoom, width, height, camera)
+
+    def scale(self, axes: int, camera: Camera | None = None) -> FieldScale:
         """Lengths for a motion of so many components."""
-        return FieldScale(axes, self.width, self.height)
+        return FieldScale(axes, self.width, self.height, camera)
 
     @property
     def most_axes(self) -> int:
@@ -445,16 +481,18 @@ def _detect_field(
     find_cause: bool = False,
 ) -> DetectionResult:
     """``_detect`` with as many components as were requested or, with ``"auto"``, as the frames require."""
-    cause: bool | Literal["unless rotating"] = "unless rotating" if find_cause and field.most_axes > 2 else find_cause
+    further = field.most_axes > 2 or field.camera is not None
+    cause: bool | Literal["unless rotating"] = "unless rotating" if find_cause and further else find_cause
     found, fit, rotates = _detect(frames, valid, timing, method, options, find_cause=cause)
-    if field.most_axes == 2 or (field.least_axes == 2 and not rotates):
+    if field.camera is None and (field.most_axes == 2 or (field.least_axes == 2 and not rotates)):
         return found
-    other, _, _ = _detect(frames, valid, timing, method, replace(options, scale=field.scale(field.most_axes)), fit)
+    scale = field.scale(field.most_axes, field.camera)
+    other, _, _ = _detect(frames, valid, timing, method, replace(options, scale=scale), fit)
     # a given number of tones is fitted to all axes, also to those that do not move
     significant = other.vibration.amplitude > MIN_SIGNIFICANCE * other.std.amplitude
     moving = significant.flatten(0, -3).any(0).any(-1).tolist()
     axes = max([field.least_axes, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
-    return found if axes == 2 else other.with_axes(axes)
+    return found if axes == 2 and field.camera is None else other.with_axes(axes)
 
 
 def _detect(
@@ -482,7 +520,7 @@ def _detect(
         A batch of results in image axes, their fit, and whether the halves of the rows of any stack move apart.
     """
     row_timing, bands, scale = timing.in_row_order(), options.bands, options.scale
-    if scale.axes == 2:
+    if scale.same_for_all_columns:
         start = band_start(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve)
     else:
         start = field_start(frames, valid, row_timing, bands, scale, translation)

@@ -18,11 +18,13 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.field import displacement_factors
 from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
-__all__ = ["FieldScale", "combined_strips", "cut_into_strips"]
+__all__ = ["FieldScale", "camera_in_row_order", "combined_strips", "cut_into_strips"]
 
 
 @dataclass(frozen=True)
@@ -33,11 +35,18 @@ class FieldScale:
         axes: Number of components of the motion, 2 to 4.
         width: Columns of a frame.
         height: Rows of a frame.
+        camera: Focal length and lens, in row order.
     """
 
     axes: int
     width: int
     height: int
+    camera: Camera | None = None
+
+    @property
+    def same_for_all_columns(self) -> bool:
+        """Whether the motion displaces all columns of a row alike."""
+        return self.axes == 2 and self.camera is None
 
     @property
     def radius(self) -> float:
@@ -57,6 +66,7 @@ class FieldScale:
             fitted.phase,
             fitted.image_motion * factor,
             fitted.image_acceleration * factor,
+            self.camera,
         )
 
     def free_motion(self, fitted: FreeMotion) -> FreeMotion:
@@ -77,8 +87,30 @@ class FieldScale:
 
     def factors(self, x: Tensor, y: Tensor) -> Tensor:
         """Displacement (S, 2, A) at positions (S) in px from the centre by unit components in px."""
-        factors: Tensor = displacement_factors(x, y, self.axes) * self.units(x)
+        factors: Tensor = displacement_factors(x, y, self.axes, self.camera) * self.units(x)
         return factors
+
+
+def camera_in_row_order(
+    focal_length: float | None,
+    principal_point: tuple[float, float] | None,
+    distortion: tuple[float, float, float, float, float] | None,
+    size: tuple[int, int],
+    timing: SensorTiming,
+) -> Camera | None:
+    """Camera of frames of ``size`` (rows, columns) in row order, from the options of ``detect_vibration``."""
+    if focal_length is None:
+        for name, value in (("principal_point", principal_point), ("distortion", distortion)):
+            if value is not None:
+                raise ValueError(f"{name}={value!r} requires focal_length, in px")
+        return None
+    height, width = size if timing.scan_axis == -2 else size[::-1]
+    centre = (0.5 * (width - 1), 0.5 * (height - 1))
+    camera = Camera(focal_length, centre if principal_point is None else principal_point, distortion or (0.0,) * 5)
+    x, y = camera.principal_point
+    camera = replace(camera, principal_point=(x - centre[0], y - centre[1]))
+    camera.check_size(width, height)
+    return Vibration.still(axes=2).with_camera(camera).to_row_order(timing).camera
 
 
 def combined_strips(measured: Measurements, factors: Tensor) -> Measurements:

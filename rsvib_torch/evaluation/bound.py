@@ -423,6 +423,8 @@ def cramer_rao_bound(
         raise ValueError(f"scene must have shape (H, W), got {tuple(scene.shape)}")
     if num_frames < 2:
         raise ValueError(f"num_frames must be at least 2, got {num_frames}")
+    if vibration.camera is not None:
+        raise ValueError("the bound is not defined with a camera: pass the vibration without camera=")
     # the simulation checks the sizes and the motion
     frames = simulate_frames(scene.double(), timing, vibration, num_frames, frame_size=frame_size)
     motion = vibration.to_row_order(timing).to(scene.device)

@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import check_pixels, checks_arguments
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
@@ -17,7 +17,7 @@ from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.sensor_model import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.motion.field import ColumnMotion, largest_in_frame
+from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slope
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 
@@ -26,6 +26,7 @@ __all__ = ["simulate_frames"]
 _DEGREE = 9  # degree of the spline across rows; its error is 2e-5 of the amplitude at a quarter cycle per pixel
 # px between the visible part and the edge of the scene; the prefilter of the spline decays to 4e-4 within it
 _MARGIN = 16
+_SLIDE = 0.032  # px, difference of the displacements of neighbouring strips
 _CHUNK_ROWS = 64  # rows of all frames that are formed at once
 
 
@@ -84,8 +85,9 @@ def simulate_frames(
             f"scene must be a floating-point tensor whose full scale is 1, got {scene.dtype}; divide counts by their "
             "full scale, e.g. scene / 255"
         )
-    if scene.ndim not in (2, 3) or not bool(torch.isfinite(scene).all()):
-        raise ValueError(f"scene must be a finite (H, W) or (C, H, W) tensor, got shape {tuple(scene.shape)}")
+    if scene.ndim not in (2, 3) or not scene.numel():
+        raise ValueError(f"scene must be a (H, W) or (C, H, W) tensor, got shape {tuple(scene.shape)}")
+    check_pixels("scene", scene)
     if channels_appear_last(scene.shape):
         raise ValueError(
             f"scene of shape {tuple(scene.shape)} appears to have its channels last: pass scene.permute(2, 0, 1)"
@@ -113,7 +115,7 @@ def simulate_frames(
     first = timing_in_rows.frame_starts(num_frames)
     last = float(first[-1]) + timing.frame_period + timing.exposure_time
     reach = largest_in_frame(
-        motion.largest_displacement(float(first[0]), last), scene.shape[-1], scene.shape[-2]
+        motion.largest_displacement(float(first[0]), last), scene.shape[-1], scene.shape[-2], motion.camera
     ).tolist()
     margins = tuple(_MARGIN + math.ceil(r) for r in reversed(reach))
     available = tuple(size - 2 * margin for size, margin in zip(scene.shape[-2:], margins, strict=True))
@@ -136,12 +138,14 @@ def simulate_frames(
 def _form_frames(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion, width: int) -> Tensor:
     """``_form_rows``, in strips of columns if the motion has roll or zoom.
 
-    Strips of 16 px differ in their displacement by 0.03 px for a roll of 2 mrad; the linear interpolation between them
-    has then errors of up to 2e-4 of full scale (rms).
+    The displacement differs between neighbouring strips by at most ``_SLIDE``, for example 16 px with a roll of 2 mrad;
+    the linear interpolation between them has then errors of up to 2e-4 of full scale (rms).
     """
-    if motion.num_axes == 2:
+    if motion.same_for_all_columns:
         return _form_rows(scene, starts, timing, motion, width)
-    strips = ColumnStrips.of(width, max_pitch=16, margin=0)
+    reached = motion.largest_displacement(float(starts.amin()), float(starts.amax()) + timing.exposure_time)
+    slope = float(largest_slope(reached, width, starts.shape[-1], motion.camera))
+    strips = ColumnStrips.of(width, max_pitch=min(max(_SLIDE / max(slope, 1e-9), 4.0), 16.0), margin=0)
     beyond = 2 * ((scene.shape[-1] - width) // 2)  # columns of the scene beside the frame
     of_strips = ColumnMotion.of_columns(motion.expanded(1), strips.columns, timing, *starts.shape)
     formed = [

@@ -16,6 +16,7 @@ from torch import Tensor
 from rsvib_torch.core.presentation import Result, plain_values, verdict_table
 from rsvib_torch.core.text import wrapped
 from rsvib_torch.core.validation import Section, checked
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, image_motion_line, tone_head, tone_rows
 
@@ -76,6 +77,14 @@ class TimingRecord(Section):
         return SensorTiming(**{name: getattr(self, name) for name in TimingRecord.model_fields})
 
 
+class CameraRecord(Section):
+    """Fields of ``Camera``, which checks their values."""
+
+    focal_length: float
+    principal_point: list[float] = Field(default_factory=lambda: [0.0] * 2, min_length=2, max_length=2)
+    distortion: list[float] = Field(default_factory=lambda: [0.0] * 5, min_length=5, max_length=5)
+
+
 class VibrationRecord(Section):
     """Fields of ``Vibration``, which checks their values.
 
@@ -87,6 +96,7 @@ class VibrationRecord(Section):
     phase: Tones
     image_motion: list[float]
     image_acceleration: list[float] = Field(default_factory=lambda: [0.0, 0.0])
+    camera: CameraRecord | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -105,9 +115,16 @@ class VibrationRecord(Section):
         """The record of one vibration (not a batch)."""
         return cls(**{name: plain_values(getattr(vibration, name)) for name in VibrationRecord.model_fields})
 
+    @model_serializer(mode="wrap")
+    def _without_unknown(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Omit an unknown camera: files written before this field was added keep their hash."""
+        values: dict[str, Any] = handler(self)
+        return {name: value for name, value in values.items() if name != "camera" or value is not None}
+
     def to_vibration(self) -> Vibration:
         """The vibration."""
-        return Vibration(**{name: getattr(self, name) for name in VibrationRecord.model_fields})
+        values = {name: getattr(self, name) for name in VibrationRecord.model_fields}
+        return Vibration(**values | {"camera": None if self.camera is None else Camera(**self.camera.model_dump())})
 
 
 class StdRecord(Section):

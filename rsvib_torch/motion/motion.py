@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Self
 
@@ -11,7 +12,8 @@ from torch import Tensor
 from rsvib_torch.core.arguments import check_broadcast, checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import Result
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.camera import Camera
+from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming
 
 __all__ = ["Motion"]
 
@@ -100,6 +102,36 @@ class Motion(Result, ABC):
         """Number of components of the displacement."""
         return self.largest_oscillation().shape[-1]
 
+    @property
+    def camera(self) -> Camera | None:
+        """Focal length and lens that the displacement follows; None for an infinite focal length."""
+        return None
+
+    @property
+    def same_for_all_columns(self) -> bool:
+        """Whether all columns of a row are displaced alike: no roll, no zoom, no finite focal length."""
+        return self.num_axes == 2 and self.camera is None
+
+    @checks_arguments
+    def attitude(self, times: Tensor) -> Tensor:
+        """Rotation of the camera in rad, see ``Camera``; times as in ``displacement``.
+
+        Returns:
+            (S, 3) float64: pitch, yaw and roll, right-handed about x (right), y (down) and z (forward).
+
+        Raises:
+            ValueError: If the motion has no camera.
+
+        Example:
+            >>> from rsvib_torch import Camera, Vibration
+            >>> motion = Vibration((2.0, 1.0), (50.0, 50.0), (1.5, 0.0), camera=Camera(focal_length=1000.0))
+            >>> motion.attitude(torch.tensor(0.005)).round(decimals=6).tolist()  # pitch and yaw in rad
+            [0.001, -0.000141, -0.0]
+        """
+        if self.camera is None:
+            raise ValueError("the attitude requires a motion with a camera: pass focal_length or camera=Camera(...)")
+        return self.camera.attitude(self.displacement(times))
+
     @checks_arguments
     def path(self, starts: Tensor, delays: Tensor) -> Tensor:
         """Displacement during exposures in px.
@@ -184,6 +216,12 @@ class Motion(Result, ABC):
         if len(signs) != self.num_axes or any(sign not in (1, -1) for sign in signs):
             raise ValueError(f"signs must be {self.num_axes} values of 1 or -1, got {list(signs)}")
 
+    def with_camera(self, camera: Camera | None) -> Self:
+        """The same components with another camera."""
+        result = copy(self)
+        object.__setattr__(result, "camera", camera)
+        return result
+
     def detached(self) -> Self:
         """The same motion without gradients."""
         return self.mapped(Tensor.detach)
@@ -191,7 +229,7 @@ class Motion(Result, ABC):
     @checks_arguments
     def expanded(self, size: int) -> Self:
         """A batch of ``size`` copies of the motion; the new dimension is the first."""
-        check_whole_number("size", size, at_least=1)
+        check_whole_number("size", size, at_least=1, at_most=MAX_BATCH)
         return self.mapped(lambda values: values.expand(size, *values.shape))
 
     @checks_arguments

@@ -14,6 +14,7 @@ from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import axis_head, axis_rows
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, gauss_legendre
 from rsvib_torch.core.text import measured_text, text_table
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME
 from rsvib_torch.motion.vibration import TensorLike, Vibration
@@ -39,6 +40,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         start: Time of the first knot in seconds; the last is at ``start + (N - 3) spacing``.
         spacing: Time between knots in seconds.
         tones: Tones and image motion of the same batch shape; by default none.
+        camera: Focal length and lens, as for ``Vibration``.
 
     Raises:
         ValueError: If shapes do not fit or a value is not finite.
@@ -57,9 +59,17 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
     start: float
     spacing: float
     tones: Vibration
+    camera: Camera | None = None
 
     @checks_arguments
-    def __init__(self, coefficients: TensorLike, start: float, spacing: float, tones: Vibration | None = None) -> None:
+    def __init__(
+        self,
+        coefficients: TensorLike,
+        start: float,
+        spacing: float,
+        tones: Vibration | None = None,
+        camera: Camera | None = None,
+    ) -> None:
         values = as_numbers("coefficients", coefficients)
         if values.ndim < 2 or not 2 <= values.shape[-2] <= 4 or values.shape[-1] < 4:
             raise ValueError(
@@ -86,10 +96,17 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         )
         object.__setattr__(self, "spacing", check_number("spacing", spacing, at_least=MIN_ROW_TIME))
         object.__setattr__(self, "tones", tones)
+        object.__setattr__(self, "camera", tones.camera if camera is None else camera)
 
     @classmethod
     @checks_arguments
-    def through(cls, times: TensorLike, displacement: TensorLike, tones: Vibration | None = None) -> "FreeMotion":
+    def through(
+        cls,
+        times: TensorLike,
+        displacement: TensorLike,
+        tones: Vibration | None = None,
+        camera: Camera | None = None,
+    ) -> "FreeMotion":
         """The motion that passes through displacements (N, A) in px at evenly spaced times (N,) in seconds.
 
         Raises:
@@ -105,7 +122,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         before = 2 * values[:1] - values[1:].flip(0)
         after = 2 * values[-1:] - values[:-1].flip(0)
         coefficients = bspline_coefficients(torch.cat([before, values, after]).T, 3, -1)
-        return cls(coefficients[:, len(grid) - 2 : 2 * len(grid)], float(grid[0]), spacing, tones)
+        return cls(coefficients[:, len(grid) - 2 : 2 * len(grid)], float(grid[0]), spacing, tones, camera)
 
     @classmethod
     @checks_arguments
@@ -116,6 +133,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         *,
         spacing: float | None = None,
         tones: Vibration | None = None,
+        camera: Camera | None = None,
     ) -> "FreeMotion":
         """The motion through displacements (N, A) at increasing times, interpolated in between by cubic splines.
 
@@ -124,6 +142,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
             displacement: px; roll, the third of A = 3 columns, in rad, and zoom, the fourth, relative.
             spacing: Time between knots; by default half the median step.
             tones: Tones that are added.
+            camera: Focal length and lens.
         """
         from scipy.interpolate import CubicSpline  # noqa: PLC0415
 
@@ -143,7 +162,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
             raise ValueError(f"spacing must give at most {MAX_KNOTS:,} knots, got {step:g} s for {last - first:g} s")
         even = np.linspace(first, last, max(4, math.ceil((last - first) / step) + 1))
         interpolated = CubicSpline(grid.numpy(), values.numpy())(even)
-        return cls.through(torch.from_numpy(even), torch.from_numpy(interpolated), tones)
+        return cls.through(torch.from_numpy(even), torch.from_numpy(interpolated), tones, camera)
 
     @classmethod
     @checks_arguments
@@ -155,9 +174,10 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         knots = {(m.start, m.spacing, m.coefficients.shape) for m in motions}
         if len(knots) > 1:
             raise ValueError(f"motions of different knots cannot be stacked: {sorted(knots)}")
-        fields = ([getattr(m.tones, name) for m in motions] for name in Vibration.__dataclass_fields__)
-        tones = Vibration(*(torch.stack(values) for values in fields))
-        return cls(torch.stack([m.coefficients for m in motions]), first.start, first.spacing, tones)
+        if any(m.camera != first.camera for m in motions):
+            raise ValueError("motions of different cameras cannot be stacked")
+        tones = Vibration.stacked([m.tones for m in motions])
+        return cls(torch.stack([m.coefficients for m in motions]), first.start, first.spacing, tones, first.camera)
 
     def summary(self) -> str:
         """Duration and range of the motion; of a batch, those of each motion."""
@@ -247,14 +267,15 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         )
         moved = self.image_motion * offset + 0.5 * self.image_acceleration * offset**2
         rest = (self.coefficients + moved[..., None]) * size[:, None]
-        return FreeMotion(rest, (self.start - offset) / scale, self.spacing / scale, tones)
+        return FreeMotion(rest, (self.start - offset) / scale, self.spacing / scale, tones, self.camera)
 
     @checks_arguments
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The motion whose component k is ``signs[k]`` (1 or -1) times component ``order[k]`` of this motion."""
         self._check_axes(order, signs)
         coefficients = self.coefficients[..., list(order), :] * self.coefficients.new_tensor(signs)[:, None]
-        return type(self)(coefficients, self.start, self.spacing, self.tones.with_axes(order, signs))
+        camera = None if self.camera is None else self.camera.with_axes(order, signs)
+        return type(self)(coefficients, self.start, self.spacing, self.tones.with_axes(order, signs), camera)
 
     def _taps(self, times: Tensor) -> tuple[Tensor, Tensor]:
         """The four coefficients (S, 2, 4) about times S, and the fraction (S,) of a knot spacing."""

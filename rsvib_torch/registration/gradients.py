@@ -87,7 +87,7 @@ def row_gradients(
     shift: Tensor,
     visible: Tensor,
     *,
-    more: Callable[[slice], Tensor] | None = None,
+    factors: Callable[[slice], Tensor] | None = None,
     parts_of_rows: int = 2,
 ) -> RowGradients:
     """Gradients of the scene, noise, and the weight of every pixel, from frames warped by a motion.
@@ -98,9 +98,8 @@ def row_gradients(
         rows: (B, G, S) frame rows of the S scene rows in each frame.
         shift: (B, G, S) px, displacement along the rows by which each was moved back.
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
-        more: Displacements (B, s, L, 2, A - 2) of the pixels of some rows by further unit components of the motion.
-            Derivatives by them become regressors beside those by x and y. None if the displacement depends on the row
-            only.
+        factors: Displacements (B, s, L, 2, A) of the pixels of some rows by unit components of the motion, x and y
+            first; the derivatives by all of them are regressors. None if the displacement depends on the row only.
         parts_of_rows: Number of parts of the rows for ``RowGradients.halves``.
 
     Returns:
@@ -113,7 +112,7 @@ def row_gradients(
     inner = functional.pad(inner_columns(width, shift, detail.real), (0, length - width))
     valid = spectra.warped_valid(rows, shift)
     parts = chunks(rows.shape[-1], 4 * length * len(rows) * (4 + rows.shape[1]), _BLOCK, rows.device)
-    regressors = 3 if more is None else 3 + more(slice(0, 1)).shape[-1]
+    regressors = 3 if factors is None else 1 + factors(slice(0, 1)).shape[-1]
     memory = inner.new_empty(
         len(rows), parts[0].stop, regressors + (1 if rows.shape[1] == 2 else rows.shape[1]), length
     )
@@ -122,10 +121,10 @@ def row_gradients(
         own, part_visible = detail[:, part].contiguous(), visible[:, :, part]
         planes = memory[:, : own.shape[1]]
         planes[:, :, 0], planes[:, :, 1] = (torch.fft.irfft(one, n=length) for one in (own * along, across[:, part]))
-        if more is not None:
-            factors = more(part).to(planes.dtype)
-            moved = factors[..., 0, :] * planes[:, :, 0, :, None] + factors[..., 1, :] * planes[:, :, 1, :, None]
-            planes[:, :, 2 : regressors - 1] = moved.movedim(-1, 2)
+        if factors is not None:
+            moved = factors(part).to(planes.dtype)
+            by_component = moved[..., 0, :] * planes[:, :, 0, :, None] + moved[..., 1, :] * planes[:, :, 1, :, None]
+            planes[:, :, : regressors - 1] = by_component.movedim(-1, 2)
         for place, one in enumerate((own, *compared.differences[:, :, part].unbind(1)), regressors - 1):
             planes[:, :, place] = torch.fft.irfft(one, n=length)
         weight = inner * (part_visible.sum(1) > 1)[..., None].to(inner.dtype)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.pixels import detailed_columns
-from rsvib_torch.motion.field import ColumnMotion
+from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slope
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
@@ -30,10 +30,12 @@ _MARGIN = 24  # px of a strip without weight, beyond the displacement: the resto
 
 def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) -> ColumnStrips:
     """Strips for frames of (height, width), for a motion (B) between two times in seconds."""
-    turning = float(motion.largest_displacement(first, last)[..., 2:].amax())
+    reached = motion.largest_displacement(first, last)
+    slope = float(largest_slope(reached, size[1], size[0], motion.camera).amax())
     narrowest, widest = _PITCHES
-    pitch = min(max(_SLIDE / max(turning, 1e-9), narrowest), widest)
-    along = float(motion.largest_oscillation()[..., 0].amax()) + turning * 0.5 * sum(size)
+    pitch = min(max(_SLIDE / max(slope, 1e-9), narrowest), widest)
+    moving = torch.cat([motion.largest_oscillation()[..., :2], reached[..., 2:]], -1)
+    along = float(largest_in_frame(moving, size[1], size[0], motion.camera)[..., 0].amax())
     return ColumnStrips.of(size[1], pitch, _MARGIN + math.ceil(along))
 
 
@@ -53,7 +55,7 @@ def restore_in_strips(
         Restored frames as from the method.
     """
     count, (height, width) = images.shape[1], images.shape[-2:]
-    if motion.num_axes == 2:
+    if motion.same_for_all_columns:
         of_frames = frame_motion(motion, timing, count, height)
         of_frames.check_fits(height, width)
         return method(images, of_frames, **options)
@@ -85,7 +87,7 @@ def judged_strip(
         columns: Width of the strip.
     """
     count, (height, width) = len(raw), raw.shape[-2:]
-    if motion.num_axes == 2:
+    if motion.same_for_all_columns:
         of_frames = frame_motion(motion, timing, count, height)
         of_frames.check_fits(height, width)
         return raw, restored, hidden, of_frames

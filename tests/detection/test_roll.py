@@ -5,10 +5,11 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from field_truth import FieldMotion, take_field_frames
+from field_truth import FieldMotion, LensMotion, take_field_frames
 from truth import decibel, draw_scene
 
 from rsvib_torch import (
+    Camera,
     DetectionResult,
     SensorTiming,
     detect_motion,
@@ -77,7 +78,7 @@ def test_windows_have_the_same_axes(rolling):
 
 
 def test_columns_refuse_roll(rolling):
-    with pytest.raises(ValueError, match="columns=128 cannot be used with roll or zoom"):
+    with pytest.raises(ValueError, match="columns=128 goes with roll=False"):
         detect_vibration(rolling[1], TIMING, columns=128, roll=True)
     assert detect_vibration(rolling[1], TIMING, columns=128).vibration.num_axes == 2
 
@@ -155,7 +156,7 @@ def test_free_motion_with_roll_in_other_orientation(rolling):
 
 
 def test_swept_tone_refuses_roll(rolling):
-    with pytest.raises(ValueError, match="roll=True goes with model='tones' or 'free', not with 'swept'"):
+    with pytest.raises(ValueError, match="roll=True goes with model='tones' or 'free', not with model='swept'"):
         detect_vibration(rolling[1], TIMING, model="swept", roll=True)
     with pytest.raises(TypeError, match="zoom must be True or False, got 'auto'"):
         detect_motion(rolling[1], TIMING, zoom="auto")
@@ -181,5 +182,48 @@ def test_visible_pixels_follow_the_roll():
 
 
 def test_row_functions_refuse_roll():
-    with pytest.raises(ValueError, match="not defined with roll and zoom"):
+    with pytest.raises(ValueError, match="not defined with roll, zoom or a camera"):
         row_psf(TRUTH.vibration(3), TIMING.row_starts(1, 8), TIMING)
+
+
+def test_focal_length_gives_the_attitude_of_a_camera_with_a_wide_field():
+    lens = (-0.12, 0.05, 1e-3, -2e-3, 0.01)
+    truth = LensMotion((3.0, 4.0, 0.0, 0.0), (38.0, 31.0, 0.0, 0.0), (0.3, 1.1, 0.0, 0.0), 300.0, (6.0, -4.0), lens)
+    scene = draw_scene(304, 368, 11, blur=1.2)
+    frames = torch.from_numpy(take_field_frames(scene, TIMING, truth, SIZE, 4, nodes=4)).float()
+    frames = frames + 0.004 * torch.randn(frames.shape)
+    options = {"focal_length": 300.0, "principal_point": (143.5 + 6.0, 111.5 - 4.0), "distortion": lens}
+    detection = detect_vibration(frames, TIMING, **options)
+    assert detection.reliable.tolist() == [True, True]
+    assert detection.vibration.camera == Camera(300.0, (6.0, -4.0), lens)
+    attitude = detection.attitude
+    error = attitude.amplitude[:, 0] - torch.tensor([4 / 300, 3 / 300, 0.0], dtype=torch.float64)
+    assert bool((error[:2].abs() < 3 * attitude.amplitude_std[:2, 0]).all())
+    assert float(error.abs().max()) < 5e-5  # rad, 0.015 px
+    assert abs(float(attitude.phase[0, 0]) - 1.1) < 0.01
+    assert abs(float(attitude.phase[1, 0]) - (0.3 - np.pi)) < 0.01
+    assert "pitch" in str(attitude)
+    without = detect_vibration(frames, TIMING)  # columns displaced alike
+    assert not bool(without.reliable.all())
+    still = torch.from_numpy(scene[40:-40, 40:-40])
+    inner = (..., slice(12, -12), slice(12, -12))
+    found = []
+    for vibration in (detection.vibration, without.vibration):
+        restored = restore(frames[:1], TIMING, vibration, method="dewarp")
+        found.append(decibel(restored[inner].numpy(), still[inner].numpy()))
+    assert found[0] > found[1] + 1.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"principal_point": (1.0, 2.0)}, "principal_point=.* requires focal_length"),
+        ({"distortion": (0.1, 0.0, 0.0, 0.0, 0.0)}, "distortion=.* requires focal_length"),
+        ({"focal_length": 300.0, "distortion": (-3.0, 0.0, 0.0, 0.0, 0.0)}, "not invertible in frames of 96 x 128 px"),
+        ({"focal_length": 300.0, "columns": 64}, "columns=64 goes with roll=False"),
+        ({"focal_length": 300.0, "model": "swept"}, "focal_length=300.0 goes with model='tones' or 'free'"),
+    ],
+)
+def test_options_of_the_camera_are_checked(options, message):
+    with pytest.raises(ValueError, match=message):
+        detect_vibration(torch.rand(2, 128, 96), TIMING, **options)

@@ -108,7 +108,7 @@ class FittedClock:
         moved = recorded.retimed(self.offset, self.scale, self.gain)
         knots = moved.knots - self.middle
         drift = knots.new_tensor(self.drift)[:, None] * knots
-        return FreeMotion(moved.coefficients + drift, moved.start, moved.spacing, moved.tones)
+        return FreeMotion(moved.coefficients + drift, moved.start, moved.spacing, moved.tones, moved.camera)
 
 
 @outside_graphs

@@ -287,7 +287,7 @@ def measure_strips(
             over_strips(positions.rows)[:, 0],
             over_strips(positions.shift).abs().amax(1),
             visible,
-            more=lambda part: factors(x, y[:, part])[..., 2:],
+            factors=lambda part: factors(x, y[:, part]),
             parts_of_rows=4,
         )
         products = gradients.residual_products

@@ -24,7 +24,7 @@ from rsvib_torch.detection.rows.displacements import (
 )
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.frames.column_strips import ColumnStrips
-from rsvib_torch.motion.field import ColumnMotion
+from rsvib_torch.motion.field import ColumnMotion, largest_slope
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming
@@ -107,6 +107,8 @@ def whole_rows(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: 
 
 # Strips
 
+_MAX_SLIDE_OF_BLUR = 0.15  # px
+
 
 def _in_rad(motion: Vibration | FreeMotion, scale: FieldScale) -> Vibration | FreeMotion:
     """The motion with roll in rad and relative zoom."""
@@ -122,12 +124,14 @@ class StripRows(MeasuredRows):
         strips: The strips.
         columns: (S,) px from the centre of the frame, middles of the strips.
         num_frames: Frames of a stack.
+        slide: px, difference of the displacements of the middle of a strip and its ends.
     """
 
     scale: FieldScale
     strips: ColumnStrips
     columns: Tensor
     num_frames: int
+    slide: float
 
     def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
         """Components of the motion of every row (B, N, G, A)."""
@@ -167,11 +171,16 @@ class StripRows(MeasuredRows):
         return ColumnMotion.of_columns(field, self.columns, self.timing, self.num_frames, self.scale.height)
 
     def blur_ratio(self, motion: Vibration) -> Tensor:
-        """(B, 3), the weighted mean over the strips."""
+        """(B, 3), the weighted mean over the strips.
+
+        A displacement that changes within a strip acts like blur: with a focal length of 400 px and 5 px, where the
+        ends of strips slide by 0.3 px, the ratio was 0 instead of 1. Its size, which counts as evidence, is then 0.
+        """
         ratio, std, size = super().blur_ratio(motion).unflatten(0, (-1, len(self.columns))).unbind(-1)
         weight = torch.where(std > 0, std.square().reciprocal(), 0.0)
         total = weight.sum(1).clamp(min=1e-300)
-        return torch.stack([(weight * ratio).sum(1) / total, total.rsqrt(), size.mean(1)], -1)
+        size = size.mean(1) if self.slide < _MAX_SLIDE_OF_BLUR else torch.zeros_like(total)
+        return torch.stack([(weight * ratio).sum(1) / total, total.rsqrt(), size], -1)
 
 
 def strip_rows(
@@ -205,10 +214,12 @@ def strip_rows(
     times = starts.expand(*of_ends.batch_shape, -1)
     along = of_ends.mean_displacement(times, timing.exposure_time)[..., 0] - of_ends.drift(times)[..., 0]
     margin = math.ceil(float(along.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
-    turned = float(field.largest_displacement(float(starts[0]), float(starts[-1]))[..., 2:].amax())
-    strips = ColumnStrips.between_ends(scale.width, max(min_pitch, max_slide / max(turned, 1e-9)), margin)
+    reached = field.largest_displacement(float(starts[0]), float(starts[-1]))
+    slope = float(largest_slope(reached, scale.width, scale.height, scale.camera).amax())
+    strips = ColumnStrips.between_ends(scale.width, max(min_pitch, max_slide / max(slope, 1e-9)), margin)
     spectra = stack_spectra(frames, valid, strips)
     columns = strips.columns.to(frames.device)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)
     groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=pairs_if_blurred_differently)
-    return StripRows(groups, timing, scale, strips, columns, count)
+    slide = slope * float(columns[1] - columns[0])
+    return StripRows(groups, timing, scale, strips, columns, count, slide)

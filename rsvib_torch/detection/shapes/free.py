@@ -26,7 +26,7 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.rows.measured_rows import strip_rows
 from rsvib_torch.detection.start import GreyFrames, band_curve, grey_frames, measurements_of_curve
-from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.io.files import FramesOrFiles, timing_of_files
@@ -59,8 +59,7 @@ class MotionDetection(
     },
     shapes={
         "times": "T R",
-        "displacement": "... T R A",
-        "std": "... T R A",
+        **dict.fromkeys(("displacement", "std"), "... T R A"),
         **dict.fromkeys(("std_seen", "unseen", "unexplained", "reliable"), "... A"),
     },
 ):
@@ -150,6 +149,9 @@ def detect_motion(
     channels: Channels = None,
     roll: bool = False,
     zoom: bool = False,
+    focal_length: float | None = None,
+    principal_point: tuple[float, float] | None = None,
+    distortion: tuple[float, float, float, float, float] | None = None,
 ) -> MotionDetection:
     """Detect a motion of any shape from consecutive frames: the free model.
 
@@ -175,6 +177,9 @@ def detect_motion(
         roll: Measure the rotation about the optical axis as a third component of the motion, in rad, from strips of
             columns.
         zoom: The same for the change of scale, as a fourth component; includes roll.
+        focal_length: Focal length in px, as in ``detect_vibration``.
+        principal_point: As in ``detect_vibration``.
+        distortion: As in ``detect_vibration``.
 
     Returns:
         The motion in image axes with its uncertainty over time.
@@ -208,7 +213,10 @@ def detect_motion(
     timing = timing_of_files(frames, timing)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     bands = RegistrationOptions(registration, band_rows, band_step, search)
-    results = [_detect(stacks.one(i), timing, bands, knot_rows, iterations, axes) for i in range(len(stacks.images))]
+    height, width = stacks.images.shape[-2:]
+    camera = camera_in_row_order(focal_length, principal_point, distortion, (height, width), timing)
+    scale = FieldScale(axes, width, height, camera)
+    results = [_detect(stacks.one(i), timing, bands, knot_rows, iterations, scale) for i in range(len(stacks.images))]
     if not stacks.batched:
         return results[0]
     names = ("displacement", "std", "std_seen", "unseen", "unexplained", "reliable")
@@ -221,18 +229,22 @@ def detect_motion(
 
 
 def _detect(
-    stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions, knot_rows: int, iterations: int, axes: int
+    stack: GreyFrames,
+    timing: SensorTiming,
+    bands: RegistrationOptions,
+    knot_rows: int,
+    iterations: int,
+    scale: FieldScale,
 ) -> MotionDetection:
     """``detect_motion`` of one stack."""
     rowwise, curve, record = start_curve(stack, timing, bands)
     longest = math.floor((record[1] - record[0]) / rowwise.row_time)
     if knot_rows > longest:
         raise ValueError(f"knot_rows must be at most {longest}, the row times of the stack, got {knot_rows}")
-    size = (stack.images.shape[-2], stack.images.shape[-1])
-    scale = FieldScale(axes, size[1], size[0])
+    size, axes = (scale.height, scale.width), scale.axes
     measured, motion, spacing = measure_freely(stack, rowwise, curve, record, bands, knot_rows, iterations)
     apart = None
-    if axes > 2:
+    if not scale.same_for_all_columns:
         measured, motion, apart = _measure_field(stack, rowwise, motion, spacing, record, scale, iterations)
     residual = residual_of_motion(measured, motion[0])
     weighed = measured.reweighted(residual)
@@ -242,7 +254,7 @@ def _detect(
     starts = rowwise.frame_starts(stack.images.shape[1], stack.images.device)
     banded = measurements_of_curve(curve, rowwise, bands.band_step)
     of_middle: Motion = motion
-    if axes > 2:
+    if not scale.same_for_all_columns:
         middle = torch.zeros(1, dtype=torch.float64, device=starts.device)
         of_middle = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), size[0])
     of_bands = [*bands_reasons(banded, of_middle[0]), [], []][:axes]

@@ -102,7 +102,7 @@ def _added(
     fitted: list[int],
     number_is_known: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Covariance (B, A, P, A, P) of the parameters and variance (B, A) of the displacement by further tones of an axis.
+    """Covariance (B, A, P, A, P) of parameters and variance (B, A) of the displacement, by further tones of an axis.
 
     ``fitted`` are the A axes whose parameters the tone changes.
     """

@@ -134,6 +134,7 @@ def trusted_vibration(
         vibration.phase,
         vibration.image_motion * keep,
         vibration.image_acceleration * keep,
+        vibration.camera,
     )
     return trusted, tuple(notes)
 

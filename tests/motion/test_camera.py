@@ -1,0 +1,143 @@
+"""Camera with lens distortion: projection against OpenCV, image formation against direct sampling of the scene."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
+from scipy.spatial.transform import Rotation
+
+import rsvib_torch as rsv
+from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.io.schema import VibrationRecord
+
+LENS = rsv.Camera(574.0, (6.5, 9.5), (-0.12, 0.05, 1e-3, -2e-3, 0.01))
+
+
+def grid(width, height, dtype=torch.float64):
+    x = torch.linspace(-0.5, 0.5, 9, dtype=dtype) * (width - 1)
+    y = torch.linspace(-0.5, 0.5, 7, dtype=dtype)[:, None] * (height - 1)
+    return torch.broadcast_tensors(x, y)
+
+
+def opencv_displacement(camera, components, points):
+    """Displacement by a rotation: undistorted by root finding, rotated by SciPy, projected by OpenCV."""
+    f, (cx, cy), lens = camera.focal_length, camera.principal_point, np.array(camera.distortion)
+
+    def project(rays, scale=1.0):
+        matrix = np.array([[scale * f, 0, cx], [0, scale * f, cy], [0, 0, 1]])
+        return cv2.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), matrix, lens)[0][:, 0]
+
+    rays = np.c_[(points - camera.principal_point) / f, np.ones(len(points))]
+    for _ in range(100):  # fixed point: the distortion of this lens moves points by less than a tenth
+        rays[:, :2] -= (project(rays) - points) / f
+    x, y, theta, zeta = components
+    turned = Rotation.from_rotvec([-y / f, x / f, theta]).apply(rays)
+    return project(turned, 1 + zeta) - points
+
+
+def test_displacement_equals_rotation_and_projection_of_opencv():
+    components = torch.tensor([7.0, -5.0, 4e-3, 3e-4], dtype=torch.float64)
+    x, y = grid(800, 600)
+    moved = LENS.displacement(components, x, y).reshape(-1, 2)
+    expected = opencv_displacement(LENS, components.tolist(), torch.stack([x, y], -1).reshape(-1, 2).numpy())
+    np.testing.assert_allclose(moved, expected, atol=1e-9)
+    assert float((moved - components[:2]).abs().max()) > 3.0  # px: far from a translation
+
+
+def test_factors_are_the_derivative_of_the_displacement():
+    x, y = grid(800, 600)
+    factors = LENS.factors(x, y, 4)
+    for axis, step in enumerate((1e-4, 1e-4, 1e-7, 1e-7)):
+        unit = torch.zeros(4, dtype=torch.float64)
+        unit[axis] = step
+        slope = (LENS.displacement(unit, x, y) - LENS.displacement(-unit, x, y)) / (2 * step)
+        torch.testing.assert_close(slope, factors[..., axis], atol=2e-5, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("scan_axis", "direction"), [("x", "forward"), ("y", "reverse"), ("x", "reverse")])
+def test_motion_in_row_order_displaces_turned_images_alike(scan_axis, direction):
+    timing = rsv.SensorTiming(4e-5, 5, 700, scan_axis=scan_axis, readout_direction=direction)
+    motion = rsv.Vibration((3.0, 5.0, 2e-3, 1e-4), (90.0, 61.0, 70.0, 50.0), (0.3, 1.0, 2.0, 0.5), camera=LENS)
+    time = torch.tensor(0.003, dtype=torch.float64)
+    x, y = grid(800, 600)
+    moved = LENS.displacement(motion.displacement(time), x, y)
+    rowwise = motion.to_row_order(timing)
+    # image coordinates in row order: transposed for scan axis x, then flipped
+    to_rows = (lambda p: p.flip(-1)) if scan_axis == "x" else (lambda p: p)
+    sign = torch.tensor([1.0, -1.0 if direction == "reverse" else 1.0], dtype=torch.float64)
+    points = to_rows(torch.stack([x, y], -1)) * sign
+    turned = rowwise.camera.displacement(rowwise.displacement(time), points[..., 0], points[..., 1])
+    torch.testing.assert_close(turned, to_rows(moved) * sign)
+    assert rowwise.from_row_order(timing).camera == LENS
+
+
+def test_attitude_is_the_rotation_of_the_camera():
+    motion = rsv.Vibration((2.0, 1.0, 1e-3), (50.0, 40.0, 30.0), (0.5, 0.7, 0.9), camera=rsv.Camera(800.0))
+    times = torch.linspace(0, 0.1, 5, dtype=torch.float64)
+    x, y, theta = motion.displacement(times).unbind(-1)
+    torch.testing.assert_close(motion.attitude(times), torch.stack([y / 800, -x / 800, -theta], -1))
+    with pytest.raises(ValueError, match="requires a motion with a camera"):
+        rsv.Vibration(2.0, 50.0).attitude(times)
+
+
+def test_simulated_frames_equal_a_scene_sampled_through_the_lens():
+    camera, height, width, margin = rsv.Camera(300.0, (6.5, 9.5), (-0.12, 0.05, 1e-3, -2e-3, 0.01)), 120, 160, 40
+    scene = gaussian_filter(city_and_fields(height + 2 * margin, width + 2 * margin, seed=3).double().numpy(), 1.0)
+    timing = rsv.SensorTiming(row_time=4e-5, exposure_rows=1, frame_rows=150)
+    motion = rsv.Vibration((3.0, 5.0, 2e-3), (90.0, 61.0, 70.0), (0.3, 1.0, 2.0), camera=camera)
+    frames = rsv.simulate_frames(torch.from_numpy(scene), timing, motion, 2, frame_size=(height, width)).numpy()
+    coefficients = spline_filter(scene, order=5)
+    x = torch.arange(width, dtype=torch.float64) - 0.5 * (width - 1)
+    for frame, row in ((0, 3), (0, 60), (1, 20), (1, 116)):
+        time = torch.tensor((frame * 150 + row + 0.5) * 4e-5, dtype=torch.float64)
+        y = torch.full_like(x, row - 0.5 * (height - 1))
+        at_x, at_y = x, y
+        for _ in range(20):
+            moved = camera.displacement(motion.displacement(time), at_x, at_y)
+            at_x, at_y = x - moved[:, 0], y - moved[:, 1]
+        places = [at_y.numpy() + margin + 0.5 * (height - 1), at_x.numpy() + margin + 0.5 * (width - 1)]
+        expected = map_coordinates(coefficients, places, order=5, prefilter=False)
+        assert np.sqrt(np.square(frames[frame, row] - expected).mean()) < 1.5e-3
+        still = map_coordinates(coefficients, [y.numpy() + margin + 59.5, x.numpy() + margin + 79.5], order=5)
+        assert np.sqrt(np.square(frames[frame, row] - still).mean()) > 0.03
+
+
+def test_restoration_with_the_camera_restores_the_corners():
+    camera = rsv.Camera(200.0, distortion=(-0.1, 0.02, 0.0, 0.0, 0.0))
+    timing = rsv.SensorTiming(row_time=4e-5, exposure_rows=8, frame_rows=260)
+    motion = rsv.Vibration((2.0, 2.5), (90.0, 61.0), (0.3, 1.0), camera=camera)
+    scene = city_and_fields(300, 320, seed=7)
+    frames = rsv.simulate_frames(scene, timing, motion, 1, frame_size=(200, 240))
+    still = rsv.simulate_frames(scene, timing, rsv.Vibration.still(), 1, frame_size=(200, 240))
+    inner = (..., slice(12, -12), slice(12, -12))
+    found = {}
+    for name, used in (("with", motion), ("without", rsv.Vibration((2.0, 2.5), (90.0, 61.0), (0.3, 1.0)))):
+        restored = rsv.restore(frames, timing, used, method="dewarp")
+        found[name] = float(rsv.psnr(restored[inner], still[inner], 1.0).mean())
+    assert found["with"] > found["without"] + 5.0  # dB
+
+
+def test_files_keep_the_camera(tmp_path):
+    vibration = rsv.Vibration((3.0, 5.0), (90.0, 61.0), camera=LENS)
+    free = rsv.FreeMotion(torch.zeros(3, 8), 0.0, 0.01, camera=LENS)
+    for motion in (vibration, free):
+        motion.save(tmp_path / "motion.json")
+        assert type(motion).load(tmp_path / "motion.json").camera == LENS
+    record = VibrationRecord.from_vibration(vibration)
+    assert VibrationRecord.model_validate_json(record.model_dump_json()).to_vibration().camera == LENS
+    assert "camera" not in VibrationRecord.from_vibration(rsv.Vibration(3.0, 50.0)).model_dump()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"focal_length": 0.0}, "focal_length must be"),
+        ({"focal_length": float("nan")}, "focal_length must be"),
+        ({"focal_length": 500.0, "distortion": (0.1, 0.2)}, "distortion must be 5 numbers"),
+        ({"focal_length": 500.0, "principal_point": (0.1, float("inf"))}, "principal_point must be"),
+    ],
+)
+def test_bad_cameras_are_refused(arguments, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        rsv.Camera(**arguments)
