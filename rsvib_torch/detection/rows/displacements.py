@@ -285,7 +285,8 @@ def measure_strips(
             shape,
             warped,
             over_strips(positions.rows)[:, 0],
-            over_strips(positions.shift).abs().amax(1),
+            over_strips(positions.shift).abs().amax(1)
+            * (visible > 0),  # a lens may displace invisible rows by any amount
             visible,
             factors=lambda part: factors(x, y[:, part]),
             parts_of_rows=4,
