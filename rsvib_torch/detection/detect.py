@@ -481,18 +481,36 @@ def _detect_field(
     find_cause: bool = False,
 ) -> DetectionResult:
     """``_detect`` with as many components as were requested or, with ``"auto"``, as the frames require."""
-    further = field.most_axes > 2 or field.camera is not None
-    cause: bool | Literal["unless rotating"] = "unless rotating" if find_cause and further else find_cause
-    found, fit, rotates = _detect(frames, valid, timing, method, options, find_cause=cause)
-    if field.camera is None and (field.most_axes == 2 or (field.least_axes == 2 and not rotates)):
-        return found
-    scale = field.scale(field.most_axes, field.camera)
-    other, _, _ = _detect(frames, valid, timing, method, replace(options, scale=scale), fit)
-    # a given number of tones is fitted to all axes, also to those that do not move
-    significant = other.vibration.amplitude > MIN_SIGNIFICANCE * other.std.amplitude
-    moving = significant.flatten(0, -3).any(0).any(-1).tolist()
-    axes = max([field.least_axes, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
-    return found if axes == 2 and field.camera is None else other.with_axes(axes)
+    alike = _detect(frames, valid, timing, method, options)
+    if field.camera is not None or field.least_axes > 2 or (field.most_axes > 2 and alike.rotates):
+        scale = field.scale(field.most_axes, field.camera)
+        found = _detect(frames, valid, timing, method, replace(options, scale=scale), alike.fit).result
+        # a given number of tones is fitted to all axes, also to those that do not move
+        significant = found.vibration.amplitude > MIN_SIGNIFICANCE * found.std.amplitude
+        moving = significant.flatten(0, -3).any(0).any(-1).tolist()
+        axes = max([field.least_axes, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
+        if axes > 2 or field.camera is not None:
+            return found.with_axes(axes)
+    return _with_cause(alike, frames, valid, timing, method, options) if find_cause else alike.result
+
+
+@dataclass(frozen=True, eq=False)
+class _Detected:
+    """Result of ``_detect``.
+
+    Attributes:
+        result: A batch of results in image axes.
+        fit: Its fit.
+        measurements: The measurements of the fit.
+        rotates: Whether the halves of the rows of any stack move apart.
+        contradicted: For each stack, the axes in row order whose measurements contradict the timing.
+    """
+
+    result: DetectionResult
+    fit: ToneFit
+    measurements: Measurements
+    rotates: bool
+    contradicted: list[tuple[bool, bool]]
 
 
 def _detect(
@@ -502,9 +520,7 @@ def _detect(
     method: _Method,
     options: _FitOptions,
     translation: ToneFit | None = None,
-    *,
-    find_cause: bool | Literal["unless rotating"] = False,
-) -> tuple[DetectionResult, ToneFit, bool]:
+) -> _Detected:
     """``detect_vibration`` of grey frames (B, T, H, W) in row order.
 
     Args:
@@ -514,10 +530,6 @@ def _detect(
         method: How tones are fitted.
         options: Its options.
         translation: Fit without roll and zoom, from which a fit with roll or zoom starts.
-        find_cause: Whether to try other timings if the measurements contradict the stated one.
-
-    Returns:
-        A batch of results in image axes, their fit, and whether the halves of the rows of any stack move apart.
     """
     row_timing, bands, scale = timing.in_row_order(), options.bands, options.scale
     if scale.same_for_all_columns:
@@ -561,20 +573,12 @@ def _detect(
         )
         for index in range(len(frames))
     ]
-    rotates = other_motion is not None and any(rotation_found(other_motion[index]) for index in range(len(frames)))
-    if other_motion is not None and (find_cause is True or (find_cause and not rotates)):
-        for index, (_, reasons) in enumerate(verdicts):
-            axes = contradicted_axes(vibration[index], other_motion[index], max_tones)
-            if not any(axes):
-                continue
-            part = slice(index, index + 1)
-            own = found.measurements.mapped(itemgetter(part))
-            of_stack = frames[part], None if valid is None else valid[part]
-            cause = _wrong_setting(*of_stack, own, axes, timing, method, options)
-            if cause is not None:
-                # the axes have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong
-                both = ((cause, *reasons[0]), (cause, *reasons[1]))
-                verdicts[index] = (torch.zeros_like(verdicts[index][0]), both)
+    rotates, contradicted = False, [(False, False)] * len(frames)
+    if other_motion is not None:
+        rotates = any(rotation_found(other_motion[index]) for index in range(len(frames)))
+        contradicted = [
+            contradicted_axes(vibration[index], other_motion[index], max_tones) for index in range(len(frames))
+        ]
     reliable = torch.stack([verdict[0] for verdict in verdicts])
     swap = timing.scan_axis == -1
     order = ([1, 0, 2, 3] if swap else [0, 1, 2, 3])[: scale.axes]
@@ -603,7 +607,31 @@ def _detect(
         ),
         timing=timing,
     )
-    return result, fit, rotates
+    return _Detected(result, fit, found.measurements, rotates, contradicted)
+
+
+def _with_cause(
+    found: _Detected,
+    frames: Tensor,
+    valid: Tensor | None,
+    timing: SensorTiming,
+    method: _Method,
+    options: _FitOptions,
+) -> DetectionResult:
+    """The result with the timing as a reason, if the measurements contradict the stated one and agree with another."""
+    reliable, all_reasons = found.result.reliable.clone(), list(found.result.reasons)
+    for index, axes in enumerate(found.contradicted):
+        if not any(axes):
+            continue
+        part = slice(index, index + 1)
+        own = found.measurements.mapped(itemgetter(part))
+        of_stack = frames[part], None if valid is None else valid[part]
+        cause = _wrong_setting(*of_stack, own, axes, timing, method, options)
+        if cause is not None:
+            # the axes have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong
+            reliable[index] = False
+            all_reasons[index] = tuple((cause, *reasons) for reasons in all_reasons[index])
+    return replace(found.result, reliable=reliable, reasons=tuple(all_reasons))
 
 
 def _wrong_setting(
@@ -632,7 +660,7 @@ def _wrong_setting(
     def agrees(other: RowTiming, change: Callable[[Tensor], Tensor], concerned: tuple[bool, bool] = axes) -> bool:
         pixels = None if valid is None else change(valid)
         try:
-            found, _, _ = _detect(change(frames), pixels, other, method, options)
+            found = _detect(change(frames), pixels, other, method, options).result
         except ValueError:  # columns may lack the detail that rows have
             return False
         return all(good or not axis for good, axis in zip(found.reliable[0].tolist(), concerned, strict=True))
