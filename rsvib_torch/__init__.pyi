@@ -44,6 +44,8 @@ from .io import (
     timing_from_first_frame,
     write_stack,
 )
+from .io.gyroscope.read_gyroscope import read_gyroscope
+from .motion.angular_rates import AngularRates
 from .motion.camera import Camera
 from .motion.recorded import read_motion
 from .motion.spline import FreeMotion
@@ -78,6 +80,7 @@ from .restoration import (
 from .stacks import StackReport, iterate_stack, process_stack, read_manifest, restore_block
 
 __all__ = [
+    "AngularRates",
     "Camera",
     "ClockAlignment",
     "DetectionResult",
@@ -126,6 +129,7 @@ __all__ = [
     "process_stack",
     "psf_figure",
     "psnr",
+    "read_gyroscope",
     "read_manifest",
     "read_motion",
     "read_stack",
