@@ -189,7 +189,8 @@ class _Part:
         rates: (N, 3) rad/s.
         start: Time of the packet in s.
         duration: Its duration in s.
-        stamp: Time of the first sample in s that the packet states; None if it states none.
+        stamp: Time of the first sample in s, exact to 1 us (STMP); None if the packet does not state it.
+        tick: The same on the clock of the camera, exact to 1 ms (TICK); None if the packet does not state it.
         total: Samples up to the end of the packet that it states; None if it states none.
         orientation: Axes in the order of the file; empty if they are not stated.
     """
@@ -198,6 +199,7 @@ class _Part:
     start: float
     duration: float
     stamp: float | None
+    tick: float | None
     total: int | None
     orientation: str
 
@@ -260,33 +262,36 @@ def _part(stream: bytes, packet: _Packet) -> _Part | None:
         raise IndexError("GYRO with a wrong SCAL")
     letters = found[b"ORIN"][2].decode("latin-1").strip("\0 ") if b"ORIN" in found else ""
     stamp = float(_values(*found[b"STMP"])[0, 0]) * 1e-6 if b"STMP" in found else None
+    tick = float(_values(*found[b"TICK"])[0, 0]) * 1e-3 if b"TICK" in found else None
     total = int(_values(*found[b"TSMP"])[0, 0]) if b"TSMP" in found else None
     orientation = check_orientation(letters) if letters else ""
-    return _Part(rates / scale, packet.start, packet.duration, stamp, total, orientation)
+    return _Part(rates / scale, packet.start, packet.duration, stamp, tick, total, orientation)
 
 
 def _sample_times(parts: list[_Part]) -> Array:
     """Times (N,) in s of the samples of all packets.
 
-    If packets state the times of their first samples, samples in between are at equal distances. Otherwise their clock is
-    regular, and the times of the packets, into which the camera puts the samples that it has, follow a straight line.
+    If packets state the times of their first samples to 1 us, samples in between are at equal distances. Otherwise the
+    clock of the gyroscope is regular: a straight line through the times of the packets on the clock of the camera, or in
+    the video, in which the camera puts those samples that it has.
     """
     counts = np.array([len(part.rates) for part in parts])
     ends = np.cumsum(counts)
-    totals = [part.total for part in parts]
-    stated = np.array([0 if total is None else total for total in totals])
-    if None not in totals and (np.diff(stated) >= counts[1:]).all():
-        ends = stated - stated[0] + counts[0]  # samples that are missing have numbers
-    number = np.concatenate([end - count + np.arange(count) for end, count in zip(ends, counts, strict=True)])
-    stamps = [part.stamp for part in parts if part.stamp is not None]
-    if len(stamps) == len(parts) > 1 and (np.diff(stamps) > 0).all():
-        step = (stamps[-1] - stamps[0]) / max(ends[-1] - counts[-1], 1)
-        known = np.append(stamps, stamps[-1] + step * counts[-1])
-        return np.asarray(np.interp(number, np.append(ends - counts, ends[-1]), known))
+    stated = np.array([np.nan if part.total is None else part.total for part in parts])
+    if (np.diff(stated) >= counts[1:]).all():  # samples that are missing have numbers
+        ends = (stated - stated[0]).astype(np.int64) + counts[0]
+    firsts = (ends - counts).astype(np.float64)
+    number = np.concatenate([first + np.arange(count) for first, count in zip(firsts, counts, strict=True)])
     starts = np.array([part.start for part in parts])
-    last = parts[-1]
-    if len(parts) > 2:
-        slope, first = np.polyfit((ends - counts).astype(np.float64), starts, 1)
-    else:
-        slope, first = (last.start + last.duration - starts[0]) / max(ends[-1], 1), starts[0]
-    return np.asarray(first + slope * number)
+    duration = parts[-1].start + parts[-1].duration - starts[0]
+    stamps = np.array([np.nan if part.stamp is None else part.stamp for part in parts])
+    ticks = np.array([np.nan if part.tick is None else part.tick for part in parts])
+    if len(parts) < 3:
+        return np.asarray(starts[0] + duration / ends[-1] * number)
+    if (np.diff(stamps) > 0).all():
+        step = (stamps[-1] - stamps[0]) / firsts[-1]
+        known = np.append(stamps, stamps[-1] + step * counts[-1])
+        return np.asarray(np.interp(number, np.append(firsts, ends[-1]), known))
+    clock = ticks if (np.diff(ticks) > 0).all() else starts
+    slope, first = np.polyfit(firsts, clock - clock.mean(), 1)
+    return np.asarray(first + starts.mean() + slope * number)
