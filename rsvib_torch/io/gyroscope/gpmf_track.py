@@ -255,6 +255,8 @@ def _part(stream: bytes, packet: _Packet) -> _Part | None:
     if b"GYRO" not in found:
         return None
     rates = _values(*found[b"GYRO"])
+    if not len(rates):
+        return None
     if rates.shape[1] != 3:
         raise IndexError(f"GYRO with {rates.shape[1]} values per sample")
     scale = _values(*found[b"SCAL"]).ravel() if b"SCAL" in found else np.ones(1)
