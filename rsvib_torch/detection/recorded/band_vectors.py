@@ -37,6 +37,7 @@ class BandVectors:
         num_pairs: Pairs of frames.
         num_rows: Bands of a frame.
         num_columns: Parts of a band.
+        overlap: Rows of a band over those from one band to the next, at least 1.
     """
 
     pair: Tensor
@@ -52,6 +53,7 @@ class BandVectors:
     num_pairs: int
     num_rows: int
     num_columns: int
+    overlap: float
 
     def times(self, row_time: float) -> Tensor:
         """(M, 2) s, exposure starts of the part in both frames."""
@@ -117,6 +119,7 @@ def band_vectors(stack: GreyFrames, timing: SensorTiming, options: RegistrationO
         num_pairs=len(curve.pairs),
         num_rows=len(rows),
         num_columns=count,
+        overlap=max(1.0, max(curve.heights) / options.band_step),
     )
 
 

@@ -131,6 +131,7 @@ class RotationFit:
         covariance: (7, 7), 0 for parameters that were not free.
         residual: (M, 2) px.
         errors: Their covariance.
+        wide: The same, larger by the correlation of neighbours, from which ``covariance`` and ``cost`` follow.
         effects: (P, 3) px, X, Y and radius theta of every pair that the gyroscope does not explain.
         cost: Sum of squares over their variance.
     """
@@ -140,6 +141,7 @@ class RotationFit:
     covariance: Tensor
     residual: Tensor
     errors: _Errors
+    wide: _Errors
     effects: Tensor
     cost: float
 
@@ -155,7 +157,7 @@ class RotationFit:
 
     def cost_with(self, orientation: str, start: Tensor, free: Sequence[bool]) -> float:
         """Sum of squares of the best fit with other axes and the same covariance of the displacements."""
-        *_, cost = _converged(replace(self.model, orientation=orientation), self.errors, start, free)
+        *_, cost = _converged(replace(self.model, orientation=orientation), self.wide, start, free)
         return cost
 
 
@@ -323,7 +325,7 @@ def _robust_weights(vectors: BandVectors, square: Tensor, counted: Tensor) -> Te
 
 
 def _estimated(
-    model: RotationModel, errors: _Errors, residual: Tensor, parameters: Tensor, *, with_effects: bool
+    model: RotationModel, errors: _Errors, residual: Tensor, parameters: Tensor, fitted: int, *, with_effects: bool
 ) -> tuple[_Errors, Tensor]:
     """Sizes of the errors from the residuals, and the effects (P, 3) of the pairs."""
     vectors, focal_length = model.vectors, float(parameters[5])
@@ -344,7 +346,9 @@ def _estimated(
     parallax = float((excess / (length / along_variance).sum().clamp(min=1e-300)).clamp(min=0.0)) ** 0.5
     known = covariance.diagonal(dim1=-2, dim2=-1)
     used = _summed(vectors, (weight > 0).to(weight)) > 8
-    spread = (effects[used].square() - known[used]).mean(0).clamp(min=0.0).sqrt().nan_to_num(0.0)
+    # the fitted parameters take their part of the effects
+    total = 3 * float(used.sum())
+    spread = (effects[used].square() * (total / max(total - fitted, 1.0)) - known[used]).mean(0).clamp(min=0.0).sqrt().nan_to_num(0.0)
     spread = spread if with_effects else torch.zeros_like(spread)
     return replace(errors, sigma=max(sigma, 1e-6), parallax=parallax, spread=spread), effects
 
@@ -363,7 +367,7 @@ def fit_robustly(model: RotationModel, start: Tensor, free: Sequence[bool], roun
     none = torch.zeros(3, dtype=torch.float64)
     errors = _Errors(vectors.weight, vectors.shape, 1.0, none, 0.0, none, torch.zeros_like(residual))
     errors = replace(errors, weight=vectors.weight * _following(vectors, model.predicted(start)))
-    errors, effects = _estimated(model, errors, residual, parameters, with_effects=False)
+    errors, effects = _estimated(model, errors, residual, parameters, sum(free), with_effects=False)
     for number in range(rounds):
         square = _square(vectors, errors, _without_effects(vectors, residual, effects))
         follows = _following(vectors, vectors.offsets - residual)
@@ -371,8 +375,8 @@ def fit_robustly(model: RotationModel, start: Tensor, free: Sequence[bool], roun
         errors = replace(errors, weight=weight)
         parameters, covariance, residual, cost = _converged(model, errors, parameters, free)
         # effects of pairs are known after the places that do not follow are
-        errors, effects = _estimated(model, errors, residual, parameters, with_effects=number > 0)
-    fit = RotationFit(model, parameters, covariance, residual, errors, effects, cost)
+        errors, effects = _estimated(model, errors, residual, parameters, sum(free), with_effects=number > 0)
+    fit = RotationFit(model, parameters, covariance, residual, errors, errors, effects, cost)
     return _with_correlated_errors(fit, free)
 
 
@@ -388,16 +392,19 @@ def _with_correlated_errors(fit: RotationFit, free: Sequence[bool]) -> RotationF
     column, used = vectors.location // vectors.num_rows, errors.weight > 0
     off, _, variance, _ = _split(errors, _without_effects(vectors, fit.residual, fit.effects))
     scaled[vectors.pair[used], column[used], vectors.row[used]] = (off / variance.sqrt())[used]
-    inflation = _inflation(scaled, 0) * _inflation(scaled, 1) * _inflation(scaled, 2)
+    inflation = _inflation(scaled, 0) * _inflation(scaled, 1) * max(_inflation(scaled, 2), vectors.overlap)
     of_pairs = fit.effects if vectors.num_pairs > 8 else fit.effects[:0]  # fewer pairs have no known correlation
+    # the effects themselves bound their standard deviation, of which noise of the same size hides the true one
+    total = 3 * len(fit.effects)
+    upper = (fit.effects.square().mean(0) * (total / max(total - sum(free), 1.0))).sqrt()
     wide = replace(
         errors,
         sigma=errors.sigma * inflation**0.5,
         parallax=errors.parallax * inflation**0.5,
-        spread=errors.spread * _inflation(of_pairs, 0) ** 0.5,
+        spread=torch.maximum(errors.spread, upper) * _inflation(of_pairs, 0) ** 0.5,
     )
     _, covariance, cost = _solve(vectors, wide, fit.model.slopes(fit.parameters, free), fit.residual)
-    return replace(fit, errors=wide, covariance=covariance, cost=cost)
+    return replace(fit, wide=wide, covariance=covariance, cost=cost)
 
 
 def _inflation(values: Tensor, axis: int) -> float:
