@@ -41,7 +41,15 @@ PACKAGES = (
 FIRST_NAMES = (
     *("SensorTiming", "Vibration", "VibrationStd", "FreeMotion", "read_motion", "AngularRates"),
     *("detect_vibration", "DetectionResult", "VibrationDetector", "detect_motion", "MotionDetection"),
-    *("detect_swept_tone", "SweptTone", "align_motion", "ClockAlignment", "RotationAlignment", "check_motion", "MotionCheck"),
+    *(
+        "detect_swept_tone",
+        "SweptTone",
+        "align_motion",
+        "ClockAlignment",
+        "RotationAlignment",
+        "check_motion",
+        "MotionCheck",
+    ),
     *("restore", "VibrationRestorer", "judge_restoration", "RestorationVerdict", "RestorationWarning"),
     *("simulate_frames", "SensorNoise", "Optics", "row_psf", "RowVaryingBlur"),
     *("register_bands", "OffsetCurve"),

@@ -121,7 +121,9 @@ def line(found: rsv.RotationAlignment, rates: rsv.AngularRates, curve: rsv.Offse
             t = start[:, None] + rows * row_time + np.nan_to_num(shift) + DRONE_EXPOSURE / 2
             clock = found.scale * t + found.offset
             for axis in range(2):
-                slowly = np.interp(clock, times, angle[:, axis].real) + 1j * np.interp(clock, times, angle[:, axis].imag)
+                slowly = np.interp(clock, times, angle[:, axis].real) + 1j * np.interp(
+                    clock, times, angle[:, axis].imag
+                )
                 predicted[..., axis] += sign * exposed * slowly * np.exp(1j * omega * clock)
         for axis, label in enumerate("xy"):
             amplitude, std, expected = _fitted(offsets[..., axis], predicted[..., axis], rows, angle[:, axis], exposed)

@@ -30,7 +30,7 @@ from rsvib_torch.motion.camera import Camera
 __all__ = ["NAMES", "RotationFit", "RotationModel", "components_of", "fit_robustly"]
 
 NAMES = ("bias x", "bias y", "bias z", "at", "scale", "focal length", "row time")
-_STEPS = 30  # of Gauss-Newton; it converges within 10, and stops when no parameter changes
+_STEPS = 8  # of Gauss-Newton in a round of weighting; it converges within 4 and stops when no parameter changes
 
 
 def components_of(rates: AngularRates, orientation: str, parameters: Tensor, times: Tensor, middle: float) -> Tensor:
@@ -191,9 +191,7 @@ def _split(errors: _Errors, rest: Tensor) -> tuple[Tensor, Tensor, Tensor, Tenso
     return (normal * rest).sum(-1), (unit * rest).sum(-1), *variances
 
 
-def _solve(
-    vectors: BandVectors, errors: _Errors, slopes: Tensor, residual: Tensor
-) -> tuple[Tensor, Tensor, float]:
+def _solve(vectors: BandVectors, errors: _Errors, slopes: Tensor, residual: Tensor) -> tuple[Tensor, Tensor, float]:
     """Change (7,) and covariance (7, 7) of the parameters, and the sum of squares, by generalised least squares.
 
     The inverse of the covariance of all residuals of a pair follows from the matrix inversion lemma.
@@ -348,7 +346,13 @@ def _estimated(
     used = _summed(vectors, (weight > 0).to(weight)) > 8
     # the fitted parameters take their part of the effects
     total = 3 * float(used.sum())
-    spread = (effects[used].square() * (total / max(total - fitted, 1.0)) - known[used]).mean(0).clamp(min=0.0).sqrt().nan_to_num(0.0)
+    spread = (
+        (effects[used].square() * (total / max(total - fitted, 1.0)) - known[used])
+        .mean(0)
+        .clamp(min=0.0)
+        .sqrt()
+        .nan_to_num(0.0)
+    )
     spread = spread if with_effects else torch.zeros_like(spread)
     return replace(errors, sigma=max(sigma, 1e-6), parallax=parallax, spread=spread), effects
 

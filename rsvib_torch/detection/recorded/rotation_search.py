@@ -115,7 +115,11 @@ def search_orientations(
         of_x, of_y, of_roll = -matrix[1], matrix[0], -matrix[2]
         along = product[:, 0] @ of_x + product[:, 1] @ of_y
         size = square[:, 0] @ of_x.square() + square[:, 1] @ of_y.square()
-        f = (along / size.clamp(min=1e-300)).clamp(min=1.0) if focal_length is None else torch.full_like(size, focal_length)
+        f = (
+            (along / size.clamp(min=1e-300)).clamp(min=1.0)
+            if focal_length is None
+            else torch.full_like(size, focal_length)
+        )
         R = vectors.radius
         turned = R**2 * (square[:, 2] @ of_roll.square()) - 2 * R * (product[:, 2] @ of_roll)
         costs[name] = energy.sum() - 2 * f * along + f**2 * size + turned
