@@ -6,10 +6,12 @@ gyroscope; github.com/lhaippp/gyro-video-stabilization) and drone_gyro/karma.mp4
 github.com/gopro/gpmf-parser).
 
 phone: axes, bias, clock, focal length and row time are fitted; the difference between frames and gyroscope is printed
-frame by frame and band by band. The dashboard in the lower third is left out by ``ignore``, or left to the robust weights.
+frame by frame and band by band. The dashboard in the lower third is left out by ``ignore``, or left to the robust
+weights.
 
 drone: the gyroscope shows a line near 167 Hz, or its alias above half of the sample rate. The line, times an unknown
-complex factor, is fitted to the offsets of the row bands of all frames: its amplitude in the image with standard deviation.
+complex factor, is fitted to the offsets of the row bands of all frames: its amplitude in the image with standard
+deviation.
 """
 
 import argparse
@@ -134,7 +136,7 @@ def line(found: rsv.RotationAlignment, rates: rsv.AngularRates, curve: rsv.Offse
             )
 
 
-def _fitted(offsets, predicted, rows, angle, exposed):  # noqa: ANN001, ANN202
+def _fitted(offsets, predicted, rows, angle, exposed):
     """Amplitude in px after the exposure, standard deviation, and the amplitude by the gyroscope.
 
     A cubic polynomial in the row is fitted to every pair of frames as well: other motion of the camera.

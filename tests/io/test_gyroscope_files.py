@@ -190,8 +190,7 @@ def test_random_damage_ends_in_an_error_or_a_result(tmp_path):
             rsv.read_gyroscope(path)
             outcomes.add("read")
         except ValueError as error:
-            assert "\n" not in str(error)
-            outcomes.add("refused")
+            outcomes.add("several lines" if "\n" in str(error) else "refused")
     assert outcomes == {"read", "refused"}
 
 

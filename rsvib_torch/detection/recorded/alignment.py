@@ -5,7 +5,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import TypedDict, Unpack, overload
 
 import torch
 from torch import Tensor
@@ -115,13 +115,28 @@ class FittedClock:
         return FreeMotion(moved.coefficients + drift, moved.start, moved.spacing, moved.tones, moved.camera)
 
 
+class _Options(TypedDict, total=False):
+    camera: Camera | None
+    offsets: tuple[float, float] | None
+    fit_scale: bool
+    fit_gain: bool
+    fit_row_time: bool
+    registration: Registration | None
+    band_rows: int
+    band_step: int
+    search: int
+    ignore: ArrayLike | None
+    full_scale: float | None
+    channels: Channels
+
+
 @overload
 def align_motion(
-    frames: FramesOrFiles, timing: SensorTiming, recorded: FreeMotion, **options: Any
+    frames: FramesOrFiles, timing: SensorTiming, recorded: FreeMotion, **options: Unpack[_Options]
 ) -> ClockAlignment: ...
 @overload
 def align_motion(
-    frames: FramesOrFiles, timing: SensorTiming, recorded: AngularRates, **options: Any
+    frames: FramesOrFiles, timing: SensorTiming, recorded: AngularRates, **options: Unpack[_Options]
 ) -> RotationAlignment: ...
 @outside_graphs
 @full_precision
@@ -151,11 +166,11 @@ def align_motion(
     first at many offsets with those of row bands, then by least squares with those measured on the images around it. A
     uniform drift of each axis is fitted as well.
 
-    **Angular rates** (``read_gyroscope``). The displacements of parts of the row bands are compared with the rotation of
-    the camera. All 24 assignments of the axes and all offsets are compared; bias, clock and, without a camera, the focal
-    length are fitted to the displacements of consecutive frames. Robust weights exclude places that move by themselves or
-    are fixed to the camera. A camera that also translates in one direction (a vehicle) displaces content along lines
-    from one point; displacements along these lines count less, as much as the scene has parallax.
+    **Angular rates** (``read_gyroscope``). The displacements of parts of the row bands between consecutive frames are
+    compared with the rotation of the camera, for all 24 assignments of the axes and all offsets. Bias, clock and,
+    without a camera, the focal length are fitted. Robust weights exclude places that move by themselves or are fixed to
+    the camera. A camera that also translates in one direction (a vehicle) displaces content along lines from one point;
+    displacements along these lines count less, as much as the scene has parallax.
 
     Args:
         frames: Stack (T, H, W) or (T, C, H, W) of at least two frames; tensor, array, list of these, or files; NaN
@@ -200,8 +215,8 @@ def align_motion(
     """
     if not isinstance(recorded, (FreeMotion, AngularRates)):
         raise TypeError(
-            "recorded must be a FreeMotion (read_motion, FreeMotion.from_samples) or AngularRates (read_gyroscope), got "
-            f"{type(recorded).__name__}"
+            "recorded must be a FreeMotion (read_motion, FreeMotion.from_samples) or AngularRates (read_gyroscope), "
+            f"got {type(recorded).__name__}"
         )
     if isinstance(recorded, FreeMotion) and recorded.batch_shape:
         raise ValueError("align_motion takes one motion, not a batch")

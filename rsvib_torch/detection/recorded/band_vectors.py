@@ -31,7 +31,7 @@ class BandVectors:
         rows: (M, 2) row times from there to the rows that contain the part, in both frames.
         place: (M, 2) px from the centre of the frame, (x, y) in the earlier frame.
         offsets: (M, 2) px, (x, y).
-        weight: (M,) inverse variances up to a common factor: q / (1 - q) of the correlation q, the ratio of signal to noise.
+        weight: (M,) inverse variances up to a common factor: signal to noise, q / (1 - q) for a correlation q.
         shape: (M, 2, 2) structure of the detail with trace 2: edges along one direction determine one component only.
         radius: px, root-mean-square distance of the pixels from the centre.
         num_pairs: Pairs of frames.
@@ -61,7 +61,7 @@ class BandVectors:
 
     def factors(self) -> Tensor:
         """(M, 2, 3) displacement by X, Y and ``radius`` theta, all in px."""
-        factors = displacement_factors(*self.place.unbind(-1), 3)
+        factors = displacement_factors(self.place[:, 0], self.place[:, 1], 3)
         return factors / factors.new_tensor([1.0, 1.0, self.radius])
 
 
@@ -124,7 +124,7 @@ def band_vectors(stack: GreyFrames, timing: SensorTiming, options: RegistrationO
 
 
 def _structure(parts: Tensor, rows: Tensor, height: int) -> Tensor:
-    """(S, T, 2, R, 2) sums of products of gradients along x and y over the bands of parts (S, T, H, w), with trace 2."""
+    """(S, T, 2, R, 2) products of gradients along x and y, summed over bands of parts (S, T, H, w), with trace 2."""
     smooth = parts - functional.avg_pool2d(parts, 5, 1, 2, count_include_pad=False)
     y, x = torch.gradient(smooth, dim=(-2, -1))
     products = torch.stack([x * x, x * y, y * y]).mean(-1).double()  # (3, S, T, H)
@@ -132,5 +132,6 @@ def _structure(parts: Tensor, rows: Tensor, height: int) -> Tensor:
     total = functional.pad(products.cumsum(-1), (1, 0))
     xx, xy, yy = total[..., (tops + height).clamp(max=parts.shape[-2])] - total[..., tops.clamp(min=0)]
     size = (xx + yy).clamp(min=1e-300) / 2
-    structure = torch.stack([torch.stack([xx, xy], -1), torch.stack([xy, yy], -1)], -3) / size[..., None, :, None]
-    return structure
+    products = torch.stack([torch.stack([xx, xy], -1), torch.stack([xy, yy], -1)], -3)
+    scaled: Tensor = products / size[..., None, :, None]
+    return scaled

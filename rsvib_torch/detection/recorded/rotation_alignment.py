@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text, text_table, wrapped
-from rsvib_torch.detection.recorded.band_vectors import BandVectors, band_vectors
+from rsvib_torch.detection.recorded.band_vectors import band_vectors
 from rsvib_torch.detection.recorded.clock_range import offset_range
 from rsvib_torch.detection.recorded.rotation_fit import NAMES, RotationFit, RotationModel, components_of, fit_robustly
 from rsvib_torch.detection.recorded.rotation_search import OrientationSearch, orientation_matrix, search_orientations
@@ -67,10 +67,10 @@ class RotationAlignment(
         focal_length_std: Its standard deviation; 0 if it was not fitted.
         row_time: s.
         row_time_std: Its standard deviation; 0 if it was not fitted.
-        translation: (3,) unit vector along the translation of the camera, in camera axes, whose parallax the fit allows.
+        translation: (3,) unit vector along the translation of the camera whose parallax the fit allows, camera axes.
         parallax: Standard deviation of translation / distance between frames, in parts of bands; 0: no parallax.
-        unexplained: (3,) px, px, rad: standard deviation of X, Y and roll from frame to frame that the gyroscope does not
-            explain, beyond the noise of the measurements.
+        unexplained: (3,) px, px, rad: standard deviation of X, Y and roll from frame to frame that the gyroscope does
+            not explain, beyond the noise of the measurements.
         unexplained_rows: (2,) px, rms difference of X and Y of single bands.
         times: (P,) s, mid-times of consecutive frames.
         measured: (P, 3) px, px, rad: X, Y and roll between consecutive frames, from the images.
@@ -103,6 +103,7 @@ class RotationAlignment(
 
     def summary(self) -> str:
         """Clock, axes, bias and focal length with standard deviations, what is not explained, and the verdict."""
+        second = measured_text(self.scale, self.scale_std or None, digits=8)
         verdict = "reliable" if self.reliable else f"not reliable: {'; '.join(self.reasons)}"
         bias, std = self.bias.tolist(), self.bias_std.tolist()
         moved, rest = (self.predicted - self.predicted.mean(0)).square().mean(0).sqrt(), self.unexplained
@@ -110,7 +111,7 @@ class RotationAlignment(
         return "\n".join(
             [
                 f"time 0 of the frames is {measured_text(self.offset, self.offset_std)} s of the gyroscope",
-                f"1 s of the frames is {measured_text(self.scale, self.scale_std or None, digits=8)} s of the gyroscope",
+                f"1 s of the frames is {second} s of the gyroscope",
                 f"axes x, y, z of the camera are {', '.join(_axis(letter) for letter in self.orientation)} of the "
                 "gyroscope",
                 f"bias {', '.join(measured_text(b, s) for b, s in zip(bias, std, strict=True))} rad/s",
@@ -247,10 +248,8 @@ def _reasons(
     moved: Tensor,
     unexplained: Tensor,
     std: Tensor,
-    *,
-    certain: float = 25.0,
 ) -> list[str]:
-    """Reasons against an alignment; ``certain`` is the difference of chi-square that excludes other axes."""
+    """Reasons against an alignment."""
     reasons = []
     if float(moved[:2].amax()) < 0.05:
         reasons.append(
@@ -269,17 +268,7 @@ def _reasons(
         )
     if search.other_offset is not None:
         reasons.append(f"an offset of {search.other_offset:.6g} s explains the frames as well: the motion repeats")
-    others = []
-    for index, name in enumerate(search.names):
-        if name == fit.model.orientation or search.costs[index] > 4.0 * search.costs[0]:
-            continue
-        start = fit.parameters.clone()
-        start[:3] = 0.0
-        start[3] = search.offsets[index] + fit.model.middle
-        if free[5]:
-            start[5] = search.focal_lengths[index]
-        if fit.cost_with(name, start, free) < fit.cost + certain:
-            others.append(name)
+    others = _other_axes(fit, search, free)
     if others:
         reasons.append(f"the axes {', '.join(others)} explain the frames as well: rotate the camera about all axes")
     if float(std[5]) > 0.05 * float(fit.parameters[5]):
@@ -293,3 +282,19 @@ def _reasons(
     if not math.isfinite(float(std.sum())):
         reasons.append("the fit does not converge")
     return reasons
+
+
+def _other_axes(fit: RotationFit, search: OrientationSearch, free: list[bool], *, certain: float = 25.0) -> list[str]:
+    """Other assignments of the axes, whose best fits have a chi-square that is larger by less than ``certain``."""
+    others = []
+    for index, name in enumerate(search.names):
+        if name == fit.model.orientation or search.costs[index] > 4.0 * search.costs[0]:
+            continue
+        start = fit.parameters.clone()
+        start[:3] = 0.0
+        start[3] = search.offsets[index] + fit.model.middle
+        if free[5]:
+            start[5] = search.focal_lengths[index]
+        if fit.cost_with(name, start, free) < fit.cost + certain:
+            others.append(name)
+    return others

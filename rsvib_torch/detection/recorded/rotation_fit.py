@@ -2,7 +2,7 @@
 
 The rotation of the camera between the exposures of a part of a band in two frames displaces it by
 
-    ``d = displacement(w),  w = A [rotation(tau(t1), tau(t2)) - b (tau(t2) - tau(t1))],  tau(t) = at + scale (t - middle)``
+    ``d = displacement(w),  w = A [rotation(tau1, tau2) - b (tau2 - tau1)],  tau = at + scale (t - middle)``
 
 with the assignment A of the axes and the bias b. The covariance of the residuals has three parts, whose sizes are
 estimated from the residuals:
@@ -242,7 +242,8 @@ def _direction(
     """(3,) direction of the translation for which the residuals (M, 2) lie along the lines of the parallax.
 
     Directions are compared on a grid of the half sphere, and on finer ones around the best. The cost of a residual is
-    bounded: most residuals of the right direction are small, and outliers do not matter. At most ``most`` parts are used.
+    bounded: most residuals of the right direction are small, and outliers do not matter. At most ``most`` parts
+    are used.
     """
     part = slice(None, None, max(1, len(rest) // most))
     weight, rest, place = weight[part], rest[part], model.vectors.place[part]
@@ -287,8 +288,8 @@ def _square(vectors: BandVectors, errors: _Errors, rest: Tensor) -> Tensor:
 def _following(vectors: BandVectors, predicted: Tensor) -> Tensor:
     """(M,) bool: parts at places whose displacements follow the predicted ones (M, 2) from pair to pair.
 
-    The slope of the displacements over the predicted ones, less their means over the pairs, is 1 for a scene at rest, and
-    0 for what is fixed to the camera (a dashboard) and for places without detail. A parallax changes slowly.
+    The slope of the displacements over the predicted ones, less their means over the pairs, is 1 for a scene at rest,
+    and 0 for what is fixed to the camera (a dashboard) and for places without detail. A parallax changes slowly.
     """
     places = vectors.num_rows * vectors.num_columns
 
@@ -387,8 +388,9 @@ def fit_robustly(model: RotationModel, start: Tensor, free: Sequence[bool], roun
 def _with_correlated_errors(fit: RotationFit, free: Sequence[bool]) -> RotationFit:
     """The fit with the covariance for residuals that are correlated between neighbours.
 
-    Overlapping bands, detail at other distances and wrong models correlate residuals; those of a first-order process with
-    the correlation rho of neighbours count as ``(1 - rho) / (1 + rho)`` of their number, along rows, columns and pairs.
+    Overlapping bands, detail at other distances and wrong models correlate residuals; those of a first-order process
+    with the correlation rho of neighbours count as ``(1 - rho) / (1 + rho)`` of their number, along rows,
+    columns and pairs.
     """
     vectors, errors = fit.model.vectors, fit.errors
     shape = (vectors.num_pairs, vectors.num_columns, vectors.num_rows)

@@ -96,17 +96,18 @@ def search_orientations(
     grid = torch.linspace(*limits, count, dtype=torch.float64)
     moved = without_drift(components, weights)
     energy = (weights * moved.square()).sum(0)  # (3,)
-    product, square = [], []  # (offset, component, axis of the gyroscope)
+    products, squares = [], []
     for part in grid.split(64):
         turned = rates.rotation(part[:, None] + first, part[:, None] + last)
         for axis in range(3):
             own = weights[:, axis : axis + 1].expand(-1, 3)
             rest = without_drift(turned, own)
-            product.append((own * moved[:, axis, None] * rest).sum(-2))
-            square.append((own * rest.square()).sum(-2))
+            products.append((own * moved[:, axis, None] * rest).sum(-2))
+            squares.append((own * rest.square()).sum(-2))
+    # (offset, component, axis of the gyroscope)
     product, square = (
         torch.cat([torch.stack(values[at : at + 3], 1) for at in range(0, len(values), 3)])
-        for values in (product, square)
+        for values in (products, squares)
     )
     # X = -f yaw, Y = f pitch, R theta = -R roll
     axes = {name: orientation_matrix(name) for name in _ALL}

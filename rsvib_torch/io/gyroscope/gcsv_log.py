@@ -51,7 +51,8 @@ def oriented(rates: NDArray[np.float64], orientation: str) -> NDArray[np.float64
         [[2.0, -1.0, 3.0]]
     """
     columns = ["xyz".index(letter.lower()) for letter in orientation]
-    return rates[:, columns] * np.array([1.0 if letter.isupper() else -1.0 for letter in orientation])
+    signs = np.array([1.0 if letter.isupper() else -1.0 for letter in orientation])
+    return np.asarray(rates[:, columns] * signs)
 
 
 def read_gcsv(path: Path) -> AngularRates:

@@ -1,8 +1,8 @@
 """Angular rates from the GPMF track of videos of GoPro cameras.
 
 Formats: ISO/IEC 14496-12 (boxes of MP4 files), and https://github.com/gopro/gpmf-parser (GPMF: entries of a key of four
-characters, a type, a size and a number of values, aligned to 4 bytes; entries of type 0 contain entries). A packet holds
-devices (DEVC), these streams (STRM), and one stream of each kind the samples (GYRO) after their scale (SCAL).
+characters, a type, a size and a number of values, aligned to 4 bytes; entries of type 0 contain entries). A packet
+holds devices (DEVC), these streams (STRM), and one stream of each kind the samples (GYRO) after their scale (SCAL).
 """
 
 import struct
@@ -274,8 +274,8 @@ def _sample_times(parts: list[_Part]) -> Array:
     """Times (N,) in s of the samples of all packets.
 
     If packets state the times of their first samples to 1 us, samples in between are at equal distances. Otherwise the
-    clock of the gyroscope is regular: a straight line through the times of the packets on the clock of the camera, or in
-    the video, in which the camera puts those samples that it has.
+    clock of the gyroscope is regular: a straight line through the times of the packets on the clock of the camera, or
+    in the video, in which the camera puts those samples that it has.
     """
     counts = np.array([len(part.rates) for part in parts])
     ends = np.cumsum(counts)

@@ -103,8 +103,8 @@ def _columns(path: Path, names: list[str], time_unit: str | None, unit: str | No
             quantity = "time" if kind == "time" else match["axis"]
             if quantity in found:
                 raise ValueError(
-                    f"{path}: columns {one_line(repr(names[found[quantity]]), 60)} and {one_line(repr(name), 60)} could "
-                    f"both be {quantity}; rename one of them"
+                    f"{path}: columns {one_line(repr(names[found[quantity]]), 60)} and {one_line(repr(name), 60)} "
+                    f"could both be {quantity}; rename one of them"
                 )
             found[quantity] = column
             if match["unit"]:
