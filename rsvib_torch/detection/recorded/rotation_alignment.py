@@ -114,9 +114,9 @@ class RotationAlignment(
                 f"1 s of the frames is {second} s of the gyroscope",
                 f"axes x, y, z of the camera are {', '.join(_axis(letter) for letter in self.orientation)} of the "
                 "gyroscope",
-                f"bias {', '.join(measured_text(b, s) for b, s in zip(bias, std, strict=True))} rad/s",
-                f"focal length {measured_text(self.focal_length, self.focal_length_std or None)} px",
-                f"row time {measured_text(1e6 * self.row_time, 1e6 * self.row_time_std or None)} us",
+                f"bias {', '.join(measured_text(b, s) for b, s in zip(bias, std, strict=True))} rad/s, focal length "
+                f"{measured_text(self.focal_length, self.focal_length_std or None)} px, row time "
+                f"{measured_text(1e6 * self.row_time, 1e6 * self.row_time_std or None)} us",
                 text_table(
                     ["between frames", "by the gyroscope (rms)", "not explained"],
                     [[names[k], measured_text(moved[k]), measured_text(rest[k], digits=2)] for k in range(3)],

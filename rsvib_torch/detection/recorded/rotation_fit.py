@@ -13,6 +13,8 @@ estimated from the residuals:
   ``s = tz (x - c) - f (tx, ty)`` and ``m = translation / Z``, a different one for every part. Displacements along s
   therefore determine the rotation less than those across s. The direction of the translation is the same in all frames
   (a vehicle, a platform), and is found by a search.
+
+Invariant: the displacement depends on the row only (docs/architecture.md), in parts of the columns.
 """
 
 from collections.abc import Sequence
@@ -23,7 +25,7 @@ from torch import Tensor
 
 from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.detection.recorded.band_vectors import BandVectors
-from rsvib_torch.detection.recorded.rotation_search import orientation_matrix
+from rsvib_torch.detection.recorded.rotation_search import MIN_FOCAL_LENGTH, orientation_matrix
 from rsvib_torch.motion.angular_rates import AngularRates
 from rsvib_torch.motion.camera import Camera
 
@@ -225,6 +227,7 @@ def _converged(
         change[5:7] = change[5:7].clamp(-limit, limit)
         change[4] = change[4].clamp(-0.01, 0.01)
         parameters = parameters + change
+        parameters[5] = parameters[5].clamp(min=MIN_FOCAL_LENGTH)
         if bool((change.abs() <= 1e-2 * covariance.diagonal().sqrt()).all()):
             break
     return parameters, covariance, model.vectors.offsets - model.predicted(parameters), cost

@@ -3,6 +3,8 @@
 The displacements of the row bands between frames give components (X, Y, theta) of every band. For each of the 24
 rotations of the axes (and the 24 mirrored ones, to detect mirrored frames), and for many offsets of the clock, a focal
 length and a drift of each component are fitted in closed form.
+
+Invariant: the displacement depends on the row only (docs/architecture.md), in parts of the columns.
 """
 
 import itertools
@@ -15,7 +17,9 @@ from torch import Tensor
 from rsvib_torch.detection.recorded.band_vectors import BandVectors
 from rsvib_torch.motion.angular_rates import AngularRates
 
-__all__ = ["ORIENTATIONS", "OrientationSearch", "orientation_matrix", "search_orientations"]
+__all__ = ["MIN_FOCAL_LENGTH", "ORIENTATIONS", "OrientationSearch", "orientation_matrix", "search_orientations"]
+
+MIN_FOCAL_LENGTH = 10.0  # px; the result is that of no motion, and refused
 
 
 def orientation_matrix(name: str) -> Tensor:
@@ -117,7 +121,7 @@ def search_orientations(
         along = product[:, 0] @ of_x + product[:, 1] @ of_y
         size = square[:, 0] @ of_x.square() + square[:, 1] @ of_y.square()
         f = (
-            (along / size.clamp(min=1e-300)).clamp(min=1.0)
+            (along / size.clamp(min=1e-300)).clamp(min=MIN_FOCAL_LENGTH)
             if focal_length is None
             else torch.full_like(size, focal_length)
         )
