@@ -28,6 +28,7 @@ import rsvib_torch as rsv
 PHONE_EXPOSURE, DRONE_EXPOSURE = 5.248e-3, 4.870e-3  # s; published, and stated in the GPMF track
 PHONE_CAMERA = rsv.Camera(574.0, principal_point=(406 - 399.5, 309 - 299.5))  # published
 SCENE_ROWS = 400  # of the phone's 600; the dashboard is below
+DRONE_CAMERA = rsv.Camera(400.0)  # px; 94 degrees across, typical of this camera: the amplitude in px scales with it
 LINE_WIDTH = 4.0  # Hz, half the width of the band around the line
 
 
@@ -84,83 +85,75 @@ def _compare(found: rsv.RotationAlignment) -> None:
 def drone(path: Path, most: int) -> None:
     """The line of the drone's gyroscope in its frames."""
     rates = rsv.read_gyroscope(path)
-    info = rsv.read_stack_info(path)
+    times = rsv.read_stack_info(path).frame_times[:most]
     frames = rsv.read_stack(path)[:most]
-    row_time = 30e-6  # s, start value
-    timing = rsv.SensorTiming(
-        row_time, DRONE_EXPOSURE / row_time, 1001 / 30000 / row_time, frame_start_times=info.frame_times[:most]
-    )
-    found = rsv.align_motion(frames, timing, rates, offsets=(-0.5, 0.5), fit_row_time=True)
-    print(f"drone, {len(frames)} frames:\n{found}")
+    timing = _drone_timing(30e-6, times[:60])
+    found = rsv.align_motion(frames[:60], timing, rates, camera=DRONE_CAMERA, offsets=(-0.1, 0.1))
+    print(f"drone, 60 frames:\n{found}")
     _compare(found)
-    curve = rsv.register_bands(frames, timing, method="phase")
-    for row_time in sorted({15e-6, 30e-6, 45e-6, 60e-6, found.row_time}):
-        line(found, rates, curve, row_time)
+    curve = rsv.register_bands(frames, _drone_timing(30e-6, times), method="phase")
+    print(f"drone, line in {len(frames)} frames (amplitudes in px, before the average over the exposure)")
+    for row_time in (10e-6, 20e-6, 30e-6, 40e-6, 50e-6, 60e-6):
+        line(rates, curve.offsets.numpy(), curve.rows.numpy(), np.array(times), row_time)
 
 
-def line(found: rsv.RotationAlignment, rates: rsv.AngularRates, curve: rsv.OffsetCurve, row_time: float) -> None:
-    """Amplitude of the line and of its alias in the offsets of the bands, for one row time."""
+def _drone_timing(row_time: float, times: tuple[float, ...]) -> rsv.SensorTiming:
+    return rsv.SensorTiming(row_time, DRONE_EXPOSURE / row_time, 1001 / 30000 / row_time, frame_start_times=list(times))
+
+
+def line(rates: rsv.AngularRates, offsets, rows, frame_times, row_time: float) -> None:
+    """Amplitude of the line and of its alias in the offsets of the bands, for one row time.
+
+    The axis with the largest line gives its phase; the factor between it and the image is unknown. The clocks agree: the
+    gyroscope's times are those of the packets in the video.
+    """
     samples, times = rates.rates.numpy(), rates.times.numpy()
     rate = (len(times) - 1) / (times[-1] - times[0])
-    spectrum = np.fft.rfft(samples * np.hanning(len(samples))[:, None], axis=0)
     frequency = np.fft.rfftfreq(len(samples), 1 / rate)
-    high = frequency > 120
-    centre = float(frequency[high][np.abs(spectrum[high]).sum(1).argmax()])
-    whole = np.fft.rfft(samples, axis=0) * (np.abs(frequency - centre) < LINE_WIDTH)[:, None]
-    slow = hilbert(np.fft.irfft(whole, len(samples), axis=0), axis=0) * np.exp(-2j * np.pi * centre * times)[:, None]
-    letters = [("xyz".index(letter.lower()), 1.0 if letter.isupper() else -1.0) for letter in found.orientation]
-    camera = np.stack([sign * slow[:, column] for column, sign in letters], -1)  # pitch, yaw, roll rates
-    starts = torch.tensor(curve.times.numpy() - curve.rows.numpy() * 30e-6)[:, 0].numpy()  # of the frames
-    after = torch.tensor(curve.later_times.numpy() - curve.rows.numpy() * 30e-6)[:, 0].numpy()
-    offsets, rows = curve.offsets.numpy(), curve.rows.numpy()
-    for name, hertz, envelope in (("line", centre, camera), ("alias", rate - centre, camera.conj())):
-        omega = 2 * np.pi * hertz
-        angle = envelope[:, [1, 0]] * np.array([-1.0, 1.0]) * found.focal_length / (1j * omega)  # px along x, y
+    spectrum = np.abs(np.fft.rfft(samples * np.hanning(len(samples))[:, None], axis=0)) * (frequency > 120)[:, None]
+    centre, axis = frequency[spectrum.max(1).argmax()], spectrum.max(0).argmax()
+    near = np.fft.rfft(samples[:, axis]) * (np.abs(frequency - centre) < LINE_WIDTH)
+    envelope = hilbert(np.fft.irfft(near, len(samples))) * np.exp(-2j * np.pi * centre * times)
+    for name, hertz, slow in (("line", centre, envelope), ("alias", rate - centre, envelope.conj())):
+        angle = DRONE_CAMERA.focal_length * slow / (2j * np.pi * hertz)  # px
         exposed = np.sinc(hertz * DRONE_EXPOSURE)
-        predicted = np.zeros((*offsets.shape[:2], 2), complex)
-        for start, sign in ((after, 1.0), (starts, -1.0)):
-            shift = offsets[..., 1] * row_time * (sign > 0)
-            t = start[:, None] + rows * row_time + np.nan_to_num(shift) + DRONE_EXPOSURE / 2
-            clock = found.scale * t + found.offset
-            for axis in range(2):
-                slowly = np.interp(clock, times, angle[:, axis].real) + 1j * np.interp(
-                    clock, times, angle[:, axis].imag
-                )
-                predicted[..., axis] += sign * exposed * slowly * np.exp(1j * omega * clock)
-        for axis, label in enumerate("xy"):
-            amplitude, std, expected = _fitted(offsets[..., axis], predicted[..., axis], rows, angle[:, axis], exposed)
+        predicted = np.zeros(offsets.shape[:2], complex)
+        for starts, moved, sign in ((frame_times[1:], offsets[..., 1], 1.0), (frame_times[:-1], 0.0, -1.0)):
+            t = starts[:, None] + (rows + np.nan_to_num(moved)) * row_time + DRONE_EXPOSURE / 2
+            slowly = np.interp(t, times, angle.real) + 1j * np.interp(t, times, angle.imag)
+            predicted += sign * exposed * slowly * np.exp(2j * np.pi * hertz * t)
+        for label, values in (("x", offsets[..., 0]), ("y", offsets[..., 1])):
+            gain, std = _gain(values, predicted, rows)
+            size = float(np.sqrt((np.abs(angle) ** 2).mean()))
             print(
-                f"  row time {1e6 * row_time:.1f} us, {name} {hertz:.2f} Hz, {label}: {amplitude:.4f} ± {std:.4f} px "
-                f"(gyroscope: {expected:.4f} px; 95 % limit {amplitude + 2 * std:.4f} px)",
+                f"  row time {1e6 * row_time:.0f} us, {name} {hertz:.2f} Hz, {label}: {gain * size:.4f} ± "
+                f"{std * size:.4f} px, 95 % limit {(gain + 2 * std) * size:.4f} px; gyroscope {size:.4f} px, of which "
+                f"the exposure leaves {abs(exposed):.2f}",
                 flush=True,
             )
 
 
-def _fitted(offsets, predicted, rows, angle, exposed):
-    """Amplitude in px after the exposure, standard deviation, and the amplitude by the gyroscope.
+def _gain(offsets, predicted, rows) -> tuple[float, float]:
+    """Size of the complex factor of the predicted offsets (P, N), and the standard deviation of each of its parts.
 
     A cubic polynomial in the row is fitted to every pair of frames as well: other motion of the camera.
     """
     smooth = np.polynomial.legendre.legvander(2 * rows / rows.max() - 1, 3)
-    values, lines, counted = [], [], 0
-    for pair in range(len(offsets)):
-        good = np.isfinite(offsets[pair])
+    parts = []
+    for measured, expected in zip(offsets, predicted, strict=True):
+        good = np.isfinite(measured)
         if good.sum() < 12:
             continue
         basis, _ = np.linalg.qr(smooth[good])
-        data = np.stack([offsets[pair, good], predicted[pair, good].real, -predicted[pair, good].imag], -1)
-        data = data - basis @ (basis.T @ data)
-        limit = 4.5 * np.median(np.abs(data[:, 0])) + 1e-9  # outliers
-        data = data[np.abs(data[:, 0]) < limit]
-        values.append(data[:, 0])
-        lines.append(data[:, 1:])
-        counted += len(data) - 4
-    y, A = np.concatenate(values), np.concatenate(lines)
-    gain, *_ = np.linalg.lstsq(A, y, rcond=None)
-    variance = 2.0 * ((y - A @ gain) ** 2).sum() / counted  # bands overlap by half
-    size = np.sqrt((np.abs(angle) ** 2).mean()) * abs(exposed)  # amplitude
-    std = np.sqrt(variance * np.linalg.inv(A.T @ A).diagonal().mean())
-    return float(np.hypot(*gain) * size), float(std * size), float(size)
+        data = np.stack([measured[good], expected[good].real, -expected[good].imag], -1)
+        data -= basis @ (basis.T @ data)
+        parts.append(data[np.abs(data[:, 0]) < 4.5 * np.median(np.abs(data[:, 0]))])  # 3 standard deviations
+    data = np.concatenate(parts)
+    normal = data[:, 1:].T @ data[:, 1:]
+    gain = np.linalg.solve(normal, data[:, 1:].T @ data[:, 0])
+    rest = data[:, 0] - data[:, 1:] @ gain
+    variance = 2.0 * (rest**2).sum() / (len(data) - 4 * len(parts))  # bands overlap by half
+    return float(np.hypot(*gain)), float(np.sqrt(variance * np.linalg.inv(normal).diagonal().mean()))
 
 
 def main() -> int:
