@@ -104,8 +104,8 @@ def _drone_timing(row_time: float, times: tuple[float, ...]) -> rsv.SensorTiming
 def line(rates: rsv.AngularRates, offsets, rows, frame_times, row_time: float) -> None:
     """Amplitude of the line and of its alias in the offsets of the bands, for one row time.
 
-    The axis with the largest line gives its phase; the factor between it and the image is unknown. The clocks agree: the
-    gyroscope's times are those of the packets in the video.
+    The axis with the largest line gives its phase; the factor between it and the image is unknown. The clocks agree:
+    the times of the gyroscope are those of the packets in the video.
     """
     samples, times = rates.rates.numpy(), rates.times.numpy()
     rate = (len(times) - 1) / (times[-1] - times[0])

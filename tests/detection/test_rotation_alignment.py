@@ -219,3 +219,33 @@ def test_rotation_is_composed_of_small_ones():
     assert np.allclose(rates.rotation(torch.from_numpy(start), torch.from_numpy(end)).numpy(), truth, atol=1e-6)
     truth = (attitude(np.array([0.1005]), size).inv() * attitude(times, size)).as_rotvec()
     assert np.allclose(rates.attitude(0.1005).numpy(), truth, atol=1e-6)
+
+
+@pytest.mark.parametrize("parallax", [0.0, 0.02])
+def test_translation_of_the_camera_is_allowed(vectors, frames, monkeypatch, parallax):
+    # each part at a distance of its own; a third of the places are fixed to the camera
+    direction = np.array([0.1, -0.05, 0.99])
+    first, last = (times.numpy() + 0.5 * TIMING.exposure_time for times in vectors.times(TIMING.row_time).unbind(-1))
+    place = vectors.place.numpy()
+    ray = np.concatenate([place, np.full((len(place), 1), FOCAL_LENGTH)], -1)
+    ray = (attitude(first).inv() * attitude(last)).inv().apply(ray)
+    random = np.random.default_rng(3)
+    lines = direction[2] * place - FOCAL_LENGTH * direction[:2]
+    near = parallax * random.uniform(0, 2, (len(place), 1))
+    moved = FOCAL_LENGTH * ray[:, :2] / ray[:, 2:] - place + near * lines
+    fixed = vectors.row.numpy() >= 0.7 * vectors.num_rows
+    moved[fixed] = 0.0
+    moved += 0.02 * random.standard_normal(moved.shape)
+    scene = replace(vectors, offsets=torch.from_numpy(moved))
+    monkeypatch.setattr(rotation_alignment, "band_vectors", lambda *_: scene)
+    found = rsv.align_motion(frames, TIMING, recorded("zxY"), registration="phase")
+    assert found.orientation == "zxY"
+    assert abs(found.offset - OFFSET) < 4 * found.offset_std < 4e-3
+    assert abs(found.focal_length - FOCAL_LENGTH) < min(4 * found.focal_length_std, 0.1 * FOCAL_LENGTH)
+    assert bool(((found.bias - torch.tensor(BIAS, dtype=torch.float64)).abs() < 4 * found.bias_std + 1e-3).all())
+    if parallax:
+        assert 0.5 * parallax < found.parallax < 2 * parallax
+        unit = torch.from_numpy(direction / np.linalg.norm(direction))
+        assert float((found.translation @ unit).abs()) > 0.99
+    else:
+        assert found.parallax < 1e-3

@@ -77,6 +77,23 @@ class RotationAlignment(
         predicted: (P, 3) The same by the gyroscope.
         reliable: Whether the gyroscope explains the frames, with this clock and these axes only.
         reasons: Why not.
+
+    Example:
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=80e-6, exposure_rows=10, frame_rows=420)
+        >>> times = torch.arange(-0.02, 0.12, 0.001, dtype=torch.float64)
+        >>> angles = [5e-3 * torch.sin(50 * times), 4e-3 * torch.sin(70 * times + 1), 6e-3 * torch.sin(45 * times + 2)]
+        >>> pitch, yaw, roll = angles  # rad, of the camera
+        >>> path = torch.stack([-400 * yaw, 400 * pitch, -roll], -1)
+        >>> motion = rsv.FreeMotion.from_samples(times, path, camera=rsv.Camera(400.0))
+        >>> frames = rsv.simulate_frames(city_and_fields(224, 240, seed=2), timing, motion, num_frames=3)
+        >>> turned = torch.stack([roll, pitch, yaw], -1)  # the gyroscope is mounted in another direction
+        >>> rates = rsv.AngularRates(times[1:-1] + 0.5, (turned[2:] - turned[:-2]) / 0.002)
+        >>> found = rsv.align_motion(frames, timing, rates)
+        >>> found.orientation, round(found.offset, 3), round(found.focal_length / 10)
+        ('YZX', 0.5, 40)
     """
 
     motion: FreeMotion
