@@ -54,6 +54,7 @@ from .motion.timing import SensorTiming
 from .motion.vibration import Vibration, VibrationStd, blind_frequencies
 from .registration import OffsetCurve, register_bands
 from .report import (
+    camera_isd,
     comparison_figure,
     gain_figure,
     motion_figure,
@@ -62,9 +63,13 @@ from .report import (
     psf_figure,
     read_vibration,
     rows_figure,
+    sampling_map,
     save_figure,
     windows_figure,
+    write_gcsv,
+    write_isd,
     write_offsets,
+    write_stmap,
     write_vibration,
     write_windows,
 )
@@ -113,6 +118,7 @@ __all__ = [
     "calibrate_row_time",
     "calibrate_row_time_by_exposure",
     "calibrate_row_time_by_motion",
+    "camera_isd",
     "check_motion",
     "comparison_figure",
     "detect_motion",
@@ -142,6 +148,7 @@ __all__ = [
     "restore_block",
     "row_psf",
     "rows_figure",
+    "sampling_map",
     "save_figure",
     "simulate_frames",
     "slanted_edge_mtf",
@@ -150,8 +157,11 @@ __all__ = [
     "trusted_vibration",
     "visible_pixels",
     "windows_figure",
+    "write_gcsv",
+    "write_isd",
     "write_offsets",
     "write_stack",
+    "write_stmap",
     "write_vibration",
     "write_windows",
 ]

@@ -58,6 +58,7 @@ FIRST_NAMES = (
     *("process_stack", "StackReport", "iterate_stack", "restore_block", "read_manifest"),
     *("slanted_edge_mtf", "MtfCurve", "find_slanted_edges", "SlantedEdge", "psnr", "ssim"),
     *("read_vibration", "write_vibration", "write_offsets", "write_windows", "save_figure"),
+    *("sampling_map", "write_stmap", "write_gcsv", "write_isd", "camera_isd"),
 )
 # Sections of the site and the order of their pages; pages that are missing here are added to the last section.
 SECTIONS = {
@@ -74,6 +75,7 @@ SECTIONS = {
         "roll_and_zoom.md",
         "gyroscope.md",
         "stacks.md",
+        "export.md",
         "reliability.md",
         "ml_pipeline.md",
         "measuring.md",

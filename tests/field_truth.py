@@ -1,14 +1,17 @@
 """Frames of a camera that rolls and zooms, independent of the package: SciPy splines in two dimensions, float64.
 
 A pixel p sees the scene position s with ``p - c = (s - c) + (X - theta y + zeta x, Y + theta x + zeta y)``, where c is
-the centre of the frame and (x, y) = s - c. Every pixel is sampled at its own position and time.
+the centre of the frame and (x, y) = s - c. Every pixel is sampled at its own position and time. With a lens, rays are
+rotated by SciPy and projected by OpenCV instead.
 """
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
+from scipy.spatial.transform import Rotation
 
 from rsvib_torch import SensorTiming, Vibration
 
@@ -30,6 +33,40 @@ class FieldMotion:
     def vibration(self, axes: int = 4) -> Vibration:
         return Vibration(self.amplitude[:axes], self.frequency[:axes], self.phase[:axes])
 
+    def seen(self, right: Array, down: Array, times: Array) -> tuple[Array, Array]:
+        """Scene positions that pixels see, both in px from the centre of the frame."""
+        x, y, roll, zoom = self.components(times)
+        right, down, scale = right - x, down - y, 1 + zoom
+        square = scale**2 + roll**2
+        return (scale * right + roll * down) / square, (scale * down - roll * right) / square
+
+
+@dataclass(frozen=True)
+class LensMotion(FieldMotion):
+    """The same for a rotation of a camera with a focal length and a lens; without zoom."""
+
+    focal_length: float = 400.0
+    principal_point: tuple[float, float] = (0.0, 0.0)
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def project(self, rays: Array) -> Array:
+        (x, y), f = self.principal_point, self.focal_length
+        matrix = np.array([[f, 0, x], [0, f, y], [0, 0, 1]])
+        return cv2.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), matrix, np.array(self.distortion))[0][:, 0]
+
+    def rays(self, points: Array) -> Array:
+        rays = np.c_[(points - self.principal_point) / self.focal_length, np.ones(len(points))]
+        for _ in range(12):  # a fixed point: the distortion moves points by less than a tenth
+            rays[:, :2] -= (self.project(rays) - points) / self.focal_length
+        return rays
+
+    def seen(self, right: Array, down: Array, times: Array) -> tuple[Array, Array]:
+        x, y, theta, _ = self.components(times)
+        moved = np.stack([-y / self.focal_length, x / self.focal_length, theta], -1).reshape(-1, 3)  # of the scene
+        rays = self.rays(np.stack([right, down], -1).reshape(-1, 2))
+        seen = self.project(Rotation.from_rotvec(-moved).apply(rays)).reshape(*right.shape, 2)
+        return seen[..., 0], seen[..., 1]
+
 
 def take_field_frames(
     scene: Array, timing: SensorTiming, motion: FieldMotion, size: tuple[int, int], num_frames: int = 2, nodes: int = 12
@@ -46,11 +83,8 @@ def take_field_frames(
     for frame in range(num_frames):
         starts = frame * timing.frame_period + line * timing.row_time
         for moment, weight in zip(0.5 * (moments + 1), 0.5 * weights, strict=True):
-            x, y, roll, zoom = motion.components(starts + moment * timing.exposure_time)
-            right, down = column - 0.5 * (width - 1) - x, row - 0.5 * (height - 1) - y
-            scale = 1 + zoom
-            seen_x = (scale * right + roll * down) / (scale**2 + roll**2)
-            seen_y = (scale * down - roll * right) / (scale**2 + roll**2)
+            times = starts + moment * timing.exposure_time
+            seen_x, seen_y = motion.seen(column - 0.5 * (width - 1), row - 0.5 * (height - 1), times)
             places = [seen_y + 0.5 * (height - 1) + top, seen_x + 0.5 * (width - 1) + left]
             frames[frame] += weight * map_coordinates(coefficients, places, order=5, prefilter=False, mode="mirror")
     return frames

@@ -37,7 +37,7 @@ INNER_LAYERS = {
         {"detect", "row_time"},
     ),
     "evaluation": ({"quality", "mtf", "bound", "scenes"},),
-    "report": ({"results", "plots"}, {"html"}),
+    "report": ({"results", "plots", "export"}, {"html"}),
     "restoration": (
         {"frame_motion"},
         {"field_motion"},

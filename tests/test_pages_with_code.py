@@ -102,3 +102,12 @@ def test_page_on_roll_and_zoom():
     assert detection.reliable.tolist() == [True, True, True]
     torch.testing.assert_close(detection.vibration.amplitude[2], truth.amplitude[2], rtol=0.03, atol=0)
     assert page["restored"].shape == page["frames"].shape
+
+
+def test_page_on_export():
+    page = run_page("export.md", 4)
+    assert page["models"] == ["frame", "line-scan"]
+    assert page["maps"].shape == (4, 480, 640, 2)
+    names = {path.name for path in page["folder"].iterdir()}
+    assert names == {"clip.gcsv", "maps", "camera.json", "slow.json", "fast.json"}
+    assert len(page["files"]) == 4

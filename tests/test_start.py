@@ -66,6 +66,7 @@ def run_code(*arguments):
         (run_code("--version"), PROGRAM),
         (run_code("run", "--help"), PROGRAM),
         (run_code("known", "--help"), PROGRAM),
+        (run_code("export", "vibration.json", "clip.unknown"), PROGRAM),
         (run_code("run", "frames.tif", "out"), PROGRAM),
         (run_code("run", "frames.tif", "out", "--config", "none.toml"), PROGRAM),
         (run_code("detect", "frames.tif", "--out", "out", "--config", "bad.toml"), PROGRAM),

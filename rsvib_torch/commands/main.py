@@ -12,6 +12,7 @@ import typer
 
 import rsvib_torch
 from rsvib_torch.commands import motion_commands, stack_commands
+from rsvib_torch.commands.export_command import export
 from rsvib_torch.commands.init import init
 from rsvib_torch.commands.options import DebugOption, JsonOption, QuietOption
 from rsvib_torch.commands.terminal import (
@@ -105,6 +106,16 @@ _COMMANDS: tuple[tuple[str, Callable[..., Answer], str, str], ...] = (
         rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
               --out camera.toml
         rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025
+        """,
+    ),
+    (
+        "export",
+        export,
+        "Write a detected vibration for other programs.",
+        """
+        rsvib export found/vibration.json clip.gcsv --frames clip.mp4 \\
+              --focal-length 1800
+        rsvib export found/vibration.json frame.json --isd camera.json
         """,
     ),
     (

@@ -7,6 +7,7 @@ are refused with the name of the argument. Bounds that depend on the function ar
 
 import collections.abc
 import inspect
+import math
 import os
 import types
 from collections.abc import Callable, Mapping, Sequence
@@ -36,6 +37,9 @@ __all__ = [
     "check_broadcast",
     "check_device",
     "check_fields",
+    "check_images",
+    "check_options",
+    "check_pixels",
     "check_shapes",
     "check_tensor",
     "checks_arguments",
@@ -108,8 +112,9 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
 
     Args:
         values: Tensors by name; None and names without a stated shape are omitted.
-        shapes: Axes of a tensor: a size, a name for a size of at least 1 that is the same in all tensors, and ``...``
-            for any leading dimensions.
+        shapes: Axes of a tensor: a size; a name for a size of at least 1 that is the same in all tensors, with its
+            limits if there are any (``A=2-4``); ``...`` for leading dimensions that are the same in all tensors, or
+            ``[...]`` for these or none.
 
     Example:
         >>> check_shapes({"scene": torch.zeros(3)}, {"scene": "... H W"})
@@ -117,22 +122,104 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
         ...
         ValueError: scene must have shape (..., H, W), got (3,)
     """
-    known: dict[str, int] = {}
-    for name, axes in shapes.items():
+    known: dict[str, Any] = {}
+    for name, stated in shapes.items():
         value = values.get(name)
         if value is None:
             continue
-        names = axes.removeprefix("...").split()
+        lead, axes = _stated_axes(stated)
         shape = tuple(value.shape)
-        sizes = shape[len(shape) - len(names) :] if len(shape) >= len(names) else ()
-        expected = [int(axis) if axis.isdecimal() else known.get(axis) for axis in names]
-        fits = all(size >= 1 if one is None else size == one for size, one in zip(sizes, expected, strict=False))
-        if len(sizes) != len(names) or not fits or ("..." not in axes and len(shape) > len(names)):
-            stated = ", ".join(["..."] * axes.startswith("...") + names) + "," * (axes.strip() == names[0])
-            sizes_known = [f"{axis} = {known[axis]}" for axis in names if axis in known]
+        count = len(shape) - len(axes)
+        batch, sizes = shape[: max(count, 0)], shape[max(count, 0) :]
+        fits = count >= 0 and all(
+            low <= size <= high and size == known.get(axis, size)
+            for size, (axis, low, high) in zip(sizes, axes, strict=True)
+        )
+        batches = {"": [()], "...": [known.get("...", batch)], "[...]": [known.get("...", batch), ()]}[lead]
+        if not fits or batch not in batches:
+            names = [lead.strip("[]")] * bool(lead) + [axis for axis, _, _ in axes]
+            limits = {axis: f"{low} to {high}" for axis, low, high in axes if math.isfinite(high) and low < high}
+            sizes_known = [f"{axis} = {(limits | known)[axis]}" for axis in names if axis in limits | known]
             where = f" with {', '.join(sizes_known)}" if sizes_known else ""
-            raise ValueError(f"{name} must have shape ({stated}){where}, got {shape}")
-        known |= {axis: size for axis, size in zip(names, sizes, strict=True) if not axis.isdecimal()}
+            raise ValueError(
+                f"{name} must have shape ({', '.join(names)}{',' * (len(names) == 1)}){where}, got {shape}"
+            )
+        known |= {axis: size for (axis, low, high), size in zip(axes, sizes, strict=True) if low < high}
+        if batch or lead == "...":
+            known["..."] = batch
+
+
+@cache
+def _stated_axes(stated: str) -> tuple[str, list[tuple[str, int, float]]]:
+    """Mark of the leading dimensions, and name, smallest and largest size of each axis of a shape."""
+    names = stated.split()
+    lead = names.pop(0) if names[0] in ("...", "[...]") else ""
+    axes: list[tuple[str, int, float]] = []
+    for entry in names:
+        axis, _, limits = entry.partition("=")
+        low, _, high = (axis if axis.isdecimal() else limits or "1").partition("-")
+        axes.append((axis, int(low), int(high or low) if limits or axis.isdecimal() else math.inf))
+    return lead, axes
+
+
+def check_images(images: Mapping[str, Tensor], shapes: Mapping[str, str]) -> None:
+    """Check that tensors are floating-point images of the shapes of ``check_shapes``.
+
+    Raises:
+        TypeError: If one is not a floating-point tensor.
+        ValueError: If one has another shape.
+
+    Example:
+        >>> check_images({"scene": torch.zeros(4, 5, dtype=torch.uint8)}, {"scene": "... H W"})
+        Traceback (most recent call last):
+        ...
+        TypeError: scene must be a floating-point tensor, got torch.uint8; divide counts by their full scale
+    """
+    for name, image in images.items():
+        if not image.is_floating_point():
+            raise TypeError(
+                f"{name} must be a floating-point tensor, got {image.dtype}; divide counts by their full scale"
+            )
+    check_shapes(images, shapes)
+
+
+def check_pixels(name: str, pixels: Tensor) -> None:
+    """Raise a ``ValueError`` if a pixel of a floating-point tensor is NaN, infinite or beyond all scales.
+
+    Example:
+        >>> check_pixels("frames", torch.tensor([[0.0, torch.inf]]))
+        Traceback (most recent call last):
+        ...
+        ValueError: frames must be finite, but pixel (0, 1) is inf
+    """
+    if not pixels.numel():
+        return
+    ends = torch.stack(pixels.detach().aminmax())  # one pass; propagates NaN and infinity
+    if not bool(torch.isfinite(ends).all()):
+        pixel = tuple((~torch.isfinite(pixels)).nonzero()[0].tolist())
+        raise ValueError(f"{name} must be finite, but pixel {pixel} is {pixels[pixel].item()}")
+    largest = float(ends.abs().max())
+    if largest > MAX_NUMBER:
+        raise ValueError(
+            f"{name} reach {largest:.3g}, at most {MAX_NUMBER:g} is possible: divide them by their full scale"
+        )
+
+
+def check_options(options: Mapping[str, Any], kind: type) -> None:
+    """Check options against the annotations of a ``TypedDict``.
+
+    Example:
+        >>> from typing import TypedDict
+        >>> Options = TypedDict("Options", {"iterations": int})
+        >>> check_options({"iterations": 1.5}, Options)
+        Traceback (most recent call last):
+        ...
+        TypeError: iterations must be a whole number, got 1.5 (float)
+    """
+    checks = _option_checks(kind)
+    for name, value in options.items():
+        if check := checks.get(name):
+            check(name, value)
 
 
 def check_broadcast(**tensors: Any) -> None:
@@ -207,20 +294,35 @@ def checks_arguments(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def check_fields(value: Any) -> None:
-    """Check the types of the fields of a dataclass against their annotations.
+    """Check the types of the fields of a dataclass against their annotations; lists and arrays become tuples.
 
     Raises:
         TypeError: If a field has another type; numbers may be infinite or NaN.
     """
-    for name, check in _field_checks(value.__class__):
-        check(name, getattr(value, name))
+    for name, check, is_tuple in _field_checks(value.__class__):
+        given = getattr(value, name)
+        check(name, given)
+        if is_tuple and given is not None and not isinstance(given, tuple):
+            given = tuple(given.tolist() if isinstance(given, _ARRAYS) else given)
+            check(name, given)
+            object.__setattr__(value, name, given)
 
 
 @cache
-def _field_checks(kind: type) -> list[tuple[str, _Check]]:
+def _field_checks(kind: type) -> list[tuple[str, _Check, bool]]:
+    """Name and check of each field, and whether it is a tuple."""
     hints = get_type_hints(kind, localns={"Tensor": Tensor})
-    checks = ((field.name, _check(hints[field.name], finite=False)) for field in fields(kind))
-    return [(name, check) for name, check in checks if check is not None]
+    checks = ((name, _check(hints[name], finite=False)) for name in (field.name for field in fields(kind)))
+    return [
+        (name, check, tuple in (get_origin(hints[name]), *map(get_origin, get_args(hints[name]))))
+        for name, check in checks
+        if check is not None
+    ]
+
+
+@cache
+def _option_checks(kind: type) -> dict[str, _Check | None]:
+    return {name: _check(hint) for name, hint in get_type_hints(kind).items()}
 
 
 @cache
@@ -233,7 +335,7 @@ def _checks_of(function: Callable[..., Any]) -> dict[str, _Check]:
     for parameter in inspect.signature(function).parameters.values():
         kind = hints.get(parameter.name, Any)
         if get_origin(kind) is Unpack:
-            checks |= {key: _check(hint) for key, hint in get_type_hints(get_args(kind)[0]).items()}
+            checks |= _option_checks(get_args(kind)[0])
         elif parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
             checks[parameter.name] = _check(kind)
     return {name: check for name, check in checks.items() if check is not None}
@@ -241,7 +343,8 @@ def _checks_of(function: Callable[..., Any]) -> dict[str, _Check]:
 
 def _check(kind: Any, *, finite: bool = True) -> _Check | None:  # noqa: PLR0911, PLR0912
     """The check of an annotation; None where every value is accepted or the function itself checks it."""
-    origin, arguments = get_origin(kind), get_args(kind)
+    kind = _without_alias(kind)
+    origin, arguments = get_origin(kind), tuple(map(_without_alias, get_args(kind)))
     if kind is Any or isinstance(kind, TypeVar):
         return None
     if torch.device in arguments and origin in (Union, types.UnionType):
@@ -274,7 +377,7 @@ def _check(kind: Any, *, finite: bool = True) -> _Check | None:  # noqa: PLR0911
     if origin is np.ndarray:
         return _instance((np.ndarray,), "a NumPy array")
     if inspect.isclass(origin) and issubclass(origin, Mapping):
-        return _instance((Mapping,), "a dictionary")
+        return _check_of_mapping(arguments, finite)
     if origin is collections.abc.Callable:
         return lambda name, value: None if callable(value) else _refuse(name, "a function", value)
     if inspect.isclass(kind) and origin is None and not is_typeddict(kind) and kind is not object:
@@ -283,6 +386,12 @@ def _check(kind: Any, *, finite: bool = True) -> _Check | None:  # noqa: PLR0911
         article, source = "an" if kind.__name__[0] in "AEIOU" else "a", getattr(kind, "_MADE_BY", "")
         return _instance((kind,), f"{article} {kind.__name__}{source and f' ({source})'}")
     return None
+
+
+def _without_alias(kind: Any) -> Any:
+    """What a ``type`` statement stands for, as numpy.typing.NDArray from NumPy 2.5 on; other annotations unchanged."""
+    alias = kind if get_origin(kind) is None else get_origin(kind)
+    return alias.__value__ if type(alias).__name__ == "TypeAliasType" else kind
 
 
 def void(_: object) -> None:
@@ -353,6 +462,21 @@ def _check_of_sequence(origin: Any, arguments: tuple[Any, ...], finite: bool) ->
                 part = parts[index] if length is not None else parts[0] if parts else None
                 if part is not None:
                     part(f"{name}[{index}]", entry)
+
+    return check
+
+
+def _check_of_mapping(arguments: tuple[Any, ...], finite: bool) -> _Check:
+    key_check, value_check = (_check(argument, finite=finite) for argument in arguments)
+
+    def check(name: str, value: Any) -> None:
+        if not isinstance(value, Mapping):
+            _refuse(name, "a dictionary", value)
+        for key, entry in value.items():
+            if key_check is not None:
+                key_check(f"keys of {name}", key)
+            if value_check is not None:
+                value_check(f"{name}[{key!r}]", entry)
 
     return check
 

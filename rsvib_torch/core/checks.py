@@ -17,16 +17,16 @@ def described(value: object) -> str:
         >>> described("3"), described(None), described([1, 2]), described([0.5] * 99)
         ("'3' (str)", 'None', '[1, 2]', 'list')
     """
+    if value is None or getattr(value, "is_nested", False):
+        return "None" if value is None else "a nested tensor"  # whose shape raises an error
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if shape is not None and dtype is not None:
-        size = "" if getattr(value, "is_nested", False) else f" of shape {tuple(shape)} and {dtype}"
-        return f"{type(value).__name__}{size}"
-    if value is None or isinstance(value, (bool, float, complex)):
-        return repr(value) if value is None else f"{value!r} ({type(value).__name__})"
+        return f"{type(value).__name__} of shape {tuple(shape)} and {dtype}"
+    if isinstance(value, (bool, float, complex, str, bytes)):
+        shown = value[:60] if isinstance(value, (str, bytes)) else value
+        return f"{shown!r} ({type(value).__name__})"
     if isinstance(value, int):
         return f"{value} (int)" if abs(value) < 10**30 else "a very large int"
-    if isinstance(value, (str, bytes)):
-        return f"{value[:60]!r} ({type(value).__name__})"
     if isinstance(value, (list, tuple)) and len(value) < 10 and all(isinstance(item, (int, float)) for item in value):
         return repr(value)
     return type(value).__name__

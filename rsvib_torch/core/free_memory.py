@@ -64,11 +64,15 @@ def check_fits(what: str, needed: int, remedy: str) -> None:
 
 
 def _free_addresses() -> list[int]:
-    """Free part of the address space, if it is limited (``ulimit -v``, some batch systems)."""
+    """Free parts of address space and data segment, if they are limited (``ulimit -v``, ``-d``, some batch systems)."""
     if resource is None:
         return []
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    return [] if limit == resource.RLIM_INFINITY else [limit - int(psutil.Process().memory_info().vms)]
+    limits = {"vms": resource.getrlimit(resource.RLIMIT_AS)[0], "data": resource.getrlimit(resource.RLIMIT_DATA)[0]}
+    limits = {name: limit for name, limit in limits.items() if limit != resource.RLIM_INFINITY}
+    if not limits:
+        return []
+    used = psutil.Process().memory_info()
+    return [limit - int(getattr(used, name, 0)) for name, limit in limits.items()]
 
 
 def _free_in_groups(root: Path) -> Iterator[int]:

@@ -19,10 +19,13 @@ __all__ = [
     "DetectionSettings",
     "DewarpSettings",
     "ExactSettings",
+    "ExportFormat",
+    "IsdModel",
     "MotionUnit",
     "PriorName",
     "Registration",
     "RichardsonLucySettings",
+    "StmapConvention",
     "TimeUnit",
     "ToneSettings",
     "method_options",
@@ -32,9 +35,12 @@ DEFAULT_WINDOW = 8  # frames
 
 BadFrames = Literal["pass", "skip"]
 DetectionMethod = Literal["direct", "bands"]
+ExportFormat = Literal["gcsv", "stmap", "isd", "csv"]
+IsdModel = Literal["auto", "frame", "line-scan"]
 MotionUnit = Literal["px", "rad", "mrad", "urad", "deg", "arcsec", "rad/s", "deg/s"]
 PriorName = Literal["gaussian", "edges"]
 Registration = Literal["projection", "ncc", "phase"]
+StmapConvention = Literal["nuke", "opencv"]
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
 
@@ -57,6 +63,9 @@ class ToneSettings(TypedDict, total=False):
     columns: int | None
     roll: bool | Literal["auto"]
     zoom: bool | Literal["auto"]
+    focal_length: float | None
+    principal_point: tuple[float, float] | None
+    distortion: tuple[float, float, float, float, float] | None
 
 
 class DetectionSettings(BandSettings, ToneSettings, total=False):

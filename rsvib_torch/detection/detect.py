@@ -27,7 +27,7 @@ from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
 from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
 from rsvib_torch.detection.start import BandStart, band_start, field_start, grey_frames
-from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.detection.tones.fit import (
     MotionModel,
     ToneFit,
@@ -38,10 +38,11 @@ from rsvib_torch.detection.tones.fit import (
     vibration_of_fit,
 )
 from rsvib_torch.detection.tones.further import with_further_tones
-from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
+from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE, find_tones
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.io.files import FramesOrFiles, timing_of_files
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
@@ -164,7 +165,7 @@ def _fit_direct(
     fit = _fit_bands(start, frames, valid, timing, options, accuracy=0.15).fit
     intervals = compared_intervals(timing, frames.shape[1], MAX_GROUP_FRAMES, frames.device)
     motion, scale = shrunk_motion(fit, intervals), options.scale
-    if scale.axes == 2:
+    if scale.same_for_all_columns:
         rows = whole_rows(frames, valid, timing, motion)
     else:
         rows = strip_rows(frames, valid, timing, motion, scale)
@@ -224,8 +225,11 @@ def detect_vibration(
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
     channels: Channels = None,
-    roll: bool | Literal["auto"] = False,
-    zoom: bool | Literal["auto"] = False,
+    roll: bool | Literal["auto"] = "auto",
+    zoom: bool | Literal["auto"] = "auto",
+    focal_length: float | None = None,
+    principal_point: tuple[float, float] | None = None,
+    distortion: tuple[float, float, float, float, float] | None = None,
 ) -> DetectionResult | MotionDetection | SweptTone:
     """Detect the vibration of the camera from consecutive frames (Sec. 2 of Liu et al. 2023).
 
@@ -243,7 +247,7 @@ def detect_vibration(
         model: ``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape; ``"swept"``: one tone per
             axis whose amplitude decays or grows and whose frequency sweeps. The last two take the options from
             ``registration`` to ``search``, ``ignore``, ``full_scale`` and ``channels``; ``detect_motion`` and
-            ``detect_swept_tone`` have further ones.
+            ``detect_swept_tone`` have further ones. ``"free"`` also measures ``roll`` and ``zoom``, if they are True.
         method: ``"direct"``, or ``"bands"`` (the paper's method), in half the time with ten times larger errors.
         registration: Method of the band registration, as in ``register_bands``.
         tones: Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance; the standard deviations
@@ -263,9 +267,15 @@ def detect_vibration(
         channels: ``"last"`` for frames (T, H, W, C) or (B, T, H, W, C). By default channels come before the image axes,
             and frames that appear to have them last are refused; ``"first"`` omits this check.
         roll: Measure the rotation about the optical axis as a third component of the motion, in rad: True, False, or
-            ``"auto"``: if the halves of the rows move apart. Results then have three axes instead of two, see
-            ``Vibration``.
+            ``"auto"``: if the halves of the rows move apart, and not with ``columns``. Results then have three axes
+            instead of two, see ``Vibration``.
         zoom: The same for the change of scale, as a fourth component; includes roll.
+        focal_length: Focal length in px, for a motion that is a rotation of the camera: displacements then follow from
+            the projection (see ``Camera``), which matters for fields of view above about 20 degrees, and the result
+            has an ``attitude``. None: the displacement by translation is the same in the whole frame.
+        principal_point: px along x and y from the centre of the first pixel, as in OpenCV; by default the centre of the
+            frame.
+        distortion: Lens distortion (k1, k2, p1, p2, k3) as in OpenCV; by default none.
 
     Returns:
         The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve: a
@@ -329,6 +339,14 @@ def detect_vibration(
             ignore=ignore,
             full_scale=full_scale,
             channels=channels,
+            **_options_of_field(
+                model,
+                roll=roll is True or None,  # "auto": not measured unless requested
+                zoom=zoom is True or None,
+                focal_length=focal_length,
+                principal_point=principal_point,
+                distortion=distortion,
+            ),
         )
     check_choice("method", method, tuple(_METHODS))
     if tones != "auto":
@@ -339,11 +357,10 @@ def detect_vibration(
     if columns is not None:
         check_whole_number("columns", columns, at_least=64)  # px; narrower bands are often registered wrongly
     bands = RegistrationOptions(registration, band_rows, band_step, search)
-    for name, value in (("roll", roll), ("zoom", zoom)):
-        if value not in (True, False, "auto"):
-            raise ValueError(f"{name} must be True, False or 'auto', got {value!r}")
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
-    field = _Field(roll, zoom, stacks.images.shape[-1], stacks.images.shape[-2])
+    height, width = stacks.images.shape[-2:]
+    camera = camera_in_row_order(focal_length, principal_point, distortion, (height, width), timing)
+    field = _Field.of(roll, zoom, columns, width, height, camera)
     model_of_tones = MotionModel(harmonics, 2 if image_acceleration else 1)
     options = _FitOptions(None if tones == "auto" else tones, model_of_tones, bands, field.scale(2))
     if columns is not None:
@@ -352,21 +369,19 @@ def detect_vibration(
     if window is None:
         found = _detect_field(grey, valid_pixels, timing, _METHODS[method], options, field, find_cause=True)
     else:
-        found = stacked(
-            [
-                _detect_field(
-                    grey[:, part],
-                    None if valid_pixels is None else valid_pixels[:, part],
-                    window_timing,
-                    _METHODS[method],
-                    options,
-                    field,
-                )
-                for part, window_timing in _windows(grey.shape[1], window, window_step, timing)
-            ]
-        )
+        windows = _windows(grey.shape[1], window, window_step, timing)
+        found = _detect_windows(grey, valid_pixels, windows, _METHODS[method], options, field)
     found = replace(found, timing=timing)  # of the stack, not of a window
     return found if stacks.batched else found[0]
+
+
+def _options_of_field(model: str, **options: object) -> dict[str, object]:
+    """Options of roll, zoom and camera that were given for another model than tones."""
+    given = {name: value for name, value in options.items() if value is not None}
+    if given and model == "swept":
+        name, value = next(iter(given.items()))
+        raise ValueError(f"{name}={value!r} goes with model='tones' or 'free', not with model='swept'")
+    return given
 
 
 def _windows(num_frames: int, window: int, step: int | None, timing: SensorTiming) -> list[tuple[slice, SensorTiming]]:
@@ -386,18 +401,63 @@ def _windows(num_frames: int, window: int, step: int | None, timing: SensorTimin
     ]
 
 
+def _detect_windows(
+    frames: Tensor,
+    valid: Tensor | None,
+    windows: list[tuple[slice, SensorTiming]],
+    method: "_Method",
+    options: _FitOptions,
+    field: "_Field",
+) -> DetectionResult:
+    """Results of all windows, with the same axes."""
+
+    def of_window(number: int, field: _Field) -> DetectionResult:
+        part, timing = windows[number]
+        of_pixels = None if valid is None else valid[:, part]
+        return _detect_field(frames[:, part], of_pixels, timing, method, options, field)
+
+    each = [of_window(number, field) for number in range(len(windows))]
+    axes = max(one.vibration.num_axes for one in each)
+    if axes > 2:
+        same = replace(field, roll=True, zoom=axes > 3)
+        each = [one if one.vibration.num_axes == axes else of_window(i, same) for i, one in enumerate(each)]
+    return stacked(each)
+
+
 @dataclass(frozen=True)
 class _Field:
-    """Whether roll and zoom are measured (True, False or ``"auto"``), and the size of the frames."""
+    """Whether roll and zoom are measured (True, False or ``"auto"``), the size of the frames, and the camera."""
 
     roll: bool | Literal["auto"]
     zoom: bool | Literal["auto"]
     width: int
     height: int
+    camera: Camera | None
 
-    def scale(self, axes: int) -> FieldScale:
+    @classmethod
+    def of(
+        cls,
+        roll: bool | Literal["auto"],
+        zoom: bool | Literal["auto"],
+        columns: int | None,
+        width: int,
+        height: int,
+        camera: Camera | None,
+    ) -> "_Field":
+        """The field of checked options; of a part of the columns, roll and zoom are not measured."""
+        for name, value in (("roll", roll), ("zoom", zoom)):
+            if value not in (True, False, "auto"):
+                raise ValueError(f"{name} must be True, False or 'auto', got {value!r}")
+        if columns is not None and (camera is not None or roll is True or zoom is True):
+            raise ValueError(
+                f"columns={columns} goes with roll=False, zoom=False and focal_length=None: roll, zoom and perspective "
+                "are measured from all columns"
+            )
+        return cls(columns is None and roll, columns is None and zoom, width, height, camera)
+
+    def scale(self, axes: int, camera: Camera | None = None) -> FieldScale:
         """Lengths for a motion of so many components."""
-        return FieldScale(axes, self.width, self.height)
+        return FieldScale(axes, self.width, self.height, camera)
 
     @property
     def most_axes(self) -> int:
@@ -421,14 +481,36 @@ def _detect_field(
     find_cause: bool = False,
 ) -> DetectionResult:
     """``_detect`` with as many components as were requested or, with ``"auto"``, as the frames require."""
-    cause: bool | Literal["unless rotating"] = "unless rotating" if find_cause and field.most_axes > 2 else find_cause
-    found, fit, rotates = _detect(frames, valid, timing, method, options, find_cause=cause)
-    if field.most_axes == 2 or (field.least_axes == 2 and not rotates):
-        return found
-    other, _, _ = _detect(frames, valid, timing, method, replace(options, scale=field.scale(field.most_axes)), fit)
-    moving = (other.vibration.amplitude > 0).flatten(0, -3).any(0).any(-1).tolist()
-    axes = max([field.least_axes, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
-    return found if axes == 2 else other.with_axes(axes)
+    alike = _detect(frames, valid, timing, method, options)
+    if field.camera is not None or field.least_axes > 2 or (field.most_axes > 2 and alike.rotates):
+        scale = field.scale(field.most_axes, field.camera)
+        found = _detect(frames, valid, timing, method, replace(options, scale=scale), alike.fit).result
+        # a given number of tones is fitted to all axes, also to those that do not move
+        significant = found.vibration.amplitude > MIN_SIGNIFICANCE * found.std.amplitude
+        moving = significant.flatten(0, -3).any(0).any(-1).tolist()
+        axes = max([field.least_axes, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
+        if axes > 2 or field.camera is not None:
+            return found.with_axes(axes)
+    return _with_cause(alike, frames, valid, timing, method, options) if find_cause else alike.result
+
+
+@dataclass(frozen=True, eq=False)
+class _Detected:
+    """Result of ``_detect``.
+
+    Attributes:
+        result: A batch of results in image axes.
+        fit: Its fit.
+        measurements: The measurements of the fit.
+        rotates: Whether the halves of the rows of any stack move apart.
+        contradicted: For each stack, the axes in row order whose measurements contradict the timing.
+    """
+
+    result: DetectionResult
+    fit: ToneFit
+    measurements: Measurements
+    rotates: bool
+    contradicted: list[tuple[bool, bool]]
 
 
 def _detect(
@@ -438,9 +520,7 @@ def _detect(
     method: _Method,
     options: _FitOptions,
     translation: ToneFit | None = None,
-    *,
-    find_cause: bool | Literal["unless rotating"] = False,
-) -> tuple[DetectionResult, ToneFit, bool]:
+) -> _Detected:
     """``detect_vibration`` of grey frames (B, T, H, W) in row order.
 
     Args:
@@ -450,13 +530,9 @@ def _detect(
         method: How tones are fitted.
         options: Its options.
         translation: Fit without roll and zoom, from which a fit with roll or zoom starts.
-        find_cause: Whether to try other timings if the measurements contradict the stated one.
-
-    Returns:
-        A batch of results in image axes, their fit, and whether the halves of the rows of any stack move apart.
     """
     row_timing, bands, scale = timing.in_row_order(), options.bands, options.scale
-    if scale.axes == 2:
+    if scale.same_for_all_columns:
         start = band_start(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve)
     else:
         start = field_start(frames, valid, row_timing, bands, scale, translation)
@@ -497,20 +573,12 @@ def _detect(
         )
         for index in range(len(frames))
     ]
-    rotates = other_motion is not None and any(rotation_found(other_motion[index]) for index in range(len(frames)))
-    if other_motion is not None and (find_cause is True or (find_cause and not rotates)):
-        for index, (_, reasons) in enumerate(verdicts):
-            axes = contradicted_axes(vibration[index], other_motion[index], max_tones)
-            if not any(axes):
-                continue
-            part = slice(index, index + 1)
-            own = found.measurements.mapped(itemgetter(part))
-            of_stack = frames[part], None if valid is None else valid[part]
-            cause = _wrong_setting(*of_stack, own, axes, timing, method, options)
-            if cause is not None:
-                # the axes have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong
-                both = ((cause, *reasons[0]), (cause, *reasons[1]))
-                verdicts[index] = (torch.zeros_like(verdicts[index][0]), both)
+    rotates, contradicted = False, [(False, False)] * len(frames)
+    if other_motion is not None:
+        rotates = any(rotation_found(other_motion[index]) for index in range(len(frames)))
+        contradicted = [
+            contradicted_axes(vibration[index], other_motion[index], max_tones) for index in range(len(frames))
+        ]
     reliable = torch.stack([verdict[0] for verdict in verdicts])
     swap = timing.scan_axis == -1
     order = ([1, 0, 2, 3] if swap else [0, 1, 2, 3])[: scale.axes]
@@ -539,7 +607,31 @@ def _detect(
         ),
         timing=timing,
     )
-    return result, fit, rotates
+    return _Detected(result, fit, found.measurements, rotates, contradicted)
+
+
+def _with_cause(
+    found: _Detected,
+    frames: Tensor,
+    valid: Tensor | None,
+    timing: SensorTiming,
+    method: _Method,
+    options: _FitOptions,
+) -> DetectionResult:
+    """The result with the timing as a reason, if the measurements contradict the stated one and agree with another."""
+    reliable, all_reasons = found.result.reliable.clone(), list(found.result.reasons)
+    for index, axes in enumerate(found.contradicted):
+        if not any(axes):
+            continue
+        part = slice(index, index + 1)
+        own = found.measurements.mapped(itemgetter(part))
+        of_stack = frames[part], None if valid is None else valid[part]
+        cause = _wrong_setting(*of_stack, own, axes, timing, method, options)
+        if cause is not None:
+            # the axes have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong
+            reliable[index] = False
+            all_reasons[index] = tuple((cause, *reasons) for reasons in all_reasons[index])
+    return replace(found.result, reliable=reliable, reasons=tuple(all_reasons))
 
 
 def _wrong_setting(
@@ -568,7 +660,7 @@ def _wrong_setting(
     def agrees(other: RowTiming, change: Callable[[Tensor], Tensor], concerned: tuple[bool, bool] = axes) -> bool:
         pixels = None if valid is None else change(valid)
         try:
-            found, _, _ = _detect(change(frames), pixels, other, method, options)
+            found = _detect(change(frames), pixels, other, method, options).result
         except ValueError:  # columns may lack the detail that rows have
             return False
         return all(good or not axis for good, axis in zip(found.reliable[0].tolist(), concerned, strict=True))

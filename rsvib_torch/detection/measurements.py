@@ -114,6 +114,15 @@ class Measurements:
         return torch.stack(inverse, -1)
 
     @property
+    def _expected(self) -> Tensor:
+        """(B, N, A) inverse variances that residuals of each axis are compared with.
+
+        x and y of a row are nearly independent. With roll and zoom, x and roll are not: the displacement along x
+        determines ``X - theta y``, so that the information of x alone is far above its inverse variance at large y.
+        """
+        return self.weights if self.information.shape[-1] == 2 else self.inverse_variances
+
+    @property
     def num_differences(self) -> Tensor:
         """(B, N) independent differences within each group: one less than the frames that contain the row."""
         return (self.visible.sum(-1) - 1).clamp(min=0.0)
@@ -174,7 +183,7 @@ class Measurements:
 
     def sizes(self, residual: Tensor) -> Tensor:
         """(B, N, 2) rms residual of each row in standard deviations; NaN where nothing was measured."""
-        return self.distances(residual) * self.weights.sqrt()
+        return self.distances(residual) * self._expected.sqrt()
 
     def distances(self, residual: Tensor) -> Tensor:
         """(B, N, 2) rms residual of each row in px; NaN where nothing was measured."""
@@ -186,7 +195,7 @@ class Measurements:
         """(B, 2) px, rms residual without the part that is explained by noise."""
         measured = (self.weights > 0) & (self.num_differences[..., None] > 0)
         square = residual.square().sum(2) / self.num_differences[..., None].clamp(min=1.0)
-        excess = square - 1 / self.weights.clamp(min=1e-300)
+        excess = square - 1 / self._expected.clamp(min=1e-300)
         return trimmed_mean(torch.where(measured, excess, torch.nan)).clamp(min=0.0).sqrt()
 
     def correlated(self, residual: Tensor, *, significance: float = 1.645) -> Tensor:
@@ -207,16 +216,29 @@ class Measurements:
         Errors of the model correlate the residuals of neighbouring rows, and the variance of a mean is larger by
         ``1 + 2 sum rho(k)``, k = 1 ... ``lags``.
         """
-        scaled = residual * self.weights.sqrt()[:, :, None]
+        scaled = residual * self._expected.sqrt()[:, :, None]
         energy = scaled.square().sum()
         total = sum((scaled[:, lag:] * scaled[:, :-lag]).sum() / energy for lag in range(1, lags + 1))
         return 1.0 / max(1.0, 1.0 + 2.0 * float(total))
 
     # Robust weights
 
+    def _sizes_for_weights(self, residual: Tensor) -> Tensor:
+        """``sizes``; with roll and zoom one of all axes of a row together.
+
+        Unequal weights of correlated components would mix them: a smaller weight of x alone turns the precise
+        combination ``X - theta y`` into another one.
+        """
+        axes = self.information.shape[-1]
+        if axes == 2:
+            return self.sizes(residual)
+        square = torch.einsum("bnga,bnac,bngc->bn", residual, self.information, residual)
+        size = (square / (axes * self.num_differences).clamp(min=1.0)).clamp(min=0.0).sqrt()[..., None]
+        return torch.where(self.distances(residual).isnan(), torch.nan, size)
+
     def for_least_absolute(self, residual: Tensor) -> "Measurements":
         """Weights that make a least-squares fit minimise the sum of absolute residuals, which limits outliers."""
-        size = self.sizes(residual)
+        size = self._sizes_for_weights(residual)
         floor = 0.1 * size.nanmedian(dim=1, keepdim=True).values.nan_to_num(1.0) + 1e-12  # no weight is unbounded
         return self.scaled(1 / torch.maximum(size.nan_to_num(0.0), floor))
 
@@ -242,7 +264,7 @@ class Measurements:
 
         With this limit the biweight is 98 % efficient for Gaussian errors.
         """
-        size = self.sizes(residual)
+        size = self._sizes_for_weights(residual)
         spread = 1.4826 * size.nanmedian(dim=1, keepdim=True).values
         return (size / (6.0 * spread.nan_to_num(1.0).clamp(min=1e-9))).nan_to_num(1.0).clamp(max=1.0)
 

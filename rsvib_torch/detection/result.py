@@ -1,5 +1,6 @@
 """Result of detection: vibration, standard deviations, verdict, and the offset curve."""
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -8,13 +9,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows, plain_values
-from rsvib_torch.core.text import text_table
+from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.io.schema import TimingRecord, detection_summary
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
 
-__all__ = ["DetectionResult", "OtherMotion", "TimingSensitivity", "stacked"]
+__all__ = ["AttitudeTones", "DetectionResult", "OtherMotion", "TimingSensitivity", "stacked"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +95,81 @@ class TimingSensitivity(Result, shapes=_SENSITIVITY_SHAPES):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+class AttitudeTones(
+    Result,
+    units={"amplitude": "rad", "amplitude_std": "rad", "frequency": "Hz", "frequency_std": "Hz", "phase": "rad"},
+    shapes=dict.fromkeys(("amplitude", "amplitude_std", "frequency", "frequency_std", "phase", "phase_std"), "... 3 K"),
+):
+    """Vibration of the attitude of the camera: tones of pitch, yaw and roll with standard deviations, (..., 3, K).
+
+    The rotation is right-handed about the axes x (right), y (down) and z (forward) of the camera, see ``Camera``. Roll
+    that was not measured has amplitude 0 and a standard deviation of infinity.
+
+    Attributes:
+        amplitude: rad.
+        amplitude_std: rad.
+        frequency: Hz.
+        frequency_std: Hz.
+        phase: rad at the time origin.
+        phase_std: rad.
+    """
+
+    amplitude: Tensor
+    amplitude_std: Tensor
+    frequency: Tensor
+    frequency_std: Tensor
+    phase: Tensor
+    phase_std: Tensor
+
+    @classmethod
+    def of(cls, vibration: Vibration, std: VibrationStd) -> "AttitudeTones":
+        """The tones of a vibration with a camera."""
+        camera = vibration.camera
+        if camera is None:
+            raise ValueError("the attitude requires a vibration with a camera")
+        focal_length = camera.focal_length
+
+        def turned(values: Tensor, factors: tuple[float, float, float], without_roll: float) -> Tensor:
+            x, y = values[..., 0, :], values[..., 1, :]
+            roll = values[..., 2, :] if values.shape[-2] > 2 else torch.full_like(x, without_roll)
+            return torch.stack([factors[0] * y, factors[1] * x, factors[2] * roll], -2)
+
+        lengths, ones = (1 / focal_length, 1 / focal_length, 1.0), (1.0, 1.0, 1.0)
+        # yaw = -X / f and roll = -theta: the phase changes by pi
+        opposite = vibration.phase.new_tensor([0.0, math.pi, math.pi])[:, None]
+        phase = torch.remainder(turned(vibration.phase, ones, 0.0) + opposite + math.pi, 2 * math.pi) - math.pi
+        return cls(
+            turned(vibration.amplitude, lengths, 0.0),
+            turned(std.amplitude, lengths, math.inf),
+            turned(vibration.frequency, ones, 0.0),
+            turned(std.frequency, ones, math.inf),
+            phase,
+            turned(std.phase, ones, math.inf),
+        )
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading dimensions: empty for one result, (B,) for a batch of stacks or windows."""
+        return self.amplitude.shape[:-2]
+
+    def summary(self) -> str:
+        """The tones as a table; of a batch, the strongest of each axis."""
+        shown = self.amplitude[..., : 1 if self.batch_shape else None]
+        rows = [
+            [
+                *([", ".join(map(str, batch))] if batch else []),
+                ("pitch", "yaw", "roll")[axis],
+                measured_text(1e3 * self.amplitude[at], 1e3 * self.amplitude_std[at]),
+                measured_text(self.frequency[at], self.frequency_std[at]),
+                measured_text(self.phase[at], self.phase_std[at]),
+            ]
+            for at in map(tuple, shown.nonzero().tolist())
+            for *batch, axis, _ in [at]
+        ]
+        return text_table([*axis_head(self.batch_shape), "amplitude (mrad)", "frequency (Hz)", "phase (rad)"], rows)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class DetectionResult(
     Result,
     units={**Vibration.units, "residual": "px", "gain": "px of offset per px of displacement", "offsets": "s and px"},
@@ -166,6 +242,11 @@ class DetectionResult(
         """Tones of each axis with standard deviations, then the verdict; of a batch, a table with one row per axis."""
         return detection_summary(self)
 
+    @property
+    def attitude(self) -> AttitudeTones | None:
+        """Tones of pitch, yaw and roll in rad; None if no focal length was given."""
+        return None if self.vibration.camera is None else AttitudeTones.of(self.vibration, self.std)
+
     def to_dict(self) -> dict[str, Any]:
         """All values as nested lists, numbers and texts, as in a ``vibration.json``; None for unknown numbers."""
         values = super().to_dict()
@@ -182,10 +263,11 @@ class DetectionResult(
             return values[..., :count]
 
         def of_tones(values: Any) -> Any:
-            kept = {name: value for name, value in vars(values).items() if isinstance(value, Tensor)}
-            return type(values)(
-                **{name: v[..., :count, :] if v.ndim == batch + 2 else v[..., :count] for name, v in kept.items()}
-            )
+            kept = {
+                name: (v[..., :count, :] if v.ndim == batch + 2 else v[..., :count]) if isinstance(v, Tensor) else v
+                for name, v in vars(values).items()
+            }
+            return type(values)(**kept)
 
         def of_reasons(reasons: tuple[Any, ...], depth: int) -> tuple[Any, ...]:
             return reasons[:count] if depth == 0 else tuple(of_reasons(part, depth - 1) for part in reasons)

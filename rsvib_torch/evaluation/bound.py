@@ -1,6 +1,7 @@
 """Cramér-Rao bound of the parameters of a vibration: the smallest standard deviation of an unbiased estimate.
 
-Invariant: the displacement depends on the row only (docs/architecture.md).
+Invariant: the displacement depends on the row only (docs/architecture.md). With roll and zoom, the operator that forms
+the frames is that of the middle column; derivatives by roll and zoom depend on the column.
 """
 
 import math
@@ -18,6 +19,7 @@ from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
 from rsvib_torch.frames.orientation import frames_to_row_order
 from rsvib_torch.imaging import exposure_nodes, exposure_trajectory, rows_showing, simulate_frames
+from rsvib_torch.motion.field import ColumnMotion, displacement_factors
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
@@ -27,6 +29,14 @@ __all__ = ["cramer_rao_bound"]
 _DEGREE = 13  # of the spline across rows; degree 9 changes bounds of a drawn scene by 0.2 %, 15 by 0.05 %
 _MARGIN = 16  # px over which the scene closes to a period; 8 and 32 px change these bounds by less than 3e-5
 _RIDGE = 1e-10  # of the largest element, for scene rows outside all frames; 1e-9, 1e-11: bounds change by 0.8 %
+# Derivative of an image of the scene by a component of the motion, less its sign: terms (field, derivative along x or y
+# or none, factor) with the fields s, y s and x s of the scene s, e.g. for roll -y ds/dx + x ds/dy.
+_DERIVATIVES = (
+    ((0, "x", 1.0),),
+    ((0, "y", 1.0),),
+    ((1, "x", -1.0), (2, "y", 1.0)),
+    ((2, "x", 1.0), (1, "y", 1.0), (0, "", -2.0)),
+)
 
 BoundMethod = Literal["projection", "gradients", "random"]
 # axis, name of the field, tone
@@ -43,11 +53,11 @@ class Recording:
     Attributes:
         scene: (Hs, Ws) float64; frames are centred on it.
         timing: The sensor.
-        motion: The motion.
+        motion: The motion, with two components: with roll and zoom that of the middle column.
         num_frames: Frames taken.
         size: (H, W) of the frames.
-        axes: For each of the P parameters the axis (0: x, 1: y) whose displacement it changes.
-        sensitivity: From times (...) to the derivatives (P, ...) of the displacement along that axis.
+        axes: For each of the P parameters the component of the motion (x, y, roll, zoom) that it changes.
+        sensitivity: From times (...) to the derivatives (P, ...) of that component.
     """
 
     scene: Tensor
@@ -68,11 +78,24 @@ class Recording:
         """(T, R) s, exposure start of every row of every frame."""
         return self.timing.row_starts(self.num_frames, self.size[0], self.scene.device)
 
+    def positions(self) -> tuple[Tensor, Tensor]:
+        """Positions x (1, Ws) and y (Hs, 1) of the scene in px from the centre of the frames."""
+        y, x = (
+            torch.arange(count, dtype=torch.float64, device=self.scene.device) - first - 0.5 * (size - 1)
+            for count, first, size in zip(self.scene.shape, self.origin, self.size, strict=True)
+        )
+        return x[None], y[:, None]
+
+    def factors(self) -> Tensor:
+        """(Hs, Ws, 2, A) displacements of the scene by unit components."""
+        return displacement_factors(*self.positions(), max(self.axes) + 1)
+
 
 def scale_of_information(recording: Recording) -> Tensor:
     """Approximate information (P,) of each parameter for a known scene and unit noise."""
     slope = recording.scene.diff(dim=0).square().mean() + recording.scene.diff(dim=1).square().mean()
-    return recording.sensitivity(recording.starts).square().sum((1, 2)) * slope * recording.size[1]
+    moved = recording.factors().square().sum(2).mean((0, 1))[list(recording.axes)]  # (P,) px^2 of a unit component
+    return recording.sensitivity(recording.starts).square().sum((1, 2)) * moved * slope * recording.size[1]
 
 
 def projected_information(recording: Recording, *, chunk: int = 1 << 17) -> Tensor:
@@ -89,14 +112,21 @@ def projected_information(recording: Recording, *, chunk: int = 1 << 17) -> Tens
     """
     place = _Places.of(recording)
     length = fast_length(recording.scene.shape[1] + 2 * _MARGIN)
-    coefficients = bspline_coefficients(_within_band(recording.scene), _DEGREE, -2)
-    spectra = torch.fft.rfft(extend_rows(coefficients, length, hold=0.0))
+    scene = _within_band(recording.scene)
+    if max(recording.axes) > 1:
+        x, y = recording.positions()
+        moments = torch.stack([torch.ones_like(scene), y.expand_as(scene), x.expand_as(scene)])
+        fields = (scene - scene.mean()) * moments  # the mean has no derivatives; without it the borders are small
+    else:
+        fields = scene[None]
+    coefficients = bspline_coefficients(fields, _DEGREE, -2)
+    spectra = torch.fft.rfft(extend_rows(coefficients, length, hold=0.0))  # (F, Hs, U)
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=spectra.device)
     step = max(1, chunk // place.first.numel())
     residuals = []
     for begin in range(0, len(u), step):
         part = slice(begin, begin + step)
-        residuals.append(_unexplained(place, spectra[:, part], u[part]))
+        residuals.append(_unexplained(place, spectra[..., part], u[part]))
     columns = slice(recording.origin[1], recording.origin[1] + recording.size[1])
     images = torch.fft.irfft(torch.cat(residuals, dim=-1), n=length)[..., columns]  # (P, T, R, W)
     images = (images * _shown_twice(recording)).flatten(1)
@@ -157,12 +187,20 @@ def _unexplained(place: _Places, spectra: Tensor, u: Tensor) -> Tensor:
     ramps = torch.polar(torch.ones_like(angle), angle) * place.weights[:, None]  # (T, R, N, U)
     reach = place.taps.shape[-1]
     source = place.first[..., None] + torch.arange(reach, device=u.device)  # (T, R, J)
-    seen = spectra[mirrored(source, len(spectra))]
-    along = (place.taps.to(seen.dtype) @ seen) * ramps * (-2j * math.pi * u)
-    across = (place.slopes.to(seen.dtype) @ seen) * -ramps
+    images: dict[tuple[int, str], Tensor] = {}  # at the nodes of the exposures, (T, R, N, U)
+    for number, field in enumerate(spectra):
+        seen = field[mirrored(source, len(field))]
+        value = (place.taps.to(seen.dtype) @ seen) * ramps
+        images[number, "x"] = value * (2j * math.pi * u)
+        images[number, "y"] = (place.slopes.to(seen.dtype) @ seen) * ramps
+        images[number, ""] = value
+    by_component = [
+        sum((-factor * images[field, of] for field, of, factor in terms), start=torch.zeros((), device=u.device))
+        for terms in _DERIVATIVES[: max(place.axes) + 1]
+    ]
     derivatives = torch.stack(
         [
-            (sensitivity[..., None] * (along, across)[axis]).sum(-2)
+            (sensitivity[..., None] * by_component[axis]).sum(-2)
             for axis, sensitivity in zip(place.axes, place.sensitivity, strict=True)
         ]
     )
@@ -233,11 +271,13 @@ def gradient_information(recording: Recording, noise: float | None = None) -> Te
     low, high = (torch.where(seen > 0, shift, far) for far in (math.inf, -math.inf))
     columns = torch.arange(recording.scene.shape[1], dtype=torch.float64, device=begin.device) - left
     window = (columns >= -low.amin(1, keepdim=True)) & (columns <= width - 1 - high.amax(1, keepdim=True))
-    products = _gradient_products(recording.scene, window.double(), noise, count)  # (S, 2, 2)
+    factors = recording.factors()
+    products = _gradient_products(recording.scene, factors, window.double(), noise, count)  # (S, A, A)
     times, weights = (value.to(begin.device) for value in exposure_nodes(timing, "gauss", 8))
     means = recording.sensitivity(moments[..., None] + times) @ weights  # over the exposures, (P, S, T)
     sensitivity = (
-        means[..., None] * functional.one_hot(torch.tensor(recording.axes, device="cpu"), 2).to(means)[:, None, None]
+        means[..., None]
+        * functional.one_hot(torch.tensor(recording.axes, device="cpu"), factors.shape[-1]).to(means)[:, None, None]
     )
     mean = (seen[..., None] * sensitivity).sum(2, keepdim=True) / seen.sum(1).clamp(min=1e-300)[:, None, None]
     shared = seen * ((seen > 0).sum(1, keepdim=True) > 1)
@@ -246,8 +286,16 @@ def gradient_information(recording: Recording, noise: float | None = None) -> Te
     return information
 
 
-def _gradient_products(scene: Tensor, window: Tensor, noise: float | None, num_frames: int) -> Tensor:
-    """Sums (S, 2, 2) of the gradient products of each scene row over the columns in the window."""
+def _gradient_products(scene: Tensor, factors: Tensor, window: Tensor, noise: float | None, num_frames: int) -> Tensor:
+    """Sums (S, A, A) of the products of the derivatives by the A components over the columns in the window.
+
+    Args:
+        scene: (S, W).
+        factors: (S, W, 2, A) displacements by unit components.
+        window: (S, W) weights of the columns.
+        noise: As in ``gradient_information``.
+        num_frames: Frames of the scene.
+    """
     lengths = [fast_length(size + 2 * _MARGIN) for size in scene.shape]
     closed = extend_rows(extend_rows(scene, lengths[1], hold=0.0).T, lengths[0], hold=0.0).T
     spectrum = torch.fft.fft2(closed - closed.mean())
@@ -265,7 +313,8 @@ def _gradient_products(scene: Tensor, window: Tensor, noise: float | None, num_f
         power = functional.pad(spectrum.abs().square()[None, None], (size // 2,) * 4, mode="circular")
         power = num_frames * functional.avg_pool2d(power, size, 1)[0, 0]
         weighted = images(slopes * (power / (power + noise**2 * spectrum.numel())))
-    products = torch.einsum("asx,sx,bsx->sab", gradients, window, weighted)
+    derivatives, weighted = (torch.einsum("isx,sxia->asx", values, factors) for values in (gradients, weighted))
+    products = torch.einsum("asx,sx,bsx->sab", derivatives, window, weighted)
     symmetric: Tensor = 0.5 * (products + products.transpose(-2, -1))
     return symmetric
 
@@ -274,9 +323,9 @@ def _gradient_products(scene: Tensor, window: Tensor, noise: float | None, num_f
 
 
 def _parameters(motion: Vibration, acceleration: bool) -> list[_Parameter]:
-    """Unknown parameters: those of all tones of non-zero amplitude, and the image motion of both axes."""
+    """Unknown parameters: those of all tones of non-zero amplitude, and the image motion of all axes."""
     parameters: list[_Parameter] = []
-    for axis in range(2):
+    for axis in range(motion.num_axes):
         for tone in range(motion.amplitude.shape[-1]):
             if float(motion.amplitude[axis, tone]) > 0:
                 parameters += [(axis, name, tone) for name in ("amplitude", "frequency", "phase")]
@@ -286,7 +335,7 @@ def _parameters(motion: Vibration, acceleration: bool) -> list[_Parameter]:
 
 
 def _sensitivity(motion: Vibration, parameter: _Parameter, times: Tensor) -> Tensor:
-    """Derivative of the displacement at ``times`` by a parameter."""
+    """Derivative of a component of the motion at ``times`` by a parameter."""
     axis, name, tone = parameter
     if name == "image_motion":
         return times
@@ -334,7 +383,8 @@ def cramer_rao_bound(
     A the operator that forms the frames, ``J = D' (1 - A (A' A)^-1 A') D / noise^2`` is the information if the scene is
     unknown too, and the bound is the root of the diagonal of its inverse.
     All parameters are unknown together: amplitude, frequency and phase (at the time origin) of all tones, and the
-    image motion. ``docs/bound.md`` has the derivation.
+    image motion, of all axes of the motion: x and y, with three or four axes also roll and zoom, tones of amplitude 0
+    included in the image motion only. ``docs/bound.md`` has the derivation.
 
     Args:
         scene: (H, W) noise-free still scene, floating point, full scale 1, larger than the frames.
@@ -373,6 +423,8 @@ def cramer_rao_bound(
         raise ValueError(f"scene must have shape (H, W), got {tuple(scene.shape)}")
     if num_frames < 2:
         raise ValueError(f"num_frames must be at least 2, got {num_frames}")
+    if vibration.camera is not None:
+        raise ValueError("the bound is not defined with a camera: pass the vibration without camera=")
     # the simulation checks the sizes and the motion
     frames = simulate_frames(scene.double(), timing, vibration, num_frames, frame_size=frame_size)
     motion = vibration.to_row_order(timing).to(scene.device)
@@ -381,7 +433,7 @@ def cramer_rao_bound(
     recording = Recording(
         scene=frames_to_row_order(scene.double(), timing),
         timing=timing.in_row_order(),
-        motion=motion,
+        motion=_of_middle_column(motion, timing.in_row_order(), num_frames, frames.shape[-2]),
         num_frames=num_frames,
         size=(frames.shape[-2], frames.shape[-1]),
         axes=tuple(axis for axis, _, _ in parameters),
@@ -398,6 +450,16 @@ def cramer_rao_bound(
     for (axis, name, tone), deviation in zip(parameters, deviations, strict=True):
         std[name][(axis, tone) if std[name].ndim == 2 else axis] = deviation
     std["period"] = std["frequency"] / torch.where(motion.frequency > 0, motion.frequency, 1.0).square()
-    if timing.scan_axis == -1:
-        std = {name: value.flip(0) for name, value in std.items()}
-    return VibrationStd(**std)
+    return VibrationStd(**std).from_row_order(timing)
+
+
+def _of_middle_column(motion: Vibration, timing: RowTiming, num_frames: int, num_rows: int) -> Motion:
+    """Motion with two components, of the middle column if there are roll and zoom.
+
+    Roll shows the content of one scene row in different frame rows, by 1 px at 1 mrad and 1000 px from the centre.
+    Their times then differ by a row time, which changes the information by less than a thousandth.
+    """
+    if motion.num_axes == 2:
+        return motion
+    middle = torch.zeros(1, dtype=torch.float64, device=motion.device)
+    return ColumnMotion.of_columns(motion.expanded(1), middle, timing, num_frames, num_rows)[0]

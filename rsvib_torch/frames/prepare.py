@@ -13,7 +13,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import MAX_NUMBER, check_number
+from rsvib_torch.core.arguments import check_pixels
+from rsvib_torch.core.checks import check_number
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import fill_with_means
@@ -190,15 +191,7 @@ def as_float_frames(
         remedy = f"; pass {name}.float()" if frames.dtype == torch.bool else ""
         raise TypeError(f"{name} must be real numbers, got {frames.dtype}{remedy}")
     if frames.dtype.is_floating_point:
-        ends = torch.stack(frames.detach().aminmax())  # one pass; propagates NaN and infinity
-        if not bool(torch.isfinite(ends).all()):
-            pixel = tuple((~torch.isfinite(frames)).nonzero()[0].tolist())
-            raise ValueError(f"{name} must be finite, but pixel {pixel} is {frames[pixel].item()}")
-        if bool((ends.abs() > MAX_NUMBER).any()):
-            largest = float(ends.abs().max())
-            raise ValueError(
-                f"{name} reach {largest:.3g}, at most {MAX_NUMBER:g} is possible: divide them by their full scale"
-            )
+        check_pixels(name, frames)
         return frames if frames.dtype == torch.float64 else frames.to(torch.float32)
     if full_scale is None:
         if frames.dtype != torch.uint8:

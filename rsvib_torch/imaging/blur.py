@@ -8,10 +8,13 @@ import math
 import torch
 from torch import Tensor, nn
 
-from rsvib_torch.core.arguments import check_shapes, checks_arguments
+from rsvib_torch.core.arguments import check_broadcast, check_images, checks_arguments
+from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.splines import bspline_coefficients, bspline_coefficients_adjoint, mirrored
 from rsvib_torch.imaging.psf import RowPSF
+from rsvib_torch.motion.timing import MAX_ROWS
 
 __all__ = ["RowVaryingBlur", "blur_rows", "blur_rows_adjoint"]
 
@@ -58,6 +61,7 @@ def blur_rows(
     width, origin = _frame_size(psf, size, frame_width, origin)
     coefficients = bspline_coefficients(bspline_coefficients(scene, psf.degree, -1), psf.degree, -2)
     weights = psf.weights.to(scene.dtype)
+    check_broadcast(scene=scene[..., 0, 0], psf=weights[..., 0, 0, 0])
     lead = torch.broadcast_shapes(scene.shape[:-2], weights.shape[:-3])
     flat = coefficients.flatten(-2).expand(*lead, -1)
     num_rows, kernel_height, kernel_width = weights.shape[-3:]
@@ -87,14 +91,22 @@ def blur_rows_adjoint(
     Returns:
         Tensor of shape ``scene_shape``.
     """
-    if len(scene_shape) < 2:
-        raise ValueError(f"scene_shape must have at least 2 sizes (..., height, width), got {len(scene_shape)}")
+    if len(scene_shape) < 2 or min(scene_shape) < 1:
+        raise ValueError(f"scene_shape must be (..., height, width), all at least 1, got {tuple(scene_shape)}")
     size = (scene_shape[-2], scene_shape[-1])
     width, origin = _frame_size(psf, size, frames.shape[-1], origin)
     weights = psf.weights.to(frames.dtype)
     if frames.shape[-2] != weights.shape[-3]:
         raise ValueError(f"frames must have the {weights.shape[-3]} rows of the kernels, got {frames.shape[-2]}")
+    check_broadcast(frames=frames[..., 0, 0], psf=weights[..., 0, 0, 0])
     lead = torch.broadcast_shapes(frames.shape[:-2], weights.shape[:-3])
+    summed = zip(reversed(scene_shape[:-2]), reversed(lead), strict=False)
+    if len(scene_shape) - 2 > len(lead) or any(one not in (1, many) for one, many in summed):
+        raise ValueError(f"scene_shape {tuple(scene_shape)} does not broadcast to the frames {(*lead, *size)}")
+    if frames.device.type == "cpu":
+        scene_bytes = math.prod((*lead, *size)) * frames.element_size()
+        if scene_bytes > 10**7:  # reading the free memory takes 0.5 ms, which would matter for small images
+            check_fits(f"scenes {(*lead, *size)}", 2 * scene_bytes, "check scene_shape")
     flat = frames.new_zeros(*lead, math.prod(size))
     num_rows, kernel_height, kernel_width = weights.shape[-3:]
     for tap in range(kernel_height):
@@ -140,8 +152,9 @@ class RowVaryingBlur(nn.Module):
         scene_size: tuple[int, int] | None = None,
     ) -> None:
         super().__init__()
-        if not isinstance(psf, RowPSF):
-            raise TypeError(f"psf must be a RowPSF (row_psf), got {type(psf).__name__}")
+        for name, size in (("frame_width", frame_width), *(("scene_size", size) for size in scene_size or ())):
+            if size is not None:
+                check_whole_number(name, size, at_least=1, at_most=MAX_ROWS)
         self.register_buffer("first_tap", psf.first_tap)
         self.register_buffer("weights", psf.weights)
         self.degree = psf.degree
@@ -157,12 +170,13 @@ class RowVaryingBlur(nn.Module):
     @checks_arguments
     def forward(self, scene: Tensor) -> Tensor:
         """Form frames (..., R, W) from a scene (..., Hs, Ws)."""
-        check_shapes({"scene": scene}, {"scene": "... H W"})
+        check_images({"scene": scene}, {"scene": "... H W"})
         return blur_rows(scene, self.psf, frame_width=self.frame_width, origin=self.origin)
 
     @checks_arguments
     def adjoint(self, frames: Tensor, scene_shape: tuple[int, ...]) -> Tensor:
         """Apply the exact adjoint to frames (..., R, W)."""
+        check_images({"frames": frames}, {"frames": "... R W"})
         return blur_rows_adjoint(frames, self.psf, scene_shape, origin=self.origin)
 
     @checks_arguments
@@ -173,6 +187,7 @@ class RowVaryingBlur(nn.Module):
     @checks_arguments
     def A_adjoint(self, y: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
         """``adjoint`` for scenes with the leading dimensions of the frames and ``scene_size``."""
+        check_images({"y": y}, {"y": "... R W"})
         size = (y.shape[-2], y.shape[-1]) if self.scene_size is None else self.scene_size
         return self.adjoint(y, (*y.shape[:-2], *size))
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice
+from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.splines import bspline_weights, spread_taps
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.motion.motion import Motion
@@ -74,6 +75,21 @@ def _axis_weights(displacement: Tensor, degree: int) -> tuple[Tensor, Tensor]:
     return first - degree // 2, weights
 
 
+def _check_memory(displacement: Tensor, degree: int) -> None:
+    """Raise a ``ValueError`` unless the kernels fit into the free memory; a GPU raises an error of its own."""
+    if displacement.device.type != "cpu":
+        return
+    reach = (displacement.amax(-2) - displacement.amin(-2)).reshape(-1, 2)
+    width, height = (int(size) + degree + 2 for size in reach.amax(0).tolist())
+    needed = 8 * len(reach) * (height * width + displacement.shape[-2] * (height + width))
+    if needed > 10**7:  # reading the free memory takes 0.5 ms, which would matter for small images
+        check_fits(
+            f"point spread functions of {len(reach)} rows, {height} x {width} px,",
+            needed,
+            "check amplitude (px), frequency (Hz) and exposure_rows",
+        )
+
+
 @checks_arguments
 def row_psf(
     vibration: Motion,
@@ -127,6 +143,7 @@ def trajectory_psf(displacement: Tensor, node_weights: Tensor, *, interpolation:
     """
     check_choice("interpolation", interpolation, tuple(SPLINE_DEGREES))
     degree = SPLINE_DEGREES[interpolation]
+    _check_memory(displacement.detach(), degree)
     first_x, weights_x = _axis_weights(displacement[..., 0], degree)
     first_y, weights_y = _axis_weights(displacement[..., 1], degree)
     weights = (weights_y * node_weights[:, None]).transpose(-2, -1) @ weights_x

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_broadcast, check_shapes, checks_arguments
+from rsvib_torch.core.arguments import check_broadcast, check_images, check_pixels, checks_arguments
 from rsvib_torch.core.checks import check_number, check_whole_number
 
 __all__ = ["Optics", "SensorNoise"]
@@ -60,9 +60,7 @@ class Optics:
         Raises:
             TypeError: If the scene is not a floating-point tensor.
         """
-        if not isinstance(scene, Tensor) or not scene.dtype.is_floating_point:
-            raise TypeError("scene must be a floating-point tensor (..., H, W)")
-        check_shapes({"scene": scene}, {"scene": "... H W"})
+        check_images({"scene": scene}, {"scene": "... H W"})
         height, width = scene.shape[-2:]
         wide = scene.to(torch.promote_types(scene.dtype, torch.float32))  # there is no FFT of 16 bits on the CPU
         mirrored = torch.cat([wide, wide.flip(-1)], dim=-1)
@@ -137,8 +135,14 @@ class SensorNoise:
         Args:
             frames: Noise-free frames (..., H, W) of the whole sensor, full scale 1.
             generator: Source of randomness, on the device of the frames.
+
+        Raises:
+            TypeError: If the frames are not a floating-point tensor.
+            ValueError: If a pixel is NaN or infinite.
         """
         patterned = self.gain_spread > 0 or self.column_offset > 0 or self.row_offset > 0
+        check_images({"frames": frames}, {"frames": "... H W" if patterned else "..."})
+        check_pixels("frames", frames)
         if patterned:
             gain, offset = (part.to(frames) for part in self.fixed_pattern(*frames.shape[-2:]))
             frames = frames * gain

@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import check_pixels, checks_arguments
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
@@ -85,8 +85,9 @@ def simulate_frames(
             f"scene must be a floating-point tensor whose full scale is 1, got {scene.dtype}; divide counts by their "
             "full scale, e.g. scene / 255"
         )
-    if scene.ndim not in (2, 3) or not bool(torch.isfinite(scene).all()):
-        raise ValueError(f"scene must be a finite (H, W) or (C, H, W) tensor, got shape {tuple(scene.shape)}")
+    if scene.ndim not in (2, 3) or not scene.numel():
+        raise ValueError(f"scene must be a (H, W) or (C, H, W) tensor, got shape {tuple(scene.shape)}")
+    check_pixels("scene", scene)
     if channels_appear_last(scene.shape):
         raise ValueError(
             f"scene of shape {tuple(scene.shape)} appears to have its channels last: pass scene.permute(2, 0, 1)"

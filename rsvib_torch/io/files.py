@@ -318,8 +318,6 @@ def check_info_target(
         )
     if info.dtype not in form.dtypes:
         raise ValueError(f"{path}: {form.name} files hold {', '.join(form.dtypes)}; got dtype {info.dtype}")
-    if len(info.shape) not in (3, 4) or min(info.shape) < 1:
-        raise ValueError(f"frames must have shape (T, H, W) or (T, C, H, W), got {tuple(info.shape)}")
     if compression is not None:
         if not form.compressions:
             raise ValueError(f"{path}: compression={compression!r} is only available for TIFF files; omit it")
@@ -371,6 +369,8 @@ def check_stack_target(
     Returns:
         The full scale that would be used; None for floats.
     """
+    if len(shape) not in (3, 4) or min(shape) < 1:
+        raise ValueError(f"frames must have shape (T, H, W) or (T, C, H, W), got {tuple(shape)}")
     kind = np.dtype(dtype or np.float32)
     if kind.kind == "f":
         full_scale = None

@@ -110,6 +110,8 @@ class StackInfo(Summarised):
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if len(self.shape) not in (3, 4) or min(self.shape) < 1:
+            raise ValueError(f"shape must be (T, H, W) or (T, C, H, W) with sizes of at least 1, got {self.shape}")
 
     def summary(self) -> str:
         """The stack in one line."""

@@ -240,9 +240,22 @@ def _info(
     return replace(info, metadata=read_metadata(tif, info))
 
 
+def _all_series(tif: Any) -> Sequence[Any]:
+    """The series of pages of a file, with their axes of length 1: an option from tifffile 2026.5.2 on."""
+    series: Sequence[Any] = tif.series(squeeze=False) if callable(tif.series) else tif.series
+    return series
+
+
+def _axes_of(series: Any) -> tuple[str, tuple[int, ...]]:
+    """Axes of a series and their sizes, those of length 1 included."""
+    if hasattr(series, "get_axes"):  # before tifffile 2026.5.2
+        return series.get_axes(squeeze=False), series.get_shape(squeeze=False)
+    return series.axes, series.shape
+
+
 def _series_info(tif: Any, series: Any) -> tuple[StackInfo, tuple[int, ...]]:
     """The stack in a series of pages, and the permutation of the stored axes into (ones, T, C, H, W)."""
-    axes, shape = series.get_axes(squeeze=False), series.get_shape(squeeze=False)
+    axes, shape = _axes_of(series)
     rows, columns = axes.index("Y"), axes.index("X")
     channels = [i for i, axis in enumerate(axes) if axis in "SC" and shape[i] > 1]
     times = [i for i in range(len(axes)) if i not in (rows, columns, *channels) and shape[i] > 1]
@@ -265,7 +278,8 @@ class _WholeReader(BlockReader):
 
     def read_block(self, first: int, last: int) -> NDArray[Any]:
         """All frames, (T, H, W) or (T, C, H, W)."""
-        pixels: NDArray[Any] = self._tif.series[0].asarray(squeeze=False, maxworkers=1)
+        series = _all_series(self._tif)[0]
+        pixels: NDArray[Any] = series.asarray(maxworkers=1).reshape(_axes_of(series)[1])
         return pixels.transpose(self._order).reshape(self.info.shape)
 
     def close(self) -> None:
@@ -284,8 +298,8 @@ class _SeriesReader:
     def __init__(self, path: Path, tif: Any, info: StackInfo, order: tuple[int, ...], complete: list[bool]) -> None:
         self.info = info
         self._path, self._tif, self._order, self._complete = path, tif, order, complete
-        series, T = tif.series[0], info.shape[0]
-        shape = series.get_shape(squeeze=False)
+        series, T = _all_series(tif)[0], info.shape[0]
+        _, shape = _axes_of(series)
         self._pages, rest = divmod(len(series.pages), T)
         time = order[len(order) - len(info.shape)] if T > 1 else None
         if rest or self._pages < 1 or (time is not None and any(size > 1 for size in shape[:time])):
@@ -298,7 +312,7 @@ class _SeriesReader:
         if not all(self._complete[number] for number in numbers):
             raise FrameError(f"{self._path}: truncated: pixels of frame {index} lie beyond the end of the file")
         with readable_frame(self._path, index):
-            pages = [self._tif.series[0].pages[number].asarray(maxworkers=1) for number in numbers]
+            pages = [_all_series(self._tif)[0].pages[number].asarray(maxworkers=1) for number in numbers]
             stored = np.stack(pages).reshape(self._frame_shape).transpose(self._order)
             return np.ascontiguousarray(stored.reshape(self.info.shape[1:]))
 
@@ -385,7 +399,7 @@ def _series_of_all_frames(tif: Any) -> Any | None:
     except RuntimeError:  # pages differ
         return None
     if len(series) == 1 and series[0].kind not in ("uniform", "generic"):
-        return series[0]
+        return _all_series(tif)[0]
     for one in series:
         _check_one_page_per_frame(one.shape, one.axes, len(one.pages))
     return None
@@ -412,7 +426,7 @@ def open_tiff(path: Path) -> FrameReader:
                 dtype = series.dtype.newbyteorder(tif.byteorder)
                 if frame_by_frame:
                     return ContiguousReader(path, info, series.dataoffset, dtype)
-                shape, axes = (1, *series.get_shape(squeeze=False)), (0, *(axis + 1 for axis in order))
+                shape, axes = (1, *_axes_of(series)[1]), (0, *(axis + 1 for axis in order))
                 return InterleavedReader(path, info, series.dataoffset, dtype, shape, axes)
             complete = _complete_pages(tif, headers, range(len(headers)), path.stat().st_size)
             try:

@@ -54,17 +54,19 @@ def _av() -> Any:
 def _open_container(path: Path) -> Any:
     """Open a video for decoding; formats that refer to other files (playlists) are refused."""
     formats = "matroska,webm,avi,mov,mp4,mpegts,mpeg,mpegvideo,asf"
-    return _av().open(str(path), metadata_errors="replace", options={"format_whitelist": formats})
+    av = _av()
+    before = {"metadata_errors": "replace"} if int(av.__version__.partition(".")[0]) < 19 else {}  # later: always
+    return av.open(str(path), options={"format_whitelist": formats}, **before)
 
 
 def _orientation(frame: Any) -> int:
     """Value of the orientation tag that corresponds to the display matrix of a frame."""
-    for data in frame.side_data:
-        if data.type.name == "DISPLAYMATRIX":
-            a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
-            signs = tuple(round(value / max(map(abs, (a, b, c, d, 1)))) for value in (a, b, c, d))
-            return next((tag for tag, matrix in _MATRICES.items() if matrix == signs), 1)
-    return 1
+    data = frame.side_data.get("DISPLAYMATRIX")
+    if data is None:
+        return 1
+    a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
+    signs = tuple(round(value / max(map(abs, (a, b, c, d, 1)))) for value in (a, b, c, d))
+    return next((tag for tag, matrix in _MATRICES.items() if matrix == signs), 1)
 
 
 def _conversion() -> Any:

@@ -8,11 +8,18 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_broadcast, checks_arguments
-from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.checks import check_number, check_whole_number
 
 __all__ = ["Camera"]
 
 _NEWTON_STEPS = 8  # of the inverse of the distortion; quadratic convergence, 1e-13 after 6 steps for 60 degrees
+
+
+def _first(components: Tensor) -> Tensor:
+    """The first of 2 to 4 components of a motion (S, A)."""
+    if components.ndim == 0 or not 2 <= components.shape[-1] <= 4:
+        raise ValueError(f"components must have the shape (..., A) with A = 2 to 4, got {tuple(components.shape)}")
+    return components[..., 0]
 
 
 @dataclass(frozen=True)
@@ -63,8 +70,11 @@ class Camera:
                 check_number(name, value, at_least=-1e6, at_most=1e6)
             object.__setattr__(self, name, tuple(float(value) for value in values))
 
+    @checks_arguments
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> "Camera":
         """The camera for images whose axis k (x, y) is ``signs[k]`` times axis ``order[k]`` of these images."""
+        if sorted(order)[:2] != [0, 1] or any(sign not in (1, -1) for sign in signs):
+            raise ValueError(f"order must be a permutation of the axes and signs 1 or -1, got {order} and {signs}")
         x, y = (signs[k] * self.principal_point[order[k]] for k in (0, 1))
         k1, k2, p1, p2, k3 = self.distortion
         tangential = (p2, p1)  # along x, along y
@@ -93,8 +103,10 @@ class Camera:
             -2,
         )
 
-    def _normalised(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """(u, v) of image points in px from the centre of the frame."""
+    @checks_arguments
+    def rays(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """(u, v) of the rays (u, v, 1) of image points in px from the centre of the frame, by Newton's method."""
+        check_broadcast(x=x, y=y)
         x, y = torch.broadcast_tensors(x, y)
         along, across = (
             (x - self.principal_point[0]) / self.focal_length,
@@ -124,7 +136,7 @@ class Camera:
         """
         x = torch.linspace(-0.5, 0.5, 33, dtype=torch.float64) * width
         y = torch.linspace(-0.5, 0.5, 33, dtype=torch.float64)[:, None] * height
-        u, v = self._normalised(x, y)
+        u, v = self.rays(x, y)
         back = self._distorted(u, v)
         px = self.focal_length * torch.stack([u, v])
         missed = max(
@@ -148,27 +160,30 @@ class Camera:
             x: px, position at rest.
             y: The same along y.
         """
-        check_broadcast(components=components[..., 0], x=x, y=y)
-        x, y = x.to(components), y.to(components)
-        u, v = self._normalised(x, y)
-        pitch, yaw = components[..., 1] / self.focal_length, -components[..., 0] / self.focal_length
+        check_broadcast(components=_first(components), x=x, y=y)
+        return self.displacement_of_rays(components, *self.rays(x.to(components), y.to(components)))
+
+    @checks_arguments
+    def displacement_of_rays(self, components: Tensor, u: Tensor, v: Tensor) -> Tensor:
+        """``displacement`` of the content at the rays (u, v, 1)."""
+        check_broadcast(components=_first(components), u=u, v=v)
+        pitch, yaw = components[..., 1] / self.focal_length, components[..., 0] / -self.focal_length
         roll = -components[..., 2] if components.shape[-1] > 2 else torch.zeros_like(pitch)
-        pitch, yaw, roll, u, v = torch.broadcast_tensors(pitch, yaw, roll, u, v)
         # Rodrigues: R(-w) r = cos a r - sinc(a) w x r + (1 - cos a) / a^2 w (w . r), a = |w|
         squared = pitch.square() + yaw.square() + roll.square()
-        angle = (squared + 1e-300).sqrt()
+        angle = squared.sqrt() if not components.requires_grad else (squared + 1e-300).sqrt()
         sine = torch.sinc(angle / math.pi)
-        versed = 0.5 * torch.sinc(0.5 * angle / math.pi).square()
-        along = versed * (pitch * u + yaw * v + roll)
+        versed = 0.5 * torch.sinc(angle / (2 * math.pi)).square()
         cosine = 1 - versed * squared
+        along = versed * (pitch * u + yaw * v + roll)
         turned_x = cosine * u - sine * (yaw - roll * v) + along * pitch
         turned_y = cosine * v - sine * (roll * u - pitch) + along * yaw
         turned_z = cosine - sine * (pitch * v - yaw * u) + along * roll
-        new_x, new_y = self._distorted(turned_x / turned_z, turned_y / turned_z)
-        scale = self.focal_length * (1 + components[..., 3] if components.shape[-1] > 3 else 1.0)
-        return torch.stack(
-            [scale * new_x + self.principal_point[0] - x, scale * new_y + self.principal_point[1] - y], -1
-        )
+        moved = torch.stack(self._distorted(turned_x / turned_z, turned_y / turned_z), -1)
+        rest = torch.stack(self._distorted(u, v), -1)
+        if components.shape[-1] > 3:
+            moved = moved * (1 + components[..., 3:])
+        return self.focal_length * (moved - rest)
 
     @checks_arguments
     def factors(self, x: Tensor, y: Tensor, axes: int) -> Tensor:
@@ -183,8 +198,9 @@ class Camera:
             >>> Camera(1000.0).factors(torch.tensor(500.0), torch.tensor(0.0), 3).tolist()
             [[1.25, 0.0, 0.0], [0.0, 1.0, 500.0]]
         """
+        check_whole_number("axes", axes, at_least=2, at_most=4)
+        u, v = self.rays(x, y)
         x, y = torch.broadcast_tensors(x, y)
-        u, v = self._normalised(x, y)
         f = self.focal_length
         rotation = torch.stack(
             [torch.stack([1 + u * u, u * v, -f * v], -1), torch.stack([u * v, 1 + v * v, f * u], -1)], -2

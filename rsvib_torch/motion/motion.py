@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Self
 
@@ -12,7 +13,7 @@ from rsvib_torch.core.arguments import check_broadcast, checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming
 
 __all__ = ["Motion"]
 
@@ -215,6 +216,12 @@ class Motion(Result, ABC):
         if len(signs) != self.num_axes or any(sign not in (1, -1) for sign in signs):
             raise ValueError(f"signs must be {self.num_axes} values of 1 or -1, got {list(signs)}")
 
+    def with_camera(self, camera: Camera | None) -> Self:
+        """The same components with another camera."""
+        result = copy(self)
+        object.__setattr__(result, "camera", camera)
+        return result
+
     def detached(self) -> Self:
         """The same motion without gradients."""
         return self.mapped(Tensor.detach)
@@ -222,7 +229,7 @@ class Motion(Result, ABC):
     @checks_arguments
     def expanded(self, size: int) -> Self:
         """A batch of ``size`` copies of the motion; the new dimension is the first."""
-        check_whole_number("size", size, at_least=1)
+        check_whole_number("size", size, at_least=1, at_most=MAX_BATCH)
         return self.mapped(lambda values: values.expand(size, *values.shape))
 
     @checks_arguments

@@ -176,9 +176,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
             raise ValueError(f"motions of different knots cannot be stacked: {sorted(knots)}")
         if any(m.camera != first.camera for m in motions):
             raise ValueError("motions of different cameras cannot be stacked")
-        names = ("amplitude", "frequency", "phase", "image_motion", "image_acceleration")
-        values = {name: torch.stack([getattr(m.tones, name) for m in motions]) for name in names}
-        tones = Vibration(camera=None, **values)
+        tones = Vibration.stacked([m.tones for m in motions])
         return cls(torch.stack([m.coefficients for m in motions]), first.start, first.spacing, tones, first.camera)
 
     def summary(self) -> str:

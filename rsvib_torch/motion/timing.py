@@ -21,6 +21,7 @@ __all__ = ["RowTiming", "SensorTiming", "check_timing"]
 
 MIN_ROW_TIME = 1e-9  # s; the fastest sensors read a row in 0.1 us
 MAX_FRAMES, MAX_ROWS = 10**8, 10**6  # 40 days of a camera with 30 frames/s; the largest sensors have 3e4 rows
+MAX_BATCH = 10**6  # stacks; their frames of 128 x 128 px would fill 130 GB
 MAX_START_TIME = 1e10  # s; clocks that count from 1970 read 1.8e9 s, to 2e-7 s in float64
 _SCAN_AXES: dict[object, int] = {-2: -2, "y": -2, -1: -1, "x": -1}
 

@@ -11,12 +11,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.arguments import as_numbers, check_broadcast, checks_arguments
-from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming
 
 __all__ = ["Vibration", "VibrationStd", "blind_frequencies", "image_motion_line", "tone_head", "tone_rows"]
 
@@ -174,8 +174,36 @@ class Vibration(Motion, units=_UNITS):
     @checks_arguments
     def still(cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None, *, axes: int = 2) -> Self:
         """No vibration and no image motion: the camera stands still."""
-        zeros = torch.zeros(*batch_shape, axes, 1, dtype=torch.float64, device=device)
+        sizes = [check_whole_number("batch_shape", size, at_least=1, at_most=MAX_BATCH) for size in batch_shape]
+        if math.prod(sizes) > MAX_BATCH:
+            raise ValueError(f"batch_shape must have at most {MAX_BATCH} motions, got {tuple(sizes)}")
+        zeros = torch.zeros(*sizes, axes, 1, dtype=torch.float64, device=device)
         return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0])
+
+    @classmethod
+    @checks_arguments
+    def stacked(cls, vibrations: Sequence["Vibration"]) -> "Vibration":
+        """Vibrations with the same shape and camera as a batch; the new dimension is the first.
+
+        Example:
+            >>> Vibration.stacked([Vibration(2.0, 50.0), Vibration(3.0, 40.0)]).amplitude.shape
+            torch.Size([2, 2, 1])
+        """
+        if len(vibrations) == 0:
+            raise ValueError("vibrations must contain at least one vibration")
+        first = vibrations[0]
+        if any(one.camera != first.camera for one in vibrations):
+            raise ValueError("motions of different cameras cannot be stacked")
+        if len({one.amplitude.shape for one in vibrations}) > 1:
+            raise ValueError(f"vibrations differ in shape: {sorted({tuple(v.amplitude.shape) for v in vibrations})}")
+        return cls(
+            torch.stack([one.amplitude for one in vibrations]),
+            torch.stack([one.frequency for one in vibrations]),
+            torch.stack([one.phase for one in vibrations]),
+            torch.stack([one.image_motion for one in vibrations]),
+            torch.stack([one.image_acceleration for one in vibrations]),
+            first.camera,
+        )
 
     def translation(self) -> "Vibration":
         """The components x and y: the motion of the centre of the frame, without roll and zoom.
@@ -341,7 +369,7 @@ class VibrationStd(
     Result,
     units=_UNITS | {"displacement": "px"},
     shapes={
-        **dict.fromkeys(("amplitude", "frequency", "period", "phase"), "... A K"),
+        **dict.fromkeys(("amplitude", "frequency", "period", "phase"), "... A=2-4 K"),
         **dict.fromkeys(("image_motion", "image_acceleration", "displacement"), "... A"),
     },
 ):

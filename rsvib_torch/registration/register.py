@@ -35,9 +35,9 @@ class OffsetCurve(
     shapes={
         "pairs": "P 2",
         "rows": "N",
-        "times": "... P N",
-        "later_times": "... P N",
-        "offsets": "... P N A",
+        "offsets": "... P N A=2-4",
+        "times": "[...] P N",
+        "later_times": "[...] P N",
         "quality": "... P N",
         "std": "... P N A",
     },

@@ -1,3 +1,6 @@
+from .export.angular_rates import write_gcsv
+from .export.community_sensor_model import camera_isd, write_isd
+from .export.pixel_map import sampling_map, write_stmap
 from .html import Box, Report, write_report_page
 from .plots import (
     comparison_figure,
@@ -15,6 +18,7 @@ from .results import read_vibration, write_offsets, write_restoration, write_vib
 __all__ = [
     "Box",
     "Report",
+    "camera_isd",
     "comparison_figure",
     "gain_figure",
     "motion_figure",
@@ -23,11 +27,15 @@ __all__ = [
     "psf_figure",
     "read_vibration",
     "rows_figure",
+    "sampling_map",
     "save_figure",
     "windows_figure",
+    "write_gcsv",
+    "write_isd",
     "write_offsets",
     "write_report_page",
     "write_restoration",
+    "write_stmap",
     "write_vibration",
     "write_windows",
 ]

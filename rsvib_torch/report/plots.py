@@ -522,6 +522,7 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figur
         ['displacement (px)', 'motion blur (px)']
     """
     _check_one(vibration)
+    vibration = vibration.detached()
     starts = timing.row_starts(1, num_rows)[0]
     figure = _Drawing(figsize=(5.6, 4.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
@@ -558,6 +559,7 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
     """
     _check_one(vibration)
     check_whole_number("num_rows", num_rows, at_least=1)
+    vibration = vibration.detached()
     down, across = 3, 8
     rows = torch.linspace(0, num_rows - 1, down * across, dtype=torch.float32, device="cpu").round()
     starts = timing.row_starts(1, num_rows)[0][rows.long()]
@@ -659,7 +661,8 @@ def comparison_figure(
         >>> len(comparison_figure(frame, frame, count=2, size=32).axes)
         4
     """
-    check_shapes({"raw": raw, "restored": restored}, {"raw": "... H W", "restored": "... H W"})
+    raw, restored = (frame[None] if frame.ndim == 2 else frame for frame in (raw, restored))
+    check_shapes({"raw": raw, "restored": restored}, {"raw": "C H W", "restored": "C H W"})
     check_whole_number("count", count, at_least=1)
     check_whole_number("size", size, at_least=1)
     raw, restored = (picture(frame) for frame in (raw, restored))

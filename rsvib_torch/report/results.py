@@ -119,12 +119,18 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
 def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None:
     """Write the measured and the fitted offset curve as CSV; offsets that were not measured are empty.
 
+    One line per band (or row, in the direct method) and pair of frames. Before correction, its rows are displaced
+    between the frames by ``offset``; the vibration predicts ``fitted``; ``residual = offset - fitted`` remains after
+    correction. All are the displacement in the later frame minus that in the earlier one, in px along x and y, in rad
+    for roll. ``std`` is the standard deviation of the offset and of the residual, if it is known.
+
     Args:
         path: The file to write; an existing file is replaced.
         result: A detection (not a batch).
 
     Raises:
         OSError: If the file cannot be written.
+        ValueError: If the result is a batch.
 
     Example:
         >>> import rsvib_torch as rsv
@@ -136,9 +142,16 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
         >>> from pathlib import Path
         >>> path = Path(tempfile.mkdtemp()) / "offsets.csv"
         >>> rsv.write_offsets(path, rsv.detect_vibration(frames, timing, method="bands", tones=1))
-        >>> path.read_text().splitlines()[0]
-        'earlier_frame,later_frame,row,time_s,offset_x_px,offset_y_px,fitted_x_px,fitted_y_px,quality'
+        >>> columns = path.read_text().splitlines()[0].split(",")
+        >>> columns[:6]
+        ['earlier_frame', 'later_frame', 'row', 'time_s', 'offset_x_px', 'offset_y_px']
+        >>> columns[6:]
+        ['fitted_x_px', 'fitted_y_px', 'residual_x_px', 'residual_y_px', 'quality']
     """
+    if result.batch_shape:
+        raise ValueError(
+            f"result is a batch of shape {tuple(result.batch_shape)}; write one: write_offsets(path, result[0])"
+        )
     curve = result.offsets
     count = curve.times.shape[-1]
     columns = {
@@ -150,6 +163,8 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
     axes = ("x_px", "y_px", "roll_rad", "zoom")[: result.vibration.num_axes]
     columns |= {f"offset_{name}": curve.offsets[..., axis] for axis, name in enumerate(axes)}
     columns |= {f"fitted_{name}": result.fitted[..., axis] for axis, name in enumerate(axes)}
+    residual = curve.offsets - result.fitted
+    columns |= {f"residual_{name}": residual[..., axis] for axis, name in enumerate(axes)}
     columns["quality"] = curve.quality
     if curve.std is not None:
         columns |= {f"std_{name}": curve.std[..., axis] for axis, name in enumerate(axes)}

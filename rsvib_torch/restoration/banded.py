@@ -144,7 +144,7 @@ def restore_banded(
         TypeError: If an option has the wrong type.
         ValueError: If an option is out of range.
     """
-    half_rows = check_whole_number("half_rows", half_rows, at_least=1)
+    half_rows = check_whole_number("half_rows", half_rows, at_least=1, at_most=max(16, frames.shape[-2]))
     stride = check_whole_number("stride", stride, at_least=1, at_most=max(2, frames.shape[-2]))
     check_choice("interpolation", interpolation, tuple(_TRANSFERS))
     weights = _noise_to_signal(frames, noise_to_signal)

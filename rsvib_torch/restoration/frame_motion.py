@@ -11,12 +11,13 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
 from rsvib_torch.imaging.trajectory import rows_showing
 from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.motion.timing import MAX_ROWS, RowTiming, SensorTiming
 
 __all__ = ["FrameMotion", "frame_motion", "joint_groups", "visible_pixels"]
 
@@ -124,9 +125,14 @@ def visible_pixels(
         (torch.Size([2, 512, 64]), True, False)
     """
     check_whole_number("num_frames", num_frames, at_least=1)
-    height, width = size if timing.scan_axis == -2 else (size[1], size[0])
+    height, width = (check_whole_number("size", side, at_least=1, at_most=MAX_ROWS) for side in size)
     batch = vibration.batch_shape
+    if vibration.device.type == "cpu":
+        needed = 25 * math.prod(batch) * num_frames * height * width  # float64 columns, their comparisons, masks
+        check_fits(f"masks of num_frames={num_frames} frames of {height} x {width} px", needed, "pass fewer frames")
+    height, width = (height, width) if timing.scan_axis == -2 else (width, height)
     rowwise, row_timing = vibration.to_row_order(timing), timing.in_row_order()
+    row_timing.check_rows(height)
     rowwise = rowwise if batch else rowwise.expanded(1)
     strips = ColumnStrips.of(width, max_pitch=width if rowwise.same_for_all_columns else 16, margin=0)
     parts = []

@@ -8,8 +8,9 @@ from typing import Any, Literal, Required, TypedDict, Unpack, overload
 
 from torch import Tensor, nn
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import check_options, checks_arguments
 from rsvib_torch.core.option_types import (
+    METHOD_SETTINGS,
     BandedSettings,
     DewarpSettings,
     ExactSettings,
@@ -104,11 +105,12 @@ METHODS: dict[str, RestorationMethod] = {
 
 
 def _check_options(method: str, options: Mapping[str, Any]) -> None:
-    """Refuse a method that does not exist, and options that the method does not have."""
+    """Refuse a method that does not exist, and options that the method does not have or that have another type."""
     valid = method_options(method)
     for name in options:
         if name not in valid:
             raise TypeError(f"method={method!r} has no option {name!r}; its options are {', '.join(valid)}")
+    check_options(options, METHOD_SETTINGS[method])
 
 
 @overload

@@ -141,6 +141,9 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
     common |= {"duration": 6e-4, "interval": 0.0104, "first": 0.0, "last": 0.03, "timing": timing, "order": [1, 0]}
     common |= {"signs": [1.0, -1.0], "size": 2, "device": "cpu", "path": folder / "out.json", "offset": 0.001}
     common |= {"scale": 1.0, "gain": (1.0, 1.0), "displacement": path, "spacing": 5e-4, "motions": [recorded, recorded]}
+    camera = rsv.Camera(300.0, (3.0, -2.0), (-0.1, 0.02, 1e-3, -2e-3, 0.0))
+    common |= {"vibrations": [vibration, vibration], "camera": camera, "axes": 3}
+    common |= {"components": torch.zeros(2, 3, dtype=torch.float64)}
     common |= {"batch_shape": (2,), "frequency": torch.tensor([0.1, 0.2], dtype=torch.float64), "num_rows": 96}
     common |= {"num_frames": 3, "line_time": 1e-4, "delays": [0.0, 0.04], "num_lines": 100, "exposure_lines": 2.0}
     common |= {"height": 24, "width": 16, "frames": frames, "generator": torch.Generator("cpu").manual_seed(1)}
@@ -357,6 +360,54 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
         "windows_figure": Call(
             rsv.windows_figure, {"times": [0.0], "detections": [detected], "time_label": "start (s)"}
         ),
+        "camera_isd": Call(
+            rsv.camera_isd,
+            {
+                "camera": rsv.Camera(2e6),
+                "size": (96, 64),
+                "position": (6878.0, 0.0, 0.0),
+                "look": (-1.0, 0.0, 0.0),
+                "radii": (6378.0, 6357.0),
+                "ephemeris_time": 0.0,
+            },
+        ),
+        "sampling_map": Call(
+            rsv.sampling_map, {"motion": vibration, "timing": timing, "size": (96, 64), "num_frames": 2}
+        ),
+        "write_gcsv": Call(
+            rsv.write_gcsv,
+            {
+                "path": folder / "rates.gcsv",
+                "motion": vibration.with_camera(rsv.Camera(900.0)),
+                "timing": timing,
+                "size": (96, 64),
+                "num_frames": 2,
+                "sample_rate": None,
+            },
+        ),
+        "write_isd": Call(
+            rsv.write_isd,
+            {
+                "path": folder / "isd.json",
+                "motion": vibration,
+                "timing": timing,
+                "isd": rsv.camera_isd(rsv.Camera(2e6), (96, 64), position=(6878.0, 0.0, 0.0), look=(-1.0, 0.0, 0.0)),
+                "frame": 1,
+                "model": "auto",
+                "tolerance": 0.005,
+            },
+        ),
+        "write_stmap": Call(
+            rsv.write_stmap,
+            {
+                "folder": folder / "maps",
+                "motion": vibration,
+                "timing": timing,
+                "size": (96, 64),
+                "num_frames": 2,
+                "convention": "nuke",
+            },
+        ),
         "write_offsets": Call(rsv.write_offsets, {"path": folder / "offsets.csv", "result": detected}),
         "write_stack": Call(
             rsv.write_stack,
@@ -451,6 +502,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
         verdict,
         calibration,
         sensor_noise,
+        camera,
         slanted,
         info,
         swept,
@@ -474,6 +526,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
         rotation,
         curve,
         optics,
+        camera,
         sensor_noise,
         verdict,
         calibration,
@@ -482,8 +535,17 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
         report,
     ):
         result |= _methods(value, **common)
-    for method, value in (("forward", {"scene": scene}), ("adjoint", {"frames": frames[0], "scene_shape": (160, 128)})):
+    images: dict[str, dict[str, Any]] = {"forward": {"scene": scene}, "A": {"x": scene}, "A_adjoint": {"y": frames[0]}}
+    images["adjoint"] = {"frames": frames[0], "scene_shape": (160, 128)}
+    for method, value in images.items():
         result[f"RowVaryingBlur.{method}"] = Call(getattr(blur, method), value)
+    place = {"x": times[:2], "y": times[2:4]}
+    for name, others in (
+        ("displacement", {"components": common["components"]}),
+        ("factors", {"axes": 3}),
+        ("rays", {}),
+    ):
+        result[f"Camera.{name}"] = Call(getattr(camera, name), place | others)
     missing = set(rsv.__all__) - _NOT_CALLED - {name.partition(" ")[0] for name in result}
     if missing:
         raise LookupError(f"no valid call of {', '.join(sorted(missing))}")
@@ -514,6 +576,11 @@ _OTHERS: dict[str, Callable[[], Any]] = {
     "list of None": lambda: [None, None],
     "list of nan": lambda: [math.nan, math.nan],
     "list of 1e300": lambda: [1e300, 1e300],
+    "list of 0": lambda: [0, 0],
+    "list of -1": lambda: [-1, -1],
+    "list of 10**9": lambda: [10**9, 10**9],
+    "three sizes": lambda: [2, 2, 2],
+    "five sizes": lambda: (2, 3, 4, 5, 6),
     "generator": lambda: (number for number in (1.0, 2.0)),
     "empty tensor": lambda: torch.zeros(0),
     "scalar tensor": lambda: torch.tensor(2.0),
@@ -544,6 +611,7 @@ _TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "complex": lambda t: t.to(torch.complex64),
     "bool": lambda t: t > 0.5,
     "int64": lambda t: (100 * t).nan_to_num().to(torch.int64),
+    "uint32": lambda t: (100 * t.abs()).nan_to_num().to(torch.uint32),
     "uint16": lambda t: (100 * t.abs()).nan_to_num().to(torch.uint16),
     "half": lambda t: t.half(),
     "bfloat16": lambda t: t.bfloat16(),

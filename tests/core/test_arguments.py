@@ -1,6 +1,7 @@
 """Arguments of public functions: the message names the argument, whatever the value."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,19 +11,39 @@ import rsvib_torch as rsv
 from rsvib_torch.core.arguments import as_numbers, check_device, check_shapes, check_tensor, checks_arguments
 
 TIMING = rsv.SensorTiming(1e-4, 6, 104)
+LONG = rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 2.0])
 CURVES = (torch.zeros(1), torch.zeros(1, 2), torch.zeros(1, 2))  # times, offsets, residual of a MotionCheck
 FRAMES = torch.rand(2, 96, 64, generator=torch.Generator().manual_seed(0))
 VIBRATION = rsv.Vibration([1.0, 0.5], [130.0, 170.0])
+STRIPES = (0.5 + 0.3 * torch.sin(0.5 * torch.arange(64.0)))[None, :, None].expand(1, 64, 32)
+PAIR, NO_TONE = torch.zeros(1, 3), torch.zeros(2, 1)
+STD = rsv.VibrationStd(NO_TONE, NO_TONE, NO_TONE, NO_TONE, torch.zeros(2), torch.zeros(2))
+CURVE = rsv.OffsetCurve(
+    torch.tensor([[0, 1]]), torch.arange(3), PAIR, PAIR + 0.01, torch.zeros(1, 3, 2), PAIR + 1, (16, 16)
+)
+SWEPT = rsv.SweptTone(
+    *[torch.zeros(2)] * 6,
+    {name: torch.ones(2) for name in ("amplitude", "frequency", "decay", "chirp", "phase")},
+    rsv.FreeMotion(torch.zeros(2, 9), 0.0, 1e-3),
+    torch.zeros(2),
+    torch.ones(2, dtype=torch.bool),
+    ((), ()),
+)
+
+
+def blur():
+    return rsv.RowVaryingBlur(rsv.row_psf(VIBRATION, TIMING.row_starts(1, 96)[0], TIMING))
+
+
+def nested():
+    return torch.nested.nested_tensor([FRAMES[0], FRAMES[0, :2]])
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: FRAMES.to("meta"), "frames must be a tensor with data"),
-        (
-            lambda: torch.nested.nested_tensor([FRAMES[0], FRAMES[0, :2]]),
-            "frames must be a dense tensor, got a nested tensor",
-        ),
+        (nested, "frames must be a dense tensor, got a nested tensor"),
         (FRAMES.to_sparse, r"frames must be a dense tensor.*to_dense"),
         (lambda: torch.quantize_per_tensor(FRAMES, 0.1, 0, torch.quint8), "frames must not be quantised"),
         (lambda: FRAMES.to(torch.complex64), "frames must be real numbers"),
@@ -80,6 +101,42 @@ def test_pixels_beyond_all_scales(value):
         (lambda: rsv.row_psf(VIBRATION, torch.tensor([math.inf]), TIMING), "starts must be finite times"),
         (lambda: rsv.psnr(FRAMES, FRAMES, 10**400), "data_range must be finite"),
         (lambda: rsv.comparison_figure(torch.tensor(1.0), FRAMES[0]), "raw must have shape"),
+        (lambda: rsv.comparison_figure(FRAMES[0], FRAMES[None]), r"restored must have shape \(C, H, W\) with C = 1"),
+        (lambda: rsv.calibrate_row_time(STRIPES, 1000.0, frame_rate=1e-40), "flicker_frequency=1000 Hz is ambiguous"),
+        (lambda: rsv.calibrate_row_time(STRIPES, 1000.0, frame_rate=5e-324), "flicker_frequency=1000 Hz is ambiguous"),
+        (
+            lambda: rsv.row_psf(rsv.Vibration(1e6, 50.0), TIMING.row_starts(1, 96)[0], TIMING),
+            r"point spread functions of 96 rows, .* GB .* free; check amplitude",
+        ),
+        (lambda: rsv.psf_figure(rsv.Vibration(1e6, 50.0), TIMING, 96), "point spread functions of 24 rows"),
+        (
+            lambda: rsv.detect_swept_tone(FRAMES[:1].expand(2, 96, 64), LONG, band_rows=16, band_step=8, search=6),
+            "frames cover 2.01 s; starts of the swept model .* at most .* s: pass fewer frames",
+        ),
+        (lambda: rsv.restore(FRAMES, TIMING, VIBRATION, method="banded", half_rows=10**9), "half_rows must be at most"),
+        (
+            lambda: rsv.restore(FRAMES, TIMING, VIBRATION, method="banded", noise_to_signal=1e300),
+            r"noise_to_signal must be at most 1e\+15",
+        ),
+        (lambda: rsv.find_slanted_edges(FRAMES[0, :0]), r"image must be one finite grey image .* \(0, 64\)"),
+        (lambda: VIBRATION.expanded(10**9), "size must be at most"),
+        (lambda: rsv.SensorNoise(5000.0).apply(FRAMES / 0), r"frames must be finite, but pixel \(0, 0, 0\) is inf"),
+        (
+            lambda: rsv.simulate_frames(FRAMES[0] * 1e38, TIMING, VIBRATION, noise=rsv.SensorNoise(5000.0)),
+            r"scene reach .*, at most 1e\+15",
+        ),
+        (lambda: rsv.StackInfo([], "uint8", 255.0), r"shape must be \(T, H, W\) or .* got \(\)"),
+        (lambda: rsv.StackInfo(torch.zeros(3), "uint8", 255.0), r"shape\[0\] must be a whole number, got 0.0"),
+        (lambda: blur().adjoint(FRAMES[0, 0], (96, 64)), r"frames must have shape \(..., R, W\)"),
+        (lambda: blur().adjoint(FRAMES[0], (5, 96, 64)), r"scene_shape \(5, 96, 64\) does not broadcast to"),
+        (lambda: blur().adjoint(FRAMES[0], (10**6, 10**6)), r"scenes \(1000000, 1000000\) need .* check scene_shape"),
+        (lambda: rsv.RowVaryingBlur(blur().psf, frame_width=10**9), "frame_width must be at most"),
+        (lambda: rsv.visible_pixels(TIMING, VIBRATION, (0, 0), 2), "size must be at least 1, got 0"),
+        (lambda: rsv.visible_pixels(TIMING, VIBRATION, (96, 64), 10**9), "masks of num_frames=1000000000 .* fewer"),
+        (lambda: rsv.Vibration.still((10**4, 10**4)), "batch_shape must have at most 1000000 motions"),
+        (lambda: blur().A_adjoint(torch.tensor(1.0)), r"y must have shape \(..., R, W\)"),
+        (lambda: blur()(FRAMES[0].to(torch.uint16)), "scene must be a floating-point tensor, got torch.uint16"),
+        (lambda: blur()((100 * FRAMES[0]).to(torch.int64)), "scene must be a floating-point tensor, got torch.int64"),
         (lambda: rsv.windows_figure([0.0], [math.nan]), r"detections\[0\] must be a detection or None"),
         (lambda: rsv.MotionCheck("x", torch.zeros(2), True, (), *CURVES), "before must be a tensor"),
         (lambda: rsv.MotionCheck(torch.zeros(3), torch.zeros(2), True, (), *CURVES), r"before must have shape \(2,\)"),
@@ -88,6 +145,66 @@ def test_pixels_beyond_all_scales(value):
 def test_values_beyond_the_limits_of_an_argument(build, message):
     with pytest.raises((ValueError, TypeError), match=message):
         build()
+
+
+@pytest.mark.filterwarnings("ignore:.*:UserWarning")  # PyTorch states that nested tensors may change
+def test_nested_tensors_are_described():
+    with pytest.raises(TypeError, match="frames must be a NumPy array, got a nested tensor"):
+        rsv.restore_block(nested(), TIMING)
+    with pytest.raises(TypeError, match="displacement must be a dense tensor or None, got a nested"):
+        replace(STD, displacement=nested())
+
+
+@pytest.mark.parametrize(
+    ("result", "changes", "message"),
+    [
+        (
+            "std",
+            {"amplitude": torch.zeros(4, 2, 1)},
+            r"frequency must have shape .* with \.\.\. = \(4,\), A = 2, K = 1",
+        ),
+        ("std", {"displacement": torch.zeros(1, 2)}, r"displacement must have shape \(\.\.\., A\) with \.\.\. = \(\)"),
+        ("curve", {"offsets": torch.zeros(1, 3, 1)}, r"offsets must have shape .* A = 2 to 4, got \(1, 3, 1\)"),
+        ("curve", {"times": torch.zeros(4, 1, 3)}, r"times must have shape .* with \.\.\. = \(\), P = 1, N = 3"),
+        ("swept", {"reliable": torch.ones(1, 2, dtype=torch.bool)}, r"reliable must have shape .* with \.\.\. = \(\)"),
+        ("swept", {"std": {"a": 1}}, r"std\['a'\] must be a tensor, got 1 \(int\)"),
+        ("swept", {"std": {"a": torch.zeros(2)}}, "std must have the keys amplitude, frequency, decay, chirp, phase"),
+        ("swept", {"std": {1: torch.zeros(2)}}, r"keys of std must be text, got 1 \(int\)"),
+    ],
+)
+def test_results_of_contradicting_shapes(result, changes, message):
+    results = {"std": STD, "curve": CURVE, "swept": SWEPT}
+    assert str(replace(results[result]))
+    with pytest.raises((TypeError, ValueError), match=message):
+        replace(results[result], **changes)
+
+
+def test_times_of_a_batch_may_be_common():
+    offsets, quality = torch.zeros(4, 1, 3, 2), torch.ones(4, 1, 3)
+    assert replace(CURVE, offsets=offsets, quality=quality)[2].times.shape == (1, 3)
+
+
+def test_lists_and_arrays_become_tuples():
+    info = rsv.StackInfo([2, 8, 9], "uint8", 255.0, frame_times=np.array([0.0, 0.04]))
+    assert info.shape == (2, 8, 9)
+    assert info.frame_times == (0.0, 0.04)
+    assert "frame times 0 … 0.04 s" in str(info)
+    assert hash(info.shape) == hash((2, 8, 9))
+    assert str(rsv.StackInfo((2, 8, 9), "uint8", 255.0, frame_times=torch.zeros(0))).endswith("full scale 255")
+
+
+def test_figures_of_motions_with_gradient():
+    vibration = rsv.Vibration(torch.tensor([1.0, 0.5], requires_grad=True), [130.0, 170.0])
+    for draw in (rsv.rows_figure, rsv.psf_figure):
+        assert draw(vibration, TIMING, 96).axes
+
+
+def test_exposure_of_many_knots():
+    """3203 nodes; the mean of a parabola over [0.2, 1.8] s is that of its integral."""
+    times = torch.linspace(0, 2, 2001, dtype=torch.float64)
+    motion = rsv.FreeMotion.through(times, torch.stack([times**2, times], -1))
+    mean = motion.mean_displacement(torch.tensor([0.2]), torch.tensor(1.6)).tolist()[0]
+    assert mean == pytest.approx([(1.8**3 - 0.2**3) / 3 / 1.6, 1.0], abs=1e-6)
 
 
 def test_checks_leave_calls_unchanged():

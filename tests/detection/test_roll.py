@@ -5,12 +5,14 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from field_truth import FieldMotion, take_field_frames
+from field_truth import FieldMotion, LensMotion, take_field_frames
 from truth import decibel, draw_scene
 
 from rsvib_torch import (
+    Camera,
     DetectionResult,
     SensorTiming,
+    detect_motion,
     detect_vibration,
     judge_restoration,
     restore,
@@ -48,11 +50,41 @@ def test_roll_is_detected(detection):
         std = getattr(detection.std, name)[:, 0]
         assert bool((error < 3.5 * std).all()), (name, error, std)
     assert abs(float(detection.vibration.amplitude[2, 0]) / TRUTH.amplitude[2] - 1) < 0.02
-    assert float(detection.std.amplitude[2, 0]) < 1e-4
+    assert float(detection.std.amplitude[2, 0]) < 1.2e-4
+
+
+def test_roll_is_measured_by_default(rolling, detection):
+    """Zoom is measured as well, found to be 0, and left out."""
+    found = detect_vibration(rolling[1], TIMING)
+    assert found.vibration.num_axes == 3
+    assert found.reliable.tolist() == [True, True, True]
+    torch.testing.assert_close(found.vibration.amplitude, detection.vibration.amplitude, rtol=5e-3, atol=0)
+
+
+def test_without_roll_the_result_is_the_same():
+    """Bit for bit: roll is measured only if the halves of the rows move apart."""
+    scene = draw_scene(224, 224, 11, blur=1.2)
+    frames = take_field_frames(scene, TIMING, FieldMotion((1.4, 1.9, 0.0, 0.0)), (160, 160), 2, nodes=4)
+    frames = torch.from_numpy(frames + 0.004 * np.random.default_rng(5).standard_normal(frames.shape)).float()
+    found, without = detect_vibration(frames, TIMING), detect_vibration(frames, TIMING, roll=False, zoom=False)
+    assert found.vibration.num_axes == 2
+    assert torch.equal(found.vibration.amplitude, without.vibration.amplitude)
+    assert torch.equal(found.std.frequency, without.std.frequency)
+
+
+def test_windows_have_the_same_axes(rolling):
+    found = detect_vibration(rolling[1], TIMING, window=3, window_step=1, tones=1)
+    assert found.vibration.amplitude.shape[:2] == (2, 3)
+
+
+def test_columns_refuse_roll(rolling):
+    with pytest.raises(ValueError, match="columns=128 goes with roll=False"):
+        detect_vibration(rolling[1], TIMING, columns=128, roll=True)
+    assert detect_vibration(rolling[1], TIMING, columns=128).vibration.num_axes == 2
 
 
 def test_ignored_roll_is_named_as_the_reason(rolling):
-    found = detect_vibration(rolling[1], TIMING)
+    found = detect_vibration(rolling[1], TIMING, roll=False, zoom=False)
     assert not bool(found.reliable[0])
     assert "roll='auto'" in " ".join(found.reasons[0])
 
@@ -88,6 +120,48 @@ def _later(timing, frame):
     return SensorTiming(timing.row_time, timing.exposure_rows, timing.frame_rows, frame_start_times=starts)
 
 
+def between_frames(components):
+    """Components (A, T, R) of the same rows less their mean over the frames, (T, R, A)."""
+    values = np.moveaxis(np.asarray(components), 0, -1)
+    return values - values.mean(0)
+
+
+def test_free_motion_with_roll(rolling):
+    """The differences between frames of the rows that show one scene row, which are what is measured."""
+    found = detect_motion(rolling[1], TIMING, roll=True)
+    assert found.motion.num_axes == 3
+    assert found.reliable.tolist() == [True, True, True]
+    rows, starts = np.arange(20.0, 200.0), TIMING.frame_starts(4).numpy()[:, None]
+    times = starts + TIMING.row_time * rows
+    for _ in range(30):
+        times = starts + TIMING.row_time * (rows + TRUTH.components(times)[1])
+    times += 0.5 * TIMING.exposure_time
+    true = between_frames(TRUTH.components(times)[:3])
+    error = between_frames(found.motion.displacement(torch.from_numpy(times)).permute(2, 0, 1).numpy()) - true
+    rms = np.sqrt((error**2).mean((0, 1)))
+    assert (rms < 2.5 * found.std_seen.numpy()).all()
+    assert rms[2] < 0.03 * np.sqrt((true[..., 2] ** 2).mean())  # of the roll itself: no roll is 100 %
+    assert "rad" in str(found)
+    through = detect_vibration(rolling[1], TIMING, model="free", roll=True)
+    torch.testing.assert_close(through.motion.coefficients, found.motion.coefficients)
+
+
+def test_free_motion_with_roll_in_other_orientation(rolling):
+    """Transposed frames of a camera that is read along x from the right."""
+    turned = SensorTiming(8e-5, 12, 280, scan_axis="x", readout_direction="reverse")
+    frames = rolling[1].flip(-2).mT.contiguous()
+    found = detect_motion(frames, turned, roll=True)
+    expected = detect_motion(rolling[1], TIMING, roll=True).motion.from_row_order(turned)
+    torch.testing.assert_close(found.motion.coefficients, expected.coefficients, atol=1e-3, rtol=1e-3)
+
+
+def test_swept_tone_refuses_roll(rolling):
+    with pytest.raises(ValueError, match="roll=True goes with model='tones' or 'free', not with model='swept'"):
+        detect_vibration(rolling[1], TIMING, model="swept", roll=True)
+    with pytest.raises(TypeError, match="zoom must be True or False, got 'auto'"):
+        detect_motion(rolling[1], TIMING, zoom="auto")
+
+
 def test_wrong_values(rolling):
     with pytest.raises(ValueError, match="roll must be True, False or 'auto', got 'yes'"):
         detect_vibration(rolling[1], TIMING, roll="yes")
@@ -108,5 +182,48 @@ def test_visible_pixels_follow_the_roll():
 
 
 def test_row_functions_refuse_roll():
-    with pytest.raises(ValueError, match="not defined with roll and zoom"):
+    with pytest.raises(ValueError, match="not defined with roll, zoom or a camera"):
         row_psf(TRUTH.vibration(3), TIMING.row_starts(1, 8), TIMING)
+
+
+def test_focal_length_gives_the_attitude_of_a_camera_with_a_wide_field():
+    lens = (-0.12, 0.05, 1e-3, -2e-3, 0.01)
+    truth = LensMotion((3.0, 4.0, 0.0, 0.0), (38.0, 31.0, 0.0, 0.0), (0.3, 1.1, 0.0, 0.0), 300.0, (6.0, -4.0), lens)
+    scene = draw_scene(304, 368, 11, blur=1.2)
+    frames = torch.from_numpy(take_field_frames(scene, TIMING, truth, SIZE, 4, nodes=4)).float()
+    frames = frames + 0.004 * torch.randn(frames.shape)
+    options = {"focal_length": 300.0, "principal_point": (143.5 + 6.0, 111.5 - 4.0), "distortion": lens}
+    detection = detect_vibration(frames, TIMING, **options)
+    assert detection.reliable.tolist() == [True, True]
+    assert detection.vibration.camera == Camera(300.0, (6.0, -4.0), lens)
+    attitude = detection.attitude
+    error = attitude.amplitude[:, 0] - torch.tensor([4 / 300, 3 / 300, 0.0], dtype=torch.float64)
+    assert bool((error[:2].abs() < 3 * attitude.amplitude_std[:2, 0]).all())
+    assert float(error.abs().max()) < 5e-5  # rad, 0.015 px
+    assert abs(float(attitude.phase[0, 0]) - 1.1) < 0.01
+    assert abs(float(attitude.phase[1, 0]) - (0.3 - np.pi)) < 0.01
+    assert "pitch" in str(attitude)
+    without = detect_vibration(frames, TIMING)  # columns displaced alike
+    assert not bool(without.reliable.all())
+    still = torch.from_numpy(scene[40:-40, 40:-40])
+    inner = (..., slice(12, -12), slice(12, -12))
+    found = []
+    for vibration in (detection.vibration, without.vibration):
+        restored = restore(frames[:1], TIMING, vibration, method="dewarp")
+        found.append(decibel(restored[inner].numpy(), still[inner].numpy()))
+    assert found[0] > found[1] + 1.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"principal_point": (1.0, 2.0)}, "principal_point=.* requires focal_length"),
+        ({"distortion": (0.1, 0.0, 0.0, 0.0, 0.0)}, "distortion=.* requires focal_length"),
+        ({"focal_length": 300.0, "distortion": (-3.0, 0.0, 0.0, 0.0, 0.0)}, "not invertible in frames of 96 x 128 px"),
+        ({"focal_length": 300.0, "columns": 64}, "columns=64 goes with roll=False"),
+        ({"focal_length": 300.0, "model": "swept"}, "focal_length=300.0 goes with model='tones' or 'free'"),
+    ],
+)
+def test_options_of_the_camera_are_checked(options, message):
+    with pytest.raises(ValueError, match=message):
+        detect_vibration(torch.rand(2, 128, 96), TIMING, **options)

@@ -151,7 +151,7 @@ def test_axis_with_large_uncertainty_is_not_restored(scene_and_frames):
 
 def test_reliability_applies_to_each_stack_of_a_batch(scene_and_frames):
     _, frames = scene_and_frames
-    both = Vibration(*(torch.stack([getattr(MOTION.vibration(), name)] * 2) for name in vars(MOTION.vibration())))
+    both = Vibration.stacked([MOTION.vibration()] * 2)
     uncertain = detection_of(both, reliable=((True, True), (False, True)), reasons=(((), ()), (("blind",), ())))
     with pytest.warns(RestorationWarning, match="stack 1: x is not restored"):
         found = restore(torch.stack([frames, frames])[:, :, None], TIMING, uncertain, method="dewarp", check=False)
@@ -178,7 +178,7 @@ def test_warnings_are_issued_for_wrong_vibrations_only(scene_and_frames):
         restore(
             torch.stack([frames, frames])[:, :, None],
             TIMING,
-            Vibration(*(torch.stack([getattr(v, name) for v in (vibration, turned)]) for name in vars(vibration))),
+            Vibration.stacked([vibration, turned]),
             method="dewarp",
         )
     restored_without_warning(frames, TIMING, turned, check=False)

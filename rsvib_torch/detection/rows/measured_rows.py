@@ -11,19 +11,22 @@ from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.displacements import (
-    BLOCK_ROWS,
     FrameGroup,
     blur_ratio,
     differential_motion,
     differently_blurred,
     frame_groups,
+    joined_groups,
     measure_groups,
+    measure_strips,
     remove_column_pattern,
     stack_spectra,
 )
-from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
-from rsvib_torch.motion.field import ColumnMotion
+from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.frames.column_strips import ColumnStrips
+from rsvib_torch.motion.field import ColumnMotion, largest_slope
 from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration.gradients import RowGradients
@@ -66,15 +69,15 @@ class MeasuredRows:
     groups: list[FrameGroup]
     timing: RowTiming
 
-    def measure(self, motion: Vibration, gradients: list[RowGradients] | None = None) -> RowRecord:
+    def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
         """Measurements around a motion, see ``measure_groups``."""
         return RowRecord(*measure_groups(self.groups, self.timing, self.view(motion), gradients))
 
-    def view(self, motion: Vibration) -> Motion:
+    def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motion of the stacks that are measured, with two components."""
         return motion
 
-    def remove_column_pattern(self, motion: Vibration, gradients: list[RowGradients]) -> bool:
+    def remove_column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> bool:
         """Subtract a pattern of columns that is fixed to the sensor; False if there is none."""
         return remove_column_pattern(self.groups, self.timing, self.view(motion), gradients)
 
@@ -104,6 +107,13 @@ def whole_rows(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: 
 
 # Strips
 
+_MAX_SLIDE_OF_BLUR = 0.15  # px
+
+
+def _in_rad(motion: Vibration | FreeMotion, scale: FieldScale) -> Vibration | FreeMotion:
+    """The motion with roll in rad and relative zoom."""
+    return scale.free_motion(motion) if isinstance(motion, FreeMotion) else scale.motion(motion)
+
 
 @dataclass(frozen=True, eq=False)
 class StripRows(MeasuredRows):
@@ -111,80 +121,78 @@ class StripRows(MeasuredRows):
 
     Attributes:
         scale: Components of the motion.
+        strips: The strips.
         columns: (S,) px from the centre of the frame, middles of the strips.
         num_frames: Frames of a stack.
+        slide: px, difference of the displacements of the middle of a strip and its ends.
     """
 
     scale: FieldScale
+    strips: ColumnStrips
     columns: Tensor
     num_frames: int
+    slide: float
 
-    def measure(self, motion: Vibration, gradients: list[RowGradients] | None = None) -> RowRecord:
-        """Components of the motion of every row (B, N, G, A), from the displacements in the strips.
+    def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
+        """Components of the motion of every row (B, N, G, A)."""
+        each = [None] * len(self.groups) if gradients is None else gradients
+        view, measured = self.view(motion), []
+        for group, own in zip(self.groups, each, strict=True):
+            measured.append(measure_strips(group, self.timing, motion, view, self.strips, self.scale.factors, own))
+        of_groups = [own for _, own in measured]
+        return RowRecord(joined_groups([part for part, _ in measured]), of_groups, self._apart(of_groups))
 
-        Roll moves the content of a scene row to different frame rows along the row, which are exposed at different
-        times. The displacements are converted to the mean time of the row by the motion.
-        """
-        record = super().measure(motion, gradients)
-        measured, factors = record.measurements, self._factors(motion, record.gradients)
-        starts = measured.exposure_starts.unflatten(0, (-1, len(self.columns)))  # (B, S, N, G)
-        mean = starts.mean(1, keepdim=True).expand_as(starts)
-        components = (motion.mean_displacement(when, self.timing.exposure_time) for when in (mean, starts))
-        moved = torch.einsum("bsnia,bsnga->bsngi", factors, next(components) - next(components)).flatten(0, 1)
-        measured = replace(measured, displacements=measured.displacements + measured.relative(moved))
-        measurements, apart = combined_strips(measured, factors)
-        return RowRecord(measurements, record.gradients, apart)
+    def _apart(self, gradients: list[RowGradients], *, rows: int = 64) -> Tensor:
+        """``RowRecord.apart``, from sums over parts of ``rows`` rows."""
+        excesses = []
+        for own in gradients:
+            count = own.halves.shape[1] // rows * rows
+            weight = torch.where(own.variance > 0, 1 / own.variance.clamp(min=1e-300), 0.0)[:, :count, None, None]
+            hxx, hxy, hyy, bx, by = (own.halves[:, :count] * weight).unflatten(1, (-1, rows)).sum(2).unbind(-1)
+            determinant = hxx * hyy - hxy.square()
+            regular = determinant > 1e-4 * hxx * hyy
+            safe = torch.where(regular, determinant, 1.0)
+            # difference of the last and the first frame, (B, N, parts, 2)
+            residual = torch.stack([hyy * bx - hxy * by, hxx * by - hxy * bx], -1) / safe[..., None]
+            noise = 2 * torch.stack([hyy, hxx], -1) / safe[..., None]
+            share = 1 - 0.5 * self.scale.axes / residual.shape[2]  # the fit of the components takes part of both
+            excess = 0.5 * (residual.square() - share * noise).mean(2) / share
+            excesses.append(torch.where(regular.all(-1)[..., None], excess, torch.nan))
+        return torch.cat(excesses, 1)
 
-    def view(self, motion: Vibration) -> Motion:
+    def remove_column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> bool:
+        """As for whole rows: all strips of a row have the same noise."""
+        of_strips = [replace(own, variance=own.variance.repeat_interleave(len(self.columns), 0)) for own in gradients]
+        return super().remove_column_pattern(motion, of_strips)
+
+    def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motions of the strips (B S)."""
-        field = self.scale.motion(motion)
+        field = _in_rad(motion, self.scale)
         return ColumnMotion.of_columns(field, self.columns, self.timing, self.num_frames, self.scale.height)
 
-    def _factors(self, motion: Vibration, gradients: list[RowGradients]) -> Tensor:
-        """Displacements (B, S, N, 2, A) that are measured in the strips of all groups, for unit components in px.
-
-        Gradients g measure the weighted mean of a displacement that changes along the row,
-        ``(sum_x g g^T)^-1 sum_x g g^T D(x)``, which is not that of the middle of the strip.
-        """
-        strips, view, each = len(self.columns), self.view(motion), []
-        for group, own in zip(self.groups, gradients, strict=True):
-            images = own.images[..., : group.spectra.width]  # gradients along x and y, detail
-            blocks = images.shape[1] // BLOCK_ROWS
-            images = images[:, : blocks * BLOCK_ROWS].unflatten(1, (blocks, BLOCK_ROWS)).transpose(2, 3).flatten(3)
-            place = torch.arange(group.spectra.width, device=images.device) - 0.5 * (group.spectra.width - 1)
-            energy = (images @ images.mT).double()  # (B S, N, 3, 3)
-            moment = ((images * place.to(images).repeat(BLOCK_ROWS)) @ images[:, :, :2].mT).double()
-            size = energy.diagonal(dim1=-2, dim2=-1)
-            regular = energy + torch.diag_embed(1e-9 * size + (size == 0))
-            mean_place = torch.linalg.solve(regular, moment)[..., :2, :]
-            middle = group.starts.mean(-1, keepdim=True) + 0.5 * self.scale.height * self.timing.row_time
-            travelled = view.drift(middle).round()[..., 0, 1]  # as the scene rows of the group
-            rows = BLOCK_ROWS * (torch.arange(blocks, device=place.device) + 0.5) - 0.5 * self.scale.height
-            y = rows - travelled[:, None]
-            x = self.columns.repeat(len(y) // strips)[:, None].expand_as(y)
-            factors = self.scale.factors(x, y)
-            along = self.scale.factors(x + 1, y) - factors  # change of the displacement per column
-            each.append(factors + mean_place @ along)
-        of_groups: Tensor = torch.cat(each, 1).unflatten(0, (-1, strips))
-        return of_groups
-
     def blur_ratio(self, motion: Vibration) -> Tensor:
-        """(B, 3), the weighted mean over the strips."""
+        """(B, 3), the weighted mean over the strips.
+
+        A displacement that changes within a strip acts like blur: with a focal length of 400 px and 5 px, where the
+        ends of strips slide by 0.3 px, the ratio was 0 instead of 1. Its size, which counts as evidence, is then 0.
+        """
         ratio, std, size = super().blur_ratio(motion).unflatten(0, (-1, len(self.columns))).unbind(-1)
         weight = torch.where(std > 0, std.square().reciprocal(), 0.0)
         total = weight.sum(1).clamp(min=1e-300)
-        return torch.stack([(weight * ratio).sum(1) / total, total.rsqrt(), size.mean(1)], -1)
+        size = size.mean(1) if self.slide < _MAX_SLIDE_OF_BLUR else torch.zeros_like(total)
+        return torch.stack([(weight * ratio).sum(1) / total, total.rsqrt(), size], -1)
 
 
 def strip_rows(
     frames: Tensor,
     valid: Tensor | None,
     timing: RowTiming,
-    motion: Vibration,
+    motion: Vibration | FreeMotion,
     scale: FieldScale,
     *,
+    pairs_if_blurred_differently: bool = True,
     max_slide: float = 0.1,
-    min_pitch: int = 48,
+    min_pitch: int = 32,
 ) -> StripRows:
     """Frames (B, T, H, W) in strips of columns.
 
@@ -194,23 +202,24 @@ def strip_rows(
         timing: The sensor, in row order.
         motion: A first estimate of the motion, all components in px.
         scale: Components of the motion.
-        max_slide: px, displacement by roll and zoom between the middle of a strip and its ends; gradients measure
-            such displacements without bias.
-        min_pitch: Columns of a strip that count; narrower strips consist of their margins mostly.
+        pairs_if_blurred_differently: As in ``frame_groups``.
+        max_slide: px, difference of the displacements by roll and zoom of two neighbouring strips; the second order of
+            their interpolation blurs as an exposure with a path of this length.
+        min_pitch: Columns from the middle of a strip to that of the next; narrower strips consist of margins mostly.
     """
-    field, count = scale.motion(motion), frames.shape[1]
+    field, count = _in_rad(motion, scale), frames.shape[1]
     starts = timing.row_starts(count, scale.height, frames.device)[:, :: max(1, scale.height // 64)].flatten()
     ends = 0.5 * scale.width * torch.tensor([-1.0, 1.0], dtype=torch.float64, device=frames.device)
     of_ends = ColumnMotion.of_columns(field, ends, timing, count, scale.height)
     times = starts.expand(*of_ends.batch_shape, -1)
     along = of_ends.mean_displacement(times, timing.exposure_time)[..., 0] - of_ends.drift(times)[..., 0]
-    edge = math.ceil(float(along.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
-    turned = float(field.largest_displacement(float(starts[0]), float(starts[-1]))[..., 2:].amax())
-    pitch = max(min_pitch, 2 * max_slide / max(turned, 1e-9))
-    number = max(2, math.ceil((scale.width - 2 * edge - MARGIN) / pitch))
-    strips, columns = cut_into_strips(frames, number, edge)
-    of_valid = None if valid is None else cut_into_strips(valid, number, edge)[0]
-    spectra = stack_spectra(strips, of_valid)
+    margin = math.ceil(float(along.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
+    reached = field.largest_displacement(float(starts[0]), float(starts[-1]))
+    slope = float(largest_slope(reached, scale.width, scale.height, scale.camera).amax())
+    strips = ColumnStrips.between_ends(scale.width, max(min_pitch, max_slide / max(slope, 1e-9)), margin)
+    spectra = stack_spectra(frames, valid, strips)
+    columns = strips.columns.to(frames.device)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)
-    groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=True)
-    return StripRows(groups, timing, scale, columns, count)
+    groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=pairs_if_blurred_differently)
+    slide = slope * float(columns[1] - columns[0])
+    return StripRows(groups, timing, scale, strips, columns, count, slide)

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_whole_number
@@ -23,10 +24,13 @@ from rsvib_torch.core.splines import bspline_weights, gauss_legendre
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
+from rsvib_torch.detection.rows.measured_rows import strip_rows
 from rsvib_torch.detection.start import GreyFrames, band_curve, grey_frames, measurements_of_curve
+from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.io.files import FramesOrFiles, timing_of_files
+from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
@@ -49,12 +53,14 @@ __all__ = [
 @dataclass(frozen=True, eq=False, repr=False)
 class MotionDetection(
     Result,
-    units={"times": "s", "displacement": "px", "std": "px", "std_seen": "px", "unseen": "px", "unexplained": "px"},
+    units={
+        "times": "s",
+        **dict.fromkeys(("displacement", "std", "std_seen", "unseen", "unexplained"), "px; of roll rad, of zoom 1"),
+    },
     shapes={
         "times": "T R",
-        "displacement": "... T R 2",
-        "std": "... T R 2",
-        **dict.fromkeys(("std_seen", "unseen", "unexplained", "reliable"), "... 2"),
+        **dict.fromkeys(("displacement", "std"), "... T R A"),
+        **dict.fromkeys(("std_seen", "unseen", "unexplained", "reliable"), "... A"),
     },
 ):
     """A motion of any shape with its uncertainty. A batch of stacks leads all tensors but ``times``.
@@ -62,7 +68,8 @@ class MotionDetection(
     Only differences of displacement between frames are measured. A warp that is fixed to the scene is not visible:
     frames of a warped scene look the same if D(t) of the row that contains scene row s is larger by w(s) in every
     frame. This component is estimated from the power of the motion at other frequencies, and ``std`` is therefore
-    larger than ``std_seen``. The mean over the record is undetermined and not included.
+    larger than ``std_seen``. The mean over the record is undetermined and not included. With roll and zoom, there are
+    three or four axes instead of two, in rad and relative.
 
     Attributes:
         motion: The motion in image axes.
@@ -111,9 +118,10 @@ class MotionDetection(
         size = self.displacement.square().mean((-3, -2)).sqrt()
         rows = [
             [*labels, *(measured_text(value[at], digits=2) for value in (size, self.std_seen, self.unseen))]
-            for at, labels in axis_rows(self.batch_shape)
+            for at, labels in axis_rows(self.batch_shape, size.shape[-1])
         ]
-        head = ("displacement (px rms)", "± between frames (px)", "± common to all (px)")
+        unit = ("px", "px; roll: rad", "px; roll: rad; zoom: 1")[size.shape[-1] - 2]
+        head = (f"displacement ({unit}, rms)", f"± between frames ({unit})", f"± common to all ({unit})")
         return "\n".join(verdict_table(head, rows, self.batch_shape, self.reliable, self.reasons))
 
     def __getitem__(self, index: int) -> "MotionDetection":
@@ -139,6 +147,11 @@ def detect_motion(
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
     channels: Channels = None,
+    roll: bool = False,
+    zoom: bool = False,
+    focal_length: float | None = None,
+    principal_point: tuple[float, float] | None = None,
+    distortion: tuple[float, float, float, float, float] | None = None,
 ) -> MotionDetection:
     """Detect a motion of any shape from consecutive frames: the free model.
 
@@ -161,6 +174,12 @@ def detect_motion(
         ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out (dead, saturated).
         full_scale: Count that means 1.0, for integer frames.
         channels: As in ``detect_vibration``.
+        roll: Measure the rotation about the optical axis as a third component of the motion, in rad, from strips of
+            columns.
+        zoom: The same for the change of scale, as a fourth component; includes roll.
+        focal_length: Focal length in px, as in ``detect_vibration``.
+        principal_point: As in ``detect_vibration``.
+        distortion: As in ``detect_vibration``.
 
     Returns:
         The motion in image axes with its uncertainty over time.
@@ -190,10 +209,14 @@ def detect_motion(
     """
     check_whole_number("knot_rows", knot_rows, at_least=4)
     check_whole_number("iterations", iterations, at_least=1, at_most=100)
+    axes = 4 if zoom else 3 if roll else 2
     timing = timing_of_files(frames, timing)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     bands = RegistrationOptions(registration, band_rows, band_step, search)
-    results = [_detect(stacks.one(i), timing, bands, knot_rows, iterations) for i in range(len(stacks.images))]
+    height, width = stacks.images.shape[-2:]
+    camera = camera_in_row_order(focal_length, principal_point, distortion, (height, width), timing)
+    scale = FieldScale(axes, width, height, camera)
+    results = [_detect(stacks.one(i), timing, bands, knot_rows, iterations, scale) for i in range(len(stacks.images))]
     if not stacks.batched:
         return results[0]
     names = ("displacement", "std", "std_seen", "unseen", "unexplained", "reliable")
@@ -206,15 +229,23 @@ def detect_motion(
 
 
 def _detect(
-    stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions, knot_rows: int, iterations: int
+    stack: GreyFrames,
+    timing: SensorTiming,
+    bands: RegistrationOptions,
+    knot_rows: int,
+    iterations: int,
+    scale: FieldScale,
 ) -> MotionDetection:
     """``detect_motion`` of one stack."""
     rowwise, curve, record = start_curve(stack, timing, bands)
     longest = math.floor((record[1] - record[0]) / rowwise.row_time)
     if knot_rows > longest:
         raise ValueError(f"knot_rows must be at most {longest}, the row times of the stack, got {knot_rows}")
+    size, axes = (scale.height, scale.width), scale.axes
     measured, motion, spacing = measure_freely(stack, rowwise, curve, record, bands, knot_rows, iterations)
-    size = (stack.images.shape[-2], stack.images.shape[-1])
+    apart = None
+    if not scale.same_for_all_columns:
+        measured, motion, apart = _measure_field(stack, rowwise, motion, spacing, record, scale, iterations)
     residual = residual_of_motion(measured, motion[0])
     weighed = measured.reweighted(residual)
     share = weighed.independent_fraction(residual) * measured.share_counted(residual)
@@ -222,7 +253,44 @@ def _detect(
     motion = _motion(fit, size, 0.25)
     starts = rowwise.frame_starts(stack.images.shape[1], stack.images.device)
     banded = measurements_of_curve(curve, rowwise, bands.band_step)
-    return _report(motion[0], fit, measured, timing, starts, size[0], bands_reasons(banded, motion[0]))
+    of_middle: Motion = motion
+    if not scale.same_for_all_columns:
+        middle = torch.zeros(1, dtype=torch.float64, device=starts.device)
+        of_middle = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), size[0])
+    of_bands = [*bands_reasons(banded, of_middle[0]), [], []][:axes]
+    return _report(motion[0], fit, measured, timing, starts, scale, of_bands, apart)
+
+
+def _measure_field(
+    stack: GreyFrames,
+    timing: RowTiming,
+    start: FreeMotion,
+    spacing: float,
+    record: tuple[float, float],
+    scale: FieldScale,
+    iterations: int,
+) -> tuple[Measurements, FreeMotion, float]:
+    """``measure_freely`` with roll and zoom, from a motion without them; all components in px.
+
+    Returns:
+        The measurements, the motion, and the rms difference in px of the displacements along a row that it does not
+        explain.
+    """
+    motion, size = start, (scale.height, scale.width)
+    for number in range(iterations):
+        if motion.num_axes == 2:
+            still = torch.zeros_like(motion.coefficients[:, :1]).expand(-1, scale.axes - 2, -1)
+            drift = torch.cat([motion.image_motion, motion.image_motion.new_zeros(1, scale.axes - 2)], -1)
+            tones = Vibration(torch.zeros(1, scale.axes, 1), 0.0, 0.0, drift)
+            motion = FreeMotion(torch.cat([motion.coefficients, still], 1), motion.start, motion.spacing, tones)
+        if number < 2:  # strips follow the size of roll and zoom, which are unknown in the first round
+            rows = strip_rows(stack.images, stack.valid, timing, motion, scale, pairs_if_blurred_differently=False)
+        rows_record = rows.measure(motion)
+        measured = rows_record.measurements
+        if number:
+            measured = measured.reweighted(residual_of_motion(measured, motion[0]))
+        motion = _motion(_fit_spline(measured, spacing, record), size, 0.0)
+    return measured, motion, float(rows_record.differential().amax())
 
 
 def measure_freely(
@@ -338,7 +406,8 @@ def _motion(fit: "_SplineFit", size: tuple[int, int], frames: float) -> FreeMoti
     centred = knots - knots.mean()
     speed = (fit.coefficients * centred).sum(-1) / centred.square().sum()
     extent = torch.tensor([size[1], size[0]], dtype=torch.float64, device=knots.device)
-    speed = torch.where(speed.abs() * float(knots[-1] - knots[0]) > frames * extent, speed, 0.0)
+    large = speed[:2].abs() * float(knots[-1] - knots[0]) > frames * extent
+    speed = torch.where(functional.pad(large, (0, len(speed) - 2)), speed, 0.0)  # none of roll and zoom
     drift = Vibration(torch.zeros_like(speed)[None, :, None], 0.0, 0.0, speed[None])
     return FreeMotion((fit.coefficients - speed[:, None] * knots)[None], fit.start, fit.spacing, drift)
 
@@ -351,8 +420,8 @@ class _SplineFit:
     """Cubic spline ``sum_n c_n B((t - start) / spacing - n + 1)`` of each axis.
 
     Attributes:
-        coefficients: (2, N) float64 px.
-        covariance: (2, N, N) float64 px^2 of each axis.
+        coefficients: (A, N) float64 px.
+        covariance: (A, N, N) float64 px^2 of each axis.
         start: Time of the first knot in seconds.
         spacing: Seconds between knots.
     """
@@ -393,22 +462,25 @@ def _fit_spline(
         learn: Whether to estimate the power spectrum of the motion, for splines of up to 800 knots.
     """
     first, last = record
+    axes = measurements.displacements.shape[-1]
     count = math.ceil((last - first) / spacing) + 3
     device = measurements.exposure_starts.device
     shape = _SplineFit(
-        torch.zeros(2, count, dtype=torch.float64, device=device),
-        torch.zeros(2, 0, 0, device=device, dtype=torch.float32),
+        torch.zeros(axes, count, dtype=torch.float64, device=device),
+        torch.zeros(axes, 0, 0, device=device, dtype=torch.float32),
         first,
         spacing,
     )
-    values, covariances = zip(*(_fit_axis(measurements, shape, axis, learn) for axis in range(2)), strict=True)
+    values, covariances = zip(*(_fit_axis(measurements, shape, axis, learn) for axis in range(axes)), strict=True)
     return replace(shape, coefficients=torch.stack(values), covariance=torch.stack(covariances))
 
 
 def _fit_axis(measurements: Measurements, shape: _SplineFit, axis: int, learn: bool) -> tuple[Tensor, Tensor]:
     """Coefficients (N,) of one axis and their covariance (N, N)."""
     values = (measurements.displacements[..., axis] * measurements.visible)[0]
-    weight = precision_of_axis(measurements.information[0], axis)
+    weight = measurements.inverse_variances[0, :, axis]  # the other axes being unknown too
+    if measurements.information.shape[-1] == 2:
+        weight = precision_of_axis(measurements.information[0], axis)
     count = shape.coefficients.shape[-1]
     gram = torch.zeros(count, count, dtype=torch.float64, device=values.device)
     right = torch.zeros(count, dtype=torch.float64, device=values.device)
@@ -453,7 +525,7 @@ def _fit_axis(measurements: Measurements, shape: _SplineFit, axis: int, learn: b
 def _design(measurements: Measurements, shape: _SplineFit, axis: int, part: slice) -> Tensor:
     """Derivatives (n, G, N) of the relative displacements of some scene rows by the coefficients of an axis."""
     exposure_starts = measurements.exposure_starts[0, part]
-    average = measurements.average_times[axis] + measurements.exposure_time
+    average = measurements.average_times[axis if axis < 2 else 0] + measurements.exposure_time
     nodes, weights = gauss_legendre(3 + math.ceil(2 * average / shape.spacing))
     first = exposure_starts + 0.5 * (measurements.exposure_time - average)
     columns = torch.zeros(*exposure_starts.shape, 1, dtype=torch.float64, device=exposure_starts.device)
@@ -523,10 +595,23 @@ def _report(
     measured: Measurements,
     timing: SensorTiming,
     starts: Tensor,
-    num_rows: int,
-    of_bands: tuple[list[str], list[str]],
+    scale: FieldScale,
+    of_bands: list[list[str]],
+    apart: float | None,
 ) -> MotionDetection:
-    """The motion in image axes, and its uncertainty at up to 32 rows of every frame."""
+    """The motion in image axes, and its uncertainty at up to 32 rows of every frame.
+
+    Args:
+        motion: The motion, all components in px.
+        fit: Its spline.
+        measured: The measurements of the fit.
+        timing: The sensor.
+        starts: (T,) s, exposure starts of the first rows.
+        scale: Components of the motion, and the size of the frames.
+        of_bands: Reasons of each axis from the row bands.
+        apart: px, difference of the displacements along a row that the motion does not explain; None if unknown.
+    """
+    num_rows = scale.height
     rows = torch.linspace(0, num_rows - 1, min(32, num_rows), dtype=torch.float64, device=starts.device)
     times = starts[:, None] + rows * timing.row_time + 0.5 * timing.exposure_time
     columns = fit.columns(times.flatten())
@@ -545,23 +630,29 @@ def _report(
     value = value - value.mean((0, 1))
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     reasons = []
-    for axis in range(2):
+    for axis in range(scale.axes):
         against = unexplained_reason(rest[axis], moved[axis], "smooth motion") + of_bands[axis]
+        if apart is not None and apart > max(0.035, 0.009 * float(moved[:2].amax())):  # px, as for tones
+            against.append(
+                f"strips of columns move apart by {apart:.3g} px that roll and zoom do not explain: the scene has "
+                "parallax, or the lens is distorted; select a part of the frame with one distance"
+            )
         if float(std_seen[axis]) > 0.3:
             against.append(
                 f"the motion is determined to {float(std_seen[axis]):.3g} px only: the frames may show different scenes"
             )
         reasons.append(tuple(against))
     reliable = torch.tensor([not against for against in reasons], device=rest.device)
-    order = [1, 0] if timing.scan_axis == -1 else [0, 1]
+    order = ([1, 0, 2, 3] if timing.scan_axis == -1 else [0, 1, 2, 3])[: scale.axes]
+    units = scale.units(value)
     return MotionDetection(
-        motion=motion.from_row_order(timing),
+        motion=scale.free_motion(motion).from_row_order(timing),
         times=times,
-        displacement=offsets_from_row_order(value, timing),
-        std=std[..., order],
-        std_seen=std_seen[order],
-        unseen=unseen[order],
-        unexplained=rest[order],
+        displacement=offsets_from_row_order(value * units, timing),
+        std=(std * units)[..., order],
+        std_seen=(std_seen * units)[order],
+        unseen=(unseen * units)[order],
+        unexplained=(rest * units)[order],
         reliable=reliable[order],
         reasons=tuple(reasons[axis] for axis in order),
     )

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.presentation import Result, axis_rows, verdict_lines, verdict_table
@@ -37,7 +37,10 @@ __all__ = ["SweptTone", "detect_swept_tone"]
 # 90 Hz as 83.6 ± 1.1 Hz with a decay of 68 ± 6 /s); of 12 in three frames and 48 in four frames, none.
 _MIN_FRAMES = 3
 _MAX_STD = 5.0  # standard deviations: fits nearer to the best one in chi-square are not excluded
+_MAX_STARTS = 1_000_000  # fits of the grid of starts; 325,000 take 11 s for 16 frames of 200 rows
 _F_THRESHOLD = 14.0  # decrease of chi-square per parameter: the maximum of noise over the grid of starts stays below
+_TONE = ("amplitude", "frequency", "decay", "chirp", "phase")
+_STD_SHAPES = dict.fromkeys(("amplitude", *(f"std[{name!r}]" for name in _TONE)), "... 2")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,9 +55,7 @@ class SweptTone(
         "image_motion": "px/s",
         "unexplained": "px",
     },
-    shapes=dict.fromkeys(
-        ("amplitude", "frequency", "decay", "chirp", "phase", "image_motion", "unexplained", "reliable"), "... 2"
-    ),
+    shapes=dict.fromkeys((*_TONE, "image_motion", "unexplained", "reliable"), "... 2"),
 ):
     """One tone an axis that decays and sweeps: ``A exp(-g t) sin(2 pi (f t + c t^2 / 2) + phi) + v t``.
 
@@ -98,6 +99,12 @@ class SweptTone(
     unexplained: Tensor
     reliable: Tensor
     reasons: tuple[Any, ...]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if set(self.std) != set(_TONE):
+            raise ValueError(f"std must have the keys {', '.join(_TONE)}, got {', '.join(map(str, self.std))}")
+        check_shapes({"amplitude": self.amplitude, **{f"std[{name!r}]": self.std[name] for name in _TONE}}, _STD_SHAPES)
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -163,7 +170,8 @@ def detect_swept_tone(
 
     Raises:
         TypeError: If frames are not numbers.
-        ValueError: If they cannot be registered, see ``detect_motion``, or an option is out of range.
+        ValueError: If they cannot be registered, see ``detect_motion``, an option is out of range, or the frames cover
+            more time than the grid of starts is searched in: 0.47 s for bands of 32 rows of 20 us.
 
     Note:
         A result of two frames is never reliable: decay, sweep and frequency replace each other there.
@@ -190,7 +198,7 @@ def detect_swept_tone(
     tones = [_report(one, timing, step) for one in fitted]
     if not stacks.batched:
         return tones[0]
-    names = ("amplitude", "frequency", "decay", "chirp", "phase", "image_motion", "unexplained", "reliable")
+    names = (*_TONE, "image_motion", "unexplained", "reliable")
     return SweptTone(
         **{name: torch.stack([getattr(tone, name) for tone in tones]) for name in names},
         std={name: torch.stack([tone.std[name] for tone in tones]) for name in tones[0].std},
@@ -316,6 +324,12 @@ def _start(measured: Measurements, axis: int, record: tuple[float, float], highe
     another tone.
     """
     middle, span = 0.5 * (record[0] + record[1]), record[1] - record[0]
+    if 7.5 * (span * highest) ** 2 > _MAX_STARTS:  # sum of the numbers of sweeps over all frequencies, five decays
+        longest = math.sqrt(_MAX_STARTS / 7.5) / highest
+        raise ValueError(
+            f"frames cover {span:.3g} s; starts of the swept model up to {highest:.4g} Hz are searched in at most "
+            f"{longest:.3g} s: pass fewer frames, or larger band_rows for lower frequencies"
+        )
     device = measured.exposure_starts.device
     grid = []
     for frequency in torch.arange(0.5 / span, highest, 0.5 / span, dtype=torch.float32, device="cpu").tolist():
@@ -478,12 +492,11 @@ def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
         reasons.append(tuple(against))
     drift = fitted.fits[:, 5] * fitted.fits.new_tensor([1.0, -1.0 if reverse else 1.0])
     order = [1, 0] if timing.scan_axis == -1 else [0, 1]
-    names = ("amplitude", "frequency", "decay", "chirp", "phase")
     reliable = torch.tensor([not against for against in reasons], device=drift.device)
     return SweptTone(
-        **dict(zip(names, torch.stack(values)[order].unbind(-1), strict=True)),
+        **dict(zip(_TONE, torch.stack(values)[order].unbind(-1), strict=True)),
         image_motion=drift[order],
-        std=dict(zip(names, torch.stack(stds)[order].unbind(-1), strict=True)),
+        std=dict(zip(_TONE, torch.stack(stds)[order].unbind(-1), strict=True)),
         motion=_motion(fitted.fits, fitted.record, step).from_row_order(timing),
         unexplained=fitted.unexplained[order],
         reliable=reliable[order],

@@ -361,12 +361,16 @@ def fit_tones(
     Returns:
         The fit with its covariance. The variance of the errors of each axis is that of its residuals: with
         ``S = diag(s_x, s_y)`` the errors of a row have the covariance ``S W^-1 S`` instead of the ``W^-1`` of the fit.
+        With roll and zoom, all axes have one variance.
     """
     problem = _Problem(measurements, active, model or MotionModel())
     state = problem.solve(start, iterations=30, tolerance=1e-7)
     spent = problem.free.unflatten(1, (problem.axes, -1)).sum(-1)
     # `num_measurements` counts independent measurements only: overlapping bands repeat each other
-    variance = measurements.square(state.residual) / (measurements.num_measurements - spent).clamp(min=1.0)
+    spare = (measurements.num_measurements - spent).clamp(min=1.0)
+    variance = measurements.square(state.residual) / spare
+    if problem.axes > 2:  # unequal variances would not keep the precise combinations of correlated components
+        variance = (state.cost / spare.sum(-1))[:, None].expand_as(variance)
     return problem.fit(state.values, problem.covariance(state, variance.sqrt()))
 
 

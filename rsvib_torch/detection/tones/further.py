@@ -12,6 +12,10 @@ the prior covariance ``s^2 I`` of its two quadratures v, the residual r gives
 with the ratio B of the evidences with and without the tone. A tone v changes the parameters by ``-X^+ Z v`` to first
 order, so that its uncertainty adds ``X^+ Z (C + v v^T) (X^+ Z)^T`` to their covariance. Smooth errors of the
 displacements add to it in the same way.
+
+x and y of a row are nearly independent, and each axis is a problem of its own. With roll and zoom, the components of a
+row are strongly correlated, and X contains the parameters of all axes: the displacement along x of all rows determines
+roll as well, and a further tone of x would change it.
 """
 
 import math
@@ -21,7 +25,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.measurements import Measurements, cholesky_root
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
     axis_jacobian,
@@ -66,9 +70,12 @@ def with_further_tones(
     of_parameters = covariance.view(len(covariance), axes, size, axes, size)
     variance = displacement_std(fit, exposure_starts, measurements.exposure_time).square()
     for axis in range(axes):
-        added, moved = _added(measurements, fit, exposure_starts, axis, number_is_known)
-        of_parameters[:, axis, :, axis] += added
-        variance[:, axis] += moved
+        fitted = [axis] if axes == 2 else list(range(axes))
+        added, moved = _added(measurements, fit, exposure_starts, axis, fitted, number_is_known)
+        for row, first in enumerate(fitted):
+            variance[:, first] += moved[:, row]
+            for column, second in enumerate(fitted):
+                of_parameters[:, first, :, second] += added[:, row, :, column]
     return replace(fit, covariance=covariance), variance.sqrt()
 
 
@@ -88,13 +95,21 @@ def _grid(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Tensor, 
 
 
 def _added(
-    measurements: Measurements, fit: ToneFit, exposure_starts: Tensor, axis: int, number_is_known: bool
+    measurements: Measurements,
+    fit: ToneFit,
+    exposure_starts: Tensor,
+    axis: int,
+    fitted: list[int],
+    number_is_known: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Covariance (B, P, P) of the parameters of an axis, and variance (B,) of its displacement, by further tones."""
-    root, X, r, to_all = _whitened(measurements, fit, axis)
+    """Covariance (B, A, P, A, P) of parameters and variance (B, A) of the displacement, by further tones of an axis.
+
+    ``fitted`` are the A axes whose parameters the tone changes.
+    """
+    root, X, r, to_all = _whitened(measurements, fit, fitted)
     rows = exposure_starts.expand(len(r), -1)
-    of_displacement = displacement_jacobian(fit, rows, measurements.exposure_time)[:, :, axis] @ to_all
-    of_displacement = _without_trend(of_displacement, rows)
+    own = displacement_jacobian(fit, rows, measurements.exposure_time)[:, :, fitted]  # (B, n, A, P)
+    of_displacement = _without_trend(torch.stack([own[:, :, i] @ to_all for i in range(len(fitted))], 2), rows)
     size = _PRIOR_SIZE * fit.amplitude[:, axis].square().sum(-1).sqrt()  # (B,) px
     precision = torch.where(size > 0, size, 1.0).square().reciprocal()[:, None, None, None]
     eye = torch.eye(2, dtype=r.dtype, device=r.device)
@@ -103,7 +118,8 @@ def _added(
     parts = []
     for chunk in frequencies.split(max(1, _CHUNK // (4 * r.numel())), dim=1):
         response = tone_response(measurements, chunk[:, None].expand(-1, fit.coefficients.shape[1], -1))[..., axis, :]
-        Z = _quadratures(root[..., None] * response).flatten(1, 2)  # (B, D, F, 2)
+        column = root[..., fitted.index(axis)][:, :, None, :, None]
+        Z = _quadratures(column * response[:, :, :, None]).flatten(1, 3)  # (B, D, F, 2)
         rounding = 1e-12 * Z.square().sum((1, 3))[..., None, None]
         back = torch.einsum("bmd,bdfq->bfmq", inverse, Z)
         Z = Z - torch.einsum("bdm,bfmq->bdfq", X, back)
@@ -114,8 +130,10 @@ def _added(
         evidence = 0.5 * (right * v).sum(-1) - 0.5 * torch.logdet(eye + information / precision)
         # displacement of the rows by the tone and by the change of the parameters
         S = _without_trend(_wave(fit, rows, chunk, measurements.exposure_time), rows)
-        S = S - torch.einsum("bnm,bfmq->bnfq", of_displacement, back)
-        moved = torch.einsum("bnfp,bnfq->bfpq", S, S) / S.shape[1]
+        of_tone = torch.eye(len(fitted), dtype=S.dtype, device=S.device)[fitted.index(axis)][:, None, None]
+        changes = back.unflatten(2, (len(fitted), -1))
+        S = S[:, :, None] * of_tone - torch.einsum("bnam,bfamq->bnafq", of_displacement, changes)
+        moved = torch.einsum("bnafp,bnafq->bfapq", S, S) / S.shape[1]
         parts.append((evidence, C + v[..., :, None] * v[..., None, :], back, moved))
     evidence, second, back, moved = (torch.cat(values, 1) for values in zip(*parts, strict=True))
     # equal prior probabilities of one tone more, of any frequency, and of none
@@ -126,24 +144,30 @@ def _added(
         probability = torch.zeros_like(probability)
     smooth = _smooth_error(measurements, fit)[:, axis].square()[:, None] * prior.exp()
     second = probability[..., None, None] * second + smooth[..., None, None] * eye
-    covariance = (back @ second @ back.mT).sum(1)
-    return to_all @ covariance @ to_all.T, (moved * second).sum((1, 2, 3))
+    covariance = (back @ second @ back.mT).sum(1).unflatten(-1, (len(fitted), -1)).unflatten(1, (len(fitted), -1))
+    of_all = torch.einsum("pm,bimjn,qn->bipjq", to_all, covariance, to_all)
+    return of_all, (moved * second[:, :, None]).sum((1, 3, 4))
 
 
-def _whitened(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The linearised problem of an axis for errors of variance 1.
+def _whitened(measurements: Measurements, fit: ToneFit, axes: list[int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The linearised problem of one axis, or of all together, for errors of variance 1.
 
     Returns:
-        Factors (B, N, 1) from px to standard deviations, the Jacobian (B, N G, M) of the free parameters, the residual
-        (B, N G), and the matrix (P, M) from the free parameters to all.
+        Matrices (B, N, A, A) from px to standard deviations, the Jacobian (B, N G A, A M) of the free parameters, the
+        residual (B, N G A), and the matrix (P, M) from the free parameters of an axis to all.
     """
-    residual = residual_of(measurements, fit)
-    jacobian, to_all = axis_jacobian(measurements, fit, axis)  # (B, N, G, M)
-    spent = (jacobian.square().amax((1, 2)) > 0).sum(-1)
-    spare = (measurements.num_measurements[:, axis] - spent).clamp(min=1.0)
-    variance = (measurements.square(residual)[:, axis] / spare).clamp(min=1e-300)
-    root = (measurements.inverse_variances[..., axis] / variance[:, None]).sqrt()[..., None]
-    return root, (root[..., None] * jacobian).flatten(1, 2), (root * residual[..., axis]).flatten(1), to_all
+    residual = residual_of(measurements, fit)[..., axes]
+    jacobians, constraints = zip(*(axis_jacobian(measurements, fit, axis) for axis in axes), strict=True)
+    jacobian = torch.stack(jacobians, 3)  # (B, N, G, A, M)
+    spent = (jacobian.square().amax((1, 2)) > 0).sum((1, 2))
+    spare = (measurements.num_measurements[:, axes].sum(1) - spent).clamp(min=1.0)
+    one = measurements.inverse_variances[..., axes, None] if len(axes) == 1 else measurements.information
+    root = cholesky_root(one)
+    whitened = (root[:, :, None] @ residual[..., None]).flatten(1)
+    deviation = (whitened.square().sum(1) / spare).clamp(min=1e-300).sqrt()[:, None, None, None]
+    root = root / deviation
+    X = (root[:, :, None, :, :, None] * jacobian[..., None, :, :]).flatten(-2).flatten(1, 3)
+    return root, X, whitened / deviation[:, :, 0, 0], constraints[0]
 
 
 def _smooth_error(measurements: Measurements, fit: ToneFit) -> Tensor:

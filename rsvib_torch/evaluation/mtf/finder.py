@@ -100,7 +100,7 @@ def find_slanted_edges(
         (16, {5.0})
     """
     grey = as_real("image", image)
-    if grey.ndim != 2 or not bool(torch.isfinite(grey).all()):
+    if grey.ndim != 2 or not grey.numel() or not bool(torch.isfinite(grey).all()):
         raise ValueError(f"image must be one finite grey image (H, W), got shape {tuple(grey.shape)}")
     min_length = check_whole_number("min_length", min_length, at_least=16)
     max_length = check_whole_number("max_length", max_length, at_least=min_length)

@@ -1,0 +1,129 @@
+"""``rsvib export``: files for other programs from a vibration.json."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+
+import rsvib_torch as rsv
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.evaluation import city_and_fields
+
+TIMING = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+VIBRATION = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("export")
+    frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), TIMING, VIBRATION, num_frames=2)
+    rsv.write_stack(folder / "frames.tif", frames, dtype="uint16", full_scale=4095)
+    detected = rsv.detect_vibration(frames, TIMING)
+    assert detected.reliable.all()
+    detected.save(folder / "vibration.json")
+    camera = rsv.camera_isd(rsv.Camera(2e6), tuple(frames.shape[-2:]), position=(6878.0, 0, 0), look=(-1.0, 0, 0))
+    (folder / "camera.json").write_text(json.dumps(camera))
+    return folder, detected, tuple(frames.shape[-2:])
+
+
+def run(*arguments):
+    return run_command(["export", *map(str, arguments)])
+
+
+def test_gcsv_with_a_focal_length(place, tmp_path, capsys):
+    folder, detected, _ = place
+    out = tmp_path / "clip.gcsv"
+    frames = ("--frames", folder / "frames.tif")
+    assert run(folder / "vibration.json", out, *frames, "--focal-length", 900, "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert (answer["format"], answer["num_frames"]) == ("gcsv", 2)
+    first = out.read_text().split("t,gx,gy,gz\n")[1].splitlines()[0]
+    tone = detected.vibration
+    rate = float(tone.amplitude[1, 0] * 2 * np.pi * tone.frequency[1, 0] * torch.cos(tone.phase[1, 0])) / 900
+    assert float(first.split(",")[1]) * 1e-9 == pytest.approx(rate, rel=1e-3)
+    assert run(folder / "vibration.json", tmp_path / "other.gcsv", *frames) == 2
+    assert "require a motion with a camera" in capsys.readouterr().err
+
+
+def test_stmap_by_size(place, tmp_path, capsys):
+    folder, detected, size = place
+    out = tmp_path / "maps"
+    options = ("--format", "stmap", "--size", f"{size[0]}x{size[1]}", "--num-frames", 2, "--convention", "opencv")
+    assert run(folder / "vibration.json", out, *options) == 0
+    assert "2 maps of" in capsys.readouterr().out
+    found = tifffile.imread(out / "stmap_0001.tif")
+    expected = rsv.sampling_map(detected.vibration, TIMING, size, 2)[1]
+    np.testing.assert_allclose(found[..., :2], expected.numpy(), atol=1e-4)
+    assert run(folder / "vibration.json", out, *options) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
+def test_isd_of_the_second_frame(place, tmp_path, capsys):
+    folder, _, size = place
+    out = tmp_path / "frame.json"
+    options = ("--isd", folder / "camera.json", "--frame", 1)
+    assert run(folder / "vibration.json", out, *options) == 0
+    assert "line scanner with one quaternion per row" in capsys.readouterr().out
+    assert len(json.loads(out.read_text())["instrument_pointing"]["quaternions"]) == size[0] + 8
+    assert run(folder / "vibration.json", out, *options, "--overwrite", "--model", "frame") == 2
+    assert "no sensor model represents this motion within 0.005 px (frame: " in capsys.readouterr().err
+    assert json.loads(out.read_text())["name_model"] == "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"  # not replaced
+
+
+def test_offsets_before_and_after(place, tmp_path, capsys):
+    folder, detected, _ = place
+    out = tmp_path / "offsets.csv"
+    assert run(folder / "vibration.json", out) == 0
+    assert "px before, 0.0" in capsys.readouterr().out
+    with out.open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == detected.offsets.times.numel()
+    after = [float(line["residual_y_px"]) for line in lines if line["residual_y_px"]]
+    before = [float(line["offset_y_px"]) for line in lines if line["offset_y_px"]]
+    assert np.std(after) < 0.2 * np.std(before)
+
+
+def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
+    folder, _, size = place
+    data = json.loads((folder / "vibration.json").read_text())
+    path = tmp_path / "doubtful.json"
+    options = ("--format", "stmap", "--size", f"{size[0]}x{size[1]}", "--num-frames", 1, "--convention", "opencv")
+    path.write_text(json.dumps(data | {"reliable": [True, False], "reasons": [[], ["blind"]]}))
+    assert run(path, tmp_path / "maps", *options) == 0
+    assert "y is not exported: its vibration is not reliable (blind)" in " ".join(capsys.readouterr().err.split())
+    rows = np.arange(size[0])[:, None]
+    assert np.abs(tifffile.imread(tmp_path / "maps" / "stmap_0000.tif")[..., 1] - rows).max() == 0
+    assert run(path, tmp_path / "forced", *options, "--force") == 0
+    assert np.abs(tifffile.imread(tmp_path / "forced" / "stmap_0000.tif")[..., 1] - rows).max() > 1
+    path.write_text(json.dumps(data | {"reliable": [False, False], "reasons": [["blind"], ["blind"]]}))
+    assert run(path, tmp_path / "none", *options) == 2
+    assert "nothing to export" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("vibration.json", "clip.xyz"), "give --format gcsv, stmap, isd or csv"),
+        (("vibration.json", "vibration.json"), "it is the same file as the input"),
+        (("vibration.json", "camera.json", "--isd", "camera.json"), "it is the same file as the input camera.json"),
+        (("vibration.json", "clip.gcsv", "--focal-length", "900"), "give --frames, or --size and --num-frames"),
+        (("vibration.json", "frame.json"), "give --isd FILE"),
+        (("vibration.json", "clip.gcsv", "--size", "300", "--num-frames", "2"), "--size must be HEIGHTxWIDTH"),
+        (("camera.json", "clip.gcsv"), "camera.json"),
+        (("vibration.json", "no/clip.gcsv"), "does not exist"),
+        (("vibration.json", "frame.json", "--isd", "camera.json", "--frame", "-1"), "at least"),
+    ],
+)
+def test_errors_are_one_line(place, monkeypatch, capsys, arguments, message):
+    folder, _, _ = place
+    monkeypatch.chdir(folder)
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    assert run(*arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
