@@ -46,8 +46,8 @@ from .io import (
     write_stack,
 )
 from .io.gyroscope.read_gyroscope import read_gyroscope
-from .motion.angular_rates import AngularRates
 from .motion.camera import Camera
+from .motion.gyroscope_rates import AngularRates
 from .motion.recorded import read_motion
 from .motion.spline import FreeMotion
 from .motion.timing import SensorTiming

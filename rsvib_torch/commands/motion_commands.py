@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from rsvib_torch.calibration import RowTimeCalibration
     from rsvib_torch.core.presentation import Result
     from rsvib_torch.detection import MotionCheck, MotionDetection, SweptTone
-    from rsvib_torch.motion.angular_rates import AngularRates
+    from rsvib_torch.motion.gyroscope_rates import AngularRates
     from rsvib_torch.motion.spline import FreeMotion
     from rsvib_torch.motion.timing import SensorTiming
 

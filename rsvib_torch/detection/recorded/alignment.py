@@ -22,8 +22,8 @@ from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, st
 from rsvib_torch.detection.start import grey_frames, measurements_of_curve
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.io.files import FramesOrFiles, timing_of_files
-from rsvib_torch.motion.angular_rates import AngularRates
 from rsvib_torch.motion.camera import Camera
+from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions

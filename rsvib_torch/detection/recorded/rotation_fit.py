@@ -26,8 +26,8 @@ from torch import Tensor
 from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.detection.recorded.band_vectors import BandVectors
 from rsvib_torch.detection.recorded.rotation_search import MIN_FOCAL_LENGTH, orientation_matrix
-from rsvib_torch.motion.angular_rates import AngularRates
 from rsvib_torch.motion.camera import Camera
+from rsvib_torch.motion.gyroscope_rates import AngularRates
 
 __all__ = ["NAMES", "RotationFit", "RotationModel", "components_of", "fit_robustly"]
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.recorded.band_vectors import BandVectors
-from rsvib_torch.motion.angular_rates import AngularRates
+from rsvib_torch.motion.gyroscope_rates import AngularRates
 
 __all__ = ["MIN_FOCAL_LENGTH", "ORIENTATIONS", "OrientationSearch", "orientation_matrix", "search_orientations"]
 

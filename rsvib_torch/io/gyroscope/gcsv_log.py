@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.text import one_line
 from rsvib_torch.io.gyroscope.rates_table import angular_rates, rows_of_numbers, text_lines
-from rsvib_torch.motion.angular_rates import AngularRates
+from rsvib_torch.motion.gyroscope_rates import AngularRates
 
 __all__ = ["check_orientation", "is_gcsv", "oriented", "read_gcsv"]
 

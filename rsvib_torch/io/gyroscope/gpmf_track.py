@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rsvib_torch.core.free_memory import size_text
 from rsvib_torch.io.gyroscope.gcsv_log import check_orientation, oriented
 from rsvib_torch.io.gyroscope.rates_table import angular_rates
-from rsvib_torch.motion.angular_rates import AngularRates
+from rsvib_torch.motion.gyroscope_rates import AngularRates
 
 __all__ = ["is_mp4", "read_gpmf"]
 

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from rsvib_torch.core.text import one_line
-from rsvib_torch.motion.angular_rates import MAX_SAMPLES, AngularRates
+from rsvib_torch.motion.gyroscope_rates import MAX_SAMPLES, AngularRates
 from rsvib_torch.motion.recorded import SECONDS
 
 __all__ = ["angular_rates", "read_rates_table", "rows_of_numbers", "text_lines"]

@@ -13,7 +13,7 @@ from rsvib_torch.core.reading import check_regular
 from rsvib_torch.io.gyroscope.gcsv_log import is_gcsv, read_gcsv
 from rsvib_torch.io.gyroscope.gpmf_track import is_mp4, read_gpmf
 from rsvib_torch.io.gyroscope.rates_table import read_rates_table
-from rsvib_torch.motion.angular_rates import AngularRates
+from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.recorded import check_times
 
 __all__ = ["RateUnit", "read_gyroscope"]
