@@ -87,8 +87,8 @@ def band_vectors(stack: GreyFrames, timing: SensorTiming, options: RegistrationO
     count = max(2, min(8, width // max(narrowest, 128)))
     rowwise = timing.in_row_order()
     rowwise.check_rows(height)
-    parts, columns = cut_into_strips(stack.images, count, 0)
-    valid = None if stack.valid is None else cut_into_strips(stack.valid, count, 0)[0]
+    parts, columns = cut_into_strips(stack.images, count)
+    valid = None if stack.valid is None else cut_into_strips(stack.valid, count)[0]
     curve = band_curve(parts, valid, rowwise, options, mere_start=False)
     good = curve.good
     if float(good.double().mean()) < 0.1:
