@@ -104,6 +104,7 @@ class _Errors:
         parallax: Standard deviation of m.
         direction: (3,) unit vector of the translation.
         lines: (M, 2) px, s.
+        turned: (M, 2, 2) px, s for the two unit vectors perpendicular to the direction.
     """
 
     weight: Tensor
@@ -113,6 +114,7 @@ class _Errors:
     parallax: float
     direction: Tensor
     lines: Tensor
+    turned: Tensor
 
     @property
     def information(self) -> Tensor:
@@ -196,8 +198,13 @@ def _split(errors: _Errors, rest: Tensor) -> tuple[Tensor, Tensor, Tensor, Tenso
 def _solve(vectors: BandVectors, errors: _Errors, slopes: Tensor, residual: Tensor) -> tuple[Tensor, Tensor, float]:
     """Change (7,) and covariance (7, 7) of the parameters, and the sum of squares, by generalised least squares.
 
-    The inverse of the covariance of all residuals of a pair follows from the matrix inversion lemma.
+    The inverse of the covariance of all residuals of a pair follows from the matrix inversion lemma. What all pairs
+    have in common is eliminated: the mean of the parallax, and the error of its direction. In three pairs with a
+    parallax of 3 px, the bias was wrong by up to 29 standard deviations without this.
     """
+    count = slopes.shape[-1]
+    if errors.parallax > 0:
+        slopes = torch.cat([slopes, _common_parallax(errors, residual)], -1)
     factors = vectors.factors() * errors.spread  # (M, 2, 3)
     information = errors.information
     weighted = factors.mT @ information
@@ -210,9 +217,27 @@ def _solve(vectors: BandVectors, errors: _Errors, slopes: Tensor, residual: Tens
     right = torch.einsum("mia,mij,mj->a", slopes, information, residual)
     right = right - torch.einsum("pij,pi->j", of_slopes, solved)
     cost = torch.einsum("mi,mij,mj->", residual, information, residual) - (of_residual * solved).sum()
+    if errors.parallax > 0:
+        prior = torch.tensor([errors.parallax**-2, 1.0, 1.0], dtype=gram.dtype)  # the direction is free
+        common = gram[count:, count:] + torch.diag(prior)
+        shared = torch.linalg.solve(common, torch.cat([gram[count:, :count], right[count:, None]], -1))
+        cost = cost - right[count:] @ shared[:, -1]
+        right = right[:count] - gram[:count, count:] @ shared[:, -1]
+        gram = gram[:count, :count] - gram[:count, count:] @ shared[:, :-1]
     size = torch.where(gram.diagonal() > 0, gram.diagonal(), 1.0).sqrt()
     inverse = torch.linalg.pinv(gram / size / size[:, None], rtol=1e-12, hermitian=True) / size / size[:, None]
     return inverse @ right, inverse, float(cost)
+
+
+def _common_parallax(errors: _Errors, residual: Tensor) -> Tensor:
+    """(M, 2, 3) change of the displacements by a mean of m, and by the two components of an error of the direction.
+
+    The latter is proportional to m of each part, which is estimated from its residual.
+    """
+    size = (errors.weight[:, None] * errors.lines.square()).sum(-1) * (errors.parallax / errors.sigma) ** 2
+    along = (errors.lines * residual).sum(-1) / errors.lines.square().sum(-1).clamp(min=1e-300)
+    parallax = (along * size / (1 + size)).clamp(-5 * errors.parallax, 5 * errors.parallax)
+    return torch.cat([errors.lines[..., None], parallax[:, None, None] * errors.turned], -1)
 
 
 def _converged(
@@ -339,7 +364,9 @@ def _estimated(
     square = torch.einsum("mi,mij,mj->m", rest, vectors.weight[:, None, None] * vectors.shape, rest)
     scale = float(square[weight > 0].median() / 1.386) ** 0.5
     direction = _direction(model, focal_length, weight, rest, max(0.5 * scale, 1e-6))
-    errors = replace(errors, direction=direction, lines=_lines(model.camera, vectors.place, direction, focal_length))
+    across = torch.linalg.svd(direction[None]).Vh[1:]  # (2, 3)
+    lines, *turned = _lines(model.camera, vectors.place, torch.stack([direction, *across]), focal_length)
+    errors = replace(errors, direction=direction, lines=lines, turned=torch.stack(turned, -1))
     off, along, off_variance, along_variance = _split(errors, rest)
     counted = float((weight > 0).sum())
     sigma = float((off.square() / off_variance).sum() / max(counted - 1.5 * vectors.num_pairs, 1.0)) ** 0.5
@@ -373,7 +400,16 @@ def fit_robustly(model: RotationModel, start: Tensor, free: Sequence[bool], roun
     vectors, parameters = model.vectors, start
     residual = vectors.offsets - model.predicted(start)
     none = torch.zeros(3, dtype=torch.float64)
-    errors = _Errors(vectors.weight, vectors.shape, 1.0, none, 0.0, none, torch.zeros_like(residual))
+    errors = _Errors(
+        vectors.weight,
+        vectors.shape,
+        1.0,
+        none,
+        0.0,
+        none,
+        torch.zeros_like(residual),
+        torch.zeros(len(residual), 2, 2),
+    )
     errors = replace(errors, weight=vectors.weight * _following(vectors, model.predicted(start)))
     errors, effects = _estimated(model, errors, residual, parameters, sum(free), with_effects=False)
     for number in range(rounds):
