@@ -16,6 +16,7 @@ from .detection import (
     DetectionResult,
     MotionCheck,
     MotionDetection,
+    RotationAlignment,
     SweptTone,
     VibrationDetector,
     align_motion,
@@ -44,7 +45,9 @@ from .io import (
     timing_from_first_frame,
     write_stack,
 )
+from .io.gyroscope.read_gyroscope import read_gyroscope
 from .motion.camera import Camera
+from .motion.gyroscope_rates import AngularRates
 from .motion.recorded import read_motion
 from .motion.spline import FreeMotion
 from .motion.timing import SensorTiming
@@ -83,6 +86,7 @@ from .restoration import (
 from .stacks import StackReport, iterate_stack, process_stack, read_manifest, restore_block
 
 __all__ = [
+    "AngularRates",
     "Camera",
     "ClockAlignment",
     "DetectionResult",
@@ -95,6 +99,7 @@ __all__ = [
     "RestorationVerdict",
     "RestorationWarning",
     "RollingShutterVibration",
+    "RotationAlignment",
     "RowTimeCalibration",
     "RowVaryingBlur",
     "SensorNoise",
@@ -132,6 +137,7 @@ __all__ = [
     "process_stack",
     "psf_figure",
     "psnr",
+    "read_gyroscope",
     "read_manifest",
     "read_motion",
     "read_stack",

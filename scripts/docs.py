@@ -39,9 +39,17 @@ PACKAGES = (
 )
 # Names with which the page of a package begins; others follow in alphabetical order.
 FIRST_NAMES = (
-    *("SensorTiming", "Vibration", "VibrationStd", "FreeMotion", "read_motion"),
+    *("SensorTiming", "Vibration", "VibrationStd", "FreeMotion", "read_motion", "AngularRates"),
     *("detect_vibration", "DetectionResult", "VibrationDetector", "detect_motion", "MotionDetection"),
-    *("detect_swept_tone", "SweptTone", "align_motion", "ClockAlignment", "check_motion", "MotionCheck"),
+    *(
+        "detect_swept_tone",
+        "SweptTone",
+        "align_motion",
+        "ClockAlignment",
+        "RotationAlignment",
+        "check_motion",
+        "MotionCheck",
+    ),
     *("restore", "VibrationRestorer", "judge_restoration", "RestorationVerdict", "RestorationWarning"),
     *("simulate_frames", "SensorNoise", "Optics", "row_psf", "RowVaryingBlur"),
     *("register_bands", "OffsetCurve"),
@@ -66,6 +74,7 @@ SECTIONS = {
         "your_own_camera.md",
         "roll_and_zoom.md",
         "finer_grid.md",
+        "gyroscope.md",
         "stacks.md",
         "export.md",
         "reliability.md",

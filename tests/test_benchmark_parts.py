@@ -189,9 +189,9 @@ def test_peak_memory():
     from benchmarks.measure import peak_memory
 
     if not Path("/proc/self/clear_refs").exists():
-        pytest.skip("the system does not tell the peak of memory")
-    frame = 4 * 1024 * 512
-    exact, dewarped = (peak_memory(method, 1, 1024, 512) for method in ("exact", "dewarp"))
+        pytest.skip("the system does not report the peak of memory")
+    frame = 4 * 2048 * 1024  # memory that the process released before is reused and does not count: several MB
+    exact, dewarped = (peak_memory(method, 1, 2048, 1024) for method in ("exact", "dewarp"))
     assert 2 * frame < dewarped < exact < 200 * frame
     assert peak_memory("detection", 2, 512, 512) > 2 * 4 * 512 * 512
 

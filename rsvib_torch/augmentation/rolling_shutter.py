@@ -1,6 +1,6 @@
 """Kornia augmentation: still images as a vibrating rolling-shutter camera records them.
 
-Invariant: the displacement depends on the row only (docs/architecture.md).
+Invariant: the displacement depends on the row only (docs/architecture.md), with roll and zoom in strips of columns.
 """
 
 import math
@@ -19,9 +19,11 @@ from rsvib_torch.core.checks import check_choice, check_number, check_whole_numb
 from rsvib_torch.core.precision import full_precision
 from rsvib_torch.core.splines import gauss_legendre, mirrored
 from rsvib_torch.frames.arrays import channels_appear_last
+from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging import blur_rows, gauss_node_count, rows_showing, trajectory_psf
 from rsvib_torch.imaging.psf import Interpolation
+from rsvib_torch.motion.field import ColumnMotion, displacement_at, largest_in_frame
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
@@ -42,29 +44,42 @@ class ImageMotion:
         starts: (B,) exposure start of the first row of each image, seconds.
         exposure_time: (B,) seconds.
         timing: The sensor; its exposure is not used.
+        size: (rows, columns) of the images.
     """
 
     vibration: Motion
     starts: Tensor
     exposure_time: Tensor
     timing: RowTiming
+    size: tuple[int, int]
 
-    def trajectory(self, num_rows: int) -> tuple[Tensor, Tensor]:
-        """Displacement (B, R, N, 2) in px at the Gauss-Legendre nodes of the exposures of rows, and weights (N,)."""
-        rows = torch.arange(num_rows, dtype=torch.float64, device=self.starts.device)
+    @property
+    def turns(self) -> bool:
+        """Whether there is roll or zoom, so that the columns of a row move differently."""
+        return self.vibration.num_axes > 2
+
+    def trajectory(self) -> tuple[Tensor, Tensor]:
+        """Components (B, R, N, A) at the Gauss-Legendre nodes of the exposures of rows, and weights (N,)."""
+        rows = torch.arange(self.size[0], dtype=torch.float64, device=self.starts.device)
         starts = self.starts[:, None] + rows * self.timing.row_time
-        count = gauss_node_count(self.vibration, float(self.exposure_time.amax()))
+        motion = self.vibration
+        if self.turns:  # the last column moves farthest
+            last = torch.full((1,), 0.5 * self.size[1], dtype=torch.float64, device=starts.device)
+            motion = ColumnMotion.of_columns(motion, last, self.timing, 1, self.size[0])
+        count = gauss_node_count(motion, float(self.exposure_time.amax()))
         nodes, weights = (tensor.to(starts.device) for tensor in gauss_legendre(count))
         times = starts[..., None] + nodes * self.exposure_time[:, None, None]
         return self.vibration.displacement(times), weights
 
     def mean_displacement(self, rows: Tensor) -> Tensor:
-        """Mean displacement (B, S, 2) in px over the exposures of frame rows (B, S) (Eq. 2)."""
+        """Mean components (B, S, A) over the exposures of frame rows (B, S) (Eq. 2)."""
         starts = self.starts[:, None] + rows * self.timing.row_time
         return self.vibration.mean_displacement(starts, self.exposure_time[:, None])
 
     def move(self, points: Tensor) -> Tensor:
         """Positions (B, S, 2) in the frame of scene points (B, S, 2) in px, both (x, y)."""
+        if self.turns:
+            return self._turn(points)
         rows = rows_showing(
             points[..., 1],
             self.starts[:, None],
@@ -74,6 +89,17 @@ class ImageMotion:
         )
         return torch.stack([points[..., 0] + self.mean_displacement(rows)[..., 0], rows], dim=-1)
 
+    def _turn(self, points: Tensor) -> Tensor:
+        """``move`` with roll or zoom: Newton's method for the row of each point, as in ``rows_showing``."""
+        x, y = ((points[..., 1 - axis] - 0.5 * (self.size[axis] - 1)) for axis in (1, 0))
+        rows = points[..., 1]
+        for _ in range(8):
+            residual = points[..., 1] + displacement_at(self.mean_displacement(rows), x, y)[..., 1] - rows
+            middle = self.starts[:, None] + rows * self.timing.row_time + 0.5 * self.exposure_time[:, None]
+            slope = displacement_at(self.vibration.velocity(middle), x, y)[..., 1].detach() * self.timing.row_time
+            rows = rows + residual / (1.0 - slope).clamp(min=0.1)
+        return torch.stack([points[..., 0] + displacement_at(self.mean_displacement(rows), x, y)[..., 0], rows], -1)
+
     @full_precision
     def move_images(self, images: Tensor, interpolation: Interpolation) -> Tensor:
         """Form frames (B, C, R, W) from still images of the same shape, in row order, with mirrored boundaries.
@@ -81,19 +107,53 @@ class ImageMotion:
         Half-precision images are formed in float32.
         """
         dtype = images.dtype if images.dtype in (torch.float32, torch.float64) else torch.float32
-        psf = trajectory_psf(*self.trajectory(images.shape[-2]), interpolation=interpolation)
+        components, weights = self.trajectory()
+        strips = self._strips()
+        displacement = components if strips is None else self._of_strips(components, strips)
+        psf = trajectory_psf(displacement, weights, interpolation=interpolation)
         psf = type(psf)(psf.first_tap[:, None], psf.weights[:, None], psf.degree)  # the same for all channels
-        return blur_rows(images.to(dtype), psf).to(images.dtype)
+        if strips is None:
+            return blur_rows(images.to(dtype), psf).to(images.dtype)
+        return strips.joined(blur_rows(strips.cut(images.to(dtype)), psf)).to(images.dtype)
+
+    def _strips(self, *, max_slide: float = 0.2, min_pitch: float = 16.0) -> ColumnStrips | None:
+        """Strips of columns that move by ``max_slide`` px more or less than their neighbours; None without roll."""
+        if not self.turns:
+            return None
+        first, last = float(self.starts.amin()), float(self.starts.amax()) + self.size[0] * self.timing.row_time
+        most = self.vibration.largest_displacement(first, last + float(self.exposure_time.amax()))
+        pitch = max(min_pitch, max_slide / max(float(most[..., 2:].amax()), 1e-9))
+        farthest = float(largest_in_frame(most, self.size[1], self.size[0])[..., 0].amax())
+        return ColumnStrips.of(self.size[1], pitch, margin=math.ceil(farthest) + 4)  # 4 px: support of the kernel
+
+    def _of_strips(self, components: Tensor, strips: ColumnStrips) -> Tensor:
+        """Displacements (B S, R, N, 2) of the middles of strips in the rows of the frame; components (B, R, N, A)."""
+        components = components.repeat_interleave(len(strips.firsts), 0)
+        x = strips.columns.to(components.device).repeat(len(self.starts))[:, None, None]
+        rows = torch.arange(self.size[0], dtype=torch.float64, device=components.device)[:, None]
+        scale = 1.0 + components[..., 3] if components.shape[-1] > 3 else 1.0
+        y = (rows - 0.5 * (self.size[0] - 1) - components[..., 1] - components[..., 2] * x) / scale
+        return displacement_at(components, x, y)
 
     def move_masks(self, masks: Tensor) -> Tensor:
         """Labels (B, C, R, W) moved by the mean displacement of their rows, to the nearest pixel."""
         B, _, R, W = masks.shape
         rows = torch.arange(R, dtype=torch.float64, device=masks.device)
-        displacement = self.mean_displacement(rows.expand(B, -1))
-        source_rows = mirrored((rows - displacement[..., 1]).round().to(torch.int64), R)
         columns = torch.arange(W, dtype=torch.float64, device=masks.device)
-        source_columns = mirrored((columns - displacement[..., :1]).round().to(torch.int64), W)
-        index = source_rows[..., None] * W + source_columns
+        components = self.mean_displacement(rows.expand(B, -1))[:, :, None]  # (B, R, 1, A)
+        right, down = columns - components[..., 0], rows[:, None] - components[..., 1]
+        if self.turns:  # the inverse of the displacement field
+            middle = [0.5 * (W - 1), 0.5 * (R - 1)]
+            right, down, roll = right - middle[0], down - middle[1], components[..., 2]
+            scale = 1.0 + components[..., 3] if components.shape[-1] > 3 else torch.ones_like(roll)
+            size = scale.square() + roll.square()
+            right, down = (scale * right + roll * down) / size, (scale * down - roll * right) / size
+            right, down = right + middle[0], down + middle[1]
+        source_rows, source_columns = (
+            mirrored(down.round().to(torch.int64), R),
+            mirrored(right.round().to(torch.int64), W),
+        )
+        index = source_rows * W + source_columns
         index = index.flatten(1)[:, None].expand(-1, masks.shape[1], -1)
         return masks.flatten(-2).gather(-1, index).reshape(masks.shape)
 
@@ -176,6 +236,9 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         frequency: Range of f in Hz.
         phase: Range of phi in rad.
         image_motion: Range of v in px/s.
+        roll: Range of the amplitude of the rotation about the optical axis in rad, ``(low, high)`` or a number; None
+            for no roll. Frequency and phase are drawn from the ranges of x.
+        zoom: The same for the relative change of scale.
         exposure_rows: Exposure in row times, a number or ``(low, high)``; by default that of the sensor.
         tones: Number of tones of each axis.
         interpolation: ``"cubic"``, or ``"linear"``, which adds a slight blur.
@@ -204,6 +267,8 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         frequency: Range = (20.0, 200.0),
         phase: Range = (-math.pi, math.pi),
         image_motion: Range = 0.0,
+        roll: float | tuple[float, float] | None = None,
+        zoom: float | tuple[float, float] | None = None,
         exposure_rows: float | tuple[float, float] | None = None,
         tones: int = 1,
         interpolation: Interpolation = "cubic",
@@ -220,10 +285,17 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         exposures = _axis_ranges("exposure_rows", timing.exposure_rows if exposure_rows is None else exposure_rows)[0]
         for value in exposures:
             check_number("exposure_rows", value, above=0.0, at_most=timing.frame_rows)
+        turns = []
+        for name, of_turn in (("roll", roll), ("zoom", zoom)):
+            if isinstance(of_turn, Sequence) and any(isinstance(part, Sequence) for part in of_turn):
+                raise TypeError(f"{name} must be a number or (low, high), got {of_turn!r}")
+            turns.append((0.0, 0.0) if of_turn is None else _axis_ranges(name, of_turn, at_least=0.0)[0])
+        turns = turns if zoom is not None else turns[:1] if roll is not None else []
+        frequencies, phases = _axis_ranges("frequency", frequency, at_least=0.0), _axis_ranges("phase", phase)
         self.flags = {
-            "amplitude": _axis_ranges("amplitude", amplitude, at_least=0.0),
-            "frequency": _axis_ranges("frequency", frequency, at_least=0.0),
-            "phase": _axis_ranges("phase", phase),
+            "amplitude": (*_axis_ranges("amplitude", amplitude, at_least=0.0), *turns),
+            "frequency": (*frequencies, *frequencies[:1] * len(turns)),
+            "phase": (*phases, *phases[:1] * len(turns)),
             "image_motion": _axis_ranges("image_motion", image_motion),
             "exposure_rows": exposures,
             "interpolation": interpolation,
@@ -238,7 +310,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
 
     @checks_arguments
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> Parameters:
-        """Draw one motion per image: amplitude, frequency, phase (B, 2, K), image_motion (B, 2), exposure_rows (B,)."""
+        """Draw one motion per image: amplitude, frequency, phase (B, A, K), image_motion (B, 2), exposure_rows (B,)."""
         draws = 1 if self.same_on_batch else batch_shape[0]
         drawn = {
             name: _draw(self.flags[name], (draws, self.tones), self.device, self.dtype).mT
@@ -337,7 +409,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             return points
         motion = self._motion(params, points)
         by_columns, reverse = self.timing.scan_axis == -1, self.timing.readout_direction == "reverse"
-        last = points.new_tensor([0, self._num_rows(params) - 1], dtype=torch.float64)
+        last = points.new_tensor([0, self._size(params)[0] - 1], dtype=torch.float64)
         sign = points.new_tensor([1, -1], dtype=torch.float64)
         rowwise = points.to(torch.float64).reshape(len(motion.starts), -1, *shape)
         rowwise = rowwise.flip(-1) if by_columns else rowwise
@@ -351,7 +423,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         exposure_rows = drawn.pop("exposure_rows")
         amplitude = drawn.pop("amplitude")
         vibration = Vibration(amplitude, camera=None, **drawn).to_row_order(self.timing)
-        self.timing.check_rows(self._num_rows(params))
+        self.timing.check_rows(self._size(params)[0])
         length = self._recording_length(params)
         starts = self.timing.frame_starts(length) if length > 1 else torch.zeros(1, dtype=torch.float64, device="cpu")
         return ImageMotion(
@@ -359,6 +431,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             starts=starts.repeat(len(exposure_rows) // length).to(like.device),
             exposure_time=exposure_rows * self.timing.row_time,
             timing=self.timing.in_row_order(),
+            size=self._size(params),
         )
 
     def _recording_length(self, params: Parameters) -> int:
@@ -370,9 +443,10 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         drawn = (params[name].unflatten(0, (int(clips), -1)) for name in (*_DRAWN, "batch_prob"))
         return count // int(clips) if all(bool((clip == clip[:, :1]).all()) for clip in drawn) else 1
 
-    def _num_rows(self, params: Parameters) -> int:
-        height, width = params["forward_input_shape"].tolist()[-2:]
-        return int(height if self.timing.scan_axis == -2 else width)
+    def _size(self, params: Parameters) -> tuple[int, int]:
+        """Rows and columns of the images in row order."""
+        height, width = (int(size) for size in params["forward_input_shape"].tolist()[-2:])
+        return (height, width) if self.timing.scan_axis == -2 else (width, height)
 
     def inverse_transform(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Raise an error: the blur is inverted by restoration only."""

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from rsvib_torch.calibration import RowTimeCalibration
     from rsvib_torch.core.presentation import Result
     from rsvib_torch.detection import MotionCheck, MotionDetection, SweptTone
+    from rsvib_torch.motion.gyroscope_rates import AngularRates
     from rsvib_torch.motion.spline import FreeMotion
     from rsvib_torch.motion.timing import SensorTiming
 
@@ -129,6 +130,7 @@ def _detect_swept_tone(frames: Tensor, timing: SensorTiming, search: int) -> tup
 def _without_curve(result: Result) -> dict[str, Any]:
     """The values of a result without its curves, which have a value for every row or knot."""
     curve = {"motion", "times", "displacement", "offsets", "residual", "light", "fitted_light"}
+    curve |= {"measured", "predicted"}
     curve |= {"std"} if isinstance(result, detection.MotionDetection) else set()
     return {name: value for name, value in result.to_dict().items() if name not in curve}
 
@@ -149,10 +151,25 @@ def known(
     restored: RestoredArgument,
     *,
     settings: Config,
-    motion: Annotated[Path, typer.Option(help="CSV file with the columns time, x and y.")],
-    unit: Annotated[MotionUnit, typer.Option(help="Unit of x and y: px, an angle, or an angular rate.")],
+    motion: Annotated[
+        Path,
+        typer.Option(
+            help="CSV file with the columns time, x and y; or, without --unit, the angular rates of a gyroscope: a "
+            "gyroflow log (.gcsv), a GoPro video (.mp4), or CSV with three rates whose names state the unit."
+        ),
+    ],
+    unit: Annotated[
+        MotionUnit | None,
+        typer.Option(
+            help="Unit of x and y: px, an angle, or an angular rate.", show_default="the rates of a gyroscope"
+        ),
+    ] = None,
     focal_length: Annotated[
-        float | None, typer.Option(help="Focal length in px; required for angles and angular rates.")
+        float | None,
+        typer.Option(
+            help="Focal length in px; required for angles and angular rates.",
+            show_default="for a gyroscope, estimated from the frames",
+        ),
     ] = None,
     time_unit: Annotated[TimeUnit, typer.Option(help="Unit of the times.")] = "s",
     flip_x: Annotated[bool, typer.Option("--flip-x", help="Positive x moves the image towards smaller x.")] = False,
@@ -185,13 +202,26 @@ def known(
     the restored frames are judged no better than the input, the input is written unchanged, unless --force is given.
     """
     check_new(io.stack_files(restored), overwrite, [*io.stack_files(frames), settings.path, motion])
-    recorded = rsvib_torch.read_motion(
-        motion,
-        unit=unit,
-        focal_length=focal_length,
-        time_unit=time_unit,
-        signs=(-1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0),
-    )
+    from rsvib_torch.motion.spline import FreeMotion  # noqa: PLC0415
+
+    recorded: FreeMotion | AngularRates
+    camera = None
+    if unit is None:
+        if flip_x or flip_y or offset is not None or time_unit != "s":
+            raise ValueError(
+                "--flip-x, --flip-y, --offset and --time-unit are for a CSV file with the columns time, x and y, and "
+                "need --unit; axes and clock of a gyroscope are estimated from the frames"
+            )
+        recorded = rsvib_torch.read_gyroscope(motion)
+        camera = None if focal_length is None else rsvib_torch.Camera(focal_length)
+    else:
+        recorded = rsvib_torch.read_motion(
+            motion,
+            unit=unit,
+            focal_length=focal_length,
+            time_unit=time_unit,
+            signs=(-1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0),
+        )
     info = io.read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
     options = restoration_options(info, scale, settings)
@@ -199,9 +229,9 @@ def known(
     results: dict[str, list[str]] = {}
     data: dict[str, Any] = {"alignment": None, "check": None}
     stack = load(frames, settings, full_scale, device, options)
-    if offset is None:
+    if offset is None or not isinstance(recorded, FreeMotion):
         with working("aligning the recording"):
-            found = detection.align_motion(stack.frames, stack.timing, recorded, fit_gain=fit_gain)
+            found = detection.align_motion(stack.frames, stack.timing, recorded, camera=camera, fit_gain=fit_gain)
         results["Recording on the clock of the frames"] = [found.summary()]
         data["alignment"] = _without_curve(found)
         _refuse(motion, found.reasons, force)
@@ -215,7 +245,9 @@ def known(
                 f"{motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, the frames need "
                 f"{offset + first:.6g} to {offset + last:.6g} s"
             )
-    check = _check_motion(motion, stack.frames, stack.timing, placed, force, required=offset is None)
+    check = None
+    if isinstance(recorded, FreeMotion):  # rates were compared by the alignment
+        check = _check_motion(motion, stack.frames, stack.timing, placed, force, required=offset is None)
     if check is not None:
         results["Motion of the frames"] = [check.summary()]
         data["check"] = _without_curve(check)

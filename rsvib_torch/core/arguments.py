@@ -149,7 +149,6 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
             known["..."] = batch
 
 
-@cache
 def _stated_axes(stated: str) -> tuple[str, list[tuple[str, int, float]]]:
     """Mark of the leading dimensions, and name, smallest and largest size of each axis of a shape."""
     names = stated.split()

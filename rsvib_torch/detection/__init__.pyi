@@ -1,6 +1,7 @@
 from .detect import DetectionMethod, VibrationDetector, detect_vibration
 from .recorded.alignment import ClockAlignment, align_motion
 from .recorded.motion_check import MotionCheck, check_motion
+from .recorded.rotation_alignment import RotationAlignment
 from .result import DetectionResult
 from .row_time.by_motion import calibrate_row_time_by_motion
 from .shapes.free import MotionDetection, detect_motion
@@ -12,6 +13,7 @@ __all__ = [
     "DetectionResult",
     "MotionCheck",
     "MotionDetection",
+    "RotationAlignment",
     "SweptTone",
     "VibrationDetector",
     "align_motion",

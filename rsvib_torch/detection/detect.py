@@ -38,7 +38,7 @@ from rsvib_torch.detection.tones.fit import (
     vibration_of_fit,
 )
 from rsvib_torch.detection.tones.further import with_further_tones
-from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones
+from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE, find_tones
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.io.files import FramesOrFiles, timing_of_files
@@ -225,8 +225,8 @@ def detect_vibration(
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
     channels: Channels = None,
-    roll: bool | Literal["auto"] = False,
-    zoom: bool | Literal["auto"] = False,
+    roll: bool | Literal["auto"] = "auto",
+    zoom: bool | Literal["auto"] = "auto",
     focal_length: float | None = None,
     principal_point: tuple[float, float] | None = None,
     distortion: tuple[float, float, float, float, float] | None = None,
@@ -247,7 +247,7 @@ def detect_vibration(
         model: ``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape; ``"swept"``: one tone per
             axis whose amplitude decays or grows and whose frequency sweeps. The last two take the options from
             ``registration`` to ``search``, ``ignore``, ``full_scale`` and ``channels``; ``detect_motion`` and
-            ``detect_swept_tone`` have further ones. ``"free"`` also takes ``roll`` and ``zoom``, True or False.
+            ``detect_swept_tone`` have further ones. ``"free"`` also measures ``roll`` and ``zoom``, if they are True.
         method: ``"direct"``, or ``"bands"`` (the paper's method), in half the time with ten times larger errors.
         registration: Method of the band registration, as in ``register_bands``.
         tones: Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance; the standard deviations
@@ -267,8 +267,8 @@ def detect_vibration(
         channels: ``"last"`` for frames (T, H, W, C) or (B, T, H, W, C). By default channels come before the image axes,
             and frames that appear to have them last are refused; ``"first"`` omits this check.
         roll: Measure the rotation about the optical axis as a third component of the motion, in rad: True, False, or
-            ``"auto"``: if the halves of the rows move apart. Results then have three axes instead of two, see
-            ``Vibration``.
+            ``"auto"``: if the halves of the rows move apart, and not with ``columns``. Results then have three axes
+            instead of two, see ``Vibration``.
         zoom: The same for the change of scale, as a fourth component; includes roll.
         focal_length: Focal length in px, for a motion that is a rotation of the camera: displacements then follow from
             the projection (see ``Camera``), which matters for fields of view above about 20 degrees, and the result
@@ -329,17 +329,6 @@ def detect_vibration(
                 raise ValueError(
                     f"{name}={value!r} goes with model='tones', not with model={model!r}, which takes {valid}"
                 )
-        of_field = {
-            "roll": roll or None,
-            "zoom": zoom or None,
-            "focal_length": focal_length,
-            "principal_point": principal_point,
-            "distortion": distortion,
-        }
-        field_options = {name: value for name, value in of_field.items() if value is not None}
-        if field_options and model == "swept":
-            given = next(f"{name}={value!r}" for name, value in field_options.items())
-            raise ValueError(f"{given} goes with model='tones' or 'free', not with model='swept'")
         return _OTHER_MODELS[model](
             frames,
             timing,
@@ -350,7 +339,14 @@ def detect_vibration(
             ignore=ignore,
             full_scale=full_scale,
             channels=channels,
-            **field_options,
+            **_options_of_field(
+                model,
+                roll=roll is True or None,  # "auto": not measured unless requested
+                zoom=zoom is True or None,
+                focal_length=focal_length,
+                principal_point=principal_point,
+                distortion=distortion,
+            ),
         )
     check_choice("method", method, tuple(_METHODS))
     if tones != "auto":
@@ -373,21 +369,19 @@ def detect_vibration(
     if window is None:
         found = _detect_field(grey, valid_pixels, timing, _METHODS[method], options, field, find_cause=True)
     else:
-        found = stacked(
-            [
-                _detect_field(
-                    grey[:, part],
-                    None if valid_pixels is None else valid_pixels[:, part],
-                    window_timing,
-                    _METHODS[method],
-                    options,
-                    field,
-                )
-                for part, window_timing in _windows(grey.shape[1], window, window_step, timing)
-            ]
-        )
+        windows = _windows(grey.shape[1], window, window_step, timing)
+        found = _detect_windows(grey, valid_pixels, windows, _METHODS[method], options, field)
     found = replace(found, timing=timing)  # of the stack, not of a window
     return found if stacks.batched else found[0]
+
+
+def _options_of_field(model: str, **options: object) -> dict[str, object]:
+    """Options of roll, zoom and camera that were given for another model than tones."""
+    given = {name: value for name, value in options.items() if value is not None}
+    if given and model == "swept":
+        name, value = next(iter(given.items()))
+        raise ValueError(f"{name}={value!r} goes with model='tones' or 'free', not with model='swept'")
+    return given
 
 
 def _windows(num_frames: int, window: int, step: int | None, timing: SensorTiming) -> list[tuple[slice, SensorTiming]]:
@@ -405,6 +399,29 @@ def _windows(num_frames: int, window: int, step: int | None, timing: SensorTimin
         (slice(first, first + window), replace(timing, frame_start_times=starts[first : first + window]))
         for first in firsts
     ]
+
+
+def _detect_windows(
+    frames: Tensor,
+    valid: Tensor | None,
+    windows: list[tuple[slice, SensorTiming]],
+    method: "_Method",
+    options: _FitOptions,
+    field: "_Field",
+) -> DetectionResult:
+    """Results of all windows, with the same axes."""
+
+    def of_window(number: int, field: _Field) -> DetectionResult:
+        part, timing = windows[number]
+        of_pixels = None if valid is None else valid[:, part]
+        return _detect_field(frames[:, part], of_pixels, timing, method, options, field)
+
+    each = [of_window(number, field) for number in range(len(windows))]
+    axes = max(one.vibration.num_axes for one in each)
+    if axes > 2:
+        same = replace(field, roll=True, zoom=axes > 3)
+        each = [one if one.vibration.num_axes == axes else of_window(i, same) for i, one in enumerate(each)]
+    return stacked(each)
 
 
 @dataclass(frozen=True)
@@ -464,16 +481,36 @@ def _detect_field(
     find_cause: bool = False,
 ) -> DetectionResult:
     """``_detect`` with as many components as were requested or, with ``"auto"``, as the frames require."""
-    further = field.most_axes > 2 or field.camera is not None
-    cause: bool | Literal["unless rotating"] = "unless rotating" if find_cause and further else find_cause
-    found, fit, rotates = _detect(frames, valid, timing, method, options, find_cause=cause)
-    if field.camera is None and (field.most_axes == 2 or (field.least_axes == 2 and not rotates)):
-        return found
-    scale = field.scale(field.most_axes, field.camera)
-    other, _, _ = _detect(frames, valid, timing, method, replace(options, scale=scale), fit)
-    moving = (other.vibration.amplitude > 0).flatten(0, -3).any(0).any(-1).tolist()
-    axes = max([field.least_axes, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
-    return found if axes == 2 and field.camera is None else other.with_axes(axes)
+    alike = _detect(frames, valid, timing, method, options)
+    if field.camera is not None or field.least_axes > 2 or (field.most_axes > 2 and alike.rotates):
+        scale = field.scale(field.most_axes, field.camera)
+        found = _detect(frames, valid, timing, method, replace(options, scale=scale), alike.fit).result
+        # a given number of tones is fitted to all axes, also to those that do not move
+        significant = found.vibration.amplitude > MIN_SIGNIFICANCE * found.std.amplitude
+        moving = significant.flatten(0, -3).any(0).any(-1).tolist()
+        axes = max([field.least_axes, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
+        if axes > 2 or field.camera is not None:
+            return found.with_axes(axes)
+    return _with_cause(alike, frames, valid, timing, method, options) if find_cause else alike.result
+
+
+@dataclass(frozen=True, eq=False)
+class _Detected:
+    """Result of ``_detect``.
+
+    Attributes:
+        result: A batch of results in image axes.
+        fit: Its fit.
+        measurements: The measurements of the fit.
+        rotates: Whether the halves of the rows of any stack move apart.
+        contradicted: For each stack, the axes in row order whose measurements contradict the timing.
+    """
+
+    result: DetectionResult
+    fit: ToneFit
+    measurements: Measurements
+    rotates: bool
+    contradicted: list[tuple[bool, bool]]
 
 
 def _detect(
@@ -483,9 +520,7 @@ def _detect(
     method: _Method,
     options: _FitOptions,
     translation: ToneFit | None = None,
-    *,
-    find_cause: bool | Literal["unless rotating"] = False,
-) -> tuple[DetectionResult, ToneFit, bool]:
+) -> _Detected:
     """``detect_vibration`` of grey frames (B, T, H, W) in row order.
 
     Args:
@@ -495,10 +530,6 @@ def _detect(
         method: How tones are fitted.
         options: Its options.
         translation: Fit without roll and zoom, from which a fit with roll or zoom starts.
-        find_cause: Whether to try other timings if the measurements contradict the stated one.
-
-    Returns:
-        A batch of results in image axes, their fit, and whether the halves of the rows of any stack move apart.
     """
     row_timing, bands, scale = timing.in_row_order(), options.bands, options.scale
     if scale.same_for_all_columns:
@@ -542,20 +573,12 @@ def _detect(
         )
         for index in range(len(frames))
     ]
-    rotates = other_motion is not None and any(rotation_found(other_motion[index]) for index in range(len(frames)))
-    if other_motion is not None and (find_cause is True or (find_cause and not rotates)):
-        for index, (_, reasons) in enumerate(verdicts):
-            axes = contradicted_axes(vibration[index], other_motion[index], max_tones)
-            if not any(axes):
-                continue
-            part = slice(index, index + 1)
-            own = found.measurements.mapped(itemgetter(part))
-            of_stack = frames[part], None if valid is None else valid[part]
-            cause = _wrong_setting(*of_stack, own, axes, timing, method, options)
-            if cause is not None:
-                # the axes have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong
-                both = ((cause, *reasons[0]), (cause, *reasons[1]))
-                verdicts[index] = (torch.zeros_like(verdicts[index][0]), both)
+    rotates, contradicted = False, [(False, False)] * len(frames)
+    if other_motion is not None:
+        rotates = any(rotation_found(other_motion[index]) for index in range(len(frames)))
+        contradicted = [
+            contradicted_axes(vibration[index], other_motion[index], max_tones) for index in range(len(frames))
+        ]
     reliable = torch.stack([verdict[0] for verdict in verdicts])
     swap = timing.scan_axis == -1
     order = ([1, 0, 2, 3] if swap else [0, 1, 2, 3])[: scale.axes]
@@ -584,7 +607,31 @@ def _detect(
         ),
         timing=timing,
     )
-    return result, fit, rotates
+    return _Detected(result, fit, found.measurements, rotates, contradicted)
+
+
+def _with_cause(
+    found: _Detected,
+    frames: Tensor,
+    valid: Tensor | None,
+    timing: SensorTiming,
+    method: _Method,
+    options: _FitOptions,
+) -> DetectionResult:
+    """The result with the timing as a reason, if the measurements contradict the stated one and agree with another."""
+    reliable, all_reasons = found.result.reliable.clone(), list(found.result.reasons)
+    for index, axes in enumerate(found.contradicted):
+        if not any(axes):
+            continue
+        part = slice(index, index + 1)
+        own = found.measurements.mapped(itemgetter(part))
+        of_stack = frames[part], None if valid is None else valid[part]
+        cause = _wrong_setting(*of_stack, own, axes, timing, method, options)
+        if cause is not None:
+            # the axes have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong
+            reliable[index] = False
+            all_reasons[index] = tuple((cause, *reasons) for reasons in all_reasons[index])
+    return replace(found.result, reliable=reliable, reasons=tuple(all_reasons))
 
 
 def _wrong_setting(
@@ -613,7 +660,7 @@ def _wrong_setting(
     def agrees(other: RowTiming, change: Callable[[Tensor], Tensor], concerned: tuple[bool, bool] = axes) -> bool:
         pixels = None if valid is None else change(valid)
         try:
-            found, _, _ = _detect(change(frames), pixels, other, method, options)
+            found = _detect(change(frames), pixels, other, method, options).result
         except ValueError:  # columns may lack the detail that rows have
             return False
         return all(good or not axis for good, axis in zip(found.reliable[0].tolist(), concerned, strict=True))

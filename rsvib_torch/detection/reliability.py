@@ -253,8 +253,8 @@ def _against_rotation(other: OtherMotion, axis: int, axes: int) -> list[str]:
         return []
     return [
         f"left and right halves of the rows move apart by {apart:.3g} px along {'yx'[axis]}, {allowed:.2g} px are "
-        "allowed: the camera rolls or zooms, or the scene has parallax; pass roll='auto', zoom='auto', or select a "
-        "part of the frame with one distance"
+        "allowed: the camera rolls or zooms (pass roll='auto', zoom='auto' and no columns), or the scene has parallax "
+        "(select a part of the frame with one distance)"
     ]
 
 

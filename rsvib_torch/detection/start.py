@@ -220,13 +220,13 @@ def field_start(
     """
     check_frame_size(frames.shape[-2], frames.shape[-1], options)
     count = min(4, max(2, frames.shape[-1] // 128))
-    parts, columns = cut_into_strips(frames, count, 0)
-    valid_parts = None if valid is None else cut_into_strips(valid, count, 0)[0]
+    parts, columns = cut_into_strips(frames, count)
+    valid_parts = None if valid is None else cut_into_strips(valid, count)[0]
     each = band_curve(parts, valid_parts, timing, options, mere_start=False)
     rows = (each.rows - 0.5 * (scale.height - 1)).repeat(len(each.pairs))
     factors = scale.factors(columns[:, None].expand(-1, len(rows)), rows.expand(count, -1))
     of_parts = measurements_of_curve(each, timing, options.band_step)
-    measurements, _ = combined_strips(of_parts, factors.expand(len(frames), *factors.shape))
+    measurements = combined_strips(of_parts, factors.expand(len(frames), *factors.shape))
     shape = each.quality.shape[1:]
     good = (measurements.weights > 0).all(-1)
     offsets = measurements.displacements[:, :, 1] - measurements.displacements[:, :, 0]

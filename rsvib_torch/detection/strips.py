@@ -1,9 +1,9 @@
 """Components of a motion with roll and zoom, from the displacements of strips of columns.
 
-Roll and zoom displace the content of a row by amounts that depend on the column (``motion.field``). Strips of columns
-are therefore measured like stacks of their own. With the displacement ``d_s`` of a row in strip s, its information
-``W_s`` and the factors ``F_s`` from the components q of the motion to the displacement at the strip, the components of
-the row are the weighted least-squares solution
+Roll and zoom displace the content of a row by amounts that depend on the column (``motion.field``). For a start,
+strips of columns are registered like stacks of their own. With the displacement ``d_s`` of a row in strip s, its
+information ``W_s`` and the factors ``F_s`` from the components q of the motion to the displacement at the strip, the
+components of the row are the weighted least-squares solution
 
     ``(sum_s F_s^T W_s F_s) q = sum_s F_s^T W_s d_s``,
 
@@ -23,7 +23,6 @@ from rsvib_torch.motion.field import displacement_factors
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
-from rsvib_torch.registration.row_spectra import MARGIN
 
 __all__ = ["FieldScale", "camera_in_row_order", "combined_strips", "cut_into_strips"]
 
@@ -114,7 +113,7 @@ def camera_in_row_order(
     return Vibration.still(axes=2).with_camera(camera).to_row_order(timing).camera
 
 
-def combined_strips(measured: Measurements, factors: Tensor) -> tuple[Measurements, Tensor]:
+def combined_strips(measured: Measurements, factors: Tensor) -> Measurements:
     """Components of the motion of every row from the displacements of strips.
 
     Args:
@@ -122,9 +121,9 @@ def combined_strips(measured: Measurements, factors: Tensor) -> tuple[Measuremen
         factors: (B, S, N, 2, A) displacements by unit components.
 
     Returns:
-        Measurements (B, N, G, A), and ``apart`` of ``RowRecord``.
+        Measurements (B, N, G, A).
     """
-    strips, axes = factors.shape[1], factors.shape[-1]
+    strips = factors.shape[1]
 
     def of_strips(values: Tensor) -> Tensor:
         each: Tensor = values.unflatten(0, (-1, strips))
@@ -145,15 +144,7 @@ def combined_strips(measured: Measurements, factors: Tensor) -> tuple[Measuremen
     solvable = torch.where(regular[..., None], values, 1.0)
     solved = torch.einsum("bnij,bnj,bnkj,bngk->bngi", vectors, 1 / solvable, vectors, right * unit[:, :, None])
     components = torch.where(regular[:, :, None, None], solved * unit[:, :, None], 0.0)
-    rest = displacements - torch.einsum("bsnia,bnga->bsngi", factors, components)
-    counted = (W.diagonal(dim1=-2, dim2=-1) > 0).to(W) * regular[:, None, :, None]
-    noise = torch.where(counted > 0, 1 / W.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300), 0.0)
-    frames = (visible.sum(-1) - 1).clamp(min=1.0)[:, None, :, None]
-    spare = (counted.sum(1) - 0.5 * axes).clamp(min=1.0)
-    share = 1 - 0.5 * axes / counted.sum(1).clamp(min=1.0)  # the fit of the components takes part of the noise
-    apart = (counted * rest.square().sum(3) / frames).sum(1) / spare - (noise.sum(1) * share) / spare
-    apart = torch.where(regular[..., None] & (visible.sum(-1) > 1)[..., None], apart, torch.nan)
-    combined = Measurements(
+    return Measurements(
         of_strips(measured.exposure_starts).mean(1),
         components,
         visible,
@@ -162,23 +153,12 @@ def combined_strips(measured: Measurements, factors: Tensor) -> tuple[Measuremen
         measured.average_times,
         measured.independent,
     )
-    return combined, apart
 
 
-def cut_into_strips(values: Tensor, count: int, edge: int) -> tuple[Tensor, Tensor]:
-    """Images (B, T, H, W) in strips of columns (B S, T, H, w), and the middles (S,) of the strips.
-
-    The columns that have weight in ``RowGradients`` begin ``edge`` px from the ends of a strip, with a ramp of
-    ``MARGIN`` px. Neighbouring strips overlap so that these ramps add up to 1: every column counts once.
-
-    Args:
-        values: The images.
-        count: Number S of strips.
-        edge: px without weight at each end.
-    """
+def cut_into_strips(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Images (B, T, H, W) in ``count`` strips of columns (B S, T, H, w), and the middles (S,) of the strips."""
     width = values.shape[-1]
-    pitch = (width - 2 * edge - MARGIN) / count
-    columns = round(pitch) + 2 * edge + MARGIN
+    columns = round(width / count)
     firsts = [round(number * (width - columns) / max(1, count - 1)) for number in range(count)]
     strips = torch.stack([values[..., first : first + columns] for first in firsts], 1).flatten(0, 1)
     middles = torch.tensor(firsts, dtype=torch.float64, device=values.device) + 0.5 * (columns - width)

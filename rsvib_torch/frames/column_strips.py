@@ -47,6 +47,16 @@ class ColumnStrips:
         firsts = tuple(min(max(round(middle - 0.5 * (width - 1)), 0), frame_width - width) for middle in middles)
         return cls(frame_width, width, firsts, middles)
 
+    @classmethod
+    def between_ends(cls, frame_width: int, max_pitch: float, margin: int) -> "ColumnStrips":
+        """Strips as from ``of``, but the middles of the first and the last are the ends of the frame."""
+        count = max(1, math.ceil((frame_width - 1) / max_pitch))
+        step = (frame_width - 1) / count
+        width = min(frame_width, math.ceil(2 * step) + 2 * margin)
+        middles = tuple(number * step for number in range(count + 1))
+        firsts = tuple(min(max(round(middle - 0.5 * (width - 1)), 0), frame_width - width) for middle in middles)
+        return cls(frame_width, width, firsts, middles)
+
     @property
     def columns(self) -> Tensor:
         """(S,) float64 px, middles of the strips from the centre of the frame."""

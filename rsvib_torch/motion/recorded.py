@@ -17,7 +17,7 @@ from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import one_line
 from rsvib_torch.motion.spline import FreeMotion
 
-__all__ = ["MotionUnit", "TimeUnit", "read_motion"]
+__all__ = ["SECONDS", "MotionUnit", "TimeUnit", "check_times", "read_motion"]
 
 _RADIANS = {
     "rad": 1.0,
@@ -28,7 +28,7 @@ _RADIANS = {
     "rad/s": 1.0,
     "deg/s": math.pi / 180,
 }
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _COLUMNS = ("time", "x", "y")
 
 Array = NDArray[np.float64]
@@ -87,8 +87,8 @@ def read_motion(
     if any(abs(check_number("signs", sign)) != 1 for sign in signs):
         raise ValueError(f"signs must be 1 or -1 for x and y, got {signs}")
     times, values = _table(path)
-    times = times * _SECONDS[time_unit]
-    _check_times(path, times, time_unit)
+    times = times * SECONDS[time_unit]
+    check_times(path, times, time_unit)
     displacement = values if focal_length is None else _displacement(path, times, values, unit, focal_length)
     displacement = (displacement - displacement.mean(0)) * np.asarray(signs)
     spacing = float(np.median(np.diff(times)))
@@ -127,7 +127,7 @@ def _number(path: Path, line: int, name: str, text: str | None) -> float:
     return value
 
 
-def _check_times(path: Path, times: Array, unit: str, longest_gap: float = 4.0) -> None:
+def check_times(path: Path, times: Array, unit: str, longest_gap: float = 4.0) -> None:
     """Raise a ValueError for times that do not increase, have gaps (in median steps), or are in another unit."""
     steps = np.diff(times)
     if (steps <= 0).any():

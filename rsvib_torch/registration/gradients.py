@@ -16,9 +16,11 @@ Rows lie on axis -2 in readout order.
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
+import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -26,7 +28,6 @@ from torch.nn import functional
 
 from rsvib_torch.core.fourier import fast_length
 from rsvib_torch.registration.row_spectra import (
-    RowSpectra,
     chunks,
     combined,
     differences,
@@ -34,20 +35,26 @@ from rsvib_torch.registration.row_spectra import (
     mean_over_frames,
 )
 
-__all__ = [
-    "FrameComparison",
-    "RowGradients",
-    "residual_products",
-    "right_sides",
-    "row_equations",
-    "row_gradients",
-    "row_information",
-    "scene_detail",
-]
+__all__ = ["FrameComparison", "RowGradients", "residual_products", "row_equations", "row_gradients", "scene_detail"]
 
 _BLOCK = 16  # px, side of the blocks of pixels that share a weight
 _SMOOTH = 16  # spectral values averaged along each axis for the power of scene and noise
 _NOISE_STEP = 4  # along the rows, every fourth frequency gives the noise power
+
+
+class WarpedRows(Protocol):
+    """What ``row_gradients`` requires of the frames: ``RowSpectra``, or rows that were joined from strips."""
+
+    @property
+    def width(self) -> int: ...  # columns of a frame
+
+    @property
+    def length(self) -> int: ...  # of the transforms along the rows
+
+    @property
+    def frequencies(self) -> Tensor: ...  # (U,) cycles/px
+
+    def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,16 +62,15 @@ class RowGradients:
     """Gradients of the scene for the rows of a group of G frames, and their products with the frames' differences.
 
     Attributes:
-        images: (B, S, 3, L) weight times gradient along x, gradient along y and detail of the scene, less their means.
-        products: (B, S, 3, 3) float64 sums of their products.
-        residual_products: (B, S, 3, G) float64 sums of their products with the differences of the frames; of two
-            frames (B, S, 3, 1), of the first.
+        images: (B, S, A + 1, L) weight times the derivatives of the scene by the A components of the motion, x and y
+            first, and the detail of the scene, less their means.
+        products: (B, S, A + 1, A + 1) float64 sums of their products.
+        residual_products: (B, S, A + 1, G) float64 sums of their products with the differences of the frames; of two
+            frames (B, S, A + 1, 1), of the first.
         variance: (B, S) float64, noise variance of a pixel in a frame.
         halves: (B, S, 2, 5) float64, sums gx gx, gx gy, gy gy, gx e and gy e over the left and the right half of each
             row, with e the residual difference between the last and the first frame. A displacement that depends on
-            the row only is equal in both halves.
-        slopes: (B, S, 3, 2) float64 sums of their products with the gradients (x, y) of the unfiltered scene times the
-            column from the middle, for displacements that change along the row; None if not requested.
+            the row only is equal in both halves. With further components, parts instead of halves.
     """
 
     images: Tensor
@@ -72,17 +78,17 @@ class RowGradients:
     residual_products: Tensor
     variance: Tensor
     halves: Tensor
-    slopes: Tensor | None = None
 
 
 def row_gradients(
-    spectra: RowSpectra,
+    spectra: WarpedRows,
     warped: Iterable[tuple[slice, Tensor]],
     rows: Tensor,
     shift: Tensor,
     visible: Tensor,
     *,
-    slopes: bool = False,
+    factors: Callable[[slice], Tensor] | None = None,
+    parts_of_rows: int = 2,
 ) -> RowGradients:
     """Gradients of the scene, noise, and the weight of every pixel, from frames warped by a motion.
 
@@ -92,7 +98,9 @@ def row_gradients(
         rows: (B, G, S) frame rows of the S scene rows in each frame.
         shift: (B, G, S) px, displacement along the rows by which each was moved back.
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
-        slopes: Whether to compute ``RowGradients.slopes``.
+        factors: Displacements (B, s, L, 2, A) of the pixels of some rows by unit components of the motion, x and y
+            first; the derivatives by all of them are regressors. None if the displacement depends on the row only.
+        parts_of_rows: Number of parts of the rows for ``RowGradients.halves``.
 
     Returns:
         The gradients.
@@ -104,22 +112,31 @@ def row_gradients(
     inner = functional.pad(inner_columns(width, shift, detail.real), (0, length - width))
     valid = spectra.warped_valid(rows, shift)
     parts = chunks(rows.shape[-1], 4 * length * len(rows) * (4 + rows.shape[1]), _BLOCK, rows.device)
-    memory = inner.new_empty(len(rows), parts[0].stop, 3 + (1 if rows.shape[1] == 2 else rows.shape[1]), length)
+    regressors = 3 if factors is None else 1 + factors(slice(0, 1)).shape[-1]
+    memory = inner.new_empty(
+        len(rows), parts[0].stop, regressors + (1 if rows.shape[1] == 2 else rows.shape[1]), length
+    )
 
     def pixels(part: slice) -> _Rows:
         own, part_visible = detail[:, part].contiguous(), visible[:, :, part]
         planes = memory[:, : own.shape[1]]
-        for place, one in enumerate((own * along, across[:, part], own, *compared.differences[:, :, part].unbind(1))):
+        planes[:, :, 0], planes[:, :, 1] = (torch.fft.irfft(one, n=length) for one in (own * along, across[:, part]))
+        if factors is not None:
+            moved = factors(part).to(planes.dtype)
+            by_component = moved[..., 0, :] * planes[:, :, 0, :, None] + moved[..., 1, :] * planes[:, :, 1, :, None]
+            planes[:, :, : regressors - 1] = by_component.movedim(-1, 2)
+        for place, one in enumerate((own, *compared.differences[:, :, part].unbind(1)), regressors - 1):
             planes[:, :, place] = torch.fft.irfft(one, n=length)
         weight = inner * (part_visible.sum(1) > 1)[..., None].to(inner.dtype)
         if valid is not None:
             weight = weight * functional.pad(valid[:, part], (0, length - width))
-        return _Rows(planes, weight, part_visible)
+        return _Rows(planes, weight, part_visible, regressors)
 
-    images = inner.new_empty(len(rows), rows.shape[-1], 3, length)
+    edges = [width * number // parts_of_rows for number in range(1, parts_of_rows)]
+    images = inner.new_empty(len(rows), rows.shape[-1], regressors, length)
     fits, blocks = [], []
     for part in parts:
-        fit, block = _fit_rows(pixels(part), width // 2, images[:, part])
+        fit, block = _fit_rows(pixels(part), edges, images[:, part])
         fits.append(fit)
         blocks.append(block)
     block_weight = _block_weight(*(torch.cat(values, 1) for values in zip(*blocks, strict=True)))
@@ -130,41 +147,21 @@ def row_gradients(
             some = pixels(part)
             spread = block_weight[:, within].repeat_interleave(_BLOCK, 1).repeat_interleave(_BLOCK, 2)
             weight = some.weight * spread[:, : some.weight.shape[1], :length]
-            fits[place], _ = _fit_rows(replace(some, weight=weight), width // 2, images[:, part])
+            fits[place], _ = _fit_rows(replace(some, weight=weight), edges, images[:, part])
     sums, solution, square = (torch.cat(values, 1) for values in zip(*fits, strict=True))
     products, right = _products(sums.sum(2))
     means = _means(products)
     return RowGradients(
         images,
-        products=products[..., :3, :3] - means * products[..., 3:, :3],
-        residual_products=right[..., :3, :] - means * right[..., 3:, :],
-        variance=square / (products[..., 3, 3] - 4).clamp(min=1.0),
+        products=products[..., :-1, :-1] - means * products[..., -1:, :-1],
+        residual_products=right[..., :-1, :] - means * right[..., -1:, :],
+        variance=square / (products[..., -1, -1] - regressors - 1).clamp(min=1.0),
         halves=_halves(sums, solution, visible),
-        slopes=_slopes(images, compared, spectra) if slopes else None,
     )
 
 
-def _slopes(images: Tensor, compared: "FrameComparison", spectra: RowSpectra) -> Tensor:
-    """``RowGradients.slopes``: products with the displacement by 1 px per column.
-
-    The gradients that weight the differences are filtered, those that cause them are not. A displacement that is equal
-    along the row is measured without error after some rounds, because its residual disappears; one that changes along
-    the row remains in the frames, and its effect must be known to first order.
-    """
-    mean = compared.mean
-    v = torch.fft.fftfreq(mean.shape[-2], dtype=torch.float64, device=mean.device)
-    by_y = (2j * math.pi * v * _low_pass(v, 0.40, 0.48)).to(mean.dtype)  # no ringing at the first and last row
-    across = torch.fft.ifft(torch.fft.fft(mean, dim=-2) * by_y[:, None], dim=-2)
-    along = mean * (2j * math.pi * spectra.frequencies).to(mean.dtype)
-    place = torch.arange(images.shape[-1], dtype=images.dtype, device=images.device) - 0.5 * (spectra.width - 1)
-    count = images.shape[1]
-    moved = torch.stack([torch.fft.irfft(one[:, :count], n=images.shape[-1]) for one in (along, across)], -1)
-    sums: Tensor = images @ (moved * place[:, None])
-    return sums.double()
-
-
 def residual_products(warped: Iterable[tuple[slice, Tensor]], gradients: RowGradients, visible: Tensor) -> Tensor:
-    """Products (B, S, 3, G) of gradients with the differences of frames, as ``RowGradients.residual_products``.
+    """Products (B, S, A + 1, G) of gradients with the differences of frames, as ``RowGradients.residual_products``.
 
     Args:
         warped: As in ``row_gradients``, one run after the other.
@@ -190,34 +187,19 @@ def row_equations(products: Tensor, gradients: RowGradients, visible: Tensor) ->
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
 
     Returns:
-        H (B, S, 2, 2) in px^-2 and b (B, G, S, 2) in px^-1, axes (x, y), float64. ``H^-1 b`` is the displacement in px
+        H (B, S, A, A) in px^-2 and b (B, G, S, A) in px^-1, float64. ``H^-1 b`` is the displacement in px
         relative to the mean over the group, and H its information matrix in one frame. Both are 0 for rows that are
         visible in fewer than two frames or have no detail.
     """
-    right = -(torch.cat([products, -products], -1) if visible.shape[1] == 2 else products)
-    return row_information(gradients), right_sides(right, gradients)
-
-
-def row_information(gradients: RowGradients) -> Tensor:
-    """Matrix H (B, S, 2, 2) of ``row_equations``."""
-    own, detail = gradients.products, gradients.products[..., 2, 2].clamp(min=1e-300)
-    matrix = own[..., :2, :2] - own[..., :2, 2:] * own[..., 2:, :2] / detail[..., None, None]
-    information: Tensor = matrix * _inverse_variance(gradients)[..., None, None]
-    return information
-
-
-def right_sides(products: Tensor, gradients: RowGradients) -> Tensor:
-    """Right-hand sides (B, G, S, 2) of ``row_equations`` for products (B, S, 3, G) with ``g . d`` of displacements."""
-    own, detail = gradients.products, gradients.products[..., 2, 2].clamp(min=1e-300)
-    right = products.permute(0, 3, 1, 2)
-    right = right[..., :2] - own[:, None, :, :2, 2] * (right[..., 2:] / detail[:, None, :, None])
-    return right * _inverse_variance(gradients)[:, None, :, None]
-
-
-def _inverse_variance(gradients: RowGradients) -> Tensor:
-    """(B, S) inverse noise variance of the rows, 0 without detail."""
-    usable = (gradients.products[..., 2, 2] > 0) & (gradients.variance > 0)
-    return torch.where(usable, 1 / torch.where(usable, gradients.variance, 1.0), 0.0)
+    right = -(torch.cat([products, -products], -1) if visible.shape[1] == 2 else products).permute(0, 3, 1, 2)
+    own = gradients.products
+    detail = own[..., -1, -1]
+    safe = detail.clamp(min=1e-300)
+    usable = (detail > 0) & (gradients.variance > 0)
+    matrix = own[..., :-1, :-1] - own[..., :-1, -1:] * own[..., -1:, :-1] / safe[..., None, None]
+    right = right[..., :-1] - own[:, None, :, :-1, -1] * (right[..., -1:] / safe[:, None, :, None])
+    factor = torch.where(usable, 1 / torch.where(usable, gradients.variance, 1.0), 0.0)
+    return matrix * factor[..., None, None], right * factor[:, None, :, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,35 +207,37 @@ class _Rows:
     """Some rows of the scene as pixels.
 
     Attributes:
-        planes: (B, s, 3 + G, L) gradients along x and y, detail, and the differences of the frames (``differences``).
+        planes: (B, s, A + 1 + G, L) derivatives, detail, and the differences of the frames (``differences``).
         weight: (B, s, L) of the pixels.
         visible: (B, G, s), 1 where a row is visible in a frame.
+        regressors: Number A + 1 of derivatives and detail.
     """
 
     planes: Tensor
     weight: Tensor
     visible: Tensor
+    regressors: int
 
 
-def _fit_rows(rows: _Rows, middle: int, out: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+def _fit_rows(rows: _Rows, edges: list[int], out: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Least-squares fit of the differences of the frames by gradients, detail and a constant, row by row.
 
     Args:
         rows: The rows.
-        middle: First column of the right half.
-        out: (B, s, 3, L), filled with the images of ``RowGradients``.
+        edges: First columns of the parts of the rows but the first.
+        out: (B, s, A + 1, L), filled with the images of ``RowGradients``.
 
     Returns:
-        Products from ``_sums_of_halves``, the coefficients (B, s, G, 4) of the fit and the weighted sum (B, s) of its
-        squared residuals in one frame; and the arguments of ``_block_weight``.
+        Products from ``_sums_of_parts``, the coefficients (B, s, G, A + 2) of the fit and the weighted sum (B, s) of
+        its squared residuals in one frame; and the arguments of ``_block_weight``.
     """
-    images, residual = rows.planes[:, :, :3], rows.planes[:, :, 3:]
+    images, residual = rows.planes[:, :, : rows.regressors], rows.planes[:, :, rows.regressors :]
     weighted = torch.mul(images, rows.weight[:, :, None], out=out)
-    sums = _sums_of_halves(weighted, rows, middle)
+    sums = _sums_of_parts(weighted, rows, edges)
     products, right = _products(sums.sum(2))
     solution = _solve(products, right.transpose(-2, -1))
     factors = solution.to(weighted.dtype)
-    fitted = torch.matmul(factors[..., :3], images).add_(factors[..., 3:])
+    fitted = torch.matmul(factors[..., :-1], images).add_(factors[..., -1:])
     energy = torch.sub(residual, fitted, out=fitted).square_().sum(2) * rows.weight
     freedom = (rows.visible.sum(1) - 1).clamp(min=1.0) * (residual.shape[2] / rows.visible.shape[1])
     energy /= freedom[..., None].to(energy.dtype)
@@ -267,47 +251,50 @@ def _fit_rows(rows: _Rows, middle: int, out: Tensor) -> tuple[tuple[Tensor, ...]
 
 
 def _products(sums: Tensor) -> tuple[Tensor, Tensor]:
-    """Products (B, s, 4, 4) of images and ones, and (B, s, 4, G) with the differences of the frames, of whole rows."""
-    return torch.cat([sums[..., :3], sums[..., -1:]], -1), sums[..., 3:-1]
+    """Products (B, s, A + 2, A + 2) of images and ones, and (B, s, A + 2, G) with the differences, of whole rows."""
+    images = sums.shape[-2] - 1
+    return torch.cat([sums[..., :images], sums[..., -1:]], -1), sums[..., images:-1]
 
 
 def _means(products: Tensor) -> Tensor:
-    """Weighted means (B, s, 3, 1) of the images."""
-    means: Tensor = products[..., :3, 3:] / products[..., 3:, 3:].clamp(min=1e-6)
+    """Weighted means (B, s, A + 1, 1) of the images."""
+    means: Tensor = products[..., :-1, -1:] / products[..., -1:, -1:].clamp(min=1e-6)
     return means
 
 
-def _sums_of_halves(weighted: Tensor, rows: _Rows, middle: int) -> Tensor:
-    """Products (B, s, 2, 4, 4 + G) float64 of weighted images and ones with images, differences and ones.
+def _sums_of_parts(weighted: Tensor, rows: _Rows, edges: list[int]) -> Tensor:
+    """Products (B, s, parts, A + 2, A + 2 + G) float64 of weighted images and ones with images, differences and ones.
 
     Args:
-        weighted: (B, s, 3, L) weight times images.
+        weighted: (B, s, A + 1, L) weight times images.
         rows: The rows they belong to.
-        middle: First column of the right half; sums over both halves of each row.
+        edges: As in ``_fit_rows``.
     """
-    sums = weighted.new_empty(*weighted.shape[:2], 2, 4, 1 + rows.planes.shape[2], dtype=torch.float64)
-    for half, columns in enumerate((slice(0, middle), slice(middle, None))):
+    count, parts = weighted.shape[2], len(edges) + 1
+    sums = weighted.new_empty(*weighted.shape[:2], parts, count + 1, 1 + rows.planes.shape[2], dtype=torch.float64)
+    for part, (first, end) in enumerate(itertools.pairwise([0, *edges, None])):
+        columns = slice(first, end)
         images, weight = weighted[..., columns], rows.weight[..., columns]
         planes = rows.planes[..., columns].transpose(-2, -1)
-        own = sums[:, :, half]
-        own[..., :3, :-1] = torch.matmul(images, planes)
-        own[..., 3:, :-1] = torch.matmul(weight[:, :, None], planes)
-        own[..., :3, -1] = own[..., 3, :3]
-        own[..., 3, -1] = weight.sum(-1)
+        own = sums[:, :, part]
+        own[..., :count, :-1] = torch.matmul(images, planes)
+        own[..., count:, :-1] = torch.matmul(weight[:, :, None], planes)
+        own[..., :count, -1] = own[..., count, :count]
+        own[..., count, -1] = weight.sum(-1)
     return sums
 
 
 def _solve(products: Tensor, right: Tensor) -> Tensor:
-    """Coefficients (B, s, G, 4) of the fit, with a relative regularisation of 1e-6; 0 for rows without detail.
+    """Coefficients (B, s, G, A + 2) of the fit, with a relative regularisation of 1e-6; 0 for rows without detail.
 
     Args:
-        products: (B, s, 4, 4) of the images and ones.
-        right: (B, s, G, 4) of the differences of the frames with them.
+        products: (B, s, A + 2, A + 2) of the images and ones.
+        right: (B, s, G, A + 2) of the differences of the frames with them.
     """
     diagonal = products.diagonal(dim1=-2, dim2=-1)
     usable = (diagonal > 0).all(-1)[..., None]
     scale = torch.where(usable, diagonal.clamp(min=1e-300).rsqrt(), 0.0)
-    eye = torch.eye(4, dtype=scale.dtype, device=scale.device)
+    eye = torch.eye(scale.shape[-1], dtype=scale.dtype, device=scale.device)
     unit = (
         products * scale[..., :, None] * scale[..., None, :]
         + torch.where(usable, scale.new_tensor(1e-6), 1.0)[..., None] * eye
@@ -346,15 +333,16 @@ def _block_weight(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
 
 
 def _halves(sums: Tensor, solution: Tensor, visible: Tensor) -> Tensor:
-    """Sums over the halves of each row, as in ``RowGradients.halves``.
+    """Sums over the parts of each row, as in ``RowGradients.halves``.
 
     Args:
-        sums: From ``_sums_of_halves``.
-        solution: (B, s, G, 4) coefficients of the fit.
+        sums: From ``_sums_of_parts``.
+        solution: (B, s, G, A + 2) coefficients of the fit.
         visible: (B, G, S), 1 where a scene row is visible in a frame.
     """
-    images, ones = solution[:, :, None].transpose(-2, -1).split((3, 1), dim=-2)
-    right = sums[..., :2, 3:-1] - sums[..., :2, :3] @ images - sums[..., :2, -1:] @ ones  # (B, s, 2, 2, G)
+    count = solution.shape[-1] - 1
+    images, ones = solution[:, :, None].transpose(-2, -1).split((count, 1), dim=-2)
+    right = sums[..., :2, count:-1] - sums[..., :2, :count] @ images - sums[..., :2, -1:] @ ones  # (B, s, parts, 2, G)
     change = right[..., -1] - right[..., 0] if right.shape[-1] > 1 else -2 * right[..., 0]
     own = torch.stack([sums[..., 0, 0], sums[..., 0, 1], sums[..., 1, 1]], dim=-1)
     return torch.cat([own, change], dim=-1) * (visible[:, 0] * visible[:, -1])[..., None, None]

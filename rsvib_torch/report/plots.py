@@ -23,7 +23,14 @@ from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.checks import check_whole_number, described
 from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES, Result
 from rsvib_torch.core.text import measured_text
-from rsvib_torch.detection import ClockAlignment, DetectionResult, MotionCheck, MotionDetection, SweptTone
+from rsvib_torch.detection import (
+    ClockAlignment,
+    DetectionResult,
+    MotionCheck,
+    MotionDetection,
+    RotationAlignment,
+    SweptTone,
+)
 from rsvib_torch.evaluation import MtfCurve
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
@@ -747,6 +754,26 @@ def _check_figure(result: MotionCheck) -> Figure:
     return figure
 
 
+def _rotation_figure(result: RotationAlignment) -> Figure:
+    """Draw X, Y and roll from frame to frame, measured in the images and by the gyroscope, and their differences."""
+    figure = _Drawing(figsize=(8, 7.2), layout="constrained")
+    panels = figure.subplots(3, 1, sharex=True)
+    times = result.times.cpu()
+    for axis, (name, unit, factor) in enumerate((("x", "px", 1.0), ("y", "px", 1.0), ("roll", "mrad", 1e3))):
+        measured, predicted = factor * result.measured[:, axis].cpu(), factor * result.predicted[:, axis].cpu()
+        rms = float((measured - predicted).square().mean().sqrt())
+        panel = panels[axis]
+        panel.plot(times, predicted, color=_FIT_COLOUR, linewidth=1.3, label="gyroscope")
+        panel.plot(times, measured, "o", color=_AXIS_COLOURS["x"], markersize=3.5, label="frames")
+        panel.plot(times, measured - predicted, color=_GREY, linewidth=1.0, label=f"difference, {rms:.3g} {unit} rms")
+        panel.set_ylabel(f"{name} ({unit})", color=_INK)
+        panel.legend(fontsize=9, frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
+        plain_axes(panel)
+    panels[0].set_title("Between consecutive frames", loc="left", fontsize=12, fontweight="bold", color=_INK)
+    panels[-1].set_xlabel("time (s)", color=_INK)
+    return figure
+
+
 FIGURES.update(
     {
         (DetectionResult, 0): offset_figure,
@@ -755,6 +782,7 @@ FIGURES.update(
         (SweptTone, 0): _swept_figure,
         (RowTimeCalibration, 0): _calibration_figure,
         (ClockAlignment, 0): lambda result: motion_figure(result.motion),
+        (RotationAlignment, 0): _rotation_figure,
         (MotionCheck, 0): _check_figure,
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,

@@ -90,6 +90,31 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
     rsv.write_stack(stack, frames, dtype="float32")
     lines = [f"{t:.9g},{x:.9g},{y:.9g}" for t, (x, y) in zip(times.tolist(), path.tolist(), strict=True)]
     motion_file.write_text("\n".join(["time,x,y", *lines]))
+    rates_file = folder / "rates.csv"
+    rates_file.write_text("\n".join(["time,gx,gy,gz", *(f"{line},0" for line in lines)]))
+    rates = rsv.read_gyroscope(rates_file, unit="rad/s")
+    unit = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    pairs = torch.zeros(2, 3, dtype=torch.float64)
+    values = (
+        0.0,
+        1e-4,
+        1.0,
+        1e-4,
+        unit,
+        unit,
+        500.0,
+        1.0,
+        1e-4,
+        1e-6,
+        unit,
+        0.01,
+        unit,
+        unit[:2],
+        unit[:2],
+        pairs,
+        pairs,
+    )
+    rotation = rsv.RotationAlignment(recorded, "YxZ", *values, True, ())
     rsv.write_vibration(folder / "vibration.json", detected)
     options: dict[str, Any] = {
         "detection": {"method": "bands", "tones": 1, **bands},
@@ -124,6 +149,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
     common |= {"height": 24, "width": 16, "frames": frames, "generator": torch.Generator("cpu").manual_seed(1)}
     common |= {"scene": scene, "u": times * 10, "v": times * 10, "input": frames[:, None], "image": image}
     common |= {"vibration": vibration, "index": 0, "count": 3, "shape": (3, 96, 64), "dtype": "float32"}
+    common |= {"start": times, "end": times + 0.01, "reference": 0.01}
     common |= {"frame": frames[0].numpy(), "x": scene, "y": frames[0], "scene_shape": (160, 128), "tones": None}
     frames_call = {"frames": frames, "timing": timing, "full_scale": None, "channels": None, "ignore": None}
     result = {
@@ -229,6 +255,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
             rsv.read_motion,
             {"path": motion_file, "unit": "rad", "focal_length": 100.0, "time_unit": "s", "signs": (1.0, -1.0)},
         ),
+        "read_gyroscope": Call(rsv.read_gyroscope, {"path": rates_file, "unit": "rad/s", "time_unit": "s"}),
         "read_stack": Call(rsv.read_stack, {"path": stack, "full_scale": None}),
         "read_stack_info": Call(rsv.read_stack_info, {"path": stack}),
         "read_vibration": Call(rsv.read_vibration, {"path": folder / "vibration.json", "timing": timing}),
@@ -464,6 +491,8 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
     augmentation(frames[:, None])
     for value in (
         alignment,
+        rates,
+        rotation,
         detected,
         check,
         free,
@@ -493,6 +522,8 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
         swept,
         check,
         alignment,
+        rates,
+        rotation,
         curve,
         optics,
         camera,

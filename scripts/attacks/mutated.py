@@ -133,6 +133,7 @@ ORIGINALS = {
     "frames.mp4": Original("frames.mp4", _read_stack),
     "camera.toml": Original("camera.toml", read_config, text=True),
     "motion.csv": Original("motion.csv", lambda path: str(rsv.read_motion(path, unit="px")), text=True),
+    "clip.gcsv": Original("clip.gcsv", lambda path: str(rsv.read_gyroscope(path)), text=True),
     "out.npy.manifest.json": Original("out.npy.manifest.json", _read_manifest, text=True),
     "vibration.json": Original("vibration.json", lambda path: str(read_vibration(path, TIMING)), text=True),
     "detection.json": Original("detection.json", lambda path: str(rsv.DetectionResult.load(path)), text=True),
@@ -192,6 +193,8 @@ def write_originals(folder: Path) -> dict[str, bytes]:
     rsv.detect_swept_tone(frames, TIMING, **bands).save(folder / "swept.json")
     lines = [f"{0.001 * i:.3f},{0.1 * i:.2f},{-0.1 * i:.2f}" for i in range(40)]
     (folder / "motion.csv").write_text("\n".join(["time,x,y", *lines]))
+    head = ["GYROFLOW IMU LOG", "version,1.3", "orientation,YxZ", "tscale,1", "gscale,1", "t,gx,gy,gz"]
+    (folder / "clip.gcsv").write_text("\n".join([*head, *(f"{line},0" for line in lines)]))
     return {name: (folder / name).read_bytes() for name in ORIGINALS}
 
 

@@ -115,13 +115,25 @@ def is_assumed(found: rsv.DetectionResult, taken: Recording, axis: int, tones: l
     return bool(names)
 
 
+def mean_of_columns(found: rsv.DetectionResult, starts: torch.Tensor, exposure: float) -> torch.Tensor:
+    """Displacement (T, R, 2) of the rows of a detected vibration, mean over the columns; roll moves them along x."""
+    components = found.vibration.mean_displacement(starts, exposure)
+    y = torch.arange(starts.shape[1], dtype=torch.float64) - 0.5 * (starts.shape[1] - 1) - components[..., 1]
+    x, down = components[..., 0], components[..., 1]
+    if components.shape[-1] > 2:
+        x = x - components[..., 2] * y
+    if components.shape[-1] > 3:
+        down = down + components[..., 3] * y
+    return torch.stack([x, down], -1)
+
+
 def judge_axis(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[str, Any]:
     """Outcome of one axis with its figures."""
     num_frames, height = taken.starts.shape
     stated = taken.timing.row_starts(num_frames, height)
     if taken.timing.readout_direction == "reverse":  # in the order of the image rows
         stated = stated.flip(1)
-    shown = found.vibration.mean_displacement(stated, taken.timing.exposure_time)[..., axis].numpy()
+    shown = mean_of_columns(found, stated, taken.timing.exposure_time)[..., axis].numpy()
     true = np.zeros((0, 3)) if taken.case.tones is None else observable_tones(taken, axis)
     truths = [without_trend(taken.displacement()[axis], taken.starts)]
     if taken.case.tones is not None:  # tones that are not observable may be found all the same
@@ -151,6 +163,32 @@ def judge_axis(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[
         "true_tones": len(true),
         "found_tones": int((found.vibration.amplitude[axis] > 0).sum()),
         "largest_z": max((abs(t[f"{name}_z"]) for t in tones for name in ("amplitude", "frequency")), default=0.0),
+        "displacement_px": size,
+        "displacement_error": error / max(size, 1e-9),
+        "displacement_std": std / max(size, 1e-9),
+        "reasons": list(found.reasons[axis]),
+    }
+
+
+def judge_turn(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[str, Any]:
+    """Outcome of roll (axis 2) or zoom (3), as displacements at half the width from the centre; 0 if there is none."""
+    num_frames, height = taken.starts.shape
+    arm = 0.5 * taken.frames.shape[-1]  # px
+    stated = taken.timing.row_starts(num_frames, height)
+    shown = arm * found.vibration.mean_displacement(stated, taken.timing.exposure_time)[..., axis].numpy()
+    truth = arm * without_trend(taken.case.motion(taken.starts + 0.5 * taken.exposure)[axis], taken.starts)
+    error, size = rms(without_trend(shown, stated.numpy()) - truth), rms(truth)
+    std = arm * float(displacement_uncertainty(found.vibration, found.std, taken.timing, num_frames, height)[0][axis])
+    reliable = bool(found.reliable[axis])
+    wrong = reliable and error > max(WRONG_DISPLACEMENT * size, WRONG_PX) and error > MANY_STD * std
+    return {
+        "outcome": "wrong" if wrong else "correct" if reliable else "refused",
+        "wrong_parameter": False,
+        "wrong_displacement": wrong,
+        "tones": [],
+        "true_tones": int(size > 0),
+        "found_tones": int((found.vibration.amplitude[axis] > 0).sum()),
+        "largest_z": 0.0,
         "displacement_px": size,
         "displacement_error": error / max(size, 1e-9),
         "displacement_std": std / max(size, 1e-9),
@@ -197,6 +235,7 @@ def judge_case(name: str, number: int, size: int) -> dict[str, Any]:
     except ValueError as error:
         return case | {"error": str(error), "axes": []}
     case["axes"] = [judge_axis(found, taken, axis) for axis in range(2)]
+    case["axes"] += [judge_turn(found, taken, axis) for axis in range(2, found.vibration.num_axes)]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", rsv.RestorationWarning)
         restored = rsv.restore(frames, taken.timing, found)

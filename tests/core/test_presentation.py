@@ -30,6 +30,14 @@ def recording():
     return rsv.FreeMotion.through(times, torch.from_numpy(MOTION.displacement(times.numpy() - 0.3)))
 
 
+def rates():
+    """The same as rates of a gyroscope of a camera with a focal length of 900 px."""
+    motion = recording()
+    velocity = motion.velocity(motion.knots[1:-1])
+    zero = torch.zeros_like(velocity[:, 0])
+    return rsv.AngularRates(motion.knots[1:-1], torch.stack([velocity[:, 1], -velocity[:, 0], zero], -1) / 900.0)
+
+
 @pytest.fixture(scope="module", name="detection")
 def make_detection(frames):
     return rsv.detect_vibration(frames, TIMING)
@@ -61,6 +69,8 @@ def make_results(frames, detection, windows):
         rsv.judge_restoration(frames, restored, TIMING, detection),
         rsv.check_motion(frames, TIMING, detection.vibration),
         rsv.align_motion(frames, TIMING, recording(), fit_scale=False),
+        rates(),
+        rsv.align_motion(frames, TIMING, rates(), camera=rsv.Camera(900.0), offsets=(0.299, 0.301)),
         rsv.calibrate_row_time(light[None, :, None].expand(1, 512, 16), 1000.0),
         rsv.slanted_edge_mtf(torch.special.ndtr(edge / 0.8)),
     )
@@ -197,6 +207,7 @@ DRAWN = {
     "MtfCurve",
     "OffsetCurve",
     "RestorationVerdict",
+    "RotationAlignment",
     "RowTimeCalibration",
     "SweptTone",
     "Vibration",

@@ -50,11 +50,9 @@ def numerical_bound(coefficients, truth):
         derivatives.append((up - down) / (2 * step[number]))
     D = np.stack(derivatives, 1)
     A = 0.0
+    inner = slice(EDGE // PITCH - 4, 4 - EDGE // PITCH)  # 8 px beyond the frame
     for share, down, right in pixel_weights(truth):
-        down, right = (
-            part[:, EDGE // PITCH - 4 : 4 - EDGE // PITCH] for part in (down, right)
-        )  # 8 px beyond the frame
-        A = A + share * (down[:, :, None] * right[:, None, :]).reshape(len(down), -1)
+        A = A + share * (down[:, inner, None] * right[:, None, inner]).reshape(len(down), -1)
     D = D - A @ (np.linalg.pinv(A.T @ A, rcond=1e-10, hermitian=True) @ (A.T @ D))
     found = np.zeros(truth.size)
     scale = np.sqrt((D**2).sum(0))

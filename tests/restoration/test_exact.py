@@ -260,7 +260,7 @@ def test_gradients_to_frames_and_vibration():
     ("options", "error", "message"),
     [
         ({"joint": 0}, ValueError, "joint must be at least 1"),
-        ({"joint": "all"}, TypeError, "joint must be a whole number, got 'all'"),
+        ({"joint": "all"}, TypeError, "joint must be True or False or a whole number, got 'all'"),
         ({"noise": -1.0}, ValueError, "noise must be at least 0"),
         ({"noise": "low"}, TypeError, "noise must be a number, got 'low'"),
         ({"regularisation": 0.0}, ValueError, "regularisation must be larger than 0"),

@@ -5,26 +5,30 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from dataclasses import dataclass, replace
+from typing import TypedDict, Unpack, overload
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text, wrapped
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.recorded.clock_range import offset_range
+from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment, align_rates
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
 from rsvib_torch.detection.start import grey_frames, measurements_of_curve
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.io.files import FramesOrFiles, timing_of_files
+from rsvib_torch.motion.camera import Camera
+from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
 
-__all__ = ["ClockAlignment", "FittedClock", "align_motion", "best_offset", "fit_clock", "offset_range"]
+__all__ = ["ClockAlignment", "FittedClock", "align_motion", "best_offset", "fit_clock"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -111,6 +115,29 @@ class FittedClock:
         return FreeMotion(moved.coefficients + drift, moved.start, moved.spacing, moved.tones, moved.camera)
 
 
+class _Options(TypedDict, total=False):
+    camera: Camera | None
+    offsets: tuple[float, float] | None
+    fit_scale: bool
+    fit_gain: bool
+    fit_row_time: bool
+    registration: Registration | None
+    band_rows: int
+    band_step: int
+    search: int
+    ignore: ArrayLike | None
+    full_scale: float | None
+    channels: Channels
+
+
+@overload
+def align_motion(
+    frames: FramesOrFiles, timing: SensorTiming, recorded: FreeMotion, **options: Unpack[_Options]
+) -> ClockAlignment: ...
+@overload
+def align_motion(
+    frames: FramesOrFiles, timing: SensorTiming, recorded: AngularRates, **options: Unpack[_Options]
+) -> RotationAlignment: ...
 @outside_graphs
 @full_precision
 @torch.no_grad()
@@ -118,34 +145,45 @@ class FittedClock:
 def align_motion(
     frames: FramesOrFiles,
     timing: SensorTiming,
-    recorded: FreeMotion,
+    recorded: FreeMotion | AngularRates,
     *,
+    camera: Camera | None = None,
     offsets: tuple[float, float] | None = None,
     fit_scale: bool = True,
     fit_gain: bool = False,
-    registration: Registration = "ncc",
+    fit_row_time: bool = False,
+    registration: Registration | None = None,
     band_rows: int = 32,
     band_step: int = 16,
     search: int = 16,
     ignore: ArrayLike | None = None,
     full_scale: float | None = None,
     channels: Channels = None,
-) -> ClockAlignment:
+) -> ClockAlignment | RotationAlignment:
     """Find offset and scale between the clock of a recorded motion and that of the frames.
 
     The recording (of a gyroscope, of attitude sensors) is compared with the displacements of the rows between frames:
     first at many offsets with those of row bands, then by least squares with those measured on the images around it. A
     uniform drift of each axis is fitted as well.
 
+    **Angular rates** (``read_gyroscope``). The displacements of parts of the row bands between consecutive frames are
+    compared with the rotation of the camera, for all 24 assignments of the axes and all offsets. Bias, clock and,
+    without a camera, the focal length are fitted. Robust weights exclude places that move by themselves or are fixed to
+    the camera. A camera that also translates in one direction (a vehicle) displaces content along lines from one point;
+    displacements along these lines count less, as much as the scene has parallax.
+
     Args:
         frames: Stack (T, H, W) or (T, C, H, W) of at least two frames; tensor, array, list of these, or files; NaN
             marks missing pixels.
         timing: The sensor.
-        recorded: The motion on its own clock, in image axes.
+        recorded: The motion on its own clock, in image axes; or the rates of a gyroscope.
+        camera: Focal length and lens, for angular rates; by default the focal length is fitted.
         offsets: Smallest and largest offset in seconds; by default all for which the recording covers the frames.
         fit_scale: Whether to fit the ratio of the speeds of the clocks.
-        fit_gain: Whether to fit a factor of the recorded motion of each axis (focal length).
-        registration: Method of the start.
+        fit_gain: Whether to fit a factor of the recorded motion of each axis; with angular rates, the focal length of
+            the camera.
+        fit_row_time: Whether to fit the row time as well, with angular rates; ``timing`` has the start value.
+        registration: Method of the bands; by default "ncc" as the start for a motion, "phase" for angular rates.
         band_rows: Rows of a band of the start.
         band_step: Rows from one band to the next.
         search: Search range of the start in px around the whole-frame offset.
@@ -157,7 +195,7 @@ def align_motion(
         The motion on the clock of the frames, offset and scale with standard deviations, and a verdict.
 
     Raises:
-        TypeError: If frames are not numbers.
+        TypeError: If frames are not numbers, or the recording is neither a motion nor angular rates.
         ValueError: If the recording is shorter than the frames or does not cover them at any offset in ``offsets``,
             frames cannot be registered, or an option is out of range.
 
@@ -175,18 +213,34 @@ def align_motion(
         >>> round(1e3 * found.offset, 2)  # ms
         2.0
     """
-    if not isinstance(recorded, FreeMotion):
+    if not isinstance(recorded, (FreeMotion, AngularRates)):
         raise TypeError(
-            f"recorded must be a FreeMotion (read_motion, FreeMotion.from_samples), got {type(recorded).__name__}"
+            "recorded must be a FreeMotion (read_motion, FreeMotion.from_samples) or AngularRates (read_gyroscope), "
+            f"got {type(recorded).__name__}"
         )
-    if recorded.batch_shape:
+    if isinstance(recorded, FreeMotion) and recorded.batch_shape:
         raise ValueError("align_motion takes one motion, not a batch")
+    if isinstance(recorded, FreeMotion) and (camera is not None or fit_row_time):
+        raise ValueError("camera and fit_row_time are for angular rates (read_gyroscope); omit them for a FreeMotion")
     timing = timing_of_files(frames, timing)
     stack = grey_frames(frames, timing, full_scale, ignore, channels)
     if stack.batched:
         raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")
     grey = stack.images
-    bands = RegistrationOptions(registration, band_rows, band_step, search)
+    if isinstance(recorded, AngularRates):
+        options = RegistrationOptions(registration or "phase", band_rows, band_step, search)
+        return align_rates(
+            stack,
+            timing,
+            recorded,
+            options,
+            camera,
+            offsets=offsets,
+            fit_scale=fit_scale,
+            fit_focal_length=camera is None or fit_gain,
+            fit_row_time=fit_row_time,
+        )
+    bands = RegistrationOptions(registration or "ncc", band_rows, band_step, search)
     rowwise, curve, (first, last) = start_curve(stack, timing, bands)
     turned = recorded.to_row_order(timing).to(grey.device)
     low, high = offset_range(turned, first, last, offsets)
@@ -230,27 +284,6 @@ def align_motion(
         reliable=not reasons,
         reasons=tuple(reasons),
     )
-
-
-def offset_range(
-    recorded: FreeMotion, first: float, last: float, limits: tuple[float, float] | None
-) -> tuple[float, float]:
-    """Range of offsets for which the recording covers the frames, within ``limits``."""
-    low, high = recorded.start - first, recorded.end - last
-    if high < low:
-        raise ValueError(
-            f"the recording of {recorded.end - recorded.start:.4g} s is shorter than the frames, {last - first:.4g} s; "
-            "are its times in another unit?"
-        )
-    if limits is not None:
-        bounds = (check_number("offsets", limits[0]), check_number("offsets", limits[1]))
-        if bounds[1] < low or bounds[0] > high or bounds[1] < bounds[0]:
-            raise ValueError(
-                f"offsets {bounds[0]:g} to {bounds[1]:g} s: the recording covers the frames from {low:.6g} to "
-                f"{high:.6g} s"
-            )
-        low, high = max(low, bounds[0]), min(high, bounds[1])
-    return low, high
 
 
 def best_offset(

@@ -6,7 +6,8 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from dataclasses import replace
 
-from rsvib_torch.detection.recorded.alignment import FittedClock, best_offset, fit_clock, offset_range
+from rsvib_torch.detection.recorded.alignment import FittedClock, best_offset, fit_clock
+from rsvib_torch.detection.recorded.clock_range import offset_range
 from rsvib_torch.detection.row_time.by_tones import CameraClock, RowTimeFit
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces
 from rsvib_torch.detection.row_time.row_tones import MAX_CHI_SQUARE, Candidate

@@ -17,18 +17,18 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.progress import steps
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
+from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.registration.gradients import (
     RowGradients,
     residual_products,
-    right_sides,
     row_equations,
     row_gradients,
-    row_information,
 )
 from rsvib_torch.registration.row_spectra import EVERY, MARGIN, RowSpectra, column_pattern
 
@@ -41,10 +41,11 @@ __all__ = [
     "differential_motion",
     "differently_blurred",
     "frame_groups",
+    "joined_groups",
     "measure_group",
     "measure_groups",
+    "measure_strips",
     "remove_column_pattern",
-    "slope_response",
     "stack_spectra",
 ]
 
@@ -122,20 +123,25 @@ def compared_intervals(
     return torch.cat([starts[step:] - starts[:-step] for step in range(1, min(num_frames, max_group_frames))])
 
 
-def stack_spectra(frames: Tensor, valid: Tensor | None) -> RowSpectra:
+def stack_spectra(frames: Tensor, valid: Tensor | None, strips: ColumnStrips | None = None) -> RowSpectra:
     """Spectra of grey frames (B, T, H, W) in row order, each frame with mean 0 and standard deviation 1.
 
     Args:
         frames: The frames.
         valid: (B, T, H, W) bool, False for missing pixels; None if all are valid.
+        strips: Strips (B S) whose spectra are computed; None for whole rows.
     """
     if valid is None:
         variance, level = torch.var_mean(frames[..., ::4, :], (-2, -1), correction=0, keepdim=True)
-        return RowSpectra(frames, None, level, variance.sqrt())
-    weight = valid / valid.sum((-2, -1), keepdim=True)
-    level = (frames * weight).sum((-2, -1), keepdim=True)
-    variance = ((frames - level).square_() * weight).sum((-2, -1), keepdim=True)
-    return RowSpectra(frames, valid, level, variance.sqrt())
+    else:
+        weight = valid / valid.sum((-2, -1), keepdim=True)
+        level = (frames * weight).sum((-2, -1), keepdim=True)
+        variance = ((frames - level).square_() * weight).sum((-2, -1), keepdim=True)
+    contrast = variance.sqrt()
+    if strips is not None:  # all strips of a frame with the level and contrast of the frame, because they are joined
+        frames, valid = strips.cut(frames), None if valid is None else strips.cut(valid)
+        level, contrast = (values.repeat_interleave(len(strips.firsts), 0) for values in (level, contrast))
+    return RowSpectra(frames, valid, level, contrast)
 
 
 def frame_groups(
@@ -177,8 +183,6 @@ def measure_group(
     timing: RowTiming,
     motion: Motion,
     gradients: RowGradients | None = None,
-    *,
-    slopes: bool = False,
 ) -> tuple[Measurements, RowGradients]:
     """Displacements of blocks of scene rows in the frames of a group, measured around a motion.
 
@@ -190,7 +194,6 @@ def measure_group(
         timing: The sensor, in row order.
         motion: Motion of each stack (B) that the frames are warped by.
         gradients: Gradients of the scene from a motion that differs by much less than a pixel; None to compute them.
-        slopes: Whether to compute ``RowGradients.slopes``.
 
     Returns:
         The measurements, and the gradients for the next call.
@@ -200,15 +203,126 @@ def measure_group(
     warp = _warp_to_scene(group.spectra, positions, timing, motion)
     warped = ((run, warp(run)) for run in group.spectra.runs(positions.rows.shape[-1], 2))
     if gradients is None:
-        gradients = row_gradients(group.spectra, warped, positions.rows, positions.shift, visible, slopes=slopes)
+        gradients = row_gradients(group.spectra, warped, positions.rows, positions.shift, visible)
         products = gradients.residual_products
     else:
         products = residual_products(warped, gradients, visible)
+    return _measured(group, timing, motion, positions.exposure_starts, visible, gradients, products), gradients
+
+
+@dataclass(frozen=True, eq=False)
+class _JoinedRows:
+    """Rows of full width, joined from strips that were warped by themselves; as ``RowSpectra`` for ``row_gradients``.
+
+    Attributes:
+        width: Columns of a frame.
+        length: Of the transforms along the rows.
+        frequencies: (U,) cycles/px.
+        valid: (B, S, W) bool, pixels of the scene that are valid in all frames; None for all.
+    """
+
+    width: int
+    length: int
+    frequencies: Tensor
+    valid: Tensor | None
+
+    def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None:
+        """``valid``: the strips have been warped."""
+        return self.valid
+
+
+def measure_strips(
+    group: FrameGroup,
+    timing: RowTiming,
+    motion: Motion,
+    of_strips: Motion,
+    strips: ColumnStrips,
+    factors: Callable[[Tensor, Tensor], Tensor],
+    gradients: RowGradients | None = None,
+) -> tuple[Measurements, RowGradients]:
+    """``measure_group`` for a motion with roll or zoom, from frames (B S) that are cut into S strips of columns.
+
+    Every strip is warped by the motion of its middle. Strips are joined with weights that are linear between middles,
+    which moves the columns between them by the amount between: exactly to first order of the difference. Rows of full
+    width then measure all A components of the motion at once, with the derivatives of the scene by roll and zoom as
+    further regressors.
+
+    Args:
+        group: The strips of the frames.
+        timing: The sensor, in row order.
+        motion: Motion (B) whose components are measured.
+        of_strips: The motions (B S) of the middles of the strips.
+        strips: The strips.
+        factors: Function of positions x and y in px from the centre to displacements (..., 2, A) by unit components.
+        gradients: As in ``measure_group``.
+    """
+    spectra, count = group.spectra, len(strips.firsts)
+    positions = _Positions.of(group, timing, of_strips)
+
+    def over_strips(values: Tensor) -> Tensor:
+        each: Tensor = values.unflatten(0, (-1, count))
+        return each
+
+    visible = over_strips(positions.visible(spectra.height, BLOCK_ROWS)).amin(1)
+    warp = _warp_to_scene(spectra, positions, timing, of_strips)
+    length = fast_length(strips.frame_width + 64)
+
+    def joined(run: slice) -> Tensor:
+        pixels = torch.fft.irfft(warp(run), n=spectra.length)[..., : spectra.width]
+        spectrum: Tensor = torch.fft.rfft(extend_rows(strips.joined(pixels), length, hold=0.0))
+        return spectrum
+
+    warped = ((run, joined(run)) for run in spectra.runs(positions.rows.shape[-1], 2))
+    if gradients is None:
+        valid = spectra.warped_valid(positions.rows, positions.shift)
+        whole = None if valid is None else strips.joined(valid.to(spectra.values.real.dtype)) > 0.999
+        frequencies = torch.fft.rfftfreq(length, dtype=torch.float64, device=positions.rows.device)
+        shape = _JoinedRows(strips.frame_width, length, frequencies, whole)
+        x = torch.arange(length, device=frequencies.device) - 0.5 * (strips.frame_width - 1)
+        x = x - over_strips(positions.columns)[:, 0]  # (B, 1, L)
+        y = over_strips(positions.scene_rows)[:, 0, 0, :, None] - 0.5 * (spectra.height - 1)
+        gradients = row_gradients(
+            shape,
+            warped,
+            over_strips(positions.rows)[:, 0],
+            over_strips(positions.shift).abs().amax(1)
+            * (visible > 0),  # a lens may displace invisible rows by any amount
+            visible,
+            factors=lambda part: factors(x, y[:, part]),
+            parts_of_rows=4,
+        )
+        products = gradients.residual_products
+    else:
+        products = residual_products(warped, gradients, visible)
+    starts = over_strips(positions.exposure_starts).mean(1)
+    return _measured(group, timing, motion, starts, visible, gradients, products), gradients
+
+
+def _measured(
+    group: FrameGroup,
+    timing: RowTiming,
+    motion: Motion,
+    exposure_starts: Tensor,
+    visible: Tensor,
+    gradients: RowGradients,
+    products: Tensor,
+) -> Measurements:
+    """Measurements of blocks from the products of the gradients with the differences of the frames.
+
+    Args:
+        group: The frames.
+        timing: The sensor, in row order.
+        motion: The motion with the components that are measured.
+        exposure_starts: (B, G, S) s.
+        visible: (B, G, S), 1 where a scene row is visible in a frame.
+        gradients: Gradients of the scene.
+        products: As ``RowGradients.residual_products``.
+    """
     residual, information = _solved(*row_equations(products, gradients, visible))
-    exposure_starts = _in_blocks(positions.exposure_starts).mean(3)
+    exposure_starts = _in_blocks(exposure_starts).mean(3)
     # a fit of frames with a wrong timing may place rows at any distance; they are invisible, but their times would make
     # the record, and with it the frequency grid, as long (18 GB)
-    first, height_time = group.starts[..., None], group.spectra.height * timing.row_time
+    first, height_time = group.starts[: len(exposure_starts), :, None], group.spectra.height * timing.row_time
     exposure_starts = exposure_starts.clamp(first - height_time, first + 2 * height_time)
     around = motion.mean_displacement(exposure_starts, timing.exposure_time)
     measurements = Measurements(
@@ -218,11 +332,11 @@ def measure_group(
         information=information,
         exposure_time=timing.exposure_time,
     )
-    return replace(measurements, displacements=measurements.relative(measurements.displacements)), gradients
+    return replace(measurements, displacements=measurements.relative(measurements.displacements))
 
 
 def _solved(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-    """Displacements (B, G, N, 2) of blocks and their information (B, N, 2, 2), from the equations of rows.
+    """Displacements (B, G, N, A) of blocks and their information (B, N, A, A), from the equations of rows.
 
     Blocks with structure along one direction only have a singular matrix; both are 0 then.
     """
@@ -231,22 +345,15 @@ def _solved(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
     xx, yy = information[..., 0, 0], information[..., 1, 1]
     determinant = xx * yy - information[..., 0, 1].square()
     measured = (determinant > 1e-4 * xx * yy) & (determinant > 0)
-    eye = torch.eye(2, dtype=information.dtype, device=information.device)
+    if (axes := information.shape[-1]) > 2:
+        unit = information.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
+        normal = torch.where(measured[..., None, None], information * unit[..., None] * unit[..., None, :], 0.0)
+        measured = measured & (torch.linalg.eigvalsh(normal)[..., 0] > 1e-6)  # detail in one place: no roll
+    eye = torch.eye(axes, dtype=information.dtype, device=information.device)
     regular = torch.where(measured[..., None, None], information, eye)
     solution = torch.linalg.solve(regular[:, None], right[..., None])[..., 0]
     solution = torch.where(measured[:, None, :, None], solution, 0.0)
     return solution, torch.where(measured[..., None, None], information, 0.0)
-
-
-def slope_response(gradients: RowGradients) -> Tensor:
-    """(B, N, 2, 2) px, displacements (x, y) that blocks measure if that along x or y grows by 1 px per column.
-
-    Args:
-        gradients: With ``slopes``; the displacement is 0 in the middle column.
-    """
-    assert gradients.slopes is not None
-    response, _ = _solved(row_information(gradients), right_sides(gradients.slopes, gradients))
-    return response.movedim(1, -1)
 
 
 def _in_blocks(values: Tensor) -> Tensor:
@@ -261,19 +368,17 @@ def measure_groups(
     timing: RowTiming,
     motion: Motion,
     gradients: list[RowGradients] | None = None,
-    *,
-    slopes: bool = False,
 ) -> tuple[Measurements, list[RowGradients]]:
     """``measure_group`` of all groups, the measurements as one record."""
     each = [None] * len(groups) if gradients is None else gradients
     measured, advance = [], steps(len(groups), "groups")
     for group, own in zip(groups, each, strict=True):
-        measured.append(measure_group(group, timing, motion, own, slopes=slopes))
+        measured.append(measure_group(group, timing, motion, own))
         advance()
-    return _joined([part for part, _ in measured]), [own for _, own in measured]
+    return joined_groups([part for part, _ in measured]), [own for _, own in measured]
 
 
-def _joined(parts: list[Measurements]) -> Measurements:
+def joined_groups(parts: list[Measurements]) -> Measurements:
     """Measurements of all groups as one record; smaller groups get frames in which no row is visible."""
     most = max(part.exposure_starts.shape[-1] for part in parts)
 

@@ -5,25 +5,25 @@ Invariant: the displacement depends on the row only (docs/architecture.md), in e
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.displacements import (
-    BLOCK_ROWS,
     FrameGroup,
     blur_ratio,
     differential_motion,
     differently_blurred,
     frame_groups,
+    joined_groups,
     measure_groups,
+    measure_strips,
     remove_column_pattern,
-    slope_response,
     stack_spectra,
 )
-from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
+from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.motion.field import ColumnMotion, largest_slope
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
@@ -68,11 +68,10 @@ class MeasuredRows:
 
     groups: list[FrameGroup]
     timing: RowTiming
-    slopes: ClassVar[bool] = False  # whether displacements change along the rows
 
     def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
         """Measurements around a motion, see ``measure_groups``."""
-        return RowRecord(*measure_groups(self.groups, self.timing, self.view(motion), gradients, slopes=self.slopes))
+        return RowRecord(*measure_groups(self.groups, self.timing, self.view(motion), gradients))
 
     def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motion of the stacks that are measured, with two components."""
@@ -122,63 +121,54 @@ class StripRows(MeasuredRows):
 
     Attributes:
         scale: Components of the motion.
+        strips: The strips.
         columns: (S,) px from the centre of the frame, middles of the strips.
         num_frames: Frames of a stack.
         slide: px, difference of the displacements of the middle of a strip and its ends.
     """
 
     scale: FieldScale
+    strips: ColumnStrips
     columns: Tensor
     num_frames: int
     slide: float
-    slopes: ClassVar[bool] = True
 
     def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
-        """Components of the motion of every row (B, N, G, A), from the displacements in the strips.
+        """Components of the motion of every row (B, N, G, A)."""
+        each = [None] * len(self.groups) if gradients is None else gradients
+        view, measured = self.view(motion), []
+        for group, own in zip(self.groups, each, strict=True):
+            measured.append(measure_strips(group, self.timing, motion, view, self.strips, self.scale.factors, own))
+        of_groups = [own for _, own in measured]
+        return RowRecord(joined_groups([part for part, _ in measured]), of_groups, self._apart(of_groups))
 
-        Roll moves the content of a scene row to different frame rows along the row, which are exposed at different
-        times. The displacements are converted to the mean time of the row by the motion.
-        """
-        record = super().measure(motion, gradients)
-        measured, (middles, factors) = record.measurements, self._factors(motion, record.gradients)
-        starts = measured.exposure_starts.unflatten(0, (-1, len(self.columns)))  # (B, S, N, G)
-        mean = starts.mean(1, keepdim=True).expand_as(starts)
-        components = (motion.mean_displacement(when, self.timing.exposure_time) for when in (mean, starts))
-        of_row, of_strips = components
-        moved = torch.einsum("bsnia,bsnga->bsngi", factors, of_row - of_strips).flatten(0, 1)
-        if self.scale.camera is not None:  # the displacement is not linear in the components
-            linear = torch.einsum("bsnia,bsnga->bsngi", middles, of_strips).flatten(0, 1)
-            exact = self.view(motion).mean_displacement(starts.flatten(0, 1), self.timing.exposure_time)
-            moved = moved + linear - exact
-        measured = replace(measured, displacements=measured.displacements + measured.relative(moved))
-        measurements, apart = combined_strips(measured, factors)
-        return RowRecord(measurements, record.gradients, apart)
+    def _apart(self, gradients: list[RowGradients], *, rows: int = 64) -> Tensor:
+        """``RowRecord.apart``, from sums over parts of ``rows`` rows."""
+        excesses = []
+        for own in gradients:
+            count = own.halves.shape[1] // rows * rows
+            weight = torch.where(own.variance > 0, 1 / own.variance.clamp(min=1e-300), 0.0)[:, :count, None, None]
+            hxx, hxy, hyy, bx, by = (own.halves[:, :count] * weight).unflatten(1, (-1, rows)).sum(2).unbind(-1)
+            determinant = hxx * hyy - hxy.square()
+            regular = determinant > 1e-4 * hxx * hyy
+            safe = torch.where(regular, determinant, 1.0)
+            # difference of the last and the first frame, (B, N, parts, 2)
+            residual = torch.stack([hyy * bx - hxy * by, hxx * by - hxy * bx], -1) / safe[..., None]
+            noise = 2 * torch.stack([hyy, hxx], -1) / safe[..., None]
+            share = 1 - 0.5 * self.scale.axes / residual.shape[2]  # the fit of the components takes part of both
+            excess = 0.5 * (residual.square() - share * noise).mean(2) / share
+            excesses.append(torch.where(regular.all(-1)[..., None], excess, torch.nan))
+        return torch.cat(excesses, 1)
+
+    def remove_column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> bool:
+        """As for whole rows: all strips of a row have the same noise."""
+        of_strips = [replace(own, variance=own.variance.repeat_interleave(len(self.columns), 0)) for own in gradients]
+        return super().remove_column_pattern(motion, of_strips)
 
     def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motions of the strips (B S)."""
         field = _in_rad(motion, self.scale)
         return ColumnMotion.of_columns(field, self.columns, self.timing, self.num_frames, self.scale.height)
-
-    def _factors(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> tuple[Tensor, Tensor]:
-        """Displacements (B, S, N, 2, A) by unit components in px: of the middles of strips, and those measured.
-
-        Gradients measure a weighted mean of a displacement that changes along the row, which is not that of the middle
-        of the strip (``slope_response``).
-        """
-        strips, view, each = len(self.columns), self.view(motion), []
-        for group, own in zip(self.groups, gradients, strict=True):
-            response = slope_response(own)  # (B S, N, 2, 2)
-            middle = group.starts.mean(-1, keepdim=True) + 0.5 * self.scale.height * self.timing.row_time
-            travelled = view.drift(middle).round()[..., 0, 1]  # as the scene rows of the group
-            blocks = torch.arange(response.shape[1], device=response.device)
-            rows = BLOCK_ROWS * (blocks + 0.5) - 0.5 * self.scale.height
-            y = rows - travelled[:, None]
-            x = self.columns.repeat(len(y) // strips)[:, None].expand_as(y)
-            factors = self.scale.factors(x, y)
-            along = self.scale.factors(x + 1, y) - factors  # change of the displacement per column
-            each.append(torch.stack([factors, factors + response @ along]))
-        of_middles, of_gradients = torch.cat(each, 2).unflatten(1, (-1, strips))
-        return of_middles, of_gradients
 
     def blur_ratio(self, motion: Vibration) -> Tensor:
         """(B, 3), the weighted mean over the strips.
@@ -201,8 +191,8 @@ def strip_rows(
     scale: FieldScale,
     *,
     pairs_if_blurred_differently: bool = True,
-    max_slide: float = 0.05,
-    min_pitch: int = 48,
+    max_slide: float = 0.1,
+    min_pitch: int = 32,
 ) -> StripRows:
     """Frames (B, T, H, W) in strips of columns.
 
@@ -213,9 +203,9 @@ def strip_rows(
         motion: A first estimate of the motion, all components in px.
         scale: Components of the motion.
         pairs_if_blurred_differently: As in ``frame_groups``.
-        max_slide: px, difference of the displacements of the middle of a strip and its ends; gradients measure
-            such displacements without bias.
-        min_pitch: Columns of a strip that count; narrower strips consist of their margins mostly.
+        max_slide: px, difference of the displacements by roll and zoom of two neighbouring strips; the second order of
+            their interpolation blurs as an exposure with a path of this length.
+        min_pitch: Columns from the middle of a strip to that of the next; narrower strips consist of margins mostly.
     """
     field, count = _in_rad(motion, scale), frames.shape[1]
     starts = timing.row_starts(count, scale.height, frames.device)[:, :: max(1, scale.height // 64)].flatten()
@@ -223,15 +213,13 @@ def strip_rows(
     of_ends = ColumnMotion.of_columns(field, ends, timing, count, scale.height)
     times = starts.expand(*of_ends.batch_shape, -1)
     along = of_ends.mean_displacement(times, timing.exposure_time)[..., 0] - of_ends.drift(times)[..., 0]
-    edge = math.ceil(float(along.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
+    margin = math.ceil(float(along.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
     reached = field.largest_displacement(float(starts[0]), float(starts[-1]))
     slope = float(largest_slope(reached, scale.width, scale.height, scale.camera).amax())
-    pitch = max(min_pitch, 2 * max_slide / max(slope, 1e-9))
-    number = max(2, math.ceil((scale.width - 2 * edge - MARGIN) / pitch))
-    strips, columns = cut_into_strips(frames, number, edge)
-    of_valid = None if valid is None else cut_into_strips(valid, number, edge)[0]
-    spectra = stack_spectra(strips, of_valid)
+    strips = ColumnStrips.between_ends(scale.width, max(min_pitch, max_slide / max(slope, 1e-9)), margin)
+    spectra = stack_spectra(frames, valid, strips)
+    columns = strips.columns.to(frames.device)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)
     groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=pairs_if_blurred_differently)
-    slide = 0.5 * slope * (scale.width - 2 * edge - MARGIN) / number
-    return StripRows(groups, timing, scale, columns, count, slide)
+    slide = slope * float(columns[1] - columns[0])
+    return StripRows(groups, timing, scale, strips, columns, count, slide)

@@ -96,7 +96,8 @@ def trusted_vibration(
         >>> from types import SimpleNamespace
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
         >>> found = Vibration([3.0, 2.0], [50.0, 30.0])
-        >>> small = SimpleNamespace(**{name: 0.01 * torch.ones_like(getattr(found, name)) for name in vars(found)})
+        >>> names = ("amplitude", "frequency", "period", "phase", "image_motion", "image_acceleration")
+        >>> small = SimpleNamespace(**{name: 0.01 * torch.ones_like(getattr(found, name)) for name in names})
         >>> doubtful = SimpleNamespace(vibration=found, std=small, reliable=(True, False), reasons=((), ("blind",)))
         >>> vibration, notes = trusted_vibration(doubtful, timing, 2, 512)
         >>> vibration.amplitude.flatten().tolist(), notes

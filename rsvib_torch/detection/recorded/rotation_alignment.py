@@ -1,0 +1,317 @@
+"""Alignment of the angular rates of a gyroscope with frames: clock, axes, bias, focal length, row time.
+
+Invariant: the displacement depends on the row only (docs/architecture.md), in parts of the columns.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.presentation import Result
+from rsvib_torch.core.text import measured_text, text_table, wrapped
+from rsvib_torch.detection.recorded.band_vectors import band_vectors
+from rsvib_torch.detection.recorded.clock_range import offset_range
+from rsvib_torch.detection.recorded.rotation_fit import NAMES, RotationFit, RotationModel, components_of, fit_robustly
+from rsvib_torch.detection.recorded.rotation_search import OrientationSearch, orientation_matrix, search_orientations
+from rsvib_torch.detection.start import GreyFrames
+from rsvib_torch.motion.camera import Camera
+from rsvib_torch.motion.gyroscope_rates import AngularRates
+from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.registration import RegistrationOptions
+
+__all__ = ["RotationAlignment", "align_rates"]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RotationAlignment(
+    Result,
+    units={
+        "offset": "s",
+        "offset_std": "s",
+        "bias": "rad/s",
+        "bias_std": "rad/s",
+        "focal_length": "px",
+        "focal_length_std": "px",
+        "row_time": "s",
+        "row_time_std": "s",
+        "unexplained_rows": "px",
+        "times": "s",
+    },
+    shapes={
+        "bias": "3",
+        "bias_std": "3",
+        "translation": "3",
+        "unexplained": "3",
+        "unexplained_rows": "2",
+        "times": "P",
+        "measured": "P 3",
+        "predicted": "P 3",
+    },
+):
+    """The motion of the image by the rotation that a gyroscope recorded. Its clock reads ``scale t + offset``.
+
+    Attributes:
+        motion: X and Y in px and roll in rad in image axes on the clock of the frames, with the camera.
+        orientation: Axes of the gyroscope that are the axes x (right), y (down) and z (forward) of the camera, a small
+            letter for a negative axis: with "yxZ", the camera turns about its x axis by minus the rate about y.
+        offset: Reading of the gyroscope's clock at time 0 of the frames, in seconds.
+        offset_std: Its standard deviation.
+        scale: Seconds on the gyroscope's clock per second of the frames.
+        scale_std: Its standard deviation; 0 if it was not fitted.
+        bias: (3,) rad/s about the axes of the gyroscope, to be subtracted from its rates.
+        bias_std: Their standard deviations.
+        focal_length: px.
+        focal_length_std: Its standard deviation; 0 if it was not fitted.
+        row_time: s.
+        row_time_std: Its standard deviation; 0 if it was not fitted.
+        translation: (3,) unit vector along the translation of the camera whose parallax the fit allows, camera axes.
+        parallax: Standard deviation of translation / distance between frames, in parts of bands; 0: no parallax.
+        unexplained: (3,) px, px, rad: standard deviation of X, Y and roll from frame to frame that the gyroscope does
+            not explain, beyond the noise of the measurements.
+        unexplained_rows: (2,) px, rms difference of X and Y of single bands.
+        times: (P,) s, mid-times of consecutive frames.
+        measured: (P, 3) px, px, rad: X, Y and roll between consecutive frames, from the images.
+        predicted: (P, 3) The same by the gyroscope.
+        reliable: Whether the gyroscope explains the frames, with this clock and these axes only.
+        reasons: Why not.
+
+    Example:
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=80e-6, exposure_rows=10, frame_rows=420)
+        >>> times = torch.arange(-0.02, 0.12, 0.001, dtype=torch.float64)
+        >>> angles = [5e-3 * torch.sin(50 * times), 4e-3 * torch.sin(70 * times + 1), 6e-3 * torch.sin(45 * times + 2)]
+        >>> pitch, yaw, roll = angles  # rad, of the camera
+        >>> path = torch.stack([-400 * yaw, 400 * pitch, -roll], -1)
+        >>> motion = rsv.FreeMotion.from_samples(times, path, camera=rsv.Camera(400.0))
+        >>> frames = rsv.simulate_frames(city_and_fields(224, 240, seed=2), timing, motion, num_frames=3)
+        >>> turned = torch.stack([roll, pitch, yaw], -1)  # the gyroscope is mounted in another direction
+        >>> rates = rsv.AngularRates(times[1:-1] + 0.5, (turned[2:] - turned[:-2]) / 0.002)
+        >>> found = rsv.align_motion(frames, timing, rates)
+        >>> found.orientation, round(found.offset, 3), round(found.focal_length / 10)
+        ('YZX', 0.5, 40)
+    """
+
+    motion: FreeMotion
+    orientation: str
+    offset: float
+    offset_std: float
+    scale: float
+    scale_std: float
+    bias: Tensor
+    bias_std: Tensor
+    focal_length: float
+    focal_length_std: float
+    row_time: float
+    row_time_std: float
+    translation: Tensor
+    parallax: float
+    unexplained: Tensor
+    unexplained_rows: Tensor
+    times: Tensor
+    measured: Tensor
+    predicted: Tensor
+    reliable: bool
+    reasons: tuple[str, ...]
+
+    def summary(self) -> str:
+        """Clock, axes, bias and focal length with standard deviations, what is not explained, and the verdict."""
+        second = measured_text(self.scale, self.scale_std or None, digits=8)
+        verdict = "reliable" if self.reliable else f"not reliable: {'; '.join(self.reasons)}"
+        bias, std = self.bias.tolist(), self.bias_std.tolist()
+        moved, rest = (self.predicted - self.predicted.mean(0)).square().mean(0).sqrt(), self.unexplained
+        names = ("X (px)", "Y (px)", "roll (rad)")
+        return "\n".join(
+            [
+                f"time 0 of the frames is {measured_text(self.offset, self.offset_std)} s of the gyroscope",
+                f"1 s of the frames is {second} s of the gyroscope",
+                f"axes x, y, z of the camera are {', '.join(_axis(letter) for letter in self.orientation)} of the "
+                "gyroscope",
+                f"bias {', '.join(measured_text(b, s) for b, s in zip(bias, std, strict=True))} rad/s, focal length "
+                f"{measured_text(self.focal_length, self.focal_length_std or None)} px, row time "
+                f"{measured_text(1e6 * self.row_time, 1e6 * self.row_time_std or None)} us",
+                text_table(
+                    ["between frames", "by the gyroscope (rms)", "not explained"],
+                    [[names[k], measured_text(moved[k]), measured_text(rest[k], digits=2)] for k in range(3)],
+                ),
+                wrapped(verdict),
+            ]
+        )
+
+
+def _axis(letter: str) -> str:
+    return letter.lower() if letter.isupper() else f"-{letter}"
+
+
+def align_rates(
+    stack: GreyFrames,
+    timing: SensorTiming,
+    rates: AngularRates,
+    options: RegistrationOptions,
+    camera: Camera | None,
+    *,
+    offsets: tuple[float, float] | None,
+    fit_scale: bool,
+    fit_focal_length: bool,
+    fit_row_time: bool,
+) -> RotationAlignment:
+    """``align_motion`` for angular rates and one stack."""
+    height, width = stack.images.shape[-2:]
+    count = stack.images.shape[1]
+    if camera is not None:
+        camera.check_size(*((height, width) if timing.scan_axis == -1 else (width, height)))
+    starts = timing.in_row_order().frame_starts(count).cpu()
+    last = float(starts[-1]) + height * timing.row_time + timing.exposure_time
+    limits = offset_range(rates, float(starts[0]), last, offsets)
+    vectors = band_vectors(stack, timing, options)
+    middle = 0.5 * (float(starts[0]) + last)
+    known = None if camera is None or fit_focal_length else camera.focal_length
+
+    def searched(weight: Tensor, row_time: float) -> OrientationSearch:
+        return search_orientations(vectors, weight, rates, row_time, timing.exposure_time, limits, known)
+
+    free = [True, True, True, True, fit_scale, known is None, fit_row_time]
+
+    def fitted(found: OrientationSearch) -> RotationFit:
+        lens = camera or Camera(found.focal_lengths[0])
+        model = RotationModel(vectors, rates, found.names[0], lens, timing.exposure_time, middle)
+        start = [0.0, 0.0, 0.0, found.offsets[0] + middle, 1.0, known or found.focal_lengths[0], timing.row_time]
+        return fit_robustly(model, torch.tensor(start, dtype=torch.float64), free)
+
+    search = searched(vectors.weight, timing.row_time)
+    fit = fitted(search)
+    # with the weights of the fit, what does not follow the gyroscope does not contribute
+    again = searched(fit.errors.weight, float(fit.parameters[6]))
+    if again.names[0] != search.names[0] or abs(again.offsets[0] - search.offsets[0]) > 5 / rates.sample_rate:
+        fit = fitted(again)
+    return _result(fit, again, free, starts, height)
+
+
+def _result(
+    fit: RotationFit, search: OrientationSearch, free: list[bool], starts: Tensor, height: int
+) -> RotationAlignment:
+    model, vectors = fit.model, fit.model.vectors
+    values = dict(zip(NAMES, fit.parameters.tolist(), strict=True))
+    std = fit.covariance.diagonal().clamp(min=0.0).sqrt()
+    at, scale, focal_length, row_time = (values[name] for name in ("at", "scale", "focal length", "row time"))
+    gradient = torch.zeros(7, dtype=torch.float64)
+    gradient[3], gradient[4] = 1.0, -model.middle  # offset = at - scale * middle
+    middles = starts + 0.5 * (height - 1) * row_time + 0.5 * model.exposure_time
+    predicted = components_of(
+        model.rates, model.orientation, fit.parameters, torch.stack([middles[:-1], middles[1:]], -1), model.middle
+    )
+    units = torch.tensor([1.0, 1.0, 1 / vectors.radius], dtype=torch.float64)
+    moved = (predicted - predicted.mean(0)).square().mean(0).sqrt()
+    unexplained = fit.errors.spread * units
+    first, last = float(middles[0]) - 0.5 * height * row_time, float(middles[-1]) + 0.5 * height * row_time
+    reasons = _reasons(fit, search, free, moved, unexplained, std)
+    clock = scale * (torch.tensor([first, last], dtype=torch.float64) - model.middle) + at
+    steps = model.rates.times.diff()
+    inside = (model.rates.times[1:] > clock[0]) & (model.rates.times[:-1] < clock[1])
+    if float(steps[inside].amax()) > 4 * float(steps.median()):
+        reasons.append(f"the recording has a gap of {float(steps[inside].amax()):.3g} s within the frames")
+    if row_time * height > float(starts.diff().amin()):
+        reasons.append(
+            f"the readout of {height} rows of {1e6 * row_time:.4g} us is longer than the interval between frames"
+        )
+    return RotationAlignment(
+        motion=_motion(fit, clock),
+        orientation=model.orientation,
+        offset=at - scale * model.middle,
+        offset_std=float(gradient @ fit.covariance @ gradient) ** 0.5,
+        scale=scale,
+        scale_std=float(std[4]),
+        bias=fit.parameters[:3],
+        bias_std=std[:3],
+        focal_length=focal_length,
+        focal_length_std=float(std[5]),
+        row_time=row_time,
+        row_time_std=float(std[6]),
+        translation=fit.errors.direction,
+        parallax=fit.errors.parallax,
+        unexplained=unexplained,
+        unexplained_rows=fit.rows_rms()[:2],
+        times=0.5 * (middles[:-1] + middles[1:]),
+        measured=predicted + fit.effects * units,
+        predicted=predicted,
+        reliable=not reasons,
+        reasons=tuple(reasons),
+    )
+
+
+def _motion(fit: RotationFit, clock: Tensor, margin: int = 4) -> FreeMotion:
+    """The motion on the clock of the frames, relative to their mid-time, with ``margin`` samples beyond the frames."""
+    model, parameters = fit.model, fit.parameters
+    times = model.rates.times.cpu()
+    low = max(int(torch.searchsorted(times, clock[0])) - margin, 0)
+    high = min(int(torch.searchsorted(times, clock[1])) + margin, len(times))
+    part = AngularRates(times[low:high], model.rates.rates[low:high].cpu() - parameters[:3])
+    pitch, yaw, roll = (part.attitude(float(parameters[3])) @ orientation_matrix(model.orientation).T).unbind(-1)
+    focal_length = float(parameters[5])
+    moved = torch.stack([-focal_length * yaw, focal_length * pitch, -roll], -1)
+    own = (part.times - parameters[3]) / parameters[4] + model.middle
+    camera = replace(model.camera, focal_length=focal_length)
+    return FreeMotion.from_samples(own, moved, spacing=float(own.diff().median()), camera=camera)
+
+
+def _reasons(
+    fit: RotationFit,
+    search: OrientationSearch,
+    free: list[bool],
+    moved: Tensor,
+    unexplained: Tensor,
+    std: Tensor,
+) -> list[str]:
+    """Reasons against an alignment."""
+    reasons = []
+    if float(moved[:2].amax()) < 0.05:
+        reasons.append(
+            f"the recorded rotation moves the image by {float(moved[:2].amax()):.2g} px between frames, too little"
+        )
+    for axis, name in enumerate(("X", "Y")):
+        if float(unexplained[axis]) > max(0.25 * float(moved[axis]), 0.05):
+            reasons.append(
+                f"frames move by {float(unexplained[axis]):.2g} px along {name.lower()} that the gyroscope does not "
+                f"explain, and by {float(moved[axis]):.2g} px that it does"
+            )
+    if search.mirrored is not None:
+        reasons.append(
+            f"the mirrored axes {search.mirrored} fit better than every rotation: the frames are mirrored, or the "
+            "recording has left-handed axes"
+        )
+    if search.other_offset is not None:
+        reasons.append(f"an offset of {search.other_offset:.6g} s explains the frames as well: the motion repeats")
+    others = _other_axes(fit, search, free)
+    if others:
+        reasons.append(f"the axes {', '.join(others)} explain the frames as well: rotate the camera about all axes")
+    if float(std[5]) > 0.05 * float(fit.parameters[5]):
+        reasons.append(
+            f"the focal length is not determined, {float(fit.parameters[5]):.4g} ± {float(std[5]):.2g} px: give camera="
+        )
+    if free[6] and float(std[6]) > 0.2 * float(fit.parameters[6]):
+        reasons.append(
+            f"the row time is not determined, {1e6 * float(fit.parameters[6]):.3g} ± {1e6 * float(std[6]):.2g} us"
+        )
+    if not math.isfinite(float(std.sum())):
+        reasons.append("the fit does not converge")
+    return reasons
+
+
+def _other_axes(fit: RotationFit, search: OrientationSearch, free: list[bool], *, certain: float = 25.0) -> list[str]:
+    """Other assignments of the axes, whose best fits have a chi-square that is larger by less than ``certain``."""
+    others = []
+    for index, name in enumerate(search.names):
+        if name == fit.model.orientation or search.costs[index] > 4.0 * search.costs[0]:
+            continue
+        start = fit.parameters.clone()
+        start[:3] = 0.0
+        start[3] = search.offsets[index] + fit.model.middle
+        if free[5]:
+            start[5] = search.focal_lengths[index]
+        if fit.cost_with(name, start, free) < fit.cost + certain:
+            others.append(name)
+    return others

@@ -1,0 +1,128 @@
+"""Angular rates from CSV files, and the table of numbers that text formats share."""
+
+import csv
+import math
+import re
+from array import array
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rsvib_torch.core.text import one_line
+from rsvib_torch.motion.gyroscope_rates import MAX_SAMPLES, AngularRates
+from rsvib_torch.motion.recorded import SECONDS
+
+__all__ = ["angular_rates", "read_rates_table", "rows_of_numbers", "text_lines"]
+
+Array = NDArray[np.float64]
+
+MAX_LINE = 2**16  # characters of a line; a line without end is not read as a whole
+RADIANS = {"rad/s": 1.0, "deg/s": math.pi / 180}
+_UNIT = {"rad/s": "rad/s", "rad_s": "rad/s", "rads": "rad/s", "deg/s": "deg/s", "deg_s": "deg/s", "dps": "deg/s"}
+_TIME_NAME = re.compile(r"(?:t|time|timestamp)(?:[ _]?[(\[]?(?P<unit>s|ms|us|ns)[)\]]?)?")
+_RATE_NAME = re.compile(
+    r"(?:gyro(?:scope)?[ _]?|angular_velocity[ _]?|rate[ _]?|omega[ _]?|[grw])?(?P<axis>[xyz])"
+    r"(?:[ _]?[(\[]?(?P<unit>rad/s|rad_s|rads|deg/s|deg_s|dps)[)\]]?)?"
+)
+
+
+def text_lines(path: Path, file: IO[str]) -> Iterator[str]:
+    """Lines of a text file, of bounded length."""
+    while line := file.readline(MAX_LINE):
+        if len(line) == MAX_LINE:
+            raise ValueError(f"{path}: a line of more than {MAX_LINE} characters; expected rows of numbers")
+        yield line
+
+
+def rows_of_numbers(
+    path: Path, lines: Iterable[str], columns: list[int], names: list[str], first_line: int
+) -> NDArray[np.float64]:
+    """Numbers (N, C) in some columns of comma-separated lines; empty lines are skipped.
+
+    Args:
+        path: The file, for messages.
+        lines: Lines after the names of the columns.
+        columns: Numbers C of the columns, from 0.
+        names: Names of these columns, for messages.
+        first_line: Number of the first of the lines in the file, from 1.
+    """
+    values = array("d")
+    limit = MAX_SAMPLES * len(columns)
+    reader = csv.reader(lines, skipinitialspace=True)
+    for cells in reader:
+        if not cells or cells == [""]:
+            continue
+        for column, name in zip(columns, names, strict=True):
+            text = cells[column] if column < len(cells) else ""
+            try:
+                value = float(text)
+            except ValueError:
+                value = math.nan
+            if not math.isfinite(value):
+                number = first_line + reader.line_num - 1
+                raise ValueError(f"{path}, line {number}: {name} must be a number, got {one_line(repr(text), 60)}")
+            values.append(value)
+        if len(values) > limit:
+            raise ValueError(f"{path}: more than {MAX_SAMPLES:,} samples; cut the recording to the time of the frames")
+    return np.frombuffer(values, dtype=np.float64).reshape(-1, len(columns))
+
+
+def angular_rates(path: Path, times: Array, rates: Array, source: str) -> AngularRates:
+    """The result of a reader; errors of its values name the file."""
+    try:
+        return AngularRates(torch.from_numpy(times.copy()), torch.from_numpy(rates.copy()), source)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def read_rates_table(path: Path, unit: str | None, time_unit: str | None) -> AngularRates:
+    """Angular rates of a CSV file, see ``read_gyroscope``."""
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        try:
+            lines = text_lines(path, file)
+            names = [name.strip().lower() for name in next(csv.reader(lines), [])]
+            columns, time_unit, unit = _columns(path, names, time_unit, unit)
+            table = rows_of_numbers(path, lines, columns, [names[column] for column in columns], 2)
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise ValueError(f"{path}: not a CSV file: {error}") from error
+    return angular_rates(path, table[:, 0] * SECONDS[time_unit], table[:, 1:] * RADIANS[unit], f"{path.name}, CSV")
+
+
+def _columns(path: Path, names: list[str], time_unit: str | None, unit: str | None) -> tuple[list[int], str, str]:
+    """Columns of the time and of the rates about x, y and z, and their units."""
+    found: dict[str, int] = {}
+    units: dict[str, set[str]] = {"time": set(), "rate": set()}
+    for column, name in enumerate(names):
+        for kind, match in (("time", _TIME_NAME.fullmatch(name)), ("rate", _RATE_NAME.fullmatch(name))):
+            if match is None:
+                continue
+            quantity = "time" if kind == "time" else match["axis"]
+            if quantity in found:
+                raise ValueError(
+                    f"{path}: columns {one_line(repr(names[found[quantity]]), 60)} and {one_line(repr(name), 60)} "
+                    f"could both be {quantity}; rename one of them"
+                )
+            found[quantity] = column
+            if match["unit"]:
+                units[kind].add(match["unit"] if kind == "time" else _UNIT[match["unit"]])
+    missing = [quantity for quantity in ("time", "x", "y", "z") if quantity not in found]
+    if missing:
+        what = "time" if missing[0] == "time" else f"rate about {missing[0]}"
+        present = one_line(", ".join(names) or "nothing", 200)
+        raise ValueError(
+            f"{path}: no column of the {what}; expected names such as time, gx, gy, gz in the first line, which has "
+            f"{present}"
+        )
+    for name, given, stated in (("time_unit", time_unit, units["time"]), ("unit", unit, units["rate"])):
+        if len(stated | ({given} - {None})) > 1:
+            kinds = ", ".join(sorted(stated))
+            raise ValueError(f"{path}: the first line states {kinds}" + (f", {name} is {given!r}" if given else ""))
+    rate_unit = unit or next(iter(units["rate"]), None)
+    if rate_unit is None:
+        raise ValueError(f"{path}: the unit of the rates is not stated; pass unit='rad/s' or unit='deg/s'")
+    order = [found[quantity] for quantity in ("time", "x", "y", "z")]
+    return order, time_unit or next(iter(units["time"]), "s"), rate_unit

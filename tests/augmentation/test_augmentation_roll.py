@@ -1,0 +1,145 @@
+"""The augmentation with roll and zoom, compared with a camera independent of the package."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from field_truth import FieldMotion, take_field_frames
+from kornia.geometry.boxes import Boxes
+from kornia.geometry.keypoints import Keypoints
+from scipy.optimize import fsolve
+from truth import decibel, draw_scene
+
+from rsvib_torch import RollingShutterVibration, SensorTiming
+
+TIMING = SensorTiming(row_time=8e-5, exposure_rows=12, frame_rows=220)
+# frequency and phase of roll and zoom are drawn from the ranges of x
+MOTION = FieldMotion((1.4, 1.9, 8e-3, 5e-3), (38.0, 31.0, 38.0, 38.0), (0.3, 1.1, 0.3, 0.3))
+SIZE, RIM = (192, 240), 32
+INNER = (slice(12, -12), slice(12, -12))
+
+
+def fixed(axes=4, timing=TIMING, **options):
+    """The augmentation with ranges of one value."""
+    ranges = {name: tuple((v, v) for v in getattr(MOTION, name)[:2]) for name in ("amplitude", "frequency", "phase")}
+    turns = dict(zip(("roll", "zoom"), MOTION.amplitude[2:axes], strict=False))
+    return RollingShutterVibration(timing, **ranges, **turns, **options)
+
+
+def moved(point, timing=TIMING, size=SIZE):
+    """Position in the frame of a scene point (x, y) in px: the mean displacement over the exposure of its row."""
+    nodes = (np.arange(200) + 0.5) / 200 * timing.exposure_time
+    middle = np.array([(size[1] - 1) / 2, (size[0] - 1) / 2])
+    x, y = np.asarray(point) - middle
+
+    def mean(row):
+        return [part.mean() for part in MOTION.components(row * timing.row_time + nodes)]
+
+    def miss(place):
+        X, Y, roll, zoom = mean(place[1])
+        return place - point - np.array([X - roll * y + zoom * x, Y + roll * x + zoom * y])
+
+    return fsolve(miss, np.asarray(point, dtype=float), xtol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return draw_scene(SIZE[0] + 2 * RIM, SIZE[1] + 2 * RIM, 11, blur=1.2)
+
+
+@pytest.fixture(scope="module")
+def still(scene):
+    return torch.from_numpy(scene[RIM:-RIM, RIM:-RIM].copy())[None, None]
+
+
+def test_images_equal_those_of_the_independent_camera(scene, still):
+    truth = take_field_frames(scene, TIMING, MOTION, SIZE, 1, nodes=8)[0]
+    image = fixed()(still)[0, 0].numpy()
+    without = fixed(axes=2)(still)[0, 0].numpy()
+    assert decibel(without[INNER], truth[INNER]) < 44
+    assert decibel(image[INNER], truth[INNER]) > 57
+
+
+def test_keypoints_move_with_the_image(still):
+    augmentation = fixed()
+    augmentation(still)
+    points = torch.tensor(
+        [[[5.0, 3.0], [230.0, 10.0], [120.5, 96.0], [20.0, 180.0], [235.0, 188.0]]], dtype=torch.float64
+    )
+    found = augmentation.transform_keypoints(Keypoints(points), augmentation._params, augmentation.flags).to_tensor()
+    expected = np.stack([moved(point) for point in points[0].numpy()])
+    np.testing.assert_allclose(found[0].numpy(), expected, rtol=0, atol=1e-6)
+    assert np.abs(expected - points[0].numpy()).max() > 2.0
+
+
+def test_masks_move_to_the_nearest_pixel(still):
+    augmentation = fixed()
+    augmentation(still)
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in SIZE), indexing="ij")
+    label = (x + 1000 * y)[None, None]
+    mask = augmentation.transform_masks(label, augmentation._params, augmentation.flags)[0, 0]
+    for row, column in ((15, 20), (30, 220), (96, 120), (170, 30), (180, 225)):
+        source = torch.tensor([float(mask[row, column]) % 1000, float(mask[row, column]) // 1000])
+        place = moved(source.numpy())
+        assert np.abs(place - [column, row]).max() < 0.52  # the nearest pixel; neighbours differ by up to 1 %
+
+
+def test_boxes_contain_the_moved_content(still):
+    augmentation = fixed()
+    augmentation(still)
+    box = torch.tensor([[[20.0, 30.0], [220.0, 30.0], [220.0, 150.0], [20.0, 150.0]]])
+    found = augmentation.transform_boxes(Boxes(box[None]), augmentation._params, augmentation.flags).data[0, 0]
+    x, y = np.meshgrid(np.linspace(20, 220, 9), np.linspace(30, 150, 13))
+    content = np.stack([moved(point) for point in np.stack([x.ravel(), y.ravel()], -1)])
+    low, high = found.amin(0).numpy(), found.amax(0).numpy()
+    np.testing.assert_allclose(content.min(0), low, atol=0.05)
+    np.testing.assert_allclose(content.max(0), high, atol=0.05)
+    assert (content >= low - 1e-3).all()
+    assert (content <= high + 1e-3).all()
+
+
+def test_other_orientation(still):
+    """A camera that is read along x from the right, and the same images transposed and flipped."""
+    turned = SensorTiming(8e-5, 12, 220, scan_axis="x", readout_direction="reverse")
+    here = fixed(3)
+    image = here(still)
+    params = here._params
+    vibration = here.drawn_vibration().from_row_order(turned)
+    aside = RollingShutterVibration(turned, roll=1e-3)
+    aside(still.flip(-2).mT)
+    changed = {name: getattr(vibration, name) for name in ("amplitude", "frequency", "phase", "image_motion")}
+    params = params | changed | {"forward_input_shape": aside._params["forward_input_shape"]}
+    torch.testing.assert_close(aside(still.flip(-2).mT, params), image.flip(-2).mT, rtol=0, atol=1e-5)
+
+
+def test_the_drawn_vibration_has_the_axes():
+    augmentation = RollingShutterVibration(TIMING, roll=(1e-3, 2e-3))
+    augmentation(torch.rand(3, 1, 64, 48))
+    vibration = augmentation.drawn_vibration()
+    assert vibration.amplitude.shape == (3, 3, 1)
+    assert bool((vibration.amplitude[:, 2] >= 1e-3).all() and (vibration.amplitude[:, 2] <= 2e-3).all())
+    assert len(set(vibration.amplitude[:, 2, 0].tolist())) == 3
+    zoom = RollingShutterVibration(TIMING, zoom=1e-3)
+    zoom(torch.rand(2, 1, 64, 48))
+    torch.testing.assert_close(zoom.drawn_vibration().amplitude[:, 2:, 0].float(), torch.tensor([[0.0, 1e-3]] * 2))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "match"),
+    [
+        ({"roll": -1e-3}, ValueError, "roll must be at least 0"),
+        ({"zoom": (2e-3, 1e-3)}, ValueError, "zoom must not have low above high"),
+        ({"roll": ((0.0, 1.0), (0.0, 1.0))}, TypeError, "roll must be a number or"),
+    ],
+)
+def test_wrong_values(options, error, match):
+    with pytest.raises(error, match=match):
+        RollingShutterVibration(TIMING, **options)
+
+
+def test_gradients_flow(still):
+    image = still.clone().requires_grad_()
+    fixed()(image).square().sum().backward()
+    assert image.grad is not None
+    assert math.isfinite(float(image.grad.abs().sum()))

@@ -1,0 +1,252 @@
+"""Alignment of a gyroscope with frames of an independent camera: axes, bias, clock, focal length, row time."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import map_coordinates, spline_filter
+from scipy.spatial.transform import Rotation
+from truth import draw_scene
+
+import rsvib_torch as rsv
+from rsvib_torch.detection.recorded import rotation_alignment
+from rsvib_torch.detection.recorded.band_vectors import band_vectors
+from rsvib_torch.detection.recorded.rotation_search import ORIENTATIONS, search_orientations
+from rsvib_torch.detection.start import grey_frames
+from rsvib_torch.registration import RegistrationOptions
+
+FOCAL_LENGTH, SIZE, COUNT = 380.0, (200, 216), 4
+BIAS, OFFSET = (0.012, -0.02, 0.008), 0.35
+TIMING = rsv.SensorTiming(row_time=8e-5, exposure_rows=10, frame_rows=420)
+
+
+def attitude(times, size=1.0):
+    """Attitude of the camera: rotations about its axes z, y, x one after another, each a sum of two tones."""
+    angles = [
+        size * a * np.sin(2 * np.pi * f * times + p) + size * b * np.sin(2 * np.pi * g * times + q)
+        for a, f, p, b, g, q in (
+            (4e-3, 7.1, 0.2, 2e-3, 17.3, 1.0),
+            (3e-3, 9.7, 1.2, 2e-3, 21.1, 0.1),
+            (4e-3, 6.3, 2.2, 3e-3, 14.9, 0.6),
+        )
+    ]
+    return Rotation.from_euler("ZYX", np.stack(angles, -1))
+
+
+def rates_of(times, size=1.0, step=1e-6):
+    """Angular rates (N, 3) about the axes of the camera, by the difference of two attitudes."""
+    return (attitude(times - step, size).inv() * attitude(times + step, size)).as_rotvec() / (2 * step)
+
+
+def take(timing, size=1.0, *, noise=0.003, dashboard=0, count=COUNT):
+    """Frames (T, H, W) of a distant scene, and of what is fixed to the camera in the last ``dashboard`` rows."""
+    height, width = SIZE
+    scene = draw_scene(height + 60, width + 60, 5)
+    coefficients = spline_filter(scene, 5)
+    row, column = np.mgrid[:height, :width].astype(float)
+    line, lines = (row, height) if timing.scan_axis == -2 else (column, width)
+    line = lines - 1 - line if timing.readout_direction == "reverse" else line
+    ray = np.stack([column - (width - 1) / 2, row - (height - 1) / 2, np.full_like(row, FOCAL_LENGTH)], -1)
+    frames = np.zeros((count, height, width))
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    for frame, (node, weight) in itertools.product(range(count), zip(nodes, weights, strict=True)):
+        times = frame * timing.frame_period + line * timing.row_time + (node + 1) / 2 * timing.exposure_time
+        seen = attitude(times.ravel(), size).apply(ray.reshape(-1, 3)).reshape(ray.shape)
+        seen = FOCAL_LENGTH * seen[..., :2] / seen[..., 2:] + (np.array(scene.shape[::-1]) - 1) / 2
+        frames[frame] += (
+            weight / 2 * map_coordinates(coefficients, [seen[..., 1], seen[..., 0]], order=5, prefilter=False)
+        )
+    if dashboard:
+        frames[:, -dashboard:] = draw_scene(dashboard, width, 9)
+    frames += noise * np.random.default_rng(1).standard_normal(frames.shape)
+    return torch.from_numpy(frames).float()
+
+
+def recorded(orientation="XYZ", size=1.0, mirrored=1.0):
+    """Rates about the axes of a gyroscope, for an assignment of the axes of the camera."""
+    times = np.arange(-0.04, 0.2, 1e-3)
+    of_camera, own = rates_of(times, size), np.zeros((len(times), 3))
+    for axis, letter in enumerate(orientation):
+        own[:, "xyz".index(letter.lower())] = of_camera[:, axis] * (1.0 if letter.isupper() else -1.0)
+    own[:, 0] *= mirrored
+    return rsv.AngularRates(torch.from_numpy(times + OFFSET), torch.from_numpy(own + np.array(BIAS)))
+
+
+@pytest.fixture(scope="module", name="frames")
+def make_frames():
+    return take(TIMING)
+
+
+@pytest.fixture(scope="module", name="vectors")
+def make_vectors(frames):
+    options = RegistrationOptions("phase", 32, 16, 16)
+    return band_vectors(grey_frames(frames, TIMING, None, None, None), TIMING, options)
+
+
+def check(found, orientation, *, limit=4.0):
+    """Values within ``limit`` standard deviations, and close."""
+    assert found.reliable, found.reasons
+    assert found.orientation == orientation
+    assert abs(found.offset - OFFSET) < min(limit * found.offset_std, 1e-3)
+    error = (found.bias - torch.tensor(BIAS, dtype=torch.float64)).abs()
+    assert bool((error < (limit * found.bias_std).clamp(max=8e-3)).all()), (error, found.bias_std)
+    assert abs(found.focal_length - FOCAL_LENGTH) <= min(limit * found.focal_length_std, 8.0)
+
+
+def test_everything_from_the_frames(frames):
+    found = rsv.align_motion(frames, TIMING, recorded("yZx"))
+    check(found, "yZx")
+    assert found.offset_std < 5e-4
+    assert abs(found.scale - 1.0) < 4 * found.scale_std < 0.02
+    assert found.measured.shape == (COUNT - 1, 3)
+    assert float((found.measured - found.predicted)[:, :2].abs().max()) < 0.05  # px
+    # the motion: content that is displaced by it comes to rest
+    restored = rsv.restore(frames, TIMING, found.motion, check=False)
+    before, after = (
+        (images[1:] - images[:-1])[:, 20:-20, 20:-20].square().mean().sqrt() for images in (frames, restored)
+    )
+    assert float(after) < 0.25 * float(before)
+
+
+def test_row_time(frames):
+    start = replace(TIMING, row_time=6e-5, exposure_rows=10 * 8 / 6, frame_rows=420 * 8 / 6)
+    camera = rsv.Camera(FOCAL_LENGTH)
+    found = rsv.align_motion(frames, start, recorded("ZXY"), camera=camera, fit_row_time=True)
+    assert found.reliable, found.reasons
+    assert abs(found.row_time - 8e-5) < min(4 * found.row_time_std, 2e-6)
+    assert found.focal_length == FOCAL_LENGTH
+    assert found.focal_length_std == 0.0
+
+
+@pytest.mark.parametrize("options", [{"scan_axis": "x"}, {"readout_direction": "reverse"}])
+def test_other_readout(options):
+    timing = replace(TIMING, **options)
+    check(
+        rsv.align_motion(take(timing), timing, recorded("XYZ"), camera=rsv.Camera(FOCAL_LENGTH), fit_gain=True), "XYZ"
+    )
+
+
+def test_search_finds_all_24_orientations(vectors):
+    assert len(ORIENTATIONS) == 24
+    for name in ORIENTATIONS:
+        limits = (OFFSET - 0.02, OFFSET + 0.02)
+        found = search_orientations(
+            vectors, vectors.weight, recorded(name), TIMING.row_time, TIMING.exposure_time, limits, None
+        )
+        assert found.names[0] == name
+        assert abs(found.offsets[0] - OFFSET) < 2e-3
+        assert found.costs[1] > 4 * found.costs[0]
+        assert found.mirrored is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ORIENTATIONS)
+def test_all_24_orientations(frames, vectors, name, monkeypatch):
+    monkeypatch.setattr(rotation_alignment, "band_vectors", lambda *_: vectors)  # the same frames: registered once
+    check(rsv.align_motion(frames, TIMING, recorded(name)), name, limit=5.0)
+
+
+def test_dashboard_is_excluded():
+    found = rsv.align_motion(take(TIMING, dashboard=60), TIMING, recorded(), camera=rsv.Camera(FOCAL_LENGTH))
+    assert found.orientation == "XYZ"
+    assert abs(found.offset - OFFSET) < 1e-3
+    assert float((found.bias - torch.tensor(BIAS, dtype=torch.float64)).abs().max()) < 0.02
+
+
+def test_mirrored_axes_are_refused(frames, vectors, monkeypatch):
+    monkeypatch.setattr(rotation_alignment, "band_vectors", lambda *_: vectors)
+    found = rsv.align_motion(frames, TIMING, recorded(mirrored=-1.0))
+    assert not found.reliable
+    assert any("mirrored axes xYZ fit better" in reason for reason in found.reasons)
+
+
+def test_recording_of_another_motion_is_refused(frames, vectors, monkeypatch):
+    monkeypatch.setattr(rotation_alignment, "band_vectors", lambda *_: vectors)
+    rates = recorded()
+    random = np.random.default_rng(4).standard_normal((len(rates.times), 3))
+    smooth = np.stack([np.convolve(column, np.hanning(25) / 12, "same") for column in random.T], -1)
+    found = rsv.align_motion(frames, TIMING, rsv.AngularRates(rates.times, torch.from_numpy(0.3 * smooth)))
+    assert not found.reliable
+    assert any("does not explain" in reason for reason in found.reasons)
+
+
+def test_rest_is_refused():
+    found = rsv.align_motion(take(TIMING, 0.002), TIMING, recorded(size=0.002), camera=rsv.Camera(FOCAL_LENGTH))
+    assert not found.reliable
+    assert any("too little" in reason for reason in found.reasons)
+
+
+def test_one_axis_alone_leaves_the_others_open(vectors, frames, monkeypatch):
+    # the camera turns about its y axis only: the assignment of x and z, and their signs, are not determined
+    monkeypatch.setattr(rotation_alignment, "band_vectors", lambda *_: only_x)
+    rates = recorded()
+    alone = torch.zeros_like(rates.rates)
+    alone[:, 1] = rates.rates[:, 1] - BIAS[1]
+    shifted = rsv.AngularRates(rates.times - OFFSET, alone)
+    first, last = vectors.times(TIMING.row_time).unbind(-1)
+    half = 0.5 * TIMING.exposure_time
+    yaw = shifted.rotation(first + half, last + half)[:, 1]
+    noise = 0.01 * torch.randn(len(yaw), 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    only_x = replace(vectors, offsets=torch.stack([-FOCAL_LENGTH * yaw, 0 * yaw], -1) + noise)
+    found = rsv.align_motion(frames, TIMING, rsv.AngularRates(rates.times, alone), camera=rsv.Camera(FOCAL_LENGTH))
+    assert not found.reliable
+    assert any("explain the frames as well: rotate the camera about all axes" in reason for reason in found.reasons)
+
+
+def test_arguments(frames):
+    rates = recorded()
+    motion = rsv.FreeMotion.from_samples(torch.linspace(0, 1, 20), torch.zeros(20, 2))
+    with pytest.raises(ValueError, match="camera and fit_row_time are for angular rates"):
+        rsv.align_motion(frames, TIMING, motion, fit_row_time=True)
+    with pytest.raises(TypeError, match="recorded must be"):
+        rsv.align_motion(frames, TIMING, rates.rates)
+    with pytest.raises(ValueError, match=r"the recording of 0\.01 s is shorter than the frames"):
+        rsv.align_motion(frames, TIMING, rsv.AngularRates(rates.times[:11], rates.rates[:11]))
+    with pytest.raises(ValueError, match="rows of 150 px are too short to measure roll"):
+        rsv.align_motion(frames[..., :150], TIMING, rates)
+    with pytest.raises(ValueError, match="times must increase"):
+        rsv.AngularRates(rates.times.flip(0), rates.rates)
+
+
+def test_rotation_is_composed_of_small_ones():
+    times = np.arange(0.0, 0.3, 1e-3)
+    size = 5.0  # 0.02 rad in 20 ms
+    rates = rsv.AngularRates(torch.from_numpy(times), torch.from_numpy(rates_of(times, size)))
+    start, end = np.array([0.05, 0.1]), np.array([0.06, 0.12])
+    truth = (attitude(start, size).inv() * attitude(end, size)).as_rotvec()
+    assert np.allclose(rates.rotation(torch.from_numpy(start), torch.from_numpy(end)).numpy(), truth, atol=1e-6)
+    truth = (attitude(np.array([0.1005]), size).inv() * attitude(times, size)).as_rotvec()
+    assert np.allclose(rates.attitude(0.1005).numpy(), truth, atol=1e-6)
+
+
+@pytest.mark.parametrize("parallax", [0.0, 0.02])
+def test_translation_of_the_camera_is_allowed(vectors, frames, monkeypatch, parallax):
+    # each part at a distance of its own; a third of the places are fixed to the camera
+    direction = np.array([0.1, -0.05, 0.99])
+    first, last = (times.numpy() + 0.5 * TIMING.exposure_time for times in vectors.times(TIMING.row_time).unbind(-1))
+    place = vectors.place.numpy()
+    ray = np.concatenate([place, np.full((len(place), 1), FOCAL_LENGTH)], -1)
+    ray = (attitude(first).inv() * attitude(last)).inv().apply(ray)
+    random = np.random.default_rng(3)
+    lines = direction[2] * place - FOCAL_LENGTH * direction[:2]
+    near = parallax * random.uniform(0, 2, (len(place), 1))
+    moved = FOCAL_LENGTH * ray[:, :2] / ray[:, 2:] - place + near * lines
+    fixed = vectors.row.numpy() >= 0.7 * vectors.num_rows
+    moved[fixed] = 0.0
+    moved += 0.02 * random.standard_normal(moved.shape)
+    scene = replace(vectors, offsets=torch.from_numpy(moved))
+    monkeypatch.setattr(rotation_alignment, "band_vectors", lambda *_: scene)
+    found = rsv.align_motion(frames, TIMING, recorded("zxY"), registration="phase")
+    assert found.orientation == "zxY"
+    assert abs(found.offset - OFFSET) < 4 * found.offset_std < 4e-3
+    assert abs(found.focal_length - FOCAL_LENGTH) < min(4 * found.focal_length_std, 0.1 * FOCAL_LENGTH)
+    error = (found.bias - torch.tensor(BIAS, dtype=torch.float64)).abs()
+    assert bool((error < 4 * found.bias_std).all())
+    if parallax:
+        assert 0.5 * parallax < found.parallax < 2 * parallax
+        unit = torch.from_numpy(direction / np.linalg.norm(direction))
+        assert float((found.translation @ unit).abs()) > 0.99
+    else:
+        assert found.parallax < 1e-3

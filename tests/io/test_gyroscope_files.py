@@ -1,0 +1,207 @@
+"""Angular rates from gyroflow logs, GPMF tracks and CSV files, written here byte by byte."""
+
+import math
+import struct
+
+import numpy as np
+import pytest
+
+import rsvib_torch as rsv
+
+TIMES = np.arange(60) / 200.0
+RATES = np.round(np.stack([0.5 * np.sin(20 * TIMES), -0.3 * np.cos(9 * TIMES), 0.1 + 0.4 * TIMES], -1), 3)
+
+
+def lines_of(times, rates):
+    return [",".join(f"{value:.10g}" for value in (time, *row)) for time, row in zip(times, rates, strict=True)]
+
+
+def gcsv(path, *, orientation="XYZ", header=(), columns="t,gx,gy,gz,ax,ay,az", rows=None):
+    """A gyroflow log with times in ms and rates in units of 0.5 mrad/s."""
+    raw = np.round(RATES / 5e-4).astype(int)
+    rows = [f"{5 * i},{x},{y},{z},0,0,1" for i, (x, y, z) in enumerate(raw)] if rows is None else rows
+    start = [
+        "GYROFLOW IMU LOG",
+        "version,1.3",
+        "id,test",
+        f"orientation,{orientation}",
+        "tscale,0.001",
+        "gscale,0.0005",
+    ]
+    path.write_text("\n".join([*start, *header, columns, *rows]) + "\n")
+    return path
+
+
+def test_gyroflow_log(tmp_path):
+    found = rsv.read_gyroscope(gcsv(tmp_path / "clip.gcsv"))
+    assert np.allclose(found.times.numpy(), TIMES, atol=1e-12)
+    assert np.allclose(found.rates.numpy(), RATES, atol=1e-12)
+    assert "gyroflow" in found.source
+
+
+def test_orientation_of_a_gyroflow_log(tmp_path):
+    found = rsv.read_gyroscope(gcsv(tmp_path / "clip.gcsv", orientation="YxZ")).rates.numpy()
+    assert np.allclose(found, np.stack([RATES[:, 1], -RATES[:, 0], RATES[:, 2]], -1), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("names", "factor", "options"),
+    [
+        ("time_s,x_rad_s,y_rad_s,z_rad_s", (1.0, 1.0), {}),
+        ("t (ms),gx (deg/s),gy (deg/s),gz (deg/s)", (1e3, 180 / math.pi), {}),
+        ("Timestamp, gyro_x, gyro_y, gyro_z", (1e6, 180 / math.pi), {"unit": "deg/s", "time_unit": "us"}),
+    ],
+)
+def test_csv(tmp_path, names, factor, options):
+    path = tmp_path / "clip.csv"
+    path.write_text("\n".join([names, *lines_of(TIMES * factor[0], RATES * factor[1])]))
+    found = rsv.read_gyroscope(path, **options)
+    assert np.allclose(found.times.numpy(), TIMES, atol=1e-9)
+    assert np.allclose(found.rates.numpy(), RATES, atol=1e-8)
+
+
+# GoPro: a writer of boxes and entries that shares nothing with the reader
+
+
+def box(kind, *contents):
+    content = b"".join(contents)
+    return struct.pack(">I", 8 + len(content)) + kind + content
+
+
+def entry(key, kind, size, count, content):
+    return key + kind + struct.pack(">BH", size, count) + content + b"\0" * (-len(content) % 4)
+
+
+def packet(rates, *, total, scale=1000, orientation=b"", stamp=None, tick=None):
+    accelerations = entry(b"ACCL", b"s", 6, 1, struct.pack(">hhh", 1, 2, 3))
+    parts = [entry(b"TSMP", b"L", 4, 1, struct.pack(">I", total))]
+    if stamp is not None:
+        parts.append(entry(b"STMP", b"J", 8, 1, struct.pack(">Q", stamp)))
+    if tick is not None:
+        parts.append(entry(b"TICK", b"L", 4, 1, struct.pack(">I", tick)))
+    parts.append(entry(b"SCAL", b"s", 2, 1, struct.pack(">h", scale)))
+    if orientation:
+        parts.append(entry(b"ORIN", b"c", 1, 3, orientation))
+    raw = np.round(np.asarray(rates) * scale).astype(">i2").tobytes()
+    parts.append(entry(b"GYRO", b"s", 6, len(rates), raw))
+    other = entry(b"STRM", b"\0", 1, len(accelerations), accelerations)
+    own = b"".join(parts)
+    content = entry(b"DVID", b"L", 4, 1, b"\0\0\0\1") + other + entry(b"STRM", b"\0", 1, len(own), own)
+    return entry(b"DEVC", b"\0", 1, len(content), content)
+
+
+def mp4(path, packets, *, duration=300, timescale=1000, kind=b"gpmd", count=None, offsets=None):
+    """A video whose only track has the packets, each in a chunk of its own."""
+    start = box(b"ftyp", b"mp41", b"\0\0\0\0")
+    places, place = [], len(start) + 8
+    for data in packets:
+        places.append(place)
+        place += len(data)
+    number = len(packets) if count is None else count
+    table = box(
+        b"stbl",
+        box(b"stsd", struct.pack(">II", 0, 1), struct.pack(">I4s", 16, kind), b"\0" * 8),
+        box(b"stts", struct.pack(">IIII", 0, 1, number, duration)),
+        box(b"stsc", struct.pack(">IIIII", 0, 1, 1, 1, 1)),
+        box(b"stsz", struct.pack(">III", 0, 0, number), *(struct.pack(">I", len(data)) for data in packets)),
+        box(b"stco", struct.pack(">II", 0, len(packets)), *(struct.pack(">I", at) for at in offsets or places)),
+    )
+    header = box(b"mdhd", struct.pack(">IIIII", 0, 0, 0, timescale, 0), b"\0" * 4)
+    track = box(b"trak", box(b"mdia", header, box(b"minf", table)))
+    path.write_bytes(start + box(b"mdat", *packets) + box(b"moov", box(b"mvhd", b"\0" * 20), track))
+    return path
+
+
+def packets_of(size=20, **options):
+    """Packets of the rates, at 200 Hz; ``stamp`` and ``tick`` are their first times on another clock."""
+    parts = []
+    for number, at in enumerate(range(0, len(RATES), size)):
+        own = {name: value(number) for name, value in options.items() if callable(value)}
+        rest = {name: value for name, value in options.items() if not callable(value)}
+        parts.append(packet(RATES[at : at + size], total=at + size, **own, **rest))
+    return parts
+
+
+def test_gopro_video(tmp_path):
+    found = rsv.read_gyroscope(mp4(tmp_path / "clip.MP4", packets_of(), duration=100))
+    assert np.allclose(found.times.numpy(), TIMES, atol=1e-9)  # packets of 20 samples in 0.1 s
+    assert np.allclose(found.rates.numpy(), RATES, atol=1e-9)
+    turned = rsv.read_gyroscope(mp4(tmp_path / "turned.mp4", packets_of(orientation=b"zXy"), duration=100)).rates
+    assert np.allclose(turned.numpy(), np.stack([-RATES[:, 2], RATES[:, 0], -RATES[:, 1]], -1), atol=1e-9)
+
+
+def test_gopro_times_follow_the_clock_of_the_camera(tmp_path):
+    # packets are 0.11 s long in the video, but their samples began 0.1 s apart
+    ticks = rsv.read_gyroscope(mp4(tmp_path / "tick.mp4", packets_of(tick=lambda n: 7000 + 100 * n), duration=110))
+    assert ticks.sample_rate == pytest.approx(200.0, rel=1e-9)
+    stamps = rsv.read_gyroscope(
+        mp4(tmp_path / "stamp.mp4", packets_of(stamp=lambda n: (0, 100_000, 210_000)[n]), duration=110)
+    )
+    assert float(stamps.times[20]) == pytest.approx(0.1)
+    assert float(stamps.times[40]) == pytest.approx(0.21)
+    assert float(stamps.times[30]) == pytest.approx(0.155)
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (lambda path: gcsv(path, rows=["0,1,2,3", "5,x,2,3"]), "line 9: gx must be a number, got 'x'"),
+        (lambda path: gcsv(path, orientation="XXZ"), "orientation must have x, y and z once each"),
+        (lambda path: gcsv(path, columns="t,ax,ay,az"), "columns t, gx, gy and gz expected"),
+        (lambda path: gcsv(path, header=["gscale,-1"]), "gscale must be a positive number, got '-1'"),
+        (lambda path: path.write_text("GYROFLOW IMU LOG\nversion,1.3\n"), "without a line of column names"),
+        (lambda path: path.write_text("time,gx,gy,gz\n" + "0,0,0,0\n" * 5), "the unit of the rates is not stated"),
+        (lambda path: path.write_text("time,gx_dps,gy_rad_s,gz_dps\n"), "the first line states deg/s, rad/s"),
+        (lambda path: path.write_text("time,gx,gy\n"), "no column of the rate about z"),
+        (lambda path: path.write_text("time,gx,rate_x,gy,gz\n"), "could both be x"),
+        (lambda path: path.write_text("time,x_dps,y_dps,z_dps\n" + "7" * 200_000), "a line of more than 65536"),
+        (
+            lambda path: path.write_text("t,x_dps,y_dps,z_dps\n" + "1,0,0,0\n" * 5),
+            "times must increase, but sample 1 at 1 s",
+        ),
+        (lambda path: mp4(path, packets_of(), kind=b"tmcd"), "a video without a GPMF track"),
+        (lambda path: mp4(path, packets_of(), count=2**31), "damaged MP4 file"),
+        (lambda path: mp4(path, packets_of(), offsets=[2**31] * 3), "beyond the end of the file"),
+        (lambda path: mp4(path, [packets_of()[0][:-40]] * 3), "damaged MP4 file: a GPMF entry"),
+        (lambda path: path.write_bytes(box(b"ftyp", b"mp41") + b"\xff\xff\xff\xffmdat"), "the file is truncated"),
+        (lambda path: path.write_bytes(box(b"ftyp", b"mp41")), "without index"),
+    ],
+)
+def test_damaged_files_are_refused_in_one_line(tmp_path, write, message):
+    path = tmp_path / "clip.dat"
+    write(path)
+    with pytest.raises(ValueError, match=r"clip\.dat") as caught:
+        rsv.read_gyroscope(path)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_random_damage_ends_in_an_error_or_a_result(tmp_path):
+    whole = mp4(tmp_path / "clip.mp4", packets_of()).read_bytes()
+    random = np.random.default_rng(0)
+    outcomes = set()
+    for _ in range(300):
+        data = bytearray(whole)
+        for place in random.integers(0, len(data), 3):
+            data[place] = random.integers(256)
+        path = tmp_path / "damaged.mp4"
+        path.write_bytes(data)
+        try:
+            rsv.read_gyroscope(path)
+            outcomes.add("read")
+        except ValueError as error:
+            outcomes.add("several lines" if "\n" in str(error) else "refused")
+    assert outcomes == {"read", "refused"}
+
+
+def test_units_of_formats_that_state_them_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="states its units; omit unit"):
+        rsv.read_gyroscope(gcsv(tmp_path / "clip.gcsv"), unit="rad/s")
+
+
+def test_result_is_saved(tmp_path):
+    rates = rsv.read_gyroscope(gcsv(tmp_path / "clip.gcsv"))
+    rates.save(tmp_path / "rates.json")
+    again = rsv.AngularRates.load(tmp_path / "rates.json")
+    assert np.array_equal(again.rates.numpy(), rates.rates.numpy())
+    assert "200 Hz" in rates.summary()
