@@ -2,8 +2,8 @@
 """Speed and accuracy of the package and of other software, in one run on one machine.
 
 Sections (see benchmarks/sections.py): registration, cost, detection, restoration, pipeline, scaling, roofline,
-finer, streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict, honesty, timing. Results are printed as
-Markdown tables and written to --out; with --store also to scripts/benchmarks/results, from which
+finer, streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict, honesty, timing. Results are printed
+as Markdown tables and written to --out; with --store also to scripts/benchmarks/results, from which
 scripts/benchmark_page.py generates docs/benchmarks.md.
 """
 

@@ -87,8 +87,8 @@ def write_gcsv(
     check_whole_number("num_frames", num_frames, at_least=1)
     if motion.camera is None:
         raise ValueError(
-            "angular rates require a motion with a camera: give it the focal length in px, "
-            "motion.with_camera(Camera(focal_length))"
+            "angular rates require the focal length in px: motion.with_camera(Camera(focal_length)), on the command "
+            "line --focal-length"
         )
     if motion.num_axes > 3 and bool(motion.moving_axes()[3]):
         raise ValueError("motion has zoom, which angular rates do not contain; write_stmap exports it")
