@@ -45,7 +45,7 @@ def test_gcsv_with_a_focal_length(place, tmp_path, capsys):
     rate = float(tone.amplitude[1, 0] * 2 * np.pi * tone.frequency[1, 0] * torch.cos(tone.phase[1, 0])) / 900
     assert float(first.split(",")[1]) * 1e-9 == pytest.approx(rate, rel=1e-3)
     assert run(folder / "vibration.json", tmp_path / "other.gcsv", *frames) == 2
-    assert "require a motion with a camera" in capsys.readouterr().err
+    assert "require the focal length in px" in capsys.readouterr().err
 
 
 def test_stmap_by_size(place, tmp_path, capsys):
