@@ -47,7 +47,7 @@ def restore_exact(
     clipped: Tensor | None = None,
     chunk_frequencies: int | None = None,
     segments: int | None = None,
-    scale: int = 1,
+    scale: Literal[1, 2] = 1,
 ) -> Tensor:
     """Restore frames with all rows coupled: the most probable scene for its frames and a prior.
 
