@@ -98,7 +98,7 @@ def test_clock_and_sample_rate(tmp_path):
 def test_errors(tmp_path):
     path = tmp_path / "clip.gcsv"
     still = rsv.Vibration((1.0, 1.0), (10.0, 10.0))
-    with pytest.raises(ValueError, match="require the focal length in px: motion.with_camera"):
+    with pytest.raises(ValueError, match=r"require the focal length in px: motion\.with_camera"):
         rsv.write_gcsv(path, still, TIMING, SIZE, 2)
     with pytest.raises(ValueError, match="is a batch"):
         rsv.write_gcsv(path, VIBRATION.expanded(2), TIMING, SIZE, 2)
