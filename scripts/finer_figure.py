@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from benchmarks.finer import EXPOSURE_ROWS, FADE, MARGIN, ROW_TIME, SHAKE, decibel, interpolated
-from benchmarks.finer_camera import FINER, after_optics, still_image, take_frames
-from benchmarks.independent_camera import Array, closed
+from benchmarks.finer_camera import BETWEEN, FINER, after_optics, still_image
+from benchmarks.independent_camera import Array, closed, take_frames
 from matplotlib import pyplot as plt
 
 import rsvib_torch as rsv
@@ -41,6 +41,8 @@ def main() -> None:
         frame_rows=timing.frame_rows,
         num_frames=COUNT,
         size=size,
+        points=FINER,
+        between=BETWEEN,
     )
     generator = np.random.default_rng(1)
     frames = torch.from_numpy(clean + NOISE * generator.standard_normal(clean.shape)).float()

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.finer_camera import FINER, after_optics, still_image, take_frames
-from benchmarks.independent_camera import Array, Shake, closed
+from benchmarks.finer_camera import BETWEEN, FINER, after_optics, still_image
+from benchmarks.independent_camera import Array, Shake, closed, take_frames
 from benchmarks.measure import one_thread
 from benchmarks.restoration import SCENES
 from scipy import ndimage
@@ -51,6 +51,8 @@ def cases(name: str, options: argparse.Namespace, sigma: float) -> list[dict[str
         frame_rows=timing.frame_rows,
         num_frames=max(FRAMES),
         size=size,
+        points=FINER,
+        between=BETWEEN,
     )
     found = []
     for noise in NOISES:

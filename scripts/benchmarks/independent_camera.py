@@ -90,11 +90,16 @@ def take_frames(
     frame_rows: float,
     num_frames: int,
     size: tuple[int, int],
+    points: int = 1,
+    between: int = FINER,
 ) -> Array:
-    """Frames (T, H, W) without noise, centred on a periodic scene."""
-    rows = fine_rows(scene)
-    top, left = ((whole - part) // 2 for whole, part in zip(scene.shape, size, strict=True))
-    u = np.fft.rfftfreq(scene.shape[1])
+    """Frames (T, H, W) without noise, centred on a periodic scene of ``points`` per px along both axes.
+
+    Rows are interpolated from ``between`` rows per row of the scene.
+    """
+    rows = fine_rows(scene, between)
+    top, left = ((whole - points * part) // 2 for whole, part in zip(scene.shape, size, strict=True))
+    u = np.fft.rfftfreq(scene.shape[1]) * points  # cycles per px
     frames = np.zeros((num_frames, *size))
     moments, shares = exposure_moments(shake, exposure_rows * row_time)
     for p in range(num_frames):
@@ -102,12 +107,12 @@ def take_frames(
         for moment, share in zip(moments, shares, strict=True):
             place = p * frame_rows + np.arange(size[0]) + moment * exposure_rows
             x, y = shake.displacement(place * row_time)
-            source = (top + np.arange(size[0]) - y) * FINER
+            source = (top + points * (np.arange(size[0]) - y)) * between
             cell = np.floor(source).astype(int)
             weights = polynomial_weights(source - cell)
             row = np.zeros_like(total)
             for i in range(POINTS):
                 row += weights[:, i, None] * rows[(cell + i - (POINTS // 2 - 1)) % len(rows)]
             total += share * row * np.exp(-2j * np.pi * x[:, None] * u)
-        frames[p] = np.fft.irfft(total, n=scene.shape[1], axis=1)[:, left : left + size[1]]
+        frames[p] = np.fft.irfft(total, n=scene.shape[1], axis=1)[:, left : left + points * size[1] : points]
     return frames

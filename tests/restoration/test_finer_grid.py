@@ -15,8 +15,8 @@ from rsvib_torch.restoration.exact import exact
 from rsvib_torch.restoration.scene_model.polynomial_prior import fit_polynomial_prior
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-from benchmarks.finer_camera import FINER, after_optics, still_image, take_frames
-from benchmarks.independent_camera import Shake, closed
+from benchmarks.finer_camera import BETWEEN, FINER, after_optics, still_image
+from benchmarks.independent_camera import Shake, closed, take_frames
 
 SIZE, MARGIN, NOISE = 96, 24, 0.002
 SHAKE = Shake(np.array([[3.1], [5.2]]), np.array([[90.0], [61.0]]), np.array([[0.4], [1.3]]), np.zeros(2))
@@ -26,7 +26,15 @@ TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=571)
 
 def taken(scene, count, shake=SHAKE, seed=1):
     clean = take_frames(
-        scene, shake, row_time=20.52e-6, exposure_rows=20, frame_rows=571, num_frames=count, size=(SIZE, SIZE)
+        scene,
+        shake,
+        row_time=20.52e-6,
+        exposure_rows=20,
+        frame_rows=571,
+        num_frames=count,
+        size=(SIZE, SIZE),
+        points=FINER,
+        between=BETWEEN,
     )
     return torch.from_numpy(clean + NOISE * np.random.default_rng(seed).standard_normal(clean.shape)).float()
 

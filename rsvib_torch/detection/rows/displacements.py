@@ -40,6 +40,7 @@ __all__ = [
     "compared_intervals",
     "differential_motion",
     "differently_blurred",
+    "displacements_of_parts",
     "frame_groups",
     "joined_groups",
     "measure_group",
@@ -430,17 +431,28 @@ def differential_motion(gradients: list[RowGradients], *, rows: int = 64) -> Ten
     """
     excesses = []
     for own in gradients:
-        count = own.halves.shape[1] // rows * rows
-        weight = torch.where(own.variance > 0, 1 / own.variance.clamp(min=1e-300), 0.0)[:, :count, None, None]
-        hxx, hxy, hyy, bx, by = (own.halves[:, :count] * weight).unflatten(1, (-1, rows)).sum(2).unbind(-1)
-        determinant = hxx * hyy - hxy.square()
-        regular = determinant > 1e-4 * hxx * hyy
-        safe = torch.where(regular, determinant, 1.0)
-        residual = -torch.stack([hyy * bx - hxy * by, hxx * by - hxy * bx], -1) / safe[..., None]  # (B, N, halves, 2)
-        noise = 2 * torch.stack([hyy, hxx], -1) / safe[..., None]  # of a difference of two frames
+        residual, noise, regular = displacements_of_parts(own, rows)
         excess = (residual[:, :, 1] - residual[:, :, 0]).square() - noise.sum(2)
-        excesses.append(torch.where(regular.all(-1)[..., None], excess, torch.nan))
+        excesses.append(torch.where(regular[..., None], excess, torch.nan))
     return trimmed_mean(torch.cat(excesses, 1)).clamp(min=0.0).sqrt()
+
+
+def displacements_of_parts(gradients: RowGradients, rows: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Residual displacements of the parts of the rows from the first to the last frame, from sums over ``rows`` rows.
+
+    Returns:
+        The differences of the displacements (B, N, parts, 2) in px, the variance of their noise, and (B, N) whether all
+        parts have structure along both directions.
+    """
+    count = gradients.halves.shape[1] // rows * rows
+    weight = torch.where(gradients.variance > 0, 1 / gradients.variance.clamp(min=1e-300), 0.0)[:, :count, None, None]
+    hxx, hxy, hyy, bx, by = (gradients.halves[:, :count] * weight).unflatten(1, (-1, rows)).sum(2).unbind(-1)
+    determinant = hxx * hyy - hxy.square()
+    regular = determinant > 1e-4 * hxx * hyy
+    safe = torch.where(regular, determinant, 1.0)[..., None]
+    residual = torch.stack([hyy * bx - hxy * by, hxx * by - hxy * bx], -1) / safe
+    noise = 2 * torch.stack([hyy, hxx], -1) / safe  # of a difference of two frames
+    return residual, noise, regular.all(-1)
 
 
 # Frames that are blurred differently

@@ -15,6 +15,7 @@ from rsvib_torch.detection.rows.displacements import (
     blur_ratio,
     differential_motion,
     differently_blurred,
+    displacements_of_parts,
     frame_groups,
     joined_groups,
     measure_groups,
@@ -146,18 +147,10 @@ class StripRows(MeasuredRows):
         """``RowRecord.apart``, from sums over parts of ``rows`` rows."""
         excesses = []
         for own in gradients:
-            count = own.halves.shape[1] // rows * rows
-            weight = torch.where(own.variance > 0, 1 / own.variance.clamp(min=1e-300), 0.0)[:, :count, None, None]
-            hxx, hxy, hyy, bx, by = (own.halves[:, :count] * weight).unflatten(1, (-1, rows)).sum(2).unbind(-1)
-            determinant = hxx * hyy - hxy.square()
-            regular = determinant > 1e-4 * hxx * hyy
-            safe = torch.where(regular, determinant, 1.0)
-            # difference of the last and the first frame, (B, N, parts, 2)
-            residual = torch.stack([hyy * bx - hxy * by, hxx * by - hxy * bx], -1) / safe[..., None]
-            noise = 2 * torch.stack([hyy, hxx], -1) / safe[..., None]
+            residual, noise, regular = displacements_of_parts(own, rows)
             share = 1 - 0.5 * self.scale.axes / residual.shape[2]  # the fit of the components takes part of both
             excess = 0.5 * (residual.square() - share * noise).mean(2) / share
-            excesses.append(torch.where(regular.all(-1)[..., None], excess, torch.nan))
+            excesses.append(torch.where(regular[..., None], excess, torch.nan))
         return torch.cat(excesses, 1)
 
     def remove_column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> bool:
