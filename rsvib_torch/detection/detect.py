@@ -28,6 +28,7 @@ from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
 from rsvib_torch.detection.start import BandStart, band_start, field_start, grey_frames
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
+from rsvib_torch.detection.tones.aliasing import without_aliasing
 from rsvib_torch.detection.tones.fit import (
     MotionModel,
     ToneFit,
@@ -537,13 +538,16 @@ def _detect(
     else:
         start = field_start(frames, valid, row_timing, bands, scale, translation)
     found = method.fit(start, frames, valid, row_timing, options)
-    fit, other_motion, measured = found.fit, found.other_motion, found.offsets
+    other_motion, measured = found.other_motion, found.offsets
     starts = row_timing.frame_starts(frames.shape[1], frames.device)[:, None]
     starts = (
         starts + torch.arange(frames.shape[-2], dtype=torch.float64, device=frames.device)[::8] * row_timing.row_time
     ).flatten()
+    fit = without_aliasing(found.measurements, found.fit)
     own_std = displacement_std(fit, starts, row_timing.exposure_time)
-    fit, total_std = with_further_tones(found.measurements, fit, starts, number_is_known=options.tones is not None)
+    total_std = own_std
+    if options.tones is None:
+        fit, total_std = with_further_tones(found.measurements, fit, starts)
     vibration, std = vibration_of_fit(fit)
     std = replace(std, displacement=total_std)
     tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
