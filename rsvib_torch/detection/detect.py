@@ -101,6 +101,7 @@ class _Found:
         offsets: The same as offsets between consecutive frames.
         fitted: (B, P, N, 2) px, the offsets that it predicts for them.
         other_motion: Motion that it does not explain; None if the method does not measure it.
+        aliasing: (B,) px, expected size of the bias of the displacements by aliasing; None if it is not known.
     """
 
     fit: ToneFit
@@ -108,6 +109,7 @@ class _Found:
     offsets: OffsetCurve
     fitted: Tensor
     other_motion: OtherMotion | None = None
+    aliasing: Tensor | None = None
 
 
 _Fit = Callable[[BandStart, Tensor, Tensor | None, RowTiming, _FitOptions], _Found]
@@ -171,7 +173,7 @@ def _fit_direct(
     else:
         rows = strip_rows(frames, valid, timing, motion, scale)
     found, offsets, fitted = refine_directly(rows, intervals, fit, options.tones)
-    return _Found(found.fit, found.measurements, offsets, fitted, found.other_motion)
+    return _Found(found.fit, found.measurements, offsets, fitted, found.other_motion, found.aliasing)
 
 
 _METHODS: dict[DetectionMethod, _Method] = {
@@ -543,7 +545,9 @@ def _detect(
     starts = (
         starts + torch.arange(frames.shape[-2], dtype=torch.float64, device=frames.device)[::8] * row_timing.row_time
     ).flatten()
-    fit = without_aliasing(found.measurements, found.fit)
+    fit = found.fit
+    if found.aliasing is not None:
+        fit = without_aliasing(found.measurements, fit, found.aliasing)
     own_std = displacement_std(fit, starts, row_timing.exposure_time)
     total_std = own_std
     if options.tones is None:

@@ -92,7 +92,7 @@ def test_bias_by_aliasing_is_removed_and_allowed_for(num_frames):
     biased = true - size * np.sin(2 * np.pi * (true[..., :, None] - true[..., None, :])).mean(-1)
     measurements = measured(biased, TIMING, generator, noise=0.5 * NOISE)
     raw = fitted(measurements, np.full(2 * batch, 37.0))
-    corrected = without_aliasing(measurements, raw)
+    corrected = without_aliasing(measurements, raw, torch.full((2 * batch,), 3e-3, dtype=torch.float64))
 
     def errors(fit):
         vibration, std = vibration_of_fit(fit)

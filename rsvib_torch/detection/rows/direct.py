@@ -58,12 +58,14 @@ class DirectFit:
         fit: The fit to them.
         other_motion: Motion in the measurements that the fit does not explain.
         robust_weights: (B, N, 2) weights 0 ... 1 by which the information of each row was multiplied; 0 for outliers.
+        aliasing: (B,) px, expected size of the bias of the displacements by aliasing.
     """
 
     measurements: Measurements
     fit: ToneFit
     other_motion: OtherMotion
     robust_weights: Tensor
+    aliasing: Tensor
 
 
 def refine_directly(
@@ -337,6 +339,7 @@ def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:
         fit,
         select_stacks(better, other.other_motion, one.other_motion),
         torch.where(better[:, None, None], other.robust_weights, one.robust_weights),
+        torch.where(better, other.aliasing, one.aliasing),
     )
 
 
@@ -360,4 +363,5 @@ def _conclude(record: RowRecord, fit: ToneFit) -> DirectFit:
         blur=measured.new_tensor([1.0, 0.0, 0.0]).expand(len(measured), 3),  # replaced once the motion is final
     )
     robust_weights = weighted.weights / measurements.weights.clamp(min=1e-300)
-    return DirectFit(weighted, fit, other, robust_weights)
+    aliasing = torch.stack([own.aliasing for own in record.gradients]).mean(0)
+    return DirectFit(weighted, fit, other, robust_weights, aliasing)

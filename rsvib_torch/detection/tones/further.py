@@ -34,9 +34,7 @@ _REACH = 8  # distance of the frequencies from those of the tones, and from 0, t
 _CHUNK = 2**22  # values at a time
 
 
-def with_further_tones(
-    measurements: Measurements, fit: ToneFit, exposure_starts: Tensor
-) -> tuple[ToneFit, Tensor]:
+def with_further_tones(measurements: Measurements, fit: ToneFit, exposure_starts: Tensor) -> tuple[ToneFit, Tensor]:
     """The fit with a covariance that allows for a further tone, and the uncertainty of the displacement of the rows.
 
     Args:

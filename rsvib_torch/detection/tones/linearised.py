@@ -58,9 +58,7 @@ class LinearisedFit:
         root = root / deviation
         X = (root[:, :, None, :, :, None] * jacobian[..., None, :, :]).flatten(-2).flatten(1, 3)
         row = axes.index(axis)
-        return cls(
-            axes, row, root[..., row], X, torch.linalg.pinv(X), whitened / deviation[:, :, 0, 0], constraints[0]
-        )
+        return cls(axes, row, root[..., row], X, torch.linalg.pinv(X), whitened / deviation[:, :, 0, 0], constraints[0])
 
     @property
     def rounding(self) -> Tensor:
