@@ -80,7 +80,8 @@ def judge(
             values = (float(value[axis]) for value in (displacement, std.displacement, own_std))
             against.extend(_against_displacement(*values, num_tones=int(amplitude.count_nonzero())))
         if other_motion is not None:
-            against.extend(_against_rotation(other_motion, axis, vibration.num_axes))
+            size = float(other_motion.size[axis])
+            against.extend(against_rotation(other_motion.differential, size, axis, vibration.num_axes))
             against.extend(_against_other_motion(other_motion, axis))
             continue
         if bool(good.any()):
@@ -224,37 +225,45 @@ def _against_other_motion(other: OtherMotion, axis: int) -> list[str]:
     return []
 
 
-def _max_apart(other: OtherMotion, axis: int) -> float:
-    """Largest permitted difference in px of the displacements along a row, for the verdict on an axis."""
-    return max(0.035, 0.009 * float(other.size[axis]))
+def _max_apart(size: float) -> float:
+    """Largest permitted difference in px of the displacements along a row, for an axis with offsets of size px rms."""
+    return max(0.035, 0.009 * size)
 
 
 def rotation_found(other: OtherMotion) -> bool:
     """Whether the halves of the rows of one stack move apart, as roll and zoom cause it."""
-    return any(float(other.differential[1 - axis]) > _max_apart(other, axis) for axis in range(2))
+    return any(float(other.differential[1 - axis]) > _max_apart(float(other.size[axis])) for axis in range(2))
 
 
-def _against_rotation(other: OtherMotion, axis: int, axes: int) -> list[str]:
-    """Reasons from rotation and zoom, which move the halves of a row apart along the other axis.
+def against_rotation(differential: Tensor, size: float, axis: int, axes: int, remedy: str = "'auto'") -> list[str]:
+    """Reasons against an axis from rotation and zoom, which move the halves of a row apart along the other axis.
 
     A roll by theta moves the halves of a row by ``theta W / 4`` along y in opposite directions, and rows by up to
     ``theta H / 2`` along x. A zoom does the same with the axes exchanged. Rows of both axes are concerned by parallax.
+
+    Args:
+        differential: (2,) px, rms difference of the displacements along a row that the motion does not explain.
+        size: px, rms offset along the axis.
+        axis: The axis, in row order.
+        axes: Number of components of the motion.
+        remedy: Value of ``roll`` and ``zoom`` with which they are measured.
     """
+    allowed = _max_apart(size)
     if axes > 2:
-        apart, allowed = float(other.differential.amax()), _max_apart(other, axis)
+        apart = float(differential.amax())
         if apart <= allowed:
             return []
         return [
             f"strips of columns move apart by {apart:.3g} px that roll and zoom do not explain, {allowed:.2g} px are "
             "allowed: the scene has parallax, or the lens is distorted; select a part of the frame with one distance"
         ]
-    apart, allowed = float(other.differential[1 - axis]), _max_apart(other, axis)
+    apart = float(differential[1 - axis])
     if apart <= allowed:
         return []
     return [
         f"left and right halves of the rows move apart by {apart:.3g} px along {'yx'[axis]}, {allowed:.2g} px are "
-        "allowed: the camera rolls or zooms (pass roll='auto', zoom='auto' and no columns), or the scene has parallax "
-        "(select a part of the frame with one distance)"
+        f"allowed: the camera rolls or zooms (pass roll={remedy}, zoom={remedy} and no columns), or the scene has "
+        "parallax (select a part of the frame with one distance)"
     ]
 
 

@@ -146,6 +146,12 @@ def test_free_motion_with_roll(rolling):
     torch.testing.assert_close(through.motion.coefficients, found.motion.coefficients)
 
 
+def test_free_motion_without_roll_refuses_rolling_frames(rolling):
+    found = detect_motion(rolling[1], TIMING)
+    assert not bool(found.reliable[0])
+    assert "pass roll=True, zoom=True" in " ".join(found.reasons[0])
+
+
 def test_free_motion_with_roll_in_other_orientation(rolling):
     """Transposed frames of a camera that is read along x from the right."""
     turned = SensorTiming(8e-5, 12, 280, scan_axis="x", readout_direction="reverse")

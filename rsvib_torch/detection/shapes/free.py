@@ -23,7 +23,13 @@ from rsvib_torch.core.presentation import Result, axis_rows, verdict_table
 from rsvib_torch.core.splines import bspline_weights, gauss_legendre
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
+from rsvib_torch.detection.reliability import against_rotation
+from rsvib_torch.detection.rows.displacements import (
+    differential_motion,
+    frame_groups,
+    measure_groups,
+    stack_spectra,
+)
 from rsvib_torch.detection.rows.measured_rows import strip_rows
 from rsvib_torch.detection.start import GreyFrames, band_curve, grey_frames, measurements_of_curve
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
@@ -242,8 +248,7 @@ def _detect(
     if knot_rows > longest:
         raise ValueError(f"knot_rows must be at most {longest}, the row times of the stack, got {knot_rows}")
     size, axes = (scale.height, scale.width), scale.axes
-    measured, motion, spacing = measure_freely(stack, rowwise, curve, record, bands, knot_rows, iterations)
-    apart = None
+    measured, motion, spacing, apart = measure_freely(stack, rowwise, curve, record, bands, knot_rows, iterations)
     if not scale.same_for_all_columns:
         measured, motion, apart = _measure_field(stack, rowwise, motion, spacing, record, scale, iterations)
     residual = residual_of_motion(measured, motion[0])
@@ -269,12 +274,12 @@ def _measure_field(
     record: tuple[float, float],
     scale: FieldScale,
     iterations: int,
-) -> tuple[Measurements, FreeMotion, float]:
+) -> tuple[Measurements, FreeMotion, Tensor]:
     """``measure_freely`` with roll and zoom, from a motion without them; all components in px.
 
     Returns:
-        The measurements, the motion, and the rms difference in px of the displacements along a row that it does not
-        explain.
+        The measurements, the motion, and the rms difference (2,) in px of the displacements along a row that it does
+        not explain.
     """
     motion, size = start, (scale.height, scale.width)
     for number in range(iterations):
@@ -290,7 +295,7 @@ def _measure_field(
         if number:
             measured = measured.reweighted(residual_of_motion(measured, motion[0]))
         motion = _motion(_fit_spline(measured, spacing, record), size, 0.0)
-    return measured, motion, float(rows_record.differential().amax())
+    return measured, motion, rows_record.differential()[0]
 
 
 def measure_freely(
@@ -301,7 +306,7 @@ def measure_freely(
     bands: RegistrationOptions,
     knot_rows: int,
     iterations: int,
-) -> tuple[Measurements, FreeMotion, float]:
+) -> tuple[Measurements, FreeMotion, float, Tensor]:
     """Displacements of the rows of one stack, measured around a spline that is fitted to them again in every round.
 
     Args:
@@ -314,7 +319,8 @@ def measure_freely(
         iterations: Rounds of measuring and fitting.
 
     Returns:
-        The measurements, the motion (a batch of one) and its knot spacing in seconds.
+        The measurements, the motion (a batch of one), its knot spacing in seconds, and the rms difference (2,) in px of
+        the displacements of the halves of the rows.
     """
     grey = stack.images
     spacing = max(knot_rows * timing.row_time, (record[1] - record[0]) / 3000)  # the cost grows with knots^3
@@ -325,12 +331,12 @@ def measure_freely(
     motion = _motion(fit, size, 0.0)
     groups = frame_groups(stack_spectra(grey, stack.valid), timing, motion)
     for step in range(iterations):
-        measured, _ = measure_groups(groups, timing, motion)
+        measured, gradients = measure_groups(groups, timing, motion)
         if step:  # objects that move by themselves get less weight
             measured = measured.reweighted(residual_of_motion(measured, motion[0]))
         fit = _fit_spline(measured, spacing, record)
         motion = _motion(fit, size, 0.0)
-    return measured, motion, spacing
+    return measured, motion, spacing, differential_motion(gradients)[0]
 
 
 def start_curve(
@@ -597,7 +603,7 @@ def _report(
     starts: Tensor,
     scale: FieldScale,
     of_bands: list[list[str]],
-    apart: float | None,
+    apart: Tensor,
 ) -> MotionDetection:
     """The motion in image axes, and its uncertainty at up to 32 rows of every frame.
 
@@ -609,7 +615,7 @@ def _report(
         starts: (T,) s, exposure starts of the first rows.
         scale: Components of the motion, and the size of the frames.
         of_bands: Reasons of each axis from the row bands.
-        apart: px, difference of the displacements along a row that the motion does not explain; None if unknown.
+        apart: (2,) px, rms difference of the displacements along a row that the motion does not explain.
     """
     num_rows = scale.height
     rows = torch.linspace(0, num_rows - 1, min(32, num_rows), dtype=torch.float64, device=starts.device)
@@ -632,11 +638,8 @@ def _report(
     reasons = []
     for axis in range(scale.axes):
         against = unexplained_reason(rest[axis], moved[axis], "smooth motion") + of_bands[axis]
-        if apart is not None and apart > max(0.035, 0.009 * float(moved[:2].amax())):  # px, as for tones
-            against.append(
-                f"strips of columns move apart by {apart:.3g} px that roll and zoom do not explain: the scene has "
-                "parallax, or the lens is distorted; select a part of the frame with one distance"
-            )
+        size = math.sqrt(2) * float(moved[axis] if scale.axes == 2 else moved[:2].amax())
+        against += against_rotation(apart, size, axis, scale.axes, remedy="True")
         if float(std_seen[axis]) > 0.3:
             against.append(
                 f"the motion is determined to {float(std_seen[axis]):.3g} px only: the frames may show different scenes"
