@@ -21,6 +21,7 @@ __all__ = [
     "ExactSettings",
     "ExportFormat",
     "IsdModel",
+    "Mosaic",
     "MotionUnit",
     "PriorName",
     "Registration",
@@ -37,6 +38,7 @@ BadFrames = Literal["pass", "skip"]
 DetectionMethod = Literal["direct", "bands"]
 ExportFormat = Literal["gcsv", "stmap", "isd", "csv"]
 IsdModel = Literal["auto", "frame", "line-scan"]
+Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 MotionUnit = Literal["px", "rad", "mrad", "urad", "deg", "arcsec", "rad/s", "deg/s"]
 PriorName = Literal["gaussian", "edges"]
 Registration = Literal["projection", "ncc", "phase"]
