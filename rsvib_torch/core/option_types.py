@@ -23,6 +23,7 @@ __all__ = [
     "IsdModel",
     "Mosaic",
     "MotionUnit",
+    "OpticsSettings",
     "PriorName",
     "Registration",
     "RichardsonLucySettings",
@@ -72,6 +73,15 @@ class ToneSettings(TypedDict, total=False):
 
 class DetectionSettings(BandSettings, ToneSettings, total=False):
     """Options of detection in a configuration file."""
+
+
+class OpticsSettings(TypedDict, total=False):
+    """Optics of the camera, see ``Optics``."""
+
+    sigma: float
+    cutoff: float | None
+    pixel: float
+    mtf: list[list[float]] | None
 
 
 class ExactSettings(TypedDict, total=False):

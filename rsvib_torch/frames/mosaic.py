@@ -12,6 +12,7 @@ from rsvib_torch.frames.pixels import fill_with_means
 
 __all__ = [
     "check_mosaic",
+    "colour_frames",
     "colours_of",
     "fill_by_colour",
     "interpolated_colours",
@@ -24,17 +25,17 @@ _LUMINANCE = (0.25, 0.5, 0.25)  # shares of red, green and blue in a mosaic
 
 
 def check_mosaic(pattern: object, shape: tuple[int, ...], name: str = "frames") -> None:
-    """Raise a ``ValueError`` unless frames (..., C, H, W) can be a mosaic of the pattern."""
+    """Raise a ``ValueError`` unless frames (T, H, W) or (..., C, H, W) can be a mosaic of the pattern."""
     check_choice("mosaic", pattern, get_args(Mosaic))
-    if shape[-3] != 1:
+    if len(shape) > 3 and shape[-3] != 1:
         raise ValueError(
             f"mosaic={pattern!r} is for raw frames (T, H, W) or (T, 1, H, W), but {name} have {shape[-3]} channels; "
             "omit mosaic for colour frames"
         )
     if shape[-2] % 2 or shape[-1] % 2:
         raise ValueError(
-            f"mosaic={pattern!r} repeats every 2 x 2 px, but {name} have {shape[-2]} x {shape[-1]} px; cut them to even "
-            "numbers of rows and columns"
+            f"mosaic={pattern!r} repeats every 2 x 2 px, but {name} have {shape[-2]} x {shape[-1]} px; cut them to "
+            "even numbers of rows and columns"
         )
 
 
@@ -54,6 +55,15 @@ def colours_of(pattern: str, height: int, width: int) -> Tensor:
     return tile.repeat(height // 2, width // 2)
 
 
+def colour_frames(frames: Tensor, pattern: str) -> Tensor:
+    """Frames (T, 3, H, W) from a mosaic (T, H, W) or (T, 1, H, W) by ``interpolated_colours``; NaN stays NaN."""
+    mosaic = frames.unsqueeze(-3) if frames.ndim == 3 else frames
+    missing = mosaic.isnan()
+    colours = colours_of(pattern, *frames.shape[-2:]).to(frames.device).expand(mosaic.shape)
+    filled = fill_by_colour(mosaic, missing) if bool(missing.any()) else mosaic
+    return interpolated_colours(filled, colours).masked_fill(missing, torch.nan)
+
+
 def measures(colours: Tensor) -> Tensor:
     """Mask (..., 3, H, W) of the colour that each pixel measures, from colours (..., 1, H, W)."""
     return colours == torch.arange(3, device=colours.device)[:, None, None]
@@ -61,8 +71,8 @@ def measures(colours: Tensor) -> Tensor:
 
 def fill_by_colour(frames: Tensor, missing: Tensor) -> Tensor:
     """``fill_with_means`` of a mosaic (..., 1, H, W), separately for the four places of the pattern."""
-    planes = fill_with_means(*(functional.pixel_unshuffle(values, 2) for values in (frames, missing.to(frames.dtype))))
-    return functional.pixel_shuffle(planes, 2)
+    holes = functional.pixel_unshuffle(missing.to(frames.dtype), 2) > 0.5
+    return functional.pixel_shuffle(fill_with_means(functional.pixel_unshuffle(frames, 2), holes), 2)
 
 
 def _smoothed(images: Tensor, weights: tuple[float, ...]) -> Tensor:

@@ -23,6 +23,7 @@ from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.mosaic import interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
+from rsvib_torch.imaging.sensor_model import Optics
 from rsvib_torch.io.files import FramesOrFiles, load_frames, timing_of_files
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
@@ -31,6 +32,7 @@ from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact.exact import restore_exact
 from rsvib_torch.restoration.field_motion import judged_strip, restore_in_strips
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
+from rsvib_torch.restoration.sharpening import check_optics, sharpened
 from rsvib_torch.restoration.verdict.judge import RestorationWarning, judge_frames
 from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError, pairs_to_judge
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
@@ -47,6 +49,7 @@ class CommonOptions(TypedDict, total=False):
     saturation: Saturation
     check: bool
     mosaic: Mosaic | None
+    optics: Optics | Mapping[str, Any] | None
 
 
 class ExactOptions(CommonOptions, ExactSettings, total=False):
@@ -155,6 +158,7 @@ def restore(
     saturation: Saturation = "auto",
     check: bool = True,
     mosaic: Mosaic | None = None,
+    optics: Optics | Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Tensor:
     """Restore frames taken by a vibrating rolling-shutter camera: geometry and sharpness.
@@ -189,6 +193,10 @@ def restore(
         mosaic: Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames (T, H, W) or (T, 1, H, W) behind
             colour filters: ``"RGGB"``, ``"BGGR"``, ``"GRBG"`` or ``"GBRG"``. The restored frames have three channels
             R, G, B. Only with method ``"exact"``, see ``restore_mosaic``.
+        optics: Optics of the camera, pixel included: the restored frames are as sharp as from a camera with pixels of
+            the restored grid behind a Gaussian of half a pixel, ``Optics(sigma=0.5 / scale, pixel=1 / scale)``, where
+            noise allows it. Only with method ``"exact"``, see ``sharpened``. None: the restored frames have the
+            sharpness of the camera at rest.
         **options: Options of the method, see ``restore_exact``, ``restore_banded``, ``restore_dewarp`` and
             ``restore_richardson_lucy``.
 
@@ -221,6 +229,7 @@ def restore(
         restored [62.0, 63.0] dB
     """
     _check_options(method, options)
+    camera = check_optics(optics, method)
     timing = timing_of_files(frames, timing)
     frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(
@@ -235,6 +244,8 @@ def restore(
     restored = restore_prepared(prepared, vibration, method, options)
     if check:
         _warn_if_worse(prepared, restored.detach(), vibration, options.get("joint", False))
+    if camera is not None:
+        restored = sharpened(restored, camera, options.get("scale", 1))
     return prepared.from_row_order(restored)
 
 

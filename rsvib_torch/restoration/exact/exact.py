@@ -96,12 +96,7 @@ def restore_exact(
     """
     B, T, C, H, W = frames.shape
     factor = check_number("regularisation", regularisation, above=0.0)
-    check_choice("prior", prior, tuple(PRIORS))
-    check_choice("scale", scale, (1, SCALE))
-    if scale != 1 and prior != "gaussian":
-        raise ValueError(f"scale={scale} has prior='gaussian' only, got {prior!r}")
-    if colours is not None and prior != "gaussian":
-        raise ValueError(f"mosaic has prior='gaussian' only, got {prior!r}")
+    _check_prior(prior, scale, colours)
     groups = joint_groups(T, joint)
     chunk, split = (
         None if value is None else check_whole_number(name, value, at_least=1)
@@ -121,9 +116,7 @@ def restore_exact(
             groups,
             (displacement, node_weights),
             [scene_period(W, reach, moved) for reach, moved in zip(reaches, displacement, strict=True)],
-            noise=noise
-            if noise == "auto"
-            else max(check_number("noise", noise, at_least=0.0, at_most=MAX_NUMBER), _MIN_LEVEL),
+            noise=noise if noise == "auto" else _given_level(noise),
             regularisation=factor,
             missing=missing,
             partition=Partition(chunk, split),
@@ -346,11 +339,22 @@ def _without_empty_frames(groups: list[tuple[list[int], int]], missing: Tensor) 
     return [([m for m in members if share[m] > 0.05] or members, reference) for members, reference in groups]
 
 
+def _check_prior(prior: str, scale: int, colours: Tensor | None) -> None:
+    """Refuse priors that do not exist, and those that the finer grid and mosaics do not have."""
+    check_choice("prior", prior, tuple(PRIORS))
+    check_choice("scale", scale, (1, SCALE))
+    if prior != "gaussian" and (scale != 1 or colours is not None):
+        raise ValueError(f"{f'scale={scale}' if scale != 1 else 'mosaic'} has prior='gaussian' only, got {prior!r}")
+
+
+def _given_level(noise: float) -> float:
+    return max(check_number("noise", noise, at_least=0.0, at_most=MAX_NUMBER), _MIN_LEVEL)
+
+
 def _noise_levels(frames: Tensor, motion: FrameMotion, noise: float | Literal["auto"], ignore: Tensor | None) -> Tensor:
     """Noise level of each frame, (B, T)."""
     if noise != "auto":
-        level = check_number("noise", noise, at_least=0.0, at_most=MAX_NUMBER)
-        return torch.full(frames.shape[:2], max(level, _MIN_LEVEL), dtype=frames.dtype, device=frames.device)
+        return torch.full(frames.shape[:2], _given_level(noise), dtype=frames.dtype, device=frames.device)
     levels = [
         noise_levels(stack.detach(), motion, index, None if ignore is None else ignore[index])
         for index, stack in enumerate(frames)

@@ -203,7 +203,7 @@ def restore_mosaic(
     filled = frames if missing is None else fill_by_colour(frames, missing)
     displacement, node_weights = exposures
     advance = steps(len(frames) * len(groups), "frames")
-    images = []
+    images: list[Tensor] = []
     for stack, mosaic in enumerate(filled):
         measured = measures(colours[stack])
         linear = interpolated_colours(mosaic, colours[stack])
@@ -230,7 +230,8 @@ def restore_mosaic(
             image = part.restored(observation, shift[:, 0], level, noise == "auto", regularisation, partition)
             images.append(image[:, :: SCALE // scale, :: SCALE // scale])
             advance()
-    return torch.stack(images).unflatten(0, (-1, len(groups)))
+    restored: Tensor = torch.stack(images).unflatten(0, (-1, len(groups)))
+    return restored
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,7 +300,7 @@ class _Frames:
             if unknown_level and count > 1:
                 level = _residual_level(first, data - predicted, measured)
         second = solver()
-        scene = second.scene(second.fit(data, coefficients, iterations=20)) + mean
+        scene: Tensor = second.scene(second.fit(data, coefficients, iterations=20)) + mean
         return scene[..., : SCALE * width]
 
     def _precisions(
