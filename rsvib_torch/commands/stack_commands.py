@@ -706,7 +706,7 @@ def report(
     stack = load(frames, settings, full_scale, device, options)
     detection = _detect(stack, settings)
     result = _restore(stack, detection, options, force, "page")
-    points, pattern = options.get("scale", 1), options.get("mosaic")
+    pattern = options.get("mosaic")
     if result.restored:
         run_it = command_text("run", frames, out, *settings.arguments)
         steps = [f"write the restored frames:\n  {run_it}"]
@@ -719,7 +719,7 @@ def report(
         title=printable(f"Vibration in {frames.name}"),
         subtitle=printable(f"{frames}, camera of {settings.source}"),
         frames=stack.frames if pattern is None else colour_frames(stack.frames, pattern),
-        restored=result.frames[..., ::points, ::points],  # the page measures in pixels
+        restored=result.frames,
         was_restored=result.restored,
         timing=stack.timing,
         detection=detection,
