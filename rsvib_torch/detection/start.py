@@ -13,7 +13,7 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
 from rsvib_torch.detection.tones.fit import ToneFit, with_axes
 from rsvib_torch.frames.arrays import Channels
-from rsvib_torch.frames.mosaic import mosaic_free
+from rsvib_torch.frames.mosaic import is_mosaic, mosaic_free
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.files import FramesOrFiles, load_frames
@@ -118,18 +118,12 @@ def grey_frames(
     return GreyFrames(images, valid, prepared.batched)
 
 
-def without_mosaic(images: Tensor, *, most: float = 0.01) -> Tensor:
-    """Grey frames (B, T, H, W) without a pattern that repeats every two pixels, which does not move with the scene.
-
-    Such a pattern is that of colour filters. Frames are changed only if the means of the four places of the pattern
-    differ by more than ``most`` of the contrast of the frames.
-    """
-    height, width = (size // 2 * 2 for size in images.shape[-2:])
-    if min(height, width) < 6:
+def without_mosaic(images: Tensor) -> Tensor:
+    """Grey frames (B, T, H, W), of colour mosaics without the pattern of the colours, which does not move."""
+    mosaic = torch.stack([is_mosaic(stack[0]) for stack in images])
+    if not bool(mosaic.any()):
         return images
-    tiles = images[..., :height, :width].unflatten(-2, (-1, 2)).unflatten(-1, (-1, 2))
-    spread = tiles.mean((1, 2, 4)).flatten(1).std(1) / tiles.flatten(1).std(1)
-    return torch.where((spread > most)[:, None, None, None], mosaic_free(images), images)
+    return torch.where(mosaic[:, None, None, None], mosaic_free(images), images)
 
 
 def constant_frame(index: int) -> str:

@@ -24,3 +24,15 @@ def still_image(scene: Array, size: tuple[int, int], scale: int = 1, offset: tup
     moved = np.roll(scene, (offset[0] - top, offset[1] - left), (0, 1))
     step = FINER // scale
     return moved[: FINER * size[0] : step, : FINER * size[1] : step]
+
+
+def mosaic_of(frames: Array, pattern: str) -> Array:
+    """Raw frames (T, H, W) behind colour filters from colour frames (T, 3, H, W).
+
+    ``pattern`` names the colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1).
+    """
+    raw = np.empty((len(frames), *frames.shape[-2:]))
+    for place, colour in enumerate(pattern):
+        part = (slice(place // 2, None, 2), slice(place % 2, None, 2))
+        raw[:, *part] = frames[:, "RGB".index(colour), *part]
+    return raw

@@ -77,7 +77,7 @@ def restore_exact(
             all others.
         clipped: Boolean mask of saturated pixels, whose values are lower bounds.
         colours: Colour that each pixel of a mosaic measures, 0 red, 1 green, 2 blue, shaped like the frames, which have
-            one channel; the result has three, see ``restore_mosaic``. Saturated pixels then count as missing.
+            one channel; the result has three, see ``restore_mosaic``.
         chunk_frequencies: Frequencies solved at a time; bounds the memory, does not change the result. None: as many
             as take 8 times the memory of the spectrum of the scene.
         segments: Overlapping segments of rows that are solved side by side, which changes the result by about 1e-5;
@@ -118,7 +118,8 @@ def restore_exact(
             [scene_period(W, reach, moved) for reach, moved in zip(reaches, displacement, strict=True)],
             noise=noise if noise == "auto" else _given_level(noise),
             regularisation=factor,
-            missing=missing,
+            ignore=ignore,
+            clipped=clipped,
             partition=Partition(chunk, split),
             scale=scale,
         )

@@ -171,7 +171,8 @@ def restore_mosaic(
     *,
     noise: float | Literal["auto"],
     regularisation: float,
-    missing: Tensor | None,
+    ignore: Tensor | None,
+    clipped: Tensor | None,
     partition: Partition,
     scale: int,
 ) -> Tensor:
@@ -192,7 +193,8 @@ def restore_mosaic(
         noise: As in ``restore_exact``; ``"auto"`` is estimated from the residual of the frames of a group. With one
             frame it is hardly known, and too low rather than too high.
         regularisation: Factor on the priors.
-        missing: (B, T, 1, H, W) bool, pixels that were not measured or are saturated; None for none.
+        ignore: (B, T, 1, H, W) bool, missing pixels; None for none.
+        clipped: Likewise, saturated pixels, whose values are lower bounds.
         partition: Parts solved at a time.
         scale: Points of the result per pixel.
 
@@ -200,7 +202,8 @@ def restore_mosaic(
         (B, groups, 3, scale H, scale W).
     """
     height = frames.shape[-2]
-    filled = frames if missing is None else fill_by_colour(frames, missing)
+    missing = ignore if clipped is None else clipped if ignore is None else ignore | clipped
+    filled = frames if ignore is None else fill_by_colour(frames, ignore)
     displacement, node_weights = exposures
     advance = steps(len(frames) * len(groups), "frames")
     images: list[Tensor] = []
@@ -208,6 +211,9 @@ def restore_mosaic(
         measured = measures(colours[stack])
         linear = interpolated_colours(mosaic, colours[stack])
         sparse = torch.where(measured, mosaic, sparse_colours(mosaic.detach(), colours[stack], linear.detach()))
+        floor = None
+        if clipped is not None:
+            floor = torch.where(measured & clipped[stack], frames[stack], -torch.inf)
         if missing is not None:
             measured = measured & ~missing[stack]
         if noise == "auto":  # of colours whose noise was halved by interpolation
@@ -219,6 +225,7 @@ def restore_mosaic(
             part = _Frames(
                 sparse[members],
                 measured[members],
+                None if floor is None else floor[members],
                 (sparse - linear)[members].detach().square().mean().sqrt(),
                 replace(motion, frame_starts=motion.frame_starts[members], shift=motion.shift[:, members]),
                 stack,
@@ -241,6 +248,7 @@ class _Frames:
     Attributes:
         images: (M, 3, H, W) colours, measured or interpolated.
         measured: (M, 3, H, W) bool.
+        floor: (M, 3, H, W) lower bounds of saturated colours, else -inf; None for none.
         error: Standard deviation of the interpolated colours.
         motion: Motion of these frames, of a batch of stacks.
         stack: Index of the stack in the batch.
@@ -249,6 +257,7 @@ class _Frames:
 
     images: Tensor
     measured: Tensor
+    floor: Tensor | None
     error: Tensor
     motion: FrameMotion
     stack: int
@@ -299,6 +308,10 @@ class _Frames:
             full = torch.where(self.measured, full, predicted[..., :width] + mean)
             if unknown_level and count > 1:
                 level = _residual_level(first, data - predicted, measured)
+            if self.floor is not None:  # saturated pixels are at least as bright as their value
+                low = predicted[..., :width] + mean < self.floor
+                data[..., :width] = torch.where(low, self.floor - mean, data[..., :width])
+                measured[..., :width] |= low
         second = solver()
         scene: Tensor = second.scene(second.fit(data, coefficients, iterations=20)) + mean
         return scene[..., : SCALE * width]
