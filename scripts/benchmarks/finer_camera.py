@@ -11,10 +11,10 @@ FINER = 4  # points of the scene per px
 BETWEEN = 4  # interpolated rows per row of the scene
 
 
-def after_optics(scene: Array, sigma: float) -> Array:
-    """The scene after Gaussian optics of ``sigma`` px and square pixels, on its own grid."""
+def after_optics(scene: Array, sigma: float, pixel: float = 1.0) -> Array:
+    """The scene after Gaussian optics of ``sigma`` px and square pixels of ``pixel`` px, on its own grid."""
     v, u = (np.fft.fftfreq(size) * FINER for size in scene.shape)  # cycles per px
-    transfer = [np.exp(-2 * (np.pi * sigma * w) ** 2) * np.sinc(w) for w in (v, u)]
+    transfer = [np.exp(-2 * (np.pi * sigma * w) ** 2) * np.sinc(pixel * w) for w in (v, u)]
     return np.fft.ifft2(np.fft.fft2(scene) * transfer[0][:, None] * transfer[1]).real
 
 
