@@ -23,7 +23,7 @@ from rsvib_torch.evaluation.scenes import city_and_fields
 
 SIGMA, PATTERN, RIM = 0.4, "RGGB", 12
 NOISES = (0.002, 0.005, 0.01)
-FRAMES = (1, 2, 8)
+FRAMES = (1, 8)
 PHOTOGRAPHS = ("astronaut", "coffee")
 Demosaicing = Callable[[Array], Array]
 
@@ -117,7 +117,7 @@ def cases(name: str, side: int) -> list[dict[str, Any]]:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this section."""
-    parser.add_argument("--mosaic-size", type=int, default=128, help="rows and columns of the frames of section mosaic")
+    parser.add_argument("--mosaic-size", type=int, default=160, help="rows and columns of the frames of section mosaic")
 
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
