@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import Field, create_model, model_validator
 
 from rsvib_torch.core.checks import check_number, check_whole_number
-from rsvib_torch.core.option_types import DEFAULT_WINDOW, METHOD_SETTINGS, BadFrames, DetectionSettings, PriorName
+from rsvib_torch.core.option_types import (
+    DEFAULT_WINDOW,
+    METHOD_SETTINGS,
+    BadFrames,
+    DetectionSettings,
+    Mosaic,
+    OpticsSettings,
+    PriorName,
+)
 from rsvib_torch.core.reading import read_text
 from rsvib_torch.core.validation import Section, checked, options_section, validate
 from rsvib_torch.motion.timing import SensorTiming
@@ -181,6 +189,7 @@ def simulation_section() -> Any:
     return SimulationSection
 
 
+_OpticsSection = options_section("_OpticsSection", OpticsSettings)
 _DetectionSection = options_section("_DetectionSection", DetectionSettings)
 
 
@@ -202,6 +211,8 @@ def _restoration_section(method: object) -> Any:
     common: dict[str, Any] = {"method": Literal[*METHOD_SETTINGS], "saturation": float | None}
     if "prior" in settings.__annotations__:
         common["prior"] = PriorName
+        common["mosaic"] = Mosaic | None
+        common["optics"] = _OpticsSection | None
     return options_section("_RestorationSection", settings, **common)
 
 

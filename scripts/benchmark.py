@@ -2,8 +2,8 @@
 """Speed and accuracy of the package and of other software, in one run on one machine.
 
 Sections (see benchmarks/sections.py): registration, cost, detection, restoration, pipeline, scaling, roofline,
-finer, streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict, honesty, timing. Results are printed
-as Markdown tables and written to --out; with --store also to scripts/benchmarks/results, from which
+finer, mosaic, streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict, honesty, timing. Results are
+printed as Markdown tables and written to --out; with --store also to scripts/benchmarks/results, from which
 scripts/benchmark_page.py generates docs/benchmarks.md.
 """
 
@@ -21,6 +21,7 @@ from benchmarks import (
     finer,
     honesty,
     measure,
+    mosaic,
     pipeline,
     regularisation,
     restoration,
@@ -72,6 +73,7 @@ def main() -> None:
         regularisation,
         difficulty,
         finer,
+        mosaic,
         slanted_edge,
         verdict_roc,
         honesty,

@@ -45,6 +45,7 @@ INNER_LAYERS = {
         {"noise"},
         {"exact", "banded", "dewarp", "verdict"},
         {"richardson_lucy"},
+        {"sharpening"},
         {"restore"},
         {"noise_gain"},
     ),

@@ -16,7 +16,7 @@ from rsvib_torch import io
 from rsvib_torch.commands.terminal import Answer, note
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.option_types import METHOD_SETTINGS, PriorName, method_options
+from rsvib_torch.core.option_types import METHOD_SETTINGS, Mosaic, PriorName, method_options
 from rsvib_torch.core.outputs import check_outputs
 
 if TYPE_CHECKING:
@@ -39,6 +39,8 @@ __all__ = [
     "JsonOption",
     "MemoryOption",
     "MethodOption",
+    "MosaicOption",
+    "OpticsOption",
     "Overrides",
     "OverwriteOption",
     "PriorOption",
@@ -172,6 +174,21 @@ FinerOption = Annotated[
         "--scale", help="Points of the restored frames per pixel along both axes: 1 or 2.", show_default="1", min=1
     ),
 ]
+MosaicOption = Annotated[
+    str | None,
+    typer.Option(
+        help=f"Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames: {', '.join(get_args(Mosaic))}. The "
+        "restored frames have three channels.",
+    ),
+]
+OpticsOption = Annotated[
+    float | None,
+    typer.Option(
+        "--optics-sigma",
+        help="Standard deviation of the Gaussian blur of the lens in px, before pixels without gaps: restored frames "
+        "are sharpened to half a point of their grid. Section [restoration.optics] describes other optics.",
+    ),
+]
 PriorOption = Annotated[
     str | None,
     typer.Option(help=f"Prior of the scene: {' or '.join(get_args(PriorName))}, for methods that have this option."),
@@ -289,6 +306,8 @@ class Overrides:
         prior: Prior for the scene.
         saturation: Saturation level in the unit of the file.
         scale: Points of the restored frames per pixel.
+        mosaic: Pattern of raw frames.
+        optics_sigma: Blur of the lens in px.
     """
 
     method: str | None
@@ -296,6 +315,8 @@ class Overrides:
     prior: str | None
     saturation: float | None
     scale: int | None = None
+    mosaic: str | None = None
+    optics_sigma: float | None = None
 
 
 NO_OVERRIDES = Overrides(None, None, None, None)
@@ -364,11 +385,18 @@ def restoration_options(
     """
     options = dict(config.restoration)
     if overrides.method is not None and overrides.method != options.get("method", "exact"):
-        shared = ("saturation", *method_options(overrides.method))  # other options belong to the configured method
+        shared = (
+            "saturation",
+            "mosaic",
+            "optics",
+            *method_options(overrides.method),
+        )  # other options belong to the configured method
         options = {name: value for name, value in options.items() if name in shared}
-    for name in ("method", "prior", "saturation", "scale"):
+    for name in ("method", "prior", "saturation", "scale", "mosaic"):
         if getattr(overrides, name) is not None:
             options[name] = getattr(overrides, name)
+    if overrides.optics_sigma is not None:
+        options["optics"] = {"pixel": 1.0, **options.get("optics", {}), "sigma": overrides.optics_sigma}
     if overrides.joint is not None:
         if overrides.joint != "all" and not (overrides.joint.isdecimal() and int(overrides.joint) >= 1):
             raise ValueError(f"--joint must be 'all' or a number of frames, got {overrides.joint!r}")
@@ -378,10 +406,18 @@ def restoration_options(
         options["saturation"] = level / full_scale if info.is_integer and full_scale is not None else level
     elif info.is_integer and full_scale is not None:
         options["saturation"] = 1.0
+    if options.get("mosaic") is not None:
+        from rsvib_torch.frames.mosaic import check_mosaic  # noqa: PLC0415
+
+        check_mosaic(options["mosaic"], info.shape)
+    if options.get("optics") is not None:
+        from rsvib_torch.restoration.sharpening import check_optics  # noqa: PLC0415
+
+        check_optics(options["optics"], options.get("method", "exact"))
     return options
 
 
 def restored_shape(info: "StackInfo", options: Mapping[str, Any]) -> tuple[int, ...]:
     """Shape of the restored frames of a stack, with options as from ``restoration_options``."""
-    shape = info.enlarged(options.get("scale", 1)).shape
+    shape = info.restored_as(options.get("scale", 1), options.get("mosaic")).shape
     return (1, *shape[1:]) if options.get("joint") is True else shape

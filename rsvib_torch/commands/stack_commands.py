@@ -30,6 +30,8 @@ from rsvib_torch.commands.options import (
     JointOption,
     MemoryOption,
     MethodOption,
+    MosaicOption,
+    OpticsOption,
     Overrides,
     OverwriteOption,
     PriorOption,
@@ -380,6 +382,8 @@ def restore_frames(
     method: MethodOption = None,
     joint: JointOption = None,
     finer: FinerOption = None,
+    mosaic: MosaicOption = None,
+    optics_sigma: OpticsOption = None,
     prior: PriorOption = None,
     saturation: SaturationOption = None,
     force: ForceOption = False,
@@ -394,7 +398,7 @@ def restore_frames(
 
     If the restored frames are judged no better than the input, the input is written unchanged, unless --force is given.
     """
-    overrides = Overrides(method, joint, prior, saturation, finer)
+    overrides = Overrides(method, joint, prior, saturation, finer, mosaic, optics_sigma)
     outputs, inputs = io.stack_files(restored), [*io.stack_files(frames), settings.path, vibration]
     check_new([*outputs, *([] if report is None else [report])], overwrite, inputs)
     check_regular(vibration)
@@ -500,6 +504,8 @@ def run(
     method: MethodOption = None,
     joint: JointOption = None,
     finer: FinerOption = None,
+    mosaic: MosaicOption = None,
+    optics_sigma: OpticsOption = None,
     prior: PriorOption = None,
     saturation: SaturationOption = None,
     force: ForceOption = False,
@@ -544,7 +550,9 @@ def run(
     info = io.read_stack_info(frames)
     print_notes(info, settings)
     scale = full_scale_of(frames, info, settings, full_scale)
-    options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation, finer))
+    options = restoration_options(
+        info, scale, settings, Overrides(method, joint, prior, saturation, finer, mosaic, optics_sigma)
+    )
     common: RestoreOptions = {
         "window": settings.stack.get("window", DEFAULT_WINDOW) if window is None else window,
         "detection": settings.detection,
@@ -577,7 +585,9 @@ def run(
     with whole_folder(out) as folder:
         if len(first.frames):
             with working("drawing the frames"):
-                names += _draw(folder / "before_after.png", lambda: _comparison(frames, scale, first))
+                names += _draw(
+                    folder / "before_after.png", lambda: _comparison(frames, scale, first, options.get("mosaic"))
+                )
         names += [output, "manifest.json"]
         if result.windows == 1:
             assert isinstance(first.detection, detection.DetectionResult)
@@ -628,8 +638,9 @@ def _video_name(frames: Path, output: str) -> str:
     return f"restored{ending if ending in ('.mp4', '.mov', '.m4v') else '.mkv'}"
 
 
-def _comparison(frames: Path, full_scale: float | None, first: WindowResult) -> Figure:
-    """Draw the first restored frame of a stack beside the frame of the input."""
+def _comparison(frames: Path, full_scale: float | None, first: WindowResult, pattern: str | None) -> Figure:
+    """Draw the first restored frame of a stack beside the frame of the input, a mosaic of a pattern or None."""
+    from rsvib_torch.frames.mosaic import colour_frames  # noqa: PLC0415
     from rsvib_torch.frames.pixels import enlarged  # noqa: PLC0415
     from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
 
@@ -638,6 +649,8 @@ def _comparison(frames: Path, full_scale: float | None, first: WindowResult) -> 
     scale, nodata = full_scale or reader.info.full_scale, reader.info.nodata
     raw = counts_to_frames(reader.frame(index)[None], scale, str(frames), nodata)[0].nan_to_num(0.0)
     reader.close()
+    if pattern is not None:
+        raw = colour_frames(raw[None], pattern)[0]
     raw = enlarged(raw, first.frames.shape[-1] // raw.shape[-1])
     names = ("input", "restored" if first.restored else "unchanged")
     return reports.comparison_figure(raw, first.frames[0].cpu().nan_to_num(0.0), names=names)
@@ -666,6 +679,8 @@ def report(
     method: MethodOption = None,
     joint: JointOption = None,
     finer: FinerOption = None,
+    mosaic: MosaicOption = None,
+    optics_sigma: OpticsOption = None,
     prior: PriorOption = None,
     saturation: SaturationOption = None,
     force: Annotated[
@@ -685,22 +700,26 @@ def report(
     _check_folder(out, ["report.html"], overwrite, inputs)
     info = io.read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
-    options = restoration_options(info, scale, settings, Overrides(method, joint, prior, saturation, finer))
+    options = restoration_options(
+        info, scale, settings, Overrides(method, joint, prior, saturation, finer, mosaic, optics_sigma)
+    )
     stack = load(frames, settings, full_scale, device, options)
     detection = _detect(stack, settings)
     result = _restore(stack, detection, options, force, "page")
-    points = options.get("scale", 1)
+    pattern = options.get("mosaic")
     if result.restored:
         run_it = command_text("run", frames, out, *settings.arguments)
         steps = [f"write the restored frames:\n  {run_it}"]
     else:
         steps = step_with_force("report", result, frames, out.with_name(f"{out.name}_forced"), settings)
     steps += steps_after_detection(detection, frames, settings)
+    from rsvib_torch.frames.mosaic import colour_frames  # noqa: PLC0415
+
     content = reports.Report(
         title=printable(f"Vibration in {frames.name}"),
         subtitle=printable(f"{frames}, camera of {settings.source}"),
-        frames=stack.frames,
-        restored=result.frames[..., ::points, ::points],  # the page measures in pixels
+        frames=stack.frames if pattern is None else colour_frames(stack.frames, pattern),
+        restored=result.frames,
         was_restored=result.restored,
         timing=stack.timing,
         detection=detection,

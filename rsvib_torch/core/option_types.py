@@ -21,7 +21,9 @@ __all__ = [
     "ExactSettings",
     "ExportFormat",
     "IsdModel",
+    "Mosaic",
     "MotionUnit",
+    "OpticsSettings",
     "PriorName",
     "Registration",
     "RichardsonLucySettings",
@@ -37,6 +39,7 @@ BadFrames = Literal["pass", "skip"]
 DetectionMethod = Literal["direct", "bands"]
 ExportFormat = Literal["gcsv", "stmap", "isd", "csv"]
 IsdModel = Literal["auto", "frame", "line-scan"]
+Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 MotionUnit = Literal["px", "rad", "mrad", "urad", "deg", "arcsec", "rad/s", "deg/s"]
 PriorName = Literal["gaussian", "edges"]
 Registration = Literal["projection", "ncc", "phase"]
@@ -70,6 +73,15 @@ class ToneSettings(TypedDict, total=False):
 
 class DetectionSettings(BandSettings, ToneSettings, total=False):
     """Options of detection in a configuration file."""
+
+
+class OpticsSettings(TypedDict, total=False):
+    """Optics of the camera, see ``Optics``."""
+
+    sigma: float
+    cutoff: float | None
+    pixel: float
+    mtf: list[list[float]] | None
 
 
 class ExactSettings(TypedDict, total=False):

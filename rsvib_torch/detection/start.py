@@ -13,6 +13,7 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
 from rsvib_torch.detection.tones.fit import ToneFit, with_axes
 from rsvib_torch.frames.arrays import Channels
+from rsvib_torch.frames.mosaic import is_mosaic, mosaic_free
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.files import FramesOrFiles, load_frames
@@ -113,8 +114,16 @@ def grey_frames(
             f"frames {first} and {first + 1} are identical: one of them is a copy (video converters repeat frames), "
             "and its time is wrong; remove copies and state the times of the others in frame_start_times"
         )
-    images = images.mean(2) if images.shape[2] > 1 else images[:, :, 0]
+    images = images.mean(2) if images.shape[2] > 1 else without_mosaic(images[:, :, 0])
     return GreyFrames(images, valid, prepared.batched)
+
+
+def without_mosaic(images: Tensor) -> Tensor:
+    """Grey frames (B, T, H, W), of colour mosaics without the pattern of the colours, which does not move."""
+    mosaic = torch.stack([is_mosaic(stack[0]) for stack in images])
+    if not bool(mosaic.any()):
+        return images
+    return torch.where(mosaic[:, None, None, None], mosaic_free(images), images)
 
 
 def constant_frame(index: int) -> str:

@@ -16,6 +16,7 @@ from torch import Tensor
 from rsvib_torch.core.arguments import check_pixels
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
+from rsvib_torch.frames.mosaic import check_mosaic, colours_of, fill_by_colour, luminance, mosaic_free
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
@@ -38,6 +39,8 @@ class PreparedFrames:
         shape: Shape of the user's frames.
         channel_axis: Their axis of the channels, -3 or -1, if they have one.
         dtype: Floating-point dtype of results for the user.
+        colours: (B, T, 1, H, W), colour that each pixel of a mosaic measures: 0 red, 1 green, 2 blue; None for frames
+            whose pixels measure all channels.
     """
 
     images: Tensor
@@ -48,6 +51,7 @@ class PreparedFrames:
     shape: tuple[int, ...]
     channel_axis: int
     dtype: torch.dtype
+    colours: Tensor | None = None
 
     @property
     def batched(self) -> bool:
@@ -57,7 +61,17 @@ class PreparedFrames:
     @cached_property
     def filled(self) -> Tensor:
         """The images with local means at missing pixels."""
-        return self.images if self.missing is None else fill_with_means(self.images, self.missing)
+        if self.missing is None:
+            return self.images
+        return (fill_with_means if self.colours is None else fill_by_colour)(self.images, self.missing)
+
+    def compared(self, restored: Tensor) -> tuple[Tensor, Tensor]:
+        """Raw frames and restored ones at their pixels, as they can be compared; of a mosaic, the smooth luminance."""
+        points = restored.shape[-1] // self.images.shape[-1]
+        restored = restored[..., ::points, ::points]
+        if self.colours is None:
+            return self.filled, restored
+        return mosaic_free(self.filled), mosaic_free(luminance(restored))
 
     def with_images(self, images: Tensor) -> "PreparedFrames":
         """The same frames with other pixel values (B, T, C, H, W') in row order; masks must be None or fit them."""
@@ -73,7 +87,11 @@ class PreparedFrames:
             images = torch.cat([images[..., :1, :], images[..., :-1, :]], dim=-2)
         turned = frames_from_row_order(images, self.image_timing)
         turned = turned if self.batched else turned[0]
-        return (turned[:, 0] if len(self.shape) == 3 else turned.movedim(-3, self.channel_axis)).to(self.dtype)
+        if len(self.shape) == 3 and self.colours is None:
+            turned = turned[:, 0]
+        else:
+            turned = turned.movedim(-3, self.channel_axis)
+        return turned.to(self.dtype)
 
 
 def prepare_frames(
@@ -86,6 +104,7 @@ def prepare_frames(
     saturation: Saturation = None,
     minimum_frames: int = 1,
     allow_missing: bool = True,
+    mosaic: str | None = None,
     name: str = "frames",
 ) -> PreparedFrames:
     """Check frames and turn them into floating-point images (B, T, C, H, W) in row order, with their masks.
@@ -102,6 +121,8 @@ def prepare_frames(
             integer frames, none for floating-point frames, whose level is unknown; None for none.
         minimum_frames: Number of frames that the stack must have.
         allow_missing: Whether NaN marks missing pixels; if not, NaN is refused.
+        mosaic: Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames, e.g. ``"RGGB"``; None for frames
+            whose pixels measure all channels.
         name: Name of the argument in error messages.
 
     Returns:
@@ -140,7 +161,13 @@ def prepare_frames(
     row_timing = timing.in_row_order()
     row_timing.check_rows(images.shape[-2])
     missing, saturated = (None if mask is None else in_row_order(mask) for mask in (missing, saturated))
-    return PreparedFrames(images, missing, saturated, row_timing, timing, tuple(given.shape), axis, dtype)
+    colours = None
+    if mosaic is not None:
+        check_mosaic(mosaic, frames_from_row_order(images, timing).shape, name)
+        size = images.shape[-2:] if timing.scan_axis == -2 else images.shape[:-3:-1]
+        pattern = frames_to_row_order(colours_of(mosaic, *size), timing)
+        colours = pattern.to(images.device).expand(images.shape)
+    return PreparedFrames(images, missing, saturated, row_timing, timing, tuple(given.shape), axis, dtype, colours)
 
 
 def as_float_frames(

@@ -1,15 +1,18 @@
 """Optics in front of a sensor as a transfer function, and the noise and fixed pattern of the sensor."""
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_broadcast, check_images, check_pixels, checks_arguments
-from rsvib_torch.core.checks import check_number, check_whole_number
+from rsvib_torch.core.arguments import as_numbers, check_broadcast, check_images, check_pixels, checks_arguments
+from rsvib_torch.core.checks import check_number, check_whole_number, described
+from rsvib_torch.frames.arrays import ArrayLike
 
-__all__ = ["Optics", "SensorNoise"]
+__all__ = ["Optics", "SensorNoise", "filtered"]
 
 
 @dataclass(frozen=True)
@@ -18,12 +21,16 @@ class Optics:
 
     ``H(u, v) = exp(-2 pi^2 sigma^2 rho^2) D(rho / cutoff) sinc(pixel u) sinc(pixel v)``, ``rho^2 = u^2 + v^2``, with
     the transfer of a round diffraction-limited pupil ``D(s) = 2 (arccos s - s sqrt(1 - s^2)) / pi``, 0 beyond s = 1.
+    A measured MTF is a further factor, interpolated linearly in rho from 1 at 0.
 
     Args:
         sigma: Standard deviation of the Gaussian blur of aberrations in px.
         cutoff: Diffraction cutoff frequency in cycles/px (pixel pitch over wavelength and f-number); None for no
             diffraction.
         pixel: Width of the light-sensitive square in px; 0 for none, for a scene that was recorded by pixels before.
+        mtf: Measured MTF: frequencies in cycles/px, increasing from above 0 or from 0 with an MTF of 1, and values; 0
+            beyond the last one. The curve of ``slanted_edge_mtf`` contains the pixel: ``Optics(mtf=(curve.frequency,
+            curve.mtf))``.
 
     Example:
         >>> optics = Optics(sigma=0.5, pixel=1.0)
@@ -34,12 +41,15 @@ class Optics:
     sigma: float = 0.0
     cutoff: float | None = None
     pixel: float = 0.0
+    mtf: tuple[ArrayLike | Sequence[float], ArrayLike | Sequence[float]] | None = None
 
     def __post_init__(self) -> None:
         check_number("sigma", self.sigma, at_least=0.0)
         if self.cutoff is not None:
             check_number("cutoff", self.cutoff, above=0.0)
         check_number("pixel", self.pixel, at_least=0.0)
+        if self.mtf is not None:
+            object.__setattr__(self, "mtf", _checked_mtf(self.mtf))  # lists of numbers, which can be compared
 
     @checks_arguments
     def transfer(self, u: Tensor, v: Tensor) -> Tensor:
@@ -51,6 +61,8 @@ class Optics:
         if self.cutoff is not None:
             s = (squared.sqrt() / self.cutoff).clamp(max=1.0)
             transfer = transfer * (2 / math.pi) * (s.arccos() - s * (1 - s.square()).sqrt())
+        if self.mtf is not None:
+            transfer = transfer * _interpolated(squared.sqrt(), *_checked_mtf(self.mtf))
         return transfer * torch.sinc(self.pixel * u) * torch.sinc(self.pixel * v)
 
     @checks_arguments
@@ -61,14 +73,53 @@ class Optics:
             TypeError: If the scene is not a floating-point tensor.
         """
         check_images({"scene": scene}, {"scene": "... H W"})
-        height, width = scene.shape[-2:]
-        wide = scene.to(torch.promote_types(scene.dtype, torch.float32))  # there is no FFT of 16 bits on the CPU
-        mirrored = torch.cat([wide, wide.flip(-1)], dim=-1)
-        mirrored = torch.cat([mirrored, mirrored.flip(-2)], dim=-2)
-        u = torch.fft.rfftfreq(2 * width, dtype=wide.dtype, device=scene.device)
-        v = torch.fft.fftfreq(2 * height, dtype=wide.dtype, device=scene.device)[:, None]
-        image: Tensor = torch.fft.irfft2(torch.fft.rfft2(mirrored) * self.transfer(u, v), s=(2 * height, 2 * width))
-        return image[..., :height, :width].to(scene.dtype).contiguous()
+        return filtered(scene, self.transfer)
+
+
+def filtered(images: Tensor, transfer: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Images (..., H, W) after a real filter with mirrored boundaries; same dtype.
+
+    Args:
+        images: The images.
+        transfer: Function of horizontal and vertical frequencies in cycles per point, even in both.
+    """
+    height, width = images.shape[-2:]
+    wide = images.to(torch.promote_types(images.dtype, torch.float32))  # there is no FFT of 16 bits on the CPU
+    mirrored = torch.cat([wide, wide.flip(-1)], dim=-1)
+    mirrored = torch.cat([mirrored, mirrored.flip(-2)], dim=-2)
+    u = torch.fft.rfftfreq(2 * width, dtype=wide.dtype, device=images.device)
+    v = torch.fft.fftfreq(2 * height, dtype=wide.dtype, device=images.device)[:, None]
+    image: Tensor = torch.fft.irfft2(torch.fft.rfft2(mirrored) * transfer(u, v), s=(2 * height, 2 * width))
+    return image[..., :height, :width].to(images.dtype).contiguous()
+
+
+def _checked_mtf(mtf: object) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Frequencies, the first of which is 0, and values of a measured MTF."""
+    if not isinstance(mtf, (tuple, list)) or len(mtf) != 2:
+        raise TypeError(f"mtf must be a pair (frequencies, values), got {described(mtf)}")
+    frequencies, values = (as_numbers(f"mtf[{index}]", part).flatten().tolist() for index, part in enumerate(mtf))
+    if len(frequencies) != len(values) or not frequencies:
+        raise ValueError(
+            f"mtf must have one value for each frequency, got {len(frequencies)} frequencies and {len(values)} values"
+        )
+    for name, number in [("a frequency", f) for f in frequencies] + [("a value", v) for v in values]:
+        check_number(f"{name} of mtf", number, at_least=0.0)
+    if frequencies[0] > 0.0:
+        frequencies, values = [0.0, *frequencies], [1.0, *values]
+    for low, high in pairwise(frequencies):
+        if high <= low:
+            raise ValueError(f"the frequencies of mtf must increase, but {high:g} follows {low:g} cycles/px")
+    return tuple(frequencies), tuple(values)
+
+
+def _interpolated(place: Tensor, places: Sequence[float], values: Sequence[float]) -> Tensor:
+    """Linear interpolation; 0 beyond the last place."""
+    known, level = place.new_tensor([*places, places[-1]]), place.new_tensor([*values, 0.0])
+    index = torch.searchsorted(known[:-1], place.contiguous(), right=True).clamp(max=len(places))
+    low, high = known[index - 1], known[index]
+    share = torch.where(high > low, (place - low) / (high - low).clamp(min=1e-30), 0.0)
+    inside = level[index - 1] + share * (level[index] - level[index - 1])
+    return torch.where(place <= known[-1], inside, 0.0)
 
 
 @dataclass(frozen=True)

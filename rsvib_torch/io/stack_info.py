@@ -181,11 +181,12 @@ class StackInfo(Summarised):
             self, shape=shape, frame_times=None, frame_numbers=None, path=None, metadata=self.metadata_for(shape)
         )
 
-    def enlarged(self, scale: int) -> "StackInfo":
-        """The same kind of stack with ``scale`` times the rows and columns."""
-        if scale == 1:
+    def restored_as(self, scale: int, mosaic: str | None) -> "StackInfo":
+        """The kind of stack of the restored frames: ``scale`` times the rows and columns, colours of a mosaic."""
+        if scale == 1 and mosaic is None:
             return self
-        shape = (*self.shape[:-2], scale * self.shape[-2], scale * self.shape[-1])
+        channels = self.shape[1:-2] if mosaic is None else (3,)
+        shape = (self.shape[0], *channels, scale * self.shape[-2], scale * self.shape[-1])
         return replace(self, shape=shape, path=None, metadata=self.metadata_for(shape))
 
     @checks_arguments

@@ -14,13 +14,16 @@ from rsvib_torch.core.option_types import (
     BandedSettings,
     DewarpSettings,
     ExactSettings,
+    Mosaic,
     RichardsonLucySettings,
     method_options,
 )
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.frames.arrays import ArrayLike, Channels
+from rsvib_torch.frames.mosaic import interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
+from rsvib_torch.imaging.sensor_model import Optics
 from rsvib_torch.io.files import FramesOrFiles, load_frames, timing_of_files
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
@@ -29,6 +32,7 @@ from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact.exact import restore_exact
 from rsvib_torch.restoration.field_motion import judged_strip, restore_in_strips
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
+from rsvib_torch.restoration.sharpening import check_optics, sharpened
 from rsvib_torch.restoration.verdict.judge import RestorationWarning, judge_frames
 from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError, pairs_to_judge
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
@@ -44,6 +48,8 @@ class CommonOptions(TypedDict, total=False):
     ignore: ArrayLike | None
     saturation: Saturation
     check: bool
+    mosaic: Mosaic | None
+    optics: Optics | Mapping[str, Any] | None
 
 
 class ExactOptions(CommonOptions, ExactSettings, total=False):
@@ -76,11 +82,12 @@ class RestorationMethod:
 
     Attributes:
         function: The method, see the contract above ``METHODS``.
-        masks: Masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels).
+        masks: Masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels), ``"colours"``
+            (colours of the pixels of a mosaic).
     """
 
     function: Callable[..., Tensor]
-    masks: tuple[Literal["ignore", "clipped"], ...] = ()
+    masks: tuple[Literal["ignore", "clipped", "colours"], ...] = ()
 
 
 # Restoration methods. A method is called as
@@ -91,6 +98,8 @@ class RestorationMethod:
 #     motion: FrameMotion of the B stacks.
 #     ignore, clipped: bool tensors shaped like the frames, passed only if listed in ``masks`` and such pixels exist.
 #         Without ``"ignore"``, missing pixels hold local means; without ``"clipped"``, saturated ones count.
+#     colours: integer tensor shaped like the frames, the colour that each pixel of a mosaic measures; a method that
+#         does not list it has no option ``mosaic``.
 #     returns: frames at rest, of the same shape and dtype, in the coordinates of ``motion.shift``; (B, 1, C, H, W) for
 #         option ``joint=True``, and (..., S H, S W) for option ``scale=S``, with point (S i, S j) at pixel (i, j).
 #
@@ -98,7 +107,7 @@ class RestorationMethod:
 # and motion. A new method is one module, its options in core/option_types.py, one line here, and one TypedDict
 # and overload of ``restore`` and of ``VibrationRestorer``.
 METHODS: dict[str, RestorationMethod] = {
-    "exact": RestorationMethod(restore_exact, ("ignore", "clipped")),
+    "exact": RestorationMethod(restore_exact, ("ignore", "clipped", "colours")),
     "banded": RestorationMethod(restore_banded),
     "dewarp": RestorationMethod(restore_dewarp),
     "richardson-lucy": RestorationMethod(restore_richardson_lucy, ("ignore",)),
@@ -148,6 +157,8 @@ def restore(
     ignore: ArrayLike | None = None,
     saturation: Saturation = "auto",
     check: bool = True,
+    mosaic: Mosaic | None = None,
+    optics: Optics | Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Tensor:
     """Restore frames taken by a vibrating rolling-shutter camera: geometry and sharpness.
@@ -179,6 +190,13 @@ def restore(
             integer frames, none for floating-point frames, whose level is unknown; None for none.
         check: Judge the result on a part of the frames, and warn if it is no better than the raw frames; needs two
             frames. ``judge_restoration`` judges all of them.
+        mosaic: Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames (T, H, W) or (T, 1, H, W) behind
+            colour filters: ``"RGGB"``, ``"BGGR"``, ``"GRBG"`` or ``"GBRG"``. The restored frames have three channels
+            R, G, B. Only with method ``"exact"``, see ``restore_mosaic``.
+        optics: Optics of the camera, pixel included: the restored frames are as sharp as from a camera with pixels of
+            the restored grid behind a Gaussian of half a pixel, ``Optics(sigma=0.5 / scale, pixel=1 / scale)``, where
+            noise allows it. Only with method ``"exact"``, see ``sharpened``. None: the restored frames have the
+            sharpness of the camera at rest.
         **options: Options of the method, see ``restore_exact``, ``restore_banded``, ``restore_dewarp`` and
             ``restore_richardson_lucy``.
 
@@ -211,10 +229,11 @@ def restore(
         restored [62.0, 63.0] dB
     """
     _check_options(method, options)
+    camera = check_optics(optics, method)
     timing = timing_of_files(frames, timing)
     frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(
-        frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, saturation=saturation
+        frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, saturation=saturation, mosaic=mosaic
     )
     _, count, _, height, _ = prepared.images.shape
     vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
@@ -225,6 +244,8 @@ def restore(
     restored = restore_prepared(prepared, vibration, method, options)
     if check:
         _warn_if_worse(prepared, restored.detach(), vibration, options.get("joint", False))
+    if camera is not None:
+        restored = sharpened(restored, camera, options.get("scale", 1))
     return prepared.from_row_order(restored)
 
 
@@ -247,7 +268,9 @@ def restore_prepared(
     options = dict(options or {})
     _check_options(method, options)
     chosen = METHODS[method]
-    masks = {"ignore": frames.missing, "clipped": frames.saturated}
+    if frames.colours is not None and "colours" not in chosen.masks:
+        raise ValueError(f"mosaic goes with method='exact', not with method={method!r}; demosaic the frames before")
+    masks = {"ignore": frames.missing, "clipped": frames.saturated, "colours": frames.colours}
     options |= {name: masks[name] for name in chosen.masks if masks[name] is not None}
     images = frames.images if "ignore" in chosen.masks else frames.filled
     motion = _motion_in_row_order(frames, vibration)
@@ -262,7 +285,7 @@ def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) 
         joint: As in ``restore_exact``; the middle frame replaces the image of all frames.
         scale: As in ``restore_exact``; values between the pixels are interpolated.
     """
-    images = frames.images
+    images = frames.images if frames.colours is None else interpolated_colours(frames.filled, frames.colours)
     if frames.missing is not None:
         images = images.masked_fill(frames.missing, math.nan)
     middle = images.shape[1] // 2
@@ -287,10 +310,10 @@ def _motion_in_row_order(frames: PreparedFrames, vibration: Motion) -> Motion:
 
 def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Motion, joint: bool | int) -> None:
     """Judge each stack of a batch on a strip of 160 columns of two pairs of frames."""
-    raw = frames.filled.detach()
-    count = raw.shape[1]
+    count = frames.images.shape[1]
     if count < 2:
         return
+    raw, restored = (images.detach() for images in frames.compared(restored))
     motion = _motion_in_row_order(frames, vibration)
     pairs = pairs_to_judge(count, joint, 2)
     shared = count if joint is True else max(int(joint), 1)

@@ -15,6 +15,7 @@ from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
 from rsvib_torch.core.presentation import Summarised, plain_values
 from rsvib_torch.detection import DetectionResult, detect_vibration
+from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.io.files import PathLike, open_stack, read_stack_info
 from rsvib_torch.io.formats import FrameReader
@@ -23,6 +24,7 @@ from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts, requir
 from rsvib_torch.io.schema import DetectedVibration, detection_to_json
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.restoration.sharpening import check_optics
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted, without_data
 from rsvib_torch.stacks.windows import Window, cut_windows, window_timing
@@ -135,6 +137,15 @@ class StackJob:
         """Points of the result per pixel."""
         return 1 if self.restoration is None else int(self.restoration.get("scale", 1))
 
+    @property
+    def mosaic(self) -> str | None:
+        """Pattern of raw frames; None for others."""
+        return None if self.restoration is None else self.restoration.get("mosaic")
+
+    def _unchanged(self, frames: Tensor) -> Tensor:
+        """Frames that were not restored, in the shape of restored ones."""
+        return enlarged(frames if self.mosaic is None else colour_frames(frames, self.mosaic), self.scale)
+
     def of_window(self, window: Window) -> "StackJob":
         """The job with only those given detections that ``window`` needs."""
         return self if self.given is None else replace(self, given={window.index: self.given[window.index]})
@@ -161,8 +172,7 @@ class StackJob:
             frames = counts_to_frames(stored, self.full_scale, str(self.source), nodata).to(self.device)
         kept = tuple(index for index in usable if index in window.written)
         bad = {index: fault for index, fault in faults.items() if index in window.written}
-        unchanged = enlarged(frames[: len(kept)], self.scale)
-        as_taken = WindowResult(window, kept, unchanged, False, None, None, None, bad)
+        as_taken = WindowResult(window, kept, self._unchanged(frames[: len(kept)]), False, None, None, None, bad)
         if faults and len(usable) < 2:
             return replace(as_taken, error=next(iter(faults.values())))
         timing = window_timing(self.timing, window, list(usable))
@@ -220,13 +230,14 @@ class StackJob:
                 frame = pixels[index - result.window.first]
                 if isinstance(frame, str):
                     frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
-                frames.append(frame if self.scale == 1 else self._enlarged(frame))
+                same = self.scale == 1 and self.mosaic is None
+                frames.append(frame if same else self._unchanged_counts(frame))
         return StoredWindow(frames, self.record(result, len(frames)))
 
-    def _enlarged(self, frame: NDArray[Any]) -> NDArray[Any]:
-        """A frame as stored, on the finer grid."""
+    def _unchanged_counts(self, frame: NDArray[Any]) -> NDArray[Any]:
+        """A frame as stored, in the shape of restored ones."""
         counts = counts_to_frames(frame[None], self.full_scale, str(self.source), self.info.nodata)
-        return frames_to_counts(enlarged(counts, self.scale)[0], frame.dtype, self.full_scale, self.info.nodata)
+        return frames_to_counts(self._unchanged(counts)[0], frame.dtype, self.full_scale, self.info.nodata)
 
     def record(self, result: WindowResult, written: int) -> dict[str, Any]:
         """Content of the ``WindowRecord`` of a result of which ``written`` frames were written."""
@@ -347,6 +358,10 @@ def plan_job(
         device,
         options.get("window", DEFAULT_WINDOW),
     )
+    if job.mosaic is not None:
+        check_mosaic(job.mosaic, info.shape, str(source))
+    if job.restoration is not None:
+        check_optics(job.restoration.get("optics"), job.restoration.get("method", "exact"))
     windows = cut_windows(info.shape[0], job.window)
     if options.get("workers") is not None:
         most = check_whole_number("workers", options["workers"], at_least=1)

@@ -282,7 +282,7 @@ def process_stack(
             f"given has {len(given)} detections for {len(windows)} windows of at most {job.window} frames; "
             "pass one for each window"
         )
-    out = job.info.with_frames(len(windows) if job.joined else job.info.shape[0]).enlarged(job.scale)
+    out = job.info.with_frames(len(windows) if job.joined else job.info.shape[0]).restored_as(job.scale, job.mosaic)
     out = replace(
         out,
         full_scale=job.full_scale,

@@ -28,6 +28,7 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
+from rsvib_torch.restoration.sharpening import check_optics, sharpened
 from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
@@ -73,7 +74,7 @@ def restore_trusted(
     """Restore frames with a motion, or the reliable part of a detection, and judge whether that helps.
 
     Args:
-        frames: Stack (T, H, W) or (T, C, H, W) whose full scale is 1.
+        frames: Stack (T, H, W) or (T, C, H, W) whose full scale is 1; raw frames with option ``mosaic``.
         timing: The sensor.
         motion: The motion in image axes, or a detection in these frames.
         options: Options of ``restore``.
@@ -88,16 +89,22 @@ def restore_trusted(
     vibration, left_alone = vibration_to_undo(motion, timing, len(frames), rows)
     frames = frames if first_frames is None else frames[:first_frames]
     joint, scale = options.get("joint", False), options.get("scale", 1)
-    prepared = prepare_frames(frames, timing, saturation=options.get("saturation", "auto"))
+    method = options.get("method", "exact")
+    optics = check_optics(options.get("optics"), method)
+    prepared = prepare_frames(
+        frames, timing, saturation=options.get("saturation", "auto"), mosaic=options.get("mosaic")
+    )
     if not bool(vibration.moving_axes().any()):
         return RestoredFrames(unchanged_frames(prepared, joint, scale), False, left_alone, None, False)
-    chosen = {name: value for name, value in options.items() if name not in ("method", "saturation")}
-    restored = restore_prepared(prepared, vibration, options.get("method", "exact"), chosen)
+    chosen = {name: options[name] for name in options if name not in ("method", "saturation", "mosaic", "optics")}
+    restored = restore_prepared(prepared, vibration, method, chosen)
     verdict = None
     with suppress(TooLittleInCommonError):
         if len(frames) > 1:
             verdict = judge_prepared(prepared, restored, vibration, joint=joint, most_pairs=most_pairs)
     keep = verdict is None or verdict.overall != "worse" or force
+    if keep and optics is not None:
+        restored = sharpened(restored, optics, scale)
     result = prepared.from_row_order(restored) if keep else unchanged_frames(prepared, joint, scale)
     return RestoredFrames(result, keep, left_alone, verdict, True, vibration.num_axes)
 
@@ -106,6 +113,8 @@ def without_data(frames: Tensor, taken: Tensor) -> Tensor:
     """Restored frames with NaN at the pixels without data of the frames as taken; of one image, without data in all."""
     points = frames.shape[-1] // taken.shape[-1]
     missing = torch.isnan(taken).repeat_interleave(points, -2).repeat_interleave(points, -1)
+    if frames.ndim > missing.ndim:  # colours of a mosaic
+        missing = missing.unsqueeze(-3)
     return frames.masked_fill(missing if len(frames) == len(taken) else missing.all(0), torch.nan)
 
 
@@ -191,6 +200,9 @@ def restore_block(
     options = dict(restoration or {})
     if options.get("joint", False) is True:
         raise ValueError("joint=True makes one image of a block; restore_block keeps its shape")
+    for name in ("scale", "mosaic"):
+        if options.get(name) not in (None, 1):
+            raise ValueError(f"{name}={options[name]!r} changes the size of the frames; restore_block keeps it")
     check_dtype(frames.dtype)
     scale = known_full_scale(frames.dtype, full_scale)
     axis = channel_axis("frames", frames.shape, channels)

@@ -27,7 +27,7 @@ SHAKE = Shake(np.array([[3.1], [5.2]]), np.array([[90.0], [61.0]]), np.array([[0
 
 def decibel(image: Array, truth: Array, rim: int = RIM) -> float:
     """PSNR in dB for full scale 1, without a rim."""
-    error = (np.asarray(image, dtype=np.float64) - truth)[rim:-rim, rim:-rim]
+    error = (np.asarray(image, dtype=np.float64) - truth)[..., rim:-rim, rim:-rim]
     return float(-10 * np.log10(np.mean(error**2)))
 
 

@@ -11,10 +11,10 @@ FINER = 4  # points of the scene per px
 BETWEEN = 4  # interpolated rows per row of the scene
 
 
-def after_optics(scene: Array, sigma: float) -> Array:
-    """The scene after Gaussian optics of ``sigma`` px and square pixels, on its own grid."""
+def after_optics(scene: Array, sigma: float, pixel: float = 1.0) -> Array:
+    """The scene after Gaussian optics of ``sigma`` px and square pixels of ``pixel`` px, on its own grid."""
     v, u = (np.fft.fftfreq(size) * FINER for size in scene.shape)  # cycles per px
-    transfer = [np.exp(-2 * (np.pi * sigma * w) ** 2) * np.sinc(w) for w in (v, u)]
+    transfer = [np.exp(-2 * (np.pi * sigma * w) ** 2) * np.sinc(pixel * w) for w in (v, u)]
     return np.fft.ifft2(np.fft.fft2(scene) * transfer[0][:, None] * transfer[1]).real
 
 
@@ -24,3 +24,15 @@ def still_image(scene: Array, size: tuple[int, int], scale: int = 1, offset: tup
     moved = np.roll(scene, (offset[0] - top, offset[1] - left), (0, 1))
     step = FINER // scale
     return moved[: FINER * size[0] : step, : FINER * size[1] : step]
+
+
+def mosaic_of(frames: Array, pattern: str) -> Array:
+    """Raw frames (T, H, W) behind colour filters from colour frames (T, 3, H, W).
+
+    ``pattern`` names the colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1).
+    """
+    raw = np.empty((len(frames), *frames.shape[-2:]))
+    for place, colour in enumerate(pattern):
+        part = (slice(place // 2, None, 2), slice(place % 2, None, 2))
+        raw[:, *part] = frames[:, "RGB".index(colour), *part]
+    return raw

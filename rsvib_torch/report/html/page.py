@@ -12,6 +12,7 @@ from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.evaluation import MtfCurve, find_slanted_edges, slanted_edge_mtf
+from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report import plots
@@ -43,7 +44,8 @@ class Report:
         title: Heading.
         subtitle: Line below.
         frames: (T, H, W) or (T, C, H, W) input frames, full scale 1.
-        restored: Frames after restoration, or one frame restored jointly from all.
+        restored: Frames after restoration, or one frame restored jointly from all; on a finer grid with as many times
+            the rows and columns.
         was_restored: Whether ``restored`` is restored, or the unchanged input.
         timing: The sensor.
         detection: The detection (not a batch).
@@ -81,12 +83,14 @@ class Edge:
     Attributes:
         box: Its position.
         before: Measurement in the input; None if it failed.
-        after: Measurement in the restored frame.
+        after: Measurement in the restored frame; its frequencies are in cycles per point.
+        points: Points of the restored frame per px.
     """
 
     box: Box
     before: MtfCurve | None
     after: MtfCurve
+    points: int = 1
 
     @property
     def direction(self) -> str:
@@ -118,7 +122,7 @@ def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = N
 
     Args:
         before: (H, W) grey.
-        after: Same shape.
+        after: Same shape, or with a whole number of points per px.
         boxes: Positions of the edges; None searches for edges in the restored frame.
 
     Returns:
@@ -127,7 +131,8 @@ def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = N
     Raises:
         ValueError: If a given box is not inside the frame.
     """
-    rows, columns = after.shape
+    rows, columns = before.shape
+    points = after.shape[-1] // columns
     for top, left, height, width in boxes or ():
         if min(top, left) < 0 or min(height, width) < 1 or top + height > rows or left + width > columns:
             raise ValueError(
@@ -135,11 +140,12 @@ def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = N
                 f"{columns} px"
             )
     edges, notes = [], []
-    for box in _find_edges(after) if boxes is None else boxes:
+    for box in _find_edges(after[::points, ::points]) if boxes is None else boxes:
         top, left, height, width = box
         crop = (slice(top, top + height), slice(left, left + width))
+        finer = tuple(slice(points * side.start, points * side.stop) for side in crop)
         try:
-            restored = slanted_edge_mtf(after[crop])
+            restored = slanted_edge_mtf(after[finer])
         except ValueError as error:
             if boxes is not None:
                 notes.append(f"The edge at {_region(*box)} was not measured: {error}.")
@@ -149,14 +155,14 @@ def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = N
             raw = slanted_edge_mtf(before[crop])
         except ValueError as error:
             notes.append(f"The edge at {_region(*box)} was not measured in the input: {error}.")
-        edges.append(Edge(box, raw, restored))
+        edges.append(Edge(box, raw, restored, points))
     return edges, notes
 
 
 def _edge_row(edge: Edge, restored: bool) -> list[str]:
     """Line of the table of edges."""
     before = "not measured" if edge.before is None else measured_text(edge.before.mtf50, edge.before.mtf50_std)
-    after = measured_text(edge.after.mtf50, edge.after.mtf50_std)
+    after = measured_text(edge.points * edge.after.mtf50, edge.points * edge.after.mtf50_std)
     return [_region(*edge.box), edge.direction, f"{edge.after.angle:.1f}°", before, *([after] if restored else [])]
 
 
@@ -166,9 +172,10 @@ def _mtf_drawings(edges: list[Edge], names: tuple[str, ...]) -> list[Drawing]:
         chosen = [edge for edge in edges if edge.direction == direction]
         if chosen:
             before, after = [edge.before for edge in chosen if edge.before is not None], [edge.after for edge in chosen]
+            points = {names[-1]: chosen[0].points}
             drawings.append(
                 drawing(
-                    plots.mtf_figure(dict(zip(names, (before, after), strict=False))),
+                    plots.mtf_figure(dict(zip(names, (before, after), strict=False)), points=points),
                     f"mtf_{direction}",
                     f"{direction.capitalize()} sharpness",
                     "Thin lines: single edges; bold lines: their mean. The displacement of rows does not count as "
@@ -179,13 +186,19 @@ def _mtf_drawings(edges: list[Edge], names: tuple[str, ...]) -> list[Drawing]:
 
 
 def _details(before: Tensor, after: Tensor, names: tuple[str, ...]) -> list[BeforeAfter]:
-    """Crops at full resolution where the restored frame has the strongest detail."""
+    """Crops at full resolution where the restored frame has the strongest detail.
+
+    If it is on a finer grid, the input is interpolated.
+    """
+    points = after.shape[-1] // before.shape[-1]
+    before = enlarged(before, points)
     grey = _grey(after).float()
-    size = min(96, *grey.shape)
+    size = min(96 * points, *grey.shape)
     pairs = []
-    for row, column in plots.detailed_places(grey, size, count=6, rim=16):
+    for row, column in plots.detailed_places(grey, size, count=6, rim=16 * points):
         crop = (..., slice(row, row + size), slice(column, column + size))
-        caption = _region(row, column, size, size)
+        caption = _region(row // points, column // points, size // points, size // points)
+        caption += f"; {points} x {points} points per px, the input is interpolated" if points > 1 else ""
         pairs.append(before_after(before[crop], after[crop], names=names, caption=caption, exact=True))
     return pairs
 
@@ -299,13 +312,17 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         ValueError: If an edge is not inside the frame.
     """
     result, timing = report.detection, report.timing
+    points, finer = report.restored.shape[-1] // report.frames.shape[-1], report.restored
+    report = replace(report, restored=finer[..., ::points, ::points])
     num_rows = report.frames.shape[int(timing.scan_axis)]
     removed = trusted_vibration(result, timing, len(report.frames), num_rows)[0].to("cpu")
     centre = removed.translation()
     where = " at the centre of the frame" if removed.num_axes > 2 else ""
     index = len(report.frames) // 2 if len(report.restored) < len(report.frames) else 0
     before = report.frames[index]
-    after = report.restored[min(index, len(report.restored) - 1)] if report.was_restored else None
+    last = min(index, len(report.restored) - 1)
+    after = report.restored[last] if report.was_restored else None
+    detail = finer[last] if report.was_restored else before
     offsets = [
         drawing(
             plots.axis_offset_figure(result, axis),
@@ -345,7 +362,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         ]
     shown = (before,) if after is None else (before, after)
     names = ("input", "restored")[: len(shown)]
-    measured, notes = measure_edges(_grey(before), _grey(shown[-1]), edges)
+    measured, notes = measure_edges(_grey(before), _grey(detail), edges)
     mtf_figures = _mtf_drawings(measured, names)
     restored = report.was_restored
     sentences = words.verdict_sentences(
@@ -370,7 +387,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         "frames_title": "Input and restored frame" if restored else "Input frame",
         "overview": whole_frame(report, index, shown, names),
         "blink": frames_in_turn(report, index, removed),
-        "details": [] if after is None else _details(before, after, names),
+        "details": [] if after is None else _details(before, detail, names),
         "offsets": offsets,
         "tones_head": words.detected_tones_head(result),
         "tones": words.detected_tones(result),

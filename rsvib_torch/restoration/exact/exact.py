@@ -18,6 +18,7 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.exact.filling import fill_beyond_ends, fill_missing, measured_values
+from rsvib_torch.restoration.exact.mosaic import restore_mosaic
 from rsvib_torch.restoration.exact.priors import PRIORS, PriorOptions
 from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem
 from rsvib_torch.restoration.exact.strength import Strengths, prior_strength
@@ -45,6 +46,7 @@ def restore_exact(
     regularisation: float = 1.0,
     ignore: Tensor | None = None,
     clipped: Tensor | None = None,
+    colours: Tensor | None = None,
     chunk_frequencies: int | None = None,
     segments: int | None = None,
     scale: Literal[1, 2] = 1,
@@ -74,6 +76,8 @@ def restore_exact(
         ignore: Boolean mask shaped like the frames of missing pixels; their values are not used, and are estimated from
             all others.
         clipped: Boolean mask of saturated pixels, whose values are lower bounds.
+        colours: Colour that each pixel of a mosaic measures, 0 red, 1 green, 2 blue, shaped like the frames, which have
+            one channel; the result has three, see ``restore_mosaic``.
         chunk_frequencies: Frequencies solved at a time; bounds the memory, does not change the result. None: as many
             as take 8 times the memory of the spectrum of the scene.
         segments: Overlapping segments of rows that are solved side by side, which changes the result by about 1e-5;
@@ -92,23 +96,35 @@ def restore_exact(
     """
     B, T, C, H, W = frames.shape
     factor = check_number("regularisation", regularisation, above=0.0)
-    check_choice("prior", prior, tuple(PRIORS))
-    check_choice("scale", scale, (1, SCALE))
-    if scale != 1 and prior != "gaussian":
-        raise ValueError(f"scale={scale} has prior='gaussian' only, got {prior!r}")
+    _check_prior(prior, scale, colours)
     groups = joint_groups(T, joint)
     chunk, split = (
         None if value is None else check_whole_number(name, value, at_least=1)
         for name, value in (("chunk_frequencies", chunk_frequencies), ("segments", segments))
     )
-    if ignore is not None:
+    if ignore is not None and colours is None:
         frames = fill_with_means(frames, ignore)
     missing = ignore if clipped is None else clipped if ignore is None else ignore | clipped
-    levels = _noise_levels(frames, motion, noise, ignore)
-    mean = brightness(frames).mean(1)[..., None, None]
     starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device)).expand(B, T, H)
     displacement, node_weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
     reaches = motion.reaches(H)
+    if colours is not None:
+        return restore_mosaic(
+            frames,
+            motion,
+            colours,
+            groups,
+            (displacement, node_weights),
+            [scene_period(W, reach, moved) for reach, moved in zip(reaches, displacement, strict=True)],
+            noise=noise if noise == "auto" else _given_level(noise),
+            regularisation=factor,
+            ignore=ignore,
+            clipped=clipped,
+            partition=Partition(chunk, split),
+            scale=scale,
+        )
+    levels = _noise_levels(frames, motion, noise, ignore)
+    mean = brightness(frames).mean(1)[..., None, None]
 
     scenes: list[_Scene] = []  # stack, its frames, the restored one, factor on the prior
     for index in range(B):
@@ -324,11 +340,22 @@ def _without_empty_frames(groups: list[tuple[list[int], int]], missing: Tensor) 
     return [([m for m in members if share[m] > 0.05] or members, reference) for members, reference in groups]
 
 
+def _check_prior(prior: str, scale: int, colours: Tensor | None) -> None:
+    """Refuse priors that do not exist, and those that the finer grid and mosaics do not have."""
+    check_choice("prior", prior, tuple(PRIORS))
+    check_choice("scale", scale, (1, SCALE))
+    if prior != "gaussian" and (scale != 1 or colours is not None):
+        raise ValueError(f"{f'scale={scale}' if scale != 1 else 'mosaic'} has prior='gaussian' only, got {prior!r}")
+
+
+def _given_level(noise: float) -> float:
+    return max(check_number("noise", noise, at_least=0.0, at_most=MAX_NUMBER), _MIN_LEVEL)
+
+
 def _noise_levels(frames: Tensor, motion: FrameMotion, noise: float | Literal["auto"], ignore: Tensor | None) -> Tensor:
     """Noise level of each frame, (B, T)."""
     if noise != "auto":
-        level = check_number("noise", noise, at_least=0.0, at_most=MAX_NUMBER)
-        return torch.full(frames.shape[:2], max(level, _MIN_LEVEL), dtype=frames.dtype, device=frames.device)
+        return torch.full(frames.shape[:2], _given_level(noise), dtype=frames.dtype, device=frames.device)
     levels = [
         noise_levels(stack.detach(), motion, index, None if ignore is None else ignore[index])
         for index, stack in enumerate(frames)

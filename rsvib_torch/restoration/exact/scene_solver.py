@@ -11,6 +11,7 @@ The plain path factors the system of every frequency, and is differentiable. The
 frequencies and interpolates the factors for all others.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import prod
@@ -146,6 +147,11 @@ class SceneSolver:
             systems = self._normal.at(self.u[nodes], precision[..., nodes])
             self._interpolated = InterpolatedFactors.of(systems, nodes)
 
+    @property
+    def interpolates(self) -> bool:
+        """Whether the factors are interpolated between some frequencies."""
+        return self._interpolated is not None
+
     def _nodes(self) -> Tensor | None:
         """Frequencies whose systems are factored; None: all.
 
@@ -170,13 +176,25 @@ class SceneSolver:
             expected: (K, C, U) added to the right sides: P times the expectation of the prior.
         """
         spectra: Tensor = torch.fft.rfft(data)
+
+        def right_side(part: slice) -> Tensor:
+            right = self.observation.adjoint(spectra[..., part], self.u[part], part, self.length)
+            return right if expected is None else right + expected[..., part]
+
+        return self._solution(right_side, spectra, *(() if expected is None else (expected,)))
+
+    def solve(self, right: Tensor) -> Tensor:
+        """Solution (K, C, U) of the normal equations for right sides (K, C, U)."""
+        return self._solution(lambda part: right[..., part], right)
+
+    def _solution(self, right_side: Callable[[slice], Tensor], *given: Tensor) -> Tensor:
+        """Solution (K, C, U) for right sides (K, C, S) of parts of the frequencies, computed from the given tensors."""
         interpolated: dict[int, BandedFactor] = {}  # of each thread, in memory that is used again
 
         def solve(number: int, thread: int | None = None) -> Tensor:
             part = self._parts[number]
             u = self.u[part]
-            right = self.observation.adjoint(spectra[..., part], u, part, self.length)
-            right = right if expected is None else right + expected[..., part]
+            right = right_side(part)
             right = torch.stack([right[window] for window in self._windows], dim=-2).flatten(-2)
             if self._interpolated is not None:
                 factor = self._interpolated.at(part, None if thread is None else interpolated.get(thread))
@@ -188,20 +206,20 @@ class SceneSolver:
             else:
                 left = self._normal.left
                 shape = (*left.shape[:2], len(self._windows) * len(u))
-                out = None if thread is None else self._partition.buffer(thread, shape, spectra)
+                out = None if thread is None else self._partition.buffer(thread, shape, given[0])
                 solution = solve_skewed(self._normal.at(u, self.precision[..., part], out), right)
             return join_windows(solution.unflatten(-1, (-1, len(u))), self._windows)
 
-        if self._differentiates(spectra, *(() if expected is None else (expected,))):
+        if self._differentiates(*given):
             return torch.cat([solve(number) for number in range(len(self._parts))], dim=-1)
-        coefficients: Tensor = spectra.new_empty(self.observation.count, spectra.shape[1], len(self.u))
-        threads = min(Partition.threads(data.device), len(self._parts))
+        coefficients: Tensor = given[0].new_empty(self.observation.count, given[0].shape[1], len(self.u))
+        threads = min(Partition.threads(given[0].device), len(self._parts))
 
         def share(thread: int) -> None:
             for number in range(thread, len(self._parts), threads):
                 coefficients[..., self._parts[number]] = solve(number, thread)
 
-        in_parallel(share, range(threads), data.device)
+        in_parallel(share, range(threads), given[0].device)
         return coefficients
 
     def predict(self, coefficients: Tensor) -> Tensor:

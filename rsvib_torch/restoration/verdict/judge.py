@@ -405,8 +405,7 @@ def judge_prepared(
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
     motion = vibration.to_row_order(frames.image_timing).to(frames.images.device).expanded(1)
     missing = None if frames.missing is None else frames.missing[0]
-    raw, image, hidden, of_part = judged_strip(
-        frames.filled[0].to(dtype), restored[0].to(dtype), missing, motion, frames.timing
-    )
+    taken, still = (images[0].to(dtype) for images in frames.compared(restored))
+    raw, image, hidden, of_part = judged_strip(taken, still, missing, motion, frames.timing)
     verdict = judge_frames(raw, image, of_part, pairs_to_judge(count, joint, limit), shared=shared, hidden=hidden)
     return verdict.in_image_axes(frames.image_timing)

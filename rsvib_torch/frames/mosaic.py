@@ -1,0 +1,131 @@
+"""Colour mosaics: frames in which every pixel measures one colour, behind filters that repeat every two pixels."""
+
+from typing import get_args
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from rsvib_torch.core.checks import check_choice
+from rsvib_torch.core.option_types import Mosaic
+from rsvib_torch.frames.pixels import fill_with_means
+
+__all__ = [
+    "check_mosaic",
+    "colour_frames",
+    "colours_of",
+    "fill_by_colour",
+    "interpolated_colours",
+    "is_mosaic",
+    "luminance",
+    "measures",
+    "mosaic_free",
+]
+
+_LUMINANCE = (0.25, 0.5, 0.25)  # shares of red, green and blue in a mosaic
+
+
+def check_mosaic(pattern: object, shape: tuple[int, ...], name: str = "frames") -> None:
+    """Raise a ``ValueError`` unless frames (T, H, W) or (..., C, H, W) can be a mosaic of the pattern."""
+    check_choice("mosaic", pattern, get_args(Mosaic))
+    if len(shape) > 3 and shape[-3] != 1:
+        raise ValueError(
+            f"mosaic={pattern!r} is for raw frames (T, H, W) or (T, 1, H, W), but {name} have {shape[-3]} channels; "
+            "omit mosaic for colour frames"
+        )
+    if shape[-2] % 2 or shape[-1] % 2:
+        raise ValueError(
+            f"mosaic={pattern!r} repeats every 2 x 2 px, but {name} have {shape[-2]} x {shape[-1]} px; cut them to "
+            "even numbers of rows and columns"
+        )
+
+
+def colours_of(pattern: str, height: int, width: int) -> Tensor:
+    """Colour of every pixel, (height, width) int64: 0 red, 1 green, 2 blue.
+
+    Args:
+        pattern: Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1).
+        height: Even number of rows.
+        width: Even number of columns.
+
+    Example:
+        >>> colours_of("RGGB", 2, 4).tolist()
+        [[0, 1, 0, 1], [1, 2, 1, 2]]
+    """
+    tile = torch.tensor(["RGB".index(colour) for colour in pattern]).view(2, 2)
+    return tile.repeat(height // 2, width // 2)
+
+
+def colour_frames(frames: Tensor, pattern: str) -> Tensor:
+    """Frames (T, 3, H, W) from a mosaic (T, H, W) or (T, 1, H, W) by ``interpolated_colours``; NaN stays NaN."""
+    mosaic = frames.unsqueeze(-3) if frames.ndim == 3 else frames
+    missing = mosaic.isnan()
+    colours = colours_of(pattern, *frames.shape[-2:]).to(frames.device).expand(mosaic.shape)
+    filled = fill_by_colour(mosaic, missing) if bool(missing.any()) else mosaic
+    return interpolated_colours(filled, colours).masked_fill(missing, torch.nan)
+
+
+def measures(colours: Tensor) -> Tensor:
+    """Mask (..., 3, H, W) of the colour that each pixel measures, from colours (..., 1, H, W)."""
+    return colours == torch.arange(3, device=colours.device)[:, None, None]
+
+
+def fill_by_colour(frames: Tensor, missing: Tensor) -> Tensor:
+    """``fill_with_means`` of a mosaic (..., 1, H, W), separately for the four places of the pattern."""
+    holes = functional.pixel_unshuffle(missing.to(frames.dtype), 2) > 0.5
+    return functional.pixel_shuffle(fill_with_means(functional.pixel_unshuffle(frames, 2), holes), 2)
+
+
+def _smoothed(images: Tensor, weights: tuple[float, ...]) -> Tensor:
+    """Images (..., H, W) after a symmetric filter along both axes, with mirrored boundaries."""
+    half = len(weights) // 2
+    taps = torch.tensor(weights, dtype=images.dtype, device=images.device)
+    wide = functional.pad(images.reshape(-1, 1, *images.shape[-2:]), (half,) * 4, mode="reflect")
+    rows = functional.conv2d(wide, taps[None, None, None])
+    return functional.conv2d(rows, taps[None, None, :, None]).view(images.shape)
+
+
+def is_mosaic(image: Tensor, *, block: int = 16, least: float = 3.0) -> Tensor:
+    """Whether an image (H, W) is a mosaic of colours: () bool.
+
+    Chequered differences of a mosaic have the same sign where the colour is the same. Their mean square over blocks,
+    relative to that of a white spectrum near 1/2 cycle per px, is 7 to 35 in mosaics (three photographs, drawn scenes,
+    one with a tenth of the colour) and at most 0.9 in grey images (nine photographs, drawn scenes, noise).
+    """
+    if min(image.shape) < block + 2:
+        return torch.zeros((), dtype=torch.bool, device=image.device)
+    high = image.diff(n=2, dim=-1).diff(n=2, dim=-2)
+    row, column = (torch.arange(size, device=image.device) for size in high.shape)
+    signed = high * (1 - 2 * ((row[:, None] + column) % 2))
+    blocks = functional.avg_pool2d(signed[None, None], block)
+    white = (8 / 3 / block) ** 2  # mean square of blocks of white noise
+    return blocks.square().mean() > least * white * high.square().mean()
+
+
+def mosaic_free(images: Tensor) -> Tensor:
+    """Images (..., H, W) without what repeats every two pixels: binomial filter of five pixels along both axes.
+
+    In a mosaic the colours are modulated on 1/2 cycle per px along either axis and both; this pattern does not move
+    with the scene. Five pixels instead of three: the error of a detected displacement decreases from 0.004 to 0.001 px,
+    from 0.034 px without a filter (drawn scene of 256 px, noise 0.002).
+    """
+    return _smoothed(images, (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16))
+
+
+def luminance(colours: Tensor) -> Tensor:
+    """Mean (..., 1, H, W) of colours (..., 3, H, W) with their shares in a mosaic."""
+    return torch.einsum("c,...chw->...hw", colours.new_tensor(_LUMINANCE), colours).unsqueeze(-3)
+
+
+def interpolated_colours(frames: Tensor, colours: Tensor) -> Tensor:
+    """Colour images (..., 3, H, W) from a mosaic (..., 1, H, W) by linear filters.
+
+    The differences of the colours from a smooth luminance are interpolated from the pixels of each colour; measured
+    values are kept.
+    """
+    weights = (0.25, 0.5, 0.25)
+    measured = measures(colours)
+    difference = (frames - _smoothed(frames, weights)) * measured
+    difference = _smoothed(difference, weights) / _smoothed(measured.to(frames.dtype), weights).expand_as(difference)
+    own = (difference * measured).sum(-3, keepdim=True)
+    return frames - own + difference

@@ -1,0 +1,102 @@
+"""rsvib with raw frames behind colour filters, optics and a finer grid."""
+
+import numpy as np
+import pytest
+import small_config
+from small_stack import HEIGHT, STILL, WIDTH, write_small
+
+from rsvib_torch import read_stack, read_stack_info
+from rsvib_torch.commands.main import run_command
+
+CAMERA = small_config.CAMERA.partition("[restoration]")[0]
+CONFIG = f"""{CAMERA}
+[restoration]
+joint = true
+scale = 2
+mosaic = "RGGB"
+
+[restoration.optics]
+sigma = 0.4
+pixel = 1.0
+
+[stack]
+window = 2
+"""
+OPTIONS = ("--scale", 2, "--joint", "all", "--mosaic", "RGGB", "--optics-sigma", 0.4)
+
+
+def run(*arguments):
+    return run_command([str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module", name="place")
+def make_place(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mosaic")
+    write_small(folder / "raw.tif", frames=3)  # of a grey scene
+    (folder / "camera.toml").write_text(CAMERA)
+    (folder / "mosaic.toml").write_text(CONFIG)
+    assert run("detect", folder / "raw.tif", "--config", folder / "camera.toml", "--out", folder / "found") == 0
+    return folder
+
+
+def restore(place, out, *more, config="camera.toml"):
+    vibration = ("--config", place / config, "--vibration", place / "found" / "vibration.json")
+    return run("restore", place / "raw.tif", out, *vibration, *more)
+
+
+def test_options(place, tmp_path):
+    assert restore(place, tmp_path / "out.tif", *OPTIONS) == 0
+    image = read_stack(tmp_path / "out.tif")
+    assert image.shape == (1, 3, 2 * HEIGHT, 2 * WIDTH)
+    error = image[0, :, ::2, ::2].double().numpy() - STILL
+    assert np.sqrt(np.mean(error[:, 12:-12, 12:-12] ** 2)) < 0.05  # sharper than the scene
+    assert np.abs(error[0] - error[1])[12:-12, 12:-12].mean() < 0.01  # grey
+
+
+def test_run_in_windows_with_keys_of_the_configuration(place, tmp_path):
+    assert run("run", place / "raw.tif", tmp_path / "out", "--config", place / "mosaic.toml", "--workers", 1) == 0
+    assert read_stack_info(tmp_path / "out" / "restored.tif").shape == (2, 3, 2 * HEIGHT, 2 * WIDTH)
+    written = read_stack(tmp_path / "out" / "restored.tif")[0, :, ::2, ::2].double().numpy()
+    assert np.sqrt(np.mean((written - STILL)[:, 12:-12, 12:-12] ** 2)) < 0.06
+    assert (tmp_path / "out" / "before_after.png").exists()
+
+
+def test_report_of_a_finer_grid(place, tmp_path):
+    more = ("--scale", 2, "--joint", "all")
+    assert run("report", place / "raw.tif", tmp_path / "out", "--config", place / "camera.toml", *more) == 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "2 x 2 points per px, the input is interpolated" in page
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (("--mosaic", "RGB"), "mosaic must be one of 'RGGB', 'BGGR', 'GRBG', 'GBRG'; got 'RGB'"),
+        (("--mosaic", "RGGB", "--method", "dewarp"), "mosaic goes with method='exact'"),
+        (("--optics-sigma", -1), "sigma must be at least 0, got -1"),
+        (("--optics-sigma", 50), "optics transmit"),
+        (("--optics-sigma", 0.4, "--method", "dewarp"), "optics goes with method='exact'"),
+        (("--scale", 3), "scale must be one of 1, 2; got 3"),
+    ],
+)
+def test_errors(place, tmp_path, capsys, more, message):
+    assert restore(place, tmp_path / "out.tif", *more) == 2
+    shown = capsys.readouterr().err.splitlines()
+    assert len(shown) == 1
+    assert message in shown[0]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('mosaic = "RGB"', "restoration.mosaic: expected 'RGGB' or 'BGGR' or 'GRBG' or 'GBRG', got 'RGB'"),
+        ("optics = {width = 1.0}", "restoration.optics.width: unknown key; expected one of sigma, cutoff, pixel, mtf"),
+        ("optics = {mtf = [[0.2, 0.1], [1.0, 0.5]]}", "the frequencies of mtf must increase"),
+    ],
+)
+def test_errors_in_a_configuration(place, tmp_path, capsys, line, message):
+    (tmp_path / "wrong.toml").write_text(f"{CAMERA}\n[restoration]\n{line}\n")
+    vibration = ("--config", tmp_path / "wrong.toml", "--vibration", place / "found" / "vibration.json")
+    assert run("restore", place / "raw.tif", tmp_path / "out.tif", *vibration) == 2
+    assert message in capsys.readouterr().err

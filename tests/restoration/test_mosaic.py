@@ -1,0 +1,253 @@
+"""Colour mosaics, against a camera that shares no code with the package."""
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from truth import decibel, draw_scene
+
+import rsvib_torch as rsv
+from rsvib_torch.frames.mosaic import colour_frames, colours_of, is_mosaic
+from rsvib_torch.restoration.exact import mosaic
+from rsvib_torch.restoration.scene_model.polynomial_prior import fit_polynomial_prior
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+from benchmarks.finer_camera import BETWEEN, FINER, after_optics, mosaic_of, still_image
+from benchmarks.independent_camera import Shake, closed, take_frames
+
+SIZE, MARGIN, NOISE = 72, 24, 0.003
+SHAKE = Shake(np.array([[3.1], [5.2]]), np.array([[90.0], [61.0]]), np.array([[0.4], [1.3]]), np.zeros(2))
+VIBRATION = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.4, 1.3])
+TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=571)
+
+
+def colour_scene(size=SIZE):
+    """Red, green and blue (3, H, W) on the grid of the camera: one landscape, and two others in the colours."""
+    side = FINER * (size + 2 * MARGIN)
+    grey, first, second = (draw_scene(side, side, seed, blur=2.5) for seed in (5, 6, 7))
+    first, second = 0.3 * (first - first.mean()), 0.2 * (second - second.mean())
+    return np.stack(
+        [after_optics(closed(part, 60), 0.35) for part in (grey + first, grey - 0.3 * first, grey - second)]
+    )
+
+
+def taken(scene, count, shake=SHAKE, size=SIZE):
+    """Noise-free colour frames (T, 3, H, W)."""
+    colours = [
+        take_frames(
+            part,
+            shake,
+            row_time=20.52e-6,
+            exposure_rows=20,
+            frame_rows=571,
+            num_frames=count,
+            size=(size, size),
+            points=FINER,
+            between=BETWEEN,
+        )
+        for part in scene
+    ]
+    return np.stack(colours, 1)
+
+
+def raw(clean, pattern="RGGB"):
+    mosaic = mosaic_of(clean, pattern)
+    return torch.from_numpy(mosaic + NOISE * np.random.default_rng(1).standard_normal(mosaic.shape)).float()
+
+
+def restored(frames, vibration=VIBRATION, timing=TIMING, **options):
+    return rsv.restore(frames, timing, vibration, **{"joint": True, "mosaic": "RGGB", "check": False, **options})
+
+
+def still(scene, scale=1):
+    return np.stack([still_image(part, (SIZE, SIZE), scale) for part in scene])
+
+
+def opencv(frames):
+    """Colour frames by the edge-aware demosaicing of OpenCV."""
+    counts = np.clip(frames.double().numpy() * 50000 + 5000, 0, 65535).round().astype(np.uint16)
+    images = [(cv2.cvtColor(frame, cv2.COLOR_BayerRGGB2RGB_EA).astype(float) - 5000) / 50000 for frame in counts]
+    return torch.from_numpy(np.moveaxis(np.stack(images), -1, 1)).float()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return colour_scene()
+
+
+@pytest.fixture(scope="module")
+def clean(scene):
+    return taken(scene, 6)
+
+
+@pytest.fixture(scope="module")
+def frames(clean):
+    return raw(clean)
+
+
+@pytest.fixture(scope="module")
+def image(frames):
+    return restored(frames, scale=2)[0]
+
+
+def test_frames_together_contain_the_colours_that_each_lacks(scene, frames, image):
+    assert image.shape == (3, 2 * SIZE, 2 * SIZE)
+    each = rsv.restore(opencv(frames), TIMING, VIBRATION, joint=True, check=False)[0]
+    assert decibel(image[:, ::2, ::2], still(scene), 8) > decibel(each, still(scene), 8) + 6
+    assert decibel(image, still(scene, 2), 16) > 40
+    for ours, true in zip(image, still(scene), strict=True):  # flux of each colour
+        assert float(ours[16:-16, 16:-16].mean()) == pytest.approx(true[8:-8, 8:-8].mean(), abs=2e-3)
+
+
+def test_one_frame_is_not_worse_than_demosaicing(scene, frames):
+    one = restored(frames[:1])[0]
+    before = rsv.restore(opencv(frames[:1]), TIMING, VIBRATION, check=False)[0]
+    linear = rsv.restore(colour_frames(frames[:1], "RGGB"), TIMING, VIBRATION, check=False)[0]
+    assert decibel(one, still(scene), 8) > 0.5 + max(decibel(part, still(scene), 8) for part in (before, linear))
+
+
+def test_patterns(scene, clean):
+    truth = still(scene)[:, :40, :40]
+    red, other = (
+        decibel(restored(raw(clean[:2, :, :40, :40], name), mosaic=name)[0], truth, 8) for name in ("RGGB", "GBRG")
+    )
+    wrong = decibel(restored(raw(clean[:2, :, :40, :40], "GBRG"))[0], truth, 8)
+    assert other > red - 2
+    assert wrong < red - 4
+
+
+def test_orientations_and_channel_axes(frames):
+    two = frames[:2, :40, :36]
+    expected = restored(two, scale=2)
+    assert expected.shape == (1, 3, 80, 72)
+    turned = rsv.SensorTiming(20.52e-6, 20, 571, scan_axis="x")
+    swapped = rsv.Vibration([5.2, 3.1], [61.0, 90.0], [1.3, 0.4])
+    across = restored(two.mT[:, None], swapped, turned, scale=2)
+    assert torch.allclose(across.mT, expected, atol=5e-3)  # rounding may change which cosines of a patch are kept
+    reverse = rsv.SensorTiming(20.52e-6, 20, 571, readout_direction="reverse")
+    opposite = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.4, 1.3 + np.pi])
+    down = restored(two.flip(-2), opposite, reverse, mosaic="GBRG", scale=2)
+    assert torch.allclose(down[..., :-1, :], expected.flip(-2)[..., 1:, :], atol=5e-3)
+    last = restored(two[..., None], channels="last", scale=2)
+    assert torch.equal(last.movedim(-1, 1), expected)
+
+
+def test_batches_and_groups_of_frames(frames):
+    part = frames[:3, :32, :32]
+    groups = restored(part, joint=2)
+    assert groups.shape == (3, 3, 32, 32)
+    batch = restored(torch.stack([part.flip(0), part])[:, :, None], joint=2)
+    assert torch.allclose(batch[1], groups, atol=1e-4)
+    assert not torch.allclose(batch[0], groups, atol=1e-2)
+
+
+def test_missing_and_saturated_pixels(scene, frames, image):
+    holes = torch.rand(frames.shape, generator=torch.Generator().manual_seed(2)) < 0.03
+    repaired = restored(frames.masked_fill(holes, torch.nan), scale=2)[0]
+    assert bool(repaired.isfinite().all())
+    assert decibel(repaired, still(scene, 2), 16) > decibel(image, still(scene, 2), 16) - 2.5
+    level = 0.7
+    clipped = frames.clamp(max=level)
+    found = restored(clipped, saturation=level, scale=2)[0].clamp(max=level)
+    naive = restored(clipped, scale=2)[0].clamp(max=level)
+    assert float((clipped == level).double().mean()) > 0.02
+    assert decibel(found, still(scene, 2).clip(max=level), 16) > decibel(naive, still(scene, 2).clip(max=level), 16)
+
+
+def test_image_motion(scene):
+    moving = Shake(SHAKE.amplitude, SHAKE.frequency, SHAKE.phase, np.array([300.0, 0.0]))
+    vibration = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.4, 1.3], [300.0, 0.0])
+    _, shift = rsv.visible_pixels(TIMING, vibration, (SIZE, SIZE), 4)
+    offset = (0, FINER * int(shift[2, 0]))
+    truth = np.stack([still_image(part, (SIZE, SIZE), 1, offset) for part in scene])
+    four = raw(taken(scene, 4, moving))
+    assert decibel(restored(four, vibration)[0], truth, 14) > decibel(restored(four[2:3], vibration)[0], truth, 14) + 3
+
+
+def test_gradients(frames, monkeypatch):
+    part = frames[:2, :32, :32].double()
+    priors, sparse = (
+        [],
+        mosaic.sparse_colours(part[:, None], colours_of("RGGB", 32, 32), part[:, None].repeat(1, 3, 1, 1)),
+    )
+
+    def fit(*arguments):  # priors and interpolated colours are constants
+        priors.append(priors[0] if priors else fit_polynomial_prior(*arguments))
+        return priors[0]
+
+    monkeypatch.setattr(mosaic, "fit_polynomial_prior", fit)
+    monkeypatch.setattr(mosaic, "sparse_colours", lambda *_: sparse)
+
+    def energy(values):
+        return restored(values, noise=0.01).square().mean()
+
+    part.requires_grad_()
+    gradient = torch.autograd.grad(energy(part), part)[0]
+    step = torch.randn(part.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    with torch.no_grad():
+        change = (energy(part + 1e-4 * step) - energy(part - 1e-4 * step)) / 2e-4
+    assert float((gradient * step).sum()) == pytest.approx(float(change), rel=0.05)
+
+
+def test_detection_in_raw_frames():
+    clean = taken(colour_scene(128), 6, size=128)
+    times = torch.linspace(0, 0.04, 200, dtype=torch.float64)
+
+    def error(frames):
+        found = rsv.detect_vibration(frames, TIMING).vibration
+        difference = found.displacement(times) - VIBRATION.displacement(times)
+        return float((difference - difference.mean(0)).square().mean().sqrt())
+
+    frames = raw(clean)
+    assert error(frames) < 0.02  # px; 0.06 without the filter
+    grey = torch.from_numpy(clean.mean(1)).float()
+    assert is_mosaic(frames[0])
+    assert not is_mosaic(grey[0])
+    assert not is_mosaic(torch.randn(64, 64, generator=torch.Generator().manual_seed(1)))
+    column = torch.arange(128)[None, :].expand(128, -1)
+    assert not is_mosaic(torch.sin(2.9 * column).float())  # detail near 1/2 cycle per px
+
+
+def test_the_check_compares_mosaics(frames):
+    with pytest.warns(rsv.RestorationWarning):
+        rsv.restore(frames[:2], TIMING, rsv.Vibration([3.1, 5.2], [90.0, 61.0], [3.5, 4.4]), joint=True, mosaic="RGGB")
+    rsv.restore(frames[:2], TIMING, VIBRATION, joint=True, mosaic="RGGB")
+
+
+def test_stacks_in_windows(tmp_path):
+    scene = colour_scene(128)
+    frames = raw(taken(scene, 6, size=128)).clamp(0, 1)
+    rsv.write_stack(tmp_path / "raw.tif", frames, dtype="uint16", full_scale=65535)
+    options = {"joint": True, "scale": 2, "mosaic": "RGGB"}
+    rsv.process_stack(tmp_path / "raw.tif", tmp_path / "out.tif", TIMING, restoration=options, force=True)
+    written = rsv.read_stack(tmp_path / "out.tif")
+    assert written.shape == (1, 3, 256, 256)
+    truth = np.stack([still_image(part, (128, 128), 2) for part in scene])
+    assert decibel(written[0].clamp(0, 1), truth, 24) > 45
+    # nothing moves: the middle frame is interpolated
+    same = frames[:1].repeat(4, 1, 1) + NOISE * torch.randn(4, 128, 128, generator=torch.Generator().manual_seed(1))
+    rsv.write_stack(tmp_path / "still.tif", same.clamp(0, 1), dtype="uint16", full_scale=65535)
+    rsv.process_stack(tmp_path / "still.tif", tmp_path / "same.tif", TIMING, restoration=options)
+    written, stored = rsv.read_stack(tmp_path / "same.tif"), rsv.read_stack(tmp_path / "still.tif")
+    assert written.shape == (1, 3, 256, 256)
+    assert torch.allclose(written[0, 0, ::4, ::4], stored[2, ::2, ::2], atol=1e-4)  # red is measured there
+    assert torch.allclose(written[0, 2, 2::4, 2::4], stored[2, 1::2, 1::2], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "message"),
+    [
+        (lambda frames: frames[:, 1:], {}, "repeats every 2 x 2 px, but frames have 71 x 72 px"),
+        (lambda frames: frames[:, None].repeat(1, 3, 1, 1), {}, "but frames have 3 channels"),
+        (lambda frames: frames, {"mosaic": "RGBG"}, "mosaic must be one of 'RGGB'"),
+        (lambda frames: frames, {"method": "dewarp", "joint": None}, "mosaic goes with method='exact'"),
+        (lambda frames: frames, {"prior": "edges"}, "mosaic has prior='gaussian' only"),
+    ],
+)
+def test_errors(frames, change, options, message):
+    given = {name: value for name, value in {"mosaic": "RGGB", **options}.items() if value is not None}
+    with pytest.raises(ValueError, match=message):
+        rsv.restore(change(frames), TIMING, VIBRATION, **given)
