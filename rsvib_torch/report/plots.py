@@ -40,7 +40,7 @@ from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve
-from rsvib_torch.restoration import RestorationVerdict
+from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
 
 __all__ = [
     "axis_offset_figure",
@@ -706,6 +706,24 @@ def _curve_figure(curve: MtfCurve) -> Figure:
     return mtf_figure({f"MTF50 {measured_text(curve.mtf50, curve.mtf50_std)} cycles/px": [curve]})
 
 
+def _restoration_mtf_figure(result: RestorationMtf) -> Figure:
+    figure = _Drawing(figsize=(5.6, 3.9), layout="constrained")
+    panel = figure.subplots()
+    frequency = result.frequency.cpu().numpy()
+    for name, values, limit in zip("xy", result.mtf.cpu().numpy(), result.resolution.tolist(), strict=True):
+        label = f"{name}: 0.5 at {limit:.2f} cycles/px"
+        panel.plot(frequency, values, color=_AXIS_COLOURS[name], linewidth=2.0, label=label)
+    panel.axhline(0.5, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
+    panel.axvline(0.5, color=_GREY, linewidth=0.8, linestyle=":", zorder=0)  # Nyquist frequency of the frames
+    panel.set_xlim(0, float(frequency[-1]))
+    panel.set_ylim(0, max(1.05, panel.get_ylim()[1]))
+    panel.set_xlabel("spatial frequency (cycles/px)")
+    panel.set_ylabel("MTF of the restoration")
+    panel.legend(title=f"noise gain {result.noise_gain:.2f}", fontsize=9, frameon=False)
+    plain_axes(panel)
+    return figure
+
+
 def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
     """Draw the measured offsets of each axis, with error bars of one standard deviation if they are known."""
     figure = _Drawing(figsize=(13, 4.2), layout="constrained")
@@ -794,6 +812,7 @@ FIGURES.update(
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,
         (MtfCurve, 0): _curve_figure,
+        (RestorationMtf, 0): _restoration_mtf_figure,
         (OffsetCurve, 0): _measured_offsets_figure,
         (RestorationVerdict, 0): verdict_figure,
     }

@@ -1,12 +1,14 @@
 from .frame_motion import visible_pixels
 from .noise.high_pass import estimate_noise
 from .noise_gain import predict_noise_gain
+from .restoration_mtf import RestorationMtf, restoration_mtf
 from .restore import VibrationRestorer, restore
 from .verdict.judge import RestorationVerdict, RestorationWarning, judge_restoration
 from .verdict.pairs import TooLittleInCommonError
 from .verdict.trust import displacement_uncertainty, trusted_vibration
 
 __all__ = [
+    "RestorationMtf",
     "RestorationVerdict",
     "RestorationWarning",
     "TooLittleInCommonError",
@@ -15,6 +17,7 @@ __all__ = [
     "estimate_noise",
     "judge_restoration",
     "predict_noise_gain",
+    "restoration_mtf",
     "restore",
     "trusted_vibration",
     "visible_pixels",

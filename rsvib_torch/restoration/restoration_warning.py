@@ -1,6 +1,9 @@
 """The warning of restoration."""
 
-__all__ = ["RestorationWarning"]
+import sys
+import warnings
+
+__all__ = ["RestorationWarning", "warn_of_restoration"]
 
 
 class RestorationWarning(UserWarning):
@@ -20,3 +23,12 @@ class RestorationWarning(UserWarning):
         >>> caught[0].category.__name__
         'RestorationWarning'
     """
+
+
+def warn_of_restoration(message: str) -> None:
+    """Raise a ``RestorationWarning`` that refers to the line of the caller of the package."""
+    package = __name__.partition(".")[0]
+    frame, level = sys._getframe(), 1
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == package:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, RestorationWarning, stacklevel=level)

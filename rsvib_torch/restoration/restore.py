@@ -1,7 +1,6 @@
 """Restoration of frames: input preparation, one of the methods, and a check of the result."""
 
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Required, TypedDict, Unpack, overload
@@ -31,9 +30,10 @@ from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact.exact import restore_exact
 from rsvib_torch.restoration.field_motion import judged_strip, restore_in_strips
+from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
 from rsvib_torch.restoration.sharpening import check_optics, sharpened
-from rsvib_torch.restoration.verdict.judge import RestorationWarning, judge_frames
+from rsvib_torch.restoration.verdict.judge import judge_frames
 from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError, pairs_to_judge
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
@@ -238,7 +238,7 @@ def restore(
     _, count, _, height, _ = prepared.images.shape
     vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
     for note in left_alone:
-        warnings.warn(note, RestorationWarning, stacklevel=5)  # the caller, above three decorators
+        warn_of_restoration(note)
     if left_alone and not bool(vibration.moving_axes().any()):
         return unchanged_frames(prepared, options.get("joint", False), options.get("scale", 1))
     restored = restore_prepared(prepared, vibration, method, options)
@@ -332,7 +332,7 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Motion, 
         if verdict.overall in ("partly", "worse"):
             where = f"stack {stack}: " if len(raw) > 1 else ""
             summary = verdict.in_image_axes(frames.image_timing).sentence
-            warnings.warn(f"{where}{summary}", RestorationWarning, stacklevel=6)  # the caller of ``restore``
+            warn_of_restoration(f"{where}{summary}")
 
 
 class VibrationRestorer(nn.Module):

@@ -3,8 +3,6 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-import math
-import warnings
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,13 +16,13 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.exact.filling import fill_beyond_ends, fill_missing, measured_values
+from rsvib_torch.restoration.exact.finer_scene import Misfit, finer_scene, warn_of_frames
 from rsvib_torch.restoration.exact.mosaic import restore_mosaic
 from rsvib_torch.restoration.exact.priors import PRIORS, PriorOptions
 from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem
 from rsvib_torch.restoration.exact.strength import Strengths, prior_strength
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise.policy import noise_levels
-from rsvib_torch.restoration.restoration_warning import RestorationWarning
 from rsvib_torch.restoration.scene_model.finer_rows import SCALE, FinerObservation, finer_kernels
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels, row_kernels
 from rsvib_torch.restoration.scene_model.polynomial_prior import PolynomialPrior, fit_polynomial_prior
@@ -151,7 +149,7 @@ def restore_exact(
         measured = groups if missing is None else _without_empty_frames(groups, missing[index])
         scenes += [(stack, *group, factor * stack.strength(*group, strengths, certain=certain)) for group in measured]
 
-    residuals: list[float] = []
+    misfits: list[Misfit] = []
 
     def restored(number: int, partition: Partition) -> Tensor:
         stack, members, reference, strength = scenes[number]
@@ -159,30 +157,31 @@ def restore_exact(
         if scale == 1:
             scene = PRIORS[prior](problem, PriorOptions(factor))
         else:
-            solver = problem.solver()
-            coefficients = solver.fit(problem.data)
-            scene = solver.scene(coefficients)
-            residuals.append(_residual(problem, solver.predict(coefficients.detach()), W))
+            scene, misfit = finer_scene(problem, W)
+            misfits.append(misfit)
         return scene[..., : scale * W] + stack.mean
 
-    count = len(scenes)
+    def check_frames() -> None:
+        if scale != 1:
+            warn_of_frames(misfits, (stack.places(members) for stack, members, _, _ in scenes))
+
     if torch.is_grad_enabled() and (frames.requires_grad or displacement.requires_grad):
         partition = Partition(chunk, split)
-        images = torch.stack([restored(number, partition) for number in range(count)])
-        _warn_of_frames(scenes, residuals)
+        images = torch.stack([restored(number, partition) for number in range(len(scenes))])
+        check_frames()
         return images.view(B, -1, *images.shape[1:])
-    images = frames.new_empty(count, C, scale * H, scale * W)
-    threads = min(Partition.threads(frames.device), count)
-    advance = steps(count, "frames")
+    images = frames.new_empty(len(scenes), C, scale * H, scale * W)
+    threads = min(Partition.threads(frames.device), len(scenes))
+    advance = steps(len(scenes), "frames")
 
     def share(thread: int) -> None:
         partition = Partition(chunk, split)
-        for number in range(thread, count, threads):
+        for number in range(thread, len(scenes), threads):
             images[number] = restored(number, partition)
             advance()
 
     in_parallel(share, range(threads), frames.device)
-    _warn_of_frames(scenes, residuals)
+    check_frames()
     return images.view(B, -1, *images.shape[1:])
 
 
@@ -230,6 +229,10 @@ class _Stack:
         make = row_kernels if self.scale == 1 else finer_kernels
         return make(moved, self.node_weights, self.weights[members], self.frames.shape[-2], 16)
 
+    def places(self, members: list[int]) -> Tensor:
+        """Mean displacement (M, R, 2) of the rows of some frames."""
+        return (self.displacement[members].detach() * self.node_weights[:, None]).sum(-2)
+
     def strength(self, members: list[int], reference: int, strengths: Strengths, *, certain: bool) -> float:
         """Factor on the prior, estimated from those frames whose columns are the same as in the restored one."""
         if isinstance(self.prior, PolynomialPrior):
@@ -275,50 +278,6 @@ class _Stack:
 
 
 _Scene = tuple[_Stack, list[int], int, float]  # stack, its frames, the restored one, factor on the prior
-
-
-@torch.no_grad()
-def _residual(problem: SceneProblem, predicted: Tensor, width: int) -> float:
-    """Residual of frames of ``width`` px (rms) in units of their noise, without the ends of rows and columns."""
-    weight, rows = problem.observation.kernels.weight, problem.data.shape[-2]
-    inner = slice(min(16, rows // 4), -min(16, rows // 4)), slice(min(16, width // 4), width - min(16, width // 4))
-    power = (problem.data - predicted)[..., *inner].square().mean((1, 3)) * weight[:, inner[0]]
-    return float((power.mean() / weight[:, inner[0]].mean()).sqrt() / problem.level)
-
-
-def _warn_of_frames(scenes: list[_Scene], residuals: list[float], *, most: float = 1.5, least: float = 0.1) -> None:
-    """Warn if frames on a finer grid do not fit their model, or do not sample between each other's pixels.
-
-    Args:
-        scenes: The scenes.
-        residuals: Residual of each in units of the noise; none with ``scale=1``.
-        most: Residual. With the true motion it is 0.4 to 0.97, with an error of the phases of 0.05 rad 2.0 to 4.3 at
-            noise 0.002 and 0.005 (amplitudes 3 and 5 px, 2 to 8 frames).
-        least: Of ``1 - |mean exp(2 pi i x)|^2``, the factor on the information on aliased detail; x the displacements
-            of a row in the frames. 0.5 on average for two frames, more for several.
-    """
-    if not residuals:
-        return
-    if max(residuals) > most:
-        warnings.warn(
-            f"the frames differ from their model by {max(residuals):.1f} times the noise: the vibration is not "
-            "accurate enough for scale=2, or the scene changes between the frames; detail between the pixels may be "
-            "false",
-            RestorationWarning,
-            stacklevel=2,
-        )
-    spread = []
-    for stack, members, _, _ in scenes:
-        place = (stack.displacement[members].detach() * stack.node_weights[:, None]).sum(-2)  # (M, R, 2)
-        mean = torch.polar(torch.ones_like(place), 2 * math.pi * place).mean(0).abs()
-        spread.append((1 - mean.square()).mean(0))
-    if bool((torch.stack(spread).median(0).values < least).any()):
-        warnings.warn(
-            "the frames of a scene sample the same points of it along at least one axis: scale=2 cannot separate "
-            "detail beyond half a cycle per px from its alias there; restore more vibrating frames jointly",
-            RestorationWarning,
-            stacklevel=2,
-        )
 
 
 def scene_period(width: int, reach: int, displacement: Tensor) -> int:
