@@ -33,7 +33,15 @@ from rsvib_torch.restoration.verdict.judge import RestorationWarning, judge_fram
 from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError, pairs_to_judge
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
-__all__ = ["METHODS", "RestorationMethod", "VibrationRestorer", "restore", "restore_prepared", "unchanged_frames"]
+__all__ = [
+    "METHODS",
+    "RestorationMethod",
+    "VibrationRestorer",
+    "check_method_options",
+    "restore",
+    "restore_prepared",
+    "unchanged_frames",
+]
 
 
 class CommonOptions(TypedDict, total=False):
@@ -105,7 +113,7 @@ METHODS: dict[str, RestorationMethod] = {
 }
 
 
-def _check_options(method: str, options: Mapping[str, Any]) -> None:
+def check_method_options(method: str, options: Mapping[str, Any]) -> None:
     """Refuse a method that does not exist, and options that the method does not have or that have another type."""
     valid = method_options(method)
     for name in options:
@@ -210,7 +218,7 @@ def restore(
         taken [23.0, 24.0] dB
         restored [62.0, 63.0] dB
     """
-    _check_options(method, options)
+    check_method_options(method, options)
     timing = timing_of_files(frames, timing)
     frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(
@@ -245,7 +253,7 @@ def restore_prepared(
         Restored frames (B, T, C, H, W) in row order.
     """
     options = dict(options or {})
-    _check_options(method, options)
+    check_method_options(method, options)
     chosen = METHODS[method]
     masks = {"ignore": frames.missing, "clipped": frames.saturated}
     options |= {name: masks[name] for name in chosen.masks if masks[name] is not None}
@@ -365,7 +373,7 @@ class VibrationRestorer(nn.Module):
         **options: Any,
     ) -> None:
         super().__init__()
-        _check_options(method, options)
+        check_method_options(method, options)
         self.timing = timing
         common = {"full_scale": full_scale, "channels": channels, "saturation": saturation, "check": check}
         self.options = {"method": method, **common, **options}

@@ -1,0 +1,3 @@
+from .tracker import TrackedFrame, VibrationTracker
+
+__all__ = ["TrackedFrame", "VibrationTracker"]
