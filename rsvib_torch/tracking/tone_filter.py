@@ -24,7 +24,7 @@ __all__ = ["PROCESS_NOISE", "ToneFilter"]
 
 # Random walk of g and 2 pi f in rad/s per square root of a second, and of a in px/s^2 per square root of a second.
 # A tone that sweeps by 2 Hz/s changes by 12.6 rad/s in a second; a tone that grows to twice its amplitude has 0.7 / s.
-PROCESS_NOISE = ((0.02, 3.0), (0.5, 60.0), (12.0, 1200.0))
+PROCESS_NOISE = ((0.02, 200.0), (0.5, 200.0), (12.0, 1200.0))
 _STAY = 0.95  # probability that the process noise of the next frame is the same
 
 
@@ -70,7 +70,8 @@ class ToneFilter:
             return values[:, None].expand(-1, models, *values.shape[1:]).clone()
 
         rates = torch.complex(torch.zeros_like(frequencies), 2 * math.pi * frequencies)
-        probability = torch.full((len(std), models), 1 / models, dtype=std.dtype, device=std.device)
+        probability = torch.full((len(std), models), (1 - _STAY) / (models - 1), dtype=std.dtype, device=std.device)
+        probability[:, 0] = _STAY
         covariance = torch.diag_embed(std.square())
         return cls(time, *map(repeated, (coefficients, rates, drift, covariance)), probability, exposure_time)
 
@@ -99,13 +100,18 @@ class ToneFilter:
 
     # Prediction
 
-    def predicted(self, time: float) -> Self:
-        """The filter at a later reference time, with the process noise added."""
-        mixed, step = self._mixed(), time - self.time
-        factor = (mixed.rates * step).exp()
-        moved = mixed.coefficients * factor
-        tones, size = self.tones, mixed.covariance.shape[-1]
-        transition = torch.eye(size, dtype=torch.float64, device=moved.device).expand_as(mixed.covariance).clone()
+    def predicted(self, time: float, *, mixed: bool = True) -> Self:
+        """The filter at another reference time, with the process noise added.
+
+        Args:
+            time: s.
+            mixed: Whether the process noise may change in between.
+        """
+        before, step = self._mixed() if mixed else self, time - self.time
+        factor = (before.rates * step).exp()
+        moved = before.coefficients * factor
+        tones, size = self.tones, before.covariance.shape[-1]
+        transition = torch.eye(size, dtype=torch.float64, device=moved.device).expand_as(before.covariance).clone()
         noise = torch.zeros_like(transition)
         walk, jerk = torch.tensor(PROCESS_NOISE, dtype=torch.float64, device=moved.device).square().unbind(-1)
         for tone in range(tones):
@@ -121,13 +127,13 @@ class ToneFilter:
         transition[..., -2, -1] = step
         of_drift = noise.new_tensor([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
         noise[..., -2:, -2:] = jerk[:, None, None] * of_drift
-        velocity, acceleration = mixed.drift.unbind(-1)
+        velocity, acceleration = before.drift.unbind(-1)
         return replace(
-            mixed,
+            before,
             time=time,
             coefficients=moved,
             drift=torch.stack([velocity + step * acceleration, acceleration], -1),
-            covariance=transition @ mixed.covariance @ transition.mT + noise,
+            covariance=transition @ before.covariance @ transition.mT + noise,
         )
 
     def _mixed(self) -> Self:
@@ -158,11 +164,8 @@ class ToneFilter:
             origin: Time origin of the measurements in s.
             noise_factor: (A,) factor of the variance of the offsets, see ``VibrationTracker``.
         """
-        middles = measurements.exposure_starts[0] + (0.5 * self.exposure_time + origin - self.time)  # (N, 2)
-        offsets = (measurements.displacements[0, :, 1] - measurements.displacements[0, :, 0]).T  # (A, N)
+        jacobian, residual = self._linearised(measurements, origin)
         weights = 0.5 * measurements.weights[0].T * (measurements.num_differences[0] > 0)  # (A, N) of an offset
-        jacobian, expected = self._jacobian(middles)
-        residual = offsets[:, None] - expected  # (A, M, N)
         weights = self._robust(jacobian, residual, weights) / noise_factor[:, None]
         weighted = jacobian * weights[:, None, :, None]
         normal, right = weighted.mT @ jacobian, (weighted.mT @ residual[..., None])[..., 0]
@@ -181,6 +184,19 @@ class ToneFilter:
         return self._with_values(
             self._values() + step, posterior, probability / probability.sum(-1, keepdim=True)
         )
+
+    def residual(self, measurements: Measurements, origin: float) -> Tensor:
+        """(1, N, 2, A) px, displacements of the rows of two frames relative to their mean, less those of the filters."""
+        _, residual = self._linearised(measurements, origin)
+        mean = (self.probability[..., None] * residual).sum(1).T
+        return measurements.relative(torch.stack([-0.5 * mean, 0.5 * mean], 1)[None])
+
+    def _linearised(self, measurements: Measurements, origin: float) -> tuple[Tensor, Tensor]:
+        """Derivatives (A, M, N, P) of the offsets between two frames, and their residuals (A, M, N) in px."""
+        middles = measurements.exposure_starts[0] + (0.5 * self.exposure_time + origin - self.time)  # (N, 2)
+        offsets = (measurements.displacements[0, :, 1] - measurements.displacements[0, :, 0]).T  # (A, N)
+        jacobian, expected = self._jacobian(middles)
+        return jacobian, offsets[:, None] - expected
 
     def _jacobian(self, middles: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives (A, M, N, P) of the offsets by the parameters, and the offsets (A, M, N), at times (N, 2)."""
@@ -230,9 +246,17 @@ class ToneFilter:
         drift = (self.probability[..., None] * self.drift).sum(1)
         return step * drift[:, 0] + 0.5 * step**2 * drift[:, 1]
 
-    def as_fit(self, origin: float) -> ToneFit:
-        """The mean of all filters as a fit whose time origin is ``origin`` in s; the growth is left out."""
-        values, covariance = self._moments(self.probability[..., None])
+    def as_fit(self, origin: float, *, most_probable: bool = False) -> ToneFit:
+        """The mean of all filters, or the most probable one of each axis, as a fit; the growth is left out.
+
+        Args:
+            origin: Time origin of the fit in s.
+            most_probable: Whether to leave out the other filters.
+        """
+        weight = self.probability
+        if most_probable:
+            weight = (weight == weight.amax(-1, keepdim=True)).to(weight)
+        values, covariance = self._moments((weight / weight.sum(-1, keepdim=True))[..., None])
         tones = values[:, 0, :-2].unflatten(-1, (-1, 4))
         place = torch.arange(values.shape[-1], device=values.device)
         keep = (place % 4 != 2) | (place >= 4 * self.tones)

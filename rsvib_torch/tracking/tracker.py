@@ -60,9 +60,12 @@ __all__ = ["TrackedFrame", "TrackingState", "VibrationTracker"]
 
 TrackingState = Literal["searching", "tracking", "unusable"]
 
-_MAX_PREDICTED_STD = 0.3  # px; gradients of rows reach a few tenths of a pixel
+_MAX_PREDICTED_STD = 0.5  # px; the gradients of rows reach a few tenths of a pixel, and there are several rounds
+_MAX_CHANGE = 0.2  # px, by which a round may change the displacement of a row; otherwise the frame is measured again
+_MAX_ROUNDS = 3
 _MAX_PATH = 4.0  # px; the scene may move so far before its gradients are computed again
 _MAX_AGE = 30  # frames; then gradients are computed again, because the scene may have changed
+_DRIFT_STD = (10.0, 500.0)  # px/s and px/s^2, at the start; tones and drift are correlated, their sum is more accurate
 _MAX_WAIT = 8  # windows from one attempt to detect the vibration to the next
 _PATIENCE = 3  # consecutive frames that contradict the tones, before the vibration is detected again
 
@@ -276,7 +279,8 @@ class VibrationTracker:
         fit = state.as_fit(centre)
         starts = torch.tensor([before.start, time], dtype=torch.float64, device=grey.device) - centre
         rows = self._row_starts(height, grey.device)
-        uncertain = displacement_std(fit, starts[1] + rows, self._rows.exposure_time)
+        likely = state.as_fit(centre, most_probable=True)
+        uncertain = displacement_std(likely, starts[1] + rows, self._rows.exposure_time)
         if not float(uncertain.amax()) < _MAX_PREDICTED_STD:
             self._filter = self._verdict = None
             return
@@ -287,19 +291,38 @@ class VibrationTracker:
         gradients, age, anchor = before.gradients, before.age + 1, path if before.path is None else before.path
         if age > _MAX_AGE or float((path - anchor).abs().amax()) > _MAX_PATH:
             gradients, age, anchor = None, 0, path
-        motion = _displaced(motion_of_fit(fit), (path - anchor)[None])
-        measurements, gradients = measure_group(group, self._rows, motion, gradients)
         gain = offset_gain(fit.frequencies, (starts[1] - starts[0])[None])[0] * fit.active[0]
         # neighbouring pairs share a frame: after many pairs, the variance of a tone is gain^2 / 2 times that of
         # independent offsets
         noise_factor = (0.5 * gain.amax(-1).square()).clamp(min=1.0)
-        corrected = state.updated(measurements, centre, noise_factor)
+        for _ in range(_MAX_ROUNDS):
+            motion = _displaced(motion_of_fit(fit), (path - anchor)[None])
+            measurements, gradients = measure_group(group, self._rows, motion, gradients)
+            corrected = state.updated(measurements, centre, noise_factor)
+            fit = corrected.as_fit(centre)
+            change = model_displacements(measurements, fit) - measurements.relative(
+                motion.mean_displacement(measurements.exposure_starts, self._rows.exposure_time)
+            )
+            if float(change.abs().amax()) < _MAX_CHANGE:
+                break
+            path, gradients = previous - corrected.path(-step), None
+            age, anchor = 0, path
         self._path, self._filter = previous - corrected.path(-step), corrected
         self._reference = _Reference(spectra, time, gradients, anchor, age)
-        self._verdict = self._judged(corrected.as_fit(time), measurements, gradients, centre - time)
+        residual = corrected.residual(measurements, centre)
+        self._verdict = self._judged(self._at_middle(time, height).as_fit(time), measurements, residual, gradients, centre - time)
         contradicted = any(self._verdict.contradicted)
         self._contradictions = self._contradictions + 1 if contradicted else 0
         self._trusted.append(self._verdict.reliable)
+
+    def _half(self, height: int) -> float:
+        """Time in s from the exposure start of a frame to its middle."""
+        return 0.5 * ((height - 1) * self._rows.row_time + self._rows.exposure_time)
+
+    def _at_middle(self, time: float, height: int) -> ToneFilter:
+        """The state at the middle of a frame that starts at ``time`` in s."""
+        assert self._filter is not None
+        return self._filter.predicted(time + self._half(height), mixed=False)
 
     def _spectra(self, grey: Tensor, valid: Tensor | None) -> RowSpectra:
         mask = None if valid is None else valid[..., self._columns]
@@ -310,11 +333,10 @@ class VibrationTracker:
         return torch.arange(0, height, step, dtype=torch.float64, device=device) * self._rows.row_time
 
     def _judged(
-        self, fit: ToneFit, measurements: Measurements, gradients: RowGradients, shift: float
+        self, fit: ToneFit, measurements: Measurements, residual: Tensor, gradients: RowGradients, shift: float
     ) -> _Verdict:
         """Verdict on the tones by the rows of one pair; the time origin moves by ``shift`` s to that of the fit."""
         measurements = replace(measurements, exposure_starts=measurements.exposure_starts + shift)
-        residual = residual_of(measurements, fit)
         visible = measurements.num_differences > 0
         measured = (visible & (measurements.weights > 0).any(-1)).double().sum(1) / visible.double().sum(1).clamp(min=1)
         tones = measurements.relative(
@@ -374,28 +396,39 @@ class VibrationTracker:
             ignore = torch.cat([~one if one is not None else torch.zeros_like(masks[-1]) for one in masks], 1)[0]
         with suppress(ValueError):  # too few bands are registered: the next frames may be better
             stack = torch.cat(frames, 1)[0]
-            self._start(
-                detect_vibration(
-                    stack, timing, window=len(times), columns=self.columns, ignore=ignore, roll=False, zoom=False
-                )[0],
-                middle,
-            )
+            found = detect_vibration(
+                stack,
+                timing,
+                image_acceleration=len(times) > 2,
+                window=len(times),
+                columns=self.columns,
+                ignore=ignore,
+                roll=False,
+                zoom=False,
+            )[0]
+            if self._filter is None or bool(found.reliable.any()):
+                self._start(found, middle)
 
     def _start(self, found: DetectionResult, middle: float) -> None:
         """Start the filter with tones at the time ``middle`` (s); they follow the last frame."""
         vibration, std = found.vibration, found.std
-        amplitude = vibration.amplitude * found.reliable[:, None]
+        record = self._last[-1][2] - self._last[0][2]
+        # a record does not distinguish a tone of less than one period from a drift, and its amplitude is not known
+        slow = vibration.frequency * record < 1.0
+        tones = torch.polar(vibration.amplitude, vibration.phase - 0.5 * math.pi) * found.reliable[:, None]
+        rate = 2j * math.pi * vibration.frequency
+        drift = torch.stack([vibration.image_motion, vibration.image_acceleration], -1)
+        drift = drift + torch.stack([(tones * rate).real, (tones * rate.square()).real], -1).mul(slow[..., None]).sum(1)
+        tones = tones * ~slow
         tone_std = [std.amplitude, std.amplitude, torch.full_like(std.amplitude, 0.5), 2 * math.pi * std.frequency]
         # the last frame is measured again
-        tone_std = torch.where((amplitude > 0)[..., None], 2.0 * torch.stack(tone_std, -1), 0.0).flatten(-2)
-        drift = torch.stack([vibration.image_motion, torch.zeros_like(vibration.image_motion)], -1)
-        drift_std = torch.stack([2.0 * std.image_motion + 1.0, torch.full_like(std.image_motion, 100.0)], -1)
+        tone_std = torch.where((tones.abs() > 0)[..., None], 2.0 * torch.stack(tone_std, -1), 0.0).flatten(-2)
         self._filter = ToneFilter.started(
             middle,
-            torch.polar(amplitude, vibration.phase - 0.5 * math.pi),
+            tones,
             vibration.frequency,
             drift,
-            torch.cat([tone_std, drift_std], -1),
+            torch.cat([tone_std, tone_std.new_tensor(_DRIFT_STD).expand(2, -1)], -1),
             self._rows.exposure_time,
         )
         (grey, valid, time), last = self._last[-2], self._last[-1]
@@ -413,8 +446,8 @@ class VibrationTracker:
         if self._filter is None or self._verdict is None:
             return self._unchanged(prepared, time, "searching", detected)
         height = prepared.images.shape[-2]
-        half = 0.5 * ((height - 1) * self._rows.row_time + self._rows.exposure_time)
-        fit = self._filter.predicted(time + half).as_fit(time + half)
+        half = self._half(height)
+        fit = self._at_middle(time, height).as_fit(time + half)
         motion = motion_of_fit(fit)
         trusted = torch.stack(list(self._trusted)).any(0)
         motion = Vibration(
