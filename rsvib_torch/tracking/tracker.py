@@ -44,8 +44,8 @@ from rsvib_torch.detection.tones.fit import (
     vibration_of_fit,
 )
 from rsvib_torch.detection.tones.selection import MAX_TONES
-from rsvib_torch.frames.arrays import ArrayLike, Channels
-from rsvib_torch.frames.orientation import offsets_from_row_order
+from rsvib_torch.frames.arrays import ArrayLike, Channels, as_tensor
+from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.motion.timing import SensorTiming
@@ -53,7 +53,7 @@ from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.row_spectra import RowSpectra
 from rsvib_torch.restoration.frame_motion import visible_pixels
-from rsvib_torch.restoration.restore import check_method_options, restore_prepared, unchanged_frames
+from rsvib_torch.restoration.restore import METHODS, check_method_options, restore_prepared, unchanged_frames
 from rsvib_torch.tracking.tone_filter import ToneFilter
 
 __all__ = ["TrackedFrame", "TrackingState", "VibrationTracker"]
@@ -75,24 +75,31 @@ class TrackedFrame:
     """Result of ``VibrationTracker.update``.
 
     Attributes:
-        restored: The frame with vibration, skew and wobble removed, in the shape of the frame; as taken if no vibration
-            is known.
         time: s, exposure start of its first row.
         latency: Number of frames that were given after this one.
-        state: ``"tracking"``: the vibration is known; ``"searching"``: it is not, or the rows contradict it;
+        state: ``"tracking"``: the motion is known; ``"searching"``: it is not, or the rows contradict it;
             ``"unusable"``: the frame is constant, or a copy of the frame before.
-        motion: The motion that was removed, in image axes; its time origin is the middle of the frame.
+        motion: The motion to remove, in image axes; its time origin is the middle of the frame. Axes whose vibration is
+            not reliable are still.
         detected: Whether ``detect_vibration`` was called for this frame.
     """
 
-    restored: Tensor
     time: float
     latency: int
     state: TrackingState
     motion: Vibration
     detected: bool
+    _restore: Callable[[], Tensor] = field(repr=False)
     _result: Callable[[], DetectionResult | None] = field(repr=False)
     _visible: Callable[[], Tensor] = field(repr=False)
+
+    @cached_property
+    def restored(self) -> Tensor:
+        """The frame without the motion, in its shape; as taken if no motion is known. Computed at the first use.
+
+        Another thread may use it while the next frame is tracked.
+        """
+        return self._restore()
 
     @cached_property
     def detection(self) -> DetectionResult | None:
@@ -232,7 +239,11 @@ class VibrationTracker:
         """
         time = self._checked_time(time)
         prepared = prepare_frames(
-            as_stack(frame), self.timing, full_scale=self.full_scale, channels=self.channels, saturation="auto"
+            as_tensor("frame", frame)[None],
+            self.timing,
+            full_scale=self.full_scale,
+            channels=self.channels,
+            saturation="auto" if "clipped" in METHODS[self.method].masks else None,
         )
         grey = prepared.filled.mean(2)
         valid = None if prepared.missing is None else ~prepared.missing.any(2)
@@ -297,7 +308,7 @@ class VibrationTracker:
         noise_factor = (0.5 * gain.amax(-1).square()).clamp(min=1.0)
         for _ in range(_MAX_ROUNDS):
             motion = _displaced(motion_of_fit(fit), (path - anchor)[None])
-            measurements, gradients = measure_group(group, self._rows, motion, gradients)
+            measurements, found = measure_group(group, self._rows, motion, gradients)
             corrected = state.updated(measurements, centre, noise_factor)
             fit = corrected.as_fit(centre)
             change = model_displacements(measurements, fit) - measurements.relative(
@@ -308,9 +319,9 @@ class VibrationTracker:
             path, gradients = previous - corrected.path(-step), None
             age, anchor = 0, path
         self._path, self._filter = previous - corrected.path(-step), corrected
-        self._reference = _Reference(spectra, time, gradients, anchor, age)
+        self._reference = _Reference(spectra, time, found, anchor, age)
         residual = corrected.residual(measurements, centre)
-        self._verdict = self._judged(self._at_middle(time, height).as_fit(time), measurements, residual, gradients, centre - time)
+        self._verdict = self._judged(self._at_middle(time, height).as_fit(time), measurements, residual, found, centre - time)
         contradicted = any(self._verdict.contradicted)
         self._contradictions = self._contradictions + 1 if contradicted else 0
         self._trusted.append(self._verdict.reliable)
@@ -461,17 +472,17 @@ class VibrationTracker:
         motion = _displaced(motion, apart[None]).from_row_order(self.timing)[0]
         timing = replace(self.timing, frame_start_times=(-half,))
         framed = replace(prepared, timing=timing.in_row_order(), image_timing=timing)
-        restored = restore_prepared(framed, motion, self.method, self.options)
+        method, options = self.method, self.options
         size = (height, prepared.images.shape[-1]) if self.timing.scan_axis == -2 else (prepared.images.shape[-1], height)
         state: TrackingState = "searching" if self._contradictions >= _PATIENCE else "tracking"
         verdict = self._verdict
         return TrackedFrame(
-            framed.from_row_order(restored)[0],
             time,
             0,
             state,
             motion,
             detected,
+            lambda: framed.from_row_order(_restored(framed, motion, method, options))[0],
             lambda: self._detection(verdict, height),
             lambda: visible_pixels(timing, motion, size, 1)[0][0],
         )
@@ -496,12 +507,19 @@ class VibrationTracker:
     def _unchanged(
         self, prepared: PreparedFrames, time: float, state: TrackingState, detected: bool = False
     ) -> TrackedFrame:
-        images = unchanged_frames(prepared, joint=False)[0]
-        still = Vibration.still(device=images.device)
-        size = images.shape[-2:] if prepared.channel_axis == -3 or images.ndim == 2 else images.shape[:2]
+        def visible() -> Tensor:
+            mask = torch.ones_like(prepared.images[0, 0, :1], dtype=torch.bool)
+            return frames_from_row_order(mask, self.timing)[0]
+
         return TrackedFrame(
-            images, time, 0, state, still, detected, lambda: None,
-            lambda: torch.ones(size, dtype=torch.bool, device=images.device),
+            time,
+            0,
+            state,
+            Vibration.still(device=prepared.images.device),
+            detected,
+            lambda: unchanged_frames(prepared, joint=False)[0],
+            lambda: None,
+            visible,
         )
 
     def _detection(self, verdict: _Verdict, height: int) -> DetectionResult:
@@ -539,9 +557,9 @@ class VibrationTracker:
         return result[0]
 
 
-def as_stack(frame: ArrayLike) -> Tensor:
-    """A frame as a stack of one frame."""
-    return torch.as_tensor(frame)[None]
+@torch.no_grad()
+def _restored(frames: PreparedFrames, motion: Vibration, method: str, options: dict[str, Any]) -> Tensor:
+    return restore_prepared(frames, motion, method, options)
 
 
 def _displaced(motion: Vibration, displacement: Tensor) -> Vibration:
