@@ -66,7 +66,7 @@ _MAX_ROUNDS = 3
 _MAX_PATH = 4.0  # px; the scene may move so far before its gradients are computed again
 _MAX_AGE = 30  # frames; then gradients are computed again, because the scene may have changed
 _DRIFT_STD = (10.0, 500.0)  # px/s and px/s^2, at the start; tones and drift are correlated, their sum is more accurate
-_MAX_WAIT = 8  # windows from one attempt to detect the vibration to the next
+_MAX_DOUBLED = 4  # times that the number of frames between two attempts to detect the vibration is doubled
 _PATIENCE = 3  # consecutive frames that contradict the tones, before the vibration is detected again
 
 
@@ -258,10 +258,10 @@ class VibrationTracker:
         self._last.append((grey, valid, time))
         self._untried += 1
         self._follow(grey, valid, time)
-        detected = self._should_detect()
-        if detected:
-            self._detect()
-        return self._result(prepared, time, detected)
+        count = self._frames_to_detect()
+        if count:
+            self._detect(count)
+        return self._result(prepared, time, count > 0)
 
     # Input
 
@@ -324,6 +324,8 @@ class VibrationTracker:
         self._verdict = self._judged(self._at_middle(time, height).as_fit(time), measurements, residual, found, centre - time)
         contradicted = any(self._verdict.contradicted)
         self._contradictions = self._contradictions + 1 if contradicted else 0
+        if not contradicted:
+            self._attempts = 0
         self._trusted.append(self._verdict.reliable)
 
     def _half(self, height: int) -> float:
@@ -389,16 +391,21 @@ class VibrationTracker:
 
     # Detection
 
-    def _should_detect(self) -> bool:
-        """Whether to detect the vibration from the last frames; the time between two attempts doubles if they fail."""
-        if self._filter is None and self._attempts == 0:
-            return len(self._last) >= max(2, self.window // 2)
-        wrong = self._filter is None or self._contradictions >= _PATIENCE
-        return wrong and self._untried >= self.window * min(2 ** (self._attempts - 1), _MAX_WAIT)
+    def _frames_to_detect(self) -> int:
+        """Number of last frames to detect the vibration from; 0 if it is known, or if it is too early to try again.
 
-    def _detect(self) -> None:
-        """Detect the vibration in the last frames, and start the filter with its reliable tones."""
-        frames, masks, times = zip(*self._last, strict=True)
+        After a change of the vibration, only frames behind the change are used: half a window first, then whole windows
+        at times that double.
+        """
+        new = len(self._last) if self._filter is None and self._attempts == 0 else self._contradictions
+        if self._filter is None:
+            new = max(new, self._untried)
+        needed = max(2, self.window // 2) * 2 ** min(self._attempts, _MAX_DOUBLED)
+        return min(new, self.window, len(self._last)) if new >= needed and self._untried >= min(needed, self.window) else 0
+
+    def _detect(self, count: int) -> None:
+        """Detect the vibration in the last ``count`` frames, and start the filter with its reliable tones."""
+        frames, masks, times = zip(*list(self._last)[-count:], strict=True)
         self._untried, self._attempts = 0, self._attempts + 1
         middle = 0.5 * (times[0] + times[-1]) + 0.5 * frames[0].shape[-2] * self._rows.row_time
         timing = replace(self._rows, frame_start_times=tuple(time - middle for time in times))
@@ -418,12 +425,14 @@ class VibrationTracker:
                 zoom=False,
             )[0]
             if self._filter is None or bool(found.reliable.any()):
-                self._start(found, middle)
+                before = self._filter, self._reference, self._verdict, self._path, self._columns
+                self._start(found, middle, times[-1] - times[0])
+                if self._filter is None or self._contradictions:  # no better
+                    self._filter, self._reference, self._verdict, self._path, self._columns = before
 
-    def _start(self, found: DetectionResult, middle: float) -> None:
-        """Start the filter with tones at the time ``middle`` (s); they follow the last frame."""
+    def _start(self, found: DetectionResult, middle: float, record: float) -> None:
+        """Start the filter with the tones of a record of ``record`` s about ``middle`` s; they follow the last frame."""
         vibration, std = found.vibration, found.std
-        record = self._last[-1][2] - self._last[0][2]
         # a record does not distinguish a tone of less than one period from a drift, and its amplitude is not known
         slow = vibration.frequency * record < 1.0
         tones = torch.polar(vibration.amplitude, vibration.phase - 0.5 * math.pi) * found.reliable[:, None]
@@ -448,8 +457,6 @@ class VibrationTracker:
         self._trusted.clear()
         self._paths.clear()
         self._follow(*last)
-        if self._filter is not None and self._contradictions == 0:
-            self._attempts = 1
 
     # Results
 
