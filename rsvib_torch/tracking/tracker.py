@@ -81,17 +81,23 @@ class TrackedFrame:
             ``"unusable"``: the frame is constant, or a copy of the frame before.
         motion: The motion to remove, in image axes; its time origin is the middle of the frame. Axes whose vibration is
             not reliable are still.
+        path: (2,) px, axes (x, y): image motion without vibration from the first tracked frame to the middle of this
+            one; NaN if it is not known.
         detected: Whether ``detect_vibration`` was called for this frame.
+        measurements: Displacements of the rows of this frame and of the frame before, in row order, with the time
+            origin at the middle between the two frames; None if they were not measured.
     """
 
     time: float
     latency: int
     state: TrackingState
     motion: Vibration
+    path: Tensor
     detected: bool
-    _restore: Callable[[], Tensor] = field(repr=False)
+    measurements: Measurements | None
+    _restore: Callable[[Vibration], Tensor] = field(repr=False)
     _result: Callable[[], DetectionResult | None] = field(repr=False)
-    _visible: Callable[[], Tensor] = field(repr=False)
+    _visible: Callable[[Vibration], Tensor] = field(repr=False)
 
     @cached_property
     def restored(self) -> Tensor:
@@ -99,7 +105,7 @@ class TrackedFrame:
 
         Another thread may use it while the next frame is tracked.
         """
-        return self._restore()
+        return self._restore(self.motion)
 
     @cached_property
     def detection(self) -> DetectionResult | None:
@@ -109,7 +115,14 @@ class TrackedFrame:
     @cached_property
     def visible(self) -> Tensor:
         """(H, W) bool, pixels of the restored frame that the sensor recorded; the others are extrapolated."""
-        return self._visible()
+        return self._visible(self.motion)
+
+    def moved_to(self, place: Tensor) -> "TrackedFrame":
+        """The same frame with its content at another place (2,) of the path in px, to stabilise a video.
+
+        Content stays at ``path`` if the frame is not moved.
+        """
+        return replace(self, motion=_displaced(self.motion, self.path - place))
 
 
 @dataclass(frozen=True, eq=False)
@@ -468,63 +481,68 @@ class VibrationTracker:
         fit = self._at_middle(time, height).as_fit(time + half)
         motion = motion_of_fit(fit)
         trusted = torch.stack(list(self._trusted)).any(0)
+        if self.steady:  # slow shaking is removed from all axes whose rows agree with the filter
+            followed = ~torch.tensor(self._verdict.contradicted, device=trusted.device)
+        else:
+            followed = trusted
         motion = Vibration(
             motion.amplitude * trusted[..., None],
             motion.frequency,
             motion.phase,
-            motion.image_motion * trusted,
-            motion.image_acceleration * trusted,
-        )
-        apart = self._unsteady(time + half, fit, trusted)
-        motion = _displaced(motion, apart[None]).from_row_order(self.timing)[0]
+            motion.image_motion * followed,
+            motion.image_acceleration * followed,
+        ).from_row_order(self.timing)[0]
         timing = replace(self.timing, frame_start_times=(-half,))
         framed = replace(prepared, timing=timing.in_row_order(), image_timing=timing)
         method, options = self.method, self.options
-        size = (height, prepared.images.shape[-1]) if self.timing.scan_axis == -2 else (prepared.images.shape[-1], height)
+        shape = tuple(prepared.images.shape[-2:])
+        size = (shape[0], shape[1]) if self.timing.scan_axis == -2 else (shape[1], shape[0])
         state: TrackingState = "searching" if self._contradictions >= _PATIENCE else "tracking"
         verdict = self._verdict
-        return TrackedFrame(
+        path = self._path + self._filter.path(time + half - self._filter.time)
+        tracked = TrackedFrame(
             time,
             0,
             state,
             motion,
+            offsets_from_row_order(path, self.timing),
             detected,
-            lambda: framed.from_row_order(_restored(framed, motion, method, options))[0],
+            verdict.measurements,
+            lambda motion: framed.from_row_order(_restored(framed, motion, method, options))[0],
             lambda: self._detection(verdict, height),
-            lambda: visible_pixels(timing, motion, size, 1)[0][0],
+            lambda motion: visible_pixels(timing, motion, size, 1)[0][0],
         )
+        return tracked.moved_to(self._steady_place(tracked)) if self.steady else tracked
 
-    def _unsteady(self, middle: float, fit: ToneFit, trusted: Tensor) -> Tensor:
-        """(2,) px, displacement of the path at the middle of the frame from its straight line."""
-        assert self._filter is not None
-        here = self._path + self._filter.path(middle - self._filter.time)
-        if self.steady == 0:
-            return torch.zeros_like(here)
-        self._paths.append((middle, here))
-        while self._paths[0][0] < middle - self.steady:
+    def _steady_place(self, tracked: TrackedFrame) -> Tensor:
+        """(2,) px, place at this frame of the straight line that fits the last part of the path."""
+        self._paths.append((tracked.time, tracked.path))
+        while self._paths[0][0] < tracked.time - self.steady:
             self._paths.popleft()
-        times = torch.tensor([t for t, _ in self._paths], dtype=torch.float64, device=here.device) - middle
-        path = torch.stack([p for _, p in self._paths])
-        if len(times) < 3:
-            return torch.zeros_like(here)
-        columns = torch.stack([torch.ones_like(times), times], -1)
-        line = torch.linalg.lstsq(columns, path).solution[0]
-        return (here - line) * trusted
+        if len(self._paths) < 3:
+            return tracked.path
+        times = torch.tensor([time for time, _ in self._paths], dtype=torch.float64, device=tracked.path.device)
+        columns = torch.stack([torch.ones_like(times), times - tracked.time], -1)
+        place: Tensor = torch.linalg.lstsq(columns, torch.stack([path for _, path in self._paths])).solution[0]
+        return place
 
     def _unchanged(
         self, prepared: PreparedFrames, time: float, state: TrackingState, detected: bool = False
     ) -> TrackedFrame:
-        def visible() -> Tensor:
+        def visible(motion: Vibration) -> Tensor:
             mask = torch.ones_like(prepared.images[0, 0, :1], dtype=torch.bool)
             return frames_from_row_order(mask, self.timing)[0]
 
+        device = prepared.images.device
         return TrackedFrame(
             time,
             0,
             state,
-            Vibration.still(device=prepared.images.device),
+            Vibration.still(device=device),
+            torch.full((2,), math.nan, dtype=torch.float64, device=device),
             detected,
-            lambda: unchanged_frames(prepared, joint=False)[0],
+            None,
+            lambda motion: unchanged_frames(prepared, joint=False)[0],
             lambda: None,
             visible,
         )
@@ -570,7 +588,7 @@ def _restored(frames: PreparedFrames, motion: Vibration, method: str, options: d
 
 
 def _displaced(motion: Vibration, displacement: Tensor) -> Vibration:
-    """The motion with a constant displacement (B, 2) in px added, as a tone of frequency 0."""
+    """The motion with a constant displacement (..., 2) in px added, as a tone of frequency 0."""
     size = displacement.abs()[..., None]
     zero = torch.zeros_like(size)
     return Vibration(
