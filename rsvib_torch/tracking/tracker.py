@@ -84,8 +84,8 @@ class TrackedFrame:
         path: (2,) px, axes (x, y): image motion without vibration from the first tracked frame to the middle of this
             one; NaN if it is not known.
         detected: Whether ``detect_vibration`` was called for this frame.
-        measurements: Displacements of the rows of this frame and of the frame before, in row order, with the time
-            origin at the middle between the two frames; None if they were not measured.
+        measurements: Displacements of the rows of this frame and of the frame before, in row order; times count
+            from the first row of this frame. None if they were not measured.
     """
 
     time: float
