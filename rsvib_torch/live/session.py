@@ -19,7 +19,7 @@ from rsvib_torch.live.sources import FrameReader, FrameSource
 from rsvib_torch.live.spectrogram import Spectrogram
 from rsvib_torch.tracking import Margins, TrackedFrame, VibrationTracker, VideoBorder
 
-__all__ = ["LiveReport", "run_live"]
+__all__ = ["LiveReport", "run_live", "steadied", "to_counts"]
 
 _WAITING_RESTORED = 2  # frames between tracking and writing: the largest delay of the output in frames
 _LATENCY_COUNTS = 64  # frames; longer delays are counted as this
@@ -95,7 +95,7 @@ def run_live(
     writer = _Writer(outputs, border or VideoBorder("mirror"), report, reader, tracker.timing.frame_period)
     complete = False
     try:
-        for tracked, arrived in _steadied(_tracked(reader, tracker, report, max_frames), steady):
+        for tracked, arrived in steadied(_tracked(reader, tracker, report, max_frames), steady):
             if spectrogram is not None:
                 spectrogram.add(tracked)
             if progress is not None:
@@ -130,7 +130,7 @@ def _tracked(
         yield tracked, frame.arrived
 
 
-def _steadied(
+def steadied(
     frames: Iterator[tuple[TrackedFrame, float]], duration: float
 ) -> Iterator[tuple[TrackedFrame, float]]:
     """Frames moved to the mean of the path over ``duration`` s around them; frames without path stay."""
@@ -142,17 +142,18 @@ def _steadied(
 
     def placed(index: int) -> tuple[TrackedFrame, float]:
         tracked, arrived = around[index]
-        reach = half
         if not bool(torch.isfinite(tracked.path).all()):
             return tracked, arrived
         # the same distance on both sides, so that a uniform motion is kept at the ends as well
         reach = min(half, tracked.time - around[0][0].time, around[-1][0].time - tracked.time)
         near = [
-            one.path
+            (one.path, 0.5 if abs(abs(one.time - tracked.time) - reach) < 1e-6 and reach > 0 else 1.0)  # trapezoidal rule
             for one, _ in around
-            if abs(one.time - tracked.time) <= reach + 1e-9 and bool(torch.isfinite(one.path).all())
+            if abs(one.time - tracked.time) <= reach + 1e-6 and bool(torch.isfinite(one.path).all())
         ]
-        return tracked.moved_to(torch.stack(near).mean(0)), arrived
+        paths, weights = zip(*near, strict=True)
+        weight = torch.tensor(weights, dtype=torch.float64, device=tracked.path.device)
+        return tracked.moved_to((weight[:, None] * torch.stack(paths)).sum(0) / weight.sum()), arrived
 
     for item in frames:
         around.append(item)

@@ -43,7 +43,7 @@ class Spectrogram:
         highest = check_number("max_frequency", max_frequency, above=1 / duration)
         self.frequencies = torch.arange(1, 1 + math.floor(2 * duration * highest), dtype=torch.float64) / (2 * duration)
         self._max_columns = max_columns
-        self._columns: list[tuple[float, Tensor, Tensor]] = []
+        self._columns: list[tuple[float, Tensor]] = []
         self._sums: list[Tensor] = []
         self._start: float | None = None
 
@@ -58,7 +58,9 @@ class Spectrogram:
             self._finish(tracked.time)
         middles = record.exposure_starts[0].cpu() + (0.5 * record.exposure_time + tracked.time - self._start)  # (N, 2)
         offsets = (record.displacements[0, :, 1] - record.displacements[0, :, 0]).cpu()  # (N, 2)
-        weights = record.weights[0].cpu() * (record.num_differences[0].cpu() > 0)[:, None]
+        # Hann window: less leakage of strong tones into other frequencies
+        window = math.sin(math.pi * (tracked.time - self._start + 0.5 * self._timing.frame_period) / self._duration) ** 2
+        weights = window * record.weights[0].cpu() * (record.num_differences[0].cpu() > 0)[:, None]
         # the mean is image motion
         mean = (weights * offsets).sum(0) / weights.sum(0).clamp(min=1e-300)
         angle = 2 * math.pi * self.frequencies[:, None] * middles[:, 0]
@@ -68,38 +70,33 @@ class Spectrogram:
         right = (wave.conj() @ (weights * (offsets - mean)).to(wave.dtype)) * response.conj()[:, None]
         # real offsets: a tone of amplitude A contributes A / 2 at f and at -f
         normal = 0.5 * weights.sum(0) * response.abs().square()[:, None]
-        parts = [right, normal, (weights * (offsets - mean).square()).sum(0), (weights > 0).sum(0)]
+        parts = [right, normal]
         self._sums = parts if not self._sums else [total + part for total, part in zip(self._sums, parts, strict=True)]
 
     def _finish(self, time: float) -> None:
         """Complete a column; the next one begins at ``time``."""
         assert self._start is not None
         if self._sums:
-            right, normal, square, count = self._sums
-            # rms offset of white noise, and the amplitude that it causes
-            noise = (square / (count * normal.amax(0)).clamp(min=1e-300)).sqrt() * (normal.amax(0) / normal).sqrt()
-            amplitude = (right / normal).abs()
+            right, normal = self._sums
             blind = normal < 0.01 * normal.amax(0)  # gain below a tenth of the largest one
-            amplitude = torch.where(blind, torch.nan, amplitude).T.float()
-            self._columns.append((self._start, amplitude, noise.T.float()))
+            amplitude = torch.where(blind, torch.nan, (right / normal).abs())
+            self._columns.append((self._start, amplitude.T.float()))
         self._sums, self._start = [], time
         if len(self._columns) > self._max_columns:
             pairs = zip(self._columns[::2], self._columns[1::2], strict=False)
-            self._columns = [
-                (one[0], torch.maximum(one[1], other[1]), torch.maximum(one[2], other[2])) for one, other in pairs
-            ]
+            self._columns = [(one[0], torch.fmax(one[1], other[1])) for one, other in pairs]
             self._duration *= 2
 
     def result(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
         """Times (T,) in s of the beginnings of the columns, frequencies (F,) in Hz, amplitudes (2, T, F) in px.
 
-        Axes are (x, y) of the image; an incomplete last column is included.
+        Axes are (x, y) of the image. The last, incomplete column is left out, unless it is the only one.
         """
-        if self._sums:
+        if self._sums and not self._columns:
             self._finish(math.inf)
-        times = np.array([time for time, _, _ in self._columns])
+        times = np.array([time for time, _ in self._columns])
         empty = np.zeros((2, 0, len(self.frequencies)), np.float32)
-        amplitude = np.stack([part.numpy() for _, part, _ in self._columns], 1) if self._columns else empty
+        amplitude = np.stack([part.numpy() for _, part in self._columns], 1) if self._columns else empty
         if self._timing.scan_axis == -1:
             amplitude = amplitude[::-1]
         return times, self.frequencies.numpy(), np.ascontiguousarray(amplitude)
@@ -126,8 +123,8 @@ def save_spectrogram(path: Path, spectrogram: Spectrogram) -> list[Path]:
         image = panel.pcolormesh(
             np.append(times, times[-1] + step),
             np.append(frequencies, 2 * frequencies[-1] - frequencies[-2]),
-            np.maximum(values.T, 1e-3 * top),
-            norm=LogNorm(1e-3 * top, top),
+            np.maximum(values.T, 3e-3 * top),
+            norm=LogNorm(3e-3 * top, top),
             cmap="viridis",
             rasterized=True,
         )

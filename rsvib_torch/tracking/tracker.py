@@ -43,7 +43,7 @@ from rsvib_torch.detection.tones.fit import (
     residual_of,
     vibration_of_fit,
 )
-from rsvib_torch.detection.tones.selection import MAX_TONES
+from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE
 from rsvib_torch.frames.arrays import ArrayLike, Channels, as_tensor
 from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
 from rsvib_torch.frames.pixels import detailed_columns
@@ -414,10 +414,10 @@ class VibrationTracker:
         if self._filter is None:
             new = max(new, self._untried)
         needed = max(2, self.window // 2) * 2 ** min(self._attempts, _MAX_DOUBLED)
-        return min(new, self.window, len(self._last)) if new >= needed and self._untried >= min(needed, self.window) else 0
+        return min(new, self.window, len(self._last)) if new >= needed and self._untried >= min(needed, self.window) // 2 else 0
 
     def _detect(self, count: int) -> None:
-        """Detect the vibration in the last ``count`` frames, and start the filter with its reliable tones."""
+        """Detect the vibration in the last ``count`` frames, and start the filter with its significant tones."""
         frames, masks, times = zip(*list(self._last)[-count:], strict=True)
         self._untried, self._attempts = 0, self._attempts + 1
         middle = 0.5 * (times[0] + times[-1]) + 0.5 * frames[0].shape[-2] * self._rows.row_time
@@ -437,18 +437,21 @@ class VibrationTracker:
                 roll=False,
                 zoom=False,
             )[0]
-            if self._filter is None or bool(found.reliable.any()):
-                before = self._filter, self._reference, self._verdict, self._path, self._columns
+            if self._filter is None or bool((found.vibration.amplitude > MIN_SIGNIFICANCE * found.std.amplitude).any()):
+                names = ("_filter", "_reference", "_verdict", "_path", "_columns", "_trusted")
+                before = {name: getattr(self, name) for name in names}
                 self._start(found, middle, times[-1] - times[0])
                 if self._filter is None or self._contradictions:  # no better
-                    self._filter, self._reference, self._verdict, self._path, self._columns = before
+                    vars(self).update(before)
 
     def _start(self, found: DetectionResult, middle: float, record: float) -> None:
         """Start the filter with the tones of a record of ``record`` s about ``middle`` s; they follow the last frame."""
         vibration, std = found.vibration, found.std
         # a record does not distinguish a tone of less than one period from a drift, and its amplitude is not known
         slow = vibration.frequency * record < 1.0
-        tones = torch.polar(vibration.amplitude, vibration.phase - 0.5 * math.pi) * found.reliable[:, None]
+        # the verdict on a record may be that a slow motion is not explained; the filter has its own verdict
+        significant = vibration.amplitude > MIN_SIGNIFICANCE * std.amplitude
+        tones = torch.polar(vibration.amplitude, vibration.phase - 0.5 * math.pi) * significant
         rate = 2j * math.pi * vibration.frequency
         drift = torch.stack([vibration.image_motion, vibration.image_acceleration], -1)
         drift = drift + torch.stack([(tones * rate).real, (tones * rate.square()).real], -1).mul(slow[..., None]).sum(1)
@@ -467,14 +470,13 @@ class VibrationTracker:
         (grey, valid, time), last = self._last[-2], self._last[-1]
         self._columns = slice(None) if self.columns is None else detailed_columns(last[0][0, 0], self.columns)
         self._reference, self._path = _Reference(self._spectra(grey, valid), time), self._path.to(grey.device)
-        self._trusted.clear()
-        self._paths.clear()
+        self._trusted = deque(maxlen=self.window)
         self._follow(*last)
 
     # Results
 
     def _result(self, prepared: PreparedFrames, time: float, detected: bool) -> TrackedFrame:
-        if self._filter is None or self._verdict is None:
+        if self._filter is None or self._verdict is None:  # nothing is known
             return self._unchanged(prepared, time, "searching", detected)
         height = prepared.images.shape[-2]
         half = self._half(height)
@@ -559,7 +561,7 @@ class VibrationTracker:
         intervals = self._intervals(measurements)
         swap = self.timing.scan_axis == -1
         order = [1, 0] if swap else [0, 1]
-        sensitivity = timing_sensitivity(fit, self._rows, 2, height).mapped(lambda values: values[..., order, :])
+        sensitivity = timing_sensitivity(fit, self._rows, self.window, height).mapped(lambda values: values[..., order, :])
         in_image = vibration.from_row_order(self.timing)
         residual = (curve.offsets - fitted).abs().nanmean(dim=(1, 2))
         result = DetectionResult(
@@ -576,7 +578,7 @@ class VibrationTracker:
             reliable=verdict.reliable[None, order],
             reasons=(tuple(verdict.reasons[axis] for axis in order),),
             sensitivity=sensitivity,
-            assumptions=(assumptions(in_image[0], sensitivity[0], self._rows, 2, height),),
+            assumptions=(assumptions(in_image[0], sensitivity[0], self._rows, self.window, height),),
             timing=self.timing,
         )
         return result[0]
