@@ -22,6 +22,7 @@ from rsvib_torch.tracking import Margins, TrackedFrame, VibrationTracker, VideoB
 __all__ = ["LiveReport", "run_live", "steadied", "to_counts"]
 
 _WAITING_RESTORED = 2  # frames between tracking and writing: the largest delay of the output in frames
+_ROUNDING = 1e-6  # s, of frame times
 _LATENCY_COUNTS = 64  # frames; longer delays are counted as this
 
 
@@ -147,9 +148,9 @@ def steadied(
         # the same distance on both sides, so that a uniform motion is kept at the ends as well
         reach = min(half, tracked.time - around[0][0].time, around[-1][0].time - tracked.time)
         near = [
-            (one.path, 0.5 if abs(abs(one.time - tracked.time) - reach) < 1e-6 and reach > 0 else 1.0)  # trapezoidal rule
+            (one.path, 0.5 if abs(abs(one.time - tracked.time) - reach) < _ROUNDING and reach > 0 else 1.0)  # trapezoidal rule
             for one, _ in around
-            if abs(one.time - tracked.time) <= reach + 1e-6 and bool(torch.isfinite(one.path).all())
+            if abs(one.time - tracked.time) <= reach + _ROUNDING and bool(torch.isfinite(one.path).all())
         ]
         paths, weights = zip(*near, strict=True)
         weight = torch.tensor(weights, dtype=torch.float64, device=tracked.path.device)
@@ -157,10 +158,10 @@ def steadied(
 
     for item in frames:
         around.append(item)
-        while position < len(around) and around[position][0].time + half <= item[0].time:
+        while position < len(around) and around[position][0].time + half <= item[0].time + _ROUNDING:
             yield placed(position)
             position += 1
-            while around[0][0].time < around[min(position, len(around) - 1)][0].time - half:
+            while around[0][0].time < around[min(position, len(around) - 1)][0].time - half - _ROUNDING:
                 around.popleft()
                 position -= 1
     while position < len(around):

@@ -1,8 +1,11 @@
 """Borders of restored video frames, and steadying, against the known path of an independent camera."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
+from skimage.registration import phase_cross_correlation
 from truth import draw_scene, take_frames
 
 import rsvib_torch as rsv
@@ -29,16 +32,12 @@ def make_tracked():
     return [tracker.update(frame) for frame in frames]
 
 
-def shift(one, other):
-    """(2,) px, displacement of the content of ``other`` against ``one`` by least squares on gradients."""
-    inner = slice(24, -24)
-    gy, gx = np.gradient(0.5 * (one + other))
-    design = np.stack([gx[inner, inner].ravel(), gy[inner, inner].ravel()], -1)
-    return -np.linalg.lstsq(design, (other - one)[inner, inner].ravel(), rcond=None)[0]
-
-
 def shifts(frames):
-    return np.array([shift(a.double().numpy(), b.double().numpy()) for a, b in zip(frames[:-1], frames[1:], strict=True)])
+    """(T - 1, 2) px, displacements (x, y) of the content of each frame against the one before."""
+    window = np.hanning(SIZE)[:, None] * np.hanning(SIZE)
+    images = [(frame.double().numpy() - 0.5) * window for frame in frames]
+    pairs = itertools.pairwise(images)
+    return -np.array([phase_cross_correlation(a, b, upsample_factor=50)[0][::-1] for a, b in pairs])
 
 
 def test_steady_frames_follow_the_moving_average_of_the_path(tracked):
