@@ -15,12 +15,12 @@ import typer
 
 from rsvib_torch import io, live, tracking
 from rsvib_torch.commands.answers import detection_data
-from rsvib_torch.commands.options import MethodOption, OverwriteOption, ScaleOption, camera_options, check_new
+from rsvib_torch.commands.options import OverwriteOption, ScaleOption, camera_options, check_new
 from rsvib_torch.commands.terminal import Answer, error_line
 from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.option_types import method_options
+from rsvib_torch.core.option_types import METHOD_SETTINGS, method_options
 from rsvib_torch.core.text import number_of
 
 if TYPE_CHECKING:
@@ -59,7 +59,12 @@ def live_session(
     realtime: Annotated[
         bool, typer.Option("--realtime", help="Read a file at its own rate, and drop frames like a camera.")
     ] = False,
-    method: MethodOption = None,
+    method: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Restoration method: {', '.join(METHOD_SETTINGS)}.", show_default="from the configuration, or dewarp"
+        ),
+    ] = None,
     columns: Annotated[
         int, typer.Option(help="Columns that are measured: those with the most detail.", min=64)
     ] = 256,
@@ -170,7 +175,7 @@ def live_session(
         files += live.save_spectrogram(spectrogram, collected)
     if report.dropped or report.lost:
         error_line(_missing(report), "warning")
-    return _answer(source, report, files)
+    return _answer(source, report, files, drops=drops)
 
 
 def _check_options(
@@ -260,15 +265,16 @@ def _missing(report: LiveReport) -> str:
     return "; ".join(parts)
 
 
-def _answer(source: str, report: LiveReport, files: list[Path]) -> Answer:
+def _answer(source: str, report: LiveReport, files: list[Path], *, drops: bool) -> Answer:
     rate = report.frames / report.seconds
     lines = [
         f"{number_of(report.frames, 'frame')} in {report.seconds:.1f} s ({rate:.1f} per second), "
         f"{report.tracked} with known motion",
-        f"delay: {report.latency(0.5)} frame periods in the median, {report.latency(0.99)} in 99 % of the frames",
         f"dropped {report.dropped}, not delivered {report.lost}, unusable {report.unusable}; vibration detected "
         f"{number_of(report.detections, 'time')}",
     ]
+    if drops:
+        lines.append(f"delay: {report.latency(0.5)} frame periods in the median, {report.latency(0.99)} in 99 % of the frames")
     found = report.detection
     data = {
         "frames": report.frames,
@@ -278,8 +284,8 @@ def _answer(source: str, report: LiveReport, files: list[Path]) -> Answer:
         "lost": report.lost,
         "detections": report.detections,
         "seconds": report.seconds,
-        "latency_median": report.latency(0.5),
-        "latency_99": report.latency(0.99),
+        "delay_median": report.latency(0.5) if drops else None,
+        "delay_99": report.latency(0.99) if drops else None,
         "detection": None if found is None else detection_data(found),
     }
     results = {f"Live frames of {source}": lines}
