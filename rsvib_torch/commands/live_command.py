@@ -45,7 +45,8 @@ def live_session(
         Path | None, typer.Option(help="Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout.")
     ] = None,
     page: Annotated[
-        int | None, typer.Option(metavar="PORT", help="Show the restored frames at http://127.0.0.1:PORT.", min=0, max=65535)
+        int | None,
+        typer.Option(metavar="PORT", help="Show the restored frames at http://127.0.0.1:PORT.", min=0, max=65535),
     ] = None,
     preview: Annotated[bool, typer.Option("--preview", help="Show the restored frames in a window.")] = False,
     spectrogram: Annotated[
@@ -65,9 +66,7 @@ def live_session(
             help=f"Restoration method: {', '.join(METHOD_SETTINGS)}.", show_default="from the configuration, or dewarp"
         ),
     ] = None,
-    columns: Annotated[
-        int, typer.Option(help="Columns that are measured: those with the most detail.", min=64)
-    ] = 256,
+    columns: Annotated[int, typer.Option(help="Columns that are measured: those with the most detail.", min=64)] = 256,
     window: Annotated[int, typer.Option(help="Frames from which the vibration is detected at first.", min=2)] = 8,
     steady: Annotated[
         float,
@@ -215,7 +214,9 @@ def _margins(source: FrameSource, tracker: Any, steady: float, num_frames: int |
         nonlocal widest
         widest = widest.widest(tracking.Margins.of(tracked.visible))
 
-    live.run_live(source, tracker(source.full_scale), [], steady=steady, drops=False, max_frames=num_frames, progress=widen)
+    live.run_live(
+        source, tracker(source.full_scale), [], steady=steady, drops=False, max_frames=num_frames, progress=widen
+    )
     return widest
 
 
@@ -274,7 +275,9 @@ def _answer(source: str, report: LiveReport, files: list[Path], *, drops: bool) 
         f"{number_of(report.detections, 'time')}",
     ]
     if drops:
-        lines.append(f"delay: {report.latency(0.5)} frame periods in the median, {report.latency(0.99)} in 99 % of the frames")
+        lines.append(
+            f"delay: {report.latency(0.5)} frame periods in the median, {report.latency(0.99)} in 99 % of the frames"
+        )
     found = report.detection
     data = {
         "frames": report.frames,
@@ -292,4 +295,3 @@ def _answer(source: str, report: LiveReport, files: list[Path], *, drops: bool) 
     if found is not None:
         results["Vibration at the last frame"] = [found.summary()]
     return Answer(results, data, files)
-

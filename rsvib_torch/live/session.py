@@ -17,7 +17,7 @@ from rsvib_torch.detection import DetectionResult
 from rsvib_torch.live.outputs import FrameOutput
 from rsvib_torch.live.sources import FrameReader, FrameSource
 from rsvib_torch.live.spectrogram import Spectrogram
-from rsvib_torch.tracking import Margins, TrackedFrame, VibrationTracker, VideoBorder
+from rsvib_torch.tracking import TrackedFrame, VibrationTracker, VideoBorder
 
 __all__ = ["LiveReport", "run_live", "steadied", "to_counts"]
 
@@ -131,9 +131,7 @@ def _tracked(
         yield tracked, frame.arrived
 
 
-def steadied(
-    frames: Iterator[tuple[TrackedFrame, float]], duration: float
-) -> Iterator[tuple[TrackedFrame, float]]:
+def steadied(frames: Iterator[tuple[TrackedFrame, float]], duration: float) -> Iterator[tuple[TrackedFrame, float]]:
     """Frames moved to the mean of the path over ``duration`` s around them; frames without path stay."""
     if duration == 0:
         yield from frames
@@ -148,7 +146,10 @@ def steadied(
         # the same distance on both sides, so that a uniform motion is kept at the ends as well
         reach = min(half, tracked.time - around[0][0].time, around[-1][0].time - tracked.time)
         near = [
-            (one.path, 0.5 if abs(abs(one.time - tracked.time) - reach) < _ROUNDING and reach > 0 else 1.0)  # trapezoidal rule
+            (
+                one.path,
+                0.5 if abs(abs(one.time - tracked.time) - reach) < _ROUNDING and reach > 0 else 1.0,
+            )  # trapezoidal rule
             for one, _ in around
             if abs(one.time - tracked.time) <= reach + _ROUNDING and bool(torch.isfinite(one.path).all())
         ]

@@ -98,7 +98,9 @@ class CameraSource:
                 periods = max(1, round((now - before) / self._period))
                 index, self.lost = index + periods, self.lost + periods - 1
             before = now
-            yield TimedFrame(_channels_first(pixels[..., ::-1]) if pixels.ndim == 3 else pixels, index * self._period, now)
+            yield TimedFrame(
+                _channels_first(pixels[..., ::-1]) if pixels.ndim == 3 else pixels, index * self._period, now
+            )
 
     def close(self) -> None:
         """Release the camera."""
@@ -115,7 +117,9 @@ class PipeSource:
         timing: The sensor.
     """
 
-    def __init__(self, stream: BinaryIO, size: tuple[int, int], pixel_format: PixelFormat, timing: SensorTiming) -> None:
+    def __init__(
+        self, stream: BinaryIO, size: tuple[int, int], pixel_format: PixelFormat, timing: SensorTiming
+    ) -> None:
         check_choice("pixel_format", pixel_format, get_args(PixelFormat))
         for side in size:
             check_whole_number("size", side, at_least=1)
@@ -194,7 +198,8 @@ class FrameReader:
     def __init__(self, source: FrameSource, waiting: int = 64, *, drops: bool = True) -> None:
         self._source, self._limit, self._drops = source, check_whole_number("waiting", waiting, at_least=1), drops
         self._frames: deque[TimedFrame] = deque()
-        self._changed, self._ended, self._error = threading.Condition(), False, None
+        self._changed, self._ended = threading.Condition(), False
+        self._error: Exception | None = None
         self.dropped = 0
         self._thread = threading.Thread(target=self._read, name="rsvib-read", daemon=True)
         self._thread.start()

@@ -59,7 +59,9 @@ class Spectrogram:
         middles = record.exposure_starts[0].cpu() + (0.5 * record.exposure_time + tracked.time - self._start)  # (N, 2)
         offsets = (record.displacements[0, :, 1] - record.displacements[0, :, 0]).cpu()  # (N, 2)
         # Hann window: less leakage of strong tones into other frequencies
-        window = math.sin(math.pi * (tracked.time - self._start + 0.5 * self._timing.frame_period) / self._duration) ** 2
+        window = (
+            math.sin(math.pi * (tracked.time - self._start + 0.5 * self._timing.frame_period) / self._duration) ** 2
+        )
         weights = window * record.weights[0].cpu() * (record.num_differences[0].cpu() > 0)[:, None]
         # the mean is image motion
         mean = (weights * offsets).sum(0) / weights.sum(0).clamp(min=1e-300)

@@ -74,7 +74,8 @@ class ToneFilter:
         probability = torch.full((len(std), models), (1 - _STAY) / (models - 1), dtype=std.dtype, device=std.device)
         probability[:, 0] = _STAY
         covariance = torch.diag_embed(std.square())
-        return cls(time, *map(repeated, (coefficients, rates, drift, covariance)), probability, exposure_time)
+        coefficients, rates, drift, covariance = map(repeated, (coefficients, rates, drift, covariance))
+        return cls(time, coefficients, rates, drift, covariance, probability, exposure_time)
 
     @property
     def tones(self) -> int:
@@ -182,12 +183,10 @@ class ToneFilter:
         fit = (weights[:, None] * residual.square()).sum(-1) - (step * right).sum(-1)
         score = self.probability.log() - 0.5 * (fit + torch.linalg.slogdet(system).logabsdet)
         probability = score.softmax(-1).clamp(min=1e-6)  # a filter that failed must be able to return
-        return self._with_values(
-            self._values() + step, posterior, probability / probability.sum(-1, keepdim=True)
-        )
+        return self._with_values(self._values() + step, posterior, probability / probability.sum(-1, keepdim=True))
 
     def residual(self, measurements: Measurements, origin: float) -> Tensor:
-        """(1, N, 2, A) px, displacements of the rows of two frames relative to their mean, less those of the filters."""
+        """(1, N, 2, A) px, displacements of rows in two frames relative to their mean, less those of the filters."""
         _, residual = self._linearised(measurements, origin)
         mean = (self.probability[..., None] * residual).sum(1).T
         return measurements.relative(torch.stack([-0.5 * mean, 0.5 * mean], 1)[None])
@@ -238,7 +237,8 @@ class ToneFilter:
             robust = weights * share
         freedom = (share * (weights > 0)).sum(-1, keepdim=True) - columns.shape[-1]
         variance = (share * apart.square()).sum(-1, keepdim=True) / freedom.clamp(min=1.0)
-        return robust / variance.clamp(min=1e-12)
+        scaled: Tensor = robust / variance.clamp(min=1e-12)
+        return scaled
 
     # Results
 

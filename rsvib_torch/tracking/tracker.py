@@ -210,7 +210,9 @@ class VibrationTracker:
         **options: Any,
     ) -> None:
         if timing.frame_start_times is not None:
-            raise ValueError("timing must not have frame_start_times: pass the time of each frame to update(frame, time)")
+            raise ValueError(
+                "timing must not have frame_start_times: pass the time of each frame to update(frame, time)"
+            )
         check_method_options(method, options)
         self.timing, self.method, self.options = timing, method, options
         self.window = check_whole_number("window", window, at_least=2)
@@ -288,7 +290,9 @@ class VibrationTracker:
 
     def _is_unusable(self, grey: Tensor) -> bool:
         some = grey[..., ::16, :]
-        constant = bool(some.amax() - some.amin() <= 1e-6 * some.abs().amax()) and bool((grey == grey[0, 0, 0, 0]).all())
+        constant = bool(some.amax() - some.amin() <= 1e-6 * some.abs().amax()) and bool(
+            (grey == grey[0, 0, 0, 0]).all()
+        )
         return constant or (bool(self._last) and torch.equal(self._last[-1][0], grey))
 
     # Tracking
@@ -334,7 +338,9 @@ class VibrationTracker:
         self._path, self._filter = previous - corrected.path(-step), corrected
         self._reference = _Reference(spectra, time, found, anchor, age)
         residual = corrected.residual(measurements, centre)
-        self._verdict = self._judged(self._at_middle(time, height).as_fit(time), measurements, residual, found, centre - time)
+        self._verdict = self._judged(
+            self._at_middle(time, height).as_fit(time), measurements, residual, found, centre - time
+        )
         contradicted = any(self._verdict.contradicted)
         self._contradictions = self._contradictions + 1 if contradicted else 0
         if not contradicted:
@@ -414,7 +420,11 @@ class VibrationTracker:
         if self._filter is None:
             new = max(new, self._untried)
         needed = max(2, self.window // 2) * 2 ** min(self._attempts, _MAX_DOUBLED)
-        return min(new, self.window, len(self._last)) if new >= needed and self._untried >= min(needed, self.window) // 2 else 0
+        return (
+            min(new, self.window, len(self._last))
+            if new >= needed and self._untried >= min(needed, self.window) // 2
+            else 0
+        )
 
     def _detect(self, count: int) -> None:
         """Detect the vibration in the last ``count`` frames, and start the filter with its significant tones."""
@@ -445,7 +455,7 @@ class VibrationTracker:
                     vars(self).update(before)
 
     def _start(self, found: DetectionResult, middle: float, record: float) -> None:
-        """Start the filter with the tones of a record of ``record`` s about ``middle`` s; they follow the last frame."""
+        """Start the filter with the tones of a record of ``record`` s about ``middle`` s, and follow the last frame."""
         vibration, std = found.vibration, found.std
         # a record does not distinguish a tone of less than one period from a drift, and its amplitude is not known
         slow = vibration.frequency * record < 1.0
@@ -456,9 +466,10 @@ class VibrationTracker:
         drift = torch.stack([vibration.image_motion, vibration.image_acceleration], -1)
         drift = drift + torch.stack([(tones * rate).real, (tones * rate.square()).real], -1).mul(slow[..., None]).sum(1)
         tones = tones * ~slow
-        tone_std = [std.amplitude, std.amplitude, torch.full_like(std.amplitude, 0.5), 2 * math.pi * std.frequency]
+        growth_std = torch.full_like(std.amplitude, 0.5)  # 1/s
+        parts = torch.stack([std.amplitude, std.amplitude, growth_std, 2 * math.pi * std.frequency], -1)
         # the last frame is measured again
-        tone_std = torch.where((tones.abs() > 0)[..., None], 2.0 * torch.stack(tone_std, -1), 0.0).flatten(-2)
+        tone_std = torch.where((tones.abs() > 0)[..., None], 2.0 * parts, 0.0).flatten(-2)
         self._filter = ToneFilter.started(
             middle,
             tones,
@@ -483,10 +494,8 @@ class VibrationTracker:
         fit = self._at_middle(time, height).as_fit(time + half)
         motion = motion_of_fit(fit)
         trusted = torch.stack(list(self._trusted)).any(0)
-        if self.steady:  # slow shaking is removed from all axes whose rows agree with the filter
-            followed = ~torch.tensor(self._verdict.contradicted, device=trusted.device)
-        else:
-            followed = trusted
+        # a steady image has no slow shaking along any axis whose rows agree with the filter
+        followed = ~trusted.new_tensor(self._verdict.contradicted) if self.steady else trusted
         motion = Vibration(
             motion.amplitude * trusted[..., None],
             motion.frequency,
@@ -561,7 +570,9 @@ class VibrationTracker:
         intervals = self._intervals(measurements)
         swap = self.timing.scan_axis == -1
         order = [1, 0] if swap else [0, 1]
-        sensitivity = timing_sensitivity(fit, self._rows, self.window, height).mapped(lambda values: values[..., order, :])
+        sensitivity = timing_sensitivity(fit, self._rows, self.window, height).mapped(
+            lambda values: values[..., order, :]
+        )
         in_image = vibration.from_row_order(self.timing)
         residual = (curve.offsets - fitted).abs().nanmean(dim=(1, 2))
         result = DetectionResult(

@@ -99,7 +99,9 @@ class VideoBorder:
     def __init__(self, border: Border = "hold", margins: Margins | None = None) -> None:
         check_choice("border", border, ("mirror", "hold", "crop"))
         if (border == "crop") != (margins is not None):
-            raise ValueError(f"margins go with border='crop' and only with it, got border={border!r}, margins={margins}")
+            raise ValueError(
+                f"margins go with border='crop' and only with it, got border={border!r}, margins={margins}"
+            )
         self.border, self.margins = border, margins
         self._before: Tensor | None = None
 

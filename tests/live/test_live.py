@@ -101,7 +101,9 @@ def test_the_page_is_served_to_this_machine_only():
 
 @pytest.mark.parametrize("ending", [".mp4", ".mkv"])
 def test_video_files(tmp_path, ending):
-    frames = (np.random.default_rng(0).random((5, 32, 48, 3)) * 50 + np.arange(5)[:, None, None, None] * 40).astype("u1")
+    frames = (np.random.default_rng(0).random((5, 32, 48, 3)) * 50 + np.arange(5)[:, None, None, None] * 40).astype(
+        "u1"
+    )
     output = live.VideoOutput(tmp_path / f"video{ending}", 30.0)
     for index, frame in zip((0, 1, 2, 5, 6), frames, strict=True):  # two are missing
         output.write(frame, index)
