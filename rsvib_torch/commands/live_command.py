@@ -7,7 +7,8 @@ import re
 import sys
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Literal
 
@@ -125,6 +126,7 @@ def live_session(
             columns=columns,
             method=name,
             steady=steady if drops else 0.0,
+            wobble=steady > 0,
             full_scale=full_scale if full_scale is not None and not is_file else scale,
             channels="first",
             **options,
@@ -135,25 +137,13 @@ def live_session(
     if border == "crop":
         margins = _margins(opened(), tracker, around, num_frames)
     frames_of = opened()
-    outputs: list[FrameOutput] = []
-    shown: list[live.PageOutput] = []
-    with _standard_output_of_frames(enabled=pipe_out) as stream:
+    with _frames_on_standard_output(enabled=pipe_out) as stream:
         try:
-            if preview:
-                outputs.append(live.PreviewOutput())
-            if page is not None:
-                shown.append(live.PageOutput(page))
-                outputs += shown
-                error_line(f"the page is {shown[0].url}", "note")
-            if stream is not None:
-                outputs.append(live.PipeOutput(stream))
-            elif out is not None:
-                outputs.append(live.VideoOutput(out, settings.timing.frame_rate))
+            outputs = _outputs(settings, preview, page, stream, None if pipe_out else out)
         except BaseException:
             frames_of.close()
-            for output in outputs:
-                output.close(complete=False)
             raise
+        shown = [output for output in outputs if isinstance(output, live.PageOutput)]
         collected = None if spectrogram is None else live.Spectrogram(settings.timing, max_frequency=max_frequency)
         report = live.run_live(
             frames_of,
@@ -191,11 +181,34 @@ def _check_options(
         raise ValueError(f"--realtime goes with a file, not with {source}: a camera has its own rate")
     if border == "crop" and (not is_file or realtime):
         raise ValueError(
-            f"--border crop goes with a file without --realtime: the margins of {source} are known at the end only; use "
-            "--border hold"
+            f"--border crop goes with a file without --realtime: the margins of {source} are known at the end only; "
+            "use --border hold"
         )
     if is_file and not Path(source).exists():
         raise FileNotFoundError(f"{source}: no such file; a camera is a number or a URL")
+
+
+def _outputs(
+    settings: Config, preview: bool, page: int | None, stream: BinaryIO | None, out: Path | None
+) -> list[FrameOutput]:
+    """The outputs that the options name; none stays open if one of them cannot be opened."""
+    outputs: list[FrameOutput] = []
+    try:
+        if preview:
+            outputs.append(live.PreviewOutput())
+        if page is not None:
+            served = live.PageOutput(page)
+            outputs.append(served)
+            error_line(f"the page is {served.url}", "note")
+        if stream is not None:
+            outputs.append(live.PipeOutput(stream))
+        if out is not None:
+            outputs.append(live.VideoOutput(out, settings.timing.frame_rate))
+    except BaseException:
+        for output in outputs:
+            output.close(complete=False)
+        raise
+    return outputs
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -220,25 +233,18 @@ def _margins(source: FrameSource, tracker: Any, steady: float, num_frames: int |
     return widest
 
 
-class _standard_output_of_frames:
-    """Standard output for frames; everything that is printed in the meantime and later goes to standard error."""
-
-    def __init__(self, *, enabled: bool) -> None:
-        self._enabled = enabled
-
-    def __enter__(self) -> BinaryIO | None:
-        if not self._enabled:
-            return None
-        if sys.stdout.isatty():
-            raise ValueError("--out - writes raw frames to standard output, which is a terminal; redirect it")
-        self._frames = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+@contextmanager
+def _frames_on_standard_output(*, enabled: bool) -> Iterator[BinaryIO | None]:
+    """Standard output for frames; everything that is printed then and later goes to standard error."""
+    if not enabled:
+        yield None
+        return
+    if sys.stdout.isatty():
+        raise ValueError("--out - writes raw frames to standard output, which is a terminal; redirect it")
+    with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as frames:
         sys.stdout = sys.stderr
-        return self._frames
-
-    def __exit__(self, *_: object) -> None:
-        if self._enabled:
-            with suppress(BrokenPipeError):
-                self._frames.close()
+        with suppress(BrokenPipeError):  # the program behind the pipe has ended
+            yield frames
 
 
 class _StateText:

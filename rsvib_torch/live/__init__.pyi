@@ -1,5 +1,5 @@
-from .outputs import FrameOutput, PipeOutput, PreviewOutput, VideoOutput
-from .page import PageOutput
+from .frame_outputs import FrameOutput, PipeOutput, PreviewOutput, VideoOutput
+from .live_page import PageOutput
 from .session import LiveReport, run_live
 from .sources import CameraSource, FileSource, FrameSource, PipeSource, TimedFrame
 from .spectrogram import Spectrogram, save_spectrogram

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.detection import DetectionResult
-from rsvib_torch.live.outputs import FrameOutput
+from rsvib_torch.live.frame_outputs import FrameOutput
 from rsvib_torch.live.sources import FrameReader, FrameSource
 from rsvib_torch.live.spectrogram import Spectrogram
 from rsvib_torch.tracking import TrackedFrame, VibrationTracker, VideoBorder

@@ -173,6 +173,8 @@ class VibrationTracker:
         method: Method of ``restore``; ``"dewarp"`` is the fastest.
         steady: s; the image is moved to the straight line that fits its path during this time, so that slow shaking is
             removed as well. 0: frames stay where they are.
+        wobble: Whether skew and wobble by slow motion are removed along axes without a reliable vibration as well, as
+            with ``steady``. Frames that move as a whole (stabilised in the camera) would be skewed by it.
         full_scale: As in ``restore``.
         channels: ``"last"`` for frames (H, W, C).
         **options: Options of the method.
@@ -205,6 +207,7 @@ class VibrationTracker:
         columns: int | None = 256,
         method: str = "dewarp",
         steady: float = 0.0,
+        wobble: bool = False,
         full_scale: float | None = None,
         channels: Channels = None,
         **options: Any,
@@ -218,6 +221,7 @@ class VibrationTracker:
         self.window = check_whole_number("window", window, at_least=2)
         self.columns = columns if columns is None else check_whole_number("columns", columns, at_least=64)
         self.steady = check_number("steady", steady, at_least=0.0)
+        self.wobble = wobble or steady > 0
         self.full_scale, self.channels = full_scale, channels
         self._rows = timing.in_row_order()
         self.reset()
@@ -494,8 +498,7 @@ class VibrationTracker:
         fit = self._at_middle(time, height).as_fit(time + half)
         motion = motion_of_fit(fit)
         trusted = torch.stack(list(self._trusted)).any(0)
-        # a steady image has no slow shaking along any axis whose rows agree with the filter
-        followed = ~trusted.new_tensor(self._verdict.contradicted) if self.steady else trusted
+        followed = ~trusted.new_tensor(self._verdict.contradicted) if self.wobble else trusted
         motion = Vibration(
             motion.amplitude * trusted[..., None],
             motion.frequency,

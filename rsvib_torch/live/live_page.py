@@ -94,8 +94,8 @@ class PageOutput:
         try:
             while self._open:
                 with self._changed:
-                    if not self._changed.wait_for(lambda: self._number > sent or not self._open, timeout=1.0):
-                        continue
+                    while self._number == sent and self._open:
+                        self._changed.wait(1.0)
                     data, sent = self._frame, self._number
                 head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
                 request.wfile.write(head.encode() + data + b"\r\n")
