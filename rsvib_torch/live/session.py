@@ -91,7 +91,8 @@ def run_live(
     Returns:
         The report.
     """
-    report, begin = LiveReport(), time.perf_counter()
+    report, begin, threads = LiveReport(), time.perf_counter(), torch.get_num_threads()
+    torch.set_num_threads(max(1, threads // 2))  # tracking and writing share the processors
     reader = FrameReader(source, waiting, drops=drops)
     writer = _Writer(outputs, border or VideoBorder("mirror"), report, reader, tracker.timing.frame_period)
     complete = False
@@ -108,6 +109,7 @@ def run_live(
         writer.finish()
         complete = True
     finally:
+        torch.set_num_threads(threads)
         reader.close()
         writer.stop()
         for output in outputs:
@@ -184,6 +186,7 @@ class _Writer:
         self._outputs, self._border, self._report, self._period = outputs, border, report, period
         self._queue: queue.Queue[tuple[TrackedFrame, float] | None] = queue.Queue(_WAITING_RESTORED)
         self._error: Exception | None = None
+        self._threads = torch.get_num_threads()
         self._thread = threading.Thread(target=self._run, name="rsvib-write", daemon=True)
         self._thread.start()
 
@@ -211,6 +214,7 @@ class _Writer:
             self._thread.join()
 
     def _run(self) -> None:
+        torch.set_num_threads(self._threads)  # of this thread
         last = None
         while (item := self._queue.get()) is not None:
             if self._error is not None:

@@ -247,17 +247,16 @@ class ToneFilter:
         drift = (self.probability[..., None] * self.drift).sum(1)
         return step * drift[:, 0] + 0.5 * step**2 * drift[:, 1]
 
-    def as_fit(self, origin: float, *, most_probable: bool = False) -> ToneFit:
-        """The mean of all filters, or the most probable one of each axis, as a fit; the growth is left out.
+    def displacement_std(self) -> float:
+        """px, standard deviation of the tones at the reference time, by the most probable filter; of the worse axis."""
+        best = self.probability.argmax(-1)[:, None, None]
+        variance = self.covariance.diagonal(dim1=-2, dim2=-1).take_along_dim(best, 1)[:, 0, :-2]
+        real, imaginary = variance[:, ::4], variance[:, 1::4]
+        return float((0.5 * (real + imaginary)).sum(-1).clamp(min=0.0).amax().sqrt())
 
-        Args:
-            origin: Time origin of the fit in s.
-            most_probable: Whether to leave out the other filters.
-        """
-        weight = self.probability
-        if most_probable:
-            weight = (weight == weight.amax(-1, keepdim=True)).to(weight)
-        values, covariance = self._moments((weight / weight.sum(-1, keepdim=True))[..., None])
+    def as_fit(self, origin: float) -> ToneFit:
+        """The mean of all filters as a fit whose time origin is ``origin`` in s; the growth is left out."""
+        values, covariance = self._moments(self.probability[..., None])
         tones = values[:, 0, :-2].unflatten(-1, (-1, 4))
         place = torch.arange(values.shape[-1], device=values.device)
         keep = (place % 4 != 2) | (place >= 4 * self.tones)

@@ -237,6 +237,7 @@ class VibrationTracker:
         self._untried, self._attempts, self._contradictions, self._time = 0, 0, 0, -math.inf
         self._trusted: deque[Tensor] = deque(maxlen=self.window)
         self._columns = slice(None)
+        self._middle: tuple[ToneFilter, ToneFilter] | None = None  # a state, and the one at the middle of the frame
 
     @outside_graphs
     @full_precision
@@ -264,7 +265,7 @@ class VibrationTracker:
             channels=self.channels,
             saturation="auto" if "clipped" in METHODS[self.method].masks else None,
         )
-        grey = prepared.filled.mean(2)
+        grey = prepared.filled[:, :, 0] if prepared.images.shape[2] == 1 else prepared.filled.mean(2)
         valid = None if prepared.missing is None else ~prepared.missing.any(2)
         if self._last and self._last[-1][0].shape != grey.shape:
             raise ValueError(
@@ -293,11 +294,12 @@ class VibrationTracker:
         return value
 
     def _is_unusable(self, grey: Tensor) -> bool:
+        """Whether a frame is constant, or a copy of the frame before; some rows are enough to find that it is not."""
         some = grey[..., ::16, :]
-        constant = bool(some.amax() - some.amin() <= 1e-6 * some.abs().amax()) and bool(
-            (grey == grey[0, 0, 0, 0]).all()
-        )
-        return constant or (bool(self._last) and torch.equal(self._last[-1][0], grey))
+        if bool(some.amax() - some.amin() <= 1e-6 * some.abs().amax()):
+            return bool((grey.amax() - grey.amin()) <= 1e-6 * grey.abs().amax())
+        before = self._last[-1][0] if self._last else None
+        return before is not None and torch.equal(before[..., ::16, :], some) and torch.equal(before, grey)
 
     # Tracking
 
@@ -310,10 +312,7 @@ class VibrationTracker:
         state = self._filter.predicted(centre)
         fit = state.as_fit(centre)
         starts = torch.tensor([before.start, time], dtype=torch.float64, device=grey.device) - centre
-        rows = self._row_starts(height, grey.device)
-        likely = state.as_fit(centre, most_probable=True)
-        uncertain = displacement_std(likely, starts[1] + rows, self._rows.exposure_time)
-        if not float(uncertain.amax()) < _MAX_PREDICTED_STD:
+        if not state.displacement_std() < _MAX_PREDICTED_STD:
             self._filter = self._verdict = None
             return
         step, previous = centre - self._filter.time, self._path
@@ -358,7 +357,9 @@ class VibrationTracker:
     def _at_middle(self, time: float, height: int) -> ToneFilter:
         """The state at the middle of a frame that starts at ``time`` in s."""
         assert self._filter is not None
-        return self._filter.predicted(time + self._half(height), mixed=False)
+        if self._middle is None or self._middle[0] is not self._filter:
+            self._middle = self._filter, self._filter.predicted(time + self._half(height), mixed=False)
+        return self._middle[1]
 
     def _spectra(self, grey: Tensor, valid: Tensor | None) -> RowSpectra:
         mask = None if valid is None else valid[..., self._columns]
