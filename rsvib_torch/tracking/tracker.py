@@ -432,7 +432,7 @@ class VibrationTracker:
         )
 
     def _detect(self, count: int) -> None:
-        """Detect the vibration in the last ``count`` frames, and start the filter with its significant tones."""
+        """Detect the vibration in the last ``count`` frames, and start the filter with its tones."""
         frames, masks, times = zip(*list(self._last)[-count:], strict=True)
         self._untried, self._attempts = 0, self._attempts + 1
         middle = 0.5 * (times[0] + times[-1]) + 0.5 * frames[0].shape[-2] * self._rows.row_time
@@ -452,7 +452,7 @@ class VibrationTracker:
                 roll=False,
                 zoom=False,
             )[0]
-            if self._filter is None or bool((found.vibration.amplitude > MIN_SIGNIFICANCE * found.std.amplitude).any()):
+            if self._filter is None or bool(_plausible(found).any()):
                 names = ("_filter", "_reference", "_verdict", "_path", "_columns", "_trusted")
                 before = {name: getattr(self, name) for name in names}
                 self._start(found, middle, times[-1] - times[0])
@@ -464,15 +464,15 @@ class VibrationTracker:
         vibration, std = found.vibration, found.std
         # a record does not distinguish a tone of less than one period from a drift, and its amplitude is not known
         slow = vibration.frequency * record < 1.0
-        # the verdict on a record may be that a slow motion is not explained; the filter has its own verdict
-        significant = vibration.amplitude > MIN_SIGNIFICANCE * std.amplitude
-        tones = torch.polar(vibration.amplitude, vibration.phase - 0.5 * math.pi) * significant
+        tones = torch.polar(vibration.amplitude, vibration.phase - 0.5 * math.pi) * _plausible(found)
         rate = 2j * math.pi * vibration.frequency
         drift = torch.stack([vibration.image_motion, vibration.image_acceleration], -1)
         drift = drift + torch.stack([(tones * rate).real, (tones * rate.square()).real], -1).mul(slow[..., None]).sum(1)
         tones = tones * ~slow
         growth_std = torch.full_like(std.amplitude, 0.5)  # 1/s
-        parts = torch.stack([std.amplitude, std.amplitude, growth_std, 2 * math.pi * std.frequency], -1)
+        # the standard deviations of a record allow for other tones
+        size_std = torch.minimum(std.amplitude, 0.05 * vibration.amplitude)
+        parts = torch.stack([size_std, size_std, growth_std, 2 * math.pi * std.frequency], -1)
         # the last frame is measured again
         tone_std = torch.where((tones.abs() > 0)[..., None], 2.0 * parts, 0.0).flatten(-2)
         self._filter = ToneFilter.started(
@@ -597,6 +597,16 @@ class VibrationTracker:
             timing=self.timing,
         )
         return result[0]
+
+
+def _plausible(found: DetectionResult) -> Tensor:
+    """(2, K) bool, tones to start with: significant ones, and the strongest of each axis above its standard deviation.
+
+    The verdict on a record may be that the motion changes, which the filter follows. It has its own verdict.
+    """
+    amplitude, std = found.vibration.amplitude, found.std.amplitude
+    strongest = amplitude == amplitude.amax(-1, keepdim=True)
+    return (amplitude > MIN_SIGNIFICANCE * std) | (strongest & (amplitude > std))
 
 
 @torch.no_grad()
