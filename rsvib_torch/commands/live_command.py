@@ -67,7 +67,7 @@ def live_session(
             help=f"Restoration method: {', '.join(METHOD_SETTINGS)}.", show_default="from the configuration, or dewarp"
         ),
     ] = None,
-    columns: Annotated[int, typer.Option(help="Columns that are measured: those with the most detail.", min=64)] = 256,
+    columns: Annotated[int, typer.Option(help="Columns that are measured: those with the most detail.", min=64)] = 384,
     window: Annotated[int, typer.Option(help="Frames from which the vibration is detected at first.", min=2)] = 8,
     steady: Annotated[
         float,

@@ -204,7 +204,7 @@ class VibrationTracker:
         timing: SensorTiming,
         *,
         window: int = 8,
-        columns: int | None = 256,
+        columns: int | None = 384,
         method: str = "dewarp",
         steady: float = 0.0,
         wobble: bool = False,
