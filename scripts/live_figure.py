@@ -32,7 +32,9 @@ def main() -> None:
         stds.append([found.std.frequency[:, 0].tolist(), found.std.amplitude[:, 0].tolist()])
     when, found_values, found_stds = np.array(times), np.array(values), np.array(stds)
     truth = MOTION.frequency(when), MOTION.amplitude(when)
-    figure, panels = plt.subplots(2, 3, figsize=(13, 5.6), layout="constrained", sharex="col", width_ratios=(1, 1, 1.15))
+    figure, panels = plt.subplots(
+        2, 3, figsize=(13, 5.6), layout="constrained", sharex="col", width_ratios=(1, 1, 1.15)
+    )
     for place, unit in enumerate(("frequency (Hz)", "amplitude (px)")):
         for axis, name in enumerate("xy"):
             start = truth[place][axis, 0]

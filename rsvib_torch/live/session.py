@@ -90,30 +90,33 @@ def run_live(
 
     Returns:
         The report.
+
+    Raises:
+        Exception: Errors of the source, the tracker and the outputs. Videos contain the frames before an error of the
+            source or the tracker.
     """
     report, begin, threads = LiveReport(), time.perf_counter(), torch.get_num_threads()
     torch.set_num_threads(max(1, threads // 2))  # tracking and writing share the processors
     reader = FrameReader(source, waiting, drops=drops)
     writer = _Writer(outputs, border or VideoBorder("mirror"), report, reader, tracker.timing.frame_period)
-    complete = False
     try:
-        for tracked, arrived in steadied(_tracked(reader, tracker, report, max_frames), steady):
-            if spectrogram is not None:
-                spectrogram.add(tracked)
-            if progress is not None:
-                progress(tracked, report)
-            writer.put(tracked, arrived)
-        writer.finish()
-        complete = True
-    except KeyboardInterrupt:  # the usual end of a session with a camera
-        writer.finish()
-        complete = True
+        try:
+            for tracked, arrived in steadied(_tracked(reader, tracker, report, max_frames), steady):
+                if spectrogram is not None:
+                    spectrogram.add(tracked)
+                if progress is not None:
+                    progress(tracked, report)
+                writer.put(tracked, arrived)
+        except KeyboardInterrupt:  # the usual end of a session with a camera
+            pass
+        finally:  # frames before an error of the source are not lost
+            writer.finish()
     finally:
         torch.set_num_threads(threads)
         reader.close()
         writer.stop()
         for output in outputs:
-            output.close(complete=complete)
+            output.close(complete=not writer.failed)
         report.dropped, report.lost = reader.dropped, source.lost
         report.seconds = time.perf_counter() - begin
     return report
@@ -200,6 +203,11 @@ class _Writer:
             except queue.Full:
                 continue
             return
+
+    @property
+    def failed(self) -> bool:
+        """Whether a frame could not be written."""
+        return self._error is not None
 
     def finish(self) -> None:
         """Wait until all frames are written."""

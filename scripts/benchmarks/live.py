@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Any
 
 import cv2
@@ -136,24 +137,15 @@ def session(pixels: NDArray[np.uint8], size: int, minutes: float) -> dict[str, A
     """A paced session."""
     process, count = psutil.Process(), round(60 * RATE * minutes)
     memory: list[float] = []
-    ours: list[NDArray[Any]] = []
 
     def watch(tracked: rsv.TrackedFrame, _: LiveReport) -> None:
-        index = round(tracked.time * RATE)
-        if index % RATE == 0:
+        if round(tracked.time * RATE) % RATE == 0:
             memory.append(process.memory_info().rss)
-        if index % 37 == 36 and tracked.detection is not None:
-            ours.append(errors(tracked.detection, AMPLITUDE, FREQUENCY))
 
     tracker = rsv.VibrationTracker(timing_of(size))
     begin = process.cpu_times()
     report = run_live(Repeated(pixels, count, paced=True), tracker, [Output()], max_frames=count, progress=watch)
     cpu = process.cpu_times()
-    batch = [
-        errors(rsv.detect_vibration(stack, timing_of(size)), AMPLITUDE, FREQUENCY)
-        for stack in (torch.as_tensor(pixels[first : first + WINDOW]) for first in range(0, len(pixels) - WINDOW + 1, 5))
-    ]
-    rms = [np.sqrt(np.mean(np.square(one), 0)) for one in (ours, batch)]
     half = len(memory) // 2
     return {
         "name": "session",
@@ -164,12 +156,27 @@ def session(pixels: NDArray[np.uint8], size: int, minutes: float) -> dict[str, A
         "within_two": sum(report.latencies[:3]) / max(report.frames, 1),
         "cpu": 1e3 * (cpu.user + cpu.system - begin.user - begin.system) / max(report.frames, 1),
         "memory": memory[-1] / 2**20,
-        "drift": float(np.mean(memory[half:]) / np.mean(memory[max(half // 2, min(5, half - 1)) : half]) - 1),
+        "drift": float(np.mean(memory[half:]) / np.mean(memory[min(5, half - 1) : half]) - 1),
         "tracked": report.tracked / max(report.frames, 1),
         "detections": report.detections,
-        "errors": rms[0].tolist(),
-        "batch_errors": rms[1].tolist(),
     }
+
+
+def accuracy(pixels: NDArray[np.uint8], size: int, periods: int = 5) -> dict[str, Any]:
+    """Errors of the tracker from the second period of the frames on, and of the batch on windows of the same frames."""
+    timing, tracker = timing_of(size), rsv.VibrationTracker(timing_of(size))
+    count, ours = len(pixels), []
+    for index in range(periods * count):
+        found = tracker.update(pixels[index % count]).detection
+        if index >= count and found is not None:
+            ours.append(errors(found, AMPLITUDE, FREQUENCY))
+    twice = torch.as_tensor(np.concatenate([pixels, pixels]))
+    batch = [
+        errors(rsv.detect_vibration(twice[first : first + WINDOW], timing), AMPLITUDE, FREQUENCY)
+        for first in range(0, count, 3)
+    ]
+    rms = [np.sqrt(np.mean(np.square(one), 0)) for one in (ours, batch)]
+    return {"name": "accuracy", "errors": rms[0].tolist(), "batch_errors": rms[1].tolist()}
 
 
 def change(name: str, size: int, motion: Changing) -> dict[str, Any]:
@@ -237,7 +244,7 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Session, changes, and speed next to peers."""
     size = options.live_size
     pixels = frames_of(size, Changing(), RATE)
-    results = [session(pixels, size, options.minutes)]
+    results = [session(pixels, size, options.minutes), accuracy(pixels, size)]
     results.append(change("sweep of 2 Hz/s", size // 2, Changing(sweep=2.0)))
     results.append(change("amplitude doubles in 1 s", size // 2, Changing(doublings=1.0)))
     clip = np.concatenate([pixels, pixels])
@@ -246,8 +253,9 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
         "`VibrationTracker`, dewarp": tracked_frames(clip, size, "dewarp"),
         "`VibrationTracker`, exact": tracked_frames(clip, size, "exact"),
         "`cv2.phaseCorrelate`, `cv2.warpAffine`": lambda: phase_correlated(clip),
-        "vidstab": lambda: stabilised(clip),
     }
+    if find_spec("vidstab") is not None:
+        tasks["vidstab"] = lambda: stabilised(clip)
     for name, work in tasks.items():
         begin, cpu = time.perf_counter(), time.process_time()
         restored = work()
@@ -268,7 +276,7 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 def lines(rows: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
     """The tables in Markdown."""
-    one, *others = rows
+    one, errors_of, *others = rows
     size = options.live_size
     text = [
         f"One session of {one['frames'] / RATE / 60:.2g} minutes, {size} x {size} at {RATE} frames/s, restored with "
@@ -284,7 +292,7 @@ def lines(rows: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
         f"| frames with known motion, detections | {one['tracked']:.1%}, {one['detections']} |",
     ]
     for place, (quantity, unit) in enumerate((("amplitude", "px"), ("frequency", "Hz"))):
-        ours, batch = (math.hypot(*one[name][place]) / math.sqrt(2) for name in ("errors", "batch_errors"))
+        ours, batch = (math.hypot(*errors_of[name][place]) / math.sqrt(2) for name in ("errors", "batch_errors"))
         text.append(
             f"| error of the {quantity}: tracker, batch, ratio | {ours:.5f} {unit}, {batch:.5f} {unit}, "
             f"{ours / batch:.2f} |"

@@ -3,7 +3,6 @@
 from typing import Any
 
 import cv2
-import imutils
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +11,8 @@ __all__ = ["stabilised"]
 
 def _stabiliser() -> Any:
     """A ``VidStab``; its last version (1.7.4) looks up names that OpenCV 5 has moved or removed."""
+    import imutils  # noqa: PLC0415
+
     if not hasattr(cv2, "BRISK_create"):
         cv2.BRISK_create = None  # type: ignore[attr-defined]  # a detector that is not used here
     imutils.is_cv4 = lambda *_: True  # and later

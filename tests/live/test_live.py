@@ -181,11 +181,30 @@ def test_the_memory_of_the_spectrogram_is_bounded():
     assert len(spectrogram.result()[0]) <= 9
 
 
-def test_a_session_that_fails_leaves_no_video(tmp_path):
-    tracker = rsv.VibrationTracker(TIMING, columns=None)
+class Broken:
+    """An output that cannot write."""
+
+    closed = None
+
+    def write(self, frame, index):
+        raise OSError("disk full")
+
+    def close(self, *, complete):
+        self.closed = complete
+
+
+def test_frames_before_an_error_of_the_source_are_not_lost(tmp_path):
     source = Numbers(3, error=OSError("unplugged"))
     output = live.VideoOutput(tmp_path / "video.mkv", 30.0)
-    with pytest.raises((OSError, ValueError)):
-        live.run_live(source, tracker, [output], drops=False)
-    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(OSError, match="unplugged"):
+        live.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False)
+    assert rsv.read_stack_info(tmp_path / "video.mkv").shape == (3, 1, 1)
+    assert source.closed
+
+
+def test_an_error_of_an_output_ends_the_session(tmp_path):
+    source, output = Numbers(), Broken()
+    with pytest.raises(OSError, match="disk full"):
+        live.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False)
+    assert output.closed is False
     assert source.closed
