@@ -343,8 +343,8 @@ def test_live(tmp_path):
 
     size = 128
     pixels = live.frames_of(size, live.Changing(), 8)
-    moving, whole = live.residual(pixels, size)
-    assert 1.5 < moving < 3.0  # px: rows move, and a stabiliser of whole frames does not help
+    moving, _ = live.residual(pixels, size)
+    assert 1.2 < moving < 3.0  # px: rows move, and a stabiliser of whole frames does not help
     assert live.residual(live.phase_correlated(pixels), size)[0] > 0.9 * moving
     restored = live.tracked_frames(pixels, size, "dewarp")()
     assert live.residual(restored[4:], size)[0] < 0.1 * moving
