@@ -35,6 +35,7 @@ from rsvib_torch.detection.rows.displacements import (
 )
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
 from rsvib_torch.detection.tones.fit import (
+    MIN_GAIN,
     ToneFit,
     displacement_std,
     model_displacements,
@@ -440,11 +441,13 @@ class VibrationTracker:
         ignore = None
         if any(mask is not None for mask in masks):
             ignore = torch.cat([~one if one is not None else torch.zeros_like(masks[-1]) for one in masks], 1)[0]
-        with suppress(ValueError):  # too few bands are registered: the next frames may be better
+        # too few bands are registered, or the fit diverges: the next frames may be better
+        with suppress(ValueError, OverflowError, torch.linalg.LinAlgError):
             stack = torch.cat(frames, 1)[0]
             found = detect_vibration(
                 stack,
                 timing,
+                method="bands",  # a start: the filter measures the rows
                 image_acceleration=len(times) > 2,
                 window=len(times),
                 columns=self.columns,
@@ -606,7 +609,8 @@ def _plausible(found: DetectionResult) -> Tensor:
     """
     amplitude, std = found.vibration.amplitude, found.std.amplitude
     strongest = amplitude == amplitude.amax(-1, keepdim=True)
-    return (amplitude > MIN_SIGNIFICANCE * std) | (strongest & (amplitude > std))
+    plausible = (amplitude > MIN_SIGNIFICANCE * std) | (strongest & (amplitude > std))
+    return plausible & (found.gain.abs() > MIN_GAIN)  # blind tones may have any amplitude
 
 
 @torch.no_grad()
