@@ -4,11 +4,13 @@ from . import detection as detection
 from . import evaluation as evaluation
 from . import imaging as imaging
 from . import io as io
+from . import live as live
 from . import motion as motion
 from . import registration as registration
 from . import report as report
 from . import restoration as restoration
 from . import stacks as stacks
+from . import tracking as tracking
 from .augmentation import RollingShutterVibration
 from .calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
 from .detection import (
@@ -86,6 +88,7 @@ from .restoration import (
     visible_pixels,
 )
 from .stacks import StackReport, iterate_stack, process_stack, read_manifest, restore_block
+from .tracking import Margins, TrackedFrame, VibrationTracker, VideoBorder
 
 __all__ = [
     "AngularRates",
@@ -93,6 +96,7 @@ __all__ = [
     "ClockAlignment",
     "DetectionResult",
     "FreeMotion",
+    "Margins",
     "MotionCheck",
     "MotionDetection",
     "MtfCurve",
@@ -112,10 +116,13 @@ __all__ = [
     "StackReport",
     "SweptTone",
     "TimingWarning",
+    "TrackedFrame",
     "Vibration",
     "VibrationDetector",
     "VibrationRestorer",
     "VibrationStd",
+    "VibrationTracker",
+    "VideoBorder",
     "align_motion",
     "blind_frequencies",
     "calibrate_row_time",

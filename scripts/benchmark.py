@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Speed and accuracy of the package and of other software, in one run on one machine.
 
-Sections (see benchmarks/sections.py): registration, cost, detection, restoration, pipeline, scaling, roofline,
+Sections (see benchmarks/sections.py): registration, cost, detection, restoration, pipeline, live, scaling, roofline,
 finer, mosaic, streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict, honesty, timing. Results are
 printed as Markdown tables and written to --out; with --store also to scripts/benchmarks/results, from which
 scripts/benchmark_page.py generates docs/benchmarks.md.
@@ -20,6 +20,7 @@ from benchmarks import (
     difficulty,
     finer,
     honesty,
+    live,
     measure,
     mosaic,
     pipeline,
@@ -65,6 +66,7 @@ def main() -> None:
         measure,
         restoration,
         pipeline,
+        live,
         scaling,
         detection,
         streaming,

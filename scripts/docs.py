@@ -75,6 +75,7 @@ SECTIONS = {
         "roll_and_zoom.md",
         "finer_grid.md",
         "gyroscope.md",
+        "live.md",
         "stacks.md",
         "export.md",
         "reliability.md",

@@ -26,10 +26,15 @@ BLUE, ORANGE, GREY = "#1f5fa8", "#d9822b", "#8a8f98"
 # Layers of the architecture from the top: name and content of each package.
 ARCHITECTURE = (
     (("commands", "the rsvib program: arguments, progress, terminal output"),),
+    (("live", "sources and outputs of a running camera"),),
     (("report", "results on disk: JSON, CSV, plots, HTML"),),
     (("config", "TOML files ↔ dataclasses"),),
     (("stacks", "windows, jobs, journal, resume, memory planning"),),
-    (("evaluation", "MTF, PSNR, Cramér-Rao bound, scenes"), ("augmentation", "training data")),
+    (
+        ("evaluation", "MTF, PSNR, bound, scenes"),
+        ("tracking", "vibration frame by frame"),
+        ("augmentation", "training data"),
+    ),
     (("detection", "offsets → motion, std, verdict"), ("restoration", "frames + motion → frames, verdict")),
     (("registration", "offsets of bands and rows"), ("calibration", "row time, exposure")),
     (("imaging", "PSF, blur, simulator"), ("io", "file formats")),

@@ -336,3 +336,35 @@ def test_verdict(tmp_path):
     assert "| < -0.3 dB | 0 | 0 | 0 | 2 |" in text
     assert sum(" 1.000 | " in line for line in text) == 2  # both scores separate these cases
     assert verdict_roc.lines(*stored("verdict", results, options(), tmp_path)) == text
+
+
+def test_live(tmp_path):
+    from benchmarks import live
+
+    size = 128
+    pixels = live.frames_of(size, live.Changing(), 8)
+    moving, _ = live.residual(pixels, size)
+    assert 1.2 < moving < 3.0  # px: rows move, and a stabiliser of whole frames does not help
+    assert live.residual(live.phase_correlated(pixels), size)[0] > 0.9 * moving
+    restored = live.tracked_frames(pixels, size, "dewarp")()
+    assert live.residual(restored[4:], size)[0] < 0.1 * moving
+    times = live.np.array([0.1, 0.3, 1.3])
+    changing = live.Changing(sweep=2.0, doublings=1.0)
+    assert changing.amplitude(times)[0] == pytest.approx([2.1, 2.1, 4.2])
+    angle = 2 * live.np.pi * (52.0 * 1.3 + 1.0) + 0.5  # 2 Hz/s during one second: one cycle more
+    assert changing.displacement(times)[0, -1] == pytest.approx(4.2 * live.np.sin(angle))
+    session = {"name": "session", "frames": 300, "dropped": 0, "delay_median": 0, "delay_99": 1, "within_two": 1.0}
+    session |= {"cpu": 40.0, "memory": 500.0, "drift": 0.01, "tracked": 0.99, "detections": 1}
+    accuracy = {
+        "name": "accuracy",
+        "errors": [[3e-4, 3e-4], [1e-3, 1e-3]],
+        "batch_errors": [[2e-4, 2e-4], [1e-3, 1e-3]],
+    }
+    change = {"name": "sweep", "size": 64, "amplitude": 0.01, "frequency": 0.05, "lost": 0, "detections": 1}
+    speed = {"name": "vidstab", "rate": 30.0, "cpu": 10.0, "rows": 2.0, "whole": 0.3}
+    chosen = options(live_size=1024)
+    text = live.lines([session, accuracy, change, speed], chosen)
+    assert "| error of the amplitude: tracker, batch, ratio | 0.00030 px, 0.00020 px, 1.50 |" in text
+    assert "| vidstab | 30.0 | 10 | 2.000 | 0.300 |" in text
+    rows, chosen = stored("live", [session, accuracy, change, speed], chosen, tmp_path)
+    assert live.lines(rows, chosen) == text

@@ -18,10 +18,11 @@ LAYERS = (
     {"imaging", "io"},
     {"registration", "calibration"},
     {"detection", "restoration"},
-    {"evaluation", "augmentation"},
+    {"evaluation", "augmentation", "tracking"},
     {"stacks"},
     {"config"},
     {"report"},
+    {"live"},
     {"commands"},
     {"__main__"},
 )

@@ -118,3 +118,12 @@ def test_page_on_export():
     names = {path.name for path in page["folder"].iterdir()}
     assert names == {"clip.gcsv", "maps", "camera.json", "slow.json", "fast.json"}
     assert len(page["files"]) == 4
+
+
+def test_page_on_live():
+    page = run_page("live.md", 1)
+    torch.testing.assert_close(
+        page["detection"].vibration.frequency[:, 0], page["truth"].frequency[:, 0], rtol=1e-3, atol=0
+    )
+    assert page["tracked"].state == "tracking"
+    assert page["restored"].shape == page["camera"][0].shape

@@ -14,6 +14,7 @@ import rsvib_torch
 from rsvib_torch.commands import motion_commands, stack_commands
 from rsvib_torch.commands.export_command import export
 from rsvib_torch.commands.init import init
+from rsvib_torch.commands.live_command import live_session
 from rsvib_torch.commands.options import DebugOption, JsonOption, QuietOption
 from rsvib_torch.commands.terminal import (
     Answer,
@@ -106,6 +107,16 @@ _COMMANDS: tuple[tuple[str, Callable[..., Answer], str, str], ...] = (
         rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
               --out camera.toml
         rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025
+        """,
+    ),
+    (
+        "live",
+        live_session,
+        "Follow the vibration of a running camera, and restore its frames.",
+        """
+        rsvib live 0 --config camera.toml --page 8080 --spectrogram vibration
+        rsvib live clip.mp4 --config camera.toml --out still.mp4 --steady 1 \\
+              --border crop
         """,
     ),
     (

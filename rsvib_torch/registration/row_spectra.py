@@ -86,6 +86,21 @@ class RowSpectra:
         part.valid = None if self.valid is None else self.valid[:, frames]
         return part
 
+    def followed_by(self, later: "RowSpectra") -> "RowSpectra":
+        """The spectra of these and of later frames of the same size."""
+        both = copy(self)
+        both.values = torch.cat([self.values, later.values], 1)
+        both._index_rows()
+        if self.valid is not None or later.valid is not None:
+            masks = [part.all_valid() if part.valid is None else part.valid for part in (self, later)]
+            both.valid = torch.cat(masks, 1)
+        return both
+
+    def all_valid(self) -> Tensor:
+        """(B, T, H, W) bool mask of frames without invalid pixels."""
+        shape = (*self.values.shape[:2], self.height, self.width)
+        return torch.ones(shape, dtype=torch.bool, device=self.values.device)
+
     def warped(self, rows: Tensor, shift: Tensor) -> Tensor:
         """Spectra (B, T, S, U) of frames at fractional rows, moved back by ``shift`` px; both (B, T, S)."""
         cell = rows.floor()

@@ -37,7 +37,15 @@ from rsvib_torch.restoration.verdict.judge import judge_frames
 from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError, pairs_to_judge
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 
-__all__ = ["METHODS", "RestorationMethod", "VibrationRestorer", "restore", "restore_prepared", "unchanged_frames"]
+__all__ = [
+    "METHODS",
+    "RestorationMethod",
+    "VibrationRestorer",
+    "check_method_options",
+    "restore",
+    "restore_prepared",
+    "unchanged_frames",
+]
 
 
 class CommonOptions(TypedDict, total=False):
@@ -114,7 +122,7 @@ METHODS: dict[str, RestorationMethod] = {
 }
 
 
-def _check_options(method: str, options: Mapping[str, Any]) -> None:
+def check_method_options(method: str, options: Mapping[str, Any]) -> None:
     """Refuse a method that does not exist, and options that the method does not have or that have another type."""
     valid = method_options(method)
     for name in options:
@@ -228,7 +236,7 @@ def restore(
         taken [23.0, 24.0] dB
         restored [62.0, 63.0] dB
     """
-    _check_options(method, options)
+    check_method_options(method, options)
     camera = check_optics(optics, method)
     timing = timing_of_files(frames, timing)
     frames, full_scale = load_frames(frames, full_scale)
@@ -266,7 +274,7 @@ def restore_prepared(
         Restored frames (B, T, C, H, W) in row order.
     """
     options = dict(options or {})
-    _check_options(method, options)
+    check_method_options(method, options)
     chosen = METHODS[method]
     if frames.colours is not None and "colours" not in chosen.masks:
         raise ValueError(f"mosaic goes with method='exact', not with method={method!r}; demosaic the frames before")
@@ -388,7 +396,7 @@ class VibrationRestorer(nn.Module):
         **options: Any,
     ) -> None:
         super().__init__()
-        _check_options(method, options)
+        check_method_options(method, options)
         self.timing = timing
         common = {"full_scale": full_scale, "channels": channels, "saturation": saturation, "check": check}
         self.options = {"method": method, **common, **options}

@@ -33,6 +33,7 @@ _LIBRARIES = {
     "NumPy": ("numpy",),
     "PyLops": ("pylops",),
     "deepinv": ("deepinv",),
+    "vidstab": ("vidstab",),
 }
 
 

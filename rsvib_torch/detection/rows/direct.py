@@ -46,7 +46,7 @@ from rsvib_torch.motion.vibration import blind_frequencies
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.registration.gradients import RowGradients
 
-__all__ = ["DirectFit", "refine_directly"]
+__all__ = ["DirectFit", "offset_curve", "refine_directly"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +103,10 @@ def refine_directly(
         found = replace(found, fit=significant_only(found.measurements, found.fit, intervals))
     blur = rows.blur_ratio(shrunk_motion(found.fit, intervals))
     found = replace(found, other_motion=replace(found.other_motion, blur=blur))
-    return found, *_offset_curve(found, [group.starts.shape[1] for group in rows.groups])
+    return found, *offset_curve(found, [group.starts.shape[1] for group in rows.groups])
 
 
-def _offset_curve(found: DirectFit, group_frames: Sequence[int]) -> tuple[OffsetCurve, Tensor]:
+def offset_curve(found: DirectFit, group_frames: Sequence[int]) -> tuple[OffsetCurve, Tensor]:
     """Measured offsets between consecutive frames, and those (B, P, N, 2) in px that the fit predicts.
 
     Args:

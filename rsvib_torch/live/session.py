@@ -1,0 +1,251 @@
+"""The loop from a source of frames to its outputs: reading, tracking and writing in three threads."""
+
+import math
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rsvib_torch.detection import DetectionResult
+from rsvib_torch.live.frame_outputs import FrameOutput
+from rsvib_torch.live.sources import FrameReader, FrameSource
+from rsvib_torch.live.spectrogram import Spectrogram
+from rsvib_torch.tracking import TrackedFrame, VibrationTracker, VideoBorder
+
+__all__ = ["LiveReport", "run_live", "steadied", "to_counts"]
+
+_WAITING_RESTORED = 2  # frames between tracking and writing: the largest delay of the output in frames
+_ROUNDING = 1e-6  # s, of frame times
+_LATENCY_COUNTS = 64  # frames; longer delays are counted as this
+
+
+@dataclass(eq=False)
+class LiveReport:
+    """What happened in a session.
+
+    Attributes:
+        frames: Frames that were written.
+        tracked: Frames whose motion was known.
+        unusable: Frames that were constant, or copies.
+        dropped: Frames that arrived and were dropped, because processing was too slow.
+        lost: Frames that the source did not deliver, by its clock.
+        detections: Calls of ``detect_vibration``.
+        seconds: Duration of the session.
+        latencies: Number of frames by their delay: how many frames had arrived behind it when a frame was written.
+        detection: The last vibration.
+        size: (height, width) of the written frames.
+    """
+
+    frames: int = 0
+    tracked: int = 0
+    unusable: int = 0
+    dropped: int = 0
+    lost: int = 0
+    detections: int = 0
+    seconds: float = 0.0
+    latencies: list[int] = field(default_factory=lambda: [0] * (_LATENCY_COUNTS + 1))
+    detection: DetectionResult | None = None
+    size: tuple[int, int] | None = None
+
+    def latency(self, share: float) -> int:
+        """Delay in frames that ``share`` (0 to 1) of the frames do not exceed."""
+        counts = np.cumsum(self.latencies)
+        return int(np.searchsorted(counts, share * counts[-1]))
+
+
+def run_live(
+    source: FrameSource,
+    tracker: VibrationTracker,
+    outputs: Sequence[FrameOutput],
+    *,
+    border: VideoBorder | None = None,
+    steady: float = 0.0,
+    drops: bool = True,
+    waiting: int = 64,
+    max_frames: int | None = None,
+    spectrogram: Spectrogram | None = None,
+    progress: Callable[[TrackedFrame, LiveReport], None] | None = None,
+) -> LiveReport:
+    """Track the frames of a source, and write the restored ones, until the source ends or Ctrl-C is pressed.
+
+    Args:
+        source: The source; it is closed at the end.
+        tracker: The tracker.
+        outputs: They get frames of 8 bits, (H, W) or (H, W, 3), and are closed at the end.
+        border: Treatment of pixels that the sensor did not record.
+        steady: s; frames are moved to the mean of the path in the interval of this length around them, and written half
+            as much later. For files; a tracker with ``steady`` does not look ahead.
+        drops: Whether the oldest waiting frames are dropped if processing is too slow, so that the source never waits.
+        waiting: Largest number of frames that wait.
+        max_frames: Number of frames to process; None for all.
+        spectrogram: Collects the offsets.
+        progress: Called for every tracked frame.
+
+    Returns:
+        The report.
+
+    Raises:
+        Exception: Errors of the source, the tracker and the outputs. Videos contain the frames before an error of the
+            source or the tracker.
+    """
+    report, begin, threads = LiveReport(), time.perf_counter(), torch.get_num_threads()
+    torch.set_num_threads(max(1, threads // 2))  # tracking and writing share the processors
+    reader = FrameReader(source, waiting, drops=drops)
+    writer = _Writer(outputs, border or VideoBorder("mirror"), report, reader, tracker.timing.frame_period)
+    try:
+        try:
+            for tracked, arrived in steadied(_tracked(reader, tracker, report, max_frames), steady):
+                if spectrogram is not None:
+                    spectrogram.add(tracked)
+                if progress is not None:
+                    progress(tracked, report)
+                writer.put(tracked, arrived)
+        except KeyboardInterrupt:  # the usual end of a session with a camera
+            pass
+        finally:  # frames before an error of the source are not lost
+            writer.finish()
+    finally:
+        torch.set_num_threads(threads)
+        reader.close()
+        writer.stop()
+        for output in outputs:
+            output.close(complete=not writer.failed)
+        report.dropped, report.lost = reader.dropped, source.lost
+        report.seconds = time.perf_counter() - begin
+    return report
+
+
+def _tracked(
+    reader: FrameReader, tracker: VibrationTracker, report: LiveReport, max_frames: int | None
+) -> Iterator[tuple[TrackedFrame, float]]:
+    """Tracked frames with the times of ``perf_counter`` at which they arrived."""
+    for count, frame in enumerate(reader):
+        if count == max_frames:
+            return
+        tracked = tracker.update(frame.pixels, frame.time)
+        report.tracked += tracked.state == "tracking"
+        report.unusable += tracked.state == "unusable"
+        report.detections += tracked.detected
+        yield tracked, frame.arrived
+
+
+def steadied(frames: Iterator[tuple[TrackedFrame, float]], duration: float) -> Iterator[tuple[TrackedFrame, float]]:
+    """Frames moved to the mean of the path over ``duration`` s around them; frames without path stay."""
+    if duration == 0:
+        yield from frames
+        return
+    around: deque[tuple[TrackedFrame, float]] = deque()
+    position, half = 0, 0.5 * duration  # index in ``around`` of the next frame to yield
+
+    def placed(index: int) -> tuple[TrackedFrame, float]:
+        tracked, arrived = around[index]
+        if not bool(torch.isfinite(tracked.path).all()):
+            return tracked, arrived
+        # the same distance on both sides, so that a uniform motion is kept at the ends as well
+        reach = min(half, tracked.time - around[0][0].time, around[-1][0].time - tracked.time)
+        near = [
+            (
+                one.path,
+                0.5 if abs(abs(one.time - tracked.time) - reach) < _ROUNDING and reach > 0 else 1.0,
+            )  # trapezoidal rule
+            for one, _ in around
+            if abs(one.time - tracked.time) <= reach + _ROUNDING and bool(torch.isfinite(one.path).all())
+        ]
+        paths, weights = zip(*near, strict=True)
+        weight = torch.tensor(weights, dtype=torch.float64, device=tracked.path.device)
+        return tracked.moved_to((weight[:, None] * torch.stack(paths)).sum(0) / weight.sum()), arrived
+
+    for item in frames:
+        around.append(item)
+        while position < len(around) and around[position][0].time + half <= item[0].time + _ROUNDING:
+            yield placed(position)
+            position += 1
+            while around[0][0].time < around[min(position, len(around) - 1)][0].time - half - _ROUNDING:
+                around.popleft()
+                position -= 1
+    while position < len(around):
+        yield placed(position)
+        position += 1
+
+
+class _Writer:
+    """Restores and writes frames in a thread, while the next ones are tracked."""
+
+    def __init__(
+        self,
+        outputs: Sequence[FrameOutput],
+        border: VideoBorder,
+        report: LiveReport,
+        reader: FrameReader,
+        period: float,
+    ) -> None:
+        self._outputs, self._border, self._report, self._period = outputs, border, report, period
+        self._queue: queue.Queue[tuple[TrackedFrame, float] | None] = queue.Queue(_WAITING_RESTORED)
+        self._error: Exception | None = None
+        self._threads = torch.get_num_threads()
+        self._thread = threading.Thread(target=self._run, name="rsvib-write", daemon=True)
+        self._thread.start()
+
+    def put(self, tracked: TrackedFrame, arrived: float) -> None:
+        """Hand over a frame; waits if the thread is behind."""
+        while True:
+            if self._error is not None:
+                raise self._error
+            try:
+                self._queue.put((tracked, arrived), timeout=0.5)
+            except queue.Full:
+                continue
+            return
+
+    @property
+    def failed(self) -> bool:
+        """Whether a frame could not be written."""
+        return self._error is not None
+
+    def finish(self) -> None:
+        """Wait until all frames are written."""
+        self.stop()
+        if self._error is not None:
+            raise self._error
+
+    def stop(self) -> None:
+        """End the thread."""
+        if self._thread.is_alive():
+            self._queue.put(None)
+            self._thread.join()
+
+    def _run(self) -> None:
+        torch.set_num_threads(self._threads)  # of this thread
+        last = None
+        while (item := self._queue.get()) is not None:
+            if self._error is not None:
+                continue
+            tracked, arrived = item
+            try:
+                frame = to_counts(self._border(tracked))
+                index = round(tracked.time / self._period)
+                for output in self._outputs:
+                    output.write(frame, index)
+                last = tracked
+                self._report.size = frame.shape[:2]
+                self._report.frames += 1
+                late = math.floor((time.perf_counter() - arrived) / self._period)
+                self._report.latencies[min(late, _LATENCY_COUNTS)] += 1
+            except Exception as error:  # raised again in the main thread
+                self._error = error
+        if last is not None and self._error is None:
+            self._report.detection = last.detection
+
+
+def to_counts(frame: Tensor) -> NDArray[np.uint8]:
+    """A frame (H, W) or (C, H, W) of full scale 1 as 8-bit counts (H, W) or (H, W, C)."""
+    counts = frame.nan_to_num(0.0).mul(255.0).round_().clamp_(0.0, 255.0).to(torch.uint8)
+    counts = counts if frame.ndim == 2 else counts[0] if frame.shape[0] == 1 else counts.movedim(0, -1)
+    return counts.cpu().numpy()

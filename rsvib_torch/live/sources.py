@@ -1,0 +1,246 @@
+"""Sources of frames: cameras, pipes of raw frames and files, and a thread that reads them without waiting.
+
+Clocks of hosts are not accurate enough for rows (a millisecond is 0.3 rad at 50 Hz). Frames of a camera therefore get
+times that are whole frame periods apart; the clock only determines how many frames are missing in between.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Literal, Protocol, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsvib_torch.core.checks import check_choice, check_whole_number
+from rsvib_torch.io import open_stack, read_stack_info, timing_from_first_frame
+from rsvib_torch.motion.timing import SensorTiming
+
+__all__ = [
+    "CameraSource",
+    "FileSource",
+    "FrameReader",
+    "FrameSource",
+    "PipeSource",
+    "PixelFormat",
+    "TimedFrame",
+]
+
+PixelFormat = Literal["gray8", "gray16le", "rgb24", "bgr24"]
+
+
+@dataclass(frozen=True, eq=False)
+class TimedFrame:
+    """A frame of a source.
+
+    Attributes:
+        pixels: (H, W) or (3, H, W) counts, or floats whose full scale is 1.
+        time: s from the first frame.
+        arrived: s of ``time.perf_counter``, when it was read.
+    """
+
+    pixels: NDArray[Any]
+    time: float
+    arrived: float
+
+
+class FrameSource(Protocol):
+    """A source of frames.
+
+    Attributes:
+        full_scale: Count that means 1.0; None for floats.
+        lost: Frames that the source did not deliver, by its clock.
+    """
+
+    full_scale: float | None
+    lost: int
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """The frames, until the source ends or is closed."""
+
+    def close(self) -> None:
+        """End the source."""
+
+
+class CameraSource:
+    """A camera of OpenCV.
+
+    Args:
+        camera: Index, or URL.
+        timing: The sensor.
+
+    Raises:
+        OSError: If the camera cannot be opened.
+    """
+
+    full_scale: float | None = 255.0
+
+    def __init__(self, camera: int | str, timing: SensorTiming) -> None:
+        import cv2  # noqa: PLC0415
+
+        self._period, self.lost = timing.frame_period, 0
+        self._capture = cv2.VideoCapture(camera)
+        if not self._capture.isOpened():
+            raise OSError(f"camera {camera} cannot be opened; check its number or URL, and whether it is in use")
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """The frames; times are whole frame periods apart."""
+        index, before = 0, None
+        while True:
+            read, pixels = self._capture.read()
+            if not read:
+                return
+            now = time.perf_counter()
+            if before is not None:
+                periods = max(1, round((now - before) / self._period))
+                index, self.lost = index + periods, self.lost + periods - 1
+            before = now
+            yield TimedFrame(
+                _channels_first(pixels[..., ::-1]) if pixels.ndim == 3 else pixels, index * self._period, now
+            )
+
+    def close(self) -> None:
+        """Release the camera."""
+        self._capture.release()
+
+
+class PipeSource:
+    """Raw frames one behind the other in a pipe.
+
+    Args:
+        stream: The pipe.
+        size: (height, width) in px.
+        pixel_format: Layout of the pixels.
+        timing: The sensor.
+    """
+
+    def __init__(
+        self, stream: BinaryIO, size: tuple[int, int], pixel_format: PixelFormat, timing: SensorTiming
+    ) -> None:
+        check_choice("pixel_format", pixel_format, get_args(PixelFormat))
+        for side in size:
+            check_whole_number("size", side, at_least=1)
+        self._stream, self._size, self._format, self._period = stream, size, pixel_format, timing.frame_period
+        self.full_scale: float | None = 65535.0 if pixel_format == "gray16le" else 255.0
+        self.lost = 0
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """The frames; an incomplete one at the end is left out."""
+        height, width = self._size
+        dtype = np.dtype("<u2" if self._format == "gray16le" else "u1")
+        channels = 3 if self._format in ("rgb24", "bgr24") else 1
+        count, index = height * width * channels * dtype.itemsize, 0
+        while len(data := self._stream.read(count)) == count:
+            pixels = np.frombuffer(data, dtype)
+            if channels == 1:
+                pixels = pixels.reshape(height, width)
+            else:
+                colours = pixels.reshape(height, width, 3)
+                pixels = _channels_first(colours[..., ::-1] if self._format == "bgr24" else colours)
+            yield TimedFrame(pixels, index * self._period, time.perf_counter())
+            index += 1
+
+    def close(self) -> None:
+        """The pipe belongs to the caller."""
+
+
+class FileSource:
+    """A file, as ``open_stack`` reads it.
+
+    Args:
+        path: The stack.
+        timing: The sensor; the frame times of the file are used, as in ``read_stack``.
+        full_scale: Count that means 1.0, if the file does not state it.
+        realtime: Whether frames come at the times of the file, instead of as fast as they are processed.
+    """
+
+    def __init__(
+        self, path: Path, timing: SensorTiming, full_scale: float | None = None, *, realtime: bool = False
+    ) -> None:
+        info = read_stack_info(path)
+        self._starts = timing_from_first_frame(timing, info).frame_starts(info.shape[0]).tolist()
+        self._reader, self._realtime, self.lost = open_stack(path), realtime, 0
+        self.full_scale = (full_scale or info.full_scale) if info.is_integer else None
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """The frames of the file."""
+        begin = time.perf_counter()
+        for index, start in enumerate(self._starts):
+            pixels = self._reader.frame(index)
+            if self._realtime and (wait := begin + start - self._starts[0] - time.perf_counter()) > 0:
+                time.sleep(wait)
+            yield TimedFrame(pixels, start - self._starts[0], time.perf_counter())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._reader.close()
+
+
+def _channels_first(pixels: NDArray[Any]) -> NDArray[Any]:
+    return np.ascontiguousarray(np.moveaxis(pixels, -1, 0))
+
+
+class FrameReader:
+    """Frames of a source, read in a thread: the source never waits, and the oldest waiting frames are dropped.
+
+    Args:
+        source: The source.
+        waiting: Largest number of frames that wait.
+        drops: Whether frames are dropped; if not, the source waits.
+
+    Attributes:
+        dropped: Number of frames that were dropped.
+    """
+
+    def __init__(self, source: FrameSource, waiting: int = 64, *, drops: bool = True) -> None:
+        self._source, self._limit, self._drops = source, check_whole_number("waiting", waiting, at_least=1), drops
+        self._frames: deque[TimedFrame] = deque()
+        self._changed, self._ended = threading.Condition(), False
+        self._error: Exception | None = None
+        self.dropped = 0
+        self._thread = threading.Thread(target=self._read, name="rsvib-read", daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        try:
+            for frame in self._source.frames():
+                with self._changed:
+                    while not self._drops and len(self._frames) >= self._limit and not self._ended:
+                        self._changed.wait()
+                    if self._ended:
+                        return
+                    if len(self._frames) >= self._limit:
+                        self._frames.popleft()
+                        self.dropped += 1
+                    self._frames.append(frame)
+                    self._changed.notify_all()
+        except Exception as error:  # raised again in the thread that takes the frames
+            self._error = error
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+    def __iter__(self) -> Iterator[TimedFrame]:
+        while True:
+            with self._changed:
+                while not self._frames and not self._ended:
+                    self._changed.wait(0.5)  # s; Ctrl-C is handled in between
+                if not self._frames:
+                    break
+                frame = self._frames.popleft()
+                self._changed.notify_all()
+            yield frame
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """Stop reading."""
+        with self._changed:
+            self._ended = True
+            self._frames.clear()
+            self._changed.notify_all()
+        self._source.close()

@@ -1,0 +1,325 @@
+"""Tracking at camera rate: dropped frames, delay, memory and errors of a long session; changes; speed next to peers.
+
+Frames come from benchmarks/independent_camera.py. The session repeats one second of frames with whole numbers of
+periods; its noise is that of this second.
+"""
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from typing import Any
+
+import cv2
+import numpy as np
+import psutil
+import torch
+from benchmarks.independent_camera import closed, take_frames
+from benchmarks.vidstab_peer import stabilised
+from numpy.typing import NDArray
+
+import rsvib_torch as rsv
+from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.live import LiveReport, TimedFrame, run_live
+
+SEED, NOISE, MARGIN, RATE, EXPOSURE_ROWS = 11, 0.005, 32, 30, 20
+AMPLITUDE, FREQUENCY, PHASE = np.array([2.1, 1.6]), np.array([52.0, 71.0]), np.array([0.5, 1.0])
+BEFORE = 0.3  # s, the vibration is steady before it changes
+WINDOW = 8  # frames of the batch
+
+
+@dataclass(frozen=True)
+class Changing:
+    """Tones along x and y; that along x may sweep (Hz/s) and grow (doublings per second) after ``BEFORE`` s."""
+
+    sweep: float = 0.0
+    doublings: float = 0.0
+
+    def amplitude(self, times: NDArray[Any]) -> NDArray[Any]:
+        """(2, ...) px."""
+        later = np.maximum(times - BEFORE, 0.0)
+        return np.stack([AMPLITUDE[0] * 2.0 ** (self.doublings * later), AMPLITUDE[1] + 0 * times])
+
+    def frequency(self, times: NDArray[Any]) -> NDArray[Any]:
+        """(2, ...) Hz."""
+        later = np.maximum(times - BEFORE, 0.0)
+        return np.stack([FREQUENCY[0] + self.sweep * later, FREQUENCY[1] + 0 * times])
+
+    def displacement(self, times: NDArray[Any]) -> NDArray[Any]:
+        """(2, ...) px."""
+        later = np.maximum(times - BEFORE, 0.0)
+        cycles = np.stack([FREQUENCY[0] * times + 0.5 * self.sweep * later**2, FREQUENCY[1] * times])
+        phase = PHASE.reshape(2, *(1,) * times.ndim)
+        return np.asarray(self.amplitude(times) * np.sin(2 * np.pi * cycles + phase))
+
+    def longest_path(self, duration: float) -> float:
+        """Upper bound of the path in px within a duration."""
+        return float(4 * np.pi * (AMPLITUDE * FREQUENCY).max() * duration)
+
+
+def timing_of(size: int) -> rsv.SensorTiming:
+    """A camera of 30 frames/s with ``size`` rows and a tenth of the frame period for blanking."""
+    row_time = 0.9 / RATE / size
+    return rsv.SensorTiming(row_time=row_time, exposure_rows=EXPOSURE_ROWS, frame_rows=1 / RATE / row_time)
+
+
+def frames_of(size: int, motion: Changing, count: int) -> NDArray[np.uint8]:
+    """Frames (T, size, size) with noise."""
+    scene = closed(city_and_fields(size + 2 * MARGIN, size + 2 * MARGIN, seed=SEED).double().numpy(), MARGIN // 2)
+    timing = timing_of(size)
+    taken = take_frames(
+        scene,
+        motion,  # type: ignore[arg-type]
+        row_time=timing.row_time,
+        exposure_rows=EXPOSURE_ROWS,
+        frame_rows=timing.frame_rows,
+        num_frames=count,
+        size=(size, size),
+        between=4,
+    )
+    noisy = taken + NOISE * np.random.default_rng(SEED).standard_normal(taken.shape)
+    return np.clip(np.round(255 * noisy), 0, 255).astype(np.uint8)
+
+
+@dataclass
+class Repeated:
+    """A source that repeats frames, at the rate of the camera or as fast as they are taken."""
+
+    pixels: NDArray[np.uint8]
+    count: int
+    paced: bool
+    full_scale: float | None = 255.0
+    lost: int = 0
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """The frames."""
+        begin = time.perf_counter()
+        for index in range(self.count):
+            if self.paced and (wait := begin + index / RATE - time.perf_counter()) > 0:
+                time.sleep(wait)
+            yield TimedFrame(self.pixels[index % len(self.pixels)], index / RATE, time.perf_counter())
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+@dataclass
+class Output:
+    """An output that keeps some of the frames."""
+
+    kept: slice = field(default_factory=lambda: slice(0))
+    frames: list[NDArray[np.uint8]] = field(default_factory=list)
+
+    def write(self, frame: NDArray[np.uint8], index: int) -> None:
+        """Take a frame."""
+        if self.kept.start is not None and self.kept.start <= index < self.kept.stop:
+            self.frames.append(frame)
+
+    def close(self, *, complete: bool) -> None:
+        """Nothing is open."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this section."""
+    parser.add_argument("--minutes", type=float, default=0.5, help="duration of the live session (default: 0.5)")
+    parser.add_argument("--live-size", type=int, default=1024, help="rows and columns of live frames (default: 1024)")
+
+
+def errors(found: rsv.DetectionResult, amplitude: NDArray[Any], frequency: NDArray[Any]) -> NDArray[Any]:
+    """(2, 2) errors of amplitudes in px and frequencies in Hz of the strongest tones."""
+    vibration = found.vibration
+    return np.stack([vibration.amplitude[:, 0].numpy() - amplitude, vibration.frequency[:, 0].numpy() - frequency])
+
+
+def session(pixels: NDArray[np.uint8], size: int, minutes: float) -> dict[str, Any]:
+    """A paced session."""
+    process, count = psutil.Process(), round(60 * RATE * minutes)
+    memory: list[float] = []
+
+    def watch(tracked: rsv.TrackedFrame, _: LiveReport) -> None:
+        if round(tracked.time * RATE) % RATE == 0:
+            memory.append(process.memory_info().rss)
+
+    tracker = rsv.VibrationTracker(timing_of(size))
+    begin = process.cpu_times()
+    report = run_live(Repeated(pixels, count, paced=True), tracker, [Output()], max_frames=count, progress=watch)
+    cpu = process.cpu_times()
+    half = len(memory) // 2
+    return {
+        "name": "session",
+        "frames": report.frames,
+        "dropped": report.dropped,
+        "delay_median": report.latency(0.5),
+        "delay_99": report.latency(0.99),
+        "within_two": sum(report.latencies[:3]) / max(report.frames, 1),
+        "cpu": 1e3 * (cpu.user + cpu.system - begin.user - begin.system) / max(report.frames, 1),
+        "memory": memory[-1] / 2**20,
+        "drift": float(np.mean(memory[half:]) / np.mean(memory[min(5, half - 1) : half]) - 1),
+        "tracked": report.tracked / max(report.frames, 1),
+        "detections": report.detections,
+    }
+
+
+def accuracy(pixels: NDArray[np.uint8], size: int, periods: int = 5) -> dict[str, Any]:
+    """Errors of the tracker from the second period of the frames on, and of the batch on windows of the same frames."""
+    timing, tracker = timing_of(size), rsv.VibrationTracker(timing_of(size))
+    count, ours = len(pixels), []
+    for index in range(periods * count):
+        found = tracker.update(pixels[index % count]).detection
+        if index >= count and found is not None:
+            ours.append(errors(found, AMPLITUDE, FREQUENCY))
+    twice = torch.as_tensor(np.concatenate([pixels, pixels]))
+    batch = [
+        errors(rsv.detect_vibration(twice[first : first + WINDOW], timing), AMPLITUDE, FREQUENCY)
+        for first in range(0, count, 3)
+    ]
+    rms = [np.sqrt(np.mean(np.square(one), 0)) for one in (ours, batch)]
+    return {"name": "accuracy", "errors": rms[0].tolist(), "batch_errors": rms[1].tolist()}
+
+
+def change(name: str, size: int, motion: Changing) -> dict[str, Any]:
+    """A vibration that changes during the second half of a second and a half."""
+    timing, tracker, found = timing_of(size), rsv.VibrationTracker(timing_of(size), columns=None), []
+    middle = 0.5 * (size - 1 + EXPOSURE_ROWS) * timing.row_time
+    pixels = frames_of(size, motion, 40)
+    detections, lost = 0, 0
+    for index, frame in enumerate(pixels):
+        tracked = tracker.update(frame)
+        detections += tracked.detected
+        when = np.array(index / RATE + middle)
+        if when < BEFORE:
+            continue
+        lost += tracked.state != "tracking"
+        if tracked.detection is not None:
+            error = errors(tracked.detection, motion.amplitude(when), motion.frequency(when))
+            found.append([abs(error[0, 0]) / motion.amplitude(when)[0], abs(error[1, 0])])
+    return {
+        "name": name,
+        "size": size,
+        "amplitude": np.sqrt(np.mean(np.square(found), 0))[0],
+        "frequency": np.sqrt(np.mean(np.square(found), 0))[1],
+        "lost": lost,
+        "detections": detections,
+    }
+
+
+def residual(frames: NDArray[np.uint8], size: int) -> tuple[float, float]:
+    """Rms offset (px) of the rows between consecutive frames, and of whole frames, over both axes."""
+    curve = rsv.register_bands(torch.as_tensor(frames), timing_of(size), full_scale=255.0)
+    whole = curve.offsets.nanmean(1, keepdim=True)
+    apart = (curve.offsets - whole).square().nanmean().sqrt()
+    return float(apart), float(whole.square().mean().sqrt())
+
+
+def phase_correlated(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Frames moved back by the whole-frame offset of OpenCV's phase correlation."""
+    first, place, results = pixels[0].astype(np.float32), np.zeros(2), [pixels[0]]
+    height, width = first.shape
+    window = cv2.createHanningWindow((width, height), cv2.CV_32F)
+    before = first
+    for frame in pixels[1:]:
+        now = frame.astype(np.float32)
+        place = place + cv2.phaseCorrelate(before.copy(), now.copy(), window)[0]
+        matrix = np.array([[1.0, 0.0, -place[0]], [0.0, 1.0, -place[1]]])
+        results.append(cv2.warpAffine(frame, matrix, (width, height), borderMode=cv2.BORDER_REFLECT_101))
+        before = now
+    return np.stack(results)
+
+
+def tracked_frames(pixels: NDArray[np.uint8], size: int, method: str) -> Callable[[], NDArray[np.uint8]]:
+    """Function that tracks and restores the frames as fast as possible."""
+
+    def run() -> NDArray[np.uint8]:
+        output = Output(slice(0, len(pixels)))
+        tracker = rsv.VibrationTracker(timing_of(size), method=method)
+        run_live(Repeated(pixels, len(pixels), paced=False), tracker, [output], drops=False)
+        return np.stack(output.frames)
+
+    return run
+
+
+def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Session, changes, and speed next to peers."""
+    size = options.live_size
+    pixels = frames_of(size, Changing(), RATE)
+    results = [session(pixels, size, options.minutes), accuracy(pixels, size)]
+    results.append(change("sweep of 2 Hz/s", size // 2, Changing(sweep=2.0)))
+    results.append(change("amplitude doubles in 1 s", size // 2, Changing(doublings=1.0)))
+    clip = np.concatenate([pixels, pixels])
+    tasks: dict[str, Callable[[], NDArray[np.uint8]]] = {
+        "as taken": lambda: clip,
+        "`VibrationTracker`, dewarp": tracked_frames(clip, size, "dewarp"),
+        "`VibrationTracker`, exact": tracked_frames(clip, size, "exact"),
+        "`cv2.phaseCorrelate`, `cv2.warpAffine`": lambda: phase_correlated(clip),
+    }
+    if find_spec("vidstab") is not None:
+        tasks["vidstab"] = lambda: stabilised(clip)
+    for name, work in tasks.items():
+        begin, cpu = time.perf_counter(), time.process_time()
+        restored = work()
+        seconds, used = time.perf_counter() - begin, time.process_time() - cpu
+        moving, whole = residual(restored[-RATE + 2 :], size)
+        timed = name != "as taken"
+        results.append(
+            {
+                "name": name,
+                "rate": len(clip) / seconds if timed else math.nan,
+                "cpu": 1e3 * used / len(clip) if timed else math.nan,
+                "rows": moving,
+                "whole": whole,
+            }
+        )
+    return results
+
+
+def lines(rows: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+    """The tables in Markdown."""
+    one, errors_of, *others = rows
+    size = options.live_size
+    text = [
+        f"One session of {one['frames'] / RATE / 60:.2g} minutes, {size} x {size} at {RATE} frames/s, restored with "
+        f"dewarp. Errors are rms over both axes; the batch is `detect_vibration` on {WINDOW} of the same frames.",
+        "",
+        "| quantity | value |",
+        "|---|---|",
+        f"| frames, dropped | {one['frames']}, {one['dropped']} |",
+        f"| delay of the written frames in frame periods: median, 99 % | {one['delay_median']}, {one['delay_99']} |",
+        f"| frames with a delay of at most 2 frame periods | {one['within_two']:.1%} |",
+        f"| processor time per frame | {one['cpu']:.0f} ms |",
+        f"| resident memory at the end, change between the halves | {one['memory']:.0f} MiB, {one['drift']:+.1%} |",
+        f"| frames with known motion, detections | {one['tracked']:.1%}, {one['detections']} |",
+    ]
+    for place, (quantity, unit) in enumerate((("amplitude", "px"), ("frequency", "Hz"))):
+        ours, batch = (math.hypot(*errors_of[name][place]) / math.sqrt(2) for name in ("errors", "batch_errors"))
+        text.append(
+            f"| error of the {quantity}: tracker, batch, ratio | {ours:.5f} {unit}, {batch:.5f} {unit}, "
+            f"{ours / batch:.2f} |"
+        )
+    changes = [row for row in others if "lost" in row]
+    text += [
+        "",
+        f"Changes along x, {changes[0]['size']} x {changes[0]['size']}, rms errors from the beginning of the change:",
+        "",
+        "| change | amplitude (%) | frequency (Hz) | frames without known motion | further detections |",
+        "|---|---|---|---|---|",
+    ]
+    text += [
+        f"| {row['name']} | {100 * row['amplitude']:.2f} | {row['frequency']:.3f} | {row['lost']} | "
+        f"{row['detections'] - 1} |"
+        for row in changes
+    ]
+    text += [
+        "",
+        "The same clip as fast as possible, with the motion between consecutive frames of the result:",
+        "",
+        "| method | frames/s | processor ms per frame | rows about the frame (px) | whole frames (px) |",
+        "|---|---|---|---|---|",
+    ]
+    for row in others:
+        if "rows" in row:
+            speed = "" if math.isnan(row["rate"]) else f"{row['rate']:.1f}"
+            cpu = "" if math.isnan(row["cpu"]) else f"{row['cpu']:.0f}"
+            text.append(f"| {row['name']} | {speed} | {cpu} | {row['rows']:.3f} | {row['whole']:.3f} |")
+    return text

@@ -1,0 +1,104 @@
+"""rsvib live: from a file or a pipe to a video, a pipe, and a spectrogram."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from truth import Motion, crop, decibel, draw_scene, take_frames
+
+from rsvib_torch import SensorTiming, StackInfo, read_stack, write_stack
+from rsvib_torch.commands.main import run_command
+
+SIZE, COUNT = 128, 12
+TIMING = SensorTiming(row_time=2e-4, exposure_rows=4, frame_rows=1 / 30 / 2e-4)
+CAMERA = ("--row-time", "200us", "--exposure", "0.8ms", "--frame-rate", "30")
+SCENE = draw_scene(SIZE + 80, SIZE + 80, seed=3)
+
+
+def run(*arguments):
+    return run_command([str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module", name="clip")
+def make_clip(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("live")
+    taken = take_frames(SCENE, TIMING, Motion((2.1, 1.6), (52.0, 71.0), (0.5, 1.0)), COUNT, 0.005, samples=4)
+    counts = np.clip(np.round(taken * 255), 0, 255).astype(np.uint8)
+    info = StackInfo(counts.shape, "uint8", 255.0, frame_rate=30.0)
+    write_stack(folder / "clip.mkv", counts, dtype="uint8", full_scale=255, like=info)
+    (folder / "clip.raw8").write_bytes(counts.tobytes())
+    return folder / "clip.mkv"
+
+
+def test_from_file_to_video_with_spectrogram(clip, tmp_path, capsys):
+    out = tmp_path / "still.mkv"
+    arguments = ("live", clip, *CAMERA, "--out", out, "--spectrogram", tmp_path / "spectrum", "--json")
+    assert run(*arguments) == 0
+    shown = capsys.readouterr()
+    answer = json.loads(shown.out)
+    assert (answer["frames"], answer["tracked"], answer["dropped"], answer["detections"]) == (COUNT, COUNT - 3, 0, 1)
+    frequency = np.array(answer["detection"]["vibration"]["frequency"])[:, 0]
+    assert frequency == pytest.approx([52.0, 71.0], abs=0.02)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["spectrum.png", "spectrum.zarr", "still.mkv"]
+    still = crop(SCENE)
+    raw, restored = read_stack(clip), read_stack(out)
+    assert restored.shape == raw.shape
+    assert min(decibel(frame, still) for frame in restored[4:]) > max(decibel(frame, still) for frame in raw[4:]) + 6
+    assert run(*arguments) == 2
+    assert "results exist already" in capsys.readouterr().err
+
+
+def test_crop_and_steady_of_a_file(clip, tmp_path, capsys):
+    assert (
+        run("live", clip, *CAMERA, "--out", tmp_path / "a.mp4", "--border", "crop", "--steady", "0.2", "--quiet") == 0
+    )
+    assert capsys.readouterr().out == ""
+    height, width = read_stack(tmp_path / "a.mp4").shape[-2:]
+    assert SIZE - 14 <= height < SIZE
+    assert SIZE - 14 <= width < SIZE
+
+
+def test_from_pipe_to_pipe(clip, monkeypatch, capfdbinary):
+    with clip.with_suffix(".raw8").open("rb") as source:
+        monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=source))
+        assert run("live", "-", *CAMERA, "--size", f"{SIZE}x{SIZE}", "--out", "-") == 0
+    shown = capfdbinary.readouterr()
+    frames = np.frombuffer(shown.out, np.uint8).reshape(-1, SIZE, SIZE) / 255
+    assert len(frames) == COUNT
+    assert decibel(frames[-1], crop(SCENE)) > 30
+    assert f"{COUNT} frames in".encode() in shown.err
+
+
+def test_a_file_at_its_own_rate(clip, capsys):
+    assert run("live", clip, *CAMERA, "--realtime", "--page", 0, "--border", "hold", "--steady", 0.2) == 0
+    shown = capsys.readouterr()
+    assert "rsvib: note: the page is http://127.0.0.1:" in shown.err
+    assert "delay: " in shown.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("-",), "--size WIDTHxHEIGHT is required for raw frames on standard input"),
+        (("-", "--size", "12"), "--size must be WIDTHxHEIGHT in px such as 1024x768, got '12'"),
+        (("0", "--size", "4x4"), "--size goes with frames on standard input (-), not with 0"),
+        (("0", "--realtime"), "--realtime goes with a file, not with 0"),
+        (("0", "--border", "crop"), "--border crop goes with a file without --realtime"),
+        (("none.mp4",), "none.mp4: no such file; a camera is a number or a URL"),
+        (("CLIP", "--out", "still.gif"), "a live video is written to .mp4, .mov, .m4v or .mkv"),
+        (("CLIP", "--preview"), "use --page 8080 and a browser"),
+        (("CLIP", "--out", "CLIP", "--overwrite"), "it is the same file as the input"),
+        (("CLIP", "--steady", "-1"), "steady must be at least 0, got -1"),
+        (("CLIP", "--method", "sharpen"), "sharpen"),
+    ],
+)
+def test_wrong_options_are_refused_in_one_line(clip, arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    given = [str(clip) if argument == "CLIP" else argument for argument in arguments]
+    assert run("live", *given, *CAMERA) == 2
+    shown = capsys.readouterr()
+    assert message in shown.err
+    assert shown.err.startswith("rsvib: error: ")
+    assert shown.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,210 @@
+"""Sources, outputs, page and spectrogram of live sessions."""
+
+import io
+import time
+import urllib.error
+import urllib.request
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+import rsvib_torch as rsv
+from rsvib_torch import live
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.live.sources import FrameReader
+
+TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=1 / 30 / 1e-4)
+
+
+def test_raw_frames_of_a_pipe():
+    colours = np.arange(2 * 3 * 4 * 3, dtype=np.uint8).reshape(2, 3, 4, 3)
+    data = colours[..., ::-1].tobytes() + b"end"
+    source = live.PipeSource(io.BytesIO(data), (3, 4), "bgr24", TIMING)
+    frames = list(source.frames())
+    assert [np.array_equal(one.pixels, np.moveaxis(truth, -1, 0)) for one, truth in zip(frames, colours, strict=True)]
+    assert [one.time for one in frames] == pytest.approx([0.0, 1 / 30])
+    deep = live.PipeSource(io.BytesIO(b"\x01\x02" * 6), (2, 3), "gray16le", TIMING)
+    assert next(deep.frames()).pixels.tolist() == [[513] * 3] * 2
+    assert deep.full_scale == 65535
+
+
+@dataclass
+class Numbers:
+    """Frames of one pixel, as fast as possible."""
+
+    count: int = 50
+    full_scale: float | None = None
+    lost: int = 0
+    closed: bool = False
+    error: Exception | None = None
+
+    def frames(self):
+        for index in range(self.count):
+            yield live.TimedFrame(np.full((1, 1), float(index)), index / 30, time.perf_counter())
+        if self.error is not None:
+            raise self.error
+
+    def close(self):
+        self.closed = True
+
+
+def values(reader):
+    return [int(frame.pixels[0, 0]) for frame in reader]
+
+
+def test_the_oldest_waiting_frames_are_dropped_and_counted():
+    reader = FrameReader(source := Numbers(), waiting=8)
+    time.sleep(0.2)
+    assert values(reader) == list(range(42, 50))
+    assert reader.dropped == 42
+    reader.close()
+    assert source.closed
+
+
+def test_a_source_that_may_wait_loses_no_frame():
+    reader = FrameReader(Numbers(), waiting=8, drops=False)
+    time.sleep(0.1)
+    assert values(reader) == list(range(50))
+    assert reader.dropped == 0
+
+
+def test_an_error_of_the_source_arrives_behind_its_frames():
+    reader = FrameReader(Numbers(3, error=OSError("unplugged")), drops=False)
+    with pytest.raises(OSError, match="unplugged"):
+        values(reader)
+
+
+def test_the_page_is_served_to_this_machine_only():
+    page = live.PageOutput(0)
+    try:
+        assert page.url.startswith("http://127.0.0.1:")
+        assert page._server.server_address[0] == "127.0.0.1"
+        page.show_state("52.0 Hz <x>")
+        assert "52.0 Hz &lt;x&gt;" in urllib.request.urlopen(page.url, timeout=5).read().decode()
+        assert urllib.request.urlopen(page.url + "state", timeout=5).read() == b"52.0 Hz <x>"
+        with pytest.raises(urllib.error.HTTPError):
+            urllib.request.urlopen(page.url + "etc/passwd", timeout=5)
+        with pytest.raises(OSError, match="choose another port"):
+            live.PageOutput(page._server.server_address[1])
+        with urllib.request.urlopen(page.url + "frames", timeout=5) as stream:
+            while page._viewers == 0:
+                time.sleep(0.01)
+            page.write(np.full((16, 24), 200, np.uint8), 0)
+            head = stream.read(90)
+        assert b"image/jpeg" in head
+        assert b"\xff\xd8\xff" in head  # the first bytes of a JPEG image
+    finally:
+        page.close(complete=True)
+
+
+@pytest.mark.parametrize("ending", [".mp4", ".mkv"])
+def test_video_files(tmp_path, ending):
+    frames = (np.random.default_rng(0).random((5, 32, 48, 3)) * 50 + np.arange(5)[:, None, None, None] * 40).astype(
+        "u1"
+    )
+    output = live.VideoOutput(tmp_path / f"video{ending}", 30.0)
+    for index, frame in zip((0, 1, 2, 5, 6), frames, strict=True):  # two are missing
+        output.write(frame, index)
+    assert not (tmp_path / f"video{ending}").exists()
+    output.close(complete=True)
+    info = rsv.read_stack_info(tmp_path / f"video{ending}")
+    assert info.shape == (5, 3, 32, 48)
+    assert np.diff(info.frame_times) == pytest.approx(np.array([1, 1, 3, 1]) / 30, abs=2e-3)
+    read = rsv.read_stack(tmp_path / f"video{ending}").numpy() * 255
+    tolerance = 0.5 if ending == ".mkv" else 12  # H.264 is lossy
+    assert np.abs(read.mean((1, 2, 3)) - frames.mean((1, 2, 3))).max() < tolerance
+
+
+def test_an_incomplete_video_leaves_no_file(tmp_path):
+    output = live.VideoOutput(tmp_path / "video.mp4", 30.0)
+    output.write(np.zeros((32, 32), np.uint8), 0)
+    output.close(complete=False)
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(ValueError, match=r"a live video is written to \.mp4"):
+        live.VideoOutput(tmp_path / "video.gif", 30.0)
+
+
+def test_preview_without_windows_names_the_page():
+    with pytest.raises(ValueError, match="has no windows; use --page 8080"):
+        live.PreviewOutput()
+
+
+class Tracked:
+    """Offsets of rows by a known displacement, as a tracked frame."""
+
+    def __init__(self, time, displacement):
+        rows = torch.arange(4.5, 300.0, 8, dtype=torch.float64) * TIMING.row_time
+        starts = torch.stack([rows - TIMING.frame_period, rows], -1)
+        middles = starts.numpy() + 0.5 * TIMING.exposure_time + time
+        moved = torch.as_tensor(displacement(middles[:, 1]) - displacement(middles[:, 0]))
+        information = torch.eye(2, dtype=torch.float64).expand(1, len(rows), 2, 2)
+        self.time = time
+        self.measurements = Measurements.of_pairs(
+            starts[None, :, 0], starts[None, :, 1], moved[None], information, TIMING.exposure_time
+        )
+
+
+def test_the_spectrogram_has_the_amplitudes_at_their_frequencies_and_times(tmp_path):
+    def displacement(t):
+        x = np.where(t < 2.0, 1.5 * np.sin(2 * np.pi * 52 * t), 0.7 * np.sin(2 * np.pi * 80 * t))
+        return np.stack([x, 0.3 * np.sin(2 * np.pi * 112 * t + 1)], -1)
+
+    spectrogram = live.Spectrogram(TIMING, duration=0.5, max_frequency=150.0)
+    for index in range(1, 121):
+        spectrogram.add(Tracked(index / 30, displacement))
+    times, frequencies, amplitude = spectrogram.result()
+    assert amplitude.shape == (2, len(times), len(frequencies))
+    assert times[1] - times[0] == pytest.approx(0.5, abs=1 / 30)
+    attenuation = np.sinc(np.array([52, 80, 112]) * TIMING.exposure_time)
+    for column, (hertz, size) in ((1, (52, 1.5)), (len(times) - 1, (80, 0.7))):
+        strongest = np.nanargmax(amplitude[0, column])
+        assert frequencies[strongest] == hertz
+        assert amplitude[0, column, strongest] == pytest.approx(size / attenuation[0 if hertz == 52 else 1], rel=0.1)
+    assert frequencies[np.nanargmax(amplitude[1, 3])] == 112
+    assert np.isnan(amplitude[:, :, frequencies == 60]).all()  # blind: twice the frame rate
+    files = live.save_spectrogram(tmp_path / "spectrum", spectrogram)
+    assert [path.name for path in files] == ["spectrum.png", "spectrum.zarr"]
+    import zarr
+
+    stored = zarr.open_group(str(files[1]), mode="r")
+    np.testing.assert_array_equal(stored["amplitude"][:], amplitude)
+    assert stored["frequency"].attrs["unit"] == "Hz"
+    assert stored["time"].shape == times.shape
+
+
+def test_the_memory_of_the_spectrogram_is_bounded():
+    spectrogram = live.Spectrogram(TIMING, duration=0.1, max_frequency=60.0, max_columns=8)
+    for index in range(1, 120):
+        spectrogram.add(Tracked(index / 30, lambda t: np.stack([np.sin(50 * t), np.sin(300 * t)], -1)))
+    assert len(spectrogram.result()[0]) <= 9
+
+
+class Broken:
+    """An output that cannot write."""
+
+    closed = None
+
+    def write(self, frame, index):
+        raise OSError("disk full")
+
+    def close(self, *, complete):
+        self.closed = complete
+
+
+def test_frames_before_an_error_of_the_source_are_not_lost(tmp_path):
+    source = Numbers(3, error=OSError("unplugged"))
+    output = live.VideoOutput(tmp_path / "video.mkv", 30.0)
+    with pytest.raises(OSError, match="unplugged"):
+        live.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False)
+    assert rsv.read_stack_info(tmp_path / "video.mkv").shape == (3, 1, 1)
+    assert source.closed
+
+
+def test_an_error_of_an_output_ends_the_session(tmp_path):
+    source, output = Numbers(), Broken()
+    with pytest.raises(OSError, match="disk full"):
+        live.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False)
+    assert output.closed is False
+    assert source.closed

@@ -1,0 +1,240 @@
+"""VibrationTracker: against truth from an independent camera, and against the batch on the same frames."""
+
+import pickle
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from truth import crop, decibel, draw_scene, take_frames
+
+import rsvib_torch as rsv
+
+SIZE, RATE = 160, 30.0
+TIMING = rsv.SensorTiming(row_time=150e-6, exposure_rows=4, frame_rows=1 / RATE / 150e-6)
+SCENE = draw_scene(SIZE + 80, SIZE + 80, seed=3)
+MIDDLE = 0.5 * (SIZE - 1 + 4) * 150e-6  # s from the start of a frame to its middle
+A, F = np.array([2.1, 1.6]), np.array([52.0, 71.0])
+
+
+@dataclass(frozen=True)
+class Sines:
+    """Tones whose amplitudes and angles are any functions of time."""
+
+    amplitude: object = lambda t: (2.1 + 0 * t, 1.6 + 0 * t)
+    angle: object = lambda t: (2 * np.pi * 52.0 * t + 0.5, 2 * np.pi * 71.0 * t + 1.0)
+    path: object = lambda t: (0 * t, 0 * t)
+
+    def displacement(self, times):
+        parts = zip(self.amplitude(times), self.angle(times), self.path(times), strict=True)
+        return np.stack([a * np.sin(angle) + p for a, angle, p in parts], -1)
+
+
+STEADY = Sines()
+
+
+def taken(motion, count, noise=0.005):
+    return torch.as_tensor(take_frames(SCENE, TIMING, motion, count, noise, seed=1, samples=4), dtype=torch.float32)
+
+
+def track(frames, times=None, **options):
+    tracker = rsv.VibrationTracker(TIMING, columns=None, **options)
+    times = [None] * len(frames) if times is None else times
+    return [tracker.update(frame, time) for frame, time in zip(frames, times, strict=True)]
+
+
+def errors(found, amplitude=A, frequency=F):
+    """Errors of amplitude and frequency (2, 2) of the strongest tones."""
+    return np.stack(
+        [found.vibration.amplitude[:, 0].numpy() - amplitude, found.vibration.frequency[:, 0].numpy() - frequency]
+    )
+
+
+@pytest.fixture(scope="module", name="steady")
+def make_steady():
+    frames = taken(STEADY, 24)
+    return frames, track(frames)
+
+
+def test_errors_are_those_of_the_batch_on_the_same_frames(steady):
+    frames, tracked = steady
+    ours, batch = [], []
+    for end in (13, 15, 17, 19, 21, 23):
+        found = rsv.detect_vibration(frames[end - 7 : end + 1], TIMING, roll=False)
+        scale = np.stack([found.std.amplitude[:, 0], found.std.frequency[:, 0]])
+        ours.append(errors(tracked[end].detection) / scale)
+        batch.append(errors(found) / scale)
+    assert np.sqrt(np.mean(np.square(ours))) < 1.5 * np.sqrt(np.mean(np.square(batch)))
+
+
+def test_result_agrees_with_the_batch_within_the_standard_deviations(steady):
+    frames, tracked = steady
+    ours = tracked[-1].detection
+    batch = rsv.detect_vibration(frames[-8:], TIMING, roll=False)
+    for name in ("amplitude", "frequency"):
+        difference = getattr(ours.vibration, name) - getattr(batch.vibration, name)
+        std = (getattr(ours.std, name).square() + getattr(batch.std, name).square()).sqrt()
+        assert (difference.abs() < 4 * std)[:, 0].all()
+        assert (getattr(ours.std, name)[:, 0] > 0).all()
+    assert ours.reliable.tolist() == [True, True]
+    assert ours.timing == TIMING
+
+
+def test_phase_counts_from_the_first_row_of_the_frame(steady):
+    _, tracked = steady
+    found = tracked[-1].detection.vibration
+    truth = 2 * np.pi * F * (23 / RATE) + np.array([0.5, 1.0])
+    apart = np.angle(np.exp(1j * (found.phase[:, 0].numpy() - truth)))
+    assert np.abs(apart).max() < 0.01
+
+
+def test_frames_are_restored_without_delay(steady):
+    frames, tracked = steady
+    still = crop(SCENE)
+    for index in (8, 15, 23):
+        assert tracked[index].latency == 0
+        assert decibel(tracked[index].restored, still) > decibel(frames[index], still) + 8
+    assert torch.equal(tracked[0].restored, frames[0])
+    assert [one.state for one in tracked] == ["searching"] * 3 + ["tracking"] * 21
+    assert sum(one.detected for one in tracked) == 1
+
+
+def test_a_sweeping_frequency_is_followed():
+    def angle(t):
+        return 2 * np.pi * (52.0 * t + np.maximum(t - 0.2, 0) ** 2) + 0.5, 2 * np.pi * 71.0 * t + 1.0  # 2 Hz/s
+
+    tracked = track(taken(Sines(angle=angle), 26))
+    time = 25 / RATE + MIDDLE
+    frequency = np.array([52.0 + 2 * (time - 0.2), 71.0])
+    assert frequency[0] > 53.2
+    assert np.abs(errors(tracked[-1].detection, A, frequency)[1]).max() < 0.15
+    assert not any(one.detected for one in tracked[4:])
+
+
+def test_an_amplitude_that_doubles_within_a_second_is_followed():
+    def amplitude(t):
+        return 2.1 * 2 ** np.maximum(t - 0.2, 0), 1.6 + 0 * t
+
+    tracked = track(taken(Sines(amplitude=amplitude), 26))
+    size = np.array([2.1 * 2 ** (25 / RATE + MIDDLE - 0.2), 1.6])
+    assert size[0] > 3.2
+    assert np.abs(errors(tracked[-1].detection, size)[0]).max() < 0.03
+    assert not any(one.detected for one in tracked[4:])
+
+
+def test_dropped_frames_are_handled_by_their_times(steady):
+    frames, _ = steady
+    kept = [*range(8), 10, 11, 15, 16, 21, 22]
+    tracked = track(frames[kept], [index / RATE for index in kept])
+    assert np.abs(errors(tracked[-1].detection)).max() < 0.004
+    assert tracked[-1].detection.reliable.all()
+    untold = track(frames[kept])  # as if no frame were missing
+    assert max(abs(errors(one.detection)).max() for one in untold[8:] if one.detection is not None) > 0.03
+
+
+def test_the_number_of_tones_changes():
+    def path(t):
+        return 0.9 * (t > 0.25) * np.sin(2 * np.pi * 97.0 * t), 0 * t
+
+    tracked = track(taken(Sines(path=path), 20))
+    before, after = tracked[6].detection.vibration, tracked[-1].detection.vibration
+    assert int(before.amplitude.count_nonzero()) == 2
+    assert after.frequency[0].numpy() == pytest.approx([52.0, 97.0], abs=0.02)
+    assert after.amplitude[0].numpy() == pytest.approx([2.1, 0.9], abs=0.01)
+    assert 2 <= sum(one.detected for one in tracked) <= 3
+
+
+def test_a_camera_at_rest_needs_no_further_detection():
+    tracked = track(taken(Sines(amplitude=lambda t: (0 * t, 0 * t)), 14))
+    assert [one.detected for one in tracked] == [index == 3 for index in range(14)]
+    assert tracked[-1].state == "tracking"
+    assert not tracked[-1].motion.moving_axes().any()
+
+
+def test_slow_motion_is_part_of_the_path_and_not_of_the_tones():
+    def path(t):
+        return 6 * np.sin(2 * np.pi * 0.8 * t), 20.0 * t
+
+    tracked = track(taken(Sines(path=path), 24))
+    times = np.array([one.time for one in tracked[5:]]) + MIDDLE
+    found = np.stack([one.path.numpy() for one in tracked[5:]])
+    truth = np.stack(path(times), -1)
+    assert np.abs((found - found[0]) - (truth - truth[0])).max() < 0.15
+    assert np.abs(errors(tracked[-1].detection)).max() < 0.01
+
+
+def test_memory_is_constant(steady):
+    frames, _ = steady
+    tracker, sizes = rsv.VibrationTracker(TIMING, steady=0.2, window=4), []
+    for index, frame in enumerate(frames):
+        tracker.update(frame)
+        if index in (11, 23):
+            sizes.append(len(pickle.dumps(tracker)))
+    assert sizes[1] < 1.05 * sizes[0]
+
+
+def test_frames_that_cannot_be_used_do_not_disturb(steady):
+    frames, _ = steady
+    tracker = rsv.VibrationTracker(TIMING, columns=None)
+    states = []
+    for index, frame in enumerate(frames[:14]):
+        given = torch.full_like(frame, 0.5) if index == 8 else frames[9] if index == 10 else frame
+        tracked = tracker.update(given)
+        states.append(tracked.state)
+        if tracked.state == "unusable":
+            assert torch.equal(tracked.restored, given)
+    assert [index for index, state in enumerate(states) if state == "unusable"] == [8, 10]
+    assert np.abs(errors(tracked.detection)).max() < 0.004
+
+
+def test_columns_as_rows_and_the_reverse_readout(steady):
+    frames, tracked = steady
+    timing = replace(TIMING, scan_axis="x", readout_direction="reverse")
+    tracker = rsv.VibrationTracker(timing, columns=None)
+    for frame in frames[:10]:
+        turned = tracker.update(frame.mT.flip(-1))
+    other = tracked[9].detection.vibration
+    assert torch.allclose(turned.detection.vibration.frequency, other.frequency.flip(0))
+    assert torch.allclose(turned.restored.flip(-1).mT, tracked[9].restored, atol=1e-5)
+    change = turned.detection.vibration.phase[:, 0] - other.phase.flip(0)[:, 0]
+    assert torch.cos(change).numpy() == pytest.approx([-1.0, 1.0])  # x is the flipped axis
+
+
+def test_missing_pixels_and_channels(steady):
+    frames, _ = steady
+    tracker = rsv.VibrationTracker(TIMING, columns=None, channels="last")
+    for frame in frames[:9]:
+        colours = torch.stack([frame, 0.5 * frame, frame], -1)
+        colours[40:60, 50:80] = torch.nan
+        tracked = tracker.update(colours)
+    assert np.abs(errors(tracked.detection)).max() < 0.01
+    assert tracked.restored.shape == colours.shape
+    assert torch.isfinite(tracked.restored).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"window": 1}, "window must be at least 2, got 1"),
+        ({"columns": 10}, "columns must be at least 64, got 10"),
+        ({"steady": -1.0}, "steady must be at least 0, got -1"),
+        ({"prior": "edges"}, "has no option 'prior'"),
+    ],
+)
+def test_wrong_options_are_refused(options, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        rsv.VibrationTracker(TIMING, **options)
+
+
+def test_wrong_frames_and_times_are_refused(steady):
+    frames, _ = steady
+    with pytest.raises(ValueError, match="must not have frame_start_times: pass the time of each frame to update"):
+        rsv.VibrationTracker(replace(TIMING, frame_start_times=(0.0, 1.0)))
+    tracker = rsv.VibrationTracker(TIMING)
+    tracker.update(frames[0], 2.0)
+    with pytest.raises(ValueError, match=r"time must be later than that of the frame before, 2 s, got 1\.5 s"):
+        tracker.update(frames[1], 1.5)
+    with pytest.raises(ValueError, match="frame has 160 rows of 100 px, the frames before had 160 of 160"):
+        tracker.update(frames[1][:, :100])
+    tracker.reset()
+    assert tracker.update(frames[1], 1.5).state == "searching"

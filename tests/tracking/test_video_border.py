@@ -1,0 +1,86 @@
+"""Borders of restored video frames, and steadying, against the known path of an independent camera."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from skimage.registration import phase_cross_correlation
+from truth import draw_scene, take_frames
+
+import rsvib_torch as rsv
+from rsvib_torch.live.session import steadied
+
+SIZE, RATE = 160, 30.0
+TIMING = rsv.SensorTiming(row_time=150e-6, exposure_rows=4, frame_rows=1 / RATE / 150e-6)
+
+
+class Shaken:
+    """Vibration on a slow pan with shaking of 3 Hz."""
+
+    def displacement(self, t):
+        x = 2.1 * np.sin(2 * np.pi * 52 * t + 0.5) + 2.0 * np.sin(2 * np.pi * 3 * t) + 12.0 * t
+        y = 1.6 * np.sin(2 * np.pi * 71 * t + 1.0)
+        return np.stack([x, y], -1)
+
+
+@pytest.fixture(scope="module", name="tracked")
+def make_tracked():
+    scene = draw_scene(SIZE + 80, SIZE + 80, seed=3)
+    frames = torch.as_tensor(take_frames(scene, TIMING, Shaken(), 30, 0.005, samples=4), dtype=torch.float32)
+    tracker = rsv.VibrationTracker(TIMING, columns=None)
+    return [tracker.update(frame) for frame in frames]
+
+
+def shifts(frames):
+    """(T - 1, 2) px, displacements (x, y) of the content of each frame against the one before."""
+    window = np.hanning(SIZE)[:, None] * np.hanning(SIZE)
+    images = [(frame.double().numpy() - 0.5) * window for frame in frames]
+    pairs = itertools.pairwise(images)
+    return -np.array([phase_cross_correlation(a, b, upsample_factor=50)[0][::-1] for a, b in pairs])
+
+
+def test_steady_frames_follow_the_moving_average_of_the_path(tracked):
+    duration = 1 / 3  # s, one period of the shaking
+    items = [(one, 0.0) for one in tracked]
+    steady = [one.restored for one, _ in steadied(iter(items), duration)]
+    raw, moved = shifts([one.restored for one in tracked[9:22]]), shifts(steady[9:22])
+    assert np.abs(raw[:, 0] - 12.0 / RATE).max() > 0.8  # the shaking
+    assert np.abs(moved[:, 0] - 12.0 / RATE).max() < 0.12  # the pan is kept
+    assert np.abs(moved[:, 1]).max() < 0.05
+    assert len(steady) == len(tracked)
+
+
+def test_held_pixels_keep_their_value_and_others_are_restored(tracked):
+    border = rsv.VideoBorder("hold")
+    before = border(tracked[10])
+    after = border(tracked[11])
+    hidden = ~tracked[11].visible
+    assert 0 < hidden.sum() < 0.1 * hidden.numel()
+    assert torch.equal(after[hidden], before[hidden])
+    assert torch.equal(after[~hidden], tracked[11].restored[~hidden])
+    assert not torch.equal(tracked[11].restored[hidden], before[hidden])
+
+
+def test_cropped_frames_contain_recorded_pixels_only(tracked):
+    margins = rsv.Margins()
+    for one in tracked:
+        margins = margins.widest(rsv.Margins.of(one.visible))
+    assert max(margins.left, margins.right, margins.top, margins.bottom) <= 6
+    border = rsv.VideoBorder("crop", margins)
+    for one in tracked:
+        frame = border(one)
+        assert torch.equal(frame, margins.cut(one.restored))
+        assert margins.cut(one.visible).all()
+    assert [side % 2 for side in frame.shape] == [0, 0]
+    narrower = rsv.Margins(margins.top, margins.bottom, max(margins.left - 1, 0), max(margins.right - 1, 0))
+    assert not all(narrower.cut(one.visible).all() for one in tracked)
+
+
+def test_wrong_borders_are_refused():
+    with pytest.raises(ValueError, match="border must be one of"):
+        rsv.VideoBorder("zoom")
+    with pytest.raises(ValueError, match="margins go with border='crop' and only with it"):
+        rsv.VideoBorder("crop")
+    with pytest.raises(ValueError, match="leave nothing of frames of 8 x 8 px"):
+        rsv.Margins(4, 4, 0, 0).cut(torch.zeros(8, 8))
