@@ -48,7 +48,7 @@ INNER_LAYERS = {
         {"richardson_lucy"},
         {"sharpening"},
         {"restore"},
-        {"noise_gain"},
+        {"noise_gain", "restoration_mtf"},
     ),
 }
 

@@ -190,13 +190,14 @@ def restoration_mtf(
     images = torch.cat([prepared.images, level * probes[None].to(prepared.images.dtype)], dim=2)
     if options.get("noise", "auto") != "auto":  # estimates are means over all channels
         options["noise"] *= (colours / images.shape[2]) ** 0.5
-    masks = {
-        name: None
+    missing, saturated = (
+        None
         if mask is None
         else torch.cat([mask, mask.any(2, keepdim=True).expand(-1, -1, images.shape[2] - colours, -1, -1)], dim=2)
-        for name, mask in (("missing", prepared.missing), ("saturated", prepared.saturated))
-    }
-    restored = restore_prepared(replace(prepared, images=images, **masks), vibration, "exact", options)[0, :, colours:]
+        for mask in (prepared.missing, prepared.saturated)
+    )
+    probed = replace(prepared, images=images, missing=missing, saturated=saturated)
+    restored = restore_prepared(probed, vibration, "exact", options)[0, :, colours:]
     gains = _gains(restored[:, :-1], frequency, points) / level
     if timing.scan_axis == -1:
         gains = gains.flip(0)

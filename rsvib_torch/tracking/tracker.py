@@ -26,7 +26,7 @@ from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.reliability import contradicted_axes, judge
 from rsvib_torch.detection.result import OtherMotion
-from rsvib_torch.detection.rows.direct import DirectFit, offset_curve
+from rsvib_torch.detection.rows.direct import offset_curve
 from rsvib_torch.detection.rows.displacements import (
     FrameGroup,
     differential_motion,
@@ -442,7 +442,7 @@ class VibrationTracker:
         if any(mask is not None for mask in masks):
             ignore = torch.cat([~one if one is not None else torch.zeros_like(masks[-1]) for one in masks], 1)[0]
         # too few bands are registered, or the fit diverges: the next frames may be better
-        with suppress(ValueError, OverflowError, torch.linalg.LinAlgError):
+        with suppress(ValueError, OverflowError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
             stack = torch.cat(frames, 1)[0]
             found = detect_vibration(
                 stack,
@@ -570,7 +570,7 @@ class VibrationTracker:
         fit, measurements = verdict.fit, verdict.measurements
         robust = measurements.reweighted(residual_of(measurements, fit))
         weights = robust.weights / measurements.weights.clamp(min=1e-300)
-        curve, fitted = offset_curve(DirectFit(robust, fit, verdict.other_motion, weights), [2])
+        curve, fitted = offset_curve(robust, fit, weights, [2])
         vibration, std = vibration_of_fit(fit)
         own_std = displacement_std(fit, self._row_starts(height, weights.device), self._rows.exposure_time)
         std = replace(std, displacement=own_std)

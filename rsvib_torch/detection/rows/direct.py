@@ -103,17 +103,22 @@ def refine_directly(
         found = replace(found, fit=significant_only(found.measurements, found.fit, intervals))
     blur = rows.blur_ratio(shrunk_motion(found.fit, intervals))
     found = replace(found, other_motion=replace(found.other_motion, blur=blur))
-    return found, *offset_curve(found, [group.starts.shape[1] for group in rows.groups])
+    return found, *offset_curve(
+        found.measurements, found.fit, found.robust_weights, [group.starts.shape[1] for group in rows.groups]
+    )
 
 
-def offset_curve(found: DirectFit, group_frames: Sequence[int]) -> tuple[OffsetCurve, Tensor]:
-    """Measured offsets between consecutive frames, and those (B, P, N, 2) in px that the fit predicts.
+def offset_curve(
+    measurements: Measurements, fit: ToneFit, robust_weights: Tensor, group_frames: Sequence[int]
+) -> tuple[OffsetCurve, Tensor]:
+    """Measured offsets between consecutive frames, and those (B, P, N, 2) in px that a fit predicts.
 
     Args:
-        found: The fit, with the measurements of all groups behind each other.
+        measurements: Displacements of the rows of all groups behind each other.
+        fit: The fit to them.
+        robust_weights: As in ``DirectFit``.
         group_frames: Number of frames of each group; neighbouring groups share a frame.
     """
-    measurements = found.measurements
     count = measurements.displacements.shape[1] // len(group_frames)
     parts = [
         (slice(number * count, (number + 1) * count), slice(frame, frame + 2))
@@ -132,9 +137,9 @@ def offset_curve(found: DirectFit, group_frames: Sequence[int]) -> tuple[OffsetC
     starts, later_starts = of_pairs(measurements.exposure_starts)
     before, after = of_pairs(measurements.displacements)
     everywhere = replace(measurements, visible=torch.ones_like(measurements.visible))
-    fitted_before, fitted_after = of_pairs(model_displacements(everywhere, found.fit))
+    fitted_before, fitted_after = of_pairs(model_displacements(everywhere, fit))
     visible = torch.stack(of_pairs(measurements.visible)).amin(0) > 0
-    weights, robust = of_rows(measurements.weights), of_rows(found.robust_weights)
+    weights, robust = of_rows(measurements.weights), of_rows(robust_weights)
     measured = visible & (weights > 0).any(-1)
     frames = torch.arange(len(parts), device=starts.device)
     curve = OffsetCurve(
