@@ -68,11 +68,12 @@ class RestorationMtf(
 def _waves_at_rest(frequency: Tensor, places: Tensor) -> Tensor:
     """Waves (N, F) at places (N,) in px, complex; phases that grow with the square avoid a peak of their sums."""
     number = torch.arange(len(frequency), dtype=torch.float64, device=places.device)
-    return (
+    result: Tensor = (
         (2 / len(frequency)) ** 0.5
         * waves(places, -frequency)
         * waves(number.square() / len(frequency), number.new_tensor([0.5]))[:, 0]
     )
+    return result
 
 
 def _probes(motion: FrameMotion, frequency: Tensor, size: tuple[int, int]) -> Tensor:
