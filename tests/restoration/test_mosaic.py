@@ -12,7 +12,7 @@ from truth import decibel, draw_scene
 
 import rsvib_torch as rsv
 from rsvib_torch.frames.mosaic import colour_frames, colours_of, is_mosaic
-from rsvib_torch.restoration.exact import mosaic
+from rsvib_torch.restoration.exact import mosaic_scene
 from rsvib_torch.restoration.scene_model.polynomial_prior import fit_polynomial_prior
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
@@ -172,15 +172,15 @@ def test_gradients(frames, monkeypatch):
     part = frames[:2, :32, :32].double()
     priors, sparse = (
         [],
-        mosaic.sparse_colours(part[:, None], colours_of("RGGB", 32, 32), part[:, None].repeat(1, 3, 1, 1)),
+        mosaic_scene.sparse_colours(part[:, None], colours_of("RGGB", 32, 32), part[:, None].repeat(1, 3, 1, 1)),
     )
 
     def fit(*arguments):  # priors and interpolated colours are constants
         priors.append(priors[0] if priors else fit_polynomial_prior(*arguments))
         return priors[0]
 
-    monkeypatch.setattr(mosaic, "fit_polynomial_prior", fit)
-    monkeypatch.setattr(mosaic, "sparse_colours", lambda *_: sparse)
+    monkeypatch.setattr(mosaic_scene, "fit_polynomial_prior", fit)
+    monkeypatch.setattr(mosaic_scene, "sparse_colours", lambda *_: sparse)
 
     def energy(values):
         return restored(values, noise=0.01).square().mean()

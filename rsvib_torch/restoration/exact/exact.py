@@ -18,7 +18,7 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.exact.filling import fill_beyond_ends, fill_missing, measured_values
-from rsvib_torch.restoration.exact.mosaic import restore_mosaic
+from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
 from rsvib_torch.restoration.exact.priors import PRIORS, PriorOptions
 from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem
 from rsvib_torch.restoration.exact.strength import Strengths, prior_strength
