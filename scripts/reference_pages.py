@@ -109,9 +109,15 @@ def configuration_page() -> str:
     lines += key_table(section_of(file, "restoration"), meaning, rsv.restore, ("method", "saturation"))
     for name, method in METHODS.items():
         section = section_of(file_section(name), "restoration")
-        own = [key for key in section.model_fields if key not in ("method", "saturation")]
+        shared = [key for key in section.model_fields if key in ("mosaic", "optics")]
+        own = [key for key in section.model_fields if key not in ("method", "saturation", *shared)]
         lines += [f'Options of `method = "{name}"`:', ""]
         lines += key_table(section, documented(method.function), method.function, own)
+        if shared:
+            lines[-1:] = key_table(section, meaning, rsv.restore, shared)[2:]
+    optics = section_of(section_of(file, "restoration"), "optics")
+    lines += ["## [restoration.optics]", "", "Optics of the camera, see `optics`.", ""]
+    lines += key_table(optics, documented(rsv.Optics), rsv.Optics)
     lines += ["## [stack]", "", "Processing of stacks in windows.", "", *key_table(section_of(file, "stack"), {})]
     lines += ["## [simulation]", "", "For `rsvib simulate`.", ""]
     lines += key_table(simulation, documented(Simulation), keys=plain)

@@ -356,6 +356,8 @@ class VibrationRestorer(nn.Module):
         channels: As in ``restore``.
         saturation: As in ``restore``.
         check: As in ``restore``.
+        mosaic: As in ``restore``.
+        optics: As in ``restore``.
         **options: As in ``restore``.
 
     Example:
@@ -393,13 +395,16 @@ class VibrationRestorer(nn.Module):
         channels: Channels = None,
         saturation: Saturation = "auto",
         check: bool = True,
+        mosaic: Mosaic | None = None,
+        optics: Optics | Mapping[str, Any] | None = None,
         **options: Any,
     ) -> None:
         super().__init__()
         check_method_options(method, options)
         self.timing = timing
         common = {"full_scale": full_scale, "channels": channels, "saturation": saturation, "check": check}
-        self.options = {"method": method, **common, **options}
+        camera = {"mosaic": mosaic, "optics": check_optics(optics, method)}
+        self.options = {"method": method, **common, **camera, **options}
 
     @checks_arguments
     def forward(self, frames: FramesOrFiles, vibration: Motion | Detected, ignore: ArrayLike | None = None) -> Tensor:

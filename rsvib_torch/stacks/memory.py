@@ -16,6 +16,7 @@ __all__ = ["check_stack_fits", "memory_limit", "memory_needed", "parse_memory", 
 # scripts/benchmark.py --only memory, rounded up
 _PROCESS_BYTES, _WINDOW_BYTES = 450 * 10**6, 80 * 10**6
 # bytes per pixel and channel of a window that is detected, restored and judged; same measurement
+_MOSAIC_BYTES, _MOSAIC_FRAME_BYTES = 450 * 10**6, 450  # more for a mosaic: of a window, per pixel of a frame
 _PIXEL_BYTES = {"dewarp": 55, "banded": 55, "exact": 68, "richardson-lucy": 105, "edges": 80}
 
 
@@ -63,11 +64,13 @@ def memory_needed(
     else:
         pixel_bytes = _PIXEL_BYTES.get(restoration.get("method", "exact"), max(_PIXEL_BYTES.values()))
     scale = 1 if restoration is None else int(restoration.get("scale", 1))
-    pixel_bytes *= scale**2
+    mosaic = restoration is not None and restoration.get("mosaic") is not None and not on_gpu
+    pixel_bytes *= (2 if mosaic else scale) ** 2  # a mosaic is solved on the finer grid
     pixels = min(window, info.shape[0]) * int(np.prod(info.shape[1:], dtype=object))
     queued = 2 * pixels * np.dtype(info.dtype).itemsize  # frames read ahead, and frames to be written
+    more = _MOSAIC_BYTES + _MOSAIC_FRAME_BYTES * info.shape[-2] * info.shape[-1] if mosaic else 0
     once = _PROCESS_BYTES + info.decoding_bytes + queued
-    return once + count * (_WINDOW_BYTES + pixels * pixel_bytes + queued)
+    return once + count * (_WINDOW_BYTES + pixels * pixel_bytes + queued + more)
 
 
 def windows_at_once(

@@ -1,6 +1,7 @@
 """Colour mosaics, against a camera that shares no code with the package."""
 
 import sys
+import warnings
 from pathlib import Path
 
 import cv2
@@ -212,9 +213,24 @@ def test_detection_in_raw_frames():
 
 
 def test_the_check_compares_mosaics(frames):
-    with pytest.warns(rsv.RestorationWarning):
-        rsv.restore(frames[:2], TIMING, rsv.Vibration([3.1, 5.2], [90.0, 61.0], [3.5, 4.4]), joint=True, mosaic="RGGB")
-    rsv.restore(frames[:2], TIMING, VIBRATION, joint=True, mosaic="RGGB")
+    wrong = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [3.5, 4.4])
+    with pytest.warns(rsv.RestorationWarning, match="no better than raw|helps in part only"):
+        rsv.restore(frames[:2], TIMING, wrong, joint=True, mosaic="RGGB")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rsv.restore(frames[:2], TIMING, VIBRATION, joint=True, mosaic="RGGB")
+
+
+def test_frames_that_do_not_fit_are_reported(frames):
+    part = frames[:3, :40, :40]
+    wrong = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.6, 1.5])
+    with pytest.warns(rsv.RestorationWarning, match="times the stated noise"):
+        restored(part, wrong, noise=NOISE)
+    with pytest.warns(rsv.RestorationWarning, match="the same colours at the same points"):
+        restored(part, rsv.Vibration([1e-6, 1e-6], [90.0, 61.0]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        restored(part, noise=NOISE)
 
 
 def test_stacks_in_windows(tmp_path):

@@ -333,7 +333,7 @@ def test_typed_options_are_those_of_the_function(name):
     method = METHODS[name]
     parameters = inspect.signature(method.function).parameters.values()
     keywords = {p.name: p.annotation for p in parameters if p.kind is p.KEYWORD_ONLY}
-    assert set(method.masks) == {"ignore", "clipped"} & set(keywords)
+    assert set(method.masks) == {"ignore", "clipped", "colours"} & set(keywords)
     assert {*method_options(name), *method.masks} == set(keywords)
     for option in method_options(name):
         assert METHOD_SETTINGS[name].__annotations__[option] == keywords[option]

@@ -35,7 +35,7 @@ def test_trusted_restoration_prepares_once_and_equals_the_public_functions(monke
     monkeypatch.setattr(window_restoration, "prepare_frames", counted)
     monkeypatch.setattr(judge, "prepare_frames", None)
     found = restore_trusted(frames, timing, detected, {"saturation": 0.99}, force=True)
-    assert calls == [{"saturation": 0.99}]
+    assert calls == [{"saturation": 0.99, "mosaic": None}]
     assert torch.equal(found.frames, expected)
     assert found.verdict.outcome == verdict.outcome
     torch.testing.assert_close(found.verdict.predicted_gain, verdict.predicted_gain)

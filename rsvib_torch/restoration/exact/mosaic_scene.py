@@ -3,6 +3,7 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -17,6 +18,7 @@ from rsvib_torch.restoration.exact.priors import shrink_patches
 from rsvib_torch.restoration.exact.scene_solver import Partition, SceneSolver
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.noise.policy import noise_levels
+from rsvib_torch.restoration.restoration_warning import RestorationWarning
 from rsvib_torch.restoration.scene_model.finer_rows import SCALE, FinerObservation, finer_kernels
 from rsvib_torch.restoration.scene_model.polynomial_prior import fit_polynomial_prior
 
@@ -232,6 +234,8 @@ def restore_mosaic(
                 lengths[stack],
             )
             moved = displacement[stack, members] - motion.shift[stack, reference]
+            if len(members) > 1:
+                _warn_if_alike(moved.detach(), node_weights)
             kernels = finer_kernels(moved, node_weights, frames.new_ones(len(members)), height, 16)
             observation = FinerObservation(kernels, height, frames.dtype)
             image = part.restored(observation, shift[:, 0], level, noise == "auto", regularisation, partition)
@@ -306,8 +310,9 @@ class _Frames:
         with torch.no_grad():
             predicted = first.predict(coefficients)
             full = torch.where(self.measured, full, predicted[..., :width] + mean)
-            if unknown_level and count > 1:
-                level = _residual_level(first, data - predicted, measured)
+            if count > 1:
+                found = _residual_level(first, data - predicted, measured)
+                level = self._checked(found, level, unknown_level)
             if self.floor is not None:  # saturated pixels are at least as bright as their value
                 low = predicted[..., :width] + mean < self.floor
                 data[..., :width] = torch.where(low, self.floor - mean, data[..., :width])
@@ -315,6 +320,23 @@ class _Frames:
         second = solver()
         scene: Tensor = second.scene(second.fit(data, coefficients, iterations=20)) + mean
         return scene[..., : SCALE * width]
+
+    def _checked(self, found: Tensor, stated: Tensor, unknown: bool, *, most: float = 1.5) -> Tensor:
+        """The standard deviation of the noise to use: that of the residual if none is stated.
+
+        Warns if the residual is larger than the stated noise explains.
+        """
+        if unknown:
+            return found
+        if bool(found > most * stated):
+            warnings.warn(
+                f"the frames differ from their model by {float(found / stated):.1f} times the stated noise: the "
+                "vibration is not accurate enough, the scene changes between the frames, or noise is too low; colours "
+                "may be false",
+                RestorationWarning,
+                stacklevel=2,
+            )
+        return stated
 
     def _precisions(
         self, images: Tensor, observation: FinerObservation, level: Tensor, regularisation: float
@@ -327,6 +349,25 @@ class _Frames:
             )
             for image in _components(images).unbind(1)
         ]
+
+
+def _warn_if_alike(displacement: Tensor, node_weights: Tensor, *, least: float = 0.1) -> None:
+    """Warn if the frames of a scene measure the same colour at the same points along both axes.
+
+    Args:
+        displacement: (M, R, N, 2) px during the exposures.
+        node_weights: (N,).
+        least: Of ``1 - |mean exp(pi i x)|^2`` over the frames, which is 0 for equal places in the pattern of two px.
+    """
+    place = (displacement * node_weights[:, None]).sum(-2)
+    mean = torch.polar(torch.ones_like(place), torch.pi * place).mean(0).abs()
+    if bool(((1 - mean.square()).median(0).values < least).all()):
+        warnings.warn(
+            "the frames of a scene measure the same colours at the same points of it: the other colours are "
+            "interpolated, as from one frame; restore more vibrating frames jointly",
+            RestorationWarning,
+            stacklevel=2,
+        )
 
 
 def _residual_level(solver: MosaicSolver, residual: Tensor, measured: Tensor) -> Tensor:
