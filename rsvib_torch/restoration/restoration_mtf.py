@@ -68,11 +68,9 @@ class RestorationMtf(
 def _waves_at_rest(frequency: Tensor, places: Tensor) -> Tensor:
     """Waves (N, F) at places (N,) in px, complex; phases that grow with the square avoid a peak of their sums."""
     number = torch.arange(len(frequency), dtype=torch.float64, device=places.device)
-    return (
-        (2 / len(frequency)) ** 0.5
-        * waves(places, -frequency)
-        * waves(number.square() / len(frequency), number.new_tensor([0.5]))[:, 0]
-    )
+    phases = waves(number.square() / len(frequency), number.new_tensor([0.5]))[:, 0]
+    result: Tensor = (2 / len(frequency)) ** 0.5 * waves(places, -frequency) * phases
+    return result
 
 
 def _probes(motion: FrameMotion, frequency: Tensor, size: tuple[int, int]) -> Tensor:
@@ -190,13 +188,12 @@ def restoration_mtf(
     images = torch.cat([prepared.images, level * probes[None].to(prepared.images.dtype)], dim=2)
     if options.get("noise", "auto") != "auto":  # estimates are means over all channels
         options["noise"] *= (colours / images.shape[2]) ** 0.5
-    masks = {
-        name: None
-        if mask is None
-        else torch.cat([mask, mask.any(2, keepdim=True).expand(-1, -1, images.shape[2] - colours, -1, -1)], dim=2)
-        for name, mask in (("missing", prepared.missing), ("saturated", prepared.saturated))
-    }
-    restored = restore_prepared(replace(prepared, images=images, **masks), vibration, "exact", options)[0, :, colours:]
+    missing, saturated = (
+        None if mask is None else torch.cat([mask, mask.any(2, keepdim=True).expand_as(images[:, :, colours:])], dim=2)
+        for mask in (prepared.missing, prepared.saturated)
+    )
+    probed = replace(prepared, images=images, missing=missing, saturated=saturated)
+    restored = restore_prepared(probed, vibration, "exact", options)[0, :, colours:]
     gains = _gains(restored[:, :-1], frequency, points) / level
     if timing.scan_axis == -1:
         gains = gains.flip(0)
