@@ -71,11 +71,8 @@ class RestorationMtf(
 def _waves_at_rest(frequency: Tensor, places: Tensor) -> Tensor:
     """Waves (N, F) at places (N,) in px, complex; phases that grow with the square avoid a peak of their sums."""
     number = torch.arange(len(frequency), dtype=torch.float64, device=places.device)
-    result: Tensor = (
-        (2 / len(frequency)) ** 0.5
-        * waves(places, -frequency)
-        * waves(number.square() / len(frequency), number.new_tensor([0.5]))[:, 0]
-    )
+    phases = waves(number.square() / len(frequency), number.new_tensor([0.5]))[:, 0]
+    result: Tensor = (2 / len(frequency)) ** 0.5 * waves(places, -frequency) * phases
     return result
 
 
@@ -195,9 +192,7 @@ def restoration_mtf(
     if options.get("noise", "auto") != "auto":  # estimates are means over all channels
         options["noise"] *= (colours / images.shape[2]) ** 0.5
     missing, saturated = (
-        None
-        if mask is None
-        else torch.cat([mask, mask.any(2, keepdim=True).expand(-1, -1, images.shape[2] - colours, -1, -1)], dim=2)
+        None if mask is None else torch.cat([mask, mask.any(2, keepdim=True).expand_as(images[:, :, colours:])], dim=2)
         for mask in (prepared.missing, prepared.saturated)
     )
     probed = replace(prepared, images=images, missing=missing, saturated=saturated)

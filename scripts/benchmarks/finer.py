@@ -1,16 +1,20 @@
-"""Joint restoration on a grid of half pixels, compared with still frames and with the grid of pixels.
+"""Joint restoration on a grid of half pixels, compared with still frames, other software and the grid of pixels.
 
-Frames come from a camera that aliases and is made without the package, see ``finer_camera``. The vibration is detected
-in the frames.
+Frames come from cameras that alias and are made without the package, see ``finer_camera``, and for roll
+``honesty_camera``. The vibration is detected in the frames of the first table, and given in those of the second.
 """
 
 import argparse
 import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
+from benchmarks import honesty_camera
 from benchmarks.finer_camera import BETWEEN, FINER, after_optics, still_image
+from benchmarks.finer_peers import drizzled, shift_and_add
 from benchmarks.independent_camera import Array, Shake, closed, take_frames
 from benchmarks.measure import one_thread
 from benchmarks.restoration import SCENES
@@ -37,49 +41,167 @@ def interpolated(image: Array) -> Array:
     return ndimage.map_coordinates(image, np.meshgrid(rows, columns, indexing="ij"), order=5, mode="mirror")
 
 
-def cases(name: str, options: argparse.Namespace, sigma: float) -> list[dict[str, Any]]:
-    """Figures of one scene behind optics of one width, for all noise levels and numbers of frames."""
-    side, size = FINER * (options.finer_size + 2 * MARGIN), (options.finer_size, options.finer_size)
-    scene = after_optics(closed(SCENES[name](side, side, 3).double().numpy(), FADE), sigma)
-    half, pixels = still_image(scene, size, 2), still_image(scene, size)
-    timing = rsv.SensorTiming(ROW_TIME, EXPOSURE_ROWS, 2 * options.finer_size + 59)
-    clean = take_frames(
+def joint(frames: torch.Tensor, timing: rsv.SensorTiming, motion: Any, scale: int = 1, **options: Any) -> Array:
+    """All frames restored jointly."""
+    restored = rsv.restore(frames, timing, motion, joint=True, scale=scale, check=False, **options)
+    return np.asarray(restored[0].double())
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Frames without noise, and the scene after optics and pixel on half pixels and on pixels.
+
+    Attributes:
+        frames: (T, H, W).
+        half: (2 H, 2 W).
+        timing: The sensor.
+        vibration: The true motion.
+    """
+
+    frames: Array
+    half: Array
+    timing: rsv.SensorTiming
+    vibration: rsv.Vibration
+
+    @property
+    def pixels(self) -> Array:
+        """The scene on pixels."""
+        return self.half[::2, ::2]
+
+    def noisy(self, noise: float) -> torch.Tensor:
+        """Frames with white noise."""
+        generator = np.random.default_rng(SEED)
+        return torch.from_numpy(self.frames + noise * generator.standard_normal(self.frames.shape)).float()
+
+    def still(self, noise: float, count: int) -> Array:
+        """Mean of as many still frames, interpolated."""
+        generator = np.random.default_rng(SEED + 1)
+        taken = self.pixels + noise * generator.standard_normal((count, *self.pixels.shape))
+        return interpolated(taken.mean(0))
+
+
+def record(
+    fine: Array, sigma: float, size: int, *, exposure: int = EXPOSURE_ROWS, image_motion: float = 0.0
+) -> Recording:
+    """Frames of a scene behind optics of a width, and the truth at the place of the middle frame."""
+    scene, shape = after_optics(closed(fine, FADE), sigma), (size, size)
+    timing = rsv.SensorTiming(ROW_TIME, exposure, max(2 * size + 59, exposure + 59))
+    shake = replace(SHAKE, image_motion=np.array([image_motion, 0.0]))
+    frames = take_frames(
         scene,
-        SHAKE,
+        shake,
         row_time=ROW_TIME,
-        exposure_rows=EXPOSURE_ROWS,
+        exposure_rows=exposure,
         frame_rows=timing.frame_rows,
         num_frames=max(FRAMES),
-        size=size,
+        size=shape,
         points=FINER,
         between=BETWEEN,
     )
+    vibration = rsv.Vibration(
+        *(torch.from_numpy(v) for v in (SHAKE.amplitude, SHAKE.frequency, SHAKE.phase)), shake.image_motion
+    )
+    _, shift = rsv.visible_pixels(timing, vibration, shape, max(FRAMES))
+    offset = (0, FINER * int(shift[max(FRAMES) // 2, 0]))
+    return Recording(frames, still_image(scene, shape, 2, offset), timing, vibration)
+
+
+def rolling(fine: Array, size: int, roll: float) -> Recording:
+    """Frames of a camera that also rolls."""
+    amplitude, frequency, phase = np.array([3.1, 5.2, roll]), np.array([90.0, 61.0, 70.0]), np.array([0.4, 1.3, 2.0])
+    layers = [honesty_camera.layer(fine)]
+    timing = rsv.SensorTiming(ROW_TIME, EXPOSURE_ROWS, 2 * size + 59)
+
+    def motion(times: Array) -> Array:
+        tones = [a * np.sin(2 * np.pi * f * times + p) for a, f, p in zip(amplitude, frequency, phase, strict=True)]
+        return np.stack([*tones, np.zeros(times.shape)])
+
+    starts = np.arange(max(FRAMES))[:, None] * timing.frame_period + np.arange(size) * ROW_TIME
+    frames = honesty_camera.take_frames(layers, motion, starts, timing.exposure_time, size)
+    half = np.empty((2 * size, 2 * size))
+    for down in (0, 1):
+        for right in (0, 1):
+            standing = honesty_camera.standing(-0.5 * right, -0.5 * down)
+            half[down::2, right::2] = honesty_camera.take_frames(layers, standing, starts[:1], 1e-9, size)[0]
+    return Recording(frames, half, timing, rsv.Vibration(amplitude, frequency, phase))
+
+
+def cases(name: str, options: argparse.Namespace, sigma: float) -> list[dict[str, Any]]:
+    """Figures of one scene behind optics of one width, for all noise levels and numbers of frames."""
+    side = FINER * (options.finer_size + 2 * MARGIN)
+    taken = record(SCENES[name](side, side, 3).double().numpy(), sigma, options.finer_size)
     found = []
     for noise in NOISES:
-        generator = np.random.default_rng(SEED)
-        taken = torch.from_numpy(clean + noise * generator.standard_normal(clean.shape)).float()
-        still = pixels + noise * generator.standard_normal(clean.shape)
-        detection = rsv.detect_vibration(taken, timing)
+        detection = rsv.detect_vibration(taken.noisy(noise), taken.timing)
         for count in FRAMES:
-            frames = taken[:count]
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", rsv.RestorationWarning)
-                joint = rsv.restore(frames, timing, detection, joint=True, check=False)[0].double().numpy()
-                finer = rsv.restore(frames, timing, detection, joint=True, check=False, scale=2)[0].double().numpy()
-            found.append(
-                {
-                    "scene": name,
-                    "sigma": sigma,
-                    "noise": noise,
-                    "frames": count,
-                    "still": decibel(interpolated(still[:count].mean(0)), half),
-                    "endless": decibel(interpolated(pixels), half),
-                    "joint": decibel(interpolated(joint), half),
-                    "finer": decibel(finer, half),
-                    "joint_pixels": decibel(joint, pixels),
-                    "finer_pixels": decibel(finer[::2, ::2], pixels),
-                }
-            )
+            frames = taken.noisy(noise)[:count]
+            before, finer = (joint(frames, taken.timing, detection, scale) for scale in (1, 2))
+            row = {
+                "scene": name,
+                "sigma": sigma,
+                "noise": noise,
+                "frames": count,
+                "still": decibel(taken.still(noise, count), taken.half),
+                "endless": decibel(interpolated(taken.pixels), taken.half),
+                "joint": decibel(interpolated(before), taken.half),
+                "finer": decibel(finer, taken.half),
+                "joint_pixels": decibel(before, taken.pixels),
+                "finer_pixels": decibel(finer[::2, ::2], taken.pixels),
+            }
+            for peer, images in (("drizzle", drizzled), ("added", shift_and_add)):
+                values = [decibel(image, taken.half) for image in images(frames, taken.timing, detection.vibration)]
+                row[peer] = max(values, default=float("nan"))
+            found.append(row)
+    return found
+
+
+def without_data(frames: torch.Tensor) -> torch.Tensor:
+    """Frames in which 3 % of the pixels and a square of 24 px have no data."""
+    missing = torch.rand(frames.shape, generator=torch.Generator().manual_seed(SEED)) < 0.03
+    missing[:, 60:84, 60:84] |= torch.arange(len(frames))[:, None, None] == 0
+    return frames.masked_fill(missing, torch.nan)
+
+
+def conditions(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Figures of eight frames of the city with other exposures, motions, missing data and a wrong vibration."""
+    size, margin = options.finer_size, 64
+    side = FINER * (size + 2 * margin)
+    scene = SCENES["city"](side, side, 3).double().numpy()
+    usual = record(scene, 0.3, size)
+    wrong = rsv.Vibration(usual.vibration.amplitude, usual.vibration.frequency, usual.vibration.phase + 0.05)
+    level = float(np.quantile(usual.frames, 0.975))
+    below = usual.half < level
+    layers = SCENES["city"](*honesty_camera.fine_shape(size, size), 3).double().numpy()
+    named: dict[str, tuple[Recording, Callable[[torch.Tensor], torch.Tensor], Any, dict[str, Any]]] = {
+        "exposure of 100 rows": (record(scene, 0.3, size, exposure=100), torch.clone, None, {}),
+        "exposure of 400 rows": (record(scene, 0.3, size, exposure=400), torch.clone, None, {}),
+        "image motion of 500 px/s": (record(scene, 0.3, size, image_motion=500.0), torch.clone, None, {}),
+        "roll of 2 mrad": (rolling(layers, size, 2e-3), torch.clone, None, {}),
+        "3 % of the pixels and a square without data": (usual, without_data, None, {}),
+        "2.5 % saturated pixels, PSNR below saturation": (
+            usual,
+            lambda frames: frames.clamp(max=level),
+            None,
+            {"saturation": level},
+        ),
+        "phases wrong by 0.05 rad": (usual, torch.clone, wrong, {}),
+    }
+    found = []
+    for name, (taken, change, motion, chosen) in named.items():
+        for noise in NOISES:
+            frames = change(taken.noisy(noise))
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", rsv.RestorationWarning)
+                before, finer = (
+                    joint(frames, taken.timing, motion or taken.vibration, scale, **chosen) for scale in (1, 2)
+                )
+            counted = below if chosen else np.ones_like(taken.half, dtype=bool)
+            still = taken.still(noise, max(FRAMES))
+            figures = {
+                kind: decibel(np.where(counted, image, taken.half), taken.half) - 10 * np.log10(1 / counted.mean())
+                for kind, image in (("still", still), ("joint", interpolated(before)), ("finer", finer))
+            }
+            found.append({"condition": name, "noise": noise, "warned": len(caught) > 0, **figures})
     return found
 
 
@@ -90,8 +212,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     """PSNR on half pixels and on pixels, for all scenes, optics, noise levels and numbers of frames."""
-    with one_thread():
-        return [row for name in options.scenes for sigma in OPTICS for row in cases(name, options, sigma)]
+    with one_thread(), warnings.catch_warnings():
+        warnings.simplefilter("ignore", rsv.RestorationWarning)
+        table = [row for name in options.scenes for sigma in OPTICS for row in cases(name, options, sigma)]
+        return [*table, *conditions(options)]
 
 
 def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
@@ -101,14 +225,30 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         f"{options.finer_size} x {options.finer_size} px, exposure of {EXPOSURE_ROWS} rows, vibration detected in all "
         f"{max(FRAMES)} frames. Still frames are averaged and interpolated; in brackets, infinitely many of them.",
         "",
-        "| scene | σ of the optics (px) | noise | frames | half pixels: still frames | `joint=True`, interpolated | "
-        "`joint=True, scale=2` | pixels: `joint=True` | `joint=True, scale=2` |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| scene | σ of the optics (px) | noise | frames | half pixels: still frames | drizzle | shift-and-add | "
+        "`joint=True`, interpolated | `joint=True, scale=2` | pixels: `joint=True` | `joint=True, scale=2` |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     text += [
         f"| {row['scene']} | {row['sigma']} | {row['noise']} | {row['frames']} | {row['still']:.1f} "
-        f"({row['endless']:.1f}) | {row['joint']:.1f} | **{row['finer']:.1f}** | {row['joint_pixels']:.1f} | "
+        f"({row['endless']:.1f}) | {row['drizzle']:.1f} | {row['added']:.1f} | "
+        f"{row['joint']:.1f} | **{row['finer']:.1f}** | {row['joint_pixels']:.1f} | "
         f"**{row['finer_pixels']:.1f}** |"
         for row in results
+        if "scene" in row
+    ]
+    text += [
+        "",
+        f"The same for {max(FRAMES)} frames of the city, σ 0.3 px (roll: 0.4 px), with the true vibration but in the "
+        "last rows. Still frames have none of the conditions. Saturated: points below saturation only.",
+        "",
+        "| condition | noise | still frames | `joint=True`, interpolated | `joint=True, scale=2` | warning |",
+        "|---|---|---|---|---|---|",
+    ]
+    text += [
+        f"| {row['condition']} | {row['noise']} | {row['still']:.1f} | {row['joint']:.1f} | **{row['finer']:.1f}** | "
+        f"{'yes' if row['warned'] else ''} |"
+        for row in results
+        if "condition" in row
     ]
     return text

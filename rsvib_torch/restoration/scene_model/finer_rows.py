@@ -12,6 +12,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -25,10 +26,11 @@ from rsvib_torch.restoration.scene_model.observation import (
     normal_matrices,
 )
 
-__all__ = ["SCALE", "FinerObservation", "finer_kernels", "spline_samples"]
+__all__ = ["SCALE", "FinerObservation", "finer_kernels", "spline_transfer"]
 
 SCALE = 2  # grid points per px, and unknowns per frequency
 _DEGREE = 3
+_SCENE_REACH = 5  # half rows on either side; support of the weights of a scene row
 
 
 class FinerKernels(RowKernels):
@@ -43,7 +45,7 @@ class FinerKernels(RowKernels):
 
     def needed(self, num_rows: int) -> tuple[int, int]:
         """First coefficient, and the one after the last, that the scene on the rows of a frame depends on."""
-        return -SCALE, SCALE * (SCALE * num_rows + 1)
+        return -SCALE * _SCENE_REACH, SCALE * (SCALE * num_rows + _SCENE_REACH)
 
     def at(self, frequencies: Tensor) -> Tensor:
         """Kernels (M, R, 2 J, Q) without the phase of the middle at the frequency."""
@@ -78,9 +80,23 @@ def finer_kernels(
     )
 
 
-def spline_samples(frequencies: Tensor) -> Tensor:
-    """Transfer function of the cubic B-spline on the grid, at frequencies in cycles per px."""
-    return (2 + torch.cos(2 * math.pi / SCALE * frequencies)) / 3
+def spline_transfer(frequencies: Tensor) -> Tensor:
+    """Transfer function of the cubic B-spline on half pixels, at frequencies in cycles per px."""
+    return torch.sinc(frequencies / SCALE) ** (_DEGREE + 1)
+
+
+@cache
+def _scene_weights() -> tuple[float, ...]:
+    """Weights of the coefficients of half rows -5 ... 5 in a row of the scene, as ``observation.scene_weights``.
+
+    The least-squares fit to ``spline_transfer`` up to 0.9 cycles per px. Samples of the spline, weights 1/6, 4/6 and
+    1/6, include its aliases: gratings across the rows have 1.14 times their contrast at 0.75 cycles per px.
+    """
+    v = torch.linspace(0, 0.9, 181, dtype=torch.float64, device="cpu")
+    order = torch.arange(_SCENE_REACH + 1, dtype=torch.float64, device="cpu")
+    cosines = torch.cos(2 * torch.pi / SCALE * v[:, None] * order) * torch.where(order > 0, 2.0, 1.0)
+    half = torch.linalg.lstsq(cosines, spline_transfer(v)[:, None]).solution[:, 0]
+    return tuple((torch.cat([half.flip(0), half[1:]]) / (half[0] + 2 * half[1:].sum())).tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,9 +146,12 @@ class FinerObservation(Observation):
 
     def scene(self, coefficients: Tensor, length: int) -> Tensor:
         """The scene at half pixels, (C, 2 R, 2 L): rows j / 2 and columns i / 2 of the frame at rest."""
-        first = -SCALE - self.top
-        rows = coefficients[first : first + SCALE * (SCALE * self.num_rows + 2)].unflatten(0, (-1, SCALE))
-        sampled = (rows[:-2] + 4 * rows[1:-1] + rows[2:]) / 6
+        first = -SCALE * _SCENE_REACH - self.top
+        count = SCALE * self.num_rows
+        rows = coefficients[first : first + SCALE * (count + 2 * _SCENE_REACH)].unflatten(0, (-1, SCALE))
+        sampled = sum(
+            (weight * rows[k : k + count] for k, weight in enumerate(_scene_weights())), start=rows.new_zeros(())
+        )
         low, alias = sampled.unbind(1)  # at u and u - 1; the scene is real
         spectra = torch.cat([low, alias[..., :-1].flip(-1).conj()], dim=-1)
         scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=SCALE * length) * SCALE

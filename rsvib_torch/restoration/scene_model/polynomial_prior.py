@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.scene_model.finer_rows import SCALE, spline_samples
+from rsvib_torch.restoration.scene_model.finer_rows import SCALE, spline_transfer
 from rsvib_torch.restoration.scene_model.row_prior import observed_spectrum, smeared
 
 __all__ = ["PolynomialPrior", "fit_polynomial_prior"]
@@ -109,7 +109,7 @@ def fit_polynomial_prior(
             beyond = (v - alias_v).abs() > 1
             along, across = u - alias_u, (v - alias_v).clamp(-1, 1)
             blur = (weight * smeared(spectrum.blur(alias_u, alias_v))).sum((0, 1)).masked_fill(beyond, 0.0)
-            gains.append(blur * _pixel(along) * spline_samples(across).square())
+            gains.append(blur * _pixel(along) * spline_transfer(across).square())
             rows = _laplacian(across)[:, None] ** order @ rising.T
             features.append(torch.stack([rows[:, m] * _laplacian(along) ** n for m, n in _POWERS], dim=-1))
     gain, feature = torch.stack(gains), torch.stack(features)  # (aliases, U, V), (aliases, U, V, powers)
