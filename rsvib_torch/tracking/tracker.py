@@ -451,7 +451,7 @@ class VibrationTracker:
         names = ("_filter", "_reference", "_verdict", "_path", "_columns", "_trusted")
         before, stack = {name: getattr(self, name) for name in names}, torch.cat(frames, 1)[0]
         # too few bands are registered, or the fit diverges: the next frames may be better
-        with suppress(ValueError, OverflowError, torch.linalg.LinAlgError):
+        with suppress(ValueError, OverflowError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
             # the filter measures the rows, so that bands are a sufficient start; small frames have too few of them
             for method, tones in _STARTS:
                 found = detect_vibration(
