@@ -21,6 +21,7 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import as_numbers, checks_arguments
 from rsvib_torch.core.checks import check_number, check_whole_number
+from rsvib_torch.core.option_types import DetectionMethod
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.detection.measurements import Measurements
@@ -62,11 +63,14 @@ __all__ = ["TrackedFrame", "TrackingState", "VibrationTracker"]
 TrackingState = Literal["searching", "tracking", "unusable"]
 
 _MAX_PREDICTED_STD = 0.5  # px; the gradients of rows reach a few tenths of a pixel, and there are several rounds
+_MAX_UNEXPLAINED = 1.0  # px, residual displacement of rows; they are not measured correctly over larger distances
 _MAX_CHANGE = 0.2  # px, by which a round may change the displacement of a row; otherwise the frame is measured again
 _MAX_ROUNDS = 3
 _MAX_PATH = 4.0  # px; the scene may move so far before its gradients are computed again
 _MAX_AGE = 30  # frames; then gradients are computed again, because the scene may have changed
 _DRIFT_STD = (10.0, 500.0)  # px/s and px/s^2, at the start; tones and drift are correlated, their sum is more accurate
+_STARTS: tuple[tuple[DetectionMethod, Literal["auto"] | int], ...] = (("bands", "auto"), ("direct", 1))
+_MIN_CORRELATION = 0.3  # of the typical band with the next frame; bands of independent noise reach 0.1
 _MAX_DOUBLED = 4  # times that the number of frames between two attempts to detect the vibration is doubled
 _PATIENCE = 3  # consecutive frames that contradict the tones, before the vibration is detected again
 
@@ -164,7 +168,7 @@ class VibrationTracker:
     The tones of ``detect_vibration`` are followed by a Kalman filter: amplitude, phase and frequency are predicted for
     every frame and corrected by the displacements of its rows from the frame before. Amplitudes may grow and
     frequencies may sweep; the filter estimates how fast. Times of frames may have gaps. If the rows contradict the
-    prediction, the vibration is detected again from the last frames, which takes as long as ``detect_vibration`` does.
+    prediction, the vibration is detected again from the last frames, which takes as long as a few frames.
     Roll and zoom are not followed.
 
     Args:
@@ -345,6 +349,9 @@ class VibrationTracker:
         self._verdict = self._judged(
             self._at_middle(time, height).as_fit(time), measurements, residual, found, centre - time
         )
+        if not float(self._verdict.other_motion.unexplained.amax()) < _MAX_UNEXPLAINED:
+            self._filter = self._verdict = None  # rows further away are not measured correctly
+            return
         contradicted = any(self._verdict.contradicted)
         self._contradictions = self._contradictions + 1 if contradicted else 0
         if not contradicted:
@@ -441,35 +448,48 @@ class VibrationTracker:
         ignore = None
         if any(mask is not None for mask in masks):
             ignore = torch.cat([~one if one is not None else torch.zeros_like(masks[-1]) for one in masks], 1)[0]
+        names = ("_filter", "_reference", "_verdict", "_path", "_columns", "_trusted")
+        before, stack = {name: getattr(self, name) for name in names}, torch.cat(frames, 1)[0]
         # too few bands are registered, or the fit diverges: the next frames may be better
         with suppress(ValueError, OverflowError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
-            stack = torch.cat(frames, 1)[0]
-            found = detect_vibration(
-                stack,
-                timing,
-                method="bands",  # a start: the filter measures the rows
-                image_acceleration=len(times) > 2,
-                window=len(times),
-                columns=self.columns,
-                ignore=ignore,
-                roll=False,
-                zoom=False,
-            )[0]
-            if self._filter is None or bool(_plausible(found).any()):
-                names = ("_filter", "_reference", "_verdict", "_path", "_columns", "_trusted")
-                before = {name: getattr(self, name) for name in names}
-                self._start(found, middle, times[-1] - times[0])
-                if self._filter is None or self._contradictions:  # no better
-                    vars(self).update(before)
+            # the filter measures the rows, so that bands are a sufficient start; small frames have too few of them
+            for method, tones in _STARTS:
+                found = detect_vibration(
+                    stack,
+                    timing,
+                    method=method,
+                    tones=tones,
+                    image_acceleration=len(times) > 2,
+                    window=len(times),
+                    columns=self.columns,
+                    ignore=ignore,
+                    roll=False,
+                    zoom=False,
+                )[0]
+                if method == "bands" and float(found.offsets.quality.median()) < _MIN_CORRELATION:
+                    break  # the frames do not show the same scene
+                plausible = _plausible(found)
+                for chosen in (plausible, plausible & False):  # without tones, the path is followed at least
+                    self._start(found, chosen, middle, times[-1] - times[0])
+                    if self._filter is not None:
+                        break
+                if self._filter is not None and self._contradictions == 0:
+                    return
+        if before["_filter"] is not None:  # no better
+            vars(self).update(before)
 
-    def _start(self, found: DetectionResult, middle: float, record: float) -> None:
-        """Start the filter with the tones of a record of ``record`` s about ``middle`` s, and follow the last frame."""
+    def _start(self, found: DetectionResult, chosen: Tensor, middle: float, record: float) -> None:
+        """Start the filter with chosen tones (2, K) of a record of ``record`` s about ``middle`` s, follow its end."""
         vibration, std = found.vibration, found.std
         # a record does not distinguish a tone of less than one period from a drift, and its amplitude is not known
         slow = vibration.frequency * record < 1.0
-        tones = torch.polar(vibration.amplitude, vibration.phase - 0.5 * math.pi) * _plausible(found)
+        tones = torch.polar(vibration.amplitude, vibration.phase - 0.5 * math.pi) * chosen
         rate = 2j * math.pi * vibration.frequency
         drift = torch.stack([vibration.image_motion, vibration.image_acceleration], -1)
+        if not bool(chosen.any()):  # the drift of a fit with wrong tones is wrong as well
+            apart = found.offsets.offsets[-1].nanmedian(0).values
+            starts = (found.offsets.later_times - found.offsets.times)[-1]
+            drift = torch.stack([apart / starts.mean(), torch.zeros_like(apart)], -1)
         drift = drift + torch.stack([(tones * rate).real, (tones * rate.square()).real], -1).mul(slow[..., None]).sum(1)
         tones = tones * ~slow
         growth_std = torch.full_like(std.amplitude, 0.5)  # 1/s
