@@ -25,7 +25,7 @@ __all__ = ["PROCESS_NOISE", "ToneFilter"]
 # Random walk of g and 2 pi f in rad/s per square root of a second, and of a in px/s^2 per square root of a second.
 # A tone that sweeps by 2 Hz/s changes by 12.6 rad/s in a second; a tone that grows to twice its amplitude has 0.7 / s.
 # A camera held by hand shakes by 2 px at 3 Hz, which are 13000 px/s^3. Measured in docs/live.md.
-PROCESS_NOISE = ((0.0003, 200.0), (0.0003, 4000.0), (0.5, 200.0), (12.0, 1200.0))
+PROCESS_NOISE = ((0.00003, 200.0), (0.00003, 4000.0), (0.5, 200.0), (12.0, 1200.0))
 _STAY = 0.95  # probability that the process noise of the next frame is the same
 
 
