@@ -549,9 +549,7 @@ def _detect(
     if found.aliasing is not None:
         fit = without_aliasing(found.measurements, fit, found.aliasing)
     own_std = displacement_std(fit, starts, row_timing.exposure_time)
-    total_std = own_std
-    if options.tones is None:
-        fit, total_std = with_further_tones(found.measurements, fit, starts)
+    fit, total_std = with_further_tones(found.measurements, fit, starts, number_is_known=options.tones is not None)
     vibration, std = vibration_of_fit(fit)
     std = replace(std, displacement=total_std)
     tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)

@@ -82,6 +82,31 @@ def test_intervals_contain_the_truth_where_a_second_tone_is_not_resolved(num_fra
     torch.testing.assert_close(allowing.coefficients, fit.coefficients)
 
 
+def test_a_known_number_of_tones_adds_nothing_to_fast_tones():
+    generator = np.random.default_rng(5)
+    truth = mean_sine([2.0], [37.0], [0.4], starts_of(TIMING, 3), TIMING.exposure_time)
+    measurements = measured(truth, TIMING, generator)
+    fit = fitted(measurements, [37.0])
+    known, _ = with_further_tones(measurements, fit, row_starts(3), number_is_known=True)
+    free, _ = with_further_tones(measurements, fit, row_starts(3))
+    std = [float(vibration_of_fit(found)[1].amplitude[0, 0, 0]) for found in (fit, known, free)]
+    assert std[1] == pytest.approx(std[0])
+    assert std[2] > 2 * std[1]
+
+
+def test_slow_errors_count_for_slow_tones():
+    generator = np.random.default_rng(6)
+    stds = []
+    for frequency in (4.0, 37.0):
+        truth = mean_sine([2.0], [frequency], [0.4], starts_of(TIMING, 4), TIMING.exposure_time)
+        fit = fitted(measurements := measured(truth, TIMING, generator, noise=1e-4), [frequency])
+        known, _ = with_further_tones(measurements, fit, row_starts(4), number_is_known=True)
+        own, total = (float(vibration_of_fit(found)[1].amplitude[0, 0, 0]) for found in (fit, known))
+        stds.append(total / own)
+    assert stds[0] > 5
+    assert stds[1] == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("num_frames", [2, 4])
 def test_bias_by_aliasing_is_removed_and_allowed_for(num_frames):
     """Bias b sin(2 pi (d_p - d_q)), mean over the frames q: b is known if the motion exceeds a pixel."""
