@@ -46,7 +46,7 @@ INNER_LAYERS = {
         {"exact", "banded", "dewarp", "verdict"},
         {"richardson_lucy"},
         {"restore"},
-        {"noise_gain"},
+        {"noise_gain", "restoration_mtf"},
     ),
 }
 

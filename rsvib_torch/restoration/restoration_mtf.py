@@ -1,4 +1,7 @@
-"""Gain of a restoration at every spatial frequency, and its noise gain, measured with waves and noise."""
+"""Gain of a restoration at every spatial frequency, and its noise gain, measured with waves and noise.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 from dataclasses import dataclass, replace
 from typing import Any
