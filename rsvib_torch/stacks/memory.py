@@ -17,7 +17,7 @@ __all__ = ["check_stack_fits", "memory_limit", "memory_needed", "parse_memory", 
 _PROCESS_BYTES, _WINDOW_BYTES = 450 * 10**6, 80 * 10**6
 # bytes per pixel and channel of a window that is detected, restored and judged; same measurement
 _PIXEL_BYTES = {"dewarp": 55, "banded": 55, "exact": 68, "richardson-lucy": 105, "edges": 80}
-_FINER = 3  # times that with scale=2; 2.1 measured with 8 frames of 512 px and 16 of 384 px, all solutions included
+_FINER = 4  # times that with scale=2; 3.5 measured for windows of 4 frames of 512 px, see scripts/attacks/memory.py
 
 
 def parse_memory(text: str | float) -> int:
