@@ -185,7 +185,8 @@ def restoration_mtf(
     # neighbours and their aliases 1 - u are at least half a step apart: more than the taper mixes
     cycles = max(4, min(40, min(size) // 5))
     frequency = torch.arange(0.25, cycles * points / 2, dtype=torch.float64, device=prepared.images.device) / cycles
-    noise = torch.randn(count, 1, *size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    generator = torch.Generator("cpu").manual_seed(0)
+    noise = torch.randn(count, 1, *size, generator=generator, dtype=torch.float64, device="cpu")
     probes = torch.cat([_probes(motion, frequency, (size[0], size[1])), noise.to(frequency.device)], dim=1)
     level = _LEVEL * float(estimate_noise(prepared.filled).square().nanmean().sqrt().clamp(min=1e-4))
     images = torch.cat([prepared.images, level * probes[None].to(prepared.images.dtype)], dim=2)

@@ -232,6 +232,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
         "predict_noise_gain": Call(
             rsv.predict_noise_gain, {"frames": frames, "timing": timing, "vibration": vibration, "method": "dewarp"}
         ),
+        "restoration_mtf": Call(rsv.restoration_mtf, {"frames": frames, "timing": timing, "vibration": vibration}),
         "process_stack": Call(
             rsv.process_stack,
             {

@@ -128,7 +128,7 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Run ``rsvib run --memory`` on stacks in different layouts, with the smallest limit that it accepts.
 
     A run that needs more than its limit has the outcome ``memory``; if its output differs from that of the first
-    layout, ``wrong``.
+    layout, ``wrong``. The last trial restores a quarter of the frames with ``scale=2``.
     """
     counts = _draw(seed)
     (folder / "camera.toml").write_text(_CAMERA, encoding="utf-8")
@@ -149,3 +149,22 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
             reference = restored if reference is None else reference
             outcome = "completed" if np.array_equal(restored, reference) else "wrong"
         yield Trial(name, outcome, f"{detail}, {run.seconds:.0f} s")
+    yield _finer_grid(folder, counts[: _FRAMES // 4])
+
+
+def _finer_grid(folder: Path, counts: Stack) -> Trial:
+    """Windows with ``scale=2``, each restored to one image."""
+    np.save(folder / "finer.npy", counts)
+    options = "scale = 2\njoint = true\n"
+    (folder / "finer.toml").write_text(_CAMERA.replace('method = "dewarp"\n', options), encoding="utf-8")
+    limit = memory_needed(rsv.read_stack_info(folder / "finer.npy"), _WINDOW, {"scale": 2})
+    command = rsvib("run", "finer.npy", "finer", "--config", "finer.toml", "--window", str(_WINDOW), "--quiet")
+    run = run_watched([*command, "--memory", str(limit), "--overwrite"], limit=300.0, folder=folder)
+    outcome, detail = outcome_of_command(run), f"{100 * run.peak_memory / limit:.0f} % of {limit / 1e6:.0f} MB"
+    if outcome == "completed":
+        shape = tifffile.imread(folder / "finer" / "restored.tif").shape
+        outcome = (
+            "memory" if run.peak_memory > limit else "completed" if shape[1:] == (2 * _SIZE, 2 * _SIZE) else "wrong"
+        )
+        detail += f", {shape}"
+    return Trial("scale 2", outcome, f"{detail}, {run.seconds:.0f} s")

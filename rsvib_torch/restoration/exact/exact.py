@@ -86,7 +86,8 @@ def restore_exact(
         scale: Points of the restored frames per pixel along both axes, 1 or 2. With 2, the unknown is the scene after
             optics and pixel on a grid of half pixels, and aliasing is part of the model: several frames that sample
             between each other's pixels contain detail beyond half a cycle per px, one frame does not. The prior is then
-            a polynomial in the Laplacians of both axes (``PolynomialPrior``).
+            a polynomial in the Laplacians of both axes (``PolynomialPrior``). ``restoration_mtf`` measures which detail
+            the restored frames contain.
 
     Returns:
         Restored frames of the same shape, or (B, 1, C, H, W); with ``scale=2``, of twice the rows and columns, point

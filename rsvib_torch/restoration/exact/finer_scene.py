@@ -137,8 +137,9 @@ def warn_of_frames(misfits: list[Misfit], places: Iterable[Tensor], *, least: fl
         least: Of ``1 - |mean exp(2 pi i x)|^2``, the factor on the information on aliased detail; x the displacements
             of a row in the frames. 0.5 on average for two frames, more for several.
     """
-    worst = max(misfits, key=lambda misfit: misfit.power)
-    if worst.noticed:
+    noticed = [misfit for misfit in misfits if misfit.noticed]
+    if noticed:
+        worst = max(noticed, key=lambda misfit: misfit.power)
         warn_of_restoration(
             f"the frames differ from their model by {worst.residual:.1f} times the noise, rows are displaced by about "
             f"{worst.error:.2g} px more than the vibration states: it is not accurate enough for scale=2, or the scene "
