@@ -15,6 +15,7 @@ from pathlib import Path
 
 import torch
 from benchmarks import (
+    bounded_cost,
     detection,
     detection_report,
     difficulty,
@@ -64,6 +65,7 @@ def main() -> None:
     )
     for part in (
         measure,
+        bounded_cost,
         restoration,
         pipeline,
         live,

@@ -83,12 +83,14 @@ class _FitOptions:
         model: Harmonics and order of the image motion.
         bands: Registration of the row bands.
         scale: Components of the motion.
+        may_be_parallax: Whether roll and zoom are assumed only because the halves of the rows move apart.
     """
 
     tones: int | None
     model: MotionModel
     bands: RegistrationOptions
     scale: FieldScale
+    may_be_parallax: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +104,7 @@ class _Found:
         fitted: (B, P, N, 2) px, the offsets that it predicts for them.
         other_motion: Motion that it does not explain; None if the method does not measure it.
         aliasing: (B,) px, expected size of the bias of the displacements by aliasing; None if it is not known.
+        abandoned: Whether roll and zoom do not explain why the halves of the rows move apart.
     """
 
     fit: ToneFit
@@ -110,6 +113,7 @@ class _Found:
     fitted: Tensor
     other_motion: OtherMotion | None = None
     aliasing: Tensor | None = None
+    abandoned: bool = False
 
 
 _Fit = Callable[[BandStart, Tensor, Tensor | None, RowTiming, _FitOptions], _Found]
@@ -170,10 +174,16 @@ def _fit_direct(
     motion, scale = shrunk_motion(fit, intervals), options.scale
     if scale.same_for_all_columns:
         rows = whole_rows(frames, valid, timing, motion)
-    else:
+    else:  # equal blur takes several times as long, and is not needed to find that there is no roll
+        rows = strip_rows(
+            frames, valid, timing, motion, scale, pairs_if_blurred_differently=not options.may_be_parallax
+        )
+    uncertain = options.may_be_parallax
+    found, offsets, fitted = refine_directly(rows, intervals, fit, options.tones, may_be_other=uncertain)
+    if uncertain and not found.abandoned and rows.differently_blurred(motion := shrunk_motion(found.fit, intervals)):
         rows = strip_rows(frames, valid, timing, motion, scale)
-    found, offsets, fitted = refine_directly(rows, intervals, fit, options.tones)
-    return _Found(found.fit, found.measurements, offsets, fitted, found.other_motion, found.aliasing)
+        found, offsets, fitted = refine_directly(rows, intervals, found.fit, options.tones)
+    return _Found(found.fit, found.measurements, offsets, fitted, found.other_motion, found.aliasing, found.abandoned)
 
 
 _METHODS: dict[DetectionMethod, _Method] = {
@@ -487,12 +497,15 @@ def _detect_field(
     alike = _detect(frames, valid, timing, method, options)
     if field.camera is not None or field.least_axes > 2 or (field.most_axes > 2 and alike.rotates):
         scale = field.scale(field.most_axes, field.camera)
-        found = _detect(frames, valid, timing, method, replace(options, scale=scale), alike.fit).result
+        uncertain = field.camera is None and field.least_axes == 2
+        assumed = replace(options, scale=scale, may_be_parallax=uncertain)
+        of_field = _detect(frames, valid, timing, method, assumed, alike.fit)
+        found = of_field.result
         # a given number of tones is fitted to all axes, also to those that do not move
         significant = found.vibration.amplitude > MIN_SIGNIFICANCE * found.std.amplitude
         moving = significant.flatten(0, -3).any(0).any(-1).tolist()
         axes = max([field.least_axes, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
-        if axes > 2 or field.camera is not None:
+        if (axes > 2 and not of_field.abandoned) or field.camera is not None:
             return found.with_axes(axes)
     return _with_cause(alike, frames, valid, timing, method, options) if find_cause else alike.result
 
@@ -507,6 +520,7 @@ class _Detected:
         measurements: The measurements of the fit.
         rotates: Whether the halves of the rows of any stack move apart.
         contradicted: For each stack, the axes in row order whose measurements contradict the timing.
+        abandoned: As in ``_Found``.
     """
 
     result: DetectionResult
@@ -514,6 +528,7 @@ class _Detected:
     measurements: Measurements
     rotates: bool
     contradicted: list[tuple[bool, bool]]
+    abandoned: bool = False
 
 
 def _detect(
@@ -613,7 +628,7 @@ def _detect(
         ),
         timing=timing,
     )
-    return _Detected(result, fit, found.measurements, rotates, contradicted)
+    return _Detected(result, fit, found.measurements, rotates, contradicted, found.abandoned)
 
 
 def _with_cause(

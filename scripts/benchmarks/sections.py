@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from benchmarks import (
+    bounded_cost,
     detection,
     detection_cost,
     difficulty,
@@ -49,10 +50,22 @@ class Section:
     by_default: bool = True
 
 
+def _cost_rows(options: argparse.Namespace) -> Rows:
+    """Time of plain recordings, then of difficult ones."""
+    return detection_cost.rows(options) + bounded_cost.rows(options)
+
+
+def _cost_lines(rows: Rows, options: argparse.Namespace) -> list[str]:
+    """Tables of both parts; results stored before the second part existed lack it."""
+    difficult = [row for row in rows if row.get("part") == "bounded"]
+    text = detection_cost.lines([row for row in rows if row.get("part") != "bounded"], options)
+    return text + (["", *bounded_cost.lines(difficult, options)] if difficult else [])
+
+
 # A new section is one module with rows, lines and, for options of its own, add_options; and one line here.
 SECTIONS: dict[str, Section] = {
     "registration": Section("Registration of bands", registration.rows, registration.lines),
-    "cost": Section("Time of detection", detection_cost.rows, detection_cost.lines),
+    "cost": Section("Time of detection", _cost_rows, _cost_lines),
     "detection": Section("Accuracy of detection", detection.rows, detection.lines),
     "restoration": Section("Restoration", restoration.rows, restoration.lines),
     "finer": Section("Finer grid", finer.rows, finer.lines),

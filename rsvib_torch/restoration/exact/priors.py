@@ -94,22 +94,27 @@ def shrink_patches(images: Tensor, level: float | Tensor, step: int = 1) -> Tens
         level: Standard deviation of white noise in them.
         step: Pixels between patches: 1, 2 or 4.
     """
-    cosines, rim = _cosines(images), _PATCH - 1
+    cosines, rim = _cosines(images).flatten(1), _PATCH - 1  # (n n, n n)
     height, width = images.shape[-2:]
     # patches begin at every step-th row and column; the last ones extend beyond the image
     size = [-(-(whole + rim) // step) * step + _PATCH - step for whole in (height, width)]
     ends = (rim, size[1] - width - rim, rim, size[0] - height - rim)
     padded = torch.nn.functional.pad(images[:, None], ends, mode="replicate")
-    ones = torch.ones_like(cosines[:1])
-    total, weights = torch.zeros_like(padded), torch.zeros_like(padded)
+    total, weights, ones = torch.zeros_like(padded), torch.zeros_like(padded), padded.new_ones(1, 1, _PATCH, 1)
     for begin in range(0, size[0] - rim, 64):  # rows at a time, a multiple of all steps: less memory
         rows = slice(begin, min(begin + 64 - step + _PATCH, size[0]))
-        values = torch.nn.functional.conv2d(padded[..., rows, :], cosines, stride=step)
+        part = padded[..., rows, :]
+        # products of matrices: several times as fast as convolutions with one channel
+        values = cosines @ torch.nn.functional.unfold(part, _PATCH, stride=step)  # (N, n n, patches)
         strong = values.detach().abs() > 2.0 * level
         strong[:, 0] = True
         weight = 1.0 / strong.sum(1, keepdim=True).to(values.dtype)
-        total[..., rows, :] += torch.nn.functional.conv_transpose2d(values * strong * weight, cosines, stride=step)
-        weights[..., rows, :] += torch.nn.functional.conv_transpose2d(weight, ones, stride=step)
+        shrunk = cosines.T @ (values * strong * weight)
+        total[..., rows, :] += torch.nn.functional.fold(shrunk, part.shape[-2:], _PATCH, stride=step)
+        spread = weight.unflatten(-1, (-1, (size[1] - _PATCH) // step + 1))
+        for kernel, stride in ((ones, (step, 1)), (ones.mT, (1, step))):  # every patch on its 8 x 8 px
+            spread = torch.nn.functional.conv_transpose2d(spread, kernel, stride=stride)
+        weights[..., rows, :] += spread
     return (total / weights)[:, 0, rim : rim + height, rim : rim + width]
 
 

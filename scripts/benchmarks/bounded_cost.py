@@ -1,0 +1,213 @@
+"""Time of detection and restoration of 30 difficult inputs, over the time of a plain vibration of the same size.
+
+The recordings are those of ``honesty_cases`` and some of other shapes and numbers of frames. An input and its plain
+counterpart alternate, and the shortest times are compared, because other load on the machine can only increase them.
+"""
+
+import argparse
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from benchmarks.honesty_cases import BLANKING, FRAME_PERIOD, of_tones, plain, record, recording, tones_of
+from benchmarks.measure import seconds_of
+
+import rsvib_torch as rsv
+from rsvib_torch.evaluation import city_and_fields
+
+SEED, NOISE = 5, 0.005
+BOUND = 3.0  # times the time of the plain recording
+OF_CLASSES = {  # recordings (class, number) of honesty_cases
+    "wrong timing": (
+        ("frame_rows +2%", 0),
+        ("frame_rows +5%", 0),
+        ("frame_rows -10%", 0),
+        ("row_time +10%", 0),
+        ("row_time +10%, start times given", 0),
+        ("exposure 300, true 200", 0),
+        ("exposure x 0.5", 0),
+        ("dropped frame", 0),
+        ("swapped frames", 0),
+        ("reversed readout", 0),
+    ),
+    "motion": (
+        ("random", 3),
+        ("random walk", 0),
+        ("ringdown", 0),
+        ("chirp", 0),
+        ("step", 0),
+        ("close pair, 3 Hz apart", 0),
+        ("roll", 3),
+        ("zoom", 4),
+        ("large amplitude", 0),
+    ),
+    "scene": (("stars", 0), ("objects", 0), ("cloud", 1), ("parallax", 0), ("parallax", 1)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Input:
+    """Frames with the stated timing, and a plain recording of as many pixels.
+
+    Attributes:
+        frames: (T, H, W).
+        timing: The stated timing.
+        plain_frames: Of the same number of pixels.
+        plain_timing: Their timing.
+    """
+
+    frames: torch.Tensor
+    timing: rsv.SensorTiming
+    plain_frames: torch.Tensor
+    plain_timing: rsv.SensorTiming
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this section."""
+    parser.add_argument(
+        "--cost-size", type=int, default=384, help="cost: rows and columns of the difficult inputs (default: 384)"
+    )
+
+
+def _frames(values: Any) -> torch.Tensor:
+    return torch.as_tensor(np.asarray(values), dtype=torch.float32)
+
+
+def _plain(size: int, count: int) -> tuple[torch.Tensor, rsv.SensorTiming]:
+    """A plain vibration in frames of the city."""
+    generator = np.random.default_rng(SEED)
+    taken = record(plain(generator, num_frames=count, scene="city"), generator, size)
+    return _frames(taken.frames), taken.timing
+
+
+def _of_class(size: int, name: str, number: int) -> Input:
+    """A recording of a class, with a plain one of as many frames."""
+    taken = recording(name, number, size)
+    return Input(_frames(taken.frames), taken.timing, *_plain(size, len(taken.frames)))
+
+
+def _of_shape(size: int, height: int, width: int) -> Input:
+    """A plain vibration in long or wide frames, with a square recording of as many pixels."""
+    timing = rsv.SensorTiming(FRAME_PERIOD / (BLANKING * height), 20 * height / 2048, BLANKING * height)
+    vibration = rsv.Vibration([1.5, 1.2], [53.0, 65.0], [0.4, 1.3])
+    frames = rsv.simulate_frames(
+        city_and_fields(height + 64, width + 64, seed=SEED),
+        timing,
+        vibration,
+        4,
+        frame_size=(height, width),
+        noise=rsv.SensorNoise(read_noise=NOISE),
+        generator=torch.Generator().manual_seed(SEED),
+    )
+    return Input(frames, timing, *_plain(size, 4))
+
+
+def _of_number(size: int, count: int, build: Callable[..., Any]) -> Input:
+    """A case in some number of frames."""
+    generator = np.random.default_rng(SEED)
+    case = build(generator)
+    taken = record(case, generator, size)
+    return Input(_frames(taken.frames), taken.timing, *_plain(size, count))
+
+
+def _many_tones(generator: np.random.Generator) -> Any:
+    """Six tones along each axis in eight frames."""
+    axes = [
+        tones_of(generator, generator.uniform(0.3, 2.0, 6).tolist(), generator.uniform(10.0, 250.0, 6).tolist())
+        for _ in range(2)
+    ]
+    return of_tones(*axes, num_frames=8)
+
+
+def _still(size: int, *, uniform: bool) -> Input:
+    """Frames of a camera at rest, of the city or of a uniform surface."""
+    frames, timing = _plain(size, 4)
+    noise = NOISE * torch.randn(frames.shape, generator=torch.Generator().manual_seed(SEED))
+    scene = torch.full_like(frames[:1], 0.5) if uniform else frames[:1]
+    return Input(scene + noise, timing, frames, timing)
+
+
+def inputs() -> dict[str, Callable[[int], Input]]:
+    """Functions of the size, by name."""
+    built: dict[str, Callable[[int], Input]] = {
+        f"{kind}: {name} {number}": partial(_of_class, name=name, number=number)
+        for kind, classes in OF_CLASSES.items()
+        for name, number in classes
+    }
+    built["no vibration"] = partial(_still, uniform=False)
+    built["uniform image"] = partial(_still, uniform=True)
+    built["six tones, 8 frames"] = partial(_of_number, count=8, build=_many_tones)
+    built["30 frames"] = partial(_of_number, count=30, build=partial(plain, num_frames=30, scene="texture"))
+    built["long frames"] = lambda size: _of_shape(size, 4 * size, size // 4)
+    built["wide frames"] = lambda size: _of_shape(size, max(96, size // 4), size * size // max(96, size // 4))
+    return built
+
+
+def _timed(frames: torch.Tensor, timing: rsv.SensorTiming) -> tuple[float, float | None, str]:
+    """Seconds of detection and of restoration with its result, and the first reason against it."""
+    found: list[rsv.DetectionResult] = []
+    try:
+        detection = seconds_of(lambda: found.append(rsv.detect_vibration(frames, timing)))
+    except ValueError as error:
+        return 0.0, None, f"error: {error}"
+    restoration = seconds_of(lambda: rsv.restore(frames, timing, found[0]))
+    reasons = [reason for reasons in found[0].reasons for reason in reasons]
+    return detection, restoration, "" if not reasons else reasons[0].partition(":")[0]
+
+
+def measure(task: Input, runs: int) -> dict[str, Any]:
+    """Ratios of the shortest times, and the outcome."""
+    seconds: list[tuple[float, ...]] = []
+    reason = ""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rsv.RestorationWarning)
+        for _ in range(max(1, runs)):
+            own = _timed(task.frames, task.timing)
+            reason = own[2]
+            normal = _timed(task.plain_frames, task.plain_timing)
+            seconds.append((own[0], own[1] or 0.0, normal[0], normal[1] or 0.0))
+    detection, restoration, plain_detection, plain_restoration = (min(values) for values in zip(*seconds, strict=True))
+    return {
+        "shape": list(task.frames.shape),
+        "detection": detection,
+        "plain_detection": plain_detection,
+        "restoration": restoration,
+        "plain_restoration": plain_restoration,
+        "detection_ratio": detection / plain_detection,
+        "restoration_ratio": restoration / plain_restoration,
+        "reason": reason,
+    }
+
+
+def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Figures of all inputs."""
+    return [
+        {"part": "bounded", "name": name, **measure(build(options.cost_size), options.runs)}
+        for name, build in inputs().items()
+    ]
+
+
+def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+    """The inputs, slowest first, as a Markdown table."""
+    slowest = sorted(results, key=lambda row: -max(row["detection_ratio"], row["restoration_ratio"]))
+    beyond = [sum(row[f"{of}_ratio"] > BOUND for row in results) for of in ("detection", "restoration")]
+    text = [
+        f"{len(results)} difficult inputs of {options.cost_size} x {options.cost_size} px, or as many pixels; times "
+        "over those of a plain vibration of the same size, the shortest of alternating runs. Restoration uses the "
+        f"result of detection. More than {BOUND:g} times as long: detection of {beyond[0]} inputs, restoration of "
+        f"{beyond[1]}.",
+        "",
+        "| input | frames | detection (s) | ratio | restoration (s) | ratio | first reason |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in slowest:
+        count, height, width = row["shape"]
+        text.append(
+            f"| {row['name']} | {count} of {height} x {width} | {row['detection']:.2f} | {row['detection_ratio']:.1f} "
+            f"| {row['restoration']:.2f} | {row['restoration_ratio']:.1f} | {row['reason']} |"
+        )
+    return text
