@@ -143,7 +143,7 @@ class _Reference:
 
 @dataclass(frozen=True, eq=False)
 class _Verdict:
-    """What the last pair of frames says about the tones, in row order.
+    """State of the tones according to the last pair of frames, in row order.
 
     Attributes:
         fit: The tones; the time origin is the exposure start of the new frame.
