@@ -62,10 +62,10 @@ def test_reference_pages_are_up_to_date():
 
 def test_every_command_and_key_is_in_the_reference():
     commands = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
-    for command in ("init", "simulate", "detect", "restore", "run", "report", "calibrate", "motion", "known"):
+    for command in ("init", "simulate", "detect", "restore", "run", "report", "calibrate", "motion", "known", "live"):
         assert f"## rsvib {command}\n" in commands
     # rsvib init has no configuration, and rsvib calibrate has only --row-time, as the range to search
-    assert commands.count("| `--config PATH` |") == commands.count("| `--row-time TIME` |") - 2 == 7
+    assert commands.count("| `--config PATH` |") == commands.count("| `--row-time TIME` |") - 2 == 8
     assert "| `--unit px\\|rad\\|" in commands
     keys = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
     assert "| `row_time` | a number | required | Time between the exposure starts" in keys
