@@ -108,9 +108,6 @@ class Measurements:
     def inverse_variances(self) -> Tensor:
         """(B, N, 2) inverse variance ``1 / (W^-1)_aa`` of the displacement of each axis, W the information."""
         axes, inverse = self.information.shape[-1], []
-        if axes == 2:
-            mixed = self.information[..., 0, 1, None].square()
-            return (self.weights - mixed / self.weights.flip(-1).clamp(min=1e-300)).clamp(min=0.0)
         for axis in range(axes):  # the last pivot of a Cholesky factor belongs to an axis that is conditioned on none
             order = [*(other for other in range(axes) if other != axis), axis]
             inverse.append(cholesky_root(self.information[..., order, :][..., order])[..., -1, -1].square())

@@ -74,7 +74,7 @@ class RowGradients:
         halves: (B, S, 2, 5) float64, sums gx gx, gx gy, gy gy, gx e and gy e over the left and the right half of each
             row, with e the residual difference between the last and the first frame. A displacement that depends on
             the row only is equal in both halves. With further components, parts instead of halves.
-        aliasing: (B,) float64 px, expected size of the bias of displacements by aliasing (``aliasing_bias``).
+        aliasing: (B,) float64 px, expected size of the bias of displacements by aliasing (``_aliasing_bias``).
     """
 
     images: Tensor

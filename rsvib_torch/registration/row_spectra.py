@@ -101,14 +101,6 @@ class RowSpectra:
         shape = (*self.values.shape[:2], self.height, self.width)
         return torch.ones(shape, dtype=torch.bool, device=self.values.device)
 
-    def below(self, highest: float) -> "RowSpectra":
-        """The spectra at frequencies below ``highest`` cycles/px."""
-        low = copy(self)
-        low.frequencies = self.frequencies[self.frequencies < highest]
-        low.values = self.values[..., : len(low.frequencies)].contiguous()
-        low._index_rows()
-        return low
-
     def warped(self, rows: Tensor, shift: Tensor) -> Tensor:
         """Spectra (B, T, S, U) of frames at fractional rows, moved back by ``shift`` px; both (B, T, S)."""
         cell = rows.floor()

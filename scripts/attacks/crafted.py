@@ -627,6 +627,7 @@ def _child(path: Path, sender: multiprocessing.connection.Connection) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # lines of libpng and ffmpeg
     limit = psutil.Process().memory_info().vms + _BYTES  # free_memory() respects it
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    sender.send(psutil.Process().memory_info().rss)
     sender.send(_try(path))
     sender.close()
 
@@ -637,16 +638,14 @@ def crafted(name: str, folder: Path) -> Trial:
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
     child = context.Process(target=_child, args=(path, sender))
-    begin, lowest = time.monotonic(), psutil.Process().memory_info().rss
     child.start()
     sender.close()
+    begin, inherited = time.monotonic(), receiver.recv()
     watched, peak, cpu = psutil.Process(child.pid), 0, 0.0
     outcome: tuple[Outcome, str] | None = None
     while outcome is None and cpu < _CPU_SECONDS and time.monotonic() - begin < _SECONDS:
         try:
-            used = watched.memory_info().rss
-            lowest = min(lowest, used)  # pages of files are not inherited
-            peak = max(peak, used - lowest)
+            peak = max(peak, watched.memory_info().rss - inherited)
             cpu = sum(watched.cpu_times()[:2])
             if receiver.poll(0.01):
                 outcome = receiver.recv()

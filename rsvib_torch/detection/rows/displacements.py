@@ -509,33 +509,32 @@ def blur_ratio(
     sums: list[tuple[Tensor, ...]] = []
     for group in groups:
         positions = _Positions.of(group, timing, motion)
-        low = group.spectra.below(highest)
-        first = int((low.frequencies <= 1 / 64).sum())  # shading affects frequencies below 1/64 cycles/px
-        u = low.frequencies[first:]
+        u = group.spectra.frequencies
+        low = (u > 1 / 64) & (u < highest)  # shading affects frequencies below 1/64 cycles/px
 
         def averaged(values: Tensor) -> Tensor:
             rows = values.shape[2] // block
             rows_of_blocks: Tensor = values[:, :, : rows * block].unflatten(2, (rows, block))
             return rows_of_blocks.mean(3)
 
-        spectra = averaged(low.warped(positions.rows, positions.shift)[..., first:])
+        spectra = averaged(group.spectra.warped(positions.rows, positions.shift)[..., low])
         moments = averaged(_second_moments(*_paths(positions.exposure_starts, timing, motion)))
         visible = averaged(positions.visible(group.spectra.height, BLOCK_ROWS))
         mean, difference = 0.5 * (spectra[:, 1:] + spectra[:, :-1]), spectra[:, 1:] - spectra[:, :-1]
-        change = (0.5 * (moments[:, 1:] - moments[:, :-1])).to(mean.real.dtype)[:, :, 1:-1, None]
+        change = (0.5 * (moments[:, 1:] - moments[:, :-1]))[:, :, 1:-1, None]
         before, here, after = mean[:, :, :-2], mean[:, :, 1:-1], mean[:, :, 2:]
-        by_x = (2j * math.pi * u).to(mean.dtype)
+        by_x = (2j * math.pi * u[low]).to(mean.dtype)
         expected = change[..., 0, 0] * by_x.square() * here + change[..., 1, 1] * (after - 2 * here + before) / block**2
         expected = expected + change[..., 0, 1] * by_x * (after - before) / block
         both = (visible[:, 1:] * visible[:, :-1] == 1).double()
-        weight = (both[:, :, 1:-1] * both[:, :, 2:] * both[:, :, :-2]).flatten(1)
-        # products of rows of real and imaginary parts: expected, mean, difference
-        rows_of_all = torch.stack(
-            [torch.view_as_real(each).flatten(-2) for each in (expected, here, difference[:, :, 1:-1])], -2
-        )
-        products = (rows_of_all @ rows_of_all.mT).double().flatten(1, 2)
-        total = (products * weight[..., None, None]).sum(1)
-        sums.append((total[:, :2, :2], total[:, :2, 2], total[:, 2, 2], weight.sum(1) * 2 * len(u)))
+        weight = (both[:, :, 1:-1] * both[:, :, 2:] * both[:, :, :-2])[..., None]
+        columns = torch.view_as_real(torch.stack([expected.to(mean.dtype), here], -1)).movedim(-1, -2)  # (..., 2, 2)
+        values = torch.view_as_real(difference[:, :, 1:-1])
+        columns, values = (part.double().flatten(1, -1 - rank) for part, rank in ((columns, 1), (values, 0)))
+        weight = weight[..., None].expand(*weight.shape[:-1], int(low.sum()), 2).flatten(1)
+        weighted = (columns * weight[..., None]).mT
+        right = (weighted @ values[..., None])[..., 0]
+        sums.append((weighted @ columns, right, (weight * values.square()).sum(1), weight.sum(1)))
     normal, right, square, count = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
     scale = normal.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).sqrt()
     inverse = torch.linalg.inv(

@@ -32,12 +32,11 @@ def without_aliasing(measurements: Measurements, fit: ToneFit, size: Tensor) -> 
         size: (B,) px, prior standard deviation of b.
     """
     precision = size.clamp(min=1e-9).square().reciprocal()[:, None]
-    covariance, batch = fit.covariance.clone(), len(fit.covariance)
-    change = fit.drift.new_zeros(batch, *fit.drift.shape[1:2], covariance.shape[-1] // fit.drift.shape[1])
+    covariance, axes = fit.covariance.clone(), fit.drift.shape[1]
+    change = fit.drift.new_zeros(len(covariance), axes, covariance.shape[-1] // axes)
     bias = _unit_bias(measurements, model_displacements(measurements, fit))
-    for axis in range(2):
-        problem = LinearisedFit.of(measurements, fit, axis)
-        Z, by_unit = problem.unexplained(bias[..., axis, None])
+    for problem in LinearisedFit.of_each_axis(measurements, fit)[:2]:
+        Z, by_unit = problem.unexplained(bias[..., problem.axis, None])
         variance = 1 / (Z.square().sum(1) + problem.rounding[:, None] + precision)  # (B, 1), of b
         b = variance * (Z[..., 0] * problem.residual).sum(1, keepdim=True)
         problem.add_covariance(covariance, by_unit * variance[..., None] @ by_unit.mT)

@@ -61,11 +61,13 @@ def with_further_tones(
         The fit, and the standard deviation (B, 2) in px of the displacement of rows without mean and linear trend, rms
         over the rows.
     """
-    covariance = fit.covariance.clone()
+    covariance, rows = fit.covariance.clone(), exposure_starts.expand(len(fit.centre), -1)
     variance = displacement_std(fit, exposure_starts, measurements.exposure_time).square()
-    for axis in range(fit.coefficients.shape[1]):
-        problem = LinearisedFit.of(measurements, fit, axis)
-        added, moved = _added(measurements, fit, exposure_starts, axis, problem, number_is_known)
+    jacobian = displacement_jacobian(fit, rows, measurements.exposure_time)
+    slow_errors = _slow_errors(measurements, fit)
+    for problem in LinearisedFit.of_each_axis(measurements, fit):
+        slow_error = slow_errors[:, problem.axis]
+        added, moved = _added(measurements, fit, problem, rows, jacobian, slow_error, number_is_known)
         problem.add_covariance(covariance, added)
         variance[:, problem.axes] += moved
     return replace(fit, covariance=covariance), variance.sqrt()
@@ -73,12 +75,11 @@ def with_further_tones(
 
 def _grid(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Tensor, Tensor]:
     """Frequencies (B, F) in Hz of the further tone of an axis, and those that count (bool): near its tones, or low."""
-    starts = measurements.exposure_starts
-    duration = (starts.amax((1, 2)) - starts.amin((1, 2)))[:, None]
+    duration = _duration(measurements)
     tones = torch.where(fit.active, fit.frequencies, 0.0)[:, axis]  # (B, K)
     centres = torch.cat([torch.zeros_like(tones[:, :1]), tones], 1)
     # only places near a tone: fits of frames with a wrong timing may have frequencies of any size
-    reach = torch.arange(-_REACH * _POINTS - 1, _REACH * _POINTS + 2, dtype=torch.float64, device=starts.device)
+    reach = torch.arange(-_REACH * _POINTS - 1, _REACH * _POINTS + 2, dtype=torch.float64, device=tones.device)
     places = ((centres * duration * _POINTS).round()[..., None] + reach).unique()
     frequencies = places[places >= 1] / (_POINTS * duration)
     near = ((frequencies[..., None] - centres[:, None]).abs() * duration[..., None] <= _REACH).any(-1)
@@ -86,23 +87,39 @@ def _grid(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Tensor, 
     return frequencies[:, used], near[:, used]
 
 
+def _duration(measurements: Measurements) -> Tensor:
+    """(B, 1) s, from the first to the last exposure start of the record."""
+    starts = measurements.exposure_starts
+    return (starts.amax((1, 2)) - starts.amin((1, 2)))[:, None]
+
+
 def _added(
     measurements: Measurements,
     fit: ToneFit,
-    exposure_starts: Tensor,
-    axis: int,
     problem: LinearisedFit,
+    rows: Tensor,
+    jacobian: Tensor,
+    slow_error: Tensor,
     number_is_known: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Covariance (B, A M, A M) of the free parameters and variance (B, A) of the displacement, by tones of an axis."""
-    axes, rows = problem.axes, exposure_starts.expand(len(fit.centre), -1)
-    own = displacement_jacobian(fit, rows, measurements.exposure_time)[:, :, axes]  # (B, n, A, P)
-    of_displacement = _without_trend(own @ problem.to_all, rows)
+    """Covariance (B, A M, A M) of the free parameters and variance (B, A) of the displacement, by tones of an axis.
+
+    Args:
+        measurements: As in ``with_further_tones``.
+        fit: As in ``with_further_tones``.
+        problem: The problem that contains the axis.
+        rows: (B, n) s, exposure starts of the rows.
+        jacobian: (B, n, A', P) derivatives of their displacements by the parameters of each axis.
+        slow_error: (B,) px, as from ``_slow_errors``.
+        number_is_known: As in ``with_further_tones``.
+    """
+    axis, axes = problem.axis, problem.axes
+    of_displacement = _without_trend(jacobian[:, :, axes] @ problem.to_all, rows)
     size = _PRIOR_SIZE * fit.amplitude[:, axis].square().sum(-1).sqrt()  # (B,) px
     precision = torch.where(size > 0, size, 1.0).square().reciprocal()[:, None, None, None]
-    eye = torch.eye(2, dtype=own.dtype, device=own.device)
+    eye = torch.eye(2, dtype=rows.dtype, device=rows.device)
     limit = precision + problem.rounding[:, None, None, None]
-    of_tone = torch.eye(len(axes), dtype=own.dtype, device=own.device)[problem.row][:, None, None]
+    of_tone = torch.eye(len(axes), dtype=rows.dtype, device=rows.device)[problem.row][:, None, None]
     frequencies, counted = _grid(measurements, fit, axis)
     parts = []
     for chunk in frequencies.split(max(1, _CHUNK // (4 * problem.residual.numel())), dim=1):
@@ -126,20 +143,17 @@ def _added(
     probability = functional.pad(evidence + prior, (1, 0)).softmax(-1)[:, 1:]
     if number_is_known:
         probability = torch.zeros_like(probability)
-    slow = _slow_variances(measurements, fit, axis, frequencies)
-    second = probability[..., None, None] * second + slow[..., None, None] * eye
+    slow = frequencies * _duration(measurements) <= _SLOW
+    slow_variance = slow * (slow_error.square() / slow.sum(1).clamp(min=1))[:, None]
+    second = probability[..., None, None] * second + slow_variance[..., None, None] * eye
     return (back @ second @ back.mT).sum(1), (moved * second[:, :, None]).sum((1, 3, 4))
 
 
-def _slow_variances(measurements: Measurements, fit: ToneFit, axis: int, frequencies: Tensor) -> Tensor:
-    """Variances (B, F) in px^2 of the quadratures of errors that all rows have in common; 0 without a slow tone."""
-    starts = measurements.exposure_starts
-    duration = (starts.amax((1, 2)) - starts.amin((1, 2)))[:, None]
-    tones = fit.active[:, axis] & (fit.frequencies[:, axis] * duration <= _SLOW)  # (B, K)
-    slow = (frequencies * duration <= _SLOW) & tones.any(-1, keepdim=True)
-    offset = math.sqrt(2) * measurements.distances(model_displacements(measurements, fit))[..., axis]
-    size = (_SLOW_ERROR * offset.square().nanmean(1).nan_to_num(0.0).sqrt()).clamp(max=_MAX_SLOW_ERROR)
-    return slow * (size.square() / slow.sum(1).clamp(min=1))[:, None]
+def _slow_errors(measurements: Measurements, fit: ToneFit) -> Tensor:
+    """(B, A) px, standard deviation of errors that all rows of an axis have in common; 0 without a slow tone."""
+    slow = (fit.active & (fit.frequencies * _duration(measurements)[..., None] <= _SLOW)).any(-1)
+    offset = math.sqrt(2) * measurements.distances(model_displacements(measurements, fit))
+    return slow * (_SLOW_ERROR * offset.square().nanmean(1).nan_to_num(0.0).sqrt()).clamp(max=_MAX_SLOW_ERROR)
 
 
 def _quadratures(response: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ row are strongly correlated, and X contains the parameters of all axes: the disp
 roll as well.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -24,17 +24,17 @@ class LinearisedFit:
     """The linearised problem of one axis, or of all together.
 
     Attributes:
-        axes: The axes of the problem.
-        row: Place of the axis of interest in ``axes``.
-        root: (B, N, A) from px of that axis to standard deviations.
+        axis: The axis of interest.
+        axes: The A axes of the problem.
+        root: (B, N, A, A) from px to standard deviations.
         jacobian: X (B, D, A M), D = N G A.
         inverse: X^+ (B, A M, D).
         residual: (B, D) of the fit.
         to_all: (P, M), from the free parameters of an axis to all.
     """
 
+    axis: int
     axes: list[int]
-    row: int
     root: Tensor
     jacobian: Tensor
     inverse: Tensor
@@ -42,10 +42,17 @@ class LinearisedFit:
     to_all: Tensor
 
     @classmethod
-    def of(cls, measurements: Measurements, fit: ToneFit, axis: int) -> "LinearisedFit":
-        """The problem that contains an axis."""
-        count = fit.coefficients.shape[1]
-        axes = [axis] if count == 2 else list(range(count))
+    def of_each_axis(cls, measurements: Measurements, fit: ToneFit) -> "list[LinearisedFit]":
+        """The problem that contains each axis."""
+        every = list(range(fit.coefficients.shape[1]))
+        if len(every) == 2:
+            return [cls._of(measurements, fit, [axis]) for axis in every]
+        together = cls._of(measurements, fit, every)
+        return [replace(together, axis=axis) for axis in every]
+
+    @classmethod
+    def _of(cls, measurements: Measurements, fit: ToneFit, axes: list[int]) -> "LinearisedFit":
+        """The problem of some axes."""
         residual = residual_of(measurements, fit)[..., axes]
         jacobians, constraints = zip(*(axis_jacobian(measurements, fit, one) for one in axes), strict=True)
         jacobian = torch.stack(jacobians, 3)  # (B, N, G, A, M)
@@ -57,13 +64,17 @@ class LinearisedFit:
         deviation = (whitened.square().sum(1) / spare).clamp(min=1e-300).sqrt()[:, None, None, None]
         root = root / deviation
         X = (root[:, :, None, :, :, None] * jacobian[..., None, :, :]).flatten(-2).flatten(1, 3)
-        row = axes.index(axis)
-        return cls(axes, row, root[..., row], X, torch.linalg.pinv(X), whitened / deviation[:, :, 0, 0], constraints[0])
+        return cls(axes[0], axes, root, X, torch.linalg.pinv(X), whitened / deviation[:, :, 0, 0], constraints[0])
+
+    @property
+    def row(self) -> int:
+        """Place of the axis of interest among those of the problem."""
+        return self.axes.index(self.axis)
 
     @property
     def rounding(self) -> Tensor:
         """(B,) error of the squared norm of whitened responses of about 1 px, for displacements without noise."""
-        return 1e-12 * self.root.square().sum((1, 2))
+        return 1e-12 * self.root[..., self.row].square().sum((1, 2))
 
     def unexplained(self, response: Tensor) -> tuple[Tensor, Tensor]:
         """Part of a response that the parameters do not explain, and the change of the parameters by it.
@@ -74,7 +85,7 @@ class LinearisedFit:
         Returns:
             Whitened responses (B, D, Q) and ``X^+ Z`` (B, A M, Q).
         """
-        Z = (self.root[:, :, None, :, None] * response[:, :, :, None]).flatten(1, 3)
+        Z = (self.root[..., self.row][:, :, None, :, None] * response[:, :, :, None]).flatten(1, 3)
         change = self.inverse @ Z
         return Z - self.jacobian @ change, change
 
