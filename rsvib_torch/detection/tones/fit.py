@@ -44,6 +44,9 @@ __all__ = [
 ]
 
 MIN_GAIN = 0.1  # px of offset per px of displacement; below it, amplitudes are ten times noisier than offsets
+# px (roll: rad; zoom: 1): rows of frames without a solution were fitted by tones of 8815 px and a zoom of 10, whose
+# exposures need thousands of quadrature nodes
+_LARGEST = (100.0, 100.0, 0.1, 0.1)
 
 Result = TypeVar("Result", bound="DataclassInstance")
 
@@ -478,6 +481,7 @@ def shrunk_motion(fit: ToneFit, intervals: Tensor) -> Vibration:
 
     An amplitude A of standard deviation s becomes ``A max(0, 1 - s^2 / A^2)`` (positive-part James-Stein estimate)
     where the gain is small. Where the gain is large, the tone moves the frames by what was measured, and stays.
+    Tones that hardly move the frames against each other, but through ``_LARGEST`` of their size, are left out.
 
     Args:
         fit: With its covariance.
@@ -486,6 +490,8 @@ def shrunk_motion(fit: ToneFit, intervals: Tensor) -> Vibration:
     blindness = 1 / (1 + (offset_gain(fit.frequencies, intervals) / MIN_GAIN).square())
     noise = (amplitude_std(fit) / fit.coefficients.abs().clamp(min=1e-30)).square()
     share = (1 - blindness * noise).clamp(min=0.0)
+    largest = share.new_tensor(_LARGEST)[: share.shape[1], None]
+    share = torch.where(blindness * (fit.amplitude / largest).square() < 1, share, 0.0)
     return motion_of_fit(replace(fit, coefficients=fit.coefficients * share))
 
 
