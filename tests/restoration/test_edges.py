@@ -14,19 +14,20 @@ restore = partial(restore_by_any_method, method="exact", check=False)
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 
 
-def test_patches_agree_with_a_loop_over_dct():
-    image = np.random.default_rng(0).standard_normal((11, 13))
-    padded = np.pad(image, 7, mode="edge")
+@pytest.mark.parametrize("offset", [(0, 0), (1, 0), (1, 1)])
+def test_patches_agree_with_a_loop_over_dct(offset):
+    image = np.random.default_rng(0).standard_normal((71, 13))  # more rows than are shrunk at a time
+    padded = np.pad(image, 8, mode="edge")
     total, weights = np.zeros_like(padded), np.zeros_like(padded)
-    for row in range(padded.shape[0] - 7):
-        for column in range(padded.shape[1] - 7):
+    for row in range(offset[0], padded.shape[0] - 7, 2):
+        for column in range(offset[1], padded.shape[1] - 7, 2):
             patch = fft.dctn(padded[row : row + 8, column : column + 8], norm="ortho")
             strong = abs(patch) > 2.0 * 0.6
             strong[0, 0] = True
             total[row : row + 8, column : column + 8] += fft.idctn(patch * strong, norm="ortho") / strong.sum()
             weights[row : row + 8, column : column + 8] += 1 / strong.sum()
-    found = shrink_patches(torch.from_numpy(image)[None], 0.6)[0].numpy()
-    np.testing.assert_allclose(found, (total / weights)[7:-7, 7:-7], rtol=0, atol=1e-12)
+    found = shrink_patches(torch.from_numpy(image)[None], 0.6, offset)[0].numpy()
+    np.testing.assert_allclose(found, total[8:-8, 8:-8] / weights[8:-8, 8:-8], rtol=0, atol=1e-12)
 
 
 @pytest.fixture(scope="module")

@@ -158,7 +158,7 @@ def sparse_colours(frames: Tensor, colours: Tensor, start: Tensor, *, iterations
     """
     measured, image = measures(colours), start
     for level in torch.logspace(-1, -2, iterations, device="cpu").tolist():
-        shrunk = shrink_patches(_components(image).flatten(0, 1), level * float(frames.std()), 2)
+        shrunk = shrink_patches(_components(image).flatten(0, 1), level * float(frames.std()))
         image = torch.where(measured, frames, _colours(shrunk.view_as(image)))
     return image
 

@@ -1,18 +1,21 @@
 """Priors of the exact restoration: their table, the Gaussian one and the one of sparse patches."""
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
 from rsvib_torch.restoration.scene_model.observation import REACH, kernel_samples
 
 __all__ = ["PRIORS", "Prior", "PriorOptions", "shrink_patches"]
 
-_PATCH = 8  # px; chosen together with the stages of the prior
+_PATCH, _STEP = 8, 2  # px, size and distance of patches; chosen together with the stages of the prior
+_ROWS = 32  # at a time, a multiple of the step
 
 
 @dataclass(frozen=True)
@@ -44,23 +47,27 @@ def edges(problem: SceneProblem, options: PriorOptions) -> Tensor:
     """
     kernels = problem.observation.kernels
     solver = replace(problem, precision=0.3 * problem.precision).solver()
-    coefficients = solver.fit(problem.data)
+    right_side = solver.right_side(problem.data)
+    coefficients = solver.solve(right_side)
     weight = float(kernels.weight.detach().mean(-1).sum())
-    # strength s in units of the weight of the data, threshold level in units of the noise, px between patches: best on
-    # scenes of four kinds at noise 0.02
-    stages = [(1.0, 1.0, 2), (3.0, 0.7, 2), (10.0, 0.5, 1)]
+    # strength s in units of the weight of the data and threshold level in units of the noise: best on scenes of four
+    # kinds at noise 0.02
+    stages = [(1.0, 1.0), (3.0, 0.7), (10.0, 0.5)]
     if kernels.blurred:  # deconvolved noise is far above that of the data: 1 to 2 dB, see the ablations
-        stages = [(0.03, 5.0, 2), (0.1, 3.0, 2), (0.3, 1.8, 2), *stages]
-    for relative, threshold, step in stages:
+        stages = [(0.03, 5.0), (0.1, 3.0), (0.3, 1.8), *stages]
+    # other patches in each stage: 0.1 to 0.2 dB, as much as patches at every pixel in the last one; steps behind an
+    # exposure of 100 or 400 rows: 0.1 to 3 dB more
+    offsets = itertools.cycle([(0, 0), (1, 1)])
+    for (relative, threshold), offset in zip(stages, offsets, strict=False):
         strength = relative * weight * options.regularisation
         level = threshold * options.regularisation**0.5 * problem.level / weight**0.5
-        spectra = torch.fft.rfft(shrink_patches(_sampled_scene(solver, coefficients), level, step))
+        spectra = torch.fft.rfft(shrink_patches(_sampled_scene(solver, coefficients), level, offset))
         expected = strength * _sampled(spectra.movedim(0, 1))
         precision = _sampling_precision(strength, problem.precision)
         order = len(problem.precision)
         precision[:order, :order] += 0.03 * problem.precision
         solver = replace(problem, precision=precision).solver()
-        coefficients = solver.fit(problem.data, expected)
+        coefficients = solver.solve(right_side + expected)
     return solver.scene(coefficients)
 
 
@@ -75,47 +82,60 @@ PRIORS: dict[str, Prior] = {"gaussian": gaussian, "edges": edges}
 
 
 def _cosines(like: Tensor) -> Tensor:
-    """Orthonormal cosines (n n, 1, n, n) of a patch; the first is constant."""
+    """Orthonormal cosines (n, n) along a side of a patch, one in each row; the first is constant."""
     order = torch.arange(_PATCH, dtype=torch.float64, device="cpu")
     waves = torch.cos(torch.pi * order[:, None] * (order + 0.5) / _PATCH) * math.sqrt(2.0 / _PATCH)
     waves[0] /= math.sqrt(2.0)
-    patches = torch.einsum("ai,bj->abij", waves, waves).flatten(0, 1)[:, None]
-    return patches.to(like)
+    return waves.to(like)
 
 
-def shrink_patches(images: Tensor, level: float | Tensor, step: int = 1) -> Tensor:
+def shrink_patches(images: Tensor, level: float | Tensor, offset: tuple[int, int] = (0, 0)) -> Tensor:
     """Images (N, H, W) without the weak cosines of their overlapping patches of 8 x 8 px.
 
-    Cosines of at most two standard deviations are set to zero. Every pixel is the mean of all patches that contain it,
-    weighted by the inverse of their numbers of remaining cosines.
+    Cosines of at most two standard deviations are set to zero. Every pixel is the mean of the patches that contain it,
+    weighted by the inverse of their numbers of remaining cosines. Patches begin at every second row and column.
 
     Args:
         images: The images.
         level: Standard deviation of white noise in them.
-        step: Pixels between patches: 1, 2 or 4.
+        offset: Row and column at which patches begin, 0 or 1.
     """
-    cosines, rim = _cosines(images).flatten(1), _PATCH - 1  # (n n, n n)
-    height, width = images.shape[-2:]
-    # patches begin at every step-th row and column; the last ones extend beyond the image
-    size = [-(-(whole + rim) // step) * step + _PATCH - step for whole in (height, width)]
-    ends = (rim, size[1] - width - rim, rim, size[0] - height - rim)
-    padded = torch.nn.functional.pad(images[:, None], ends, mode="replicate")
-    total, weights, ones = torch.zeros_like(padded), torch.zeros_like(padded), padded.new_ones(1, 1, _PATCH, 1)
-    for begin in range(0, size[0] - rim, 64):  # rows at a time, a multiple of all steps: less memory
-        rows = slice(begin, min(begin + 64 - step + _PATCH, size[0]))
-        part = padded[..., rows, :]
-        # products of matrices: several times as fast as convolutions with one channel
-        values = cosines @ torch.nn.functional.unfold(part, _PATCH, stride=step)  # (N, n n, patches)
-        strong = values.detach().abs() > 2.0 * level
-        strong[:, 0] = True
-        weight = 1.0 / strong.sum(1, keepdim=True).to(values.dtype)
-        shrunk = cosines.T @ (values * strong * weight)
-        total[..., rows, :] += torch.nn.functional.fold(shrunk, part.shape[-2:], _PATCH, stride=step)
-        spread = weight.unflatten(-1, (-1, (size[1] - _PATCH) // step + 1))
-        for kernel, stride in ((ones, (step, 1)), (ones.mT, (1, step))):  # every patch on its 8 x 8 px
-            spread = torch.nn.functional.conv_transpose2d(spread, kernel, stride=stride)
-        weights[..., rows, :] += spread
-    return (total / weights)[:, 0, rim : rim + height, rim : rim + width]
+    waves, overlap = _cosines(images), _PATCH - _STEP
+    before = [overlap + begin for begin in offset]
+    after = [overlap + (begin + size) % _STEP for begin, size in zip(offset, images.shape[1:], strict=True)]
+    ends = (before[1], after[1], before[0], after[0])
+    padded = functional.pad(images[:, None], ends, mode="replicate")[:, 0]
+    total = torch.zeros_like(padded)
+    weights = total.new_zeros(len(total), *(size // _STEP for size in total.shape[1:]))  # the same for _STEP x _STEP px
+    shifts = _PATCH // _STEP
+    for begin in range(0, padded.shape[1] - overlap, _ROWS):  # rows at a time: less memory
+        rows = slice(begin, begin + _ROWS + overlap)
+        # cosines along the rows, then across them, in units of the threshold
+        along = padded[:, rows].unfold(-1, _PATCH, _STEP) @ (waves / (2.0 * level)).mT  # (N, rows, patches, n)
+        values = waves @ along.flatten(-2).unfold(1, _PATCH, _STEP).mT  # (N, patches, n, patches n)
+        values = values.unflatten(-1, (-1, _PATCH))
+        strong = functional.hardshrink(values, 1.0)
+        strong[:, :, 0, :, 0] = 1.0
+        weight = 1.0 / strong.detach().abs().clamp_(max=1.0).sum(2).sum(-1)  # (N, patches, patches)
+        strong[:, :, 0, :, 0] = values[:, :, 0, :, 0]
+        shrunk = (strong * weight[:, :, None, :, None]).flatten(-2)
+        lines = _overlapped((2.0 * level * waves).mT @ shrunk, _STEP).unflatten(-1, (-1, _PATCH)) @ waves
+        total[:, rows] += _overlapped(lines.flatten(0, 1), _STEP).view_as(total[:, rows])
+        lines = _overlapped(weight[:, :, None].expand(-1, -1, shifts, -1), 1).flatten(0, 1)
+        places = weights[:, rows.start // _STEP : rows.stop // _STEP]
+        places += _overlapped(lines[..., None].expand(-1, -1, shifts), 1).view_as(places)
+    mean = total / weights.repeat_interleave(_STEP, 1).repeat_interleave(_STEP, 2)
+    return mean[:, before[0] : before[0] + images.shape[1], before[1] : before[1] + images.shape[2]]
+
+
+def _overlapped(values: Tensor, step: int) -> Tensor:
+    """Sums (N, size, ...) of the values (N, patches, n, ...) of patches that begin at every step-th place."""
+    parts = values.unflatten(2, (-1, step))
+    count, shifts = parts.shape[1:3]
+    total = values.new_zeros(len(values), count + shifts - 1, *parts.shape[3:])
+    for shift in range(shifts):
+        total[:, shift : shift + count] += parts[:, :, shift]
+    return total.flatten(1, 2)
 
 
 def _sampled(values: Tensor) -> Tensor:
@@ -124,9 +144,10 @@ def _sampled(values: Tensor) -> Tensor:
     With the samples of the kernel: the more numerous ``scene_weights`` would widen the band of ``E^T E``.
     """
     edge = values.new_zeros(REACH - 1, *values.shape[1:])
-    padded = torch.cat([edge, values, edge])
-    shifted = (weight * padded[k : k + len(values)] for k, weight in enumerate(kernel_samples()))
-    return sum(shifted, start=values.new_zeros(()))
+    padded, total = torch.cat([edge, values, edge]), torch.zeros_like(values)
+    for k, weight in enumerate(kernel_samples()):
+        total.add_(padded[k : k + len(values)], alpha=weight)
+    return total
 
 
 def _sampled_scene(solver: SceneSolver, coefficients: Tensor) -> Tensor:

@@ -164,31 +164,29 @@ class SceneSolver:
         # above a fifth of the frequencies, interpolation takes as long as factoring
         return nodes if reach <= 1.5 and 5 * len(nodes) <= len(self.u) else None
 
-    def _differentiates(self, *values: Tensor) -> bool:
-        given = (*values, self._normal.left, self.precision)
-        return torch.is_grad_enabled() and any(value.requires_grad for value in given)
+    def _differentiates(self, *given: Tensor) -> bool:
+        values = (*given, self._normal.left, self.precision)
+        return torch.is_grad_enabled() and any(value.requires_grad for value in values)
 
-    def fit(self, data: Tensor, expected: Tensor | None = None) -> Tensor:
-        """Coefficients (K, C, U) of the scene for data (M, C, R, L), whose rows are extended to a period.
-
-        Args:
-            data: The data.
-            expected: (K, C, U) added to the right sides: P times the expectation of the prior.
-        """
+    def fit(self, data: Tensor) -> Tensor:
+        """Coefficients (K, C, U) of the scene for data (M, C, R, L), whose rows are extended to a period."""
         spectra: Tensor = torch.fft.rfft(data)
+        return self._solution(lambda part: self._right_side(spectra, part), spectra)
 
-        def right_side(part: slice) -> Tensor:
-            right = self.observation.adjoint(spectra[..., part], self.u[part], part, self.length)
-            return right if expected is None else right + expected[..., part]
+    def right_side(self, data: Tensor) -> Tensor:
+        """Right sides (K, C, U) of the normal equations for data (M, C, R, L)."""
+        spectra = torch.fft.rfft(data)
+        return torch.cat([self._right_side(spectra, part) for part in self._parts], dim=-1)
 
-        return self._solution(right_side, spectra, *(() if expected is None else (expected,)))
+    def _right_side(self, spectra: Tensor, part: slice) -> Tensor:
+        return self.observation.adjoint(spectra[..., part], self.u[part], part, self.length)
 
     def solve(self, right: Tensor) -> Tensor:
         """Solution (K, C, U) of the normal equations for right sides (K, C, U)."""
         return self._solution(lambda part: right[..., part], right)
 
-    def _solution(self, right_side: Callable[[slice], Tensor], *given: Tensor) -> Tensor:
-        """Solution (K, C, U) for right sides (K, C, S) of parts of the frequencies, computed from the given tensors."""
+    def _solution(self, right_side: Callable[[slice], Tensor], given: Tensor) -> Tensor:
+        """Solution (K, C, U) for right sides (K, C, S) of parts of the frequencies, computed from ``given``."""
         interpolated: dict[int, BandedFactor] = {}  # of each thread, in memory that is used again
 
         def solve(number: int, thread: int | None = None) -> Tensor:
@@ -206,20 +204,20 @@ class SceneSolver:
             else:
                 left = self._normal.left
                 shape = (*left.shape[:2], len(self._windows) * len(u))
-                out = None if thread is None else self._partition.buffer(thread, shape, given[0])
+                out = None if thread is None else self._partition.buffer(thread, shape, given)
                 solution = solve_skewed(self._normal.at(u, self.precision[..., part], out), right)
             return join_windows(solution.unflatten(-1, (-1, len(u))), self._windows)
 
-        if self._differentiates(*given):
+        if self._differentiates(given):
             return torch.cat([solve(number) for number in range(len(self._parts))], dim=-1)
-        coefficients: Tensor = given[0].new_empty(self.observation.count, given[0].shape[1], len(self.u))
-        threads = min(Partition.threads(given[0].device), len(self._parts))
+        coefficients: Tensor = given.new_empty(self.observation.count, given.shape[1], len(self.u))
+        threads = min(Partition.threads(given.device), len(self._parts))
 
         def share(thread: int) -> None:
             for number in range(thread, len(self._parts), threads):
                 coefficients[..., self._parts[number]] = solve(number, thread)
 
-        in_parallel(share, range(threads), given[0].device)
+        in_parallel(share, range(threads), given.device)
         return coefficients
 
     def predict(self, coefficients: Tensor) -> Tensor:
