@@ -93,6 +93,13 @@ class PreparedFrames:
             turned = turned.movedim(-3, self.channel_axis)
         return turned.to(self.dtype)
 
+    def restored_shape(self, count: int, scale: int) -> tuple[int, ...]:
+        """Shape of ``count`` restored images of a stack with ``scale`` times the rows and columns, in image axes."""
+        channels, height, width = self.images.shape[-3:]
+        channels = channels if self.colours is None else 3
+        restored = torch.empty(1, count, channels, scale * height, scale * width, device="meta")
+        return tuple(self.from_row_order(restored).shape)
+
 
 def prepare_frames(
     frames: FramesLike,

@@ -435,3 +435,29 @@ def test_pairs_to_judge():
     assert pairs_to_judge(4, True) == [(2, 0), (2, 1), (2, 3)]
     assert pairs_to_judge(9, False, 3) == [(0, 1), (4, 5), (7, 8)]
     assert pairs_to_judge(3, False, 2) == [(0, 1), (1, 2)]
+
+
+@pytest.mark.parametrize(
+    ("options", "direction"),
+    [({"scale": 2}, "forward"), ({"scale": 2}, "reverse"), ({"mosaic": "GRBG", "scale": 2}, "reverse")],
+    ids=str,
+)
+def test_finer_grids_and_mosaics_are_judged_at_the_pixels(options, direction):
+    timing = SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=200, readout_direction=direction)
+    motion = scaled_motion()
+    frames = torch.from_numpy(take_frames(draw_scene(240, 200, seed=3), timing, motion, 2)).float()
+    frames = frames if direction == "forward" else frames.flip(-2)  # grey, so that it is a mosaic as well
+    frames = frames + 0.003 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
+    right = motion.vibration()
+    right = right if direction == "forward" else right.with_axes((0, 1), (1.0, -1.0))
+    mosaic = options.get("mosaic")
+    for vibration, outcome in ((right, "helps"), (right.with_axes((0, 1), (-1.0, -1.0)), "worse")):
+        restored = restore(frames, timing, vibration, check=False, joint=True, **options)
+        verdict = judge_restoration(frames, restored, timing, vibration, joint=True, mosaic=mosaic)
+        assert verdict.overall == outcome
+    if not mosaic:
+        colour = torch.stack([frames, frames], -1)
+        restored = restore(colour, timing, right, check=False, joint=True, channels="last", **options)
+        assert judge_restoration(colour, restored, timing, right, joint=True, channels="last").overall == "helps"
+    with pytest.raises(ValueError, match="with scale=2, got"):
+        judge_restoration(frames, restored[..., 1:], timing, right, joint=True, mosaic=mosaic)

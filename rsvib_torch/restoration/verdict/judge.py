@@ -308,6 +308,7 @@ def judge_restoration(
     full_scale: float | None = None,
     channels: Channels = None,
     ignore: ArrayLike | None = None,
+    mosaic: str | None = None,
     most_pairs: int | None = None,
 ) -> RestorationVerdict:
     """Judge whether restored frames are better than raw ones, without the true scene.
@@ -322,13 +323,15 @@ def judge_restoration(
 
     Args:
         frames: Raw stack (T, H, W) or (T, C, H, W), at least two frames.
-        restored: Result of ``restore``: one frame from each, or one image (1, ...) from all.
+        restored: Result of ``restore``: one frame from each, or one image (1, ...) from all; with ``scale=2``, the
+            points at the pixels are judged.
         timing: The sensor.
         vibration: The vibration that was undone, in image axes, or the detection that ``restore`` was given.
         joint: As in ``restore``.
         full_scale: As in ``restore``.
         channels: As in ``restore``, for both stacks.
         ignore: As in ``restore``; ignored pixels and NaN are not judged.
+        mosaic: As in ``restore``; the smooth luminance is judged.
         most_pairs: Compare no more pairs than these, evenly spread over the stack; None for all.
 
     Returns:
@@ -356,14 +359,13 @@ def judge_restoration(
     given_scale = full_scale
     timing = timing_of_files(frames, timing)
     frames, full_scale = load_frames(frames, full_scale)
-    prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, minimum_frames=2)
+    prepared = prepare_frames(
+        frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, mosaic=mosaic, minimum_frames=2
+    )
     if prepared.batched:
         raise ValueError(f"frames must be one stack (T, H, W) or (T, C, H, W), got shape {prepared.shape}")
     restored, restored_scale = load_frames(restored, given_scale)
-    restored = as_tensor("restored", restored)
-    expected = (1, *prepared.shape[1:]) if joint is True else prepared.shape
-    if tuple(restored.shape) != expected:
-        raise ValueError(f"restored must have the shape {expected}, got {tuple(restored.shape)}")
+    restored = _at_pixels(as_tensor("restored", restored), prepared, 1 if joint is True else prepared.images.shape[1])
     count, height = prepared.images.shape[1], prepared.images.shape[-2]
     vibration, _ = vibration_to_undo(vibration, timing, count, height)
     images = prepare_frames(
@@ -375,6 +377,19 @@ def judge_restoration(
         name="restored",
     ).images
     return judge_prepared(prepared, images, vibration, joint=joint, most_pairs=most_pairs)
+
+
+def _at_pixels(restored: Tensor, frames: PreparedFrames, count: int) -> Tensor:
+    """Restored images at the pixels of the frames, in image axes; ``count`` images, possibly on a finer grid."""
+    expected = [frames.restored_shape(count, scale) for scale in (1, 2)]
+    if tuple(restored.shape) not in expected:
+        raise ValueError(
+            f"restored must have the shape {expected[0]}, or {expected[1]} with scale=2, got {tuple(restored.shape)}"
+        )
+    step = 1 + expected.index(tuple(restored.shape))
+    if restored.ndim == 4 and frames.channel_axis == -1:
+        return restored[:, ::step, ::step]
+    return restored[..., ::step, ::step]
 
 
 def judge_prepared(
