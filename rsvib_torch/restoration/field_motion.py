@@ -7,6 +7,7 @@ added up with triangular weights: between two middles, the displacement is inter
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -28,15 +29,22 @@ _PITCHES = (48, 160)  # px, bounds on the distance of the strips: narrow ones co
 _MARGIN = 24  # px of a strip without weight, beyond the displacement: the restoration is not exact near its ends
 
 
-def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) -> ColumnStrips:
-    """Strips for frames of (height, width), for a motion (B) between two times in seconds."""
+def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) -> tuple[ColumnStrips, float]:
+    """Strips for frames of (height, width), for a motion (B) between two times in seconds.
+
+    Returns:
+        The strips, and the standard deviation in px of the displacement of their columns about that of their middle.
+    """
     reached = motion.largest_displacement(first, last)
     slope = float(largest_slope(reached, size[1], size[0], motion.camera).amax())
     narrowest, widest = _PITCHES
     pitch = min(max(_SLIDE / max(slope, 1e-9), narrowest), widest)
     moving = torch.cat([motion.largest_oscillation()[..., :2], reached[..., 2:]], -1)
     along = float(largest_in_frame(moving, size[1], size[0], motion.camera)[..., 0].amax())
-    return ColumnStrips.of(size[1], pitch, _MARGIN + math.ceil(along))
+    strips = ColumnStrips.of(size[1], pitch, _MARGIN + math.ceil(along))
+    centres = (first + 0.5 * (strips.width - 1) for first in strips.firsts)
+    distance = max(abs(centre - middle) for centre, middle in zip(centres, strips.middles, strict=True))
+    return strips, math.sqrt(0.5) * slope * math.hypot(strips.width / math.sqrt(12), distance)  # tones: rms over time
 
 
 def restore_in_strips(
@@ -60,13 +68,14 @@ def restore_in_strips(
         of_frames.check_fits(height, width)
         return method(images, of_frames, **options)
     starts = timing.frame_starts(count).tolist()
-    strips = _strips(motion, (height, width), starts[0], starts[-1] + height * timing.row_time + timing.exposure_time)
+    end = starts[-1] + height * timing.row_time + timing.exposure_time
+    strips, neglected = _strips(motion, (height, width), starts[0], end)
     of_strips = ColumnMotion.of_columns(motion, strips.columns, timing, count, height)
     cut = {
         name: strips.cut(value) if isinstance(value, Tensor) and value.shape[-2:] == images.shape[-2:] else value
         for name, value in options.items()
     }
-    of_frames = frame_motion(of_strips, timing, count, height)
+    of_frames = replace(frame_motion(of_strips, timing, count, height), neglected=neglected)
     of_frames.check_fits(height, width)
     restored = method(strips.cut(images), of_frames, **cut)
     return strips.finer(restored.shape[-1] // strips.width).joined(restored)

@@ -35,12 +35,14 @@ class FrameMotion:
         timing: The sensor, in row order.
         frame_starts: (T,) seconds.
         shift: (B, T, 2) whole px, axes (x, y), float64.
+        neglected: Standard deviation in px of the differences of the columns, where the motion is that of one of them.
     """
 
     vibration: Motion
     timing: RowTiming
     frame_starts: Tensor
     shift: Tensor
+    neglected: float = 0.0
 
     def frame_rows(self, scene_rows: Tensor) -> Tensor:
         """Frame rows (B, T, S) that contain rows (S,) of the restored frames."""

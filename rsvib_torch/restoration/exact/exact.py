@@ -158,7 +158,7 @@ def restore_exact(
         if scale == 1:
             scene = PRIORS[prior](problem, PriorOptions(factor))
         else:
-            scene, misfit = finer_scene(problem, W)
+            scene, misfit = finer_scene(problem, W, motion.neglected)
             misfits.append(misfit)
         return scene[..., : scale * W] + stack.mean
 

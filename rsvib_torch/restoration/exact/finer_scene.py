@@ -36,12 +36,14 @@ class Misfit:
         residual: Standard deviation in units of the noise.
         error: Displacement error in px, rms over the blocks of rows of all frames and both axes.
         effect: Standard deviation of the difference that the displacement error causes, in units of the noise.
+        expected: The same of displacements that the problem neglects.
         noticed: Whether the motion is inaccurate, or the scene changes.
     """
 
     residual: float
     error: float
     effect: float
+    expected: float
     noticed: bool = False
 
     @property
@@ -49,9 +51,13 @@ class Misfit:
         """Power of noise and differences, in units of the noise power."""
         return max(1 + self.effect**2, self.residual**2)
 
+    def exceeds(self, effect: float, residual: float) -> bool:
+        """Whether the effect, or the residual, is larger than given values and the expected effect explain."""
+        return self.effect > math.hypot(effect, self.expected) or self.residual > math.hypot(residual, self.expected)
+
 
 @torch.no_grad()
-def _misfit(problem: SceneProblem, predicted: Tensor, width: int) -> Misfit:
+def _misfit(problem: SceneProblem, predicted: Tensor, width: int, neglected: float) -> Misfit:
     """Misfit of frames of ``width`` px, without the ends of rows and columns.
 
     The displacement error of a block of rows is the least-squares factor of the gradient of the prediction in the
@@ -61,6 +67,7 @@ def _misfit(problem: SceneProblem, predicted: Tensor, width: int) -> Misfit:
         problem: The scene.
         predicted: (M, C, R, L) prediction of the data.
         width: Columns of the frames.
+        neglected: As in ``finer_scene``.
     """
     level, weight, rows = problem.level, problem.observation.kernels.weight, problem.data.shape[-2]
     inner = slice(min(16, rows // 4), -min(16, rows // 4)), slice(min(16, width // 4), width - min(16, width // 4))
@@ -78,8 +85,9 @@ def _misfit(problem: SceneProblem, predicted: Tensor, width: int) -> Misfit:
     error = torch.linalg.solve(normal, slopes.transpose(-2, -1) @ difference[..., None])[..., 0]
     chance = power[..., None] * torch.linalg.inv(normal).diagonal(dim1=-2, dim2=-1)
     squares = (error.square() - chance).mean((0, 1)).clamp(min=0.0)
-    effect = (squares * slopes.square().mean((0, 1, 2))).sum().sqrt()
-    figures = torch.stack([power.mean().sqrt() / level, squares.sum().sqrt(), effect / level])
+    steepness = slopes.square().mean((0, 1, 2))
+    effect, expected = (squares * steepness).sum().sqrt(), neglected * steepness.amax().sqrt()
+    figures = torch.stack([power.mean().sqrt() / level, squares.sum().sqrt(), effect / level, expected / level])
     return Misfit(*figures.tolist())
 
 
@@ -95,7 +103,7 @@ def _excess(problem: SceneProblem, predicted: Tensor, width: int) -> Tensor:
     return (mean / problem.level.square()).to(problem.precision.dtype)
 
 
-def finer_scene(problem: SceneProblem, width: int) -> tuple[Tensor, Misfit]:
+def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Tensor, Misfit]:
     """Scene on the finer grid, and the misfit of its frames of ``width`` px.
 
     A fine pattern in a scene with otherwise little detail is far above the spectrum of the prior, and remains in the
@@ -106,6 +114,12 @@ def finer_scene(problem: SceneProblem, width: int) -> tuple[Tensor, Misfit]:
     differences then count as noise: detail is restored only as far as they allow. With an error of the phases of 0.05
     rad, 27.5 dB become 32.6 dB (chart, noise 0.002, 2 frames; 32.8 dB on pixels), 34.4 become 38.1 dB with 8 frames
     (34.7 dB on pixels).
+
+    Args:
+        problem: The scene.
+        width: Columns of the frames.
+        neglected: Standard deviation in px of displacements that the problem neglects. They count as noise, but do not
+            contradict the motion.
     """
     factor, relaxed, largest = 1.0, torch.ones_like(problem.precision[0, 0]), math.inf
     allowed, noticed = _MAX_EFFECT, False
@@ -113,7 +127,7 @@ def finer_scene(problem: SceneProblem, width: int) -> tuple[Tensor, Misfit]:
         solver = replace(problem, precision=factor / relaxed * problem.precision).solver()
         coefficients = solver.fit(problem.data)
         predicted = solver.predict(coefficients.detach())
-        misfit, excess = _misfit(problem, predicted, width), _excess(problem, predicted, width)
+        misfit, excess = _misfit(problem, predicted, width, neglected), _excess(problem, predicted, width)
         before, largest = largest, float(excess.amax())
         # a pattern leaves a tenth of its effect, a wrong motion at least a fifth
         allowed = max(_MAX_EFFECT, 0.15 * misfit.effect) if before == math.inf else allowed
@@ -121,8 +135,9 @@ def finer_scene(problem: SceneProblem, width: int) -> tuple[Tensor, Misfit]:
         if narrow and factor == 1 and _MAX_EXCESS < largest < 0.7 * before:
             relaxed = relaxed * excess.clamp(min=1.0)
             continue
-        noticed = misfit.effect > allowed or misfit.residual > _MAX_RESIDUAL
-        if not noticed or misfit.power < 1.2 * factor:
+        noticed = misfit.exceeds(allowed, _MAX_RESIDUAL)
+        differs = misfit.effect > allowed or misfit.residual > _MAX_RESIDUAL
+        if not differs or misfit.power < 1.2 * factor:
             break
         factor, relaxed = misfit.power, torch.ones_like(relaxed)
     return solver.scene(coefficients), replace(misfit, noticed=noticed)
