@@ -385,12 +385,8 @@ def restoration_options(
     """
     options = dict(config.restoration)
     if overrides.method is not None and overrides.method != options.get("method", "exact"):
-        shared = (
-            "saturation",
-            "mosaic",
-            "optics",
-            *method_options(overrides.method),
-        )  # other options belong to the configured method
+        # other options belong to the configured method
+        shared = ("saturation", "mosaic", "optics", *method_options(overrides.method))
         options = {name: value for name, value in options.items() if name in shared}
     for name in ("method", "prior", "saturation", "scale", "mosaic"):
         if getattr(overrides, name) is not None:

@@ -150,15 +150,14 @@ def steadied(frames: Iterator[tuple[TrackedFrame, float]], duration: float) -> I
             return tracked, arrived
         # the same distance on both sides, so that a uniform motion is kept at the ends as well
         reach = min(half, tracked.time - around[0][0].time, around[-1][0].time - tracked.time)
-        near = [
-            (
-                one.path,
-                0.5 if abs(abs(one.time - tracked.time) - reach) < _ROUNDING and reach > 0 else 1.0,
-            )  # trapezoidal rule
-            for one, _ in around
-            if abs(one.time - tracked.time) <= reach + _ROUNDING and bool(torch.isfinite(one.path).all())
-        ]
-        paths, weights = zip(*near, strict=True)
+        paths, weights = [], []
+        for one, _ in around:
+            distance = abs(one.time - tracked.time)
+            if distance > reach + _ROUNDING or not bool(torch.isfinite(one.path).all()):
+                continue
+            is_end = reach > 0 and abs(distance - reach) < _ROUNDING
+            paths.append(one.path)
+            weights.append(0.5 if is_end else 1.0)  # trapezoidal rule
         weight = torch.tensor(weights, dtype=torch.float64, device=tracked.path.device)
         return tracked.moved_to((weight[:, None] * torch.stack(paths)).sum(0) / weight.sum()), arrived
 

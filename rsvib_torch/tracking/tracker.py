@@ -433,11 +433,9 @@ class VibrationTracker:
         if self._filter is None:
             new = max(new, self._untried)
         needed = max(2, self.window // 2) * 2 ** min(self._attempts, _MAX_DOUBLED)
-        return (
-            min(new, self.window, len(self._last))
-            if new >= needed and self._untried >= min(needed, self.window) // 2
-            else 0
-        )
+        if new < needed or self._untried < min(needed, self.window) // 2:
+            return 0
+        return min(new, self.window, len(self._last))
 
     def _detect(self, count: int) -> None:
         """Detect the vibration in the last ``count`` frames, and start the filter with its tones."""
