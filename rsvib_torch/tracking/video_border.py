@@ -1,9 +1,10 @@
 """Pixels of restored video frames that the sensor did not record: a border that moves from frame to frame."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
@@ -13,6 +14,7 @@ from rsvib_torch.tracking.tracker import TrackedFrame
 __all__ = ["Border", "Margins", "VideoBorder"]
 
 Border = Literal["mirror", "hold", "crop"]
+Pixels = TypeVar("Pixels", Tensor, NDArray[Any])
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Margins:
         names = ("top", "bottom", "left", "right")
         return Margins(*(max(getattr(self, name), getattr(other, name)) for name in names))
 
-    def cut(self, images: Tensor) -> Tensor:
+    def cut(self, images: Pixels) -> Pixels:
         """Images (..., H, W) without the margins; height and width remain even, as video encoders require.
 
         Raises:
@@ -68,7 +70,8 @@ class Margins:
                 "border='hold', or a shorter --steady"
             )
         rows, columns = rows - rows % 2, columns - columns % 2
-        return images[..., self.top : self.top + rows, self.left : self.left + columns]
+        part: Pixels = images[..., self.top : self.top + rows, self.left : self.left + columns]
+        return part
 
 
 class VideoBorder:

@@ -1,0 +1,469 @@
+"""Videos from file to file, followed from frame to frame: ``process_video``."""
+
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.atomic import make_folder, sync, whole_file
+from rsvib_torch.core.checks import check_choice, check_number
+from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.prefetch import prefetched
+from rsvib_torch.core.unexpected import unexpected_errors_in_one_line
+from rsvib_torch.frames.pixels import detailed_columns
+from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept, open_stack, stack_files
+from rsvib_torch.io.formats import FrameReader
+from rsvib_torch.io.frame_times import exposure_times
+from rsvib_torch.io.full_scale import counts_to_frames
+from rsvib_torch.io.schema import detection_to_json
+from rsvib_torch.io.stack_info import FrameError, StackInfo
+from rsvib_torch.io.video import CONTAINERS
+from rsvib_torch.io.video_parts import planes_of
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
+from rsvib_torch.restoration.restore import check_method_options, restore_prepared
+from rsvib_torch.restoration.verdict.judge import judge_prepared
+from rsvib_torch.stacks.heap import share_one_heap
+from rsvib_torch.stacks.job import StackJob, plan_job
+from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_manifest
+from rsvib_torch.stacks.output import Journal, describe_difference, disk_errors_named, work_folder
+from rsvib_torch.stacks.process import StackReport, totals
+from rsvib_torch.stacks.video_frames import FrameLayout, RestoredFrame, VideoRestorer
+from rsvib_torch.stacks.video_output import PartSink
+from rsvib_torch.stacks.video_tracks import FrameTrack, followed
+from rsvib_torch.tracking import Margins, VibrationTracker
+from rsvib_torch.tracking.steadying import steadied
+
+__all__ = ["process_video"]
+
+_PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
+_JUDGED_COLUMNS = 320  # with the most detail; the verdict itself takes 160 of them
+_AHEAD = 4  # frames decoded, and frames tracked, before they are used
+
+Frame = NDArray[Any]
+Planes = list[Frame]
+
+
+@dataclass(frozen=True, eq=False)
+class _Video:
+    """What the passes through a video have in common."""
+
+    job: StackJob
+    layout: FrameLayout
+    restorer: VideoRestorer
+    starts: list[float]
+    steady: float
+    columns: int | None
+    window: int
+
+    @property
+    def parts(self) -> int:
+        """Number of parts."""
+        return -(-len(self.starts) // _PART_FRAMES)
+
+    def _decoded(self) -> Generator[tuple[int, float, Frame | str, Frame | str], None, None]:
+        """Number and start of every frame, its luma, and the frame itself, or why it cannot be read."""
+        reader = open_stack(self.job.source)
+        try:
+            if reader.info != self.job.info:
+                raise ValueError(f"{self.job.source} has changed since it was first opened; start again")
+            source: Any = planes_of(reader) or reader if self.layout.planar else reader
+            for index, start in enumerate(self.starts):
+                try:
+                    frame = source.frame(index)
+                except FrameError as error:
+                    reason = " ".join(str(error).split())
+                    yield index, start, reason, reason
+                    continue
+                yield index, start, self.layout.luma(frame), frame
+        finally:
+            reader.close()
+
+    def tracked(self) -> Generator[tuple[FrameTrack, Frame | str], None, None]:
+        """Every frame with its motion, at its place in the steady video; decoded and tracked ahead in threads."""
+        tracker = VibrationTracker(
+            replace(self.job.timing, frame_start_times=None),
+            window=self.window,
+            columns=self.columns,
+            wobble=self.steady > 0,
+            full_scale=self.layout.full_scale,
+            channels="first",
+        )
+
+        def steady_frames() -> Generator[tuple[FrameTrack, Frame | str], None, None]:
+            with closing(prefetched(self._decoded(), _AHEAD)) as decoded:
+                yield from steadied(followed(decoded, tracker, reported=_PART_FRAMES), self.steady)
+
+        return prefetched(steady_frames(), _AHEAD)
+
+    def margins(self, progress: Callable[[], None]) -> Margins:
+        """The widest margins of all frames, from a pass that only follows the motion."""
+        widest = Margins()
+        with closing(self.tracked()) as tracks:
+            for track, _ in tracks:
+                if track.known and track.fault is None:
+                    widest = widest.widest(Margins.of(torch.from_numpy(self.restorer.visible(track)[0])))
+                progress()
+        return self.layout.margins(widest)
+
+    def verdict(self, frames: list[tuple[FrameTrack, Frame]]) -> RestorationVerdict | None:
+        """Whether restoration helps, from two neighbouring frames before they are steadied; None if unknown."""
+        (first, one), (_, other) = frames
+        pixels = np.stack([self.layout.luma(one), self.layout.luma(other)])
+        images = counts_to_frames(pixels, self.layout.full_scale, str(self.job.source)).to(self.job.device)
+        timing = self.job.timing
+        if timing.scan_axis == -2:
+            images = images[..., detailed_columns(images, _JUDGED_COLUMNS)]
+        start = self.restorer.timing_of(0).frame_start_times
+        assert start is not None
+        starts = (float(start[0]), float(start[0]) + frames[1][0].time - first.time)
+        prepared = prepare_frames(images, replace(timing, frame_start_times=starts), channels="first")
+        if not bool(first.motion.moving_axes().any()):
+            return None
+        with suppress(TooLittleInCommonError), torch.no_grad():
+            restored = restore_prepared(prepared, first.motion, self.restorer.method, self.restorer.options)
+            return judge_prepared(prepared, restored, first.motion, most_pairs=1)
+        return None
+
+    def record(self, part: int, tracks: list[FrameTrack], verdict: RestorationVerdict | None) -> dict[str, Any]:
+        """Content of the ``WindowRecord`` of a part of the video."""
+        last = tracks[-1]
+        moved = [track for track in tracks if track.known and track.fault is None]
+        reported = next((track for track in reversed(tracks) if track.detection is not None), None)
+        unknown = len([track for track in tracks if not track.known and track.fault is None])
+        return {
+            "window": part,
+            "first": tracks[0].index,
+            "last": last.index,
+            "start_time": (reported or tracks[0]).time,
+            "written": len(tracks),
+            "frames": "restored" if moved else "as taken",
+            "detection": None if reported is None else detection_to_json(reported.detection),
+            "left_alone": [],
+            "outcome": None if verdict is None else verdict.overall,
+            "summary": None if verdict is None else verdict.sentence,
+            "predicted_gain": None if verdict is None else _number(float(verdict.predicted_gain.nanmean())),
+            "error": f"the motion of {unknown} frames is not known; they are as taken" if unknown else None,
+            "bad_frames": {str(track.index): track.fault for track in tracks if track.fault is not None},
+        }
+
+
+def _number(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+@unexpected_errors_in_one_line()
+@checks_arguments
+def process_video(
+    source: PathLike,
+    sink: PathLike,
+    timing: SensorTiming,
+    *,
+    border: str = "mirror",
+    steady: float = 0.0,
+    restoration: Mapping[str, Any] | None = None,
+    columns: int | None = 384,
+    window: int = 8,
+    full_scale: float | None = None,
+    resume: bool = False,
+    manifest: PathLike | None = None,
+    memory: str | float | None = None,
+    workers: int | None = None,
+    device: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> StackReport:
+    """Restore a video of any length from file to file, and steady it.
+
+    The vibration is followed from frame to frame (``VibrationTracker``) instead of detected in windows: neighbouring
+    frames are restored alike, nothing changes at the borders of windows, and detection takes little time. Frames of
+    4:2:0 videos are restored as they are stored: luma with the method, chroma, which has half the resolution, with
+    ``"dewarp"``. Decoding, tracking, restoration and encoding run in threads.
+
+    Frames that cannot be decoded, constant frames and copies are replaced by the frame before. Frames whose motion is
+    not known are written as taken; the manifest counts them. The video is encoded in parts of 32 frames in the folder
+    ``.NAME.rsvib`` beside it, from which an interrupted run is resumed.
+
+    Args:
+        source: A video, or another stack as in ``read_stack``.
+        sink: The video to write: .mp4, .mov, .m4v (H.264) or .mkv, .avi (FFV1, without loss). Times, sound and metadata
+            are those of the source.
+        timing: As in ``process_stack``.
+        border: Pixels that the sensor did not record: ``"mirror"``: extrapolated from each frame by itself;
+            ``"hold"``: as in the frame before; ``"crop"``: cut off by constant margins, for which the video is read
+            twice.
+        steady: s; every frame is moved to the mean of its path in the interval of this length around it: vibration,
+            rolling-shutter wobble and shaking are removed, slow motion is kept. 0: frames stay where they are.
+        restoration: ``method`` (default ``"exact"``), its options, and ``saturation``, as in ``restore``, for frames
+            whose full scale is 1. Not ``joint``, ``scale``, ``mosaic`` or ``optics``.
+        columns: As in ``VibrationTracker``.
+        window: As in ``VibrationTracker``.
+        full_scale: As in ``read_stack``.
+        resume: Whether to continue an interrupted run; a complete output is not changed.
+        manifest: As in ``process_stack``. A part of the video is a window there; its detection is that of the last
+            frame, at ``start_time``.
+        memory: As in ``process_stack``.
+        workers: Number of frames that are restored at the same time; by default the number of processors.
+        device: As in ``process_stack``.
+        progress: As in ``process_stack``. Both passes of ``border="crop"`` count as half.
+
+    Returns:
+        Summary of the run.
+
+    Raises:
+        FileExistsError: If there is an interrupted run and ``resume`` is False.
+        ModuleNotFoundError: If an optional package is missing, with the extra to install.
+        OSError: If a file cannot be read or written; the run can then be resumed.
+        TypeError: If an option is unknown.
+        ValueError: If a value is out of range, the source is not readable, margins leave nothing, an output would
+            replace the input, or input, settings or versions differ from those of the run to resume.
+
+    Example:
+        >>> process_video("shaky.mp4", "steady.mp4", timing, steady=1.0, border="crop")  # doctest: +SKIP
+    """
+    begin, source, sink = time.perf_counter(), Path(source), Path(sink)
+    check_choice("border", border, ("mirror", "hold", "crop"))
+    check_number("steady", steady, at_least=0.0)
+    video = _planned(
+        source, timing, restoration, full_scale, steady, (columns, window), device, masks=border != "mirror"
+    )
+    job = video.job
+    if sink.suffix.lower() not in CONTAINERS:
+        raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
+    target = sink.with_name(sink.name + ".manifest.json") if manifest is None else Path(manifest)
+    check_outputs([sink, work_folder(sink), target], stack_files(source))
+    content = _content(job, timing)
+    if border != "crop":
+        check_info_target(sink, content, check_folder=False)
+    header = manifest_header(job, sink.name, None)
+    header["settings"] |= {
+        "window": None,  # for the commands that read manifests: parts are not windows of their own
+        "video": {"border": border, "steady": steady, "columns": columns, "window": window},
+    }
+    at_once = _frames_at_once(source, timing, full_scale, restoration, memory, workers, device)
+
+    def report(records: Iterable[Mapping[str, Any]], resumed: int, not_kept: Iterable[str]) -> StackReport:
+        return StackReport(
+            **totals(records),
+            windows=video.parts,
+            resumed=resumed,
+            seconds=time.perf_counter() - begin,
+            first=None,
+            manifest=target,
+            not_kept=tuple(not_kept),
+        )
+
+    journal = Journal(sink)
+    try:
+        if resume and not journal.has_lines and sink.exists() and target.exists():
+            complete = read_manifest(target)
+            difference = describe_difference(complete.header(), header)
+            if difference:
+                raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
+            return report((one.model_dump() for one in complete.windows), video.parts, complete.not_kept)
+        resumes = journal.open(header, resume=resume)
+        shown = _Progress(progress, len(video.starts), 2 if border == "crop" else 1)
+        margins = video.margins(shown) if border == "crop" else None
+        if margins is not None:
+            kept = margins.cut(torch.empty(video.layout.size, device="meta")).shape
+            content = replace(content, shape=(*content.shape[:-2], *kept))
+            check_info_target(sink, content, check_folder=False)
+        reader = open_stack(source)
+        parts = PartSink(sink, journal.folder, content, planes_of(reader) if video.layout.planar else None)
+        try:
+            with disk_errors_named(journal):
+                journal.drop(parts.resume(journal.entries() if resumes else ()))
+            resumed = journal.count
+            _restore_parts(video, parts, journal, border, margins, at_once, shown)
+            not_kept = metadata_not_kept(job.info, sink, tuple(content.shape))
+            with disk_errors_named(journal):
+                make_folder(target.parent)
+                with whole_file(target) as part:
+                    write_manifest(part, header, journal.records(), not_kept)
+                    parts.finish(range(video.parts))
+                sync(target.absolute().parent)
+        finally:
+            parts.close()
+            reader.close()
+        summary = report(journal.records(), resumed, not_kept)
+        journal.remove()
+        return summary
+    finally:
+        journal.close()
+
+
+class _Progress:
+    """Progress over the passes through a video, each of which counts alike."""
+
+    def __init__(self, show: Callable[[int, int], None] | None, count: int, passes: int) -> None:
+        self._show, self._count, self._passes, self._done = show, count, passes, 0
+        if show is not None:
+            show(0, count)
+
+    def __call__(self) -> None:
+        """Count one frame of a pass."""
+        self._done += 1
+        if self._show is not None:
+            self._show(self._done // self._passes, self._count)
+
+
+def _planned(
+    source: Path,
+    timing: SensorTiming,
+    restoration: Mapping[str, Any] | None,
+    full_scale: float | None,
+    steady: float,
+    tracking: tuple[int | None, int],
+    device: str,
+    *,
+    masks: bool,
+) -> _Video:
+    """The job of a run and the layout of its frames."""
+    options = dict(restoration or {})
+    for name in ("joint", "scale", "mosaic", "optics"):
+        if options.pop(name, None) not in (None, False, 1):
+            raise ValueError(f"{name} is not available for videos that are followed frame by frame; use process_stack")
+    plan = {"restoration": options, "full_scale": full_scale, "device": device}
+    job, _, _ = plan_job(source, timing, plan, here=False)
+    reader: FrameReader = open_stack(source)
+    try:
+        planes = planes_of(reader)
+    finally:
+        reader.close()
+    method, saturation = options.pop("method", "exact"), options.pop("saturation", "auto")
+    check_method_options(method, options)
+    white = job.full_scale if planes is None else planes.white
+    if saturation != "auto":
+        white = None if saturation is None else saturation * (white or 1.0)
+    scale = 255.0 if planes is not None else job.full_scale
+    layout = FrameLayout(job.info.shape[1:], planes is not None, scale, white, np.dtype(job.info.dtype))
+    restorer = VideoRestorer(layout, job.timing, method, options, job.device, masks)
+    starts = job.timing.frame_starts(job.info.shape[0]).tolist()
+    return _Video(job, layout, restorer, [start - starts[0] for start in starts], steady, *tracking)
+
+
+def _content(job: StackJob, timing: SensorTiming) -> StackInfo:
+    return replace(
+        job.info,
+        full_scale=job.full_scale,
+        frame_times=None if job.info.frame_times is None else exposure_times(job.info, timing),
+        time_error=0.0,
+        frame_rate=job.info.frame_rate or timing.frame_rate,
+    )
+
+
+def _frames_at_once(
+    source: Path,
+    timing: SensorTiming,
+    full_scale: float | None,
+    restoration: Mapping[str, Any] | None,
+    memory: str | float | None,
+    workers: int | None,
+    device: str,
+) -> int:
+    """Number of frames to restore at the same time, within the memory."""
+    plan = {"restoration": restoration, "full_scale": full_scale, "memory": memory, "workers": workers, "window": 2}
+    with warnings.catch_warnings():  # given before
+        warnings.simplefilter("ignore")
+        return plan_job(source, timing, plan | {"device": device})[2]
+
+
+def _restore_parts(
+    video: _Video,
+    sink: PartSink,
+    journal: Journal,
+    border: str,
+    margins: Margins | None,
+    at_once: int,
+    progress: Callable[[], None],
+) -> None:
+    """Restore and encode all parts that are not in the journal."""
+    share_one_heap()
+    default_threads = torch.get_num_threads()
+    threads = 1 if video.job.device == "cpu" else default_threads
+    pool = ThreadPoolExecutor(at_once, "rsvib-restore", initializer=torch.set_num_threads, initargs=(threads,))
+    tracks: list[FrameTrack] = []  # of the part
+    pair: list[tuple[FrameTrack, Frame]] = []  # the first two neighbouring frames of known motion
+    before: Planes | None = None
+    done = -1
+    try:
+        with (
+            closing(video.tracked()) as followed_frames,
+            closing(_in_order(video, followed_frames, pool, at_once, journal, progress)) as frames,
+        ):
+            for track, frame, restored in frames:
+                part = track.index // _PART_FRAMES
+                if track.index != done + 1 or before is None:
+                    ended = sink.last_frame(part - 1)
+                    before = None if ended is None else video.layout.planes(ended)
+                before, done = _without_gaps(restored, before, video.layout, border), track.index
+                sink.write(part, video.layout.frame(_cut(before, margins)))
+                tracks.append(track)
+                if len(pair) < 2 and track.known and not isinstance(frame, str):
+                    pair = [*pair[-1:], (track, frame)] if pair and pair[-1][0].index == done - 1 else [(track, frame)]
+                if done % _PART_FRAMES == _PART_FRAMES - 1 or done == len(video.starts) - 1:
+                    verdict = video.verdict(pair) if len(pair) == 2 else None
+                    with disk_errors_named(journal):
+                        stored = sink.finish_part(part, video.layout.frame(before))
+                        journal.add(video.record(part, tracks, verdict), stored)
+                    tracks, pair = [], []
+                progress()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        torch.set_num_threads(default_threads)
+
+
+def _in_order(
+    video: _Video,
+    tracks: Iterator[tuple[FrameTrack, Frame | str]],
+    pool: ThreadPoolExecutor,
+    at_once: int,
+    journal: Journal,
+    progress: Callable[[], None],
+) -> Generator[tuple[FrameTrack, Frame | str, RestoredFrame], None, None]:
+    """Frames of the parts that are not in the journal, in order; some more are restored ahead."""
+    waiting: deque[tuple[FrameTrack, Frame | str, Future[RestoredFrame]]] = deque()
+
+    def first() -> tuple[FrameTrack, Frame | str, RestoredFrame]:
+        track, frame, future = waiting.popleft()
+        return track, frame, future.result()
+
+    for track, frame in tracks:
+        if track.index // _PART_FRAMES in journal:
+            progress()
+            continue
+        waiting.append((track, frame, pool.submit(video.restorer.restored, frame, track)))
+        if len(waiting) > at_once + 1:
+            yield first()
+    while waiting:
+        yield first()
+
+
+def _without_gaps(restored: RestoredFrame, before: Planes | None, layout: FrameLayout, border: str) -> Planes:
+    """Planes of a frame to write: those of the frame before where there are none, and at hidden pixels if they hold."""
+    planes = restored.planes
+    if planes is None or (restored.fault is not None and before is not None):
+        return layout.black() if before is None else before
+    if border == "mirror" or restored.visible is None or before is None:
+        return planes
+    pairs = zip(restored.visible, planes, before, strict=True)
+    return [np.where(visible, plane, old) for visible, plane, old in pairs]
+
+
+def _cut(planes: Planes, margins: Margins | None) -> Planes:
+    """Planes without margins; those of chroma are half as wide."""
+    if margins is None:
+        return planes
+    first, *others = planes
+    sides = (margins.top, margins.bottom, margins.left, margins.right)
+    return [margins.cut(first), *(Margins(*(side // 2 for side in sides)).cut(plane) for plane in others)]

@@ -1,0 +1,90 @@
+"""Steady videos: every frame is moved to the mean of the path around it."""
+
+from collections import deque
+from collections.abc import Iterator
+from typing import Protocol, Self, TypeVar
+
+import torch
+from torch import Tensor
+
+__all__ = ["steadied"]
+
+_ROUNDING = 1e-6  # s, of frame times
+
+
+class PlacedFrame(Protocol):
+    """A frame whose place on the path is known, such as ``TrackedFrame``."""
+
+    @property
+    def time(self) -> float:
+        """Exposure start of its first row in s."""
+
+    @property
+    def path(self) -> Tensor:
+        """Place (2,) on the path in px; NaN if it is not known."""
+
+    def moved_to(self, place: Tensor) -> Self:
+        """The frame with its content at another place."""
+
+
+Placed = TypeVar("Placed", bound=PlacedFrame)
+Item = TypeVar("Item")
+
+
+def steadied(frames: Iterator[tuple[Placed, Item]], duration: float) -> Iterator[tuple[Placed, Item]]:
+    """Frames moved to the mean of the path over ``duration`` s around them, so that slow motion is kept.
+
+    Near both ends of the video the interval is shorter, and stays symmetric. Frames without path stay.
+
+    Args:
+        frames: Tracked frames in order, each with anything that belongs to it.
+        duration: s; 0: all frames stay.
+
+    Yields:
+        The frames, as soon as those half of ``duration`` behind them are known.
+
+    Example:
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=8)
+        >>> tracker = rsv.VibrationTracker(timing, window=4, wobble=True)
+        >>> tracked = ((tracker.update(frame), number) for number, frame in enumerate(frames))
+        >>> [number for _, number in steadied(tracked, 0.05)]
+        [0, 1, 2, 3, 4, 5, 6, 7]
+    """
+    if duration == 0:
+        yield from frames
+        return
+    around: deque[tuple[Placed, Item]] = deque()
+    position, half = 0, 0.5 * duration  # index in ``around`` of the next frame to yield
+
+    def placed(index: int) -> tuple[Placed, Item]:
+        tracked, item = around[index]
+        if not bool(torch.isfinite(tracked.path).all()):
+            return tracked, item
+        # the same distance on both sides, so that a uniform motion is kept at the ends as well
+        reach = min(half, tracked.time - around[0][0].time, around[-1][0].time - tracked.time)
+        paths, weights = [], []
+        for one, _ in around:
+            distance = abs(one.time - tracked.time)
+            if distance > reach + _ROUNDING or not bool(torch.isfinite(one.path).all()):
+                continue
+            is_end = reach > 0 and abs(distance - reach) < _ROUNDING
+            paths.append(one.path)
+            weights.append(0.5 if is_end else 1.0)  # trapezoidal rule
+        weight = torch.tensor(weights, dtype=torch.float64, device=tracked.path.device)
+        return tracked.moved_to((weight[:, None] * torch.stack(paths)).sum(0) / weight.sum()), item
+
+    for latest in frames:
+        around.append(latest)
+        while position < len(around) and around[position][0].time + half <= latest[0].time + _ROUNDING:
+            yield placed(position)
+            position += 1
+            while around[0][0].time < around[min(position, len(around) - 1)][0].time - half - _ROUNDING:
+                around.popleft()
+                position -= 1
+    while position < len(around):
+        yield placed(position)
+        position += 1
