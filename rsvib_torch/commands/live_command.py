@@ -21,7 +21,7 @@ from rsvib_torch.commands.terminal import Answer, error_line
 from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.option_types import METHOD_SETTINGS, method_options
+from rsvib_torch.core.option_types import METHOD_SETTINGS, BorderName, method_options
 from rsvib_torch.core.text import number_of
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 __all__ = ["live_session"]
 
 PixelFormatName = Literal["gray8", "gray16le", "rgb24", "bgr24"]
-BorderName = Literal["mirror", "hold", "crop"]
 
 
 @camera_options

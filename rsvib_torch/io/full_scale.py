@@ -99,8 +99,11 @@ def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str, 
         return torch.from_numpy(np.ascontiguousarray(counts, dtype=np.float32))
     full_scale = full_scale_of_counts(counts, full_scale, name)
     narrow = counts.dtype.itemsize <= 2  # float32 holds 16-bit counts exactly
-    signed = counts.astype(np.int32 if narrow else np.int64)  # torch does not compute with all unsigned types
-    floats = torch.from_numpy(signed).to(torch.float32 if narrow else torch.float64)
+    # torch does not compute with all unsigned types
+    signed = counts if counts.dtype == np.uint8 else counts.astype(np.int32 if narrow else np.int64)
+    floats = torch.from_numpy(np.require(signed, requirements=["C", "W"])).to(
+        torch.float32 if narrow else torch.float64
+    )
     return floats.div_(full_scale).to(torch.float32)
 
 

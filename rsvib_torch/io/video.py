@@ -109,15 +109,10 @@ def _pixels(frame: Any) -> NDArray[Any]:
     return np.ascontiguousarray(pixels if pixels.ndim == 2 else np.moveaxis(pixels, -1, 0))
 
 
-def _frames(container: Any, *, pixels: bool = True) -> Generator[Any, None, None]:
-    """Decode the frames of the main video stream in the order of presentation; damaged packets are skipped.
-
-    Without ``pixels``, decoders that can leave out transforms and filters do so, and pixels are wrong.
-    """
+def _frames(container: Any) -> Generator[Any, None, None]:
+    """Decode the frames of the main video stream in the order of presentation; damaged packets are skipped."""
     av, stream = _av(), container.streams.best("video")
     stream.thread_type = "AUTO"
-    if not pixels:
-        stream.codec_context.options = {"skip_idct": "all", "skip_loop_filter": "all"}
     packets = container.demux(stream)
     while True:
         try:
@@ -157,7 +152,7 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
         size = stream.width * stream.height
         check_fits(f"{path}: frames of {stream.height} x {stream.width} px", _FRAMES * 6 * size, "free more memory")
         times, first = [], None
-        for frame in _frames(container, pixels=False):
+        for frame in _frames(container):
             first = first or frame
             times.append(Fraction(frame.pts or 0) * stream.time_base if frame.pts is not None else None)
         if first is None:

@@ -3,10 +3,10 @@
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,7 @@ __all__ = ["process_video"]
 
 _PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
 _JUDGED_COLUMNS = 320  # with the most detail; the verdict itself takes 160 of them
+_MAX_INITIAL_FAILURES = 8  # parts; a run stops if the motion is known in none of them
 _AHEAD = 4  # frames decoded, and frames tracked, before they are used
 
 Frame = NDArray[Any]
@@ -71,6 +72,10 @@ class _Video:
     def parts(self) -> int:
         """Number of parts."""
         return -(-len(self.starts) // _PART_FRAMES)
+
+    def ends_part(self, index: int) -> bool:
+        """Whether a frame is the last one of a part."""
+        return index % _PART_FRAMES == _PART_FRAMES - 1 or index == len(self.starts) - 1
 
     def _decoded(self) -> Generator[tuple[int, float, Frame | str, Frame | str], None, None]:
         """Number and start of every frame, its luma, and the frame itself, or why it cannot be read."""
@@ -103,7 +108,7 @@ class _Video:
 
         def steady_frames() -> Generator[tuple[FrameTrack, Frame | str], None, None]:
             with closing(prefetched(self._decoded(), _AHEAD)) as decoded:
-                yield from steadied(followed(decoded, tracker, reported=_PART_FRAMES), self.steady)
+                yield from steadied(followed(decoded, tracker, self.ends_part), self.steady)
 
         return prefetched(steady_frames(), _AHEAD)
 
@@ -205,7 +210,9 @@ def process_video(
         steady: s; every frame is moved to the mean of its path in the interval of this length around it: vibration,
             rolling-shutter wobble and shaking are removed, slow motion is kept. 0: frames stay where they are.
         restoration: ``method`` (default ``"exact"``), its options, and ``saturation``, as in ``restore``, for frames
-            whose full scale is 1. Not ``joint``, ``scale``, ``mosaic`` or ``optics``.
+            whose full scale is 1. Without ``saturation``, saturated pixels count as measured: their values are restored
+            0.2 dB worse if 1 % of the pixels are saturated, in a quarter of the time. Not ``joint``, ``scale``,
+            ``mosaic`` or ``optics``.
         columns: As in ``VibrationTracker``.
         window: As in ``VibrationTracker``.
         full_scale: As in ``read_stack``.
@@ -267,17 +274,13 @@ def process_video(
     try:
         if resume and not journal.has_lines and sink.exists() and target.exists():
             complete = read_manifest(target)
-            difference = describe_difference(complete.header(), header)
-            if difference:
-                raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
+            _check_complete(sink, complete.header(), header)
             return report((one.model_dump() for one in complete.windows), video.parts, complete.not_kept)
         resumes = journal.open(header, resume=resume)
         shown = _Progress(progress, len(video.starts), 2 if border == "crop" else 1)
         margins = video.margins(shown) if border == "crop" else None
-        if margins is not None:
-            kept = margins.cut(torch.empty(video.layout.size, device="meta")).shape
-            content = replace(content, shape=(*content.shape[:-2], *kept))
-            check_info_target(sink, content, check_folder=False)
+        content = _cut_content(content, margins)
+        check_info_target(sink, content, check_folder=False)
         reader = open_stack(source)
         parts = PartSink(sink, journal.folder, content, planes_of(reader) if video.layout.planar else None)
         try:
@@ -286,12 +289,8 @@ def process_video(
             resumed = journal.count
             _restore_parts(video, parts, journal, border, margins, at_once, shown)
             not_kept = metadata_not_kept(job.info, sink, tuple(content.shape))
-            with disk_errors_named(journal):
-                make_folder(target.parent)
-                with whole_file(target) as part:
-                    write_manifest(part, header, journal.records(), not_kept)
-                    parts.finish(range(video.parts))
-                sync(target.absolute().parent)
+            header["settings"]["video"]["margins"] = None if margins is None else asdict(margins)
+            _finish(parts, video.parts, journal, target, header, not_kept)
         finally:
             parts.close()
             reader.close()
@@ -300,6 +299,44 @@ def process_video(
         return summary
     finally:
         journal.close()
+
+
+def _finish(
+    sink: PartSink, parts: int, journal: Journal, manifest: Path, header: dict[str, Any], not_kept: Sequence[str]
+) -> None:
+    """Write the manifest, and join the parts to the video."""
+    with disk_errors_named(journal):
+        make_folder(manifest.parent)
+        with whole_file(manifest) as part:
+            write_manifest(part, header, journal.records(), not_kept)
+            sink.finish(range(parts))
+        sync(manifest.absolute().parent)
+
+
+def _check_complete(sink: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
+    """Raise a ``ValueError`` if a complete video has other settings than a run that is to be resumed."""
+    old["settings"].get("video", {}).pop("margins", None)  # a result
+    difference = describe_difference(old, new)
+    if difference:
+        raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
+
+
+def _cut_content(content: StackInfo, margins: Margins | None) -> StackInfo:
+    """The content of the video without the margins."""
+    if margins is None:
+        return content
+    kept = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
+    return replace(content, shape=(*content.shape[:-2], *kept))
+
+
+def _check_found(contents: list[str], parts: int, journal: Journal) -> None:
+    """Raise a ``ValueError`` if the motion is known in no frame of the parts so far."""
+    if len(contents) >= min(_MAX_INITIAL_FAILURES, parts) and "restored" not in contents:
+        journal.clear()
+        raise ValueError(
+            "no vibration was found that the rows of the frames have in common; detect it in windows, which states the "
+            "reasons (process_stack; rsvib run with --output restored.mp4 instead of --video)"
+        )
 
 
 class _Progress:
@@ -340,11 +377,12 @@ def _planned(
         planes = planes_of(reader)
     finally:
         reader.close()
-    method, saturation = options.pop("method", "exact"), options.pop("saturation", "auto")
+    method, saturation = options.pop("method", "exact"), options.pop("saturation", None)
     check_method_options(method, options)
-    white = job.full_scale if planes is None else planes.white
-    if saturation != "auto":
-        white = None if saturation is None else saturation * (white or 1.0)
+    white = None
+    if saturation is not None:
+        black, full = (0.0, job.full_scale or 1.0) if planes is None else (planes.black, planes.white)
+        white = black + check_number("saturation", saturation, above=0.0) * (full - black)
     scale = 255.0 if planes is not None else job.full_scale
     layout = FrameLayout(job.info.shape[1:], planes is not None, scale, white, np.dtype(job.info.dtype))
     restorer = VideoRestorer(layout, job.timing, method, options, job.device, masks)
@@ -394,6 +432,7 @@ def _restore_parts(
     pool = ThreadPoolExecutor(at_once, "rsvib-restore", initializer=torch.set_num_threads, initargs=(threads,))
     tracks: list[FrameTrack] = []  # of the part
     pair: list[tuple[FrameTrack, Frame]] = []  # the first two neighbouring frames of known motion
+    contents = [record["frames"] for record in journal.records()]
     before: Planes | None = None
     done = -1
     try:
@@ -411,11 +450,13 @@ def _restore_parts(
                 tracks.append(track)
                 if len(pair) < 2 and track.known and not isinstance(frame, str):
                     pair = [*pair[-1:], (track, frame)] if pair and pair[-1][0].index == done - 1 else [(track, frame)]
-                if done % _PART_FRAMES == _PART_FRAMES - 1 or done == len(video.starts) - 1:
+                if video.ends_part(done):
                     verdict = video.verdict(pair) if len(pair) == 2 else None
+                    record = video.record(part, tracks, verdict)
                     with disk_errors_named(journal):
-                        stored = sink.finish_part(part, video.layout.frame(before))
-                        journal.add(video.record(part, tracks, verdict), stored)
+                        journal.add(record, sink.finish_part(part, video.layout.frame(before)))
+                    contents.append(record["frames"])
+                    _check_found(contents, video.parts, journal)
                     tracks, pair = [], []
                 progress()
     finally:

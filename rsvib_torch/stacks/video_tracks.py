@@ -1,7 +1,7 @@
 """The motion of every frame of a video, followed from frame to frame."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -65,7 +65,9 @@ class FrameTrack:
 
 
 def followed(
-    frames: Iterator[tuple[int, float, NDArray[Any] | str, Any]], tracker: VibrationTracker, *, reported: int
+    frames: Iterator[tuple[int, float, NDArray[Any] | str, Any]],
+    tracker: VibrationTracker,
+    reports: Callable[[int], bool],
 ) -> Iterator[tuple[FrameTrack, Any]]:
     """Follow the vibration through a video.
 
@@ -76,7 +78,7 @@ def followed(
         frames: Number, start time in s, pixels to track or the reason why they cannot be used, and anything that
             belongs to the frame.
         tracker: A new tracker.
-        reported: Every so many frames, the last of them gets its detection.
+        reports: Whether a frame of this number gets its detection.
 
     Yields:
         What is known of every frame, and what belongs to it.
@@ -84,7 +86,7 @@ def followed(
     first: deque[tuple[FrameTrack, Any]] = deque()  # frames up to that at which the motion is known
     start: FrameTrack | None = None
     for index, time, pixels, item in frames:
-        track = _tracked(tracker, index, time, pixels, reports=(index + 1) % reported == 0)
+        track = _tracked(tracker, index, time, pixels, reports=reports(index))
         if start is not None:
             if first:
                 velocity = (track.path - start.path) / (track.time - start.time)
@@ -110,6 +112,10 @@ def _tracked(
     fault = f"frame {index} is constant, or a copy of the frame before" if tracked.state == "unusable" else None
     known = bool(torch.isfinite(tracked.path).all())
     detection = tracked.detection if reports and known else None
+    if detection is not None:  # an axis is restored if it was reliable in one of the last frames
+        reliable = tracked.motion.moving_axes() & (tracked.motion.amplitude > 0).any(-1)
+        reasons = tuple(() if good else why for good, why in zip(reliable.tolist(), detection.reasons, strict=True))
+        detection = replace(detection, reliable=reliable, reasons=reasons)
     return FrameTrack(index, time, tracked.motion, tracked.path.cpu(), known, fault, detection)
 
 

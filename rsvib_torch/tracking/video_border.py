@@ -1,7 +1,7 @@
 """Pixels of restored video frames that the sensor did not record: a border that moves from frame to frame."""
 
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from numpy.typing import NDArray
@@ -9,11 +9,11 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice, check_whole_number
+from rsvib_torch.core.option_types import BorderName
 from rsvib_torch.tracking.tracker import TrackedFrame
 
-__all__ = ["Border", "Margins", "VideoBorder"]
+__all__ = ["Margins", "VideoBorder"]
 
-Border = Literal["mirror", "hold", "crop"]
 Pixels = TypeVar("Pixels", Tensor, NDArray[Any])
 
 
@@ -99,7 +99,7 @@ class VideoBorder:
     """
 
     @checks_arguments
-    def __init__(self, border: Border = "hold", margins: Margins | None = None) -> None:
+    def __init__(self, border: BorderName = "hold", margins: Margins | None = None) -> None:
         check_choice("border", border, ("mirror", "hold", "crop"))
         if (border == "crop") != (margins is not None):
             raise ValueError(
