@@ -1,9 +1,9 @@
 """The motion of every frame of a video, followed from frame to frame."""
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from numpy.typing import NDArray
@@ -14,6 +14,8 @@ from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.tracking.tracker import VibrationTracker, displaced
 
 __all__ = ["FrameTrack", "followed"]
+
+_OPPOSITE: dict[str, Literal["forward", "reverse"]] = {"forward": "reverse", "reverse": "forward"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,20 +51,6 @@ class FrameTrack:
         """The frame with its content at another place (2,) of the path in px."""
         return replace(self, shift=self.path - place)
 
-    def before(self, index: int, time: float, velocity: Tensor) -> "FrameTrack":
-        """The motion at an earlier frame, if the vibration was steady and the path moved at (2,) px/s.
-
-        Args:
-            index: Number of the frame.
-            time: s, its start.
-            velocity: Of the path at this frame.
-        """
-        motion, passed = self.motion, time - self.time
-        phase = motion.phase + 2.0 * torch.pi * motion.frequency * passed
-        speed = motion.image_motion + motion.image_acceleration * passed
-        earlier = Vibration(motion.amplitude, motion.frequency, phase, speed, motion.image_acceleration)
-        return FrameTrack(index, time, earlier, self.path + velocity * passed, known=True)
-
 
 def followed(
     frames: Iterator[tuple[int, float, NDArray[Any] | str, Any]],
@@ -71,8 +59,8 @@ def followed(
 ) -> Iterator[tuple[FrameTrack, Any]]:
     """Follow the vibration through a video.
 
-    It is known after a few frames; the motion of those before is that of the first one at which it is known, continued
-    backwards.
+    It is known after a few frames. Those before are followed backwards in time, from frames behind them: the reversed
+    video is that of a sensor which reads its rows in the opposite direction.
 
     Args:
         frames: Number, start time in s, pixels to track or the reason why they cannot be used, and anything that
@@ -83,23 +71,67 @@ def followed(
     Yields:
         What is known of every frame, and what belongs to it.
     """
-    first: deque[tuple[FrameTrack, Any]] = deque()  # frames up to that at which the motion is known
-    start: FrameTrack | None = None
+    first: deque[_Given] = deque()  # frames before the motion is known, and a window behind them
+    start: int | None = None  # number of the first frame whose motion is known
     for index, time, pixels, item in frames:
         track = _tracked(tracker, index, time, pixels, reports=reports(index))
-        if start is not None:
-            if first:
-                velocity = (track.path - start.path) / (track.time - start.time)
-                yield from _continued(first, start, torch.where(torch.isfinite(velocity), velocity, 0.0))
-                first.clear()
+        if start is not None and not first:
             yield track, item
             continue
-        first.append((track, item))
-        if track.known:
-            start = track
-        elif len(first) > 4 * tracker.window:  # the vibration is not known for a while
-            yield first.popleft()
-    yield from first if start is None else _continued(first, start, torch.zeros(2, dtype=torch.float64))
+        first.append(_Given(track, pixels, item))
+        if start is None:
+            start = index if track.known else None
+            if start is None and len(first) > 4 * tracker.window:  # the vibration is not known for a while
+                yield first[0].track, first.popleft().item
+        elif index >= start + tracker.window:
+            yield from _followed_backwards(first, tracker)
+            first.clear()
+    yield from _followed_backwards(first, tracker)
+
+
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """A frame with what is known of it, and what belongs to it."""
+
+    track: FrameTrack
+    pixels: NDArray[Any] | str
+    item: Any
+
+
+def _followed_backwards(frames: Sequence[_Given], tracker: VibrationTracker) -> Iterator[tuple[FrameTrack, Any]]:
+    """Tracks of frames, those of unknown motion followed backwards from the last frame."""
+    known = [one.track for one in frames if one.track.known]
+    unknown = {one.track.index for one in frames if not one.track.known and one.track.fault is None}
+    found: dict[int, FrameTrack] = {}
+    if known and unknown:
+        backwards = VibrationTracker(
+            replace(tracker.timing, readout_direction=_OPPOSITE[tracker.timing.readout_direction]),
+            window=tracker.window,
+            columns=tracker.columns,
+            wobble=tracker.wobble,
+            full_scale=tracker.full_scale,
+            channels=tracker.channels,
+        )
+        last = frames[-1].track.time
+        for one in reversed(frames):
+            if one.track.fault is None:
+                track = _tracked(backwards, one.track.index, last - one.track.time, one.pixels, reports=False)
+                found[track.index] = _reversed(track, one.track.time)
+    both = next((track for track in known if track.index in found and found[track.index].known), None)
+    apart = torch.zeros(2, dtype=torch.float64) if both is None else both.path - found[both.index].path
+    for one in frames:
+        track = one.track
+        if both is not None and track.index in unknown and found[track.index].known:
+            track = replace(found[track.index], path=found[track.index].path + apart)
+        yield track, one.item
+
+
+def _reversed(track: FrameTrack, time: float) -> FrameTrack:
+    """What was found backwards in time, for a frame that starts at ``time`` in s."""
+    motion = track.motion
+    phase, velocity = torch.pi - motion.phase, -motion.image_motion
+    forwards = Vibration(motion.amplitude, motion.frequency, phase, velocity, motion.image_acceleration)
+    return replace(track, time=time, motion=forwards)
 
 
 def _tracked(
@@ -117,11 +149,3 @@ def _tracked(
         reasons = tuple(() if good else why for good, why in zip(reliable.tolist(), detection.reasons, strict=True))
         detection = replace(detection, reliable=reliable, reasons=reasons)
     return FrameTrack(index, time, tracked.motion, tracked.path.cpu(), known, fault, detection)
-
-
-def _continued(
-    frames: deque[tuple[FrameTrack, Any]], start: FrameTrack, velocity: Tensor
-) -> Iterator[tuple[FrameTrack, Any]]:
-    for track, item in frames:
-        usable = not track.known and track.fault is None
-        yield (start.before(track.index, track.time, velocity) if usable else track), item

@@ -66,23 +66,22 @@ def steadied(frames: Iterator[tuple[Placed, Item]], duration: float) -> Iterator
             return tracked, item
         # the same distance on both sides, so that a uniform motion is kept at the ends as well
         reach = min(half, tracked.time - around[0][0].time, around[-1][0].time - tracked.time)
-        paths, weights = [], []
-        for one, _ in around:
-            distance = abs(one.time - tracked.time)
-            if distance > reach + _ROUNDING or not bool(torch.isfinite(one.path).all()):
-                continue
-            is_end = reach > 0 and abs(distance - reach) < _ROUNDING
-            paths.append(one.path)
-            weights.append(0.5 if is_end else 1.0)  # trapezoidal rule
-        weight = torch.tensor(weights, dtype=torch.float64, device=tracked.path.device)
-        return tracked.moved_to((weight[:, None] * torch.stack(paths)).sum(0) / weight.sum()), item
+        known = [one for one, _ in around if bool(torch.isfinite(one.path).all())]
+        distances = torch.tensor([abs(one.time - tracked.time) for one in known], dtype=torch.float64)
+        # a frame stands for the time of one interval; half of it counts at the end of the time around the frame
+        weights = ((reach - distances) / interval() + 0.5).clamp(0.0, 1.0).to(tracked.path.device)
+        paths = torch.stack([one.path for one in known])
+        return tracked.moved_to((weights[:, None] * paths).sum(0) / weights.sum()), item
+
+    def interval() -> float:
+        return (around[-1][0].time - around[0][0].time) / max(len(around) - 1, 1) or 1.0
 
     for latest in frames:
         around.append(latest)
-        while position < len(around) and around[position][0].time + half <= latest[0].time + _ROUNDING:
+        while position < len(around) - 1 and around[position][0].time + half + interval() <= latest[0].time + _ROUNDING:
             yield placed(position)
             position += 1
-            while around[0][0].time < around[min(position, len(around) - 1)][0].time - half - _ROUNDING:
+            while around[0][0].time < around[position][0].time - half - 2.0 * interval():
                 around.popleft()
                 position -= 1
     while position < len(around):
