@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from io import BytesIO
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -139,11 +139,28 @@ class Picture:
     color_range: int
 
 
+def _time_of(frame: Any, stream: Any) -> Fraction | None:
+    """Presentation time of a decoded frame or of a packet in s; None if it is not known."""
+    return None if frame.pts is None else Fraction(frame.pts) * stream.time_base
+
+
+def _listed_times(container: Any, stream: Any) -> list[Fraction | None] | None:
+    """Presentation times in s of all frames that an MP4 file lists; None if frames must be decoded to find them."""
+    if "mp4" not in container.format.name:
+        return None
+    listed = [packet for packet in container.demux(stream) if packet.size]
+    if any(packet.is_corrupt or packet.is_discard for packet in listed):
+        return None
+    times = sorted({time for packet in listed if (time := _time_of(packet, stream)) is not None})
+    return [*times] if len(times) == len(listed) == stream.frames else None
+
+
 @lru_cache(maxsize=8)
 def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fraction, ...], Picture]:
-    """Decode a video once: what it states, and the presentation times in s of the frames that can be decoded.
+    """What a video states, and the presentation times in s of its frames.
 
-    Containers state the number of frames only roughly. ``size`` and ``changed`` (ns) identify the state of the file.
+    MP4 files list all frames. Other containers state their number only roughly and are decoded once. ``size`` and
+    ``changed`` (ns) identify the state of the file.
     """
     with open_container(path) as container:
         stream = container.streams.best("video")
@@ -151,12 +168,15 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
             raise ValueError("it contains no video stream")
         size = stream.width * stream.height
         check_fits(f"{path}: frames of {stream.height} x {stream.width} px", _FRAMES * 6 * size, "free more memory")
-        times, first = [], None
-        for frame in _frames(container):
-            first = first or frame
-            times.append(Fraction(frame.pts or 0) * stream.time_base if frame.pts is not None else None)
-        if first is None:
-            raise ValueError("no frame can be decoded")
+        times = _listed_times(container, stream)
+        with open_container(path) as again:
+            frames = _frames(again)
+            first = next(frames, None)
+            if first is None:
+                raise ValueError("no frame can be decoded")
+            if times is None:
+                times = [_time_of(frame, stream) for frame in chain([first], frames)]
+            frames.close()
         known = [time for time in times if time is not None]
         rising = len(known) == len(times) > 1 and all(a < b for a, b in pairwise(known))
         pixels, rate = _pixels(first), stream.average_rate
@@ -194,14 +214,15 @@ class VideoReader:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.info = scanned(path)[0]
+        self.info, self._times, _ = scanned(path)
         self._container: Any = None
+        self._early: Any = None  # a decoded frame, if those before it cannot be decoded
         self._restart()
 
     def _restart(self) -> None:
         self.close()
         self._container, self._next = open_container(self._path), 0
-        self._decoding = _frames(self._container)
+        self._decoding, self._early = _frames(self._container), None
 
     def frame(self, index: int) -> NDArray[Any]:
         """Pixels of a frame as stored."""
@@ -213,7 +234,7 @@ class VideoReader:
             self._restart()
         frame = None
         while self._next <= index:
-            frame = next(self._decoding, None)
+            frame = self._decode(self._times[self._next] if self._times else None)
             self._next += 1
         if frame is None:
             raise FrameError(f"{self._path}: frame {index} cannot be decoded")
@@ -222,6 +243,20 @@ class VideoReader:
         if (frame.height, frame.width) != self.info.shape[-2:]:
             raise FrameError(f"{self._path}: frames of different size: frame {index} is {frame.height, frame.width}")
         return frame
+
+    def _decode(self, expected: Fraction | None) -> Any:
+        """The frame of an expected presentation time in s; None if it cannot be decoded."""
+        while True:
+            frame = next(self._decoding, None) if self._early is None else self._early
+            self._early = None
+            if frame is None or frame.pts is None or expected is None:
+                return frame
+            time = Fraction(frame.pts) * frame.time_base
+            if time > expected:
+                self._early = frame
+                return None
+            if time == expected:
+                return frame
 
     def close(self) -> None:
         """Close the file."""
