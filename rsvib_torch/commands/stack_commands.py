@@ -453,6 +453,11 @@ def _restore_windows(
         timing = replace(timing, frame_start_times=stored.frame_start_times)
     check_same_timing(str(vibration), stored, timing)
     window = manifest.settings.get("window")
+    if "video" in manifest.settings:
+        raise ValueError(
+            f"{vibration}: it describes a video that was followed frame by frame, and its parts are not windows; "
+            "detect the windows (rsvib detect --window 8), or repeat rsvib run --video"
+        )
     if not isinstance(window, int):
         raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")
     info = io.read_stack_info(frames)

@@ -53,7 +53,7 @@ PARTS: dict[str, list[tuple[str, str]]] = {
         ("rsvib_torch.stacks.process_video", "PartSink.finish_part"),
     ],
 }
-CODECS = "decoding (twice), encoding and the rest"
+CODECS = "decoding, encoding and the rest"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

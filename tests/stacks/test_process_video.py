@@ -239,7 +239,9 @@ def test_one_command_makes_a_shaky_video_steady(shaky, tmp_path, capsys):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
     frames = pixels(tmp_path / "out" / "restored.mp4").mean(1)
     assert np.abs(shifts(frames)[5:-6, 0] - 12.0 / RATE).max() < 0.2
+    vibration = ("--vibration", tmp_path / "out" / "manifest.json")
     wrong = {
+        ("restore", shaky, tmp_path / "again.mp4", *CAMERA, *vibration): "its parts are not windows; detect",
         steady: "results exist already",
         (*arguments[:3], *CAMERA, "--steady", "1"): "--steady goes with --video",
         (*steady, "--overwrite", "--joint", "3"): "--joint cannot be used with --video, which follows the frames one",
