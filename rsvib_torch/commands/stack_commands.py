@@ -564,6 +564,8 @@ def run(
 
     Stacks of any length are processed in windows. If the restored frames are judged no better than the input, the
     input is written unchanged, unless --force is given. Ctrl-C stops after the current windows; --resume continues.
+    With --video, the vibration of a video is followed frame by frame: --steady 1 --border crop makes a shaky video
+    steady.
     """
     if not video and (border is not None or steady is not None):
         raise ValueError(f"{'--border' if border is not None else '--steady'} goes with --video")

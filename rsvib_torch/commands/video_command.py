@@ -81,10 +81,13 @@ def run_followed(
     unknown = [record for record in stored.windows if record.error is not None]
     if unknown:
         first = unknown[0]
-        error_line(f"frames {first.first} to {first.last}: {first.error}; see manifest.json", "warning")
+        text = f"frames {first.first} to {first.last}: {first.error}, and they are written as taken"
+        error_line(f"{text}; see manifest.json", "warning")
     if result.bad_frames:
         bad = number_of(result.bad_frames, "frame")
         error_line(f"{bad} could not be used and repeat the frame before: see manifest.json", "warning")
+    if not result.restored:
+        error_line("no vibration to remove: the frames are written unchanged", "warning")
     worse = [record for record in stored.windows if record.outcome == "worse"]
     if worse:
         where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"

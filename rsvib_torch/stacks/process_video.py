@@ -1,12 +1,13 @@
 """Videos from file to file, followed from frame to frame: ``process_video``."""
 
+import math
 import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, suppress
-from dataclasses import asdict, dataclass, replace
+from contextlib import closing
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +18,17 @@ from numpy.typing import NDArray
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import make_folder, sync, whole_file
 from rsvib_torch.core.checks import check_choice, check_number
+from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.outputs import check_outputs
-from rsvib_torch.core.prefetch import prefetched
 from rsvib_torch.core.unexpected import unexpected_errors_in_one_line
-from rsvib_torch.frames.pixels import detailed_columns
-from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept, open_stack, stack_files
 from rsvib_torch.io.formats import FrameReader
 from rsvib_torch.io.frame_times import exposure_times
-from rsvib_torch.io.full_scale import counts_to_frames
-from rsvib_torch.io.schema import detection_to_json
-from rsvib_torch.io.stack_info import FrameError, StackInfo
+from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.video import CONTAINERS
 from rsvib_torch.io.video_parts import planes_of
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
-from rsvib_torch.restoration.restore import check_method_options, restore_prepared
-from rsvib_torch.restoration.verdict.judge import judge_prepared
+from rsvib_torch.restoration.restore import check_method_options
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, plan_job
 from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_manifest
@@ -41,131 +36,16 @@ from rsvib_torch.stacks.output import Journal, describe_difference, disk_errors_
 from rsvib_torch.stacks.process import StackReport, totals
 from rsvib_torch.stacks.video_frames import FrameLayout, RestoredFrame, VideoRestorer
 from rsvib_torch.stacks.video_output import PartSink
-from rsvib_torch.stacks.video_tracks import FrameTrack, followed
-from rsvib_torch.tracking import Margins, VibrationTracker
-from rsvib_torch.tracking.steadying import steadied
+from rsvib_torch.stacks.video_passes import PART_FRAMES, VideoPasses
+from rsvib_torch.stacks.video_tracks import FrameTrack
+from rsvib_torch.tracking import Margins
 
 __all__ = ["process_video"]
 
-_PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
-_JUDGED_COLUMNS = 320  # with the most detail; the verdict itself takes 160 of them
 _MAX_INITIAL_FAILURES = 8  # parts; a run stops if the motion is known in none of them
-_AHEAD = 4  # frames decoded, and frames tracked, before they are used
 
 Frame = NDArray[Any]
 Planes = list[Frame]
-
-
-@dataclass(frozen=True, eq=False)
-class _Video:
-    """What the passes through a video have in common."""
-
-    job: StackJob
-    layout: FrameLayout
-    restorer: VideoRestorer
-    starts: list[float]
-    steady: float
-    columns: int | None
-    window: int
-
-    @property
-    def parts(self) -> int:
-        """Number of parts."""
-        return -(-len(self.starts) // _PART_FRAMES)
-
-    def ends_part(self, index: int) -> bool:
-        """Whether a frame is the last one of a part."""
-        return index % _PART_FRAMES == _PART_FRAMES - 1 or index == len(self.starts) - 1
-
-    def _decoded(self) -> Generator[tuple[int, float, Frame | str, Frame | str], None, None]:
-        """Number and start of every frame, its luma, and the frame itself, or why it cannot be read."""
-        reader = open_stack(self.job.source)
-        try:
-            if reader.info != self.job.info:
-                raise ValueError(f"{self.job.source} has changed since it was first opened; start again")
-            source: Any = planes_of(reader) or reader if self.layout.planar else reader
-            for index, start in enumerate(self.starts):
-                try:
-                    frame = source.frame(index)
-                except FrameError as error:
-                    reason = " ".join(str(error).split())
-                    yield index, start, reason, reason
-                    continue
-                yield index, start, self.layout.luma(frame), frame
-        finally:
-            reader.close()
-
-    def tracked(self) -> Generator[tuple[FrameTrack, Frame | str], None, None]:
-        """Every frame with its motion, at its place in the steady video; decoded and tracked ahead in threads."""
-        tracker = VibrationTracker(
-            replace(self.job.timing, frame_start_times=None),
-            window=self.window,
-            columns=self.columns,
-            wobble=self.steady > 0,
-            full_scale=self.layout.full_scale,
-            channels="first",
-        )
-
-        def steady_frames() -> Generator[tuple[FrameTrack, Frame | str], None, None]:
-            with closing(prefetched(self._decoded(), _AHEAD)) as decoded:
-                yield from steadied(followed(decoded, tracker, self.ends_part), self.steady)
-
-        return prefetched(steady_frames(), _AHEAD)
-
-    def margins(self, progress: Callable[[], None]) -> Margins:
-        """The widest margins of all frames, from a pass that only follows the motion."""
-        widest = Margins()
-        with closing(self.tracked()) as tracks:
-            for track, _ in tracks:
-                if track.known and track.fault is None:
-                    widest = widest.widest(Margins.of(torch.from_numpy(self.restorer.visible(track)[0])))
-                progress()
-        return self.layout.margins(widest)
-
-    def verdict(self, frames: list[tuple[FrameTrack, Frame]]) -> RestorationVerdict | None:
-        """Whether restoration helps, from two neighbouring frames before they are steadied; None if unknown."""
-        (first, one), (_, other) = frames
-        pixels = np.stack([self.layout.luma(one), self.layout.luma(other)])
-        images = counts_to_frames(pixels, self.layout.full_scale, str(self.job.source)).to(self.job.device)
-        timing = self.job.timing
-        if timing.scan_axis == -2:
-            images = images[..., detailed_columns(images, _JUDGED_COLUMNS)]
-        start = self.restorer.timing_of(0).frame_start_times
-        assert start is not None
-        starts = (float(start[0]), float(start[0]) + frames[1][0].time - first.time)
-        prepared = prepare_frames(images, replace(timing, frame_start_times=starts), channels="first")
-        if not bool(first.motion.moving_axes().any()):
-            return None
-        with suppress(TooLittleInCommonError), torch.no_grad():
-            restored = restore_prepared(prepared, first.motion, self.restorer.method, self.restorer.options)
-            return judge_prepared(prepared, restored, first.motion, most_pairs=1)
-        return None
-
-    def record(self, part: int, tracks: list[FrameTrack], verdict: RestorationVerdict | None) -> dict[str, Any]:
-        """Content of the ``WindowRecord`` of a part of the video."""
-        last = tracks[-1]
-        moved = [track for track in tracks if track.known and track.fault is None]
-        reported = next((track for track in reversed(tracks) if track.detection is not None), None)
-        unknown = len([track for track in tracks if not track.known and track.fault is None])
-        return {
-            "window": part,
-            "first": tracks[0].index,
-            "last": last.index,
-            "start_time": (reported or tracks[0]).time,
-            "written": len(tracks),
-            "frames": "restored" if moved else "as taken",
-            "detection": None if reported is None else detection_to_json(reported.detection),
-            "left_alone": [],
-            "outcome": None if verdict is None else verdict.overall,
-            "summary": None if verdict is None else verdict.sentence,
-            "predicted_gain": None if verdict is None else _number(float(verdict.predicted_gain.nanmean())),
-            "error": f"the motion of {unknown} frames is not known; they are as taken" if unknown else None,
-            "bad_frames": {str(track.index): track.fault for track in tracks if track.fault is not None},
-        }
-
-
-def _number(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 @unexpected_errors_in_one_line()
@@ -258,6 +138,8 @@ def process_video(
         "video": {"border": border, "steady": steady, "columns": columns, "window": window},
     }
     at_once = _frames_at_once(source, timing, full_scale, restoration, memory, workers, device)
+    waiting = math.ceil(0.5 * steady / timing.frame_period) * 2 * content.frame_bytes
+    check_fits(f"{source}: the frames of half of steady={steady:g} s", waiting, "choose a shorter time")
 
     def report(records: Iterable[Mapping[str, Any]], resumed: int, not_kept: Iterable[str]) -> StackReport:
         return StackReport(
@@ -329,9 +211,9 @@ def _cut_content(content: StackInfo, margins: Margins | None) -> StackInfo:
     return replace(content, shape=(*content.shape[:-2], *kept))
 
 
-def _check_found(contents: list[str], parts: int, journal: Journal) -> None:
-    """Raise a ``ValueError`` if the motion is known in no frame of the parts so far."""
-    if len(contents) >= min(_MAX_INITIAL_FAILURES, parts) and "restored" not in contents:
+def _check_known(known: list[bool], parts: int, journal: Journal) -> None:
+    """Raise a ``ValueError`` if the motion is known in none of the parts so far."""
+    if len(known) >= min(_MAX_INITIAL_FAILURES, parts) and not any(known):
         journal.clear()
         raise ValueError(
             "no vibration was found that the rows of the frames have in common; detect it in windows, which states the "
@@ -364,7 +246,7 @@ def _planned(
     device: str,
     *,
     masks: bool,
-) -> _Video:
+) -> VideoPasses:
     """The job of a run and the layout of its frames."""
     options = dict(restoration or {})
     for name in ("joint", "scale", "mosaic", "optics"):
@@ -387,7 +269,7 @@ def _planned(
     layout = FrameLayout(job.info.shape[1:], planes is not None, scale, white, np.dtype(job.info.dtype))
     restorer = VideoRestorer(layout, job.timing, method, options, job.device, masks)
     starts = job.timing.frame_starts(job.info.shape[0]).tolist()
-    return _Video(job, layout, restorer, [start - starts[0] for start in starts], steady, *tracking)
+    return VideoPasses(job, layout, restorer, [start - starts[0] for start in starts], steady, *tracking)
 
 
 def _content(job: StackJob, timing: SensorTiming) -> StackInfo:
@@ -417,7 +299,7 @@ def _frames_at_once(
 
 
 def _restore_parts(
-    video: _Video,
+    video: VideoPasses,
     sink: PartSink,
     journal: Journal,
     border: str,
@@ -432,7 +314,7 @@ def _restore_parts(
     pool = ThreadPoolExecutor(at_once, "rsvib-restore", initializer=torch.set_num_threads, initargs=(threads,))
     tracks: list[FrameTrack] = []  # of the part
     pair: list[tuple[FrameTrack, Frame]] = []  # the first two neighbouring frames of known motion
-    contents = [record["frames"] for record in journal.records()]
+    known = [record["detection"] is not None for record in journal.records()]
     before: Planes | None = None
     done = -1
     try:
@@ -441,7 +323,7 @@ def _restore_parts(
             closing(_in_order(video, followed_frames, pool, at_once, journal, progress)) as frames,
         ):
             for track, frame, restored in frames:
-                part = track.index // _PART_FRAMES
+                part = track.index // PART_FRAMES
                 if track.index != done + 1 or before is None:
                     ended = sink.last_frame(part - 1)
                     before = None if ended is None else video.layout.planes(ended)
@@ -455,8 +337,8 @@ def _restore_parts(
                     record = video.record(part, tracks, verdict)
                     with disk_errors_named(journal):
                         journal.add(record, sink.finish_part(part, video.layout.frame(before)))
-                    contents.append(record["frames"])
-                    _check_found(contents, video.parts, journal)
+                    known.append(any(track.known for track in tracks))
+                    _check_known(known, video.parts, journal)
                     tracks, pair = [], []
                 progress()
     finally:
@@ -465,7 +347,7 @@ def _restore_parts(
 
 
 def _in_order(
-    video: _Video,
+    video: VideoPasses,
     tracks: Iterator[tuple[FrameTrack, Frame | str]],
     pool: ThreadPoolExecutor,
     at_once: int,
@@ -480,7 +362,7 @@ def _in_order(
         return track, frame, future.result()
 
     for track, frame in tracks:
-        if track.index // _PART_FRAMES in journal:
+        if track.index // PART_FRAMES in journal:
             progress()
             continue
         waiting.append((track, frame, pool.submit(video.restorer.restored, frame, track)))

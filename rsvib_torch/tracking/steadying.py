@@ -57,33 +57,32 @@ def steadied(frames: Iterator[tuple[Placed, Item]], duration: float) -> Iterator
     if duration == 0:
         yield from frames
         return
-    around: deque[tuple[Placed, Item]] = deque()
-    position, half = 0, 0.5 * duration  # index in ``around`` of the next frame to yield
+    around: deque[Placed] = deque()  # frames whose place counts for those to yield
+    items: deque[Item] = deque()  # what belongs to the frames to yield
+    half = 0.5 * duration
 
-    def placed(index: int) -> tuple[Placed, Item]:
-        tracked, item = around[index]
+    def interval() -> float:
+        return (around[-1].time - around[0].time) / max(len(around) - 1, 1) or 1.0
+
+    def placed() -> tuple[Placed, Item]:
+        tracked = around[len(around) - len(items)]
         if not bool(torch.isfinite(tracked.path).all()):
-            return tracked, item
+            return tracked, items.popleft()
         # the same distance on both sides, so that a uniform motion is kept at the ends as well
-        reach = min(half, tracked.time - around[0][0].time, around[-1][0].time - tracked.time)
-        known = [one for one, _ in around if bool(torch.isfinite(one.path).all())]
+        reach = min(half, tracked.time - around[0].time, around[-1].time - tracked.time)
+        known = [one for one in around if bool(torch.isfinite(one.path).all())]
         distances = torch.tensor([abs(one.time - tracked.time) for one in known], dtype=torch.float64)
         # a frame stands for the time of one interval; half of it counts at the end of the time around the frame
         weights = ((reach - distances) / interval() + 0.5).clamp(0.0, 1.0).to(tracked.path.device)
         paths = torch.stack([one.path for one in known])
-        return tracked.moved_to((weights[:, None] * paths).sum(0) / weights.sum()), item
+        return tracked.moved_to((weights[:, None] * paths).sum(0) / weights.sum()), items.popleft()
 
-    def interval() -> float:
-        return (around[-1][0].time - around[0][0].time) / max(len(around) - 1, 1) or 1.0
-
-    for latest in frames:
+    for latest, item in frames:
         around.append(latest)
-        while position < len(around) - 1 and around[position][0].time + half + interval() <= latest[0].time + _ROUNDING:
-            yield placed(position)
-            position += 1
-            while around[0][0].time < around[position][0].time - half - 2.0 * interval():
-                around.popleft()
-                position -= 1
-    while position < len(around):
-        yield placed(position)
-        position += 1
+        items.append(item)
+        while len(items) > 1 and (around[len(around) - len(items)].time + half + interval() <= latest.time + _ROUNDING):
+            yield placed()
+        while around[0].time < around[len(around) - len(items)].time - half - 2.0 * interval():
+            around.popleft()
+    while items:
+        yield placed()

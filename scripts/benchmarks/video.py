@@ -47,7 +47,7 @@ PARTS: dict[str, list[tuple[str, str]]] = {
         ("rsvib_torch.stacks.video_frames", "frames_to_counts"),
         ("rsvib_torch.stacks.video_frames", "FrameLayout.frame"),
     ],
-    "verdict": [("rsvib_torch.stacks.process_video", "_Video.verdict")],
+    "verdict": [("rsvib_torch.stacks.process_video", "VideoPasses.verdict")],
     "joining parts, checksums": [
         ("rsvib_torch.stacks.process_video", "PartSink.finish"),
         ("rsvib_torch.stacks.process_video", "PartSink.finish_part"),

@@ -220,6 +220,15 @@ def test_wrong_arguments_are_refused_before_anything_is_written(clip, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_axis_without_vibration_is_left_as_taken(tmp_path):
+    source = write(tmp_path / "clip.mp4", counts_of(Motion((2.1, 0.0), (52.0, 71.0), (0.5, 1.0)), 20))
+    report = process_video(source, tmp_path / "still.mp4", TIMING, **OPTIONS)
+    assert gains(source, pixels(tmp_path / "still.mp4")).min() > 6
+    (record,) = read_manifest(report.manifest).windows
+    assert record.frames == "restored"
+    assert record.left_alone[0].startswith("y is not restored: its vibration is not reliable (")
+
+
 def test_a_video_without_a_common_motion_is_refused(tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (10, HEIGHT, WIDTH, 3), dtype=np.uint8)
     write(tmp_path / "noise.mp4", noise)
