@@ -1,6 +1,7 @@
 """Videos from file to file, followed from frame to frame: ``process_video``."""
 
 import math
+import tempfile
 import time
 import warnings
 from collections import deque
@@ -152,15 +153,14 @@ def process_video(
             not_kept=tuple(not_kept),
         )
 
-    journal = Journal(sink)
-    try:
+    with closing(Journal(sink)) as journal, tempfile.TemporaryFile() as tracks:
         if resume and not journal.has_lines and sink.exists() and target.exists():
             complete = read_manifest(target)
             _check_complete(sink, complete.header(), header)
             return report((one.model_dump() for one in complete.windows), video.parts, complete.not_kept)
         resumes = journal.open(header, resume=resume)
         shown = _Progress(progress, len(video.starts), 2 if border == "crop" else 1)
-        margins = video.margins(shown) if border == "crop" else None
+        margins = video.margins(tracks, shown) if border == "crop" else None
         content = _cut_content(content, margins)
         check_info_target(sink, content, check_folder=False)
         reader = open_stack(source)
@@ -169,7 +169,8 @@ def process_video(
             with disk_errors_named(journal):
                 journal.drop(parts.resume(journal.entries() if resumes else ()))
             resumed = journal.count
-            _restore_parts(video, parts, journal, border, margins, at_once, shown)
+            followed_frames = video.tracked(None if margins is None else tracks)
+            _restore_parts(video, followed_frames, parts, journal, border, margins, at_once, shown)
             not_kept = metadata_not_kept(job.info, sink, tuple(content.shape))
             header["settings"]["video"]["margins"] = None if margins is None else asdict(margins)
             _finish(parts, video.parts, journal, target, header, not_kept)
@@ -179,8 +180,6 @@ def process_video(
         summary = report(journal.records(), resumed, not_kept)
         journal.remove()
         return summary
-    finally:
-        journal.close()
 
 
 def _finish(
@@ -300,6 +299,7 @@ def _frames_at_once(
 
 def _restore_parts(
     video: VideoPasses,
+    followed_frames: Generator[tuple[FrameTrack, Frame | str], None, None],
     sink: PartSink,
     journal: Journal,
     border: str,
@@ -319,7 +319,7 @@ def _restore_parts(
     done = -1
     try:
         with (
-            closing(video.tracked()) as followed_frames,
+            closing(followed_frames),
             closing(_in_order(video, followed_frames, pool, at_once, journal, progress)) as frames,
         ):
             for track, frame, restored in frames:

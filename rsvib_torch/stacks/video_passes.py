@@ -1,9 +1,10 @@
 """Passes through a video: decoding, tracking and steadying of its frames, verdict and record of its parts."""
 
+import pickle
 from collections.abc import Callable, Generator
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -87,8 +88,14 @@ class VideoPasses:
         finally:
             reader.close()
 
-    def tracked(self) -> Generator[tuple[FrameTrack, Frame | str], None, None]:
-        """Every frame with its motion, at its place in the steady video; decoded and tracked ahead in threads."""
+    def tracked(self, found: BinaryIO | None = None) -> Generator[tuple[FrameTrack, Frame | str], None, None]:
+        """Every frame with its motion, at its place in the steady video; decoded and tracked ahead in threads.
+
+        Args:
+            found: The tracks that ``margins`` has written, if the motion was followed before.
+        """
+        if found is not None:
+            return prefetched(self._with_tracks(found), _AHEAD)
         tracker = VibrationTracker(
             replace(self.job.timing, frame_start_times=None),
             window=self.window,
@@ -104,11 +111,24 @@ class VideoPasses:
 
         return prefetched(steady_frames(), _AHEAD)
 
-    def margins(self, progress: Callable[[], None]) -> Margins:
-        """The widest margins of all frames, from a pass that only follows the motion."""
+    def _with_tracks(self, found: BinaryIO) -> Generator[tuple[FrameTrack, Frame | str], None, None]:
+        """Every frame with its track from a file."""
+        found.seek(0)
+        with closing(prefetched(self._decoded(), _AHEAD)) as decoded:
+            for _, _, _, frame in decoded:
+                yield pickle.load(found), frame  # written by this process to a file without a name
+
+    def margins(self, found: BinaryIO, progress: Callable[[], None]) -> Margins:
+        """The widest margins of all frames, from a pass that only follows the motion.
+
+        Args:
+            found: File to which the tracks are written.
+            progress: Called for every frame.
+        """
         widest = Margins()
         with closing(self.tracked()) as tracks:
             for track, _ in tracks:
+                pickle.dump(track, found)
                 if track.known and track.fault is None:
                     visible = next(iter(self.restorer.visible(track)))
                     widest = widest.widest(Margins.of(torch.from_numpy(visible)))
