@@ -103,14 +103,14 @@ def run_followed(
 
 
 def followed_figure(frames: Path, restored: Path, manifest: stacks.StackManifest) -> Figure:
-    """Draw a frame in the middle of a video beside the restored one."""
+    """Draw one of the first frames of a video beside the restored one."""
     from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
     from rsvib_torch.tracking import Margins  # noqa: PLC0415
 
     images = []
     for path in (frames, restored):
         reader = io.open_stack(path)
-        pixels = reader.frame(reader.info.shape[0] // 2)[None]
+        pixels = reader.frame(min(8, reader.info.shape[0] // 2))[None]  # earlier ones must be decoded as well
         scale = manifest.settings["full_scale"] if path == frames else reader.info.full_scale
         images.append(counts_to_frames(pixels, scale, str(path))[0].nan_to_num(0.0))
         reader.close()

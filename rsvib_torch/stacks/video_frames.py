@@ -121,11 +121,11 @@ class VideoRestorer:
         results = [self._plane(plane, number, *motions[number]) for number, plane in enumerate(planes)]
         return RestoredFrame(results, self.visible(track) if self.masks else None)
 
-    def visible(self, track: FrameTrack) -> list[NDArray[np.bool_]]:
+    def visible(self, track: FrameTrack, *, luma_only: bool = False) -> list[NDArray[np.bool_]]:
         """For each plane, the pixels of the restored frame that the sensor recorded."""
         height, width = self.layout.size
         parts = [(self.timing_of(0), track.removed, (height, width))]
-        if self.layout.planar:
+        if self.layout.planar and not luma_only:
             parts.append((self.timing_of(1), _halved(track.removed), (height // 2, width // 2)))
         return [visible_pixels(timing, motion, size, 1)[0][0].numpy() for timing, motion, size in parts]
 

@@ -130,7 +130,7 @@ class VideoPasses:
             for track, _ in tracks:
                 pickle.dump(track, found)
                 if track.known and track.fault is None:
-                    visible = next(iter(self.restorer.visible(track)))
+                    (visible,) = self.restorer.visible(track, luma_only=True)
                     widest = widest.widest(Margins.of(torch.from_numpy(visible)))
                 progress()
         return self.layout.margins(widest)

@@ -202,6 +202,18 @@ def test_columns_that_are_read_one_after_another(frames, tmp_path, ending):
     assert gains(source, pixels(sink), STILL.transpose(0, 2, 1)).min() > 6
 
 
+def test_rotation_and_missing_frames_are_kept(frames, tmp_path):
+    kept = [index for index in range(24) if index not in (9, 15)]  # dropped by the camera
+    path = tmp_path / "clip.mp4"
+    options = {"layout": "rgb24", "codec": "libx264", "encoded": "yuv420p", "options": {"crf": "6"}, "rate": 30}
+    write_video(path, frames[kept], TIMES[kept], rotation=-90, **options)
+    process_video(path, tmp_path / "still.mp4", TIMING, **OPTIONS)
+    before, after = read_stack_info(path), read_stack_info(tmp_path / "still.mp4")
+    assert before.orientation == after.orientation == 6
+    assert before.frame_times == after.frame_times
+    assert gains(path, pixels(tmp_path / "still.mp4")).min() > 6
+
+
 def test_wrong_arguments_are_refused_before_anything_is_written(clip, tmp_path):
     cases = [
         ({"border": "zoom"}, "border must be one of"),
