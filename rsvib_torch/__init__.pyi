@@ -87,7 +87,7 @@ from .restoration import (
     trusted_vibration,
     visible_pixels,
 )
-from .stacks import StackReport, iterate_stack, process_stack, read_manifest, restore_block
+from .stacks import StackReport, iterate_stack, process_stack, process_video, read_manifest, restore_block
 from .tracking import Margins, TrackedFrame, VibrationTracker, VideoBorder
 
 __all__ = [
@@ -145,6 +145,7 @@ __all__ = [
     "open_stack",
     "predict_noise_gain",
     "process_stack",
+    "process_video",
     "psf_figure",
     "psnr",
     "read_gyroscope",

@@ -1,9 +1,9 @@
 #!/usr/bin/env python
 """Speed and accuracy of the package and of other software, in one run on one machine.
 
-Sections (see benchmarks/sections.py): registration, cost, detection, restoration, pipeline, live, scaling, roofline,
-finer, mosaic, streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict, honesty, timing. Results are
-printed as Markdown tables and written to --out; with --store also to scripts/benchmarks/results, from which
+Sections (see benchmarks/sections.py): registration, cost, detection, restoration, pipeline, live, video, scaling,
+roofline, finer, mosaic, streaming, memory, dask, regularisation, difficulty, slanted_edge, verdict, honesty, timing.
+Results are printed as Markdown tables and written to --out; with --store also to scripts/benchmarks/results, from which
 scripts/benchmark_page.py generates docs/benchmarks.md.
 """
 
@@ -34,6 +34,7 @@ from benchmarks import (
     streaming_memory,
     timing_mistakes,
     verdict_roc,
+    video,
 )
 from benchmarks.sections import SECTIONS, machine_line
 from benchmarks.store import write_result
@@ -69,6 +70,7 @@ def main() -> None:
         restoration,
         pipeline,
         live,
+        video,
         scaling,
         detection,
         streaming,

@@ -55,7 +55,7 @@ FIRST_NAMES = (
     *("register_bands", "OffsetCurve"),
     *("calibrate_row_time", "calibrate_row_time_by_exposure", "RowTimeCalibration"),
     *("read_stack", "write_stack", "read_stack_info", "StackInfo", "open_stack"),
-    *("process_stack", "StackReport", "iterate_stack", "restore_block", "read_manifest"),
+    *("process_stack", "process_video", "StackReport", "iterate_stack", "restore_block", "read_manifest"),
     *("slanted_edge_mtf", "MtfCurve", "find_slanted_edges", "SlantedEdge", "psnr", "ssim"),
     *("read_vibration", "write_vibration", "write_offsets", "write_windows", "save_figure"),
     *("sampling_map", "write_stmap", "write_gcsv", "write_isd", "camera_isd"),

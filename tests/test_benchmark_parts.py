@@ -368,3 +368,20 @@ def test_live(tmp_path):
     assert "| vidstab | 30.0 | 10 | 2.000 | 0.300 |" in text
     rows, chosen = stored("live", [session, accuracy, change, speed], chosen, tmp_path)
     assert live.lines(rows, chosen) == text
+
+
+def test_video(tmp_path):
+    from benchmarks import video
+
+    chosen = options(video_rows=180, video_frames=12)
+    results = video.rows(chosen)
+    taken, exact, dewarp = results
+    for row in (exact, dewarp):
+        assert row["psnr"][0] > taken["psnr"][0] + 10  # dB, of luma
+        assert row["psnr"][1] > taken["psnr"][1] + 3  # of chroma
+        assert sum(row["parts"].values()) == pytest.approx(1.0)
+        assert min(row["parts"].values()) > 0
+    assert exact["parts"]["restoration"] > dewarp["parts"]["restoration"] > 0.03
+    text = video.lines(results, chosen)
+    assert any(line.startswith(f"| exact | {exact['cpu']:.3f} | 0.6") for line in text)
+    assert video.lines(*stored("video", results, chosen, tmp_path)) == text

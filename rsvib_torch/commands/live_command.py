@@ -16,12 +16,18 @@ import typer
 
 from rsvib_torch import io, live, tracking
 from rsvib_torch.commands.answers import detection_data
-from rsvib_torch.commands.options import OverwriteOption, ScaleOption, camera_options, check_new
+from rsvib_torch.commands.options import (
+    OverwriteOption,
+    ScaleOption,
+    camera_options,
+    check_new,
+    file_of_source,
+)
 from rsvib_torch.commands.terminal import Answer, error_line
 from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.option_types import METHOD_SETTINGS, method_options
+from rsvib_torch.core.option_types import METHOD_SETTINGS, BorderName, method_options
 from rsvib_torch.core.text import number_of
 
 if TYPE_CHECKING:
@@ -31,7 +37,6 @@ if TYPE_CHECKING:
 __all__ = ["live_session"]
 
 PixelFormatName = Literal["gray8", "gray16le", "rgb24", "bgr24"]
-BorderName = Literal["mirror", "hold", "crop"]
 
 
 @camera_options
@@ -94,8 +99,7 @@ def live_session(
     The source is never blocked: if frames come faster than they are processed, the oldest waiting ones are dropped and
     counted. Ctrl-C ends the session, and the video is complete.
     """
-    is_camera = source.isdecimal() or re.match(r"[a-z]+://", source) is not None
-    is_file = not is_camera and source != "-"
+    is_camera, is_file = source.isdecimal() or "://" in source, file_of_source(source) is not None
     _check_options(source, out, size, realtime, border, is_file=is_file)
     check_number("steady", steady, at_least=0.0)
     pipe_out = out is not None and str(out) == "-"
@@ -181,11 +185,9 @@ def _check_options(
         raise ValueError(f"--realtime goes with a file, not with {source}: a camera has its own rate")
     if border == "crop" and (not is_file or realtime):
         raise ValueError(
-            f"--border crop goes with a file without --realtime: the margins of {source} are known at the end only; "
-            "use --border hold"
+            "--border crop reads a file twice, to know the margins of all frames; it cannot be used with "
+            f"{'--realtime' if realtime else source}: use --border hold"
         )
-    if is_file and not Path(source).exists():
-        raise FileNotFoundError(f"{source}: no such file; a camera is a number or a URL")
 
 
 def _outputs(

@@ -52,6 +52,7 @@ __all__ = [
     "WorkersOption",
     "camera_options",
     "check_new",
+    "file_of_source",
     "full_scale_of",
     "rate",
     "restoration_options",
@@ -282,7 +283,8 @@ def camera_options(command: Callable[..., Answer]) -> Callable[..., Answer]:
 
     @functools.wraps(command)
     def with_camera(**options: Any) -> Answer:
-        settings = _read_camera(**{name: options.pop(name) for name in camera}, frames=options.get("frames"))
+        frames = file_of_source(options["source"]) if "source" in options else options.get("frames")
+        settings = _read_camera(**{name: options.pop(name) for name in camera}, frames=frames)
         if options.get("full_scale") is not None and scaled:
             scale = ("--full-scale", f"{options['full_scale']:.10g}")
             settings = replace(settings, arguments=(*settings.arguments, *scale))
@@ -294,6 +296,19 @@ def camera_options(command: Callable[..., Answer]) -> Callable[..., Answer]:
     with_camera.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     with_camera.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return with_camera
+
+
+def file_of_source(source: str) -> Path | None:
+    """The file that a source of live frames names; None for the number or URL of a camera, and for standard input.
+
+    Raises:
+        FileNotFoundError: If it does not exist.
+    """
+    if source == "-" or source.isdecimal() or "://" in source:
+        return None
+    if not Path(source).exists():
+        raise FileNotFoundError(f"{source}: no such file; a camera is a number or a URL")
+    return Path(source)
 
 
 @dataclass(frozen=True)
@@ -385,12 +400,8 @@ def restoration_options(
     """
     options = dict(config.restoration)
     if overrides.method is not None and overrides.method != options.get("method", "exact"):
-        shared = (
-            "saturation",
-            "mosaic",
-            "optics",
-            *method_options(overrides.method),
-        )  # other options belong to the configured method
+        # other options belong to the configured method
+        shared = ("saturation", "mosaic", "optics", *method_options(overrides.method))
         options = {name: value for name, value in options.items() if name in shared}
     for name in ("method", "prior", "saturation", "scale", "mosaic"):
         if getattr(overrides, name) is not None:

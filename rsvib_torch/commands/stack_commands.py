@@ -47,9 +47,11 @@ from rsvib_torch.commands.options import (
     torch_device,
 )
 from rsvib_torch.commands.terminal import Answer, counting, error_line, note, running_command, working
+from rsvib_torch.commands.video_command import check_followed, followed_figure, is_followed, run_followed
 from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable, whole_folder
-from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
+from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames, BorderName
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import number_of, printable, write_json
 from rsvib_torch.core.validation import validate
@@ -64,7 +66,7 @@ if TYPE_CHECKING:
     from rsvib_torch.motion.timing import SensorTiming
     from rsvib_torch.report import Box
     from rsvib_torch.restoration.verdict.trust import Detected
-    from rsvib_torch.stacks import RestoredFrames, WindowResult
+    from rsvib_torch.stacks import RestoredFrames, StackReport, WindowResult
     from rsvib_torch.stacks.job import RestoreOptions
 
 __all__ = ["Stack", "detect", "load", "report", "restore_and_save", "restore_frames", "run", "simulate"]
@@ -451,6 +453,11 @@ def _restore_windows(
         timing = replace(timing, frame_start_times=stored.frame_start_times)
     check_same_timing(str(vibration), stored, timing)
     window = manifest.settings.get("window")
+    if "video" in manifest.settings:
+        raise ValueError(
+            f"{vibration}: it describes a video that was followed frame by frame, and its parts are not windows; "
+            "detect the windows (rsvib detect --window 8), or repeat rsvib run --video"
+        )
     if not isinstance(window, int):
         raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")
     info = io.read_stack_info(frames)
@@ -497,9 +504,25 @@ def run(
         typer.Option(
             "--video",
             help="Write a video: restored.mp4 (H.264) from .mp4, restored.mov from .mov, else restored.mkv (FFV1, "
-            "without loss).",
+            "without loss). Videos are followed frame by frame instead of in windows.",
         ),
     ] = False,
+    border: Annotated[
+        BorderName | None,
+        typer.Option(
+            help="With --video, pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame "
+            "before; crop, cut off by constant margins (the video is read twice).",
+            show_default="mirror",
+        ),
+    ] = None,
+    steady: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="With --video, stabilise the image to the moving average of its path over this time.",
+            show_default="the image stays where it is",
+        ),
+    ] = None,
     compression: Annotated[str | None, typer.Option(help="Compression of a TIFF stack: zlib or lzma.")] = None,
     method: MethodOption = None,
     joint: JointOption = None,
@@ -541,7 +564,13 @@ def run(
 
     Stacks of any length are processed in windows. If the restored frames are judged no better than the input, the
     input is written unchanged, unless --force is given. Ctrl-C stops after the current windows; --resume continues.
+    With --video, the vibration of a video is followed frame by frame: --steady 1 --border crop makes a shaky video
+    steady.
     """
+    if not video and (border is not None or steady is not None):
+        raise ValueError(f"{'--border' if border is not None else '--steady'} goes with --video")
+    if steady is not None:
+        check_number("steady", steady, at_least=0.0)
     output = _video_name(frames, output) if video else output
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
@@ -553,8 +582,33 @@ def run(
     options = restoration_options(
         info, scale, settings, Overrides(method, joint, prior, saturation, finer, mosaic, optics_sigma)
     )
+    frames_at_once = settings.stack.get("window", DEFAULT_WINDOW) if window is None else window
+    requested = border is not None or steady is not None
+    if video and is_followed(frames, info.shape[0], frames_at_once, requested=requested):
+        windows_only = {"--window": window, "--bad-frames skip": bad_frames == "skip"}
+        check_followed(windows_only | {"--scheduler": scheduler, "--compression": compression}, options)
+        if saturation is None and settings.restoration.get("saturation") is None:
+            options.pop("saturation", None)  # that of integer formats
+        answer = run_followed(
+            frames,
+            out,
+            output,
+            settings,
+            options,
+            lambda: _draw_windows(out),
+            lambda stored: _draw(out / "before_after.png", lambda: followed_figure(frames, out / output, stored)),
+            border=border or "mirror",
+            steady=steady or 0.0,
+            full_scale=scale,
+            resume=resume,
+            memory=memory,
+            workers=workers,
+            device=str(torch_device(device)),
+        )
+        _remove_old(out, results if overwrite else (), [path.name for path in answer.files])
+        return answer
     common: RestoreOptions = {
-        "window": settings.stack.get("window", DEFAULT_WINDOW) if window is None else window,
+        "window": frames_at_once,
         "detection": settings.detection,
         "restoration": options,
         "full_scale": scale,
@@ -599,6 +653,20 @@ def run(
             names += _write_windows(folder, out / "manifest.json")
     if overwrite:
         _remove_old(out, results, names)
+    return _answer_of_windows(frames, info.shape[0], out, output, settings, result, first, names)
+
+
+def _answer_of_windows(
+    frames: Path,
+    count: int,
+    out: Path,
+    output: str,
+    settings: Config,
+    result: StackReport,
+    first: WindowResult,
+    names: list[str],
+) -> Answer:
+    """What a run on a stack of ``count`` frames found and did, with its warnings."""
     if result.bad_frames:
         error_line(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json", "warning")
     _note_lost(out / output, result.not_kept)
@@ -613,7 +681,7 @@ def run(
         return Answer(
             {
                 f"Vibration in {frames.name}": [first.detection.summary()],
-                "Restoration": restoration_lines(first.restoration, info.shape[0]),
+                "Restoration": restoration_lines(first.restoration, count),
             },
             {"detection": detection_data(first.detection), "restoration": restoration_data(first.restoration)},
             files,
@@ -628,6 +696,12 @@ def run(
         files,
         steps,
     )
+
+
+def _draw_windows(out: Path) -> list[str]:
+    """Write summary, table and figure of the windows of a manifest in the same folder."""
+    with whole_folder(out) as folder:
+        return _write_windows(folder, out / "manifest.json")
 
 
 def _video_name(frames: Path, output: str) -> str:

@@ -101,8 +101,7 @@ def check_whole_number(name: str, value: object, *, at_least: int, at_most: int 
     """
     if isinstance(value, bool) or not isinstance(value, int):
         raise TypeError(f"{name} must be a whole number, got {described(value)}")
-    if value < at_least:
-        raise ValueError(f"{name} must be at least {at_least}, got {described(value)}")
-    if value > at_most:
-        raise ValueError(f"{name} must be at most {at_most}, got {described(value)}")
+    if not at_least <= value <= at_most:
+        bound = f"at least {at_least}" if value < at_least else f"at most {at_most}"
+        raise ValueError(f"{name} must be {bound}, got {described(value).removesuffix(' (int)')}")
     return value

@@ -15,6 +15,7 @@ __all__ = [
     "BadFrames",
     "BandSettings",
     "BandedSettings",
+    "BorderName",
     "DetectionMethod",
     "DetectionSettings",
     "DewarpSettings",
@@ -35,6 +36,7 @@ __all__ = [
 
 DEFAULT_WINDOW = 8  # frames
 
+BorderName = Literal["mirror", "hold", "crop"]
 BadFrames = Literal["pass", "skip"]
 DetectionMethod = Literal["direct", "bands"]
 ExportFormat = Literal["gcsv", "stmap", "isd", "csv"]

@@ -99,8 +99,11 @@ def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str, 
         return torch.from_numpy(np.ascontiguousarray(counts, dtype=np.float32))
     full_scale = full_scale_of_counts(counts, full_scale, name)
     narrow = counts.dtype.itemsize <= 2  # float32 holds 16-bit counts exactly
-    signed = counts.astype(np.int32 if narrow else np.int64)  # torch does not compute with all unsigned types
-    floats = torch.from_numpy(signed).to(torch.float32 if narrow else torch.float64)
+    # torch does not compute with all unsigned types
+    signed = counts if counts.dtype == np.uint8 else counts.astype(np.int32 if narrow else np.int64)
+    floats = torch.from_numpy(np.require(signed, requirements=["C", "W"])).to(
+        torch.float32 if narrow else torch.float64
+    )
     return floats.div_(full_scale).to(torch.float32)
 
 
@@ -128,7 +131,8 @@ def frames_to_counts(
     if dtype.kind == "f":
         return pixels.to(torch.float64 if dtype.itemsize == 8 else torch.float32).numpy().astype(dtype, copy=False)
     full_scale = required_full_scale(full_scale, dtype, "frames")
-    if not bool(torch.isfinite(pixels).all()):
+    # one pass; NaN and infinity are among the ends
+    if pixels.numel() and not bool(torch.isfinite(torch.stack(pixels.aminmax())).all()):
         raise ValueError(f"frames contain NaN or infinite pixels, which {dtype} cannot represent; write floats")
     narrow = dtype.itemsize <= 2 and pixels.dtype != torch.float64
     counts = pixels.to(torch.float32 if narrow else torch.float64) * full_scale

@@ -7,10 +7,11 @@ applied; the videos that are written state it.
 import math
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from io import BytesIO
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,26 @@ from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.io.formats import StackFormat, needed_package
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 
-__all__ = ["FFV1_FORMAT", "H264_FORMAT", "READ_ONLY_FORMAT"]
+__all__ = [
+    "CONTAINERS",
+    "FFV1_FORMAT",
+    "H264",
+    "H264_FORMAT",
+    "READ_ONLY_FORMAT",
+    "Picture",
+    "VideoReader",
+    "add_sound",
+    "add_video",
+    "open_container",
+    "open_source",
+    "packets",
+    "picture_of",
+    "presentation_times",
+    "scanned",
+]
 
-_LOSSLESS, _H264 = (".mkv", ".avi"), (".mp4", ".mov", ".m4v")
-_CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}
+_LOSSLESS, H264 = (".mkv", ".avi"), (".mp4", ".mov", ".m4v")
+CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}
 _READ_ONLY = (".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
 _H264_OPTIONS = {"crf": "12"}  # constant rate factor, 0 (no loss) to 51; differences of less than 18 are hardly visible
 _FFV1_OPTIONS = {"level": "3", "g": "1"}  # each frame can be decoded alone: damage does not affect other frames
@@ -51,7 +68,7 @@ def _av() -> Any:
     return needed_package("av", "reading and writing video", "video")
 
 
-def _open_container(path: Path) -> Any:
+def open_container(path: Path) -> Any:
     """Open a video for decoding; formats that refer to other files (playlists) are refused."""
     formats = "matroska,webm,avi,mov,mp4,mpegts,mpeg,mpegvideo,asf"
     av = _av()
@@ -107,24 +124,59 @@ def _frames(container: Any) -> Generator[Any, None, None]:
             continue
 
 
-@lru_cache(maxsize=8)
-def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fraction, ...]]:
-    """Decode a video once: what it states, and the presentation times in s of the frames that can be decoded.
+@dataclass(frozen=True)
+class Picture:
+    """How the pixels of a video are stored.
 
-    Containers state the number of frames only roughly. ``size`` and ``changed`` (ns) identify the state of the file.
+    Attributes:
+        layout: Name of the pixel format in FFmpeg.
+        colorspace: Matrix of luma and chroma, code of FFmpeg.
+        color_range: Range of the counts, code of FFmpeg: 2 is full, others are limited.
     """
-    with _open_container(path) as container:
+
+    layout: str
+    colorspace: int
+    color_range: int
+
+
+def _time_of(frame: Any, stream: Any) -> Fraction | None:
+    """Presentation time of a decoded frame or of a packet in s; None if it is not known."""
+    return None if frame.pts is None else Fraction(frame.pts) * stream.time_base
+
+
+def _listed_times(container: Any, stream: Any) -> list[Fraction | None] | None:
+    """Presentation times in s of all frames that an MP4 file lists; None if frames must be decoded to find them."""
+    if "mp4" not in container.format.name:
+        return None
+    listed = [packet for packet in container.demux(stream) if packet.size]
+    if any(packet.is_corrupt or packet.is_discard for packet in listed):
+        return None
+    times = sorted({time for packet in listed if (time := _time_of(packet, stream)) is not None})
+    return [*times] if len(times) == len(listed) == stream.frames else None
+
+
+@lru_cache(maxsize=8)
+def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fraction, ...], Picture]:
+    """What a video states, and the presentation times in s of its frames.
+
+    MP4 files list all frames. Other containers state their number only roughly and are decoded once. ``size`` and
+    ``changed`` (ns) identify the state of the file.
+    """
+    with open_container(path) as container:
         stream = container.streams.best("video")
         if stream is None:
             raise ValueError("it contains no video stream")
         size = stream.width * stream.height
         check_fits(f"{path}: frames of {stream.height} x {stream.width} px", _FRAMES * 6 * size, "free more memory")
-        times, first = [], None
-        for frame in _frames(container):
-            first = first or frame
-            times.append(Fraction(frame.pts or 0) * stream.time_base if frame.pts is not None else None)
-        if first is None:
-            raise ValueError("no frame can be decoded")
+        times = _listed_times(container, stream)
+        with open_container(path) as again:
+            frames = _frames(again)
+            first = next(frames, None)
+            if first is None:
+                raise ValueError("no frame can be decoded")
+            if times is None:
+                times = [_time_of(frame, stream) for frame in chain([first], frames)]
+            frames.close()
         known = [time for time in times if time is not None]
         rising = len(known) == len(times) > 1 and all(a < b for a, b in pairwise(known))
         pixels, rate = _pixels(first), stream.average_rate
@@ -143,10 +195,12 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
             time_error=float(stream.time_base),
             time_source="time stamps",
         )
-        return info, tuple(known) if rising else ()
+        picture = Picture(first.format.name, int(first.colorspace), int(first.color_range))
+        return info, tuple(known) if rising else (), picture
 
 
-def _scanned(path: Path) -> tuple[StackInfo, tuple[Fraction, ...]]:
+def scanned(path: Path) -> tuple[StackInfo, tuple[Fraction, ...], Picture]:
+    """What a video states, the presentation times in s of its frames (empty if unknown), and how it stores pixels."""
     av, state = _av(), path.stat()
     with readable_stack(path, "video"):
         try:
@@ -155,36 +209,54 @@ def _scanned(path: Path) -> tuple[StackInfo, tuple[Fraction, ...]]:
             raise ValueError(error.strerror) from error
 
 
-class _VideoReader:
+class VideoReader:
     """Frames of a video, decoded in sequence; reading an earlier frame starts again at the beginning."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.info = _scanned(path)[0]
+        self.info, self._times, _ = scanned(path)
         self._container: Any = None
+        self._early: Any = None  # a decoded frame, if those before it cannot be decoded
         self._restart()
 
     def _restart(self) -> None:
         self.close()
-        self._container, self._next = _open_container(self._path), 0
-        self._decoding = _frames(self._container)
+        self._container, self._next = open_container(self._path), 0
+        self._decoding, self._early = _frames(self._container), None
 
     def frame(self, index: int) -> NDArray[Any]:
         """Pixels of a frame as stored."""
+        return _pixels(self.decoded(index))
+
+    def decoded(self, index: int) -> Any:
+        """A frame of FFmpeg."""
         if index < self._next:
             self._restart()
         frame = None
         while self._next <= index:
-            frame = next(self._decoding, None)
+            frame = self._decode(self._times[self._next] if self._times else None)
             self._next += 1
         if frame is None:
             raise FrameError(f"{self._path}: frame {index} cannot be decoded")
         if frame.is_corrupt:
             raise FrameError(f"{self._path}: frame {index} is damaged")
-        pixels = _pixels(frame)
-        if pixels.shape != self.info.shape[1:]:
-            raise FrameError(f"{self._path}: frames of different size: frame {index} is {pixels.shape[-2:]}")
-        return pixels
+        if (frame.height, frame.width) != self.info.shape[-2:]:
+            raise FrameError(f"{self._path}: frames of different size: frame {index} is {frame.height, frame.width}")
+        return frame
+
+    def _decode(self, expected: Fraction | None) -> Any:
+        """The frame of an expected presentation time in s; None if it cannot be decoded."""
+        while True:
+            frame = next(self._decoding, None) if self._early is None else self._early
+            self._early = None
+            if frame is None or frame.pts is None or expected is None:
+                return frame
+            time = Fraction(frame.pts) * frame.time_base
+            if time > expected:
+                self._early = frame
+                return None
+            if time == expected:
+                return frame
 
     def close(self) -> None:
         """Close the file."""
@@ -196,18 +268,18 @@ class _VideoReader:
 
 def _source(info: StackInfo) -> Path | None:
     """The video from which the frames to write were computed, one for each of its frames."""
-    endings = (*_LOSSLESS, *_H264, *_READ_ONLY)
+    endings = (*_LOSSLESS, *H264, *_READ_ONLY)
     return info.path if info.path is not None and info.path.suffix.lower() in endings else None
 
 
-def _presentation_times(path: Path, info: StackInfo) -> tuple[Fraction, list[int], Fraction | None]:
+def presentation_times(path: Path, info: StackInfo) -> tuple[Fraction, list[int], Fraction | None]:
     """Time unit in s of the video to write, presentation time of each frame in this unit, and their time origin in s.
 
     Times are those of the source if it is a video, else the frame times of the stack, else equal intervals. The time
     origin is None if it is that of the source.
     """
     source = _source(info)
-    times: Sequence[Fraction] = _scanned(source)[1] if source is not None else ()
+    times: Sequence[Fraction] = scanned(source)[1] if source is not None else ()
     if not times and info.frame_times is not None:
         fine = 90000  # Hz; usual unit of .mp4
         times = [Fraction(round(fine * (time - info.frame_times[0])), fine) for time in info.frame_times]
@@ -230,7 +302,7 @@ def _presentation_times(path: Path, info: StackInfo) -> tuple[Fraction, list[int
 
 def _encoded_as(path: Path, info: StackInfo) -> tuple[str, str, float]:
     """Pixel formats of the array of a frame and of the encoder, and their full scale."""
-    grey, lossy = info.axes == "THW" or info.shape[1] == 1, path.suffix.lower() in _H264
+    grey, lossy = info.axes == "THW" or info.shape[1] == 1, path.suffix.lower() in H264
     bits = next(bits for bits in (8, 10, 12, 14, 16) if lossy or 2**bits - 1 >= (info.full_scale or 0.0))
     if bits > 8:
         layout = f"gray{bits}le" if grey else f"gbrp{bits}le"
@@ -239,17 +311,24 @@ def _encoded_as(path: Path, info: StackInfo) -> tuple[str, str, float]:
     return layout, "yuv420p" if lossy else "gray" if grey else "bgr0", 255.0
 
 
-def _add_streams(output: Any, path: Path, info: StackInfo, source: Any) -> tuple[Any, dict[Any, Any]]:
-    """Add a video stream to an open container; also the audio of ``source``, a container or None, without encoding it.
+def add_video(output: Any, path: Path, info: StackInfo, source: Any, **options: str) -> Any:
+    """Add a video stream to an open container, with the metadata of ``source``, a container or None.
+
+    Args:
+        output: The container.
+        path: Name of the video, whose ending selects the codec.
+        info: Its content.
+        source: The video from which it was computed.
+        **options: Options of the encoder in addition.
 
     Returns:
-        The video stream, and the audio stream of the output for each of ``source``.
+        The stream.
     """
-    lossy = path.suffix.lower() in _H264
-    unit, ticks, _ = _presentation_times(path, info)
+    lossy = path.suffix.lower() in H264
+    unit, ticks, _ = presentation_times(path, info)
     rate = 1 / (unit * int(np.median(np.diff(ticks)))) if len(ticks) > 1 else Fraction(_DEFAULT_RATE)
-    codec, options = ("libx264", _H264_OPTIONS) if lossy else ("ffv1", _FFV1_OPTIONS)
-    video = output.add_stream(codec, rate=rate, options=options)
+    codec, usual = ("libx264", _H264_OPTIONS) if lossy else ("ffv1", _FFV1_OPTIONS)
+    video = output.add_stream(codec, rate=rate, options=usual | options)
     video.height, video.width = info.shape[-2:]
     video.pix_fmt = _encoded_as(path, info)[1]
     video.codec_context.time_base = video.time_base = unit
@@ -260,25 +339,36 @@ def _add_streams(output: Any, path: Path, info: StackInfo, source: Any) -> tuple
     if lossy:
         video.codec_context.colorspace, video.codec_context.color_range = _BT709, _LIMITED_RANGE
     if source is None:
-        return video, {}
+        return video
     output.metadata.update(source.metadata)
     taken, encoder = source.streams.best("video").codec_context, video.codec_context
     encoder.color_primaries, encoder.color_trc = taken.color_primaries, taken.color_trc
     if taken.sample_aspect_ratio:
         encoder.sample_aspect_ratio = taken.sample_aspect_ratio
-    return video, {stream: output.add_stream_from_template(stream) for stream in source.streams.audio}
+    return video
 
 
-def _open_source(info: StackInfo, opened: ExitStack) -> Any:
+def add_sound(output: Any, source: Any) -> dict[Any, Any]:
+    """Add streams for the sound of ``source``, a container or None, without encoding it.
+
+    Returns:
+        The stream of the output for each of the source.
+    """
+    streams = source.streams.audio if source is not None else ()
+    return {stream: output.add_stream_from_template(stream) for stream in streams}
+
+
+def open_source(info: StackInfo, opened: ExitStack) -> Any:
+    """The open video from which the frames to write were computed, closed with ``opened``; None if there is none."""
     path = _source(info)
-    return None if path is None else opened.enter_context(_open_container(path))
+    return None if path is None else opened.enter_context(open_container(path))
 
 
 def _check(path: Path, info: StackInfo) -> None:
     av, ending = _av(), path.suffix.lower()
     if info.axes == "TCHW" and info.shape[1] not in (1, 3):
         raise ValueError(f"{path}: videos hold 1 or 3 channels, got {info.shape[1]}; write .tif")
-    if ending in _H264 and (info.shape[-2] % 2 or info.shape[-1] % 2):
+    if ending in H264 and (info.shape[-2] % 2 or info.shape[-1] % 2):
         raise ValueError(f"{path}: H.264 needs an even height and width, got {info.shape[-2:]}; write .mkv")
     held = {".avi": (1,), ".mkv": (1, 3, 6, 8)}.get(ending, tuple(_MATRICES))
     if info.orientation not in held:
@@ -286,39 +376,46 @@ def _check(path: Path, info: StackInfo) -> None:
         raise ValueError(
             f"{path}: {ending} cannot hold the orientation {info.orientation} of the input; write {better}"
         )
-    _presentation_times(path, info)
+    presentation_times(path, info)
     with ExitStack() as opened:
-        source = _open_source(info, opened)
-        output = opened.enter_context(av.open(BytesIO(), "w", format=_CONTAINERS[ending]))
+        source = open_source(info, opened)
+        output = opened.enter_context(av.open(BytesIO(), "w", format=CONTAINERS[ending]))
         for stream in source.streams.audio if source is not None else ():
             name = stream.codec_context.name
             if name not in output.supported_codecs:
                 raise ValueError(f"{path}: {ending} cannot hold the audio ({name}) of {info.path}; write .mkv")
 
 
+def picture_of(pixels: NDArray[Any], path: Path, info: StackInfo) -> Any:
+    """A frame of FFmpeg for the encoder of a video, from its pixels (H, W) or (C, H, W)."""
+    layout, encoded, full_scale = _encoded_as(path, info)
+    counts = np.moveaxis(pixels, 0, -1) if pixels.shape[:-2] == (3,) else pixels.reshape(pixels.shape[-2:])
+    if full_scale != info.full_scale:
+        relative = counts / (info.full_scale or 1.0)  # the full scale of floats is 1
+        counts = np.rint(full_scale * np.clip(np.nan_to_num(relative), 0.0, 1.0))
+    counts = np.ascontiguousarray(counts, dtype=np.uint8 if full_scale <= 255 else np.uint16)
+    frame = _av().VideoFrame.from_ndarray(counts, format=layout)
+    if encoded != layout:
+        frame = frame.reformat(format=encoded, dst_colorspace="ITU709", interpolation=_conversion())
+    return frame
+
+
 def _write(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
-    av, (layout, encoded, full_scale) = _av(), _encoded_as(path, info)
-    unit, ticks, start = _presentation_times(path, info)
+    av = _av()
+    unit, ticks, start = presentation_times(path, info)
     with ExitStack() as opened:
-        source = _open_source(info, opened)
+        source = open_source(info, opened)
         output = opened.enter_context(
-            av.open(str(path), "w", format=_CONTAINERS[path.suffix.lower()], options={"fflags": "+bitexact"})
+            av.open(str(path), "w", format=CONTAINERS[path.suffix.lower()], options={"fflags": "+bitexact"})
         )
-        video, audio = _add_streams(output, path, info, source)
-        sound = _packets(source, audio, start)
+        video = add_video(output, path, info, source)
+        sound = packets(source, add_sound(output, source), start)
         packet = next(sound, None)
         for tick, pixels in zip(ticks, frames, strict=True):
             while packet is not None and packet.pts * packet.time_base <= tick * unit:  # players read both together
                 output.mux(packet)
                 packet = next(sound, None)
-            counts = np.moveaxis(pixels, 0, -1) if pixels.shape[:-2] == (3,) else pixels.reshape(pixels.shape[-2:])
-            if full_scale != info.full_scale:
-                relative = counts / (info.full_scale or 1.0)  # the full scale of floats is 1
-                counts = np.rint(full_scale * np.clip(np.nan_to_num(relative), 0.0, 1.0))
-            counts = np.ascontiguousarray(counts, dtype=np.uint8 if full_scale <= 255 else np.uint16)
-            frame = av.VideoFrame.from_ndarray(counts, format=layout)
-            if encoded != layout:
-                frame = frame.reformat(format=encoded, dst_colorspace="ITU709", interpolation=_conversion())
+            frame = picture_of(pixels, path, info)
             frame.pts, frame.time_base = tick, unit
             output.mux(video.encode(frame))
         output.mux(video.encode())
@@ -327,7 +424,7 @@ def _write(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compress
             packet = next(sound, None)
 
 
-def _packets(source: Any, streams: dict[Any, Any], start: Fraction | None) -> Iterator[Any]:
+def packets(source: Any, streams: dict[Any, Any], start: Fraction | None) -> Iterator[Any]:
     """Packets of the streams of ``source``, for the streams of the output that belong to them.
 
     Packets before the time origin ``start`` (s) of the output are omitted; None if it is that of the source.
@@ -346,7 +443,7 @@ def _packets(source: Any, streams: dict[Any, Any], start: Fraction | None) -> It
 
 _KEEPS = ("full_scale", "frame_times", "orientation")
 FFV1_FORMAT = StackFormat(
-    "FFV1 video", _LOSSLESS, _VideoReader, write_all=_write, dtypes=("uint8", "uint16"), check=_check, keeps=_KEEPS
+    "FFV1 video", _LOSSLESS, VideoReader, write_all=_write, dtypes=("uint8", "uint16"), check=_check, keeps=_KEEPS
 )
-H264_FORMAT = StackFormat("H.264 video", _H264, _VideoReader, write_all=_write, check=_check, keeps=_KEEPS)
-READ_ONLY_FORMAT = StackFormat("webm, mpeg, 3gp and wmv", _READ_ONLY, _VideoReader)
+H264_FORMAT = StackFormat("H.264 video", H264, VideoReader, write_all=_write, check=_check, keeps=_KEEPS)
+READ_ONLY_FORMAT = StackFormat("webm, mpeg, 3gp and wmv", _READ_ONLY, VideoReader)

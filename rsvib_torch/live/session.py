@@ -4,7 +4,6 @@ import math
 import queue
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -18,11 +17,11 @@ from rsvib_torch.live.frame_outputs import FrameOutput
 from rsvib_torch.live.sources import FrameReader, FrameSource
 from rsvib_torch.live.spectrogram import Spectrogram
 from rsvib_torch.tracking import TrackedFrame, VibrationTracker, VideoBorder
+from rsvib_torch.tracking.steadying import steadied
 
-__all__ = ["LiveReport", "run_live", "steadied", "to_counts"]
+__all__ = ["LiveReport", "run_live", "to_counts"]
 
 _WAITING_RESTORED = 2  # frames between tracking and writing: the largest delay of the output in frames
-_ROUNDING = 1e-6  # s, of frame times
 _LATENCY_COUNTS = 64  # frames; longer delays are counted as this
 
 
@@ -134,45 +133,6 @@ def _tracked(
         report.unusable += tracked.state == "unusable"
         report.detections += tracked.detected
         yield tracked, frame.arrived
-
-
-def steadied(frames: Iterator[tuple[TrackedFrame, float]], duration: float) -> Iterator[tuple[TrackedFrame, float]]:
-    """Frames moved to the mean of the path over ``duration`` s around them; frames without path stay."""
-    if duration == 0:
-        yield from frames
-        return
-    around: deque[tuple[TrackedFrame, float]] = deque()
-    position, half = 0, 0.5 * duration  # index in ``around`` of the next frame to yield
-
-    def placed(index: int) -> tuple[TrackedFrame, float]:
-        tracked, arrived = around[index]
-        if not bool(torch.isfinite(tracked.path).all()):
-            return tracked, arrived
-        # the same distance on both sides, so that a uniform motion is kept at the ends as well
-        reach = min(half, tracked.time - around[0][0].time, around[-1][0].time - tracked.time)
-        near = [
-            (
-                one.path,
-                0.5 if abs(abs(one.time - tracked.time) - reach) < _ROUNDING and reach > 0 else 1.0,
-            )  # trapezoidal rule
-            for one, _ in around
-            if abs(one.time - tracked.time) <= reach + _ROUNDING and bool(torch.isfinite(one.path).all())
-        ]
-        paths, weights = zip(*near, strict=True)
-        weight = torch.tensor(weights, dtype=torch.float64, device=tracked.path.device)
-        return tracked.moved_to((weight[:, None] * torch.stack(paths)).sum(0) / weight.sum()), arrived
-
-    for item in frames:
-        around.append(item)
-        while position < len(around) and around[position][0].time + half <= item[0].time + _ROUNDING:
-            yield placed(position)
-            position += 1
-            while around[0][0].time < around[min(position, len(around) - 1)][0].time - half - _ROUNDING:
-                around.popleft()
-                position -= 1
-    while position < len(around):
-        yield placed(position)
-        position += 1
 
 
 class _Writer:

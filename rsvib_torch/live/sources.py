@@ -82,7 +82,12 @@ class CameraSource:
         import cv2  # noqa: PLC0415
 
         self._period, self.lost = timing.frame_period, 0
-        self._capture = cv2.VideoCapture(camera)
+        level = cv2.utils.logging.getLogLevel()
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below says it in one line
+        try:
+            self._capture = cv2.VideoCapture(camera)
+        finally:
+            cv2.utils.logging.setLogLevel(level)
         if not self._capture.isOpened():
             raise OSError(f"camera {camera} cannot be opened; check its number or URL, and whether it is in use")
 

@@ -1,6 +1,7 @@
 from .job import WindowResult
 from .manifest import StackManifest, read_manifest
 from .process import StackReport, detect_stack, iterate_stack, process_stack
+from .process_video import process_video
 from .window_restoration import RestoredFrames, restore_block, restore_trusted, without_data
 from .windows import Window, cut_windows
 
@@ -14,6 +15,7 @@ __all__ = [
     "detect_stack",
     "iterate_stack",
     "process_stack",
+    "process_video",
     "read_manifest",
     "restore_block",
     "restore_trusted",

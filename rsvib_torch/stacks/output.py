@@ -23,7 +23,7 @@ from rsvib_torch.io.formats import FrameWriter, StackFormat
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.stacks.private_folder import PrivateFolder
 
-__all__ = ["Journal", "Sink", "describe_difference", "disk_errors_named", "work_folder"]
+__all__ = ["Journal", "Sink", "describe_difference", "digest_of_file", "disk_errors_named", "work_folder"]
 
 
 def work_folder(sink: Path) -> Path:
@@ -298,6 +298,12 @@ def _digest(blocks: Iterable[bytes]) -> str:
     return digest.hexdigest()
 
 
+def digest_of_file(path: Path) -> str:
+    """Hash of the content of a file."""
+    with path.open("rb") as file:
+        return _digest(iter(lambda: file.read(1 << 20), b""))
+
+
 def _digest_on_disk(writer: FrameWriter | None, index: int | None) -> str | None:
     """Hash of the bytes of a frame, or for None of everything else; None if they cannot be read."""
     if writer is None or not hasattr(writer, "stored"):  # formats of users may lack it
@@ -440,8 +446,7 @@ class Sink:
     def _staged_digests(self, window: int) -> list[str]:
         """Hash of the file of a window; empty if it has none."""
         try:
-            with self._staged(window).open("rb") as file:
-                return [_digest(iter(lambda: file.read(1 << 20), b""))]
+            return [digest_of_file(self._staged(window))]
         except OSError:
             return []
 

@@ -33,7 +33,7 @@ from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_ma
 from rsvib_torch.stacks.output import Journal, Sink, describe_difference, disk_errors_named, work_folder
 from rsvib_torch.stacks.windows import Window
 
-__all__ = ["StackReport", "detect_stack", "iterate_stack", "process_stack"]
+__all__ = ["StackReport", "detect_stack", "iterate_stack", "process_stack", "totals"]
 
 _MAX_INITIAL_FAILURES = 8  # windows; a run stops if all windows up to this number fail
 
@@ -304,7 +304,7 @@ def process_stack(
 
     def report(records: Iterable[Mapping[str, Any]], resumed: int, not_kept: Sequence[str]) -> StackReport:
         return StackReport(
-            **_totals(records),
+            **totals(records),
             windows=len(windows),
             resumed=resumed,
             seconds=time.perf_counter() - start,
@@ -346,14 +346,15 @@ def process_stack(
         journal.close()
 
 
-def _totals(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    totals = dict.fromkeys(("frames", "restored", "failed", "bad_frames"), 0)
+def totals(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """Numbers of frames and windows of a run, from the records of its windows."""
+    counts = dict.fromkeys(("frames", "restored", "failed", "bad_frames"), 0)
     for record in records:
-        totals["frames"] += record["written"]
-        totals["restored"] += record["frames"] == "restored"
-        totals["failed"] += record["error"] is not None
-        totals["bad_frames"] += len(record["bad_frames"])
-    return totals
+        counts["frames"] += record["written"]
+        counts["restored"] += record["frames"] == "restored"
+        counts["failed"] += record["error"] is not None
+        counts["bad_frames"] += len(record["bad_frames"])
+    return counts
 
 
 def _check_not_all_failed(errors: Sequence[str | None], windows: Sequence[Window]) -> None:

@@ -58,7 +58,7 @@ from rsvib_torch.restoration.frame_motion import visible_pixels
 from rsvib_torch.restoration.restore import METHODS, check_method_options, restore_prepared, unchanged_frames
 from rsvib_torch.tracking.tone_filter import ToneFilter
 
-__all__ = ["TrackedFrame", "TrackingState", "VibrationTracker"]
+__all__ = ["TrackedFrame", "TrackingState", "VibrationTracker", "displaced"]
 
 TrackingState = Literal["searching", "tracking", "unusable"]
 
@@ -127,7 +127,7 @@ class TrackedFrame:
 
         Content stays at ``path`` if the frame is not moved.
         """
-        return replace(self, motion=_displaced(self.motion, self.path - place))
+        return replace(self, motion=displaced(self.motion, self.path - place))
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +332,7 @@ class VibrationTracker:
         # independent offsets
         noise_factor = (0.5 * gain.amax(-1).square()).clamp(min=1.0)
         for _ in range(_MAX_ROUNDS):
-            motion = _displaced(motion_of_fit(fit), (path - anchor)[None])
+            motion = displaced(motion_of_fit(fit), (path - anchor)[None])
             measurements, found = measure_group(group, self._rows, motion, gradients)
             corrected = state.updated(measurements, centre, noise_factor)
             fit = corrected.as_fit(centre)
@@ -433,11 +433,9 @@ class VibrationTracker:
         if self._filter is None:
             new = max(new, self._untried)
         needed = max(2, self.window // 2) * 2 ** min(self._attempts, _MAX_DOUBLED)
-        return (
-            min(new, self.window, len(self._last))
-            if new >= needed and self._untried >= min(needed, self.window) // 2
-            else 0
-        )
+        if new < needed or self._untried < min(needed, self.window) // 2:
+            return 0
+        return min(new, self.window, len(self._last))
 
     def _detect(self, count: int) -> None:
         """Detect the vibration in the last ``count`` frames, and start the filter with its tones."""
@@ -638,7 +636,7 @@ def _restored(frames: PreparedFrames, motion: Vibration, method: str, options: d
     return restore_prepared(frames, motion, method, options)
 
 
-def _displaced(motion: Vibration, displacement: Tensor) -> Vibration:
+def displaced(motion: Vibration, displacement: Tensor) -> Vibration:
     """The motion with a constant displacement (..., 2) in px added, as a tone of frequency 0."""
     size = displacement.abs()[..., None]
     zero = torch.zeros_like(size)

@@ -1,18 +1,20 @@
 """Pixels of restored video frames that the sensor did not record: a border that moves from frame to frame."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, TypeVar
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice, check_whole_number
+from rsvib_torch.core.option_types import BorderName
 from rsvib_torch.tracking.tracker import TrackedFrame
 
-__all__ = ["Border", "Margins", "VideoBorder"]
+__all__ = ["Margins", "VideoBorder"]
 
-Border = Literal["mirror", "hold", "crop"]
+Pixels = TypeVar("Pixels", Tensor, NDArray[Any])
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Margins:
         names = ("top", "bottom", "left", "right")
         return Margins(*(max(getattr(self, name), getattr(other, name)) for name in names))
 
-    def cut(self, images: Tensor) -> Tensor:
+    def cut(self, images: Pixels) -> Pixels:
         """Images (..., H, W) without the margins; height and width remain even, as video encoders require.
 
         Raises:
@@ -68,7 +70,8 @@ class Margins:
                 "border='hold', or a shorter --steady"
             )
         rows, columns = rows - rows % 2, columns - columns % 2
-        return images[..., self.top : self.top + rows, self.left : self.left + columns]
+        part: Pixels = images[..., self.top : self.top + rows, self.left : self.left + columns]
+        return part
 
 
 class VideoBorder:
@@ -96,7 +99,7 @@ class VideoBorder:
     """
 
     @checks_arguments
-    def __init__(self, border: Border = "hold", margins: Margins | None = None) -> None:
+    def __init__(self, border: BorderName = "hold", margins: Margins | None = None) -> None:
         check_choice("border", border, ("mirror", "hold", "crop"))
         if (border == "crop") != (margins is not None):
             raise ValueError(

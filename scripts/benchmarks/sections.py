@@ -26,6 +26,7 @@ from benchmarks import (
     streaming_memory,
     timing_mistakes,
     verdict_roc,
+    video,
 )
 
 __all__ = ["SECTIONS", "Section", "machine_line"]
@@ -72,6 +73,7 @@ SECTIONS: dict[str, Section] = {
     "mosaic": Section("Colour mosaics", mosaic.rows, mosaic.lines),
     "pipeline": Section("Detection and restoration", pipeline.rows, pipeline.lines),
     "live": Section("Tracking at camera rate", live.rows, live.lines),
+    "video": Section("Colour video", video.rows, video.lines),
     "scaling": Section("Scaling of time and memory", scaling.rows, scaling.lines),
     "roofline": Section("Limits of the device", roofline.rows, roofline.lines),
     "streaming": Section("Long stacks", streaming.rows, streaming.lines),

@@ -84,7 +84,8 @@ def test_a_file_at_its_own_rate(clip, capsys):
         (("-", "--size", "12"), "--size must be WIDTHxHEIGHT in px such as 1024x768, got '12'"),
         (("0", "--size", "4x4"), "--size goes with frames on standard input (-), not with 0"),
         (("0", "--realtime"), "--realtime goes with a file, not with 0"),
-        (("0", "--border", "crop"), "--border crop goes with a file without --realtime"),
+        (("0", "--border", "crop"), "it cannot be used with 0: use --border hold"),
+        (("CLIP", "--border", "crop", "--realtime"), "it cannot be used with --realtime: use --border hold"),
         (("none.mp4",), "none.mp4: no such file; a camera is a number or a URL"),
         (("CLIP", "--out", "still.gif"), "a live video is written to .mp4, .mov, .m4v or .mkv"),
         (("CLIP", "--preview"), "use --page 8080 and a browser"),
@@ -102,3 +103,13 @@ def test_wrong_options_are_refused_in_one_line(clip, arguments, message, capsys,
     assert shown.err.startswith("rsvib: error: ")
     assert shown.err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_file_is_named_before_missing_options(capsys):
+    assert run("live", "none.mp4") == 2
+    assert "none.mp4: no such file; a camera is a number or a URL" in capsys.readouterr().err
+
+
+def test_the_frame_rate_is_that_of_the_file(clip, capsys):
+    assert run("live", clip, *CAMERA[:4]) == 0
+    assert "per second, from the times in" in capsys.readouterr().out

@@ -336,3 +336,24 @@ def test_missing_package_names_the_extra(tmp_path, monkeypatch):
         read_stack(tmp_path / "a.mp4")
     with pytest.raises(ModuleNotFoundError, match=message):
         write_stack(tmp_path / "b.mp4", torch.rand(2, 48, 64), dtype="uint8")
+
+
+def test_frames_keep_their_places_behind_one_that_cannot_be_decoded(tmp_path):
+    path, times = tmp_path / "a.mp4", np.arange(8) / 25
+    levels = np.broadcast_to((20 + 25 * np.arange(8, dtype=np.uint8))[:, None, None, None], (8, 48, 64, 3))
+    options = {"g": "1", "crf": "4"}
+    write_video(path, levels, times, layout="rgb24", codec="libx264", encoded="yuv420p", options=options)
+    with av.open(str(path)) as video:
+        packet = [one for one in video.demux(video.streams.video[0]) if one.size][3]
+        place, size = packet.pos, packet.size
+    content = bytearray(path.read_bytes())
+    content[place : place + size] = bytes(size)
+    path.write_bytes(content)
+    reader = open_stack(path)
+    assert reader.info.shape[0] == 8
+    assert reader.info.frame_times == pytest.approx(times)
+    for index in (4, 5, 2, 7):
+        assert abs(float(reader.frame(index).mean()) - 20 - 25 * index) < 2
+    with pytest.raises(FrameError, match=r"frame 3 (cannot be decoded|is damaged)"):
+        reader.frame(3)
+    reader.close()

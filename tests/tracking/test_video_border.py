@@ -9,7 +9,7 @@ from skimage.registration import phase_cross_correlation
 from truth import draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.live.session import steadied
+from rsvib_torch.tracking.steadying import steadied
 
 SIZE, RATE = 160, 30.0
 TIMING = rsv.SensorTiming(row_time=150e-6, exposure_rows=4, frame_rows=1 / RATE / 150e-6)

@@ -1,0 +1,120 @@
+"""``rsvib run --video`` of a video: it is followed from frame to frame, restored and steadied."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rsvib_torch import io, stacks
+from rsvib_torch import report as reports
+from rsvib_torch.commands.answers import command_text
+from rsvib_torch.commands.terminal import Answer, counting, error_line
+from rsvib_torch.core.text import number_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from rsvib_torch.config import Config
+
+__all__ = ["check_followed", "followed_figure", "is_followed", "run_followed"]
+
+_VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
+
+
+def is_followed(frames: Path, count: int, window: int, *, requested: bool) -> bool:
+    """Whether ``--video`` follows a stack from frame to frame: videos of more than one window, or if requested."""
+    return requested or (frames.suffix.lower() in _VIDEOS and count > window)
+
+
+def check_followed(given: Mapping[str, Any], options: Mapping[str, Any]) -> None:
+    """Refuse options that only windows have.
+
+    Args:
+        given: Options of the command line that only windows have; None or False if they are not given.
+        options: Options of ``restore``.
+    """
+    others = {"--joint": options.get("joint"), "--scale": options.get("scale", 1) != 1}
+    others |= {"--mosaic": options.get("mosaic"), "--optics-sigma": options.get("optics")}
+    names = [name for name, value in {**given, **others}.items() if value]
+    if names:
+        raise ValueError(
+            f"{', '.join(names)} cannot be used with --video, which follows the frames one by one; give --output "
+            "restored.mp4 instead of --video, which processes windows"
+        )
+
+
+def run_followed(
+    frames: Path,
+    out: Path,
+    output: str,
+    settings: Config,
+    options: dict[str, Any],
+    draw_windows: Callable[[], list[str]],
+    draw_frames: Callable[[stacks.StackManifest], list[str]],
+    **others: Any,
+) -> Answer:
+    """Process a video.
+
+    Args:
+        frames: The video.
+        out: Folder of the results.
+        output: Name of the restored video in it.
+        settings: The camera.
+        options: Options of ``restore``.
+        draw_windows: Writes table and figure of the parts of the video, and returns the names of the files.
+        draw_frames: Draws frames before and after, and returns the name of the file.
+        **others: Options of ``process_video``.
+    """
+    with counting(f"restoring {frames.name}") as progress:
+        result = stacks.process_video(
+            frames,
+            out / output,
+            settings.timing,
+            restoration=options,
+            manifest=out / "manifest.json",
+            progress=progress,
+            **others,
+        )
+    stored = stacks.read_manifest(out / "manifest.json")
+    names = [output, *draw_frames(stored), "manifest.json", *draw_windows()]
+    unknown = [record for record in stored.windows if record.error is not None]
+    if unknown:
+        first = unknown[0]
+        text = f"frames {first.first} to {first.last}: {first.error}, and they are written as taken"
+        error_line(f"{text}; see manifest.json", "warning")
+    if result.bad_frames:
+        bad = number_of(result.bad_frames, "frame")
+        error_line(f"{bad} could not be used and repeat the frame before: see manifest.json", "warning")
+    if not result.restored:
+        error_line("no vibration to remove: the frames are written unchanged", "warning")
+    worse = [record for record in stored.windows if record.outcome == "worse"]
+    if worse:
+        where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"
+        error_line(f"the restored frames are judged worse than the input in {where}: {worse[0].summary}", "warning")
+    vibration, lines = stored.lines()
+    page = command_text("report", frames, out / "report", *settings.arguments, "--manifest", out / "manifest.json")
+    return Answer(
+        {f"Vibration in {frames.name}": vibration, "Restoration": [result.summary(), *lines[1:]]},
+        {"windows": stored.totals()},
+        [out / name for name in names],
+        [f"write a page with all figures and the sharpness before and after:\n  {page}"],
+    )
+
+
+def followed_figure(frames: Path, restored: Path, manifest: stacks.StackManifest) -> Figure:
+    """Draw one of the first frames of a video beside the restored one."""
+    from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
+    from rsvib_torch.tracking import Margins  # noqa: PLC0415
+
+    images = []
+    for path in (frames, restored):
+        reader = io.open_stack(path)
+        pixels = reader.frame(min(8, reader.info.shape[0] // 2))[None]  # earlier ones must be decoded as well
+        scale = manifest.settings["full_scale"] if path == frames else reader.info.full_scale
+        images.append(counts_to_frames(pixels, scale, str(path))[0].nan_to_num(0.0))
+        reader.close()
+    margins = manifest.settings["video"]["margins"]
+    if margins is not None:
+        images[0] = Margins(**margins).cut(images[0])
+    return reports.comparison_figure(*images)

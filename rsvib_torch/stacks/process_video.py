@@ -1,0 +1,392 @@
+"""Videos from file to file, followed from frame to frame: ``process_video``."""
+
+import math
+import tempfile
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.atomic import make_folder, sync, whole_file
+from rsvib_torch.core.checks import check_choice, check_number
+from rsvib_torch.core.free_memory import check_fits
+from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.unexpected import unexpected_errors_in_one_line
+from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept, open_stack, stack_files
+from rsvib_torch.io.formats import FrameReader
+from rsvib_torch.io.frame_times import exposure_times
+from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.video import CONTAINERS
+from rsvib_torch.io.video_parts import planes_of
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.restoration.restore import check_method_options
+from rsvib_torch.stacks.heap import share_one_heap
+from rsvib_torch.stacks.job import StackJob, plan_job
+from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_manifest
+from rsvib_torch.stacks.output import Journal, describe_difference, disk_errors_named, work_folder
+from rsvib_torch.stacks.process import StackReport, totals
+from rsvib_torch.stacks.video_frames import FrameLayout, RestoredFrame, VideoRestorer
+from rsvib_torch.stacks.video_output import PartSink
+from rsvib_torch.stacks.video_passes import PART_FRAMES, VideoPasses
+from rsvib_torch.stacks.video_tracks import FrameTrack
+from rsvib_torch.tracking import Margins
+
+__all__ = ["process_video"]
+
+_MAX_INITIAL_FAILURES = 8  # parts; a run stops if the motion is known in none of them
+
+Frame = NDArray[Any]
+Planes = list[Frame]
+
+
+@unexpected_errors_in_one_line()
+@checks_arguments
+def process_video(
+    source: PathLike,
+    sink: PathLike,
+    timing: SensorTiming,
+    *,
+    border: str = "mirror",
+    steady: float = 0.0,
+    restoration: Mapping[str, Any] | None = None,
+    columns: int | None = 384,
+    window: int = 8,
+    full_scale: float | None = None,
+    resume: bool = False,
+    manifest: PathLike | None = None,
+    memory: str | float | None = None,
+    workers: int | None = None,
+    device: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> StackReport:
+    """Restore a video of any length from file to file, and steady it.
+
+    The vibration is followed from frame to frame (``VibrationTracker``) instead of detected in windows: neighbouring
+    frames are restored alike, nothing changes at the borders of windows, and detection takes little time. Frames of
+    4:2:0 videos are restored as they are stored: luma with the method, chroma, which has half the resolution, with
+    ``"dewarp"``. Decoding, tracking, restoration and encoding run in threads.
+
+    Frames that cannot be decoded, constant frames and copies are replaced by the frame before. Frames whose motion is
+    not known are written as taken; the manifest counts them. The video is encoded in parts of 32 frames in the folder
+    ``.NAME.rsvib`` beside it, from which an interrupted run is resumed.
+
+    Args:
+        source: A video, or another stack as in ``read_stack``.
+        sink: The video to write: .mp4, .mov, .m4v (H.264) or .mkv, .avi (FFV1, without loss). Times, sound and metadata
+            are those of the source.
+        timing: As in ``process_stack``.
+        border: Pixels that the sensor did not record: ``"mirror"``: extrapolated from each frame by itself;
+            ``"hold"``: as in the frame before; ``"crop"``: cut off by constant margins, for which the video is read
+            twice.
+        steady: s; every frame is moved to the mean of its path in the interval of this length around it: vibration,
+            rolling-shutter wobble and shaking are removed, slow motion is kept. 0: frames stay where they are.
+        restoration: ``method`` (default ``"exact"``), its options, and ``saturation``, as in ``restore``, for frames
+            whose full scale is 1. Without ``saturation``, saturated pixels count as measured: their values are restored
+            0.2 dB worse if 1 % of the pixels are saturated, in a quarter of the time. Not ``joint``, ``scale``,
+            ``mosaic`` or ``optics``.
+        columns: As in ``VibrationTracker``.
+        window: As in ``VibrationTracker``.
+        full_scale: As in ``read_stack``.
+        resume: Whether to continue an interrupted run; a complete output is not changed.
+        manifest: As in ``process_stack``. A part of the video is a window there; its detection is that of the last
+            frame, at ``start_time``.
+        memory: As in ``process_stack``.
+        workers: Number of frames that are restored at the same time; by default the number of processors.
+        device: As in ``process_stack``.
+        progress: As in ``process_stack``. Both passes of ``border="crop"`` count as half.
+
+    Returns:
+        Summary of the run.
+
+    Raises:
+        FileExistsError: If there is an interrupted run and ``resume`` is False.
+        ModuleNotFoundError: If an optional package is missing, with the extra to install.
+        OSError: If a file cannot be read or written; the run can then be resumed.
+        TypeError: If an option is unknown.
+        ValueError: If a value is out of range, the source is not readable, margins leave nothing, an output would
+            replace the input, or input, settings or versions differ from those of the run to resume.
+
+    Example:
+        >>> process_video("shaky.mp4", "steady.mp4", timing, steady=1.0, border="crop")  # doctest: +SKIP
+    """
+    begin, source, sink = time.perf_counter(), Path(source), Path(sink)
+    check_choice("border", border, ("mirror", "hold", "crop"))
+    check_number("steady", steady, at_least=0.0)
+    video = _planned(
+        source, timing, restoration, full_scale, steady, (columns, window), device, masks=border != "mirror"
+    )
+    job = video.job
+    if sink.suffix.lower() not in CONTAINERS:
+        raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
+    target = sink.with_name(sink.name + ".manifest.json") if manifest is None else Path(manifest)
+    check_outputs([sink, work_folder(sink), target], stack_files(source))
+    content = _content(job, timing)
+    if border != "crop":
+        check_info_target(sink, content, check_folder=False)
+    header = manifest_header(job, sink.name, None)
+    header["settings"] |= {
+        "window": None,  # for the commands that read manifests: parts are not windows of their own
+        "video": {"border": border, "steady": steady, "columns": columns, "window": window},
+    }
+    at_once = _frames_at_once(source, timing, full_scale, restoration, memory, workers, device)
+    waiting = math.ceil(0.5 * steady / timing.frame_period) * 2 * content.frame_bytes
+    check_fits(f"{source}: the frames of half of steady={steady:g} s", waiting, "choose a shorter time")
+
+    def report(records: Iterable[Mapping[str, Any]], resumed: int, not_kept: Iterable[str]) -> StackReport:
+        return StackReport(
+            **totals(records),
+            windows=video.parts,
+            resumed=resumed,
+            seconds=time.perf_counter() - begin,
+            first=None,
+            manifest=target,
+            not_kept=tuple(not_kept),
+        )
+
+    with closing(Journal(sink)) as journal, tempfile.TemporaryFile() as tracks:
+        if resume and not journal.has_lines and sink.exists() and target.exists():
+            complete = read_manifest(target)
+            _check_complete(sink, complete.header(), header)
+            return report((one.model_dump() for one in complete.windows), video.parts, complete.not_kept)
+        resumes = journal.open(header, resume=resume)
+        shown = _Progress(progress, len(video.starts), 2 if border == "crop" else 1)
+        margins = video.margins(tracks, shown) if border == "crop" else None
+        content = _cut_content(content, margins)
+        check_info_target(sink, content, check_folder=False)
+        reader = open_stack(source)
+        parts = PartSink(sink, journal.folder, content, planes_of(reader) if video.layout.planar else None)
+        try:
+            with disk_errors_named(journal):
+                journal.drop(parts.resume(journal.entries() if resumes else ()))
+            resumed = journal.count
+            followed_frames = video.tracked(None if margins is None else tracks)
+            _restore_parts(video, followed_frames, parts, journal, border, margins, at_once, shown)
+            not_kept = metadata_not_kept(job.info, sink, tuple(content.shape))
+            header["settings"]["video"]["margins"] = None if margins is None else asdict(margins)
+            _finish(parts, video.parts, journal, target, header, not_kept)
+        finally:
+            parts.close()
+            reader.close()
+        summary = report(journal.records(), resumed, not_kept)
+        journal.remove()
+        return summary
+
+
+def _finish(
+    sink: PartSink, parts: int, journal: Journal, manifest: Path, header: dict[str, Any], not_kept: Sequence[str]
+) -> None:
+    """Write the manifest, and join the parts to the video."""
+    with disk_errors_named(journal):
+        make_folder(manifest.parent)
+        with whole_file(manifest) as part:
+            write_manifest(part, header, journal.records(), not_kept)
+            sink.finish(range(parts))
+        sync(manifest.absolute().parent)
+
+
+def _check_complete(sink: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
+    """Raise a ``ValueError`` if a complete video has other settings than a run that is to be resumed."""
+    old["settings"].get("video", {}).pop("margins", None)  # a result
+    difference = describe_difference(old, new)
+    if difference:
+        raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
+
+
+def _cut_content(content: StackInfo, margins: Margins | None) -> StackInfo:
+    """The content of the video without the margins."""
+    if margins is None:
+        return content
+    kept = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
+    return replace(content, shape=(*content.shape[:-2], *kept))
+
+
+def _check_known(known: list[bool], parts: int, journal: Journal) -> None:
+    """Raise a ``ValueError`` if the motion is known in none of the parts so far."""
+    if len(known) >= min(_MAX_INITIAL_FAILURES, parts) and not any(known):
+        journal.clear()
+        raise ValueError(
+            "no vibration was found that the rows of the frames have in common; detect it in windows, which states the "
+            "reasons (process_stack; rsvib run with --output restored.mp4 instead of --video)"
+        )
+
+
+class _Progress:
+    """Progress over the passes through a video, each of which counts alike."""
+
+    def __init__(self, show: Callable[[int, int], None] | None, count: int, passes: int) -> None:
+        self._show, self._count, self._passes, self._done = show, count, passes, 0
+        if show is not None:
+            show(0, count)
+
+    def __call__(self) -> None:
+        """Count one frame of a pass."""
+        self._done += 1
+        if self._show is not None:
+            self._show(self._done // self._passes, self._count)
+
+
+def _planned(
+    source: Path,
+    timing: SensorTiming,
+    restoration: Mapping[str, Any] | None,
+    full_scale: float | None,
+    steady: float,
+    tracking: tuple[int | None, int],
+    device: str,
+    *,
+    masks: bool,
+) -> VideoPasses:
+    """The job of a run and the layout of its frames."""
+    options = dict(restoration or {})
+    for name in ("joint", "scale", "mosaic", "optics"):
+        if options.pop(name, None) not in (None, False, 1):
+            raise ValueError(f"{name} is not available for videos that are followed frame by frame; use process_stack")
+    plan = {"restoration": options, "full_scale": full_scale, "device": device}
+    job, _, _ = plan_job(source, timing, plan, here=False)
+    reader: FrameReader = open_stack(source)
+    try:
+        planes = planes_of(reader)
+    finally:
+        reader.close()
+    method, saturation = options.pop("method", "exact"), options.pop("saturation", None)
+    check_method_options(method, options)
+    white = None
+    if saturation is not None:
+        black, full = (0.0, job.full_scale or 1.0) if planes is None else (planes.black, planes.white)
+        white = black + check_number("saturation", saturation, above=0.0) * (full - black)
+    scale = 255.0 if planes is not None else job.full_scale
+    layout = FrameLayout(job.info.shape[1:], planes is not None, scale, white, np.dtype(job.info.dtype))
+    restorer = VideoRestorer(layout, job.timing, method, options, job.device, masks)
+    starts = job.timing.frame_starts(job.info.shape[0]).tolist()
+    return VideoPasses(job, layout, restorer, [start - starts[0] for start in starts], steady, *tracking)
+
+
+def _content(job: StackJob, timing: SensorTiming) -> StackInfo:
+    return replace(
+        job.info,
+        full_scale=job.full_scale,
+        frame_times=None if job.info.frame_times is None else exposure_times(job.info, timing),
+        time_error=0.0,
+        frame_rate=job.info.frame_rate or timing.frame_rate,
+    )
+
+
+def _frames_at_once(
+    source: Path,
+    timing: SensorTiming,
+    full_scale: float | None,
+    restoration: Mapping[str, Any] | None,
+    memory: str | float | None,
+    workers: int | None,
+    device: str,
+) -> int:
+    """Number of frames to restore at the same time, within the memory."""
+    plan = {"restoration": restoration, "full_scale": full_scale, "memory": memory, "workers": workers, "window": 2}
+    with warnings.catch_warnings():  # given before
+        warnings.simplefilter("ignore")
+        return plan_job(source, timing, plan | {"device": device})[2]
+
+
+def _restore_parts(
+    video: VideoPasses,
+    followed_frames: Generator[tuple[FrameTrack, Frame | str], None, None],
+    sink: PartSink,
+    journal: Journal,
+    border: str,
+    margins: Margins | None,
+    at_once: int,
+    progress: Callable[[], None],
+) -> None:
+    """Restore and encode all parts that are not in the journal."""
+    share_one_heap()
+    default_threads = torch.get_num_threads()
+    threads = 1 if video.job.device == "cpu" else default_threads
+    pool = ThreadPoolExecutor(at_once, "rsvib-restore", initializer=torch.set_num_threads, initargs=(threads,))
+    tracks: list[FrameTrack] = []  # of the part
+    pair: list[tuple[FrameTrack, Frame]] = []  # the first two neighbouring frames of known motion
+    known = [record["detection"] is not None for record in journal.records()]
+    before: Planes | None = None
+    done = -1
+    try:
+        with (
+            closing(followed_frames),
+            closing(_in_order(video, followed_frames, pool, at_once, journal, progress)) as frames,
+        ):
+            for track, frame, restored in frames:
+                part = track.index // PART_FRAMES
+                if track.index != done + 1 or before is None:
+                    ended = sink.last_frame(part - 1)
+                    before = None if ended is None else video.layout.planes(ended)
+                before, done = _without_gaps(restored, before, video.layout, border), track.index
+                sink.write(part, video.layout.frame(_cut(before, margins)))
+                tracks.append(track)
+                if len(pair) < 2 and track.known and not isinstance(frame, str):
+                    pair = [*pair[-1:], (track, frame)] if pair and pair[-1][0].index == done - 1 else [(track, frame)]
+                if video.ends_part(done):
+                    verdict = video.verdict(pair) if len(pair) == 2 else None
+                    record = video.record(part, tracks, verdict)
+                    with disk_errors_named(journal):
+                        journal.add(record, sink.finish_part(part, video.layout.frame(before)))
+                    known.append(any(track.known for track in tracks))
+                    _check_known(known, video.parts, journal)
+                    tracks, pair = [], []
+                progress()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        torch.set_num_threads(default_threads)
+
+
+def _in_order(
+    video: VideoPasses,
+    tracks: Iterator[tuple[FrameTrack, Frame | str]],
+    pool: ThreadPoolExecutor,
+    at_once: int,
+    journal: Journal,
+    progress: Callable[[], None],
+) -> Generator[tuple[FrameTrack, Frame | str, RestoredFrame], None, None]:
+    """Frames of the parts that are not in the journal, in order; some more are restored ahead."""
+    waiting: deque[tuple[FrameTrack, Frame | str, Future[RestoredFrame]]] = deque()
+
+    def first() -> tuple[FrameTrack, Frame | str, RestoredFrame]:
+        track, frame, future = waiting.popleft()
+        return track, frame, future.result()
+
+    for track, frame in tracks:
+        if track.index // PART_FRAMES in journal:
+            progress()
+            continue
+        waiting.append((track, frame, pool.submit(video.restorer.restored, frame, track)))
+        if len(waiting) > at_once + 1:
+            yield first()
+    while waiting:
+        yield first()
+
+
+def _without_gaps(restored: RestoredFrame, before: Planes | None, layout: FrameLayout, border: str) -> Planes:
+    """Planes of a frame to write: those of the frame before where there are none, and at hidden pixels if they hold."""
+    planes = restored.planes
+    if planes is None or (restored.fault is not None and before is not None):
+        return layout.black() if before is None else before
+    if border == "mirror" or restored.visible is None or before is None:
+        return planes
+    pairs = zip(restored.visible, planes, before, strict=True)
+    return [np.where(visible, plane, old) for visible, plane, old in pairs]
+
+
+def _cut(planes: Planes, margins: Margins | None) -> Planes:
+    """Planes without margins; those of chroma are half as wide."""
+    if margins is None:
+        return planes
+    first, *others = planes
+    sides = (margins.top, margins.bottom, margins.left, margins.right)
+    return [margins.cut(first), *(Margins(*(side // 2 for side in sides)).cut(plane) for plane in others)]
