@@ -3,7 +3,6 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-import warnings
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -14,11 +13,12 @@ from rsvib_torch.core.fourier import extend_rows
 from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.mosaic import fill_by_colour, interpolated_colours, measures
 from rsvib_torch.restoration.exact.filling import measured_values
+from rsvib_torch.restoration.exact.finer_scene import phase_spread
 from rsvib_torch.restoration.exact.priors import shrink_patches
 from rsvib_torch.restoration.exact.scene_solver import Partition, SceneSolver
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.noise.policy import noise_levels
-from rsvib_torch.restoration.restoration_warning import RestorationWarning
+from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.scene_model.finer_rows import SCALE, FinerObservation, finer_kernels
 from rsvib_torch.restoration.scene_model.polynomial_prior import fit_polynomial_prior
 
@@ -204,7 +204,6 @@ def restore_mosaic(
         (B, groups, 3, scale H, scale W).
     """
     height = frames.shape[-2]
-    missing = ignore if clipped is None else clipped if ignore is None else ignore | clipped
     filled = frames if ignore is None else fill_by_colour(frames, ignore)
     displacement, node_weights = exposures
     advance = steps(len(frames) * len(groups), "frames")
@@ -216,8 +215,9 @@ def restore_mosaic(
         floor = None
         if clipped is not None:
             floor = torch.where(measured & clipped[stack], frames[stack], -torch.inf)
-        if missing is not None:
-            measured = measured & ~missing[stack]
+            measured = measured & ~clipped[stack]
+        if ignore is not None:
+            measured = measured & ~ignore[stack]
         if noise == "auto":  # of colours whose noise was halved by interpolation
             level = 2 * noise_levels(sparse.detach(), motion, stack).square().mean().sqrt()
         else:
@@ -330,12 +330,10 @@ class _Frames:
         if unknown:
             return found
         if bool(found > most * stated):
-            warnings.warn(
+            warn_of_restoration(
                 f"the frames differ from their model by {float(found / stated):.1f} times the stated noise: the "
                 "vibration is not accurate enough, the scene changes between the frames, or noise is too low; colours "
-                "may be false",
-                RestorationWarning,
-                stacklevel=2,
+                "may be false"
             )
         return stated
 
@@ -358,16 +356,13 @@ def _warn_if_alike(displacement: Tensor, node_weights: Tensor, *, least: float =
     Args:
         displacement: (M, R, N, 2) px during the exposures.
         node_weights: (N,).
-        least: Of ``1 - |mean exp(pi i x)|^2`` over the frames, which is 0 for equal places in the pattern of two px.
+        least: Of ``phase_spread`` at 1/2 cycle per px, the pattern of the colours.
     """
     place = (displacement * node_weights[:, None]).sum(-2)
-    mean = torch.polar(torch.ones_like(place), torch.pi * place).mean(0).abs()
-    if bool(((1 - mean.square()).median(0).values < least).all()):
-        warnings.warn(
+    if bool((phase_spread(place, 0.5).median(0).values < least).all()):
+        warn_of_restoration(
             "the frames of a scene measure the same colours at the same points of it: the other colours are "
-            "interpolated, as from one frame; restore more vibrating frames jointly",
-            RestorationWarning,
-            stacklevel=2,
+            "interpolated, as from one frame; restore more vibrating frames jointly"
         )
 
 
