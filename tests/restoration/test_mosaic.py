@@ -23,8 +23,8 @@ from finer_truth import (
 from truth import decibel, draw_scene
 
 import rsvib_torch as rsv
-from rsvib_torch.frames.mosaic import colour_frames, colours_of, is_mosaic
-from rsvib_torch.restoration.exact import mosaic_scene
+from rsvib_torch.frames.mosaic import colour_frames, is_mosaic
+from rsvib_torch.restoration.exact import mosaic_scene, similar_patches
 from rsvib_torch.restoration.scene_model.polynomial_prior import fit_polynomial_prior
 
 SIZE, MARGIN, NOISE = 72, 24, 0.003
@@ -158,21 +158,30 @@ def test_image_motion(scene):
     assert decibel(restored(four, vibration)[0], truth, 14) > decibel(restored(four[2:3], vibration)[0], truth, 14) + 3
 
 
-def test_gradients(frames, monkeypatch):
-    part = frames[:2, :32, :32].double()
-    priors, sparse = (
-        [],
-        mosaic_scene.sparse_colours(part[:, None], colours_of("RGGB", 32, 32), part[:, None].repeat(1, 3, 1, 1)),
-    )
+@pytest.mark.parametrize("count", [1, 2])
+def test_gradients(frames, monkeypatch, count):
+    found, number = [], 0  # priors, groups of similar patches and their models are constants
 
-    def fit(*arguments):  # priors and interpolated colours are constants
-        priors.append(priors[0] if priors else fit_polynomial_prior(*arguments))
-        return priors[0]
+    def constant(function):
+        def first_result(*arguments):
+            nonlocal number
+            number += 1
+            if number > len(found):
+                found.append(function(*arguments))
+            return found[number - 1]
 
-    monkeypatch.setattr(mosaic_scene, "fit_polynomial_prior", fit)
-    monkeypatch.setattr(mosaic_scene, "sparse_colours", lambda *_: sparse)
+        return first_result
 
-    check_gradient(lambda values: restored(values, noise=0.01).square().mean(), part, rel=0.05)
+    monkeypatch.setattr(mosaic_scene, "fit_polynomial_prior", constant(fit_polynomial_prior))
+    monkeypatch.setattr(similar_patches, "_similar", constant(similar_patches._similar))
+    monkeypatch.setattr(similar_patches, "_model", constant(similar_patches._model))
+
+    def energy(values):
+        nonlocal number
+        number = 0
+        return restored(values, noise=0.01).square().mean()
+
+    check_gradient(energy, frames[:count, :32, :32], rel=0.05)
 
 
 def test_detection_in_raw_frames():
