@@ -28,6 +28,9 @@ __all__ = ["restore_mosaic"]
 # Luminance, red - blue, and magenta - green. Orthonormal, so that white noise stays white; the three components of a
 # scene are nearly independent, those of the colours are not.
 _COMPONENTS = ((3**-0.5,) * 3, (2**-0.5, 0.0, -(2**-0.5)), (6**-0.5, -2 * 6**-0.5, 6**-0.5))
+# Weight of the local means in place of missing pixels, so that holes that no frame sees are filled: 0.01 instead loses
+# 0.5 to 0.9 dB, 0 loses 4 dB (hole of 16 px in all frames, noise 0.003).
+_FILLED = 0.001
 
 
 def _components(colours: Tensor) -> Tensor:
@@ -195,7 +198,6 @@ def restore_mosaic(
         floor = None
         if clipped is not None:
             floor = torch.where(measured & clipped[stack], frames[stack], -torch.inf)
-            measured = measured & ~clipped[stack]
         if ignore is not None:
             measured = measured & ~ignore[stack]
         if noise == "auto":  # of colours whose noise was halved by interpolation
@@ -285,11 +287,15 @@ class _Frames:
         measured = torch.zeros_like(inside)
         measured[..., :width] = self.measured
         measured &= inside
+        filled = torch.zeros_like(inside)
+        filled[..., :width] = ~self.measured.any(1, keepdim=True)
+        filled &= inside
         full = self.images.detach()
 
         def solver(strength: float) -> MosaicSolver:
+            weights = measured.to(data.dtype).masked_fill(filled, _FILLED)
             precisions = self._precisions(full - mean, observation, level, strength)
-            return MosaicSolver(observation, measured.to(data.dtype), precisions, self.length, partition)
+            return MosaicSolver(observation, weights, precisions, self.length, partition)
 
         # Twice, with priors fitted to predicted instead of interpolated colours: 1 to 3 dB for eight frames. The
         # interpolated ones lack detail, so that their prior is too strong: 0.01 instead of 1 gains 2 to 3 dB for eight
@@ -303,10 +309,8 @@ class _Frames:
             if count > 1:
                 found, gain = _residual_level(first, data - predicted, measured)
                 level = self._checked(found, level, unknown_level)
-            if self.floor is not None:  # saturated pixels are at least as bright as their value
-                low = predicted[..., :width] + mean < self.floor
-                data[..., :width] = torch.where(low, self.floor - mean, data[..., :width])
-                measured[..., :width] |= low
+            if self.floor is not None:  # saturated values are lower bounds: only those above the prediction count
+                measured[..., :width] &= (predicted[..., :width] + mean <= self.floor) | self.floor.isinf()
         second = solver(regularisation)
         scene = second.scene(second.fit(data, coefficients, iterations=20)) + mean
         scene = scene[:, :: SCALE // scale, : SCALE * width : SCALE // scale]
