@@ -21,7 +21,9 @@ __all__ = ["similar_patches"]
 _PATCH = 4  # px; 3 px: -0.6 to -1.2 dB, 5 px: -0.3 to +0.1 dB in three times the time
 _REACH = 7  # px to the patches that are compared; 10 px: -0.1 to +0.1 dB
 _GROUP = 64  # patches; 48 or 96: -0.3 to +0.1 dB
-_LEAST = 1e-6  # variance of a patch in squared units of full scale; 1e-5: -0.1 to -0.5 dB
+# Variance that every patch has at least, in units of that of the images (1e-4: -0.1 to -0.5 dB), and of the sum of the
+# variances of its group, for factors in single precision
+_LEAST, _LEAST_OF_GROUP = 1e-5, 1e-6
 _REFERENCES = 1024  # at a time: less memory
 
 
@@ -60,12 +62,13 @@ def _round(images: Tensor, values: Tensor, measured: Tensor | None, level: Tenso
         masks = functional.unfold(measured[None].to(images.dtype), _PATCH)[0].mT.unflatten(0, (rows, columns))
         known = masks[:period, :period].flatten(0, 1).nonzero()[:, 1].view(period**2, -1)
     first = torch.arange(count, device=images.device) * (rows * columns)
+    least = (_LEAST * images.detach().var()).clamp(min=1e-20)  # of constant images 0
     total, weight = torch.zeros_like(patches), patches.new_zeros(len(patches))
     starts, places = _references(height, images.device), _references(width, images.device)
     for some in starts.split(max(1, _REFERENCES // (count * len(places)))):
         group = _similar(images.detach(), some, places, period)
         group = (group + first[:, None, None, None]).flatten(0, 1)  # (references, phases, patches)
-        result = _posterior(patches[group], given[group], known, level, steps)
+        result = _posterior(patches[group], given[group], known, level, least, steps)
         total = total.index_add(0, group.flatten(), result.flatten(0, -2))
         weight += torch.bincount(group.flatten(), minlength=len(weight))
 
@@ -123,14 +126,16 @@ def _similar(images: Tensor, starts: Tensor, places: Tensor, period: int) -> Ten
     return torch.stack(numbers, dim=2)
 
 
-def _posterior(patches: Tensor, values: Tensor, known: Tensor, level: Tensor | float, steps: int) -> Tensor:
+def _posterior(
+    patches: Tensor, values: Tensor, known: Tensor, level: Tensor | float, least: Tensor, steps: int
+) -> Tensor:
     """Patches (G, Q, k, n) of G groups, of which the values ``known`` (Q, m) are measured at each place Q."""
     groups, phases, count, size = patches.shape
     values = values.gather(-1, known[:, None].expand(groups, phases, count, -1))
     unknown = patches.new_zeros(size, size)
     result = patches
     for step in range(steps):
-        mean, covariance, factor, gain = _model(result, unknown, known, level)
+        mean, covariance, factor, gain = _model(result, unknown, known, level, least)
         with torch.set_grad_enabled(torch.is_grad_enabled() and step == steps - 1):
             innovation = (values - mean[:, known][:, :, None]).mT
             innovation = torch.linalg.solve_triangular(factor, innovation, upper=False)
@@ -142,14 +147,15 @@ def _posterior(patches: Tensor, values: Tensor, known: Tensor, level: Tensor | f
 
 @torch.no_grad()
 def _model(
-    patches: Tensor, unknown: Tensor, known: Tensor, level: Tensor | float
+    patches: Tensor, unknown: Tensor, known: Tensor, level: Tensor | float, least: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Mean (G, n) and covariance C (G, n, n) of groups, L of A C A' + s^2 = L L' and L^-1 A C for each place."""
     groups, phases, count, _ = patches.shape
     mean = patches.mean((1, 2))
     deviation = (patches - mean[:, None, None]).flatten(1, 2)
     covariance = deviation.mT @ deviation / (phases * count) + unknown
-    covariance.diagonal(dim1=-2, dim2=-1).add_(_LEAST)
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    variance.add_(least + _LEAST_OF_GROUP * variance.sum(-1, keepdim=True))
     rows = covariance[:, known]  # (G, Q, m, n)
     square = rows.gather(-1, known[:, None].expand(groups, phases, known.shape[-1], -1))
     square.diagonal(dim1=-2, dim2=-1).add_(level**2)
