@@ -280,7 +280,7 @@ class _Frames:
             scale: Points of the result per pixel.
         """
         count, width, level = len(self.images), self.images.shape[-1], self.level
-        mean = self.images.detach().mean((0, 2, 3))[:, None, None]
+        mean = self.images.mean((0, 2, 3))[:, None, None]
         data = extend_rows(self.images, self.length).sub_(mean)
         inside = measured_values(along, None, data.shape, width, ends=True)
         assert inside is not None
