@@ -316,10 +316,10 @@ class _Frames:
         scene = scene[:, :: SCALE // scale, : SCALE * width : SCALE // scale]
         if gain is None:
             return scene
-        # the points of each pixel are four images
-        points = pixel_unshuffle(scene, scale).unflatten(0, (3, -1)).movedim(1, 0)
-        points = similar_patches(points, points, None, gain * level, rounds=2, steps=2)
-        image: Tensor = pixel_shuffle(points.movedim(0, 1).flatten(0, 1), scale)
+        # the points of each pixel are four images, one at a time: less memory
+        points = pixel_unshuffle(scene, scale).unflatten(0, (3, -1)).movedim(1, 0).split(1)
+        points = [similar_patches(part, part, None, gain * level, rounds=2, steps=2) for part in points]
+        image: Tensor = pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
         return image
 
     def _checked(self, found: Tensor, stated: Tensor, unknown: bool, *, most: float = 1.5) -> Tensor:
