@@ -1,13 +1,25 @@
 """Restoration on a grid of half pixels, against a camera that aliases and shares no code with the package."""
 
 import re
-import sys
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from field_truth import FieldMotion, take_field_frames
+from finer_truth import (
+    FINER,
+    SHAKE,
+    TIMING,
+    VIBRATION,
+    Shake,
+    after_optics,
+    check_gradient,
+    closed,
+    noisy,
+    still_image,
+    taken,
+)
 from truth import decibel, draw_scene
 
 import rsvib_torch as rsv
@@ -15,29 +27,11 @@ from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.restoration.exact import exact
 from rsvib_torch.restoration.scene_model.polynomial_prior import fit_polynomial_prior
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-from benchmarks.finer_camera import BETWEEN, FINER, after_optics, still_image
-from benchmarks.independent_camera import Shake, closed, take_frames
-
 SIZE, MARGIN, NOISE = 96, 24, 0.002
-SHAKE = Shake(np.array([[3.1], [5.2]]), np.array([[90.0], [61.0]]), np.array([[0.4], [1.3]]), np.zeros(2))
-VIBRATION = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.4, 1.3])
-TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=571)
 
 
-def taken(scene, count, shake=SHAKE, seed=1):
-    clean = take_frames(
-        scene,
-        shake,
-        row_time=20.52e-6,
-        exposure_rows=20,
-        frame_rows=571,
-        num_frames=count,
-        size=(SIZE, SIZE),
-        points=FINER,
-        between=BETWEEN,
-    )
-    return torch.from_numpy(clean + NOISE * np.random.default_rng(seed).standard_normal(clean.shape)).float()
+def frames_of(scene, count, shake=SHAKE, seed=1):
+    return noisy(taken(scene, count, SIZE, shake), NOISE, seed)
 
 
 def restored(frames, vibration=VIBRATION, timing=TIMING, **options):
@@ -57,7 +51,7 @@ def truth(scene):
 
 @pytest.fixture(scope="module")
 def frames(scene):
-    return taken(scene, 6)
+    return frames_of(scene, 6)
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +102,7 @@ def test_contrast_of_a_sine_beyond_the_nyquist_frequency(cycles, kind, axis):
     scene = after_optics(fine, 0.3)
     still = still_image(scene, (SIZE, SIZE))
     true = contrast(still_image(scene, (SIZE, SIZE), 2), cycles, axis)
-    image = restored(taken(scene, 8))[0]
+    image = restored(frames_of(scene, 8))[0]
     interpolated = contrast(enlarged(torch.from_numpy(still.copy())[None], 2)[0], cycles, axis)
     assert interpolated < 0.6 * true
     assert contrast(image, cycles, axis) == pytest.approx(true, rel=0.06)
@@ -149,7 +143,7 @@ def test_image_motion(scene):
     truth = still_image(scene, (SIZE, SIZE), 2, offset=(0, FINER * int(shift[2, 0])))
     single = still_image(scene, (SIZE, SIZE), offset=(0, FINER * int(shift[2, 0])))
     still = enlarged(torch.from_numpy(single.copy())[None], 2)[0]
-    assert decibel(restored(taken(scene, 4, moving), vibration)[0], truth, 48) > decibel(still, truth, 48) + 3
+    assert decibel(restored(frames_of(scene, 4, moving), vibration)[0], truth, 48) > decibel(still, truth, 48) + 3
 
 
 def test_gradients(frames, monkeypatch):
@@ -161,23 +155,13 @@ def test_gradients(frames, monkeypatch):
         return fitted[0]
 
     monkeypatch.setattr(exact, "fit_polynomial_prior", fit_once)
-    part = frames[:2, :32, :40].double()
-
-    def energy(values):
-        return restored(values, noise=0.01).square().mean()
-
-    part.requires_grad_()
-    gradient = torch.autograd.grad(energy(part), part)[0]
-    step = torch.randn(part.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    with torch.no_grad():
-        change = (energy(part + 1e-4 * step) - energy(part - 1e-4 * step)) / 2e-4
-    assert float((gradient * step).sum()) == pytest.approx(float(change), rel=0.02)
+    check_gradient(lambda values: restored(values, noise=0.01).square().mean(), frames[:2, :32, :40], rel=0.02)
 
 
 @pytest.mark.parametrize("noise", [0.002, 0.02])
 def test_mtf_predicts_the_contrast_of_waves(scene, noise):
     """The restored contrast of weak waves in a textured scene, from frames of an independent camera."""
-    frames = taken(scene, 4) + (noise**2 - NOISE**2) ** 0.5 * torch.randn(
+    frames = frames_of(scene, 4) + (noise**2 - NOISE**2) ** 0.5 * torch.randn(
         4, SIZE, SIZE, generator=torch.Generator().manual_seed(1)
     )
     curve = rsv.restoration_mtf(frames, TIMING, VIBRATION, joint=True, scale=2)
@@ -187,7 +171,7 @@ def test_mtf_predicts_the_contrast_of_waves(scene, noise):
             values, cycles = wave(wanted, axis)
             grating = after_optics(0.1 * noise * values, 0.3)  # too weak to change the prior
             true = contrast(still_image(grating, (SIZE, SIZE), 2), cycles, axis)
-            clean = taken(grating, 4) - taken(0 * grating, 4)
+            clean = frames_of(grating, 4) - frames_of(0 * grating, 4)
             found = contrast(restored(frames + clean)[0].double().numpy() - plain, cycles, axis)
             predicted = np.interp(cycles, curve.frequency.numpy(), curve.mtf[axis].numpy())
             assert found / true == pytest.approx(predicted, abs=0.08)
@@ -215,7 +199,7 @@ def test_mtf_of_pixels_orientations_and_errors(frames):
 
 
 def test_frames_that_sample_the_same_points_are_reported(scene, truth):
-    still = taken(scene, 3, Shake(0 * SHAKE.amplitude, SHAKE.frequency, SHAKE.phase, SHAKE.image_motion))
+    still = frames_of(scene, 3, Shake(0 * SHAKE.amplitude, SHAKE.frequency, SHAKE.phase, SHAKE.image_motion))
     with pytest.warns(rsv.RestorationWarning, match="sample the same points"):
         image = restored(still, rsv.Vibration([1e-6, 1e-6], [90.0, 61.0], [0.4, 1.3]))[0]
     mean = enlarged(still.mean(0, keepdim=True), 2)[0]
@@ -266,3 +250,15 @@ def test_stacks_in_windows(frames, tmp_path):
 def test_errors(frames, options, message):
     with pytest.raises((ValueError, TypeError), match=message):
         rsv.restore(frames, TIMING, VIBRATION, **options)
+
+
+@pytest.mark.parametrize("error", [0.0, 0.1])
+def test_strips_of_frames_with_roll_do_not_contradict_the_vibration(error):
+    timing = rsv.SensorTiming(row_time=5e-5, exposure_rows=10, frame_rows=150)
+    motion = FieldMotion((2.0, 3.0, 2e-3, 0.0))
+    frames = noisy(take_field_frames(draw_scene(150, 280, 3, blur=0.6), timing, motion, (112, 240), 4), NOISE)
+    vibration = rsv.Vibration(motion.amplitude[:3], motion.frequency[:3], np.add(motion.phase[:3], error))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", rsv.RestorationWarning)
+        restored(frames, vibration, timing)
+    assert any("not accurate enough" in str(warning.message) for warning in caught) == (error > 0)

@@ -1,38 +1,18 @@
 """Sharpening to the response of a better camera, against scenes that have this response."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
+from finer_truth import FINER, TIMING, VIBRATION, after_optics, closed, noisy, still_image, taken
 from truth import decibel, draw_scene
 
 import rsvib_torch as rsv
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-from benchmarks.finer_camera import BETWEEN, FINER, after_optics, still_image
-from benchmarks.independent_camera import Shake, closed, take_frames
-
 SIZE, MARGIN, NOISE, SIGMA = 80, 24, 0.002, 0.5
-SHAKE = Shake(np.array([[3.1], [5.2]]), np.array([[90.0], [61.0]]), np.array([[0.4], [1.3]]), np.zeros(2))
-VIBRATION = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.4, 1.3])
-TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=571)
 
 
-def taken(scene, count):
-    clean = take_frames(
-        scene,
-        SHAKE,
-        row_time=20.52e-6,
-        exposure_rows=20,
-        frame_rows=571,
-        num_frames=count,
-        size=(SIZE, SIZE),
-        points=FINER,
-        between=BETWEEN,
-    )
-    return torch.from_numpy(clean + NOISE * np.random.default_rng(1).standard_normal(clean.shape)).float()
+def frames_of(scene):
+    return noisy(taken(scene, 6, SIZE), NOISE)
 
 
 def restored(frames, optics, scale):
@@ -51,12 +31,12 @@ def scene():
 
 @pytest.fixture(scope="module")
 def frames(scene):
-    return taken(after_optics(scene, SIGMA), 6)
+    return frames_of(after_optics(scene, SIGMA))
 
 
 @pytest.mark.parametrize(("scale", "sigma"), [(1, 0.8), (2, 0.5)])
 def test_a_sharper_camera_would_take_the_restored_image(scene, sigma, scale):
-    frames = taken(after_optics(scene, sigma), 6)
+    frames = frames_of(after_optics(scene, sigma))
     target = still_image(after_optics(scene, 0.5 / scale, 1 / scale), (SIZE, SIZE), scale)
     image = restored(frames, rsv.Optics(sigma=sigma, pixel=1.0), scale)
     blurred = restored(frames, None, scale)

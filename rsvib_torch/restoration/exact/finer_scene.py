@@ -14,7 +14,7 @@ from rsvib_torch.core.fourier import squared_modulus
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 
-__all__ = ["Misfit", "finer_scene", "warn_of_frames"]
+__all__ = ["Misfit", "finer_scene", "phase_spread", "warn_of_frames"]
 
 _BLOCK = 16  # rows of a frame whose displacement error is measured together
 _SOLUTIONS = 10  # at most; one in general
@@ -143,14 +143,25 @@ def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Te
     return solver.scene(coefficients), replace(misfit, noticed=noticed)
 
 
+def phase_spread(places: Tensor, frequency: float) -> Tensor:
+    """``1 - |mean exp(2 pi i f x)|^2`` over the frames: 0 if all sample a wave at the same phase.
+
+    Args:
+        places: (M, ...) displacements x in px.
+        frequency: f in cycles per px.
+    """
+    mean = torch.polar(torch.ones_like(places), 2 * math.pi * frequency * places).mean(0).abs()
+    return 1 - mean.square()
+
+
 def warn_of_frames(misfits: list[Misfit], places: Iterable[Tensor], *, least: float = 0.1) -> None:
     """Warn if frames on a finer grid do not fit their model, or do not sample between each other's pixels.
 
     Args:
         misfits: Of each scene.
         places: Mean displacements (M, R, 2) of the rows of the frames of each scene.
-        least: Of ``1 - |mean exp(2 pi i x)|^2``, the factor on the information on aliased detail; x the displacements
-            of a row in the frames. 0.5 on average for two frames, more for several.
+        least: Of ``phase_spread`` at 1 cycle per px, the factor on the information on aliased detail. 0.5 on average
+            for two frames, more for several.
     """
     noticed = [misfit for misfit in misfits if misfit.noticed]
     if noticed:
@@ -160,10 +171,7 @@ def warn_of_frames(misfits: list[Misfit], places: Iterable[Tensor], *, least: fl
             f"{worst.error:.2g} px more than the vibration states: it is not accurate enough for scale=2, or the scene "
             "changes between the frames; detail between the pixels is restored only in part and may be false",
         )
-    spread = []
-    for place in places:
-        mean = torch.polar(torch.ones_like(place), 2 * math.pi * place).mean(0).abs()
-        spread.append((1 - mean.square()).mean(0))
+    spread = [phase_spread(place, 1.0).mean(0) for place in places]
     if bool((torch.stack(spread).median(0).values < least).any()):
         warn_of_restoration(
             "the frames of a scene sample the same points of it along at least one axis: scale=2 cannot separate "
