@@ -197,7 +197,7 @@ def _refine(
             # the noise of rows is nearly white: a tone that explains a fiftieth of the residual is significant
             fit = find_tones(independent, interval, tones, model, 0.02, strongest_only(fit), blind)
         else:
-            fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual)
+            fit, _ = robust_fit(measurements, fit, fit.active, model, residual, steps=1)
         warped_by, motion, gradients = motion, shrunk_motion(fit, intervals), record.gradients
         if number == max_rounds - 1:
             break
@@ -218,7 +218,7 @@ def _refine(
         steps = [*steps[-3:], step] if same_tones and number > search_round else [step]
         if len(steps) > 1 and bool((inexact := step.is_inexact_after(steps[-2])).any()):
             accelerated = _accelerated(measurements, steps, inexact)
-            fit, _ = robust_fit(accelerated, fit.frequencies, fit.active, model, residual_of(accelerated, fit))
+            fit, _ = robust_fit(accelerated, fit, fit.active, model, residual_of(accelerated, fit), steps=1)
             motion = shrunk_motion(fit, intervals)
             step = _Step.between(measurements, warped_by, motion)
         if float(step.change.abs().amax()) > 0.05:  # px; over smaller distances the gradients of the scene are the same
@@ -374,7 +374,7 @@ def _conclude(record: RowRecord, fit: ToneFit) -> DirectFit:
     weighted = measurements.reweighted(residual)
     share = weighted.independent_fraction(residual) * measurements.share_counted(residual)
     weighted = replace(weighted, independent=share)
-    fit = fit_tones(weighted, fit.frequencies, fit.active, fit.model)
+    fit = fit_tones(weighted, fit, fit.active, fit.model)
     shown = measurements.num_differences > 0
     measured = (shown & (measurements.weights > 0).any(-1)).double().sum(1) / shown.double().sum(1).clamp(min=1.0)
     tones = measurements.relative(model_displacements(measurements, replace(fit, drift=torch.zeros_like(fit.drift))))

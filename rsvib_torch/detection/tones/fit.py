@@ -98,6 +98,16 @@ class ToneFit:
         """(B, 2, K) px, 0 for tones that are not active."""
         return torch.where(self.active, self.coefficients.abs(), 0.0)
 
+    def about(self, centre: Tensor) -> "ToneFit":
+        """The same motion with another centre (B,) in s; only the covariance is not changed."""
+        moved = (centre - self.centre)[:, None]
+        turn = 2 * math.pi * self.frequencies * moved[..., None]
+        drift = self.drift
+        if drift.shape[-1] > 1:  # the constant of (s + moved)^2 / 2 cancels within the group
+            drift = torch.stack([drift[..., 0] + drift[..., 1] * moved, drift[..., 1]], -1)
+        turned = self.coefficients * torch.complex(turn.cos(), turn.sin())
+        return replace(self, coefficients=turned, drift=drift, centre=centre)
+
 
 def tone_response(measurements: Measurements, frequencies: Tensor) -> Tensor:
     """Relative displacements that unit tones cause at the measurements.
@@ -126,15 +136,10 @@ def drift_response(measurements: Measurements, order: int) -> Tensor:
 
 def model_displacements(measurements: Measurements, fit: ToneFit) -> Tensor:
     """Displacements (B, N, G, 2) in px that the fitted motion predicts at the measurements."""
-    moved = measurements.centre - fit.centre
-    turn = 2 * math.pi * fit.frequencies * moved[:, None, None]
-    phasor = fit.coefficients * torch.polar(torch.ones_like(turn), turn)
-    tones = phasor[:, None, None] * tone_response(measurements, fit.frequencies)
-    drift = fit.drift.clone()
-    if fit.drift.shape[-1] > 1:  # the constant of (s + moved)^2 / 2 cancels within the group
-        drift[..., 0] += fit.drift[..., 1] * moved[:, None]
+    fit = fit.about(measurements.centre)
+    tones = fit.coefficients[:, None, None] * tone_response(measurements, fit.frequencies)
     response = drift_response(measurements, fit.drift.shape[-1])
-    return tones.real.sum(-1) + torch.einsum("bngj,baj->bnga", response, drift)
+    return tones.real.sum(-1) + torch.einsum("bngj,baj->bnga", response, fit.drift)
 
 
 def residual_of(measurements: Measurements, fit: ToneFit) -> Tensor:
@@ -312,7 +317,9 @@ class _Problem:
             tolerance: Relative decrease of the cost that a step must promise.
         """
         if isinstance(start, ToneFit):
-            state = self.evaluate(torch.cat([start.tones.flatten(-2), start.drift], -1))
+            start = start.about(self.measurements.centre)
+            tones = torch.where(self.active[..., None], start.tones, 0.0)
+            state = self.evaluate(torch.cat([tones.flatten(-2), start.drift], -1))
         else:  # amplitudes, phases and drifts are linear once the frequencies are given
             values = start.new_zeros(len(start), self.axes, len(self.is_frequency))
             values[..., self.is_frequency] = torch.where(self.active, start, 0.0)
@@ -349,7 +356,7 @@ def _step(state: _Estimate, free: Tensor, damping: Tensor) -> Tensor:
 
 
 def fit_roughly(
-    measurements: Measurements, frequencies: Tensor, active: Tensor, model: MotionModel
+    measurements: Measurements, start: Tensor | ToneFit, active: Tensor, model: MotionModel, iterations: int = 5
 ) -> tuple[ToneFit, Tensor]:
     """A few steps of ``fit_tones``, as a start for another fit.
 
@@ -357,7 +364,7 @@ def fit_roughly(
         The fit, whose covariance has no meaning, and its residual displacements (B, N, G, 2).
     """
     problem = _Problem(measurements, active, model)
-    state = problem.solve(frequencies, iterations=5, tolerance=1e-4)
+    state = problem.solve(start, iterations, tolerance=1e-4)
     return problem.fit(state.values, state.matrix), state.residual
 
 
@@ -371,7 +378,7 @@ def fit_tones(
     Args:
         measurements: The displacements.
         start: (B, 2, K) start frequencies in Hz; with harmonics, K is a multiple of their number, each family with its
-            fundamental first. Or a fit of the same tones to these measurements with other weights.
+            fundamental first. Or an earlier fit of the same tones.
         active: (B, 2, K) bool, tones to fit; the others stay at zero.
         model: Structure of the motion.
 

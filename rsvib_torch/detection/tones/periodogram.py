@@ -209,7 +209,7 @@ def best_candidate(
     sample_interval: float,
     *,
     leave_out: bool,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[ToneFit, Tensor]:
     """The further tone of each axis that fits the majority of the rows best.
 
     The peaks of the periodogram of the residual are fitted roughly, each with the tones of an earlier fit.
@@ -225,7 +225,7 @@ def best_candidate(
             stretches of rows: without them, the other rows agree.
 
     Returns:
-        Frequencies (B, 2, K), and the residual of a rough fit with them, (B, N, G, 2).
+        A rough fit, and its residual (B, N, G, 2).
     """
     model, harmonics = before.model, before.model.harmonics
     parts, weights, peaks = measurements, weighed.weights[:, None], 4  # outliers may raise a wrong peak
@@ -240,7 +240,8 @@ def best_candidate(
     count = len(further) // len(found)
     earlier = before.frequencies[..., : active.shape[-1] - harmonics].repeat_interleave(count, 0)
     tried = torch.cat([earlier, further], -1)
-    rough, residuals = fit_roughly(parts.repeated(found.shape[-1]), tried, active.repeat_interleave(count, 0), model)
+    each_active = active.repeat_interleave(count, 0)
+    rough, residuals = fit_roughly(parts.repeated(found.shape[-1]), tried, each_active, model, iterations=3)
     several = measurements.repeated(count)
     # 65 % of the rows count: outliers may be all others
     size = several.sizes(residuals).nanquantile(0.65, dim=1).nan_to_num(0.0).unflatten(0, (-1, count))
@@ -253,8 +254,9 @@ def best_candidate(
         picked: Tensor = each.gather(1, place)[:, 0].movedim(1, axis)
         return picked
 
-    frequencies, residual = chosen(rough.frequencies, 1), chosen(residuals, 3)
+    of_best = (chosen(values, 1) for values in (rough.coefficients, rough.frequencies, rough.drift))
+    coefficients, frequencies, drift = of_best
+    fit, residual = ToneFit(coefficients, frequencies, active, drift, rough.covariance[:0], before.centre, model), chosen(residuals, 3)
     for _ in range(3 if leave_out else 0):  # towards the least absolute residuals
-        nearest, residual = fit_roughly(measurements.for_least_absolute(residual), frequencies, active, model)
-        frequencies = nearest.frequencies
-    return frequencies, residual
+        fit, residual = fit_roughly(measurements.for_least_absolute(residual), fit, active, model)
+    return fit, residual

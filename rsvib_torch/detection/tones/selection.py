@@ -35,29 +35,32 @@ _F_THRESHOLD = 14.0  # decrease of chi-square per parameter: the maximum of nois
 
 def robust_fit(
     measurements: Measurements,
-    frequencies: Tensor,
+    start: Tensor | ToneFit,
     active: Tensor,
     model: MotionModel,
     residual: Tensor | None = None,
+    *,
+    steps: int = 2,
 ) -> tuple[ToneFit, Measurements]:
     """Fit with the weights of outliers reduced in two steps (Tukey's biweight).
 
     Args:
         measurements: The displacements.
-        frequencies: (B, 2, K) Hz to start from.
+        start: (B, 2, K) Hz to start from, or an earlier fit.
         active: (B, 2, K) bool.
         model: Structure of the motion.
         residual: (B, N, G, 2) px of an earlier fit; None to start with a fit of equal weights.
+        steps: 1 if the residual is that of a fit with reduced weights.
 
     Returns:
         The fit and the measurements with its weights.
     """
     if residual is None:
-        fit = fit_tones(measurements, frequencies, active, model)
-        frequencies, residual = fit.frequencies, residual_of(measurements, fit)
-    rough, residual = fit_roughly(measurements.reweighted(residual), frequencies, active, model)
+        start, residual = fit_roughly(measurements, start, active, model)
+    for _ in range(steps - 1):
+        start, residual = fit_roughly(measurements.reweighted(residual), start, active, model)
     weighed = measurements.reweighted(residual)
-    return fit_tones(weighed, rough, active, model), weighed
+    return fit_tones(weighed, start, active, model), weighed
 
 
 def typical_size(measurements: Measurements, fit: ToneFit) -> Tensor:
@@ -102,7 +105,7 @@ def find_tones(
         accepted, (fit, weighed) = none[..., :0], robust_fit(measurements, none.double(), none, model)
     else:
         accepted, given = start.active, residual_of(measurements, start)
-        fit, weighed = robust_fit(measurements, start.frequencies, accepted, model, given)
+        fit, weighed = robust_fit(measurements, start, accepted, model, given, steps=1)
 
     def with_one_more(axes: Tensor) -> Tensor:
         """Accepted tones and a further one (or family) of the axes (B, 2) that need it."""
@@ -112,6 +115,14 @@ def find_tones(
         """(B, 2) bool; the first tone of an axis is kept even if nearly blind, for the verdict."""
         seen = visibility(measurements, trial.frequencies[..., -model.harmonics :]) > 0.5
         return seen if accepted.shape[-1] > 0 else torch.ones_like(seen)
+
+    def decreases(by: Measurements, active: Tensor, before: Tensor, after: Tensor, share: float = 1.0) -> Tensor:
+        """(B, 2) bool, whether the residual decreases by a share of what is needed for a further tone."""
+        first, second = by.square(before), by.square(after)
+        parameters = 2 * model.harmonics + 1
+        spare = measurements.num_measurements - parameters * active.sum(-1) // model.harmonics - 1
+        needed = torch.maximum(_F_THRESHOLD * parameters * second / spare.clamp(min=1.0), least_gain * first)
+        return first - second > share * needed
 
     open_axes = torch.ones_like(none[..., 0])  # (B, 2), those that may need a further tone
     for _ in range(MAX_TONES):
@@ -127,6 +138,12 @@ def find_tones(
             break
         active = with_one_more(open_axes)
         candidate = best_candidate(measurements, weighed, fit, residual, active, sample_interval, leave_out=False)
+        if tones is None and accepted.shape[-1] > 0:
+            promising = decreases(weighed, active, residual, candidate[1], 0.5)
+            if not bool((open_axes & promising).any()):
+                break
+            open_axes = open_axes & promising
+            active = with_one_more(open_axes)
         trial, trial_weighed = robust_fit(measurements, candidate[0], active, model, candidate[1])
         if start is None and bool((disturbed := _disturbed(measurements, trial)).any()):
             candidate = best_candidate(measurements, weighed, fit, residual, active, sample_interval, leave_out=True)
@@ -136,15 +153,11 @@ def find_tones(
             trial_weighed = select_stacks(better, other_weighed, trial_weighed)
         if tones is None:
             # both fits are compared with the weights of the richer one
-            before = trial_weighed.square(residual)
-            after = trial_weighed.square(residual_of(measurements, trial))
-            parameters = 2 * model.harmonics + 1
-            spare = measurements.num_measurements - parameters * active.sum(-1) // model.harmonics - 1
-            needed = torch.maximum(_F_THRESHOLD * parameters * after / spare.clamp(min=1.0), least_gain * before)
-            passed = open_axes & (before - after > needed) & _resolved(measurements, trial) & visible(trial)
+            passed = decreases(trial_weighed, active, residual, residual_of(measurements, trial))
+            passed = open_axes & passed & _resolved(measurements, trial) & visible(trial)
             while bool(passed.any()) and not bool((passed == open_axes).all()):
                 open_axes = passed
-                trial, trial_weighed = robust_fit(measurements, trial.frequencies, with_one_more(open_axes), model)
+                trial, trial_weighed = robust_fit(measurements, trial, with_one_more(open_axes), model)
                 passed = passed & visible(trial)
             if not bool(passed.any()):
                 break
@@ -243,7 +256,7 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor
         if not bool(dropped.any()):
             return fit
         dropped = dropped.repeat_interleave(harmonics, -1) & fit.active
-        other = fit_tones(measurements, fit.frequencies, fit.active & ~dropped, fit.model)
+        other = fit_tones(measurements, fit, fit.active & ~dropped, fit.model)
         after = measurements.square(residual_of(measurements, fit))
         before = measurements.square(residual_of(measurements, other))
         spare = measurements.num_measurements - 3 * fit.active.sum(-1)
