@@ -495,7 +495,7 @@ def _detect_field(
 ) -> DetectionResult:
     """``_detect`` with as many components as were requested or, with ``"auto"``, as the frames require."""
     alike = _detect(frames, valid, timing, method, options)
-    if field.camera is not None or field.least_axes > 2 or (field.most_axes > 2 and alike.rotates):
+    if field.camera is not None or field.least_axes > 2 or (field.most_axes > 2 and any(alike.rotates)):
         scale = field.scale(field.most_axes, field.camera)
         uncertain = field.camera is None and field.least_axes == 2
         assumed = replace(options, scale=scale, may_be_parallax=uncertain)
@@ -518,7 +518,7 @@ class _Detected:
         result: A batch of results in image axes.
         fit: Its fit.
         measurements: The measurements of the fit.
-        rotates: Whether the halves of the rows of any stack move apart.
+        rotates: For each stack, whether the halves of its rows move apart.
         contradicted: For each stack, the axes in row order whose measurements contradict the timing.
         abandoned: As in ``_Found``.
     """
@@ -526,7 +526,7 @@ class _Detected:
     result: DetectionResult
     fit: ToneFit
     measurements: Measurements
-    rotates: bool
+    rotates: list[bool]
     contradicted: list[tuple[bool, bool]]
     abandoned: bool = False
 
@@ -594,9 +594,9 @@ def _detect(
         )
         for index in range(len(frames))
     ]
-    rotates, contradicted = False, [(False, False)] * len(frames)
+    rotates, contradicted = [False] * len(frames), [(False, False)] * len(frames)
     if other_motion is not None:
-        rotates = any(rotation_found(other_motion[index]) for index in range(len(frames)))
+        rotates = [rotation_found(other_motion[index]) for index in range(len(frames))]
         contradicted = [
             contradicted_axes(vibration[index], other_motion[index], max_tones) for index in range(len(frames))
         ]
@@ -647,7 +647,7 @@ def _with_cause(
         part = slice(index, index + 1)
         own = found.measurements.mapped(itemgetter(part))
         of_stack = frames[part], None if valid is None else valid[part]
-        cause = _wrong_setting(*of_stack, own, axes, timing, method, options)
+        cause = _wrong_setting(*of_stack, own, axes, timing, method, options, rotates=found.rotates[index])
         if cause is not None:
             # the axes have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong
             reliable[index] = False
@@ -663,10 +663,13 @@ def _wrong_setting(
     timing: SensorTiming,
     method: _Method,
     options: _FitOptions,
+    *,
+    rotates: bool,
 ) -> str | None:
     """Sentence about another timing with which the frames of one stack agree; None if none was found.
 
-    A timing agrees if detection with it is reliable along the axes that contradict the stated one.
+    A timing agrees if detection with it is reliable along the axes that contradict the stated one. With the wrong scan
+    axis, the halves of a row are exposed at different times and move apart.
 
     Args:
         frames: (1, T, H, W) in row order.
@@ -676,6 +679,7 @@ def _wrong_setting(
         timing: The stated timing, in image order.
         method: The method.
         options: Its options.
+        rotates: Whether the halves of the rows move apart.
     """
 
     def agrees(other: RowTiming, change: Callable[[Tensor], Tensor], concerned: tuple[bool, bool] = axes) -> bool:
@@ -709,7 +713,8 @@ def _wrong_setting(
                 f"the frames agree with row_time={changed.row_time:.5g} s, not with {timing.row_time:g} s, if the "
                 "start times of the frames are right"
             )
-    if frames.shape[-1] <= timing.frame_rows and agrees(row_timing, lambda images: images.mT, (axes[1], axes[0])):
+    swapped = (axes[1], axes[0])
+    if rotates and frames.shape[-1] <= timing.frame_rows and agrees(row_timing, lambda images: images.mT, swapped):
         other, stated = ("x", "y") if timing.scan_axis == -2 else ("y", "x")
         return f"the frames agree with scan_axis={other!r}, not with {stated!r}"
     return None

@@ -147,11 +147,6 @@ class Measurements:
         """Every stack ``count`` times in a row."""
         return self.mapped(lambda values: values.repeat_interleave(count, dim=0))
 
-    def in_segments(self, count: int) -> "Measurements":
-        """The record cut into ``count`` pieces of equal length, as a batch (B count, N / count, ...)."""
-        rows = self.exposure_starts.shape[1] // count * count
-        return self.mapped(lambda values: values[:, :rows].unflatten(1, (count, -1)).flatten(0, 1))
-
     def mapped(self, function: Callable[[Tensor], Tensor]) -> "Measurements":
         """The measurements with a function applied to all tensors."""
         return replace(

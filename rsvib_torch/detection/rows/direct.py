@@ -6,7 +6,7 @@ Every round of ``_refine`` has four steps:
 2. measure the residual displacement and the information matrix of every scene row (``rows.displacements``), with roll
    and zoom in strips of columns (``rows.measured_rows``),
 3. fit tones and image motion to the measurements by weighted least squares (``tones``),
-4. stop if the next round would change the motion by much less than its standard deviation.
+4. stop if the next round would change the motion by much less than its standard deviation, or if the residual stalls.
 
 Steps 1 and 2 do not depend on the model of the motion, step 3 does not depend on images.
 
@@ -183,6 +183,7 @@ def _refine(
     motion = shrunk_motion(fit, intervals)
     gradients: list[RowGradients] | None = None  # None: compute them from the warped frames
     steps: list[_Step] = []
+    sizes: list[Tensor] = []  # (B, A), typical residuals since the search in standard deviations
     search_round = 1  # the first round removes the error of the band offsets; weak tones are significant after it
     pattern_rounds = 2  # a strong pattern biases the motion by which its first estimate is warped
     interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)  # exposures average out faster tones
@@ -192,6 +193,8 @@ def _refine(
         measurements = record.measurements
         residual = residual_of(measurements, fit)
         previous = fit
+        residual_size = measurements.sizes(residual).nanmedian(1).values
+        sizes = [*sizes, residual_size] if number != search_round else []  # fewer tones before the search
         if number == search_round:
             independent = replace(measurements, independent=measurements.independent_fraction(residual))
             # the noise of rows is nearly white: a tone that explains a fiftieth of the residual is significant
@@ -208,11 +211,13 @@ def _refine(
         step = _Step.between(measurements, warped_by, motion)
         same_tones = torch.equal(previous.active, fit.active)
         ratio = step.ratio_to(steps[-1]) if steps and same_tones else None
-        if number >= search_round and _converged(previous, fit, ratio):
+        converged = _converged(previous, fit, ratio) & (number >= search_round)
+        stalled = _stalled(sizes) & ~converged
+        if bool((converged | stalled).all()):
             if pattern_rounds == 0 or not rows.remove_column_pattern(motion, gradients):
-                break
+                return _conclude(record, fit, torch.where(stalled, residual_size, 0.0))
             pattern_rounds, search_round = pattern_rounds - 1, number + 1
-            gradients, steps = None, []
+            gradients, steps, sizes = None, [], []
             continue
         # steps with other tones do not predict the next one
         steps = [*steps[-3:], step] if same_tones and number > search_round else [step]
@@ -261,8 +266,19 @@ class _Step:
         return (product / previous.change.square().sum((1, 2, 3)).clamp(min=1e-30)).abs() > 0.3
 
 
-def _converged(previous: ToneFit, fit: ToneFit, ratio: Tensor | None) -> bool:
-    """Whether the next round is expected to change amplitudes and frequencies by a twentieth of their std or less.
+def _stalled(sizes: list[Tensor]) -> Tensor:
+    """(B, A) bool, axes whose typical residual exceeds 2 standard deviations and did not decrease in two rounds.
+
+    Args:
+        sizes: Typical residuals of the rounds so far.
+    """
+    if len(sizes) < 3:
+        return torch.zeros((), dtype=torch.bool, device="cpu")
+    return (sizes[-1] > 2.0) & (sizes[-1] > 0.9 * sizes[-3])
+
+
+def _converged(previous: ToneFit, fit: ToneFit, ratio: Tensor | None) -> Tensor:
+    """(B, A) bool, whether the next round is expected to change the tones of an axis by a twentieth of their std.
 
     Without long exposures a step is a tenth of the previous one or shorter. Changes of up to half a standard deviation
     are therefore small enough, and up to 1.5 standard deviations if the measured ratio of two steps allows it.
@@ -273,19 +289,18 @@ def _converged(previous: ToneFit, fit: ToneFit, ratio: Tensor | None) -> bool:
         ratio: (B,) length of the last step over that of the step before; None if unknown.
     """
     if previous.active.shape != fit.active.shape:
-        return False
+        return torch.zeros_like(fit.active[..., 0])
     deviation = fit.covariance.diagonal(dim1=-2, dim2=-1)
     deviation = deviation.unflatten(-1, (fit.coefficients.shape[1], -1)).clamp(min=0.0).sqrt()
     std = deviation[..., : 3 * fit.frequencies.shape[-1]].unflatten(-1, (-1, 3))  # of Re C, Im C and f
-    turn = 2 * math.pi * previous.frequencies * (fit.centre - previous.centre)[:, None, None]
-    change = (previous.coefficients * torch.polar(torch.ones_like(turn), turn) - fit.coefficients).abs()
+    change = (previous.about(fit.centre).coefficients - fit.coefficients).abs()
     max_change_std = change.new_full((), 0.5)
     if ratio is not None:
         max_change_std = (0.05 / ratio.clamp(min=1e-3)).clamp(0.5, 1.5)[:, None, None]
     small = (change <= max_change_std * std[..., :2].amax(-1)) & (
         (previous.frequencies - fit.frequencies).abs() <= max_change_std * std[..., 2]
     )
-    return bool((small | ~fit.active).all())
+    return (small | ~fit.active).all(-1)
 
 
 def _accelerated(measurements: Measurements, steps: list[_Step], where: Tensor) -> Measurements:
@@ -367,7 +382,7 @@ def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:
     )
 
 
-def _conclude(record: RowRecord, fit: ToneFit) -> DirectFit:
+def _conclude(record: RowRecord, fit: ToneFit, stalled: Tensor | None = None) -> DirectFit:
     """The last fit, to the measurements themselves, with a covariance that accounts for correlated residuals."""
     measurements = record.measurements
     residual = residual_of(measurements, fit)
@@ -385,6 +400,7 @@ def _conclude(record: RowRecord, fit: ToneFit) -> DirectFit:
         differential=record.differential(),
         measured=measured,
         blur=measured.new_tensor([1.0, 0.0, 0.0]).expand(len(measured), 3),  # replaced once the motion is final
+        stalled=torch.zeros_like(residual[:, 0, 0]) if stalled is None else stalled,
     )
     robust_weights = weighted.weights / measurements.weights.clamp(min=1e-300)
     aliasing = torch.stack([own.aliasing for own in record.gradients]).mean(0)

@@ -41,6 +41,7 @@ def robust_fit(
     residual: Tensor | None = None,
     *,
     steps: int = 2,
+    iterations: int = 30,
 ) -> tuple[ToneFit, Measurements]:
     """Fit with the weights of outliers reduced in two steps (Tukey's biweight).
 
@@ -51,6 +52,7 @@ def robust_fit(
         model: Structure of the motion.
         residual: (B, N, G, 2) px of an earlier fit; None to start with a fit of equal weights.
         steps: 1 if the residual is that of a fit with reduced weights.
+        iterations: As in ``fit_tones``.
 
     Returns:
         The fit and the measurements with its weights.
@@ -60,7 +62,7 @@ def robust_fit(
     for _ in range(steps - 1):
         start, residual = fit_roughly(measurements.reweighted(residual), start, active, model)
     weighed = measurements.reweighted(residual)
-    return fit_tones(weighed, start, active, model), weighed
+    return fit_tones(weighed, start, active, model, iterations), weighed
 
 
 def typical_size(measurements: Measurements, fit: ToneFit) -> Tensor:
@@ -77,6 +79,9 @@ def find_tones(
     start: ToneFit | None = None,
     blind: Tensor | None = None,
     accuracy: float = 0.0,
+    *,
+    stretches: bool = True,
+    iterations: int = 30,
 ) -> ToneFit:
     """Find and fit the tones of both axes; no initial guess is needed.
 
@@ -89,9 +94,11 @@ def find_tones(
         tones: Number of tones of each axis (of families, where harmonics are tied); None to choose it from the data.
         model: Structure of the motion.
         least_gain: Share of the residual sum of squares that a further tone must explain.
-        start: Fit whose tones are accepted. Without it, the search allows for stretches of outliers.
+        start: Fit whose tones are accepted.
         blind: (F,) Hz, blind frequencies of the frames, to recognise side tones of blind tones.
         accuracy: px; an axis with a tone needs no further one once nearly all residuals are smaller.
+        stretches: Whether the search allows for stretches of outliers, if there is no start.
+        iterations: As in ``fit_tones``.
 
     Returns:
         The fit, with K the largest number of tones of any axis (at least 1).
@@ -101,11 +108,17 @@ def find_tones(
     none = measurements.exposure_starts.new_zeros(
         len(measurements.exposure_starts), axes, model.harmonics, dtype=torch.bool
     )
+
+    def refitted(
+        start: Tensor | ToneFit, active: Tensor, residual: Tensor | None = None
+    ) -> tuple[ToneFit, Measurements]:
+        return robust_fit(measurements, start, active, model, residual, iterations=iterations)
+
     if start is None:
-        accepted, (fit, weighed) = none[..., :0], robust_fit(measurements, none.double(), none, model)
+        accepted, (fit, weighed) = none[..., :0], refitted(none.double(), none)
     else:
         accepted, given = start.active, residual_of(measurements, start)
-        fit, weighed = robust_fit(measurements, start, accepted, model, given, steps=1)
+        fit, weighed = refitted(start.frequencies, accepted, given)
 
     def with_one_more(axes: Tensor) -> Tensor:
         """Accepted tones and a further one (or family) of the axes (B, 2) that need it."""
@@ -125,6 +138,8 @@ def find_tones(
         return first - second > share * needed
 
     open_axes = torch.ones_like(none[..., 0])  # (B, 2), those that may need a further tone
+    if accuracy and start is not None:  # a tone of roll in bands of strips is found as a tone of x or y otherwise
+        open_axes = ~accepted.any(-1)
     for _ in range(MAX_TONES):
         if tones is None and accepted.shape[-1] // model.harmonics >= MAX_TONES:
             break
@@ -144,10 +159,10 @@ def find_tones(
                 break
             open_axes = open_axes & promising
             active = with_one_more(open_axes)
-        trial, trial_weighed = robust_fit(measurements, candidate[0], active, model, candidate[1])
-        if start is None and bool((disturbed := _disturbed(measurements, trial)).any()):
+        trial, trial_weighed = refitted(candidate[0], active, candidate[1])
+        if stretches and start is None and bool((disturbed := _disturbed(measurements, trial)).any()):
             candidate = best_candidate(measurements, weighed, fit, residual, active, sample_interval, leave_out=True)
-            other, other_weighed = robust_fit(measurements, candidate[0], active, model, candidate[1])
+            other, other_weighed = refitted(candidate[0], active, candidate[1])
             better = disturbed & (typical_size(measurements, other) < typical_size(measurements, trial))
             trial = select_stacks(better, other, trial)
             trial_weighed = select_stacks(better, other_weighed, trial_weighed)
@@ -157,7 +172,7 @@ def find_tones(
             passed = open_axes & passed & _resolved(measurements, trial) & visible(trial)
             while bool(passed.any()) and not bool((passed == open_axes).all()):
                 open_axes = passed
-                trial, trial_weighed = robust_fit(measurements, trial, with_one_more(open_axes), model)
+                trial, trial_weighed = refitted(trial, with_one_more(open_axes))
                 passed = passed & visible(trial)
             if not bool(passed.any()):
                 break
