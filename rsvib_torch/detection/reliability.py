@@ -213,7 +213,7 @@ def _against_other_motion(other: OtherMotion, axis: int) -> list[str]:
     """
     size = float(other.size[axis])
     limits = (
-        ("rows", float(other.unexplained[axis]), max(0.05, 0.006 * size)),
+        ("rows", float(other.unexplained[axis]), float(other.permitted[axis])),
         ("neighbouring rows", float(other.correlated[axis]), max(0.01, 0.0025 * size)),
     )
     for rows, unexplained, allowed in limits:

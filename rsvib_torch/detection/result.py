@@ -42,6 +42,11 @@ class OtherMotion:
     blur: Tensor
     stalled: Tensor
 
+    @property
+    def permitted(self) -> Tensor:
+        """(..., 2) px, largest ``unexplained`` of a reliable axis: errors of interpolation and of unequal blur."""
+        return (0.006 * self.size).clamp(min=0.05)
+
     def __getitem__(self, index: int) -> "OtherMotion":
         """The part of one stack out of a batch."""
         return OtherMotion(*(getattr(self, field.name)[index] for field in fields(self)))

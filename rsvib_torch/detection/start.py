@@ -208,10 +208,20 @@ class BandStart:
 
 
 def band_start(
-    frames: Tensor, valid: Tensor | None, timing: RowTiming, options: RegistrationOptions, *, mere_start: bool
+    frames: Tensor,
+    valid: Tensor | None,
+    timing: RowTiming,
+    options: RegistrationOptions,
+    *,
+    mere_start: bool,
+    known: OffsetCurve | None = None,
 ) -> BandStart:
-    """``band_curve`` with its measurements."""
-    curve = band_curve(frames, valid, timing, options, mere_start=mere_start)
+    """``band_curve`` with its measurements; ``known`` are the offsets of these frames with another timing."""
+    if known is None:
+        curve = band_curve(frames, valid, timing, options, mere_start=mere_start)
+    else:
+        times = timing.frame_starts(frames.shape[1], frames.device)[:, None] + known.rows * timing.row_time
+        curve = replace(known, times=times[:-1], later_times=times[1:])
     return BandStart(curve, measurements_of_curve(curve, timing, options.band_step))
 
 

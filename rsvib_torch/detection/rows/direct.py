@@ -46,7 +46,7 @@ from rsvib_torch.motion.vibration import blind_frequencies
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.registration.gradients import RowGradients
 
-__all__ = ["DirectFit", "offset_curve", "refine_directly"]
+__all__ = ["AbandonedError", "DirectFit", "offset_curve", "refine_directly"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,6 @@ class DirectFit:
         other_motion: Motion in the measurements that the fit does not explain.
         robust_weights: (B, N, 2) weights 0 ... 1 by which the information of each row was multiplied; 0 for outliers.
         aliasing: (B,) px, expected size of the bias of the displacements by aliasing.
-        abandoned: Whether the motion was found to be of another kind after few rounds, see ``refine_directly``.
     """
 
     measurements: Measurements
@@ -67,12 +66,14 @@ class DirectFit:
     other_motion: OtherMotion
     robust_weights: Tensor
     aliasing: Tensor
-    abandoned: bool = False
 
 
-# rounds; std of the typical residual after them, of two axes together: 3 in 10 of 11 recordings with roll or zoom;
-# 13 and 14 in two recordings with parallax
-_TRIED_ROUNDS, _MAX_TRIED_SIZE = 3, 10.0
+class AbandonedError(Exception):
+    """The motion that was tried does not explain the rows after few rounds."""
+
+
+# rounds; multiple of the residual that the verdict permits. Roll and zoom leave 0.1 times as much, parallax 2 to 10 times
+_TRIED_ROUNDS, _MAX_TRIED = 3, 2.0
 
 
 def refine_directly(
@@ -82,7 +83,7 @@ def refine_directly(
     tones: int | None,
     max_rounds: int = 12,
     *,
-    may_be_other: bool = False,
+    is_trial: bool = False,
 ) -> tuple[DirectFit, OffsetCurve, Tensor]:
     """Refine a detected motion on the images.
 
@@ -96,16 +97,19 @@ def refine_directly(
         start: Fit to the offsets of row bands.
         tones: Number of tones of each axis; None to select it by significance.
         max_rounds: Largest number of rounds of measuring and fitting; exposures of 400 rows need more than six.
-        may_be_other: Whether the motion is possibly of another kind than assumed (parallax instead of roll). It is
-            abandoned if a large residual remains after three rounds.
+        is_trial: Whether the motion is possibly of another kind than assumed (parallax instead of roll). It is abandoned
+            if a large residual remains after three rounds.
 
     Returns:
         The last measurements and the fit to them, the measurements as offsets between consecutive frames, and the
         offsets (B, P, N, 2) in px that the fit predicts.
+
+    Raises:
+        AbandonedError: If a trial is abandoned.
     """
     motion = shrunk_motion(start, intervals)
-    found = _refine(rows, intervals, start, tones, max_rounds, may_be_other)
-    if not found.abandoned and rows.differently_blurred(motion):
+    found = _refine(rows, intervals, start, tones, max_rounds, is_trial)
+    if rows.differently_blurred(motion):
         tried = torch.zeros_like(start.active[..., 0])
         for _ in range(2):  # one axis after the other
             frequencies, mirrored = _mirrored_frequencies(found, start, tried)
@@ -176,7 +180,7 @@ def _refine(
     start: ToneFit,
     tones: int | None,
     max_rounds: int,
-    may_be_other: bool = False,
+    is_trial: bool = False,
 ) -> DirectFit:
     """Measure around the motion, fit, repeat."""
     timing, fit, model = rows.timing, start, start.model
@@ -205,9 +209,10 @@ def _refine(
         if number == max_rounds - 1:
             break
 
-        tried = may_be_other and number == _TRIED_ROUNDS - 1
-        if tried and float(typical_size(measurements, fit).amin()) > _MAX_TRIED_SIZE**2:
-            return replace(_conclude(record, fit), abandoned=True)
+        if is_trial and number == _TRIED_ROUNDS - 1:
+            other = _conclude(record, fit).other_motion
+            if bool((other.unexplained > _MAX_TRIED * other.permitted).any()):
+                raise AbandonedError
         step = _Step.between(measurements, warped_by, motion)
         same_tones = torch.equal(previous.active, fit.active)
         ratio = step.ratio_to(steps[-1]) if steps and same_tones else None

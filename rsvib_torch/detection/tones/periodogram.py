@@ -222,7 +222,7 @@ def best_candidate(
     earlier = before.frequencies[..., : active.shape[-1] - harmonics].repeat_interleave(count, 0)
     tried = torch.cat([earlier, further], -1)
     each_active = active.repeat_interleave(count, 0)
-    rough, residuals = fit_roughly(parts.repeated(found.shape[-1]), tried, each_active, model, iterations=3)
+    rough, residuals = fit_roughly(parts.repeated(found.shape[-1]), tried, each_active, model, iterations=5)
     several = measurements.repeated(count)
     # 65 % of the rows count: outliers may be all others
     size = several.sizes(residuals).nanquantile(0.65, dim=1).nan_to_num(0.0).unflatten(0, (-1, count))

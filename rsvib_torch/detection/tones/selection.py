@@ -154,7 +154,7 @@ def find_tones(
         active = with_one_more(open_axes)
         candidate = best_candidate(measurements, weighed, fit, residual, active, sample_interval, leave_out=False)
         if tones is None and accepted.shape[-1] > 0:
-            promising = decreases(weighed, active, residual, candidate[1], 0.5)
+            promising = decreases(weighed, active, residual, candidate[1], 0.25)
             if not bool((open_axes & promising).any()):
                 break
             open_axes = open_axes & promising
