@@ -74,6 +74,11 @@ class Measurements:
         return self.visible / self.visible.sum(2, keepdim=True).clamp(min=1.0)
 
     @cached_property
+    def span(self) -> Tensor:
+        """(B,) seconds from the first to the last exposure start of the record."""
+        return self.exposure_starts.amax((1, 2)) - self.exposure_starts.amin((1, 2))
+
+    @cached_property
     def centre(self) -> Tensor:
         """(B,) mid-time of the record in seconds: phases are fitted there, where they depend least on frequency."""
         return 0.5 * (self.exposure_starts.amin((1, 2)) + self.exposure_starts.amax((1, 2)) + self.exposure_time)

@@ -96,7 +96,7 @@ def find_tones(
         least_gain: Share of the residual sum of squares that a further tone must explain.
         start: Fit whose tones are accepted.
         blind: (F,) Hz, blind frequencies of the frames, to recognise side tones of blind tones.
-        accuracy: px; an axis with a tone needs no further one once nearly all residuals are smaller.
+        accuracy: px; a fit is good enough once nearly all residuals of an axis are smaller.
         stretches: Whether the search allows for stretches of outliers, if there is no start.
         iterations: As in ``fit_tones``.
 
@@ -129,6 +129,11 @@ def find_tones(
         seen = visibility(measurements, trial.frequencies[..., -model.harmonics :]) > 0.5
         return seen if accepted.shape[-1] > 0 else torch.ones_like(seen)
 
+    def inexact(residual: Tensor) -> Tensor:
+        """(B, 2) bool, axes with residuals above the accuracy that is needed."""
+        most = measurements.distances(residual).nanquantile(0.9, dim=1).nan_to_num(torch.inf)
+        return (most > accuracy) | (accuracy == 0)
+
     def decreases(by: Measurements, active: Tensor, before: Tensor, after: Tensor, share: float = 1.0) -> Tensor:
         """(B, 2) bool, whether the residual decreases by a share of what is needed for a further tone."""
         first, second = by.square(before), by.square(after)
@@ -146,9 +151,8 @@ def find_tones(
         if tones is not None:  # roll and zoom may have fewer tones than x and y to start with
             open_axes = accepted.sum(-1) < tones * model.harmonics
         residual = residual_of(measurements, fit)
-        if accuracy and accepted.shape[-1] > 0:
-            most = measurements.distances(residual).nanquantile(0.9, dim=1).nan_to_num(torch.inf)
-            open_axes = open_axes & (most > accuracy)
+        if accepted.shape[-1] > 0:
+            open_axes = open_axes & inexact(residual)
         if not bool(open_axes.any()):
             break
         active = with_one_more(open_axes)
@@ -160,7 +164,11 @@ def find_tones(
             open_axes = open_axes & promising
             active = with_one_more(open_axes)
         trial, trial_weighed = refitted(candidate[0], active, candidate[1])
-        if stretches and start is None and bool((disturbed := _disturbed(measurements, trial)).any()):
+        disturbed = torch.zeros_like(open_axes[:, 0])
+        if stretches and start is None:
+            after = residual_of(measurements, trial)
+            disturbed = _disturbed(measurements, after) & inexact(after).any(-1)
+        if bool(disturbed.any()):
             candidate = best_candidate(measurements, weighed, fit, residual, active, sample_interval, leave_out=True)
             other, other_weighed = refitted(candidate[0], active, candidate[1])
             better = disturbed & (typical_size(measurements, other) < typical_size(measurements, trial))
@@ -180,9 +188,9 @@ def find_tones(
     return fit if blind is None or tones is not None else _with_blind_tones(measurements, weighed, fit, blind)
 
 
-def _disturbed(measurements: Measurements, fit: ToneFit) -> Tensor:
+def _disturbed(measurements: Measurements, residual: Tensor) -> Tensor:
     """(B,) bool: a stretch of outliers may have biased a fit, which leaves more than 5 % of the motion of some rows."""
-    most = measurements.sizes(residual_of(measurements, fit)).nanquantile(0.9, dim=1)
+    most = measurements.sizes(residual).nanquantile(0.9, dim=1)
     whole = measurements.sizes(measurements.relative(measurements.displacements)).nanmedian(1).values
     return ~(most < 0.05 * whole).all(-1)
 
