@@ -174,9 +174,7 @@ def _fit_direct(
     if scale.same_for_all_columns:
         rows = whole_rows(frames, valid, timing, motion)
     else:  # equal blur takes several times as long, and is not needed to find that there is no roll
-        rows = strip_rows(
-            frames, valid, timing, motion, scale, pairs_if_blurred_differently=not options.is_trial
-        )
+        rows = strip_rows(frames, valid, timing, motion, scale, pairs_if_blurred_differently=not options.is_trial)
     found, offsets, fitted = refine_directly(rows, intervals, fit, options.tones, is_trial=options.is_trial)
     motion = shrunk_motion(found.fit, intervals)
     if options.is_trial and not scale.same_for_all_columns and rows.differently_blurred(motion):
@@ -500,7 +498,9 @@ def _detect_field(
         assumed = replace(options, scale=scale, is_trial=uncertain)
         try:
             found = _detect(frames, valid, timing, method, assumed, alike.fit).result
-        except AbandonedError:  # the scene has parallax
+        except (AbandonedError, ValueError):  # parallax; narrow frames, and fits that diverge
+            if not uncertain:
+                raise
             return _with_cause(alike, frames, valid, timing, method, options) if find_cause else alike.result
         # a given number of tones is fitted to all axes, also to those that do not move
         significant = found.vibration.amplitude > MIN_SIGNIFICANCE * found.std.amplitude
@@ -557,9 +557,7 @@ def _detect(
     """
     row_timing, bands, scale = timing.in_row_order(), options.bands, options.scale
     if scale.same_for_all_columns:
-        start = band_start(
-            frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve, known=bands_known
-        )
+        start = band_start(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve, known=bands_known)
     else:
         start = field_start(frames, valid, row_timing, bands, scale, translation)
     found = method.fit(start, frames, valid, row_timing, options)
@@ -655,9 +653,7 @@ def _with_cause(
         part = slice(index, index + 1)
         own = found.measurements.mapped(itemgetter(part))
         of_stack = frames[part], None if valid is None else valid[part]
-        curve = replace(
-            found.bands, offsets=found.bands.offsets[part], quality=found.bands.quality[part]
-        )
+        curve = replace(found.bands, offsets=found.bands.offsets[part], quality=found.bands.quality[part])
         rotates = found.rotates[index]
         cause = _wrong_setting(*of_stack, own, curve, axes, timing, method, options, rotates=rotates)
         if cause is not None:

@@ -187,8 +187,8 @@ def differences(spectra: Tensor, visible: Tensor) -> Tensor:
 
 def inner_columns(width: int, shift: Tensor, like: Tensor) -> Tensor:
     """(1, 1, W) weight of columns: 1 where all frames of the group show the scene, falling to 0 over 8 px."""
-    # the shift of a fit that diverges may be infinite
-    edge = math.ceil(min(float(shift.abs().amax()), width)) + MARGIN
+    largest = float(shift.abs().amax())
+    edge = (math.ceil(largest) if largest < width else width) + MARGIN  # that of a fit that diverges may be infinite
     place = torch.arange(width, dtype=like.dtype, device=like.device)
     inside = torch.minimum(place, width - 1 - place) - edge
     return (inside / MARGIN).clamp(0.0, 1.0)[None, None]

@@ -206,7 +206,7 @@ def _refine(
         else:
             fit, _ = robust_fit(measurements, fit, fit.active, model, residual, steps=1)
         warped_by, motion, gradients = motion, shrunk_motion(fit, intervals), record.gradients
-        if number == max_rounds - 1:
+        if number == max_rounds - 1 or not bool((measurements.weights > 0).any()):  # or nothing is visible any more
             break
 
         if is_trial and number == _TRIED_ROUNDS - 1:

@@ -237,7 +237,10 @@ def best_candidate(
 
     of_best = (chosen(values, 1) for values in (rough.coefficients, rough.frequencies, rough.drift))
     coefficients, frequencies, drift = of_best
-    fit, residual = ToneFit(coefficients, frequencies, active, drift, rough.covariance[:0], before.centre, model), chosen(residuals, 3)
+    fit, residual = (
+        ToneFit(coefficients, frequencies, active, drift, rough.covariance[:0], before.centre, model),
+        chosen(residuals, 3),
+    )
     for _ in range(3 if leave_out else 0):  # towards the least absolute residuals
         fit, residual = fit_roughly(measurements.for_least_absolute(residual), fit, active, model)
     return fit, residual
