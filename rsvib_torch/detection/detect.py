@@ -691,7 +691,6 @@ def _wrong_setting(
         options: Its options.
         rotates: Whether the halves of the rows move apart.
     """
-
     trial = replace(options, is_trial=True)
 
     def agrees(

@@ -224,8 +224,8 @@ def _against_other_motion(other: OtherMotion, axis: int) -> list[str]:
             ]
     if float(other.stalled[axis]) > 0:
         return [
-            f"the fit does not converge: {float(other.stalled[axis]):.2g} standard deviations of the motion of a typical "
-            "row remain, which no tone explains; try more tones or model='free'"
+            f"the fit does not converge: rows move by {float(other.stalled[axis]):.2g} standard deviations that "
+            "no tone explains; try more tones or model='free'"
         ]
     return []
 

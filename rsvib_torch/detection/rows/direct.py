@@ -72,7 +72,7 @@ class AbandonedError(Exception):
     """The motion that was tried does not explain the rows after few rounds."""
 
 
-# rounds; multiple of the residual that the verdict permits. Roll and zoom leave 0.1 times as much, parallax 2 to 10 times
+# rounds; multiple of the residual that the verdict permits. Roll and zoom leave 0.1 of it, parallax 2 to 10 times it
 _TRIED_ROUNDS, _MAX_TRIED = 3, 2.0
 
 
@@ -97,8 +97,8 @@ def refine_directly(
         start: Fit to the offsets of row bands.
         tones: Number of tones of each axis; None to select it by significance.
         max_rounds: Largest number of rounds of measuring and fitting; exposures of 400 rows need more than six.
-        is_trial: Whether the motion is possibly of another kind than assumed (parallax instead of roll). It is abandoned
-            if a large residual remains after three rounds.
+        is_trial: Whether the motion is possibly of another kind than assumed (parallax instead of roll). It is
+            abandoned if a large residual remains after three rounds.
 
     Returns:
         The last measurements and the fit to them, the measurements as offsets between consecutive frames, and the
@@ -305,7 +305,8 @@ def _converged(previous: ToneFit, fit: ToneFit, ratio: Tensor | None) -> Tensor:
     small = (change <= max_change_std * std[..., :2].amax(-1)) & (
         (previous.frequencies - fit.frequencies).abs() <= max_change_std * std[..., 2]
     )
-    return (small | ~fit.active).all(-1)
+    converged: Tensor = (small | ~fit.active).all(-1)
+    return converged
 
 
 def _accelerated(measurements: Measurements, steps: list[_Step], where: Tensor) -> Measurements:

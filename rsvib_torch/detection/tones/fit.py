@@ -196,7 +196,7 @@ def _constraints(model: MotionModel, tones: int, axes: int, device: torch.device
     matrix = torch.zeros(3 * tones + model.drift_order, count, dtype=torch.float64, device="cpu")
     column = 0
     for tone in range(tones):
-        family, harmonic = divmod(tone, model.harmonics)
+        harmonic = tone % model.harmonics
         matrix[3 * tone, column] = matrix[3 * tone + 1, column + 1] = 1.0
         if harmonic == 0:
             of_frequency = column + 2
@@ -204,7 +204,8 @@ def _constraints(model: MotionModel, tones: int, axes: int, device: torch.device
         column += 3 if harmonic == 0 else 2
     for power in range(model.drift_order):
         matrix[3 * tones + power, column + power] = 1.0
-    return torch.block_diag(*[matrix] * axes).to(device)
+    of_axes: Tensor = torch.block_diag(*[matrix] * axes)
+    return of_axes.to(device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +258,8 @@ class _Problem:
 
     def tones_of(self, values: Tensor) -> Tensor:
         """Tones (B, 2, K, 3) of parameters (B, 2, P), as in ``_jacobian_of_tones``."""
-        return values[..., : 3 * self.tones].unflatten(-1, (self.tones, 3))
+        tones: Tensor = values[..., : 3 * self.tones].unflatten(-1, (self.tones, 3))
+        return tones
 
     def fit(self, values: Tensor, covariance: Tensor) -> ToneFit:
         """The parameters (B, 2, P) as a ``ToneFit``."""
@@ -360,7 +362,8 @@ def _scaled(state: _Estimate, free: Tensor, damping: Tensor) -> tuple[Tensor, Te
 def _step(state: _Estimate, free: Tensor, damping: Tensor) -> Tensor:
     """Step (B, M) of the ``free`` (B, M) parameters."""
     matrix, scale = _scaled(state, free, damping)
-    return torch.linalg.solve(matrix, state.right * scale) * scale
+    scaled: Tensor = torch.linalg.solve(matrix, state.right * scale)
+    return scaled * scale
 
 
 def fit_roughly(

@@ -80,10 +80,10 @@ def _power(measurements: Measurements, grid: tuple[float, int, int], weights: Te
 
 
 def _transform(times: Tensor, values: Tensor, grid: tuple[float, int, int]) -> Tensor:
-    """Sums of ``values exp(2 pi i f t)`` over unequal times for equally spaced frequencies, to 1e-7 of the sum of |values|.
+    """Sums of ``values exp(2 pi i f t)`` over unequal times for equally spaced frequencies.
 
     The values are spread over a grid of times with a Kaiser-Bessel kernel, transformed, and divided by the transform of
-    the kernel (Fessler and Sutton, IEEE Trans. Signal Process. 51, 560, 2003).
+    the kernel (Fessler and Sutton, IEEE Trans. Signal Process. 51, 560, 2003), to 1e-7 of the sum of their moduli.
 
     Args:
         times: (B, N, G) s.

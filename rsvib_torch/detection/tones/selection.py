@@ -1,5 +1,7 @@
 """Number of tones: added one by one, strongest first, while they are significant, with weights against outliers."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -104,88 +106,121 @@ def find_tones(
         The fit, with K the largest number of tones of any axis (at least 1).
     """
     model = model or MotionModel()
-    axes = measurements.displacements.shape[-1]
-    none = measurements.exposure_starts.new_zeros(
-        len(measurements.exposure_starts), axes, model.harmonics, dtype=torch.bool
+    search = _Search(
+        measurements, sample_interval, model, least_gain, accuracy, stretches and start is None, iterations
     )
-
-    def refitted(
-        start: Tensor | ToneFit, active: Tensor, residual: Tensor | None = None
-    ) -> tuple[ToneFit, Measurements]:
-        return robust_fit(measurements, start, active, model, residual, iterations=iterations)
-
+    axes = measurements.displacements.shape[-1]
+    shape = (len(measurements.exposure_starts), axes, model.harmonics)
+    none = measurements.exposure_starts.new_zeros(shape, dtype=torch.bool)
+    open_axes = torch.ones_like(none[..., 0])  # (B, 2), those that may need a further tone
     if start is None:
-        accepted, (fit, weighed) = none[..., :0], refitted(none.double(), none)
+        accepted, (fit, weighed) = none[..., :0], search.refitted(none.double(), none)
     else:
         accepted, given = start.active, residual_of(measurements, start)
-        fit, weighed = refitted(start.frequencies, accepted, given)
+        fit, weighed = search.refitted(start.frequencies, accepted, given)
+        if accuracy:  # a tone of roll in bands of strips is found as a tone of x or y otherwise
+            open_axes = ~accepted.any(-1)
 
     def with_one_more(axes: Tensor) -> Tensor:
         """Accepted tones and a further one (or family) of the axes (B, 2) that need it."""
         return torch.cat([accepted, axes[..., None].expand(-1, -1, model.harmonics)], -1)
 
-    def visible(trial: ToneFit) -> Tensor:
-        """(B, 2) bool; the first tone of an axis is kept even if nearly blind, for the verdict."""
-        seen = visibility(measurements, trial.frequencies[..., -model.harmonics :]) > 0.5
-        return seen if accepted.shape[-1] > 0 else torch.ones_like(seen)
-
-    def inexact(residual: Tensor) -> Tensor:
-        """(B, 2) bool, axes with residuals above the accuracy that is needed."""
-        most = measurements.distances(residual).nanquantile(0.9, dim=1).nan_to_num(torch.inf)
-        return (most > accuracy) | (accuracy == 0)
-
-    def decreases(by: Measurements, active: Tensor, before: Tensor, after: Tensor, share: float = 1.0) -> Tensor:
-        """(B, 2) bool, whether the residual decreases by a share of what is needed for a further tone."""
-        first, second = by.square(before), by.square(after)
-        parameters = 2 * model.harmonics + 1
-        spare = measurements.num_measurements - parameters * active.sum(-1) // model.harmonics - 1
-        needed = torch.maximum(_F_THRESHOLD * parameters * second / spare.clamp(min=1.0), least_gain * first)
-        return first - second > share * needed
-
-    open_axes = torch.ones_like(none[..., 0])  # (B, 2), those that may need a further tone
-    if accuracy and start is not None:  # a tone of roll in bands of strips is found as a tone of x or y otherwise
-        open_axes = ~accepted.any(-1)
-    for _ in range(MAX_TONES):
-        if tones is None and accepted.shape[-1] // model.harmonics >= MAX_TONES:
-            break
+    for _ in range(MAX_TONES if tones is not None else MAX_TONES - accepted.shape[-1] // model.harmonics):
         if tones is not None:  # roll and zoom may have fewer tones than x and y to start with
             open_axes = accepted.sum(-1) < tones * model.harmonics
         residual = residual_of(measurements, fit)
         if accepted.shape[-1] > 0:
-            open_axes = open_axes & inexact(residual)
+            open_axes = open_axes & search.inexact(residual)
         if not bool(open_axes.any()):
             break
         active = with_one_more(open_axes)
-        candidate = best_candidate(measurements, weighed, fit, residual, active, sample_interval, leave_out=False)
+        candidate = search.candidate(weighed, fit, residual, active)
         if tones is None and accepted.shape[-1] > 0:
-            promising = decreases(weighed, active, residual, candidate[1], 0.25)
-            if not bool((open_axes & promising).any()):
+            # most further tones fail the F-test by far, and are not fitted exactly
+            open_axes = open_axes & search.decreases(weighed, active, residual, candidate[1], share=0.25)
+            if not bool(open_axes.any()):
                 break
-            open_axes = open_axes & promising
             active = with_one_more(open_axes)
-        trial, trial_weighed = refitted(candidate[0], active, candidate[1])
-        disturbed = torch.zeros_like(open_axes[:, 0])
-        if stretches and start is None:
-            after = residual_of(measurements, trial)
-            disturbed = _disturbed(measurements, after) & inexact(after).any(-1)
-        if bool(disturbed.any()):
-            candidate = best_candidate(measurements, weighed, fit, residual, active, sample_interval, leave_out=True)
-            other, other_weighed = refitted(candidate[0], active, candidate[1])
-            better = disturbed & (typical_size(measurements, other) < typical_size(measurements, trial))
-            trial = select_stacks(better, other, trial)
-            trial_weighed = select_stacks(better, other_weighed, trial_weighed)
+        trial, trial_weighed = search.trial(weighed, fit, residual, active, candidate)
         if tones is None:
             # both fits are compared with the weights of the richer one
-            passed = decreases(trial_weighed, active, residual, residual_of(measurements, trial))
-            passed = open_axes & passed & _resolved(measurements, trial) & visible(trial)
+            passed = search.decreases(trial_weighed, active, residual, residual_of(measurements, trial))
+            first = accepted.shape[-1] == 0  # kept even if nearly blind, for the verdict
+            passed = open_axes & passed & _resolved(measurements, trial) & (search.visible(trial) | first)
             while bool(passed.any()) and not bool((passed == open_axes).all()):
                 open_axes = passed
-                trial, trial_weighed = refitted(trial, with_one_more(open_axes))
-                passed = passed & visible(trial)
+                trial, trial_weighed = search.refitted(trial, with_one_more(open_axes))
+                passed = passed & (search.visible(trial) | first)
             if not bool(passed.any()):
                 break
         fit, weighed, accepted = trial, trial_weighed, trial.active
     return fit if blind is None or tones is not None else _with_blind_tones(measurements, weighed, fit, blind)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """What all steps of ``find_tones`` share; see its arguments."""
+
+    measurements: Measurements
+    sample_interval: float
+    model: MotionModel
+    least_gain: float
+    accuracy: float
+    stretches: bool
+    iterations: int
+
+    def refitted(
+        self, start: Tensor | ToneFit, active: Tensor, residual: Tensor | None = None
+    ) -> tuple[ToneFit, Measurements]:
+        """``robust_fit`` of all measurements."""
+        return robust_fit(self.measurements, start, active, self.model, residual, iterations=self.iterations)
+
+    def candidate(
+        self, weighed: Measurements, fit: ToneFit, residual: Tensor, active: Tensor, *, leave_out: bool = False
+    ) -> tuple[ToneFit, Tensor]:
+        """``best_candidate``: a rough fit with a further tone, and its residual."""
+        interval = self.sample_interval
+        return best_candidate(self.measurements, weighed, fit, residual, active, interval, leave_out=leave_out)
+
+    def trial(
+        self,
+        weighed: Measurements,
+        fit: ToneFit,
+        residual: Tensor,
+        active: Tensor,
+        candidate: tuple[ToneFit, Tensor],
+    ) -> tuple[ToneFit, Measurements]:
+        """The fit with a further tone, of all rows or without a stretch, and the measurements with its weights."""
+        trial, trial_weighed = self.refitted(candidate[0], active, candidate[1])
+        if not self.stretches:
+            return trial, trial_weighed
+        after = residual_of(self.measurements, trial)
+        disturbed = _disturbed(self.measurements, after) & self.inexact(after).any(-1)
+        if not bool(disturbed.any()):
+            return trial, trial_weighed
+        candidate = self.candidate(weighed, fit, residual, active, leave_out=True)
+        other, other_weighed = self.refitted(candidate[0], active, candidate[1])
+        better = disturbed & (typical_size(self.measurements, other) < typical_size(self.measurements, trial))
+        return select_stacks(better, other, trial), select_stacks(better, other_weighed, trial_weighed)
+
+    def visible(self, fit: ToneFit) -> Tensor:
+        """(B, 2) bool, whether the last tone (or family) of each axis is visible."""
+        return visibility(self.measurements, fit.frequencies[..., -self.model.harmonics :]) > 0.5
+
+    def inexact(self, residual: Tensor) -> Tensor:
+        """(B, 2) bool, axes with residuals above the accuracy that is needed."""
+        most = self.measurements.distances(residual).nanquantile(0.9, dim=1).nan_to_num(torch.inf)
+        return (most > self.accuracy) | (self.accuracy == 0)
+
+    def decreases(
+        self, weighed: Measurements, active: Tensor, before: Tensor, after: Tensor, *, share: float = 1.0
+    ) -> Tensor:
+        """(B, 2) bool, whether the residual decreases by a share of what is needed for a further tone."""
+        first, second = weighed.square(before), weighed.square(after)
+        parameters = 2 * self.model.harmonics + 1
+        spare = self.measurements.num_measurements - parameters * active.sum(-1) // self.model.harmonics - 1
+        needed = torch.maximum(_F_THRESHOLD * parameters * second / spare.clamp(min=1.0), self.least_gain * first)
+        return first - second > share * needed
 
 
 def _disturbed(measurements: Measurements, residual: Tensor) -> Tensor:
