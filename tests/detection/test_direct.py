@@ -336,7 +336,7 @@ def test_convergence_follows_from_the_change_and_the_ratio_of_steps(change, rati
         tone_fit([1.0 + 0.01 * change, 2.0], [50.0, 30.0]),
         tone_fit([1.0, 2.0], [50.0, 30.0 - 0.02 * change]),
     ):
-        assert direct._converged(before, after, ratio) is converged
+        assert bool(direct._converged(before, after, ratio).all()) is converged
 
 
 @pytest.mark.parametrize("remaining", [0.0, 0.05, -0.3])

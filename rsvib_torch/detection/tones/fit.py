@@ -307,16 +307,9 @@ class _Problem:
         return _Estimate(values, jacobian, residual, whitened.square().sum((1, 2)), columns.mT @ columns, right)
 
     def moved(self, values: Tensor, step: Tensor) -> Tensor:
-        """Parameters after a step (B, M) of the free ones; frequencies stay positive.
-
-        Without harmonics, tones keep a tenth of a period in the record: slower ones equal a drift, of any amplitude.
-        """
+        """Parameters after a step (B, M) of the free ones; frequencies stay positive."""
         values = values + (step if self.to_all is None else step @ self.to_all.T).unflatten(1, (self.axes, -1))
-        positive = values.abs()
-        if self.to_all is None:
-            slowest = (0.1 / self.measurements.span)[:, None, None]
-            positive = torch.where(positive > 0, torch.maximum(positive, slowest), positive)
-        return torch.where(self.is_frequency, positive, values)
+        return torch.where(self.is_frequency, values.abs(), values)
 
     def solve(self, start: Tensor | ToneFit, iterations: int, tolerance: float) -> _Estimate:
         """Levenberg-Marquardt from start frequencies or another fit, each stack on its own.
