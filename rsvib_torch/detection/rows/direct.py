@@ -204,7 +204,7 @@ def _refine(
             # the noise of rows is nearly white: a tone that explains a fiftieth of the residual is significant
             fit = find_tones(independent, interval, tones, model, 0.02, strongest_only(fit), blind)
         else:
-            fit, _ = robust_fit(measurements, fit, fit.active, model, residual, steps=1)
+            fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual, steps=1)
         warped_by, motion, gradients = motion, shrunk_motion(fit, intervals), record.gradients
         if number == max_rounds - 1 or not bool((measurements.weights > 0).any()):  # or nothing is visible any more
             break
@@ -228,7 +228,8 @@ def _refine(
         steps = [*steps[-3:], step] if same_tones and number > search_round else [step]
         if len(steps) > 1 and bool((inexact := step.is_inexact_after(steps[-2])).any()):
             accelerated = _accelerated(measurements, steps, inexact)
-            fit, _ = robust_fit(accelerated, fit, fit.active, model, residual_of(accelerated, fit), steps=1)
+            given = residual_of(accelerated, fit)
+            fit, _ = robust_fit(accelerated, fit.frequencies, fit.active, model, given, steps=1)
             motion = shrunk_motion(fit, intervals)
             step = _Step.between(measurements, warped_by, motion)
         if float(step.change.abs().amax()) > 0.05:  # px; over smaller distances the gradients of the scene are the same

@@ -37,7 +37,7 @@ _F_THRESHOLD = 14.0  # decrease of chi-square per parameter: the maximum of nois
 
 def robust_fit(
     measurements: Measurements,
-    start: Tensor | ToneFit,
+    frequencies: Tensor,
     active: Tensor,
     model: MotionModel,
     residual: Tensor | None = None,
@@ -49,7 +49,8 @@ def robust_fit(
 
     Args:
         measurements: The displacements.
-        start: (B, 2, K) Hz to start from, or an earlier fit.
+        frequencies: (B, 2, K) Hz to start from. Amplitudes and phases follow from them by linear equations; starts with
+            those of an earlier fit take more steps along the valleys of slow tones.
         active: (B, 2, K) bool.
         model: Structure of the motion.
         residual: (B, N, G, 2) px of an earlier fit; None to start with a fit of equal weights.
@@ -60,11 +61,13 @@ def robust_fit(
         The fit and the measurements with its weights.
     """
     if residual is None:
-        start, residual = fit_roughly(measurements, start, active, model)
+        rough, residual = fit_roughly(measurements, frequencies, active, model)
+        frequencies = rough.frequencies
     for _ in range(steps - 1):
-        start, residual = fit_roughly(measurements.reweighted(residual), start, active, model)
+        rough, residual = fit_roughly(measurements.reweighted(residual), frequencies, active, model)
+        frequencies = rough.frequencies
     weighed = measurements.reweighted(residual)
-    return fit_tones(weighed, start, active, model, iterations), weighed
+    return fit_tones(weighed, frequencies, active, model, iterations), weighed
 
 
 def typical_size(measurements: Measurements, fit: ToneFit) -> Tensor:
@@ -149,7 +152,7 @@ def find_tones(
             passed = open_axes & passed & _resolved(measurements, trial) & (search.visible(trial) | first)
             while bool(passed.any()) and not bool((passed == open_axes).all()):
                 open_axes = passed
-                trial, trial_weighed = search.refitted(trial, with_one_more(open_axes))
+                trial, trial_weighed = search.refitted(trial.frequencies, with_one_more(open_axes))
                 passed = passed & (search.visible(trial) | first)
             if not bool(passed.any()):
                 break
@@ -170,10 +173,10 @@ class _Search:
     iterations: int
 
     def refitted(
-        self, start: Tensor | ToneFit, active: Tensor, residual: Tensor | None = None
+        self, frequencies: Tensor, active: Tensor, residual: Tensor | None = None
     ) -> tuple[ToneFit, Measurements]:
         """``robust_fit`` of all measurements."""
-        return robust_fit(self.measurements, start, active, self.model, residual, iterations=self.iterations)
+        return robust_fit(self.measurements, frequencies, active, self.model, residual, iterations=self.iterations)
 
     def candidate(
         self, weighed: Measurements, fit: ToneFit, residual: Tensor, active: Tensor, *, leave_out: bool = False
@@ -191,7 +194,7 @@ class _Search:
         candidate: tuple[ToneFit, Tensor],
     ) -> tuple[ToneFit, Measurements]:
         """The fit with a further tone, of all rows or without a stretch, and the measurements with its weights."""
-        trial, trial_weighed = self.refitted(candidate[0], active, candidate[1])
+        trial, trial_weighed = self.refitted(candidate[0].frequencies, active, candidate[1])
         if not self.stretches:
             return trial, trial_weighed
         after = residual_of(self.measurements, trial)
@@ -199,7 +202,7 @@ class _Search:
         if not bool(disturbed.any()):
             return trial, trial_weighed
         candidate = self.candidate(weighed, fit, residual, active, leave_out=True)
-        other, other_weighed = self.refitted(candidate[0], active, candidate[1])
+        other, other_weighed = self.refitted(candidate[0].frequencies, active, candidate[1])
         better = disturbed & (typical_size(self.measurements, other) < typical_size(self.measurements, trial))
         return select_stacks(better, other, trial), select_stacks(better, other_weighed, trial_weighed)
 
