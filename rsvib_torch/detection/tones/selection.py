@@ -138,8 +138,8 @@ def find_tones(
             break
         active = with_one_more(open_axes)
         candidate = search.candidate(weighed, fit, residual, active)
-        if tones is None and accepted.shape[-1] > 0:
-            # most further tones fail the F-test by far, and are not fitted exactly
+        if tones is None and start is not None and accepted.shape[-1] > 0:
+            # most further tones fail the F-test by far, and are not fitted exactly; offsets of bands need exact fits
             open_axes = open_axes & search.decreases(weighed, active, residual, candidate[1], share=0.25)
             if not bool(open_axes.any()):
                 break
