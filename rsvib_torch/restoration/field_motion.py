@@ -44,7 +44,7 @@ def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) ->
     strips = ColumnStrips.of(size[1], pitch, _MARGIN + math.ceil(along))
     centres = (first + 0.5 * (strips.width - 1) for first in strips.firsts)
     distance = max(abs(centre - middle) for centre, middle in zip(centres, strips.middles, strict=True))
-    return strips, math.sqrt(0.5) * slope * math.hypot(strips.width / math.sqrt(12), distance)  # tones: rms over time
+    return strips, slope * math.hypot(strips.width / math.sqrt(12), distance)
 
 
 def restore_in_strips(
