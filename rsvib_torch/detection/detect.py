@@ -20,7 +20,7 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.other_timing import period_factor
 from rsvib_torch.detection.reliability import contradicted_axes, judge, rotation_found
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, stacked
-from rsvib_torch.detection.rows.direct import refine_directly
+from rsvib_torch.detection.rows.direct import AbandonedError, refine_directly
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
 from rsvib_torch.detection.rows.measured_rows import strip_rows, whole_rows
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
@@ -83,14 +83,15 @@ class _FitOptions:
         model: Harmonics and order of the image motion.
         bands: Registration of the row bands.
         scale: Components of the motion.
-        may_be_parallax: Whether roll and zoom are assumed only because the halves of the rows move apart.
+        is_trial: Whether roll and zoom are assumed only because the halves of the rows move apart, or another timing
+            than the stated one is tried.
     """
 
     tones: int | None
     model: MotionModel
     bands: RegistrationOptions
     scale: FieldScale
-    may_be_parallax: bool = False
+    is_trial: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +105,6 @@ class _Found:
         fitted: (B, P, N, 2) px, the offsets that it predicts for them.
         other_motion: Motion that it does not explain; None if the method does not measure it.
         aliasing: (B,) px, expected size of the bias of the displacements by aliasing; None if it is not known.
-        abandoned: Whether roll and zoom do not explain why the halves of the rows move apart.
     """
 
     fit: ToneFit
@@ -113,7 +113,6 @@ class _Found:
     fitted: Tensor
     other_motion: OtherMotion | None = None
     aliasing: Tensor | None = None
-    abandoned: bool = False
 
 
 _Fit = Callable[[BandStart, Tensor, Tensor | None, RowTiming, _FitOptions], _Found]
@@ -175,15 +174,13 @@ def _fit_direct(
     if scale.same_for_all_columns:
         rows = whole_rows(frames, valid, timing, motion)
     else:  # equal blur takes several times as long, and is not needed to find that there is no roll
-        rows = strip_rows(
-            frames, valid, timing, motion, scale, pairs_if_blurred_differently=not options.may_be_parallax
-        )
-    uncertain = options.may_be_parallax
-    found, offsets, fitted = refine_directly(rows, intervals, fit, options.tones, may_be_other=uncertain)
-    if uncertain and not found.abandoned and rows.differently_blurred(motion := shrunk_motion(found.fit, intervals)):
+        rows = strip_rows(frames, valid, timing, motion, scale, pairs_if_blurred_differently=not options.is_trial)
+    found, offsets, fitted = refine_directly(rows, intervals, fit, options.tones, is_trial=options.is_trial)
+    motion = shrunk_motion(found.fit, intervals)
+    if options.is_trial and not scale.same_for_all_columns and rows.differently_blurred(motion):
         rows = strip_rows(frames, valid, timing, motion, scale)
         found, offsets, fitted = refine_directly(rows, intervals, found.fit, options.tones)
-    return _Found(found.fit, found.measurements, offsets, fitted, found.other_motion, found.aliasing, found.abandoned)
+    return _Found(found.fit, found.measurements, offsets, fitted, found.other_motion, found.aliasing)
 
 
 _METHODS: dict[DetectionMethod, _Method] = {
@@ -495,17 +492,21 @@ def _detect_field(
 ) -> DetectionResult:
     """``_detect`` with as many components as were requested or, with ``"auto"``, as the frames require."""
     alike = _detect(frames, valid, timing, method, options)
-    if field.camera is not None or field.least_axes > 2 or (field.most_axes > 2 and alike.rotates):
+    if field.camera is not None or field.least_axes > 2 or (field.most_axes > 2 and any(alike.rotates)):
         scale = field.scale(field.most_axes, field.camera)
         uncertain = field.camera is None and field.least_axes == 2
-        assumed = replace(options, scale=scale, may_be_parallax=uncertain)
-        of_field = _detect(frames, valid, timing, method, assumed, alike.fit)
-        found = of_field.result
+        assumed = replace(options, scale=scale, is_trial=uncertain)
+        try:
+            found = _detect(frames, valid, timing, method, assumed, alike.fit).result
+        except (AbandonedError, ValueError):  # parallax; narrow frames, and fits that diverge
+            if not uncertain:
+                raise
+            return _with_cause(alike, frames, valid, timing, method, options) if find_cause else alike.result
         # a given number of tones is fitted to all axes, also to those that do not move
         significant = found.vibration.amplitude > MIN_SIGNIFICANCE * found.std.amplitude
         moving = significant.flatten(0, -3).any(0).any(-1).tolist()
         axes = max([field.least_axes, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
-        if (axes > 2 and not of_field.abandoned) or field.camera is not None:
+        if axes > 2 or field.camera is not None:
             return found.with_axes(axes)
     return _with_cause(alike, frames, valid, timing, method, options) if find_cause else alike.result
 
@@ -518,17 +519,17 @@ class _Detected:
         result: A batch of results in image axes.
         fit: Its fit.
         measurements: The measurements of the fit.
-        rotates: Whether the halves of the rows of any stack move apart.
+        rotates: For each stack, whether the halves of its rows move apart.
         contradicted: For each stack, the axes in row order whose measurements contradict the timing.
-        abandoned: As in ``_Found``.
+        bands: Offsets of the row bands.
     """
 
     result: DetectionResult
     fit: ToneFit
     measurements: Measurements
-    rotates: bool
+    rotates: list[bool]
     contradicted: list[tuple[bool, bool]]
-    abandoned: bool = False
+    bands: OffsetCurve
 
 
 def _detect(
@@ -538,6 +539,7 @@ def _detect(
     method: _Method,
     options: _FitOptions,
     translation: ToneFit | None = None,
+    bands_known: OffsetCurve | None = None,
 ) -> _Detected:
     """``detect_vibration`` of grey frames (B, T, H, W) in row order.
 
@@ -548,10 +550,14 @@ def _detect(
         method: How tones are fitted.
         options: Its options.
         translation: Fit without roll and zoom, from which a fit with roll or zoom starts.
+        bands_known: Offsets of the row bands, if they were measured with another timing.
+
+    Raises:
+        AbandonedError: If the options are a trial, and the motion is another one.
     """
     row_timing, bands, scale = timing.in_row_order(), options.bands, options.scale
     if scale.same_for_all_columns:
-        start = band_start(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve)
+        start = band_start(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve, known=bands_known)
     else:
         start = field_start(frames, valid, row_timing, bands, scale, translation)
     found = method.fit(start, frames, valid, row_timing, options)
@@ -594,9 +600,9 @@ def _detect(
         )
         for index in range(len(frames))
     ]
-    rotates, contradicted = False, [(False, False)] * len(frames)
+    rotates, contradicted = [False] * len(frames), [(False, False)] * len(frames)
     if other_motion is not None:
-        rotates = any(rotation_found(other_motion[index]) for index in range(len(frames)))
+        rotates = [rotation_found(other_motion[index]) for index in range(len(frames))]
         contradicted = [
             contradicted_axes(vibration[index], other_motion[index], max_tones) for index in range(len(frames))
         ]
@@ -628,7 +634,7 @@ def _detect(
         ),
         timing=timing,
     )
-    return _Detected(result, fit, found.measurements, rotates, contradicted, found.abandoned)
+    return _Detected(result, fit, found.measurements, rotates, contradicted, start.curve)
 
 
 def _with_cause(
@@ -647,7 +653,9 @@ def _with_cause(
         part = slice(index, index + 1)
         own = found.measurements.mapped(itemgetter(part))
         of_stack = frames[part], None if valid is None else valid[part]
-        cause = _wrong_setting(*of_stack, own, axes, timing, method, options)
+        curve = replace(found.bands, offsets=found.bands.offsets[part], quality=found.bands.quality[part])
+        rotates = found.rotates[index]
+        cause = _wrong_setting(*of_stack, own, curve, axes, timing, method, options, rotates=rotates)
         if cause is not None:
             # the axes have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong
             reliable[index] = False
@@ -659,30 +667,43 @@ def _wrong_setting(
     frames: Tensor,
     valid: Tensor | None,
     measurements: Measurements,
+    curve: OffsetCurve,
     axes: tuple[bool, bool],
     timing: SensorTiming,
     method: _Method,
     options: _FitOptions,
+    *,
+    rotates: bool,
 ) -> str | None:
     """Sentence about another timing with which the frames of one stack agree; None if none was found.
 
-    A timing agrees if detection with it is reliable along the axes that contradict the stated one.
+    A timing agrees if detection with it is reliable along the axes that contradict the stated one. With the wrong scan
+    axis, the halves of a row are exposed at different times and move apart.
 
     Args:
         frames: (1, T, H, W) in row order.
         valid: Their valid pixels.
         measurements: Displacements of the rows.
+        curve: Offsets of the row bands.
         axes: Axes (x, y) in row order that contradict the stated timing.
         timing: The stated timing, in image order.
         method: The method.
         options: Its options.
+        rotates: Whether the halves of the rows move apart.
     """
+    trial = replace(options, is_trial=True)
 
-    def agrees(other: RowTiming, change: Callable[[Tensor], Tensor], concerned: tuple[bool, bool] = axes) -> bool:
-        pixels = None if valid is None else change(valid)
+    def agrees(
+        other: RowTiming,
+        change: Callable[[Tensor], Tensor] | None = None,
+        concerned: tuple[bool, bool] = axes,
+    ) -> bool:
+        changed, pixels, bands = frames, valid, curve if change is None else None
+        if change is not None:
+            changed, pixels = change(frames), None if valid is None else change(valid)
         try:
-            found = _detect(change(frames), pixels, other, method, options).result
-        except ValueError:  # columns may lack the detail that rows have
+            found = _detect(changed, pixels, other, method, trial, bands_known=bands).result
+        except (ValueError, AbandonedError):  # columns may lack the detail that rows have
             return False
         return all(good or not axis for good, axis in zip(found.reliable[0].tolist(), concerned, strict=True))
 
@@ -695,7 +716,7 @@ def _wrong_setting(
     elif factor is not None and timing.frame_start_times is None:
         frame_rows = factor * timing.frame_rows
         changed = replace(row_timing, frame_rows=max(frame_rows, frames.shape[-2], timing.exposure_rows))
-        if changed.frame_rows == frame_rows and agrees(changed, lambda images: images):
+        if changed.frame_rows == frame_rows and agrees(changed):
             return (
                 f"the frames agree with frame_rows={frame_rows:.5g}, not with {timing.frame_rows:g}: frame_rows counts "
                 "the blanking rows and is not the image height; if the frame rate is known, row_time is 1 / (frame "
@@ -704,12 +725,13 @@ def _wrong_setting(
     elif factor is not None:
         times = {name: getattr(timing, name) * factor for name in ("frame_rows", "exposure_rows")}
         changed = replace(row_timing, row_time=timing.row_time / factor, **times)
-        if agrees(changed, lambda images: images):
+        if agrees(changed):
             return (
                 f"the frames agree with row_time={changed.row_time:.5g} s, not with {timing.row_time:g} s, if the "
                 "start times of the frames are right"
             )
-    if frames.shape[-1] <= timing.frame_rows and agrees(row_timing, lambda images: images.mT, (axes[1], axes[0])):
+    swapped = (axes[1], axes[0])
+    if rotates and frames.shape[-1] <= timing.frame_rows and agrees(row_timing, lambda images: images.mT, swapped):
         other, stated = ("x", "y") if timing.scan_axis == -2 else ("y", "x")
         return f"the frames agree with scan_axis={other!r}, not with {stated!r}"
     return None

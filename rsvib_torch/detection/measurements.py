@@ -74,6 +74,11 @@ class Measurements:
         return self.visible / self.visible.sum(2, keepdim=True).clamp(min=1.0)
 
     @cached_property
+    def span(self) -> Tensor:
+        """(B,) seconds from the first to the last exposure start of the record."""
+        return self.exposure_starts.amax((1, 2)) - self.exposure_starts.amin((1, 2))
+
+    @cached_property
     def centre(self) -> Tensor:
         """(B,) mid-time of the record in seconds: phases are fitted there, where they depend least on frequency."""
         return 0.5 * (self.exposure_starts.amin((1, 2)) + self.exposure_starts.amax((1, 2)) + self.exposure_time)
@@ -93,6 +98,12 @@ class Measurements:
             :, None, :, None
         ]
 
+    @cached_property
+    def drifts(self) -> Tensor:
+        """(B, N, G, 2) relative displacements by unit drifts t and t^2 / 2 from the centre, averaged over exposures."""
+        time = self.middles[..., 0, 0]
+        return self.relative(torch.stack([time, 0.5 * time.square() + self.exposure_time**2 / 24.0], -1))
+
     @property
     def duration(self) -> Tensor:
         """(B,) seconds from the first to the last row of the record, in any frame but the last of a group."""
@@ -104,14 +115,19 @@ class Measurements:
         """(B, N, 2) information of each axis alone."""
         return self.information.diagonal(dim1=-2, dim2=-1)
 
-    @property
+    @cached_property
+    def root(self) -> Tensor:
+        """(B, N, 2, 2) upper triangular R with ``W = R^T R``, W the information."""
+        return cholesky_root(self.information)
+
+    @cached_property
     def inverse_variances(self) -> Tensor:
         """(B, N, 2) inverse variance ``1 / (W^-1)_aa`` of the displacement of each axis, W the information."""
-        axes, inverse = self.information.shape[-1], []
-        for axis in range(axes):  # the last pivot of a Cholesky factor belongs to an axis that is conditioned on none
-            order = [*(other for other in range(axes) if other != axis), axis]
-            inverse.append(cholesky_root(self.information[..., order, :][..., order])[..., -1, -1].square())
-        return torch.stack(inverse, -1)
+        axes = self.information.shape[-1]
+        # the last pivot of a Cholesky factor belongs to an axis that is conditioned on none
+        orders = [[*(other for other in range(axes) if other != axis), axis] for axis in range(axes)]
+        each = torch.stack([self.information[..., order, :][..., order] for order in orders], 2)
+        return cholesky_root(each)[..., -1, -1].square()
 
     @property
     def _expected(self) -> Tensor:
@@ -136,11 +152,6 @@ class Measurements:
         """Every stack ``count`` times in a row."""
         return self.mapped(lambda values: values.repeat_interleave(count, dim=0))
 
-    def in_segments(self, count: int) -> "Measurements":
-        """The record cut into ``count`` pieces of equal length, as a batch (B count, N / count, ...)."""
-        rows = self.exposure_starts.shape[1] // count * count
-        return self.mapped(lambda values: values[:, :rows].unflatten(1, (count, -1)).flatten(0, 1))
-
     def mapped(self, function: Callable[[Tensor], Tensor]) -> "Measurements":
         """The measurements with a function applied to all tensors."""
         return replace(
@@ -161,16 +172,19 @@ class Measurements:
         return self._with_information(self.information * root[..., :, None] * root[..., None, :])
 
     def _with_information(self, information: Tensor) -> "Measurements":
-        """The same displacements with other information; cached values are kept, because they depend on times only."""
+        """The same displacements with other information; cached values are kept if they depend on times only."""
         result = copy(self)
         object.__setattr__(result, "information", information)
+        for name in ("root", "inverse_variances"):
+            result.__dict__.pop(name, None)
         return result
 
     def relative(self, values: Tensor) -> Tensor:
         """Values (B, N, G, ...) less their mean over the frames that contain the row; 0 in the other frames."""
         ones = (1,) * (values.ndim - 3)
-        mean = (self._mean_weights.reshape(*self.visible.shape, *ones) * values).sum(2, keepdim=True)
-        return self.visible.reshape(*self.visible.shape, *ones) * (values - mean)
+        visible = self.visible.reshape(*self.visible.shape, *ones)
+        mean = (self._mean_weights.reshape(visible.shape) * values).sum(2, keepdim=True)
+        return visible * (values - mean)
 
     # Residuals of a fit, (B, N, G, 2) px
 
@@ -274,10 +288,12 @@ def cholesky_root(information: Tensor) -> Tensor:
     axes = information.shape[-1]
     root, rest = torch.zeros_like(information), information
     for axis in range(axes):
-        pivot = rest[..., axis, axis].clamp(min=0.0).sqrt()[..., None]
-        row = torch.where(pivot > 0, rest[..., axis, :] / torch.where(pivot > 0, pivot, 1.0), 0.0)
-        root[..., axis, axis:] = row[..., axis:]
-        rest = rest - row[..., :, None] * row[..., None, :]
+        square = rest[..., :1, :1]
+        row = torch.where(square > 0, rest[..., :1, :] * square.rsqrt(), 0.0)  # (..., 1, A - axis)
+        root[..., axis, axis:] = row[..., 0, :]
+        if axis + 1 < axes:
+            later = row[..., 1:]
+            rest = rest[..., 1:, 1:] - later.mT * later
     return root
 
 

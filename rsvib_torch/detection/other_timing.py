@@ -19,6 +19,7 @@ _ROWS = (32, 128)  # measured rows that are used in the search and its refinemen
 _SHORTEST, _LONGEST, _STEP = 0.8, 1.5, 0.02  # frame periods that are tried, over the stated one
 _LEVELS, _POINTS = 4, 9  # refinement of the best one, each level in steps four times smaller
 _SMALLER = 0.5  # of the square of the residual with the stated timing; correct alternatives reach 0.3 or less
+_ITERATIONS = 5  # of fits; most factors are wrong, and their fits converge slowly
 _MINIMA, _EQUAL = 4, 4.0  # minima that are refined, and their squared residual over the least to count as equal
 
 
@@ -48,9 +49,10 @@ def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int
         moved = (factors[:, None, None] - 1.0) * (starts - starts[0])[frame]
         trial = replace(trial, exposure_starts=trial.exposure_starts + moved)
         if frequencies is None:
-            fit = find_tones(trial, interval, 1)
+            fit = find_tones(trial, interval, 1, stretches=False, iterations=_ITERATIONS)
         else:
-            fit, _ = robust_fit(trial, frequencies, torch.ones_like(frequencies, dtype=torch.bool), MotionModel())
+            active = torch.ones_like(frequencies, dtype=torch.bool)
+            fit, _ = robust_fit(trial, frequencies, active, MotionModel(), iterations=_ITERATIONS)
         return typical_size(trial, fit), fit.frequencies
 
     ends = starts.new_tensor([1.0, -1.0])

@@ -30,6 +30,8 @@ class OtherMotion:
         measured: (...) fraction of the visible rows whose displacement was measured.
         blur: (..., 3) measured difference of the blur of the frames relative to the expected one, its standard
             deviation, and the size of the expected difference relative to the detail of the scene.
+        stalled: (..., 2) typical residual of a row in standard deviations where the fit ended without convergence, else
+            0.
     """
 
     size: Tensor
@@ -38,6 +40,12 @@ class OtherMotion:
     differential: Tensor
     measured: Tensor
     blur: Tensor
+    stalled: Tensor
+
+    @property
+    def permitted(self) -> Tensor:
+        """(..., 2) px, largest ``unexplained`` of a reliable axis: errors of interpolation and of unequal blur."""
+        return (0.006 * self.size).clamp(min=0.05)
 
     def __getitem__(self, index: int) -> "OtherMotion":
         """The part of one stack out of a batch."""

@@ -54,10 +54,10 @@ class GreyFrames:
         """The given number of neighbouring columns of each stack, those with the most detail."""
         if columns >= self.images.shape[-1]:
             return self
-        parts = [detailed_columns(stack[0], columns) for stack in self.images]
+        parts = _detailed(self.images, columns)
 
         def cut(values: Tensor) -> Tensor:
-            return torch.stack([stack[..., part] for stack, part in zip(values, parts, strict=True)])
+            return _cut(values, parts)
 
         return self._with(cut(self.images), None if self.valid is None else cut(self.valid), self.batched)
 
@@ -65,6 +65,16 @@ class GreyFrames:
         """One stack out of the batch, as a batch of one."""
         part = slice(index, index + 1)
         return self._with(self.images[part], None if self.valid is None else self.valid[part], False)
+
+
+def _detailed(images: Tensor, columns: int) -> list[slice]:
+    """The given number of neighbouring columns with the most detail of each stack (B, T, H, W)."""
+    return [detailed_columns(stack[0], columns) for stack in images]
+
+
+def _cut(values: Tensor, parts: list[slice]) -> Tensor:
+    """Columns of each stack."""
+    return torch.stack([stack[..., part] for stack, part in zip(values, parts, strict=True)])
 
 
 def grey_frames(
@@ -150,7 +160,7 @@ def band_curve(
     options: RegistrationOptions,
     *,
     mere_start: bool,
-    start_columns: int = 512,
+    start_columns: int = 320,
 ) -> OffsetCurve:
     """Offsets of the row bands of grey frames, NaN for bands with more than half of their pixels missing.
 
@@ -159,15 +169,14 @@ def band_curve(
         valid: (B, T, H, W) bool, False at missing pixels; None if there are none.
         timing: The sensor, in row order.
         options: How the bands are registered.
-        mere_start: Whether the offsets are only the start of a fit to rows. Of wide frames, the middle
-            ``start_columns`` are used then, unless a fifth of their bands cannot be registered.
+        mere_start: Whether the offsets are only the start of a fit to rows. Of wide frames, the ``start_columns``
+            with the most detail are used then, unless a fifth of their bands cannot be registered.
         start_columns: Columns that give a start of sufficient accuracy.
     """
     check_frame_size(frames.shape[-2], frames.shape[-1], options)  # of the user's frames, not of the columns in use
-    first = (frames.shape[-1] - start_columns) // 2
     curve = None
-    if mere_start and first > 0:
-        curve = register_rows(frames[..., first : first + start_columns], timing, options)
+    if mere_start and frames.shape[-1] > start_columns:
+        curve = register_rows(_cut(frames, _detailed(frames, start_columns)), timing, options)
     if curve is None or float(curve.good.double().mean((1, 2)).amin()) <= 0.8:
         curve = register_rows(frames, timing, options)
     if valid is None:
@@ -199,10 +208,20 @@ class BandStart:
 
 
 def band_start(
-    frames: Tensor, valid: Tensor | None, timing: RowTiming, options: RegistrationOptions, *, mere_start: bool
+    frames: Tensor,
+    valid: Tensor | None,
+    timing: RowTiming,
+    options: RegistrationOptions,
+    *,
+    mere_start: bool,
+    known: OffsetCurve | None = None,
 ) -> BandStart:
-    """``band_curve`` with its measurements."""
-    curve = band_curve(frames, valid, timing, options, mere_start=mere_start)
+    """``band_curve`` with its measurements; ``known`` are the offsets of these frames with another timing."""
+    if known is None:
+        curve = band_curve(frames, valid, timing, options, mere_start=mere_start)
+    else:
+        times = timing.frame_starts(frames.shape[1], frames.device)[:, None] + known.rows * timing.row_time
+        curve = replace(known, times=times[:-1], later_times=times[1:])
     return BandStart(curve, measurements_of_curve(curve, timing, options.band_step))
 
 

@@ -472,7 +472,7 @@ def _aliasing_bias(scene_power: Tensor, u: Tensor, v: Tensor) -> Tensor:
     slope = 2 * math.pi * of_blocks[0] * along
     squares = (slope.square() @ power @ across.square()).clamp(min=1e-300)
     bias: Tensor = _SHARE_OF_ALIASING * at_nyquist * slope.sum() * across.sum() / squares
-    return bias
+    return bias.clamp(max=1.0)  # px; without a scene, its power is that of rounding
 
 
 def _low_pass(frequency: Tensor, low: float, high: float) -> Tensor:

@@ -67,6 +67,7 @@ class RowSpectra:
         self.values = gathered(pieces, self.height, frames.ndim - 2)
         self._index_rows()
         self.frequencies = torch.fft.rfftfreq(self.length, dtype=torch.float64, device=frames.device)
+        self._band = slice(0, len(self.frequencies))
         self.valid = None
         if valid is not None and not bool(valid.all()):
             # pixels that are interpolated from an invalid one are invalid as well
@@ -84,6 +85,14 @@ class RowSpectra:
         part = copy(self)
         part.values, part._first_rows = self.values[:, frames], self._first_rows[:, frames]
         part.valid = None if self.valid is None else self.valid[:, frames]
+        return part
+
+    def band(self, frequencies: slice) -> "RowSpectra":
+        """Some of the frequencies of all frames; the values are copied."""
+        part = copy(self)
+        part.values, part.frequencies = self.values[..., frequencies].contiguous(), self.frequencies[frequencies]
+        part._band = frequencies
+        part._index_rows()
         return part
 
     def followed_by(self, later: "RowSpectra") -> "RowSpectra":
@@ -123,7 +132,7 @@ class RowSpectra:
 
     def ramp(self, shift: Tensor) -> Tensor:
         """exp(2 pi i u shift) for all frequencies u, (..., U)."""
-        return shift_phases(shift, self.length, slice(0, len(self.frequencies)), self.values.dtype)
+        return shift_phases(shift, self.length, self._band, self.values.dtype)
 
     def subtract(self, pattern: Tensor) -> None:
         """Subtract a pattern (B, U) from every row of these frames; the spectra of other parts stay unchanged."""
@@ -178,7 +187,8 @@ def differences(spectra: Tensor, visible: Tensor) -> Tensor:
 
 def inner_columns(width: int, shift: Tensor, like: Tensor) -> Tensor:
     """(1, 1, W) weight of columns: 1 where all frames of the group show the scene, falling to 0 over 8 px."""
-    edge = math.ceil(float(shift.abs().amax())) + MARGIN
+    largest = float(shift.abs().amax())
+    edge = (math.ceil(largest) if largest < width else width) + MARGIN  # that of a fit that diverges may be infinite
     place = torch.arange(width, dtype=like.dtype, device=like.device)
     inside = torch.minimum(place, width - 1 - place) - edge
     return (inside / MARGIN).clamp(0.0, 1.0)[None, None]

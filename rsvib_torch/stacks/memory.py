@@ -16,8 +16,8 @@ __all__ = ["check_stack_fits", "memory_limit", "memory_needed", "parse_memory", 
 # scripts/benchmark.py --only memory, rounded up
 _PROCESS_BYTES, _WINDOW_BYTES = 450 * 10**6, 80 * 10**6
 # bytes per pixel and channel of a window that is detected, restored and judged; same measurement
-_MOSAIC_BYTES, _MOSAIC_FRAME_BYTES = 750 * 10**6, 1000  # more for a mosaic: of a window, per pixel of a frame
 _PIXEL_BYTES = {"dewarp": 55, "banded": 55, "exact": 68, "richardson-lucy": 105, "edges": 80}
+_MOSAIC_BYTES, _MOSAIC_FRAME_BYTES = 750 * 10**6, 1000  # more for a mosaic: of a window, per pixel of a frame
 _FINER = 4  # times that with scale=2; 3.5 measured for windows of 4 frames of 512 px, see scripts/attacks/memory.py
 
 

@@ -51,3 +51,13 @@ def test_halves_that_move_apart_are_refused_after_three_rounds_of_roll(rounds):
     assert found.vibration.num_axes == 2
     assert any("parallax" in reason for reasons in found.reasons for reason in reasons)
     assert rounds["StripRows"] == 3
+
+
+def test_motion_that_no_tones_explain_is_refused_after_few_rounds(rounds):
+    generator = torch.Generator().manual_seed(2)
+    frequency, phase = (torch.rand(2, 40, generator=generator, dtype=torch.float64) for _ in range(2))
+    walk = rsv.Vibration(1.5 / (4 + 80 * frequency), 2 + 40 * frequency, 6 * phase)
+    found = rsv.detect_vibration(frames_of(walk), TIMING)
+    assert not found.reliable.any()
+    assert rounds["MeasuredRows"] <= 10, rounds  # of the stated timing, and of another one if one is tried
+    assert rounds["StripRows"] <= 3

@@ -6,7 +6,7 @@ Every round of ``_refine`` has four steps:
 2. measure the residual displacement and the information matrix of every scene row (``rows.displacements``), with roll
    and zoom in strips of columns (``rows.measured_rows``),
 3. fit tones and image motion to the measurements by weighted least squares (``tones``),
-4. stop if the next round would change the motion by much less than its standard deviation.
+4. stop if the next round would change the motion by much less than its standard deviation, or if the residual stalls.
 
 Steps 1 and 2 do not depend on the model of the motion, step 3 does not depend on images.
 
@@ -46,7 +46,7 @@ from rsvib_torch.motion.vibration import blind_frequencies
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.registration.gradients import RowGradients
 
-__all__ = ["DirectFit", "offset_curve", "refine_directly"]
+__all__ = ["AbandonedError", "DirectFit", "offset_curve", "refine_directly"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,6 @@ class DirectFit:
         other_motion: Motion in the measurements that the fit does not explain.
         robust_weights: (B, N, 2) weights 0 ... 1 by which the information of each row was multiplied; 0 for outliers.
         aliasing: (B,) px, expected size of the bias of the displacements by aliasing.
-        abandoned: Whether the motion was found to be of another kind after few rounds, see ``refine_directly``.
     """
 
     measurements: Measurements
@@ -67,12 +66,14 @@ class DirectFit:
     other_motion: OtherMotion
     robust_weights: Tensor
     aliasing: Tensor
-    abandoned: bool = False
 
 
-# rounds; std of the typical residual after them, of two axes together: 3 in 10 of 11 recordings with roll or zoom;
-# 13 and 14 in two recordings with parallax
-_TRIED_ROUNDS, _MAX_TRIED_SIZE = 3, 10.0
+class AbandonedError(Exception):
+    """The motion that was tried does not explain the rows after few rounds."""
+
+
+# rounds; multiple of the residual that the verdict permits. Roll and zoom leave 0.1 of it, parallax 2 to 10 times it
+_TRIED_ROUNDS, _MAX_TRIED = 3, 2.0
 
 
 def refine_directly(
@@ -82,7 +83,7 @@ def refine_directly(
     tones: int | None,
     max_rounds: int = 12,
     *,
-    may_be_other: bool = False,
+    is_trial: bool = False,
 ) -> tuple[DirectFit, OffsetCurve, Tensor]:
     """Refine a detected motion on the images.
 
@@ -96,16 +97,19 @@ def refine_directly(
         start: Fit to the offsets of row bands.
         tones: Number of tones of each axis; None to select it by significance.
         max_rounds: Largest number of rounds of measuring and fitting; exposures of 400 rows need more than six.
-        may_be_other: Whether the motion is possibly of another kind than assumed (parallax instead of roll). It is
+        is_trial: Whether the motion is possibly of another kind than assumed (parallax instead of roll). It is
             abandoned if a large residual remains after three rounds.
 
     Returns:
         The last measurements and the fit to them, the measurements as offsets between consecutive frames, and the
         offsets (B, P, N, 2) in px that the fit predicts.
+
+    Raises:
+        AbandonedError: If a trial is abandoned.
     """
     motion = shrunk_motion(start, intervals)
-    found = _refine(rows, intervals, start, tones, max_rounds, may_be_other)
-    if not found.abandoned and rows.differently_blurred(motion):
+    found = _refine(rows, intervals, start, tones, max_rounds, is_trial)
+    if rows.differently_blurred(motion):
         tried = torch.zeros_like(start.active[..., 0])
         for _ in range(2):  # one axis after the other
             frequencies, mirrored = _mirrored_frequencies(found, start, tried)
@@ -176,13 +180,14 @@ def _refine(
     start: ToneFit,
     tones: int | None,
     max_rounds: int,
-    may_be_other: bool = False,
+    is_trial: bool = False,
 ) -> DirectFit:
     """Measure around the motion, fit, repeat."""
     timing, fit, model = rows.timing, start, start.model
     motion = shrunk_motion(fit, intervals)
     gradients: list[RowGradients] | None = None  # None: compute them from the warped frames
     steps: list[_Step] = []
+    sizes: list[Tensor] = []  # (B, A), typical residuals since the search in standard deviations
     search_round = 1  # the first round removes the error of the band offsets; weak tones are significant after it
     pattern_rounds = 2  # a strong pattern biases the motion by which its first estimate is warped
     interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)  # exposures average out faster tones
@@ -192,33 +197,39 @@ def _refine(
         measurements = record.measurements
         residual = residual_of(measurements, fit)
         previous = fit
+        residual_size = measurements.sizes(residual).nanmedian(1).values
+        sizes = [*sizes, residual_size] if number != search_round else []  # fewer tones before the search
         if number == search_round:
             independent = replace(measurements, independent=measurements.independent_fraction(residual))
             # the noise of rows is nearly white: a tone that explains a fiftieth of the residual is significant
             fit = find_tones(independent, interval, tones, model, 0.02, strongest_only(fit), blind)
         else:
-            fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual)
+            fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual, steps=1)
         warped_by, motion, gradients = motion, shrunk_motion(fit, intervals), record.gradients
-        if number == max_rounds - 1:
+        if number == max_rounds - 1 or not bool((measurements.weights > 0).any()):  # or nothing is visible any more
             break
 
-        tried = may_be_other and number == _TRIED_ROUNDS - 1
-        if tried and float(typical_size(measurements, fit).amin()) > _MAX_TRIED_SIZE**2:
-            return replace(_conclude(record, fit), abandoned=True)
+        if is_trial and number == _TRIED_ROUNDS - 1:
+            other = _conclude(record, fit).other_motion
+            if bool((other.unexplained > _MAX_TRIED * other.permitted).any()):
+                raise AbandonedError
         step = _Step.between(measurements, warped_by, motion)
         same_tones = torch.equal(previous.active, fit.active)
         ratio = step.ratio_to(steps[-1]) if steps and same_tones else None
-        if number >= search_round and _converged(previous, fit, ratio):
+        converged = _converged(previous, fit, ratio) & (number >= search_round)
+        stalled = _stalled(sizes) & ~converged
+        if bool((converged | stalled).all()):
             if pattern_rounds == 0 or not rows.remove_column_pattern(motion, gradients):
-                break
+                return _conclude(record, fit, torch.where(stalled, residual_size, 0.0))
             pattern_rounds, search_round = pattern_rounds - 1, number + 1
-            gradients, steps = None, []
+            gradients, steps, sizes = None, [], []
             continue
         # steps with other tones do not predict the next one
         steps = [*steps[-3:], step] if same_tones and number > search_round else [step]
         if len(steps) > 1 and bool((inexact := step.is_inexact_after(steps[-2])).any()):
             accelerated = _accelerated(measurements, steps, inexact)
-            fit, _ = robust_fit(accelerated, fit.frequencies, fit.active, model, residual_of(accelerated, fit))
+            given = residual_of(accelerated, fit)
+            fit, _ = robust_fit(accelerated, fit.frequencies, fit.active, model, given, steps=1)
             motion = shrunk_motion(fit, intervals)
             step = _Step.between(measurements, warped_by, motion)
         if float(step.change.abs().amax()) > 0.05:  # px; over smaller distances the gradients of the scene are the same
@@ -261,8 +272,19 @@ class _Step:
         return (product / previous.change.square().sum((1, 2, 3)).clamp(min=1e-30)).abs() > 0.3
 
 
-def _converged(previous: ToneFit, fit: ToneFit, ratio: Tensor | None) -> bool:
-    """Whether the next round is expected to change amplitudes and frequencies by a twentieth of their std or less.
+def _stalled(sizes: list[Tensor]) -> Tensor:
+    """(B, A) bool, axes whose typical residual exceeds 2 standard deviations and did not decrease in two rounds.
+
+    Args:
+        sizes: Typical residuals of the rounds so far.
+    """
+    if len(sizes) < 3:
+        return torch.zeros((), dtype=torch.bool, device="cpu")
+    return (sizes[-1] > 2.0) & (sizes[-1] > 0.9 * sizes[-3])
+
+
+def _converged(previous: ToneFit, fit: ToneFit, ratio: Tensor | None) -> Tensor:
+    """(B, A) bool, whether the next round is expected to change the tones of an axis by a twentieth of their std.
 
     Without long exposures a step is a tenth of the previous one or shorter. Changes of up to half a standard deviation
     are therefore small enough, and up to 1.5 standard deviations if the measured ratio of two steps allows it.
@@ -273,19 +295,19 @@ def _converged(previous: ToneFit, fit: ToneFit, ratio: Tensor | None) -> bool:
         ratio: (B,) length of the last step over that of the step before; None if unknown.
     """
     if previous.active.shape != fit.active.shape:
-        return False
+        return torch.zeros_like(fit.active[..., 0])
     deviation = fit.covariance.diagonal(dim1=-2, dim2=-1)
     deviation = deviation.unflatten(-1, (fit.coefficients.shape[1], -1)).clamp(min=0.0).sqrt()
     std = deviation[..., : 3 * fit.frequencies.shape[-1]].unflatten(-1, (-1, 3))  # of Re C, Im C and f
-    turn = 2 * math.pi * previous.frequencies * (fit.centre - previous.centre)[:, None, None]
-    change = (previous.coefficients * torch.polar(torch.ones_like(turn), turn) - fit.coefficients).abs()
+    change = (previous.about(fit.centre).coefficients - fit.coefficients).abs()
     max_change_std = change.new_full((), 0.5)
     if ratio is not None:
         max_change_std = (0.05 / ratio.clamp(min=1e-3)).clamp(0.5, 1.5)[:, None, None]
     small = (change <= max_change_std * std[..., :2].amax(-1)) & (
         (previous.frequencies - fit.frequencies).abs() <= max_change_std * std[..., 2]
     )
-    return bool((small | ~fit.active).all())
+    converged: Tensor = (small | ~fit.active).all(-1)
+    return converged
 
 
 def _accelerated(measurements: Measurements, steps: list[_Step], where: Tensor) -> Measurements:
@@ -367,14 +389,14 @@ def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:
     )
 
 
-def _conclude(record: RowRecord, fit: ToneFit) -> DirectFit:
+def _conclude(record: RowRecord, fit: ToneFit, stalled: Tensor | None = None) -> DirectFit:
     """The last fit, to the measurements themselves, with a covariance that accounts for correlated residuals."""
     measurements = record.measurements
     residual = residual_of(measurements, fit)
     weighted = measurements.reweighted(residual)
     share = weighted.independent_fraction(residual) * measurements.share_counted(residual)
     weighted = replace(weighted, independent=share)
-    fit = fit_tones(weighted, fit.frequencies, fit.active, fit.model)
+    fit = fit_tones(weighted, fit, fit.active, fit.model)
     shown = measurements.num_differences > 0
     measured = (shown & (measurements.weights > 0).any(-1)).double().sum(1) / shown.double().sum(1).clamp(min=1.0)
     tones = measurements.relative(model_displacements(measurements, replace(fit, drift=torch.zeros_like(fit.drift))))
@@ -385,6 +407,7 @@ def _conclude(record: RowRecord, fit: ToneFit) -> DirectFit:
         differential=record.differential(),
         measured=measured,
         blur=measured.new_tensor([1.0, 0.0, 0.0]).expand(len(measured), 3),  # replaced once the motion is final
+        stalled=torch.zeros_like(residual[:, 0, 0]) if stalled is None else stalled,
     )
     robust_weights = weighted.weights / measurements.weights.clamp(min=1e-300)
     aliasing = torch.stack([own.aliasing for own in record.gradients]).mean(0)

@@ -510,14 +510,15 @@ def blur_ratio(
     for group in groups:
         positions = _Positions.of(group, timing, motion)
         u = group.spectra.frequencies
-        low = (u > 1 / 64) & (u < highest)  # shading affects frequencies below 1/64 cycles/px
+        low = slice(int((u <= 1 / 64).sum()), int((u < highest).sum()))  # shading affects frequencies below 1/64
+        low_spectra = group.spectra.band(low)
 
         def averaged(values: Tensor) -> Tensor:
             rows = values.shape[2] // block
             rows_of_blocks: Tensor = values[:, :, : rows * block].unflatten(2, (rows, block))
             return rows_of_blocks.mean(3)
 
-        spectra = averaged(group.spectra.warped(positions.rows, positions.shift)[..., low])
+        spectra = averaged(low_spectra.warped(positions.rows, positions.shift))
         moments = averaged(_second_moments(*_paths(positions.exposure_starts, timing, motion)))
         visible = averaged(positions.visible(group.spectra.height, BLOCK_ROWS))
         mean, difference = 0.5 * (spectra[:, 1:] + spectra[:, :-1]), spectra[:, 1:] - spectra[:, :-1]
@@ -531,7 +532,7 @@ def blur_ratio(
         columns = torch.view_as_real(torch.stack([expected.to(mean.dtype), here], -1)).movedim(-1, -2)  # (..., 2, 2)
         values = torch.view_as_real(difference[:, :, 1:-1])
         columns, values = (part.double().flatten(1, -1 - rank) for part, rank in ((columns, 1), (values, 0)))
-        weight = weight[..., None].expand(*weight.shape[:-1], int(low.sum()), 2).flatten(1)
+        weight = weight[..., None].expand(*weight.shape[:-1], low.stop - low.start, 2).flatten(1)
         weighted = (columns * weight[..., None]).mT
         right = (weighted @ values[..., None])[..., 0]
         sums.append((weighted @ columns, right, (weight * values.square()).sum(1), weight.sum(1)))

@@ -46,7 +46,7 @@ def without_aliasing(measurements: Measurements, fit: ToneFit, size: Tensor) -> 
     return replace(
         fit,
         coefficients=fit.coefficients + torch.complex(real, imaginary),
-        frequencies=fit.frequencies + frequency,
+        frequencies=(fit.frequencies + frequency).clamp(min=0.0),
         drift=fit.drift + drift,
         covariance=covariance,
     )

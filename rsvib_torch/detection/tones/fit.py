@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.detection.measurements import Measurements, cholesky_root
+from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
 if TYPE_CHECKING:
@@ -92,9 +92,24 @@ class ToneFit:
     model: MotionModel
 
     @property
+    def tones(self) -> Tensor:
+        """(B, 2, K, 3) Re C, Im C and f."""
+        return torch.stack([self.coefficients.real, self.coefficients.imag, self.frequencies], -1)
+
+    @property
     def amplitude(self) -> Tensor:
         """(B, 2, K) px, 0 for tones that are not active."""
         return torch.where(self.active, self.coefficients.abs(), 0.0)
+
+    def about(self, centre: Tensor) -> "ToneFit":
+        """The same motion with another centre (B,) in s; only the covariance is not changed."""
+        moved = (centre - self.centre)[:, None]
+        turn = 2 * math.pi * self.frequencies * moved[..., None]
+        drift = self.drift
+        if drift.shape[-1] > 1:  # the constant of (s + moved)^2 / 2 cancels within the group
+            drift = torch.stack([drift[..., 0] + drift[..., 1] * moved, drift[..., 1]], -1)
+        turned = self.coefficients * torch.complex(turn.cos(), turn.sin())
+        return replace(self, coefficients=turned, drift=drift, centre=centre)
 
 
 def tone_response(measurements: Measurements, frequencies: Tensor) -> Tensor:
@@ -119,22 +134,15 @@ def tone_response(measurements: Measurements, frequencies: Tensor) -> Tensor:
 
 def drift_response(measurements: Measurements, order: int) -> Tensor:
     """Relative displacements (B, N, G, J) of unit drifts s^j / j!, averaged over the exposure."""
-    time = measurements.middles[..., 0, 0]
-    powers = [time, 0.5 * time.square() + measurements.exposure_time**2 / 24.0]
-    return measurements.relative(torch.stack(powers[:order], dim=-1))
+    return measurements.drifts[..., :order]
 
 
 def model_displacements(measurements: Measurements, fit: ToneFit) -> Tensor:
     """Displacements (B, N, G, 2) in px that the fitted motion predicts at the measurements."""
-    moved = measurements.centre - fit.centre
-    turn = 2 * math.pi * fit.frequencies * moved[:, None, None]
-    phasor = fit.coefficients * torch.polar(torch.ones_like(turn), turn)
-    tones = phasor[:, None, None] * tone_response(measurements, fit.frequencies)
-    drift = fit.drift.clone()
-    if fit.drift.shape[-1] > 1:  # the constant of (s + moved)^2 / 2 cancels within the group
-        drift[..., 0] += fit.drift[..., 1] * moved[:, None]
+    fit = fit.about(measurements.centre)
+    tones = fit.coefficients[:, None, None] * tone_response(measurements, fit.frequencies)
     response = drift_response(measurements, fit.drift.shape[-1])
-    return tones.real.sum(-1) + torch.einsum("bngj,baj->bnga", response, drift)
+    return tones.real.sum(-1) + torch.einsum("bngj,baj->bnga", response, fit.drift)
 
 
 def residual_of(measurements: Measurements, fit: ToneFit) -> Tensor:
@@ -155,50 +163,52 @@ def select_stacks(where: Tensor, one: Result, other: Result) -> Result:
 # --- Weighted least squares ---
 
 
-def _jacobian_of_tones(smearing_times: Tensor, time: Tensor, coefficients: Tensor, frequencies: Tensor) -> Tensor:
-    """Derivatives (B, N, G, 2, 3 K) of mean displacements by Re C, Im C and f (B, 2, K) of each tone.
+def _jacobian_of_tones(smearing_times: Tensor, time: Tensor, tones: Tensor) -> Tensor:
+    """Derivatives (B, N, G, 2, 3 K) of mean displacements by Re C, Im C and f of each tone.
 
     Args:
         smearing_times: (2, 1, 2, 1) s, as in ``Measurements``.
         time: (B, N, G, 1, 1) s, mid-exposures from the centre of the record.
-        coefficients: C.
-        frequencies: f in Hz.
+        tones: (B, 2, K, 3) Re C and Im C in px, and f >= 0 in Hz.
     """
+    frequencies = tones[..., 2]
     smeared, smeared_slope = _sinc(frequencies * smearing_times)
     attenuation = smeared[0] * smeared[1]
     slope = (smeared_slope * smearing_times * smeared.flip(0)).sum(0)
-    angle = 2 * math.pi * frequencies[:, None, None] * time
-    wave = torch.complex(angle.cos(), angle.sin())
-    # the frequency changes the attenuation and the angle
-    by_attenuation = (slope * coefficients)[:, None, None]
-    by_angle = (2j * math.pi * attenuation * coefficients)[:, None, None]
-    by_frequency = ((by_attenuation + time * by_angle) * wave).real
-    by_parts = torch.view_as_real((attenuation[:, None, None] * wave).conj_physical())
-    return torch.cat([by_parts, by_frequency[..., None]], dim=-1).flatten(-2)
+    # the frequency changes the attenuation and the angle: Re((slope + 2 pi i time attenuation) C exp(i angle))
+    by_attenuation = (tones[..., :2] * slope[..., None])[:, None, None].unbind(-1)
+    by_angle = (tones[..., :2] * (2 * math.pi * attenuation)[..., None])[:, None, None].unbind(-1)
+    angle = (2 * math.pi * frequencies)[:, None, None] * time
+    cos, sin, attenuation = angle.cos(), angle.sin(), attenuation[:, None, None]
+    by_frequency = cos * torch.addcmul(by_attenuation[0], time, by_angle[1], value=-1)
+    by_frequency.addcmul_(sin, torch.addcmul(by_attenuation[1], time, by_angle[0]), value=-1)
+    return torch.stack([attenuation * cos, -attenuation * sin, by_frequency], dim=-1).flatten(-2)
 
 
 def _sinc(x: Tensor) -> tuple[Tensor, Tensor]:
-    """sin(pi x) / (pi x) and its derivative."""
-    value = torch.sinc(x)
-    small = x.abs() < 1e-4
-    slope = (torch.cos(math.pi * x) - value) / torch.where(small, 1.0, x)
-    return value, torch.where(small, -(math.pi**2) * x / 3, slope)
+    """sin(pi x) / (pi x) of x >= 0 and its derivative, which is -3e-4 instead of 0 below 1e-4."""
+    value, positive = torch.sinc(x), x.clamp(min=1e-4)
+    return value, ((math.pi * positive).cos() - torch.sinc(positive)) / positive
 
 
 @cache
-def _constraints(model: MotionModel, tones: int, device: torch.device) -> Tensor:
-    """Matrix (3 K + J, M) from the free parameters of an axis to all: harmonics share a frequency."""
+def _constraints(model: MotionModel, tones: int, axes: int, device: torch.device) -> Tensor:
+    """Matrix (A (3 K + J), A M) from the free parameters of A axes to all: harmonics share a frequency."""
     families = tones // model.harmonics
-    matrix = torch.zeros(
-        3 * tones + model.drift_order, 2 * tones + families + model.drift_order, dtype=torch.float64, device="cpu"
-    )
+    count = 2 * tones + families + model.drift_order
+    matrix = torch.zeros(3 * tones + model.drift_order, count, dtype=torch.float64, device="cpu")
+    column = 0
     for tone in range(tones):
-        family, harmonic = divmod(tone, model.harmonics)
-        matrix[3 * tone, 2 * tone] = matrix[3 * tone + 1, 2 * tone + 1] = 1.0
-        matrix[3 * tone + 2, 2 * tones + family] = harmonic + 1.0
+        harmonic = tone % model.harmonics
+        matrix[3 * tone, column] = matrix[3 * tone + 1, column + 1] = 1.0
+        if harmonic == 0:
+            of_frequency = column + 2
+        matrix[3 * tone + 2, of_frequency] = harmonic + 1.0
+        column += 3 if harmonic == 0 else 2
     for power in range(model.drift_order):
-        matrix[3 * tones + power, 2 * tones + families + power] = 1.0
-    return matrix.to(device)
+        matrix[3 * tones + power, column + power] = 1.0
+    of_axes: Tensor = torch.block_diag(*[matrix] * axes)
+    return of_axes.to(device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,6 +217,7 @@ class _Estimate:
 
     Attributes:
         values: (B, 2, P) all parameters.
+        jacobian: (B, N, G, 2, P) derivatives of the displacements of each axis by its parameters.
         residual: (B, N, G, 2) px.
         cost: (B,) weighted square of the residual.
         matrix: (B, M, M) normal matrix of the free parameters.
@@ -214,6 +225,7 @@ class _Estimate:
     """
 
     values: Tensor
+    jacobian: Tensor
     residual: Tensor
     cost: Tensor
     matrix: Tensor
@@ -232,65 +244,74 @@ class _Problem:
     def __init__(self, measurements: Measurements, active: Tensor, model: MotionModel) -> None:
         self.measurements, self.active, self.model = measurements, active, model
         (self.axes, self.tones), order = active.shape[1:], model.drift_order
-        self.to_all = torch.block_diag(*[_constraints(model, self.tones, active.device)] * self.axes)  # (A P, M)
-        of_tones = active[..., None].expand(-1, -1, -1, 3).flatten(-2)
-        exists = torch.cat([of_tones, torch.ones_like(of_tones[..., :1]).expand(-1, -1, order)], -1)
+        self.to_all: Tensor | None = None  # (A P, M); None: all parameters are free
+        if model.harmonics > 1:
+            self.to_all = _constraints(model, self.tones, self.axes, active.device)
+        exists = functional.pad(active.repeat_interleave(3, -1), (0, order), value=True)
         place = torch.arange(exists.shape[-1], device=active.device)
         self.is_frequency = (place < 3 * self.tones) & (place % 3 == 2)  # (P,)
-        self.free = exists.flatten(1).double() @ self.to_all > 0  # (B, M)
-        self.linear = (exists & ~self.is_frequency).flatten(1).double() @ self.to_all > 0
+        self.free, self.linear = (self._of_free(these) for these in (exists, exists & ~self.is_frequency))  # (B, M)
         self.drift_columns = drift_response(measurements, order)[..., None, :].expand(-1, -1, -1, self.axes, -1)
-        self.root = cholesky_root(measurements.information)[:, :, None]  # (B, N, 1, A, A)
+        self.root = measurements.root[:, :, None]  # (B, N, 1, A, A)
 
-    def unpack(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Coefficients (B, 2, K), frequencies (B, 2, K) and drifts (B, 2, J) of parameters (B, 2, P)."""
-        tones = values[..., : 3 * self.tones].unflatten(-1, (self.tones, 3))
-        return torch.complex(tones[..., 0], tones[..., 1]), tones[..., 2], values[..., 3 * self.tones :]
+    def _of_free(self, parameters: Tensor) -> Tensor:
+        """(B, M) bool, free parameters that change any of the parameters (B, 2, P)."""
+        these = parameters.flatten(1)
+        return these if self.to_all is None else these.double() @ self.to_all > 0
+
+    def tones_of(self, values: Tensor) -> Tensor:
+        """Tones (B, 2, K, 3) of parameters (B, 2, P), as in ``_jacobian_of_tones``."""
+        tones: Tensor = values[..., : 3 * self.tones].unflatten(-1, (self.tones, 3))
+        return tones
 
     def fit(self, values: Tensor, covariance: Tensor) -> ToneFit:
         """The parameters (B, 2, P) as a ``ToneFit``."""
-        coefficients, frequencies, drift = self.unpack(values)
+        real, imaginary, frequencies = self.tones_of(values).unbind(-1)
+        coefficients, drift = torch.complex(real, imaginary), values[..., 3 * self.tones :]
         centre = self.measurements.centre
         return ToneFit(coefficients, frequencies, self.active, drift, covariance, centre, self.model)
 
     def jacobian(self, values: Tensor) -> Tensor:
         """Derivatives (B, N, G, 2, P) of the displacements of each axis by its parameters (B, 2, P)."""
-        coefficients, frequencies, _ = self.unpack(values)
         measurements = self.measurements
-        tones = _jacobian_of_tones(measurements.smearing_times, measurements.middles, coefficients, frequencies)
+        tones = _jacobian_of_tones(measurements.smearing_times, measurements.middles, self.tones_of(values))
         return torch.cat([measurements.relative(tones), self.drift_columns], dim=-1)
 
     def covariance(self, state: _Estimate, deviation: Tensor) -> Tensor:
         """Covariance (B, 2 P, 2 P) for errors of a row of the covariance ``S W^-1 S``, S the deviations (B, 2)."""
-        _, inverse = _step(state, self.free, torch.zeros_like(state.cost))
+        matrix, scale = _scaled(state, self.free, torch.zeros_like(state.cost))
+        inverse = torch.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
         # W = R^T R, and the whitened errors R e have the covariance T T^T with T = R S R^-1; T^T R = R^-T S W
         diagonal = self.root.diagonal(dim1=-2, dim2=-1)
         safe = self.root + torch.diag_embed((diagonal == 0).to(diagonal))
         scaled = deviation[:, None, None, :, None] * (self.root.mT @ self.root)
         mixed = torch.linalg.solve_triangular(safe.mT, scaled, upper=False)  # (B, N, 1, A, A)
-        columns = self._whitened(mixed, self.jacobian(state.values)) @ (self.to_all @ inverse)
-        covariance: Tensor = self.to_all @ (columns.mT @ columns) @ self.to_all.T
-        return covariance
+        to_all = inverse if self.to_all is None else self.to_all @ inverse
+        columns = self._whitened(mixed, state.jacobian) @ to_all
+        covariance: Tensor = columns.mT @ columns
+        return covariance if self.to_all is None else self.to_all @ covariance @ self.to_all.T
 
     @staticmethod
     def _whitened(root: Tensor, jacobian: Tensor) -> Tensor:
         """Derivatives (B, N G A, A P) of the displacements times ``root``, from those of each axis (B, N, G, A, P)."""
-        return (root[..., None] * jacobian[..., None, :, :]).flatten(-2).flatten(1, 3)
+        factors = root.repeat_interleave(jacobian.shape[-1], -1)  # long inner loops are twice as fast
+        return (factors * jacobian.flatten(-2)[..., None, :]).flatten(1, 3)
 
     def evaluate(self, values: Tensor) -> _Estimate:
         """Residual and normal equations at the parameters ``values`` (B, 2, P)."""
         jacobian = self.jacobian(values)
-        linear = torch.where(self.is_frequency, 0.0, values)[:, None, None]
+        linear = values.masked_fill(self.is_frequency, 0.0)[:, None, None]
         residual = self.measurements.displacements - (jacobian * linear).sum(-1)
-        whitened = (self.root @ residual[..., None]).flatten(1)
+        whitened = (self.root @ residual[..., None]).flatten(1)[..., None]
         columns = self._whitened(self.root, jacobian)
-        matrix = self.to_all.T @ (columns.mT @ columns) @ self.to_all
-        right = (columns.mT @ whitened[..., None])[..., 0] @ self.to_all
-        return _Estimate(values, residual, whitened.square().sum(-1), matrix, right)
+        if self.to_all is not None:
+            columns = columns @ self.to_all
+        right = (columns.mT @ whitened)[..., 0]
+        return _Estimate(values, jacobian, residual, whitened.square().sum((1, 2)), columns.mT @ columns, right)
 
     def moved(self, values: Tensor, step: Tensor) -> Tensor:
         """Parameters after a step (B, M) of the free ones; frequencies stay positive."""
-        values = values + (step @ self.to_all.T).unflatten(1, (self.axes, -1))
+        values = values + (step if self.to_all is None else step @ self.to_all.T).unflatten(1, (self.axes, -1))
         return torch.where(self.is_frequency, values.abs(), values)
 
     def solve(self, start: Tensor | ToneFit, iterations: int, tolerance: float) -> _Estimate:
@@ -302,40 +323,47 @@ class _Problem:
             tolerance: Relative decrease of the cost that a step must promise.
         """
         if isinstance(start, ToneFit):
-            tones = torch.stack([start.coefficients.real, start.coefficients.imag, start.frequencies], -1)
+            start = start.about(self.measurements.centre)
+            tones = torch.where(self.active[..., None], start.tones, 0.0)
             state = self.evaluate(torch.cat([tones.flatten(-2), start.drift], -1))
         else:  # amplitudes, phases and drifts are linear once the frequencies are given
             values = start.new_zeros(len(start), self.axes, len(self.is_frequency))
             values[..., self.is_frequency] = torch.where(self.active, start, 0.0)
             state = self.evaluate(values)
-            step, _ = _step(state, self.linear, torch.zeros_like(state.cost))
-            state = self.evaluate(self.moved(values, step))
+            state = self.evaluate(self.moved(values, _step(state, self.linear, torch.zeros_like(state.cost))))
         damping = torch.full_like(state.cost, 1e-3)
         done = torch.zeros_like(state.cost, dtype=torch.bool)
         for _ in range(iterations):
-            step, _ = _step(state, self.free, damping)
+            step = _step(state, self.free, damping)
             done = done | ((step * state.right).sum(-1) <= tolerance * state.cost)
             if bool(done.all()):
                 break
             trial = self.evaluate(self.moved(state.values, step))
             better = trial.cost <= state.cost
-            state = select_stacks(better & ~done, trial, state)
+            taken = better & ~done
+            state = trial if bool(taken.all()) else select_stacks(taken, trial, state)
             damping = torch.where(better, damping * 0.1, damping * 10.0).clamp(1e-12, 1e6)
         return state
 
 
-def _step(state: _Estimate, free: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
-    """Step (B, M) of the ``free`` (B, M) parameters, and the inverse of the damped normal matrix."""
+def _scaled(state: _Estimate, free: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+    """Damped normal matrix of the ``free`` (B, M) parameters, each divided by its size, and the factors (B, M)."""
     size = state.matrix.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(free & (size > 1e-200), size.clamp(min=1e-200).rsqrt(), 0.0)
     matrix = state.matrix * scale[:, :, None] * scale[:, None]
-    matrix = matrix + torch.diag_embed(torch.where(free, 1e-12 + damping[:, None], 1.0))
-    inverse = torch.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
-    return (inverse @ state.right[..., None])[..., 0], inverse
+    matrix.diagonal(dim1=-2, dim2=-1).add_(torch.where(free, 1e-12 + damping[:, None], 1.0))
+    return matrix, scale
+
+
+def _step(state: _Estimate, free: Tensor, damping: Tensor) -> Tensor:
+    """Step (B, M) of the ``free`` (B, M) parameters."""
+    matrix, scale = _scaled(state, free, damping)
+    scaled: Tensor = torch.linalg.solve(matrix, state.right * scale)
+    return scaled * scale
 
 
 def fit_roughly(
-    measurements: Measurements, frequencies: Tensor, active: Tensor, model: MotionModel
+    measurements: Measurements, start: Tensor | ToneFit, active: Tensor, model: MotionModel, iterations: int = 5
 ) -> tuple[ToneFit, Tensor]:
     """A few steps of ``fit_tones``, as a start for another fit.
 
@@ -343,12 +371,16 @@ def fit_roughly(
         The fit, whose covariance has no meaning, and its residual displacements (B, N, G, 2).
     """
     problem = _Problem(measurements, active, model)
-    state = problem.solve(frequencies, iterations=5, tolerance=1e-4)
+    state = problem.solve(start, iterations, tolerance=1e-4)
     return problem.fit(state.values, state.matrix), state.residual
 
 
 def fit_tones(
-    measurements: Measurements, start: Tensor | ToneFit, active: Tensor, model: MotionModel | None = None
+    measurements: Measurements,
+    start: Tensor | ToneFit,
+    active: Tensor,
+    model: MotionModel | None = None,
+    iterations: int = 30,
 ) -> ToneFit:
     """Fit all tones of both axes and the image motion by weighted least squares (Levenberg-Marquardt).
 
@@ -357,9 +389,10 @@ def fit_tones(
     Args:
         measurements: The displacements.
         start: (B, 2, K) start frequencies in Hz; with harmonics, K is a multiple of their number, each family with its
-            fundamental first. Or a fit of the same tones to these measurements with other weights.
+            fundamental first. Or an earlier fit of the same tones.
         active: (B, 2, K) bool, tones to fit; the others stay at zero.
         model: Structure of the motion.
+        iterations: At most.
 
     Returns:
         The fit with its covariance. The variance of the errors of each axis is that of its residuals: with
@@ -367,7 +400,7 @@ def fit_tones(
         With roll and zoom, all axes have one variance.
     """
     problem = _Problem(measurements, active, model or MotionModel())
-    state = problem.solve(start, iterations=30, tolerance=1e-7)
+    state = problem.solve(start, iterations, tolerance=1e-7)
     spent = problem.free.unflatten(1, (problem.axes, -1)).sum(-1)
     # `num_measurements` counts independent measurements only: overlapping bands repeat each other
     spare = (measurements.num_measurements - spent).clamp(min=1.0)
@@ -454,7 +487,7 @@ def displacement_jacobian(fit: ToneFit, exposure_starts: Tensor, exposure_time: 
     time = (exposure_starts + 0.5 * exposure_time - fit.centre[:, None])[..., None, None, None]
     smearing = torch.tensor([exposure_time, 0.0], dtype=time.dtype, device=time.device)[:, None, None, None]
     axes = fit.coefficients.shape[1]
-    tones = _jacobian_of_tones(smearing.expand(2, 1, axes, 1), time, fit.coefficients, fit.frequencies)
+    tones = _jacobian_of_tones(smearing.expand(2, 1, axes, 1), time, fit.tones)
     powers = [time, 0.5 * time.square()][: fit.drift.shape[-1]]
     drift = torch.cat(powers, -1).expand(*tones.shape[:-1], -1)
     return torch.cat([tones, drift], -1)[:, :, 0]
@@ -463,10 +496,9 @@ def displacement_jacobian(fit: ToneFit, exposure_starts: Tensor, exposure_time: 
 def axis_jacobian(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Tensor, Tensor]:
     """Derivatives (B, N, G, M) of the displacements of an axis by its free parameters, and the matrix (P, M) to all."""
     problem = _Problem(measurements, fit.active, fit.model)
-    tones = torch.stack([fit.coefficients.real, fit.coefficients.imag, fit.frequencies], -1)
-    jacobian = problem.jacobian(torch.cat([tones.flatten(-2), fit.drift], -1))[..., axis, :]
+    jacobian = problem.jacobian(torch.cat([fit.tones.flatten(-2), fit.drift], -1))[..., axis, :]
     free = problem.free.unflatten(1, (problem.axes, -1))[:, axis]
-    to_all = _constraints(fit.model, fit.active.shape[-1], fit.active.device)
+    to_all = _constraints(fit.model, fit.active.shape[-1], 1, fit.active.device)
     return (jacobian @ to_all) * free[:, None, None], to_all
 
 

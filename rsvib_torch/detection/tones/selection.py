@@ -1,5 +1,7 @@
 """Number of tones: added one by one, strongest first, while they are significant, with weights against outliers."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -39,25 +41,33 @@ def robust_fit(
     active: Tensor,
     model: MotionModel,
     residual: Tensor | None = None,
+    *,
+    steps: int = 2,
+    iterations: int = 30,
 ) -> tuple[ToneFit, Measurements]:
     """Fit with the weights of outliers reduced in two steps (Tukey's biweight).
 
     Args:
         measurements: The displacements.
-        frequencies: (B, 2, K) Hz to start from.
+        frequencies: (B, 2, K) Hz to start from. Amplitudes and phases follow from them by linear equations; starts with
+            those of an earlier fit take more steps along the valleys of slow tones.
         active: (B, 2, K) bool.
         model: Structure of the motion.
         residual: (B, N, G, 2) px of an earlier fit; None to start with a fit of equal weights.
+        steps: 1 if the residual is that of a fit with reduced weights.
+        iterations: As in ``fit_tones``.
 
     Returns:
         The fit and the measurements with its weights.
     """
     if residual is None:
-        fit = fit_tones(measurements, frequencies, active, model)
-        frequencies, residual = fit.frequencies, residual_of(measurements, fit)
-    rough, residual = fit_roughly(measurements.reweighted(residual), frequencies, active, model)
+        rough, residual = fit_roughly(measurements, frequencies, active, model)
+        frequencies = rough.frequencies
+    for _ in range(steps - 1):
+        rough, residual = fit_roughly(measurements.reweighted(residual), frequencies, active, model)
+        frequencies = rough.frequencies
     weighed = measurements.reweighted(residual)
-    return fit_tones(weighed, rough, active, model), weighed
+    return fit_tones(weighed, frequencies, active, model, iterations), weighed
 
 
 def typical_size(measurements: Measurements, fit: ToneFit) -> Tensor:
@@ -74,6 +84,9 @@ def find_tones(
     start: ToneFit | None = None,
     blind: Tensor | None = None,
     accuracy: float = 0.0,
+    *,
+    stretches: bool = True,
+    iterations: int = 30,
 ) -> ToneFit:
     """Find and fit the tones of both axes; no initial guess is needed.
 
@@ -86,75 +99,136 @@ def find_tones(
         tones: Number of tones of each axis (of families, where harmonics are tied); None to choose it from the data.
         model: Structure of the motion.
         least_gain: Share of the residual sum of squares that a further tone must explain.
-        start: Fit whose tones are accepted. Without it, the search allows for stretches of outliers.
+        start: Fit whose tones are accepted.
         blind: (F,) Hz, blind frequencies of the frames, to recognise side tones of blind tones.
-        accuracy: px; an axis with a tone needs no further one once nearly all residuals are smaller.
+        accuracy: px; a fit is good enough once nearly all residuals of an axis are smaller.
+        stretches: Whether the search allows for stretches of outliers, if there is no start.
+        iterations: As in ``fit_tones``.
 
     Returns:
         The fit, with K the largest number of tones of any axis (at least 1).
     """
     model = model or MotionModel()
-    axes = measurements.displacements.shape[-1]
-    none = measurements.exposure_starts.new_zeros(
-        len(measurements.exposure_starts), axes, model.harmonics, dtype=torch.bool
+    search = _Search(
+        measurements, sample_interval, model, least_gain, accuracy, stretches and start is None, iterations
     )
+    axes = measurements.displacements.shape[-1]
+    shape = (len(measurements.exposure_starts), axes, model.harmonics)
+    none = measurements.exposure_starts.new_zeros(shape, dtype=torch.bool)
+    open_axes = torch.ones_like(none[..., 0])  # (B, 2), those that may need a further tone
     if start is None:
-        accepted, (fit, weighed) = none[..., :0], robust_fit(measurements, none.double(), none, model)
+        accepted, (fit, weighed) = none[..., :0], search.refitted(none.double(), none)
     else:
         accepted, given = start.active, residual_of(measurements, start)
-        fit, weighed = robust_fit(measurements, start.frequencies, accepted, model, given)
+        fit, weighed = search.refitted(start.frequencies, accepted, given)
+        if accuracy:  # a tone of roll in bands of strips is found as a tone of x or y otherwise
+            open_axes = ~accepted.any(-1)
 
     def with_one_more(axes: Tensor) -> Tensor:
         """Accepted tones and a further one (or family) of the axes (B, 2) that need it."""
         return torch.cat([accepted, axes[..., None].expand(-1, -1, model.harmonics)], -1)
 
-    def visible(trial: ToneFit) -> Tensor:
-        """(B, 2) bool; the first tone of an axis is kept even if nearly blind, for the verdict."""
-        seen = visibility(measurements, trial.frequencies[..., -model.harmonics :]) > 0.5
-        return seen if accepted.shape[-1] > 0 else torch.ones_like(seen)
-
-    open_axes = torch.ones_like(none[..., 0])  # (B, 2), those that may need a further tone
-    for _ in range(MAX_TONES):
-        if tones is None and accepted.shape[-1] // model.harmonics >= MAX_TONES:
-            break
+    for _ in range(MAX_TONES if tones is not None else MAX_TONES - accepted.shape[-1] // model.harmonics):
         if tones is not None:  # roll and zoom may have fewer tones than x and y to start with
             open_axes = accepted.sum(-1) < tones * model.harmonics
         residual = residual_of(measurements, fit)
-        if accuracy and accepted.shape[-1] > 0:
-            most = measurements.distances(residual).nanquantile(0.9, dim=1).nan_to_num(torch.inf)
-            open_axes = open_axes & (most > accuracy)
+        if accepted.shape[-1] > 0:
+            open_axes = open_axes & search.inexact(residual)
         if not bool(open_axes.any()):
             break
         active = with_one_more(open_axes)
-        candidate = best_candidate(measurements, weighed, fit, residual, active, sample_interval, leave_out=False)
-        trial, trial_weighed = robust_fit(measurements, candidate[0], active, model, candidate[1])
-        if start is None and bool((disturbed := _disturbed(measurements, trial)).any()):
-            candidate = best_candidate(measurements, weighed, fit, residual, active, sample_interval, leave_out=True)
-            other, other_weighed = robust_fit(measurements, candidate[0], active, model, candidate[1])
-            better = disturbed & (typical_size(measurements, other) < typical_size(measurements, trial))
-            trial = select_stacks(better, other, trial)
-            trial_weighed = select_stacks(better, other_weighed, trial_weighed)
+        candidate = search.candidate(weighed, fit, residual, active)
+        if tones is None and start is not None and accepted.shape[-1] > 0:
+            # most further tones fail the F-test by far, and are not fitted exactly; offsets of bands need exact fits
+            open_axes = open_axes & search.decreases(weighed, active, residual, candidate[1], share=0.25)
+            if not bool(open_axes.any()):
+                break
+            active = with_one_more(open_axes)
+        trial, trial_weighed = search.trial(weighed, fit, residual, active, candidate)
         if tones is None:
             # both fits are compared with the weights of the richer one
-            before = trial_weighed.square(residual)
-            after = trial_weighed.square(residual_of(measurements, trial))
-            parameters = 2 * model.harmonics + 1
-            spare = measurements.num_measurements - parameters * active.sum(-1) // model.harmonics - 1
-            needed = torch.maximum(_F_THRESHOLD * parameters * after / spare.clamp(min=1.0), least_gain * before)
-            passed = open_axes & (before - after > needed) & _resolved(measurements, trial) & visible(trial)
+            passed = search.decreases(trial_weighed, active, residual, residual_of(measurements, trial))
+            first = accepted.shape[-1] == 0  # kept even if nearly blind, for the verdict
+            passed = open_axes & passed & _resolved(measurements, trial) & (search.visible(trial) | first)
             while bool(passed.any()) and not bool((passed == open_axes).all()):
                 open_axes = passed
-                trial, trial_weighed = robust_fit(measurements, trial.frequencies, with_one_more(open_axes), model)
-                passed = passed & visible(trial)
+                trial, trial_weighed = search.refitted(trial.frequencies, with_one_more(open_axes))
+                passed = passed & (search.visible(trial) | first)
             if not bool(passed.any()):
                 break
         fit, weighed, accepted = trial, trial_weighed, trial.active
     return fit if blind is None or tones is not None else _with_blind_tones(measurements, weighed, fit, blind)
 
 
-def _disturbed(measurements: Measurements, fit: ToneFit) -> Tensor:
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """What all steps of ``find_tones`` share; see its arguments."""
+
+    measurements: Measurements
+    sample_interval: float
+    model: MotionModel
+    least_gain: float
+    accuracy: float
+    stretches: bool
+    iterations: int
+
+    def refitted(
+        self, frequencies: Tensor, active: Tensor, residual: Tensor | None = None
+    ) -> tuple[ToneFit, Measurements]:
+        """``robust_fit`` of all measurements."""
+        return robust_fit(self.measurements, frequencies, active, self.model, residual, iterations=self.iterations)
+
+    def candidate(
+        self, weighed: Measurements, fit: ToneFit, residual: Tensor, active: Tensor, *, leave_out: bool = False
+    ) -> tuple[ToneFit, Tensor]:
+        """``best_candidate``: a rough fit with a further tone, and its residual."""
+        interval = self.sample_interval
+        return best_candidate(self.measurements, weighed, fit, residual, active, interval, leave_out=leave_out)
+
+    def trial(
+        self,
+        weighed: Measurements,
+        fit: ToneFit,
+        residual: Tensor,
+        active: Tensor,
+        candidate: tuple[ToneFit, Tensor],
+    ) -> tuple[ToneFit, Measurements]:
+        """The fit with a further tone, of all rows or without a stretch, and the measurements with its weights."""
+        trial, trial_weighed = self.refitted(candidate[0].frequencies, active, candidate[1])
+        if not self.stretches:
+            return trial, trial_weighed
+        after = residual_of(self.measurements, trial)
+        disturbed = _disturbed(self.measurements, after) & self.inexact(after).any(-1)
+        if not bool(disturbed.any()):
+            return trial, trial_weighed
+        candidate = self.candidate(weighed, fit, residual, active, leave_out=True)
+        other, other_weighed = self.refitted(candidate[0].frequencies, active, candidate[1])
+        better = disturbed & (typical_size(self.measurements, other) < typical_size(self.measurements, trial))
+        return select_stacks(better, other, trial), select_stacks(better, other_weighed, trial_weighed)
+
+    def visible(self, fit: ToneFit) -> Tensor:
+        """(B, 2) bool, whether the last tone (or family) of each axis is visible."""
+        return visibility(self.measurements, fit.frequencies[..., -self.model.harmonics :]) > 0.5
+
+    def inexact(self, residual: Tensor) -> Tensor:
+        """(B, 2) bool, axes with residuals above the accuracy that is needed."""
+        most = self.measurements.distances(residual).nanquantile(0.9, dim=1).nan_to_num(torch.inf)
+        return (most > self.accuracy) | (self.accuracy == 0)
+
+    def decreases(
+        self, weighed: Measurements, active: Tensor, before: Tensor, after: Tensor, *, share: float = 1.0
+    ) -> Tensor:
+        """(B, 2) bool, whether the residual decreases by a share of what is needed for a further tone."""
+        first, second = weighed.square(before), weighed.square(after)
+        parameters = 2 * self.model.harmonics + 1
+        spare = self.measurements.num_measurements - parameters * active.sum(-1) // self.model.harmonics - 1
+        needed = torch.maximum(_F_THRESHOLD * parameters * second / spare.clamp(min=1.0), self.least_gain * first)
+        return first - second > share * needed
+
+
+def _disturbed(measurements: Measurements, residual: Tensor) -> Tensor:
     """(B,) bool: a stretch of outliers may have biased a fit, which leaves more than 5 % of the motion of some rows."""
-    most = measurements.sizes(residual_of(measurements, fit)).nanquantile(0.9, dim=1)
+    most = measurements.sizes(residual).nanquantile(0.9, dim=1)
     whole = measurements.sizes(measurements.relative(measurements.displacements)).nanmedian(1).values
     return ~(most < 0.05 * whole).all(-1)
 
@@ -243,7 +317,7 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor
         if not bool(dropped.any()):
             return fit
         dropped = dropped.repeat_interleave(harmonics, -1) & fit.active
-        other = fit_tones(measurements, fit.frequencies, fit.active & ~dropped, fit.model)
+        other = fit_tones(measurements, fit, fit.active & ~dropped, fit.model)
         after = measurements.square(residual_of(measurements, fit))
         before = measurements.square(residual_of(measurements, other))
         spare = measurements.num_measurements - 3 * fit.active.sum(-1)

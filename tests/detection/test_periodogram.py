@@ -1,0 +1,59 @@
+"""The periodogram by transforms of unequal times, compared with a least-squares fit for each frequency."""
+
+import math
+
+import pytest
+import torch
+
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.tones import periodogram
+
+EXPOSURE = 4e-4
+
+
+def measurements_of(rows, frames, seed=0):
+    """Random displacements and weights of rows that some frames do not contain, at unequal times."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(*shape):
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    starts = (
+        3e-4 * torch.arange(rows, dtype=torch.float64)[:, None]
+        + 0.04 * torch.arange(frames)
+        + 2e-5 * random(1, rows, frames)
+    )
+    visible = (random(1, rows, frames) > 0.1).double()
+    information = torch.diag_embed(0.1 + random(1, rows, 2))
+    record = Measurements(starts, torch.zeros(1, rows, frames, 2, dtype=torch.float64), visible, information, EXPOSURE)
+    values = record.relative(random(1, rows, frames, 2) - 0.5)
+    return Measurements(starts, values, visible, information, EXPOSURE)
+
+
+def decrease(record, weight, frequency, axis):
+    """Decrease of the weighted square by cosine, sine (with their prior) and drift, from the normal equations."""
+    time = record.middles[0, ..., 0, 0]
+    size = math.sin(math.pi * frequency * EXPOSURE) / (math.pi * frequency * EXPOSURE)
+    angle = 2 * math.pi * frequency * time
+    columns = torch.stack([size * angle.cos(), size * angle.sin(), time], -1)
+    columns = record.relative(columns[None])[0].flatten(0, 1)
+    each = (weight[:, None] * record.visible[0]).flatten()
+    prior = 0.5 * 0.1**2 * float((weight * record.num_differences[0]).sum())
+    normal = columns.mT @ (each[:, None] * columns) + torch.diag(torch.tensor([prior, prior, 0.0]).double())
+    right = columns.mT @ (each * record.displacements[0, ..., axis].flatten())
+    return float(right @ torch.linalg.solve(normal, right))
+
+
+@pytest.mark.parametrize(("rows", "frames"), [(40, 2), (60, 5)])
+def test_power_is_that_of_a_least_squares_fit(rows, frames):
+    record = measurements_of(rows, frames)
+    weights = torch.stack([record.weights, record.weights.flip(1)], 1)
+    grid = periodogram._grid(float(record.duration[0]), 6e-4)
+    power = periodogram._power(record, grid, weights)
+    step, first, count = grid
+    for place in range(0, count, count // 7):
+        frequency = step * (first + place)
+        for weighting in range(2):
+            for axis in range(2):
+                expected = decrease(record, weights[0, weighting, :, axis], frequency, axis)
+                assert float(power[0, weighting, axis, place]) == pytest.approx(expected, rel=1e-4, abs=1e-5)
