@@ -222,11 +222,6 @@ def _against_other_motion(other: OtherMotion, axis: int) -> list[str]:
                 f"{rows} move by {unexplained:.3g} px that no tone explains, {allowed:.2g} px are allowed; try more "
                 "tones or model='free', and check frame_rows, row_time and the start times of the frames"
             ]
-    if float(other.stalled[axis]) > 0:
-        return [
-            f"the fit does not converge: rows move by {float(other.stalled[axis]):.2g} standard deviations that "
-            "no tone explains; try more tones or model='free'"
-        ]
     return []
 
 

@@ -30,8 +30,6 @@ class OtherMotion:
         measured: (...) fraction of the visible rows whose displacement was measured.
         blur: (..., 3) measured difference of the blur of the frames relative to the expected one, its standard
             deviation, and the size of the expected difference relative to the detail of the scene.
-        stalled: (..., 2) typical residual of a row in standard deviations where the fit ended without convergence, else
-            0.
     """
 
     size: Tensor
@@ -40,7 +38,6 @@ class OtherMotion:
     differential: Tensor
     measured: Tensor
     blur: Tensor
-    stalled: Tensor
 
     @property
     def permitted(self) -> Tensor:

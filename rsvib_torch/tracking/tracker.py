@@ -394,7 +394,6 @@ class VibrationTracker:
             differential=differential_motion([gradients]),
             measured=measured,
             blur=measured.new_tensor([[1.0, 0.0, 0.0]]),
-            stalled=torch.zeros_like(residual[:, 0, 0]),
         )[0]
         vibration, std = vibration_of_fit(fit)
         starts = self._row_starts(gradients.images.shape[1], measured.device)

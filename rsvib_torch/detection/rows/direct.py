@@ -197,8 +197,8 @@ def _refine(
         measurements = record.measurements
         residual = residual_of(measurements, fit)
         previous = fit
-        residual_size = measurements.sizes(residual).nanmedian(1).values
-        sizes = [*sizes, residual_size] if number != search_round else []  # fewer tones before the search
+        size = measurements.sizes(residual).nanmedian(1).values
+        sizes = [*sizes, size] if number != search_round else []  # fewer tones before the search
         if number == search_round:
             independent = replace(measurements, independent=measurements.independent_fraction(residual))
             # the noise of rows is nearly white: a tone that explains a fiftieth of the residual is significant
@@ -217,10 +217,9 @@ def _refine(
         same_tones = torch.equal(previous.active, fit.active)
         ratio = step.ratio_to(steps[-1]) if steps and same_tones else None
         converged = _converged(previous, fit, ratio) & (number >= search_round)
-        stalled = _stalled(sizes) & ~converged
-        if bool((converged | stalled).all()):
+        if bool((converged | _stalled(sizes, record, fit)).all()):
             if pattern_rounds == 0 or not rows.remove_column_pattern(motion, gradients):
-                return _conclude(record, fit, torch.where(stalled, residual_size, 0.0))
+                break
             pattern_rounds, search_round = pattern_rounds - 1, number + 1
             gradients, steps, sizes = None, [], []
             continue
@@ -272,15 +271,18 @@ class _Step:
         return (product / previous.change.square().sum((1, 2, 3)).clamp(min=1e-30)).abs() > 0.3
 
 
-def _stalled(sizes: list[Tensor]) -> Tensor:
-    """(B, A) bool, axes whose typical residual exceeds 2 standard deviations and did not decrease in two rounds.
+def _stalled(sizes: list[Tensor], record: RowRecord, fit: ToneFit) -> Tensor:
+    """(B, A) bool, axes whose typical residual did not decrease in two rounds, and which are refused because of it.
 
     Args:
-        sizes: Typical residuals of the rounds so far.
+        sizes: Typical residuals of the rounds so far, in standard deviations.
+        record: Measurements of this round.
+        fit: The fit to them.
     """
-    if len(sizes) < 3:
+    if len(sizes) < 3 or not bool((stalled := (sizes[-1] > 2.0) & (sizes[-1] > 0.9 * sizes[-3])).any()):
         return torch.zeros((), dtype=torch.bool, device="cpu")
-    return (sizes[-1] > 2.0) & (sizes[-1] > 0.9 * sizes[-3])
+    other = _conclude(record, fit).other_motion
+    return stalled & (other.unexplained > other.permitted)
 
 
 def _converged(previous: ToneFit, fit: ToneFit, ratio: Tensor | None) -> Tensor:
@@ -389,7 +391,7 @@ def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:
     )
 
 
-def _conclude(record: RowRecord, fit: ToneFit, stalled: Tensor | None = None) -> DirectFit:
+def _conclude(record: RowRecord, fit: ToneFit) -> DirectFit:
     """The last fit, to the measurements themselves, with a covariance that accounts for correlated residuals."""
     measurements = record.measurements
     residual = residual_of(measurements, fit)
@@ -407,7 +409,6 @@ def _conclude(record: RowRecord, fit: ToneFit, stalled: Tensor | None = None) ->
         differential=record.differential(),
         measured=measured,
         blur=measured.new_tensor([1.0, 0.0, 0.0]).expand(len(measured), 3),  # replaced once the motion is final
-        stalled=torch.zeros_like(residual[:, 0, 0]) if stalled is None else stalled,
     )
     robust_weights = weighted.weights / measurements.weights.clamp(min=1e-300)
     aliasing = torch.stack([own.aliasing for own in record.gradients]).mean(0)
