@@ -99,7 +99,7 @@ def test_reasons_for_an_unreliable_tone(options, reason):
 def other_motion(unexplained=0.0, correlated=0.0, differential=0.0, measured=1.0, blur=(1.2, 0.1, 0.05), size=1.0):
     """Residual motion along x only, beside tones with offsets of ``size`` px along both axes."""
     axes = (torch.tensor([value, 0.0]) for value in (unexplained, correlated, differential))
-    return OtherMotion(torch.full((2,), size), *axes, torch.tensor(measured), torch.tensor(blur), torch.zeros(2))
+    return OtherMotion(torch.full((2,), size), *axes, torch.tensor(measured), torch.tensor(blur))
 
 
 @pytest.mark.parametrize(
