@@ -54,7 +54,7 @@ def make_place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("answers")
     (folder / "camera.toml").write_text(CONFIG)
     steady = rsv.Vibration([1.6, 1.1], [71.0, 113.0], [0.6, -1.2])
-    blind = rsv.Vibration([1.6, 1.1], [71.0, 50.5], [0.6, -1.2])
+    blind = rsv.Vibration([1.6, 1.1], [71.0, 49.5], [0.6, -1.2])
     still = rsv.Vibration.still()
     for name, vibration, count in (
         ("frames", steady, 2),
