@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 __all__ = ["check_followed", "followed_figure", "is_followed", "run_followed"]
 
-_VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
-
 
 def is_followed(frames: Path, count: int, window: int, *, requested: bool) -> bool:
     """Whether ``--video`` follows a stack from frame to frame: videos of more than one window, or if requested."""
-    return requested or (frames.suffix.lower() in _VIDEOS and count > window)
+    from rsvib_torch.io.video import ENDINGS  # noqa: PLC0415 - loads PyTorch, which other commands do not need
+
+    return requested or (frames.suffix.lower() in ENDINGS and count > window)
 
 
 def check_followed(given: Mapping[str, Any], options: Mapping[str, Any]) -> None:

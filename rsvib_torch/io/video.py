@@ -24,17 +24,18 @@ from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 
 __all__ = [
     "CONTAINERS",
+    "ENDINGS",
     "FFV1_FORMAT",
     "H264",
     "H264_FORMAT",
     "READ_ONLY_FORMAT",
     "Picture",
+    "Sound",
     "VideoReader",
-    "add_sound",
     "add_video",
     "open_container",
+    "open_output",
     "open_source",
-    "packets",
     "picture_of",
     "presentation_times",
     "scanned",
@@ -43,6 +44,7 @@ __all__ = [
 _LOSSLESS, H264 = (".mkv", ".avi"), (".mp4", ".mov", ".m4v")
 CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}
 _READ_ONLY = (".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
+ENDINGS = (*_LOSSLESS, *H264, *_READ_ONLY)
 _H264_OPTIONS = {"crf": "12"}  # constant rate factor, 0 (no loss) to 51; differences of less than 18 are hardly visible
 _FFV1_OPTIONS = {"level": "3", "g": "1"}  # each frame can be decoded alone: damage does not affect other frames
 _BT709, _LIMITED_RANGE = 1, 1  # codes of ITU-T H.273 and FFmpeg
@@ -268,8 +270,7 @@ class VideoReader:
 
 def _source(info: StackInfo) -> Path | None:
     """The video from which the frames to write were computed, one for each of its frames."""
-    endings = (*_LOSSLESS, *H264, *_READ_ONLY)
-    return info.path if info.path is not None and info.path.suffix.lower() in endings else None
+    return info.path if info.path is not None and info.path.suffix.lower() in ENDINGS else None
 
 
 def presentation_times(path: Path, info: StackInfo) -> tuple[Fraction, list[int], Fraction | None]:
@@ -348,14 +349,28 @@ def add_video(output: Any, path: Path, info: StackInfo, source: Any, **options: 
     return video
 
 
-def add_sound(output: Any, source: Any) -> dict[Any, Any]:
-    """Add streams for the sound of ``source``, a container or None, without encoding it.
+class Sound:
+    """Sound of another video, copied between the frames of a video without encoding it.
 
-    Returns:
-        The stream of the output for each of the source.
+    Packets before the time origin ``start`` (s) of the output are omitted.
+
+    Args:
+        output: The open container to write; streams are added to it.
+        source: The open container with the sound; None for none.
+        start: Time origin of the output in s; None if it is that of the source.
     """
-    streams = source.streams.audio if source is not None else ()
-    return {stream: output.add_stream_from_template(stream) for stream in streams}
+
+    def __init__(self, output: Any, source: Any, start: Fraction | None) -> None:
+        streams = source.streams.audio if source is not None else ()
+        added = {stream: output.add_stream_from_template(stream) for stream in streams}
+        self._output, self._packets = output, _packets(source, added, start)
+        self._next = next(self._packets, None)
+
+    def write(self, until: Fraction | None = None) -> None:
+        """Write the packets up to a time in s, because players read sound and frames together; None for all."""
+        while self._next is not None and (until is None or self._next.pts * self._next.time_base <= until):
+            self._output.mux(self._next)
+            self._next = next(self._packets, None)
 
 
 def open_source(info: StackInfo, opened: ExitStack) -> Any:
@@ -400,35 +415,29 @@ def picture_of(pixels: NDArray[Any], path: Path, info: StackInfo) -> Any:
     return frame
 
 
+def open_output(path: Path, opened: ExitStack) -> Any:
+    """The container of a video to write, closed with ``opened``; equal content gives equal bytes."""
+    options = {"fflags": "+bitexact"}
+    return opened.enter_context(_av().open(str(path), "w", format=CONTAINERS[path.suffix.lower()], options=options))
+
+
 def _write(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
-    av = _av()
     unit, ticks, start = presentation_times(path, info)
     with ExitStack() as opened:
-        source = open_source(info, opened)
-        output = opened.enter_context(
-            av.open(str(path), "w", format=CONTAINERS[path.suffix.lower()], options={"fflags": "+bitexact"})
-        )
+        source, output = open_source(info, opened), open_output(path, opened)
         video = add_video(output, path, info, source)
-        sound = packets(source, add_sound(output, source), start)
-        packet = next(sound, None)
+        sound = Sound(output, source, start)
         for tick, pixels in zip(ticks, frames, strict=True):
-            while packet is not None and packet.pts * packet.time_base <= tick * unit:  # players read both together
-                output.mux(packet)
-                packet = next(sound, None)
+            sound.write(tick * unit)
             frame = picture_of(pixels, path, info)
             frame.pts, frame.time_base = tick, unit
             output.mux(video.encode(frame))
         output.mux(video.encode())
-        while packet is not None:
-            output.mux(packet)
-            packet = next(sound, None)
+        sound.write()
 
 
-def packets(source: Any, streams: dict[Any, Any], start: Fraction | None) -> Iterator[Any]:
-    """Packets of the streams of ``source``, for the streams of the output that belong to them.
-
-    Packets before the time origin ``start`` (s) of the output are omitted; None if it is that of the source.
-    """
+def _packets(source: Any, streams: dict[Any, Any], start: Fraction | None) -> Iterator[Any]:
+    """Packets of the streams of ``source``, for the streams of the output that belong to them, see ``Sound``."""
     if not streams:
         return
     for packet in source.demux(*streams):

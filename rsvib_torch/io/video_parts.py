@@ -16,12 +16,12 @@ from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.video import (
     CONTAINERS,
     H264,
+    Sound,
     VideoReader,
-    add_sound,
     add_video,
     open_container,
+    open_output,
     open_source,
-    packets,
     picture_of,
     presentation_times,
     scanned,
@@ -125,29 +125,21 @@ class PartWriter:
 
 def join_parts(path: Path, info: StackInfo, parts: Sequence[Path]) -> None:
     """Write the video whose frames are in ``parts``, with the times, the metadata and the sound of its source."""
-    av = needed_package("av", "writing video", "video")
     unit, ticks, start = presentation_times(path, info)
     with ExitStack() as opened:
-        source = open_source(info, opened)
-        output = opened.enter_context(
-            av.open(str(path), "w", format=CONTAINERS[path.suffix.lower()], options={"fflags": "+bitexact"})
-        )
+        source, output = open_source(info, opened), open_output(path, opened)
         with open_container(parts[0]) as first:
             video = output.add_stream_from_template(first.streams.video[0])
         video.time_base = unit
         if source is not None:
             output.metadata.update(source.metadata)
-        sound = packets(source, add_sound(output, source), start)
-        heard = next(sound, None)
-        index = 0
+        sound, index = Sound(output, source, start), 0
         for part in parts:
             with open_container(part) as container:
                 for packet in container.demux(container.streams.video[0]):
                     if packet.size == 0:  # the last packet of a stream
                         continue
-                    while heard is not None and heard.pts * heard.time_base <= ticks[index] * unit:
-                        output.mux(heard)
-                        heard = next(sound, None)
+                    sound.write(ticks[index] * unit)
                     last = index + 1 == len(ticks)
                     packet.stream, packet.time_base = video, unit
                     packet.pts = packet.dts = ticks[index]
@@ -156,6 +148,4 @@ def join_parts(path: Path, info: StackInfo, parts: Sequence[Path]) -> None:
                     index += 1
         if index != len(ticks):
             raise ValueError(f"{path}: the parts have {index} frames, expected {len(ticks)}; delete them to start over")
-        while heard is not None:
-            output.mux(heard)
-            heard = next(sound, None)
+        sound.write()

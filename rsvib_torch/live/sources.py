@@ -83,7 +83,7 @@ class CameraSource:
 
         self._period, self.lost = timing.frame_period, 0
         level = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below says it in one line
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # only the error below is shown
         try:
             self._capture = cv2.VideoCapture(camera)
         finally:

@@ -3,7 +3,6 @@
 import math
 import tempfile
 import time
-import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -122,9 +121,8 @@ def process_video(
     begin, source, sink = time.perf_counter(), Path(source), Path(sink)
     check_choice("border", border, ("mirror", "hold", "crop"))
     check_number("steady", steady, at_least=0.0)
-    video = _planned(
-        source, timing, restoration, full_scale, steady, (columns, window), device, masks=border != "mirror"
-    )
+    plan = {"full_scale": full_scale, "memory": memory, "workers": workers, "device": device}
+    video, at_once = _planned(source, timing, restoration, plan, steady, (columns, window), masks=border != "mirror")
     job = video.job
     if sink.suffix.lower() not in CONTAINERS:
         raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
@@ -138,7 +136,6 @@ def process_video(
         "window": None,  # for the commands that read manifests: parts are not windows of their own
         "video": {"border": border, "steady": steady, "columns": columns, "window": window},
     }
-    at_once = _frames_at_once(source, timing, full_scale, restoration, memory, workers, device)
     waiting = math.ceil(0.5 * steady / timing.frame_period) * 2 * content.frame_bytes
     check_fits(f"{source}: the frames of half of steady={steady:g} s", waiting, "choose a shorter time")
 
@@ -239,20 +236,18 @@ def _planned(
     source: Path,
     timing: SensorTiming,
     restoration: Mapping[str, Any] | None,
-    full_scale: float | None,
+    plan: Mapping[str, Any],
     steady: float,
     tracking: tuple[int | None, int],
-    device: str,
     *,
     masks: bool,
-) -> VideoPasses:
-    """The job of a run and the layout of its frames."""
+) -> tuple[VideoPasses, int]:
+    """The job of a run with the layout of its frames, and the number of frames to restore at the same time."""
     options = dict(restoration or {})
     for name in ("joint", "scale", "mosaic", "optics"):
         if options.pop(name, None) not in (None, False, 1):
             raise ValueError(f"{name} is not available for videos that are followed frame by frame; use process_stack")
-    plan = {"restoration": options, "full_scale": full_scale, "device": device}
-    job, _, _ = plan_job(source, timing, plan, here=False)
+    job, _, at_once = plan_job(source, timing, {**plan, "restoration": options, "window": 2})
     reader: FrameReader = open_stack(source)
     try:
         planes = planes_of(reader)
@@ -268,7 +263,7 @@ def _planned(
     layout = FrameLayout(job.info.shape[1:], planes is not None, scale, white, np.dtype(job.info.dtype))
     restorer = VideoRestorer(layout, job.timing, method, options, job.device, masks)
     starts = job.timing.frame_starts(job.info.shape[0]).tolist()
-    return VideoPasses(job, layout, restorer, [start - starts[0] for start in starts], steady, *tracking)
+    return VideoPasses(job, layout, restorer, [start - starts[0] for start in starts], steady, *tracking), at_once
 
 
 def _content(job: StackJob, timing: SensorTiming) -> StackInfo:
@@ -279,22 +274,6 @@ def _content(job: StackJob, timing: SensorTiming) -> StackInfo:
         time_error=0.0,
         frame_rate=job.info.frame_rate or timing.frame_rate,
     )
-
-
-def _frames_at_once(
-    source: Path,
-    timing: SensorTiming,
-    full_scale: float | None,
-    restoration: Mapping[str, Any] | None,
-    memory: str | float | None,
-    workers: int | None,
-    device: str,
-) -> int:
-    """Number of frames to restore at the same time, within the memory."""
-    plan = {"restoration": restoration, "full_scale": full_scale, "memory": memory, "workers": workers, "window": 2}
-    with warnings.catch_warnings():  # given before
-        warnings.simplefilter("ignore")
-        return plan_job(source, timing, plan | {"device": device})[2]
 
 
 def _restore_parts(

@@ -75,7 +75,7 @@ def with_further_tones(
 
 def _grid(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Tensor, Tensor]:
     """Frequencies (B, F) in Hz of the further tone of an axis, and those that count (bool): near its tones, or low."""
-    duration = _duration(measurements)
+    duration = measurements.span[:, None]
     tones = torch.where(fit.active, fit.frequencies, 0.0)[:, axis]  # (B, K)
     centres = torch.cat([torch.zeros_like(tones[:, :1]), tones], 1)
     # only places near a tone: fits of frames with a wrong timing may have frequencies of any size
@@ -85,12 +85,6 @@ def _grid(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Tensor, 
     near = ((frequencies[..., None] - centres[:, None]).abs() * duration[..., None] <= _REACH).any(-1)
     used = near.any(0)
     return frequencies[:, used], near[:, used]
-
-
-def _duration(measurements: Measurements) -> Tensor:
-    """(B, 1) s, from the first to the last exposure start of the record."""
-    starts = measurements.exposure_starts
-    return (starts.amax((1, 2)) - starts.amin((1, 2)))[:, None]
 
 
 def _added(
@@ -143,7 +137,7 @@ def _added(
     probability = functional.pad(evidence + prior, (1, 0)).softmax(-1)[:, 1:]
     if number_is_known:
         probability = torch.zeros_like(probability)
-    slow = frequencies * _duration(measurements) <= _SLOW
+    slow = frequencies * measurements.span[:, None] <= _SLOW
     slow_variance = slow * (slow_error.square() / slow.sum(1).clamp(min=1))[:, None]
     second = probability[..., None, None] * second + slow_variance[..., None, None] * eye
     return (back @ second @ back.mT).sum(1), (moved * second[:, :, None]).sum((1, 3, 4))
@@ -151,7 +145,7 @@ def _added(
 
 def _slow_errors(measurements: Measurements, fit: ToneFit) -> Tensor:
     """(B, A) px, standard deviation of errors that all rows of an axis have in common; 0 without a slow tone."""
-    slow = (fit.active & (fit.frequencies * _duration(measurements)[..., None] <= _SLOW)).any(-1)
+    slow = (fit.active & (fit.frequencies * measurements.span[:, None, None] <= _SLOW)).any(-1)
     offset = math.sqrt(2) * measurements.distances(model_displacements(measurements, fit))
     return slow * (_SLOW_ERROR * offset.square().nanmean(1).nan_to_num(0.0).sqrt()).clamp(max=_MAX_SLOW_ERROR)
 
