@@ -9,13 +9,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.chunking import runs
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
 from rsvib_torch.restoration.scene_model.observation import REACH, kernel_samples
 
 __all__ = ["PRIORS", "Prior", "PriorOptions", "shrink_patches"]
 
 _PATCH, _STEP = 8, 2  # px, size and distance of patches; chosen together with the stages of the prior
-_ROWS = 32  # at a time, a multiple of the step
+_NEIGHBOURS = _PATCH // _STEP  # patches that begin before the next one that shares no pixel
+_LINES = 4  # of patches, each of neighbours, at a time
 
 
 @dataclass(frozen=True)
@@ -81,12 +83,17 @@ def edges(problem: SceneProblem, options: PriorOptions) -> Tensor:
 PRIORS: dict[str, Prior] = {"gaussian": gaussian, "edges": edges}
 
 
-def _cosines(like: Tensor) -> Tensor:
-    """Orthonormal cosines (n, n) along a side of a patch, one in each row; the first is constant."""
+def _cosines_of_neighbours(like: Tensor) -> Tensor:
+    """Orthonormal cosines of neighbouring patches along a side, one in each row; the first of a patch is constant.
+
+    One product with these (neighbours x 8, 14) transforms four patches, and one with the transpose adds them up, which
+    takes three quarters of the time of single patches.
+    """
     order = torch.arange(_PATCH, dtype=torch.float64, device="cpu")
     waves = torch.cos(torch.pi * order[:, None] * (order + 0.5) / _PATCH) * math.sqrt(2.0 / _PATCH)
     waves[0] /= math.sqrt(2.0)
-    return waves.to(like)
+    ends = [(_STEP * k, _STEP * (_NEIGHBOURS - 1 - k)) for k in range(_NEIGHBOURS)]
+    return torch.cat([functional.pad(waves, each) for each in ends]).to(like)
 
 
 def shrink_patches(images: Tensor, level: float | Tensor, offset: tuple[int, int] = (0, 0)) -> Tensor:
@@ -100,42 +107,37 @@ def shrink_patches(images: Tensor, level: float | Tensor, offset: tuple[int, int
         level: Standard deviation of white noise in them.
         offset: Row and column at which patches begin, 0 or 1.
     """
-    waves, overlap = _cosines(images), _PATCH - _STEP
-    before = [overlap + begin for begin in offset]
-    after = [overlap + (begin + size) % _STEP for begin, size in zip(offset, images.shape[1:], strict=True)]
-    ends = (before[1], after[1], before[0], after[0])
-    padded = functional.pad(images[:, None], ends, mode="replicate")[:, 0]
+    cosines, shared = _cosines_of_neighbours(images), _PATCH - _STEP
+    before = [shared + begin for begin in offset]
+    counts = [-(-(size + begin) // _PATCH) for size, begin in zip(images.shape[1:], before, strict=True)]
+    sides = [_PATCH * count + shared for count in counts]
+    after = [side - begin - size for side, begin, size in zip(sides, before, images.shape[1:], strict=True)]
+    padded = functional.pad(images[:, None], (before[1], after[1], before[0], after[0]), mode="replicate")[:, 0]
     total = torch.zeros_like(padded)
-    weights = total.new_zeros(len(total), *(size // _STEP for size in total.shape[1:]))  # the same for _STEP x _STEP px
-    shifts = _PATCH // _STEP
-    for begin in range(0, padded.shape[1] - overlap, _ROWS):  # rows at a time: less memory
-        rows = slice(begin, begin + _ROWS + overlap)
+    weights = total.new_empty(len(total), *(_NEIGHBOURS * count for count in counts))  # of the patches
+    for part in runs(counts[0], _LINES):  # less memory, and faster
+        rows = slice(_PATCH * part.start, _PATCH * part.stop + shared)
         # cosines along the rows, then across them, in units of the threshold
-        along = padded[:, rows].unfold(-1, _PATCH, _STEP) @ (waves / (2.0 * level)).mT  # (N, rows, patches, n)
-        values = waves @ along.flatten(-2).unfold(1, _PATCH, _STEP).mT  # (N, patches, n, patches n)
-        values = values.unflatten(-1, (-1, _PATCH))
-        strong = functional.hardshrink(values, 1.0)
-        strong[:, :, 0, :, 0] = 1.0
-        weight = 1.0 / strong.detach().abs().clamp_(max=1.0).sum(2).sum(-1)  # (N, patches, patches)
-        strong[:, :, 0, :, 0] = values[:, :, 0, :, 0]
-        shrunk = (strong * weight[:, :, None, :, None]).flatten(-2)
-        lines = _overlapped((2.0 * level * waves).mT @ shrunk, _STEP).unflatten(-1, (-1, _PATCH)) @ waves
-        total[:, rows] += _overlapped(lines.flatten(0, 1), _STEP).view_as(total[:, rows])
-        lines = _overlapped(weight[:, :, None].expand(-1, -1, shifts, -1), 1).flatten(0, 1)
-        places = weights[:, rows.start // _STEP : rows.stop // _STEP]
-        places += _overlapped(lines[..., None].expand(-1, -1, shifts), 1).view_as(places)
-    mean = total / weights.repeat_interleave(_STEP, 1).repeat_interleave(_STEP, 2)
+        along = (padded[:, rows].unfold(-1, len(cosines[0]), _PATCH) @ (cosines / (2.0 * level)).mT).flatten(-2)
+        lines = torch.zeros_like(along)
+        for line in range(part.stop - part.start):
+            place = slice(_PATCH * line, _PATCH * line + len(cosines[0]))
+            values = (cosines @ along[:, place]).view(len(along), -1, _PATCH, _NEIGHBOURS * counts[1], _PATCH)
+            strong = functional.hardshrink(values, 1.0)
+            strong[:, :, 0, :, 0] = 1.0
+            weight = 1.0 / strong.detach().abs().clamp_(max=1.0).sum(2).sum(-1)  # (N, patches, patches)
+            strong[:, :, 0, :, 0] = values[:, :, 0, :, 0]
+            strong *= weight[:, :, None, :, None]
+            lines[:, place] += (2.0 * level * cosines).mT @ strong.view(len(along), len(cosines), -1)
+            weights[:, _NEIGHBOURS * (part.start + line) :][:, :_NEIGHBOURS] = weight
+        pixels = lines.unflatten(-1, (counts[1], -1)) @ cosines
+        total[:, rows, :-shared] += pixels[..., :_PATCH].flatten(-2)
+        beyond = functional.pad(pixels[..., _PATCH:], (0, _PATCH - shared)).flatten(-2)
+        total[:, rows, _PATCH:] += beyond[..., : shared - _PATCH]
+    reach = _NEIGHBOURS - 1
+    sums = functional.avg_pool2d(functional.pad(weights, (reach,) * 4), _NEIGHBOURS, stride=1) * _NEIGHBOURS**2
+    mean = total / sums.repeat_interleave(_STEP, 1).repeat_interleave(_STEP, 2)
     return mean[:, before[0] : before[0] + images.shape[1], before[1] : before[1] + images.shape[2]]
-
-
-def _overlapped(values: Tensor, step: int) -> Tensor:
-    """Sums (N, size, ...) of the values (N, patches, n, ...) of patches that begin at every step-th place."""
-    parts = values.unflatten(2, (-1, step))
-    count, shifts = parts.shape[1:3]
-    total = values.new_zeros(len(values), count + shifts - 1, *parts.shape[3:])
-    for shift in range(shifts):
-        total[:, shift : shift + count] += parts[:, :, shift]
-    return total.flatten(1, 2)
 
 
 def _sampled(values: Tensor) -> Tensor:
