@@ -1,11 +1,14 @@
 """Sources, outputs, page and spectrogram of live sessions."""
 
 import io
+import threading
 import time
 import urllib.error
 import urllib.request
 from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -13,7 +16,7 @@ import torch
 import rsvib_torch as rsv
 from rsvib_torch import live
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.live.sources import FrameReader
+from rsvib_torch.live.sources import FrameCounter, FrameReader
 
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=1 / 30 / 1e-4)
 
@@ -74,6 +77,66 @@ def test_an_error_of_the_source_arrives_behind_its_frames():
     reader = FrameReader(Numbers(3, error=OSError("unplugged")), drops=False)
     with pytest.raises(OSError, match="unplugged"):
         values(reader)
+
+
+@pytest.mark.parametrize("stamps", ["none", "made up", "of the camera"])
+@pytest.mark.parametrize("drift", [-3e-4, 0.0, 3e-4])
+def test_missing_frames_of_a_camera_are_counted_and_late_ones_are_not(stamps, drift):
+    """Delays of arrival are random, with a mean of a fifth of a frame period (5 minutes)."""
+    generator = np.random.default_rng(1)
+    numbers = np.flatnonzero(np.arange(9000) % 1000 != 500)  # nine frames are lost
+    taken = numbers / 30 * (1 + drift)
+    arrived = np.maximum.accumulate(taken + generator.exponential(0.2 / 30, len(taken)))
+    given = {"none": 0 * taken, "made up": np.arange(len(taken)) / 25, "of the camera": 17.3 + taken}[stamps]
+    counter = FrameCounter(1 / 30)
+    found = np.array([counter.number(*times) for times in zip(arrived, given, strict=True)])
+    wrong = np.count_nonzero(np.diff(found - numbers))
+    assert (np.diff(found) > 0).all()
+    if stamps == "of the camera":
+        # the delay of the first frames hides how fast the clock of the stamps runs
+        assert wrong <= 1
+    else:
+        assert wrong <= 25  # rounding of the intervals to whole periods: 350 to 390
+        assert abs(found[-1] - numbers[-1]) <= 10
+
+
+def test_a_camera_at_an_address():
+    """Motion JPEG over HTTP, as network cameras send it."""
+    coloured = np.zeros((12, 48, 64, 3), np.uint8)  # blue, green, red
+    coloured[..., 2] = 20 * np.arange(12)[:, None, None]
+    parts = [cv2.imencode(".jpg", frame)[1].tobytes() for frame in coloured]
+
+    class Stream(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=part")
+            self.end_headers()
+            for part in parts:
+                self.wfile.write(b"--part\r\nContent-Type: image/jpeg\r\n\r\n" + part + b"\r\n")
+                time.sleep(1 / 30)
+
+        def log_message(self, *arguments):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Stream)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        source = live.CameraSource(f"http://127.0.0.1:{server.server_address[1]}/video.mjpg", TIMING)
+        frames = list(source.frames())
+        source.close()
+    finally:
+        server.shutdown()
+        server.server_close()
+    assert len(frames) >= 10  # the last one may be incomplete
+    reds = np.array([frame.pixels[0].mean() for frame in frames])
+    assert frames[0].pixels.shape == (3, 48, 64)
+    assert np.abs(reds - 20 * np.arange(len(frames))).max() < 4
+    assert max(frame.pixels[2].max() for frame in frames) < 40  # blue
+    numbers = np.array([frame.time for frame in frames]) * 30
+    assert numbers[-1] == pytest.approx(len(frames) - 1 + source.lost)
+    assert np.diff(numbers).min() > 0.99
+    with pytest.raises(OSError, match="cannot be opened; check its number or URL"):
+        live.CameraSource("http://127.0.0.1:1/none", TIMING)
 
 
 def test_the_page_is_served_to_this_machine_only():
