@@ -4,15 +4,20 @@ Counted from the shapes of the steps, complex64. "Least" is the input and output
 values; "moved" is the input and output of each of its tensor operations, without regard to caches. A complex product
 and sum is eight operations, a real Fourier transform of L values 2.5 L log2 L. The estimation of noise and prior is not
 counted, but it is part of the measured time; so is the repeated work of overlapping segments of rows on a GPU.
+
+Second, the rate of frames of detection and restoration together, from pairs of frames and tracked from frame to frame,
+next to the limit by memory traffic.
 """
 
 import argparse
 import math
+import statistics
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from benchmarks.measure import in_turns, shown_seconds
+from benchmarks.measure import in_turns, seconds_of, shown_seconds
 from benchmarks.restoration import MARGIN, SEED, TIMED_NOISE, camera, vibration
 
 import rsvib_torch as rsv
@@ -27,6 +32,7 @@ from rsvib_torch.restoration.scene_model.row_prior import ORDER
 REAL, COMPLEX = 4, 8  # bytes
 COPIED = 1 << 28  # bytes copied to measure the bandwidth
 MULTIPLIED = 1536  # rows and columns of the matrices multiplied to measure the rate
+FOLLOWED, WINDOW = 12, 4  # frames of the clip, and of them for the first detection of the tracker
 
 
 @dataclass(frozen=True)
@@ -155,16 +161,66 @@ def _device(options: argparse.Namespace, device: str, frame: torch.Tensor, timin
     }
 
 
+def _least_bytes(s: Shapes, method: str) -> float:
+    """Bytes that detection and restoration of one frame move at least.
+
+    Detection by one round of measurements: Fourier transforms of the rows, the spectra warped to the scene, two images
+    of derivatives written and read, and the difference from the other frame; ``"dewarp"`` reads and writes the frame.
+    """
+    frame, spectrum = REAL * s.rows * s.columns, COMPLEX * s.rows * s.frequencies
+    restoration = 2 * frame if method == "dewarp" else sum(step["bytes_least"] for step in steps(s))
+    return frame + 3 * spectrum + 2 * 2 * frame + frame + restoration
+
+
+def _rates(device: str, frames: torch.Tensor, timing: rsv.SensorTiming, bandwidth: float) -> list[dict[str, Any]]:
+    """Frames per second of detection and restoration on a device."""
+    frames, results = frames.to(device), []
+    shapes = shapes_of(tuple(frames.shape[-2:]), timing, vibration(), device)
+
+    def of_pairs(method: str) -> Iterator[torch.Tensor]:
+        for first in range(len(frames) - 1):
+            found = rsv.detect_vibration(frames[first : first + 2], timing)
+            yield rsv.restore(frames[first : first + 1], timing, found, method=method)
+
+    def tracked(method: str) -> Iterator[torch.Tensor]:
+        tracker = rsv.VibrationTracker(timing, window=WINDOW, method=method)
+        for frame in frames:
+            yield tracker.update(frame).restored
+
+    for method in ("dewarp", "exact"):
+        for name, restored in (("pair by pair", of_pairs), ("tracked", tracked)):
+            images = restored(method)
+            for _ in range(WINDOW):  # the first detection of the tracker
+                next(images)
+            seconds = [seconds_of(lambda images=images: next(images)) for _ in range(FOLLOWED - WINDOW - 1)]
+            results.append(
+                {
+                    "part": "rate",
+                    "device": device,
+                    "name": name,
+                    "method": method,
+                    "seconds": statistics.median(seconds),
+                    "limit": _least_bytes(shapes, method) / bandwidth,
+                }
+            )
+    return results
+
+
 def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """The counts, and the measurement on every device."""
+    """The counts, and the measurements on every device."""
     size, timing, truth = options.size, camera(20), vibration()
     if size > timing.frame_rows:
         timing = rsv.SensorTiming(timing.row_time, timing.exposure_rows, size)
     scene = city_and_fields(size + 2 * MARGIN, size + 2 * MARGIN, SEED)
     noise, generator = rsv.SensorNoise(read_noise=TIMED_NOISE), torch.Generator().manual_seed(SEED)
-    frame = rsv.simulate_frames(scene, timing, truth, 1, frame_size=(size, size), noise=noise, generator=generator)
-    counted = steps(shapes_of((size, size), timing, truth))
-    return [*counted, *(_device(options, device, frame, timing) for device in options.device)]
+    frames = rsv.simulate_frames(
+        scene, timing, truth, FOLLOWED, frame_size=(size, size), noise=noise, generator=generator
+    )
+    results = steps(shapes_of((size, size), timing, truth))
+    for device in options.device:
+        rates = _device(options, device, frames[:1], timing)
+        results += [rates, *_rates(device, frames, timing, rates["bytes_a_second"])]
+    return results
 
 
 def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
@@ -202,6 +258,19 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
             f"| {row['least_seconds']:.4f} | {row['moved_seconds']:.4f} | {shown_seconds(row)} "
             f"| {100 * row['share_of_bandwidth']:.0f} % | {100 * row['share_of_operations']:.0f} % |"
         )
+    text += [
+        "",
+        "Detection and restoration of one frame after the other: `detect_vibration` of each pair of frames and "
+        "`restore`, or `VibrationTracker`. Limit: the least bytes at the rate of copying.",
+        "",
+        "| device | restoration | detection | frames/s | limit (frames/s) |",
+        "|---|---|---|---|---|",
+    ]
+    text += [
+        f"| {row['device']} | {row['method']} | {row['name']} | {1 / row['seconds']:.1f} | {1 / row['limit']:.0f} |"
+        for row in results
+        if row["part"] == "rate"
+    ]
     if all(row["device"] == "cpu" for row in on_devices):
         text += ["", "No CUDA device, or not measured on it."]
     return text
