@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
 from rsvib_torch.restoration.scene_model.observation import REACH, kernel_samples
 
@@ -113,13 +114,13 @@ def shrink_patches(images: Tensor, level: float | Tensor, offset: tuple[int, int
     sides = [_PATCH * count + shared for count in counts]
     after = [side - begin - size for side, begin, size in zip(sides, before, images.shape[1:], strict=True)]
     padded = functional.pad(images[:, None], (before[1], after[1], before[0], after[0]), mode="replicate")[:, 0]
-    total = torch.zeros_like(padded)
-    weights = total.new_empty(len(total), *(_NEIGHBOURS * count for count in counts))  # of the patches
-    for part in runs(counts[0], _LINES):  # less memory, and faster
+
+    def shrunk(part: slice) -> tuple[Tensor, Tensor]:
+        """Sums of the patches of some lines of neighbours, and the weights of the patches."""
         rows = slice(_PATCH * part.start, _PATCH * part.stop + shared)
         # cosines along the rows, then across them, in units of the threshold
         along = (padded[:, rows].unfold(-1, len(cosines[0]), _PATCH) @ (cosines / (2.0 * level)).mT).flatten(-2)
-        lines = torch.zeros_like(along)
+        lines, weights = torch.zeros_like(along), []
         for line in range(part.stop - part.start):
             place = slice(_PATCH * line, _PATCH * line + len(cosines[0]))
             values = (cosines @ along[:, place]).view(len(along), -1, _PATCH, _NEIGHBOURS * counts[1], _PATCH)
@@ -129,11 +130,20 @@ def shrink_patches(images: Tensor, level: float | Tensor, offset: tuple[int, int
             strong[:, :, 0, :, 0] = values[:, :, 0, :, 0]
             strong *= weight[:, :, None, :, None]
             lines[:, place] += (2.0 * level * cosines).mT @ strong.view(len(along), len(cosines), -1)
-            weights[:, _NEIGHBOURS * (part.start + line) :][:, :_NEIGHBOURS] = weight
+            weights.append(weight)
         pixels = lines.unflatten(-1, (counts[1], -1)) @ cosines
-        total[:, rows, :-shared] += pixels[..., :_PATCH].flatten(-2)
-        beyond = functional.pad(pixels[..., _PATCH:], (0, _PATCH - shared)).flatten(-2)
-        total[:, rows, _PATCH:] += beyond[..., : shared - _PATCH]
+        total = functional.pad(pixels[..., :_PATCH].flatten(-2), (0, shared))
+        total[..., _PATCH:] += functional.pad(pixels[..., _PATCH:], (0, _PATCH - shared)).flatten(-2)[..., :-_STEP]
+        return total, torch.cat(weights, 1)
+
+    parts = runs(counts[0], _LINES)  # less memory, and faster
+    if torch.is_grad_enabled() and images.requires_grad:
+        each = [shrunk(part) for part in parts]
+    else:
+        each = in_parallel(shrunk, parts, images.device)
+    total, weights = torch.zeros_like(padded), torch.cat([weight for _, weight in each], 1)
+    for part, (own, _) in zip(parts, each, strict=True):
+        total[:, _PATCH * part.start :][:, : own.shape[1]] += own
     reach = _NEIGHBOURS - 1
     sums = functional.avg_pool2d(functional.pad(weights, (reach,) * 4), _NEIGHBOURS, stride=1) * _NEIGHBOURS**2
     mean = total / sums.repeat_interleave(_STEP, 1).repeat_interleave(_STEP, 2)
