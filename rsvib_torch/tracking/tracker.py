@@ -132,11 +132,15 @@ class TrackedFrame:
 
 @dataclass(frozen=True, eq=False)
 class _Reference:
-    """The frame before: its spectra and time; the gradients of the scene, their path and age in frames."""
+    """The frame before: its spectra and time; the gradients of the scene, their ``differential_motion``, path and age.
+
+    The age is in frames.
+    """
 
     spectra: RowSpectra
     start: float
     gradients: RowGradients | None = None
+    apart: Tensor | None = None
     path: Tensor | None = None
     age: int = 0
 
@@ -335,19 +339,23 @@ class VibrationTracker:
             motion = displaced(motion_of_fit(fit), (path - anchor)[None])
             measurements, found = measure_group(group, self._rows, motion, gradients)
             corrected = state.updated(measurements, centre, noise_factor)
-            fit = corrected.as_fit(centre)
-            change = model_displacements(measurements, fit) - measurements.relative(
-                motion.mean_displacement(measurements.exposure_starts, self._rows.exposure_time)
+            residual = corrected.residual(measurements, centre)
+            change = (
+                measurements.displacements
+                - residual
+                - measurements.relative(
+                    motion.mean_displacement(measurements.exposure_starts, self._rows.exposure_time)
+                )
             )
             if float(change.abs().amax()) < _MAX_CHANGE:
                 break
-            path, gradients = previous - corrected.path(-step), None
+            fit, path, gradients = corrected.as_fit(centre), previous - corrected.path(-step), None
             age, anchor = 0, path
         self._path, self._filter = previous - corrected.path(-step), corrected
-        self._reference = _Reference(spectra, time, found, anchor, age)
-        residual = corrected.residual(measurements, centre)
+        apart = before.apart if found is before.gradients and before.apart is not None else differential_motion([found])
+        self._reference = _Reference(spectra, time, found, apart, anchor, age)
         self._verdict = self._judged(
-            self._at_middle(time, height).as_fit(time), measurements, residual, found, centre - time
+            self._at_middle(time, height).as_fit(time), measurements, residual, apart, centre - time
         )
         if not float(self._verdict.other_motion.unexplained.amax()) < _MAX_UNEXPLAINED:
             self._filter = self._verdict = None  # rows further away are not measured correctly
@@ -378,9 +386,12 @@ class VibrationTracker:
         return torch.arange(0, height, step, dtype=torch.float64, device=device) * self._rows.row_time
 
     def _judged(
-        self, fit: ToneFit, measurements: Measurements, residual: Tensor, gradients: RowGradients, shift: float
+        self, fit: ToneFit, measurements: Measurements, residual: Tensor, apart: Tensor, shift: float
     ) -> _Verdict:
-        """Verdict on the tones by the rows of one pair; the time origin moves by ``shift`` s to that of the fit."""
+        """Verdict on the tones by the rows of one pair; the time origin moves by ``shift`` s to that of the fit.
+
+        ``apart`` is the ``differential_motion``.
+        """
         measurements = replace(measurements, exposure_starts=measurements.exposure_starts + shift)
         visible = measurements.num_differences > 0
         measured = (visible & (measurements.weights > 0).any(-1)).double().sum(1) / visible.double().sum(1).clamp(min=1)
@@ -391,12 +402,12 @@ class VibrationTracker:
             size=math.sqrt(2) * measurements.distances(tones).square().nanmean(1).sqrt(),
             unexplained=measurements.unexplained(residual),
             correlated=measurements.correlated(residual),
-            differential=differential_motion([gradients]),
+            differential=apart,
             measured=measured,
             blur=measured.new_tensor([[1.0, 0.0, 0.0]]),
         )[0]
         vibration, std = vibration_of_fit(fit)
-        starts = self._row_starts(gradients.images.shape[1], measured.device)
+        starts = self._row_starts(self._last[-1][0].shape[-2], measured.device)
         own_std = displacement_std(fit, starts, self._rows.exposure_time)
         moved = vibration.mean_displacement(starts[None], self._rows.exposure_time) - vibration.drift(starts[None])
         offsets = measurements.displacements[0, :, 1] - measurements.displacements[0, :, 0]
@@ -517,8 +528,8 @@ class VibrationTracker:
             return self._unchanged(prepared, time, "searching", detected)
         height = prepared.images.shape[-2]
         half = self._half(height)
-        fit = self._at_middle(time, height).as_fit(time + half)
-        motion = motion_of_fit(fit)
+        fit = self._verdict.fit  # its time origin is the first row; that of the motion is the middle of the frame
+        motion = motion_of_fit(replace(fit, centre=fit.centre - half))
         trusted = torch.stack(list(self._trusted)).any(0)
         followed = ~trusted.new_tensor(self._verdict.contradicted) if self.wobble else trusted
         motion = Vibration(
