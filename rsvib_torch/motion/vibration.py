@@ -170,15 +170,14 @@ class Vibration(Motion, units=_UNITS):
         acceleration = _per_axis("image_acceleration", image_acceleration, axes, device)
         try:
             tones = list(torch.broadcast_tensors(*tones))
-            batch = tones[0].shape[:-2]
-            if not batch == motion.shape[:-1] == acceleration.shape[:-1]:  # torch.broadcast_shapes takes 40 us
-                batch = torch.broadcast_shapes(batch, motion.shape[:-1], acceleration.shape[:-1])
+            # torch.broadcast_shapes takes 40 us, and its first call imports sympy (0.3 s)
+            batch = torch.broadcast_tensors(tones[0][..., 0, 0], motion[..., 0], acceleration[..., 0])[0].shape
         except RuntimeError as error:
             shapes = ", ".join(str(tuple(t.shape)) for t in (*tones, motion, acceleration))
             raise ValueError(f"amplitude, frequency, phase and image_motion do not fit together: {shapes}") from error
         _check_values(dict(zip(_LIMITS, (*tones, motion, acceleration), strict=True)))
         tones = [tensor.expand(*batch, *tensor.shape[-2:]) for tensor in tones]
-        if tones[0].shape[-1] > 1:
+        if tones[0].shape[-1] > 1:  # sorted
             order = tones[0].detach().argsort(dim=-1, descending=True, stable=True)
             tones = [tensor.take_along_dim(order, dim=-1) for tensor in tones]
         for name, tensor in zip(("amplitude", "frequency", "phase"), tones, strict=True):
