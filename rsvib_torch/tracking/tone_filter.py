@@ -119,13 +119,15 @@ class ToneFilter:
         for tone in range(tones):
             place = slice(4 * tone, 4 * tone + 2), slice(4 * tone + 2, 4 * tone + 4)
             turned, by_rate = _as_matrix(factor[..., tone]), _as_matrix(moved[..., tone])
+            eye = torch.eye(2, dtype=torch.float64, device=moved.device)
             transition[..., place[0], place[0]] = turned
             transition[..., place[0], place[1]] = step * by_rate
             exists = (moved[..., tone].abs() > 0)[..., None, None] * walk[:, None, None]
             noise[..., place[0], place[0]] = exists * (step**3 / 3) * (by_rate @ by_rate.mT)
-            noise[..., place[0], place[1]] = exists * (step**2 / 2) * by_rate
-            noise[..., place[1], place[0]] = exists * (step**2 / 2) * by_rate.mT
-            noise[..., place[1], place[1]] = exists * step * torch.eye(2, dtype=torch.float64, device=moved.device)
+            mixed = exists * (step**2 / 2) * by_rate
+            noise[..., place[0], place[1]] = mixed
+            noise[..., place[1], place[0]] = mixed.mT
+            noise[..., place[1], place[1]] = exists * step * eye
         transition[..., -2, -1] = step
         of_drift = noise.new_tensor([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
         noise[..., -2:, -2:] = jerk[:, None, None] * of_drift
@@ -187,12 +189,16 @@ class ToneFilter:
         probability = score.softmax(-1).clamp(min=1e-6)  # a filter that failed must be able to return
         return self._with_values(self._values() + step, posterior, probability / probability.sum(-1, keepdim=True))
 
-    def residual(self, measurements: Measurements, origin: float) -> Tensor:
-        """(1, N, 2, A) px, displacements of rows in two frames relative to their mean, less those of the filters."""
-        middles, offsets = self._offsets(measurements, origin)
-        residual = offsets[:, None] - self._expected(self._waves(middles), middles)
-        mean = (self.probability[..., None] * residual).sum(1).T
-        return measurements.relative(torch.stack([-0.5 * mean, 0.5 * mean], 1)[None])
+    def explained(self, measurements: Measurements, origin: float) -> tuple[Tensor, Tensor]:
+        """Displacements (1, N, 2, A) in px of rows in two frames relative to their mean, by the tones and by the drift.
+
+        They are the means of all filters.
+        """
+        middles, _ = self._offsets(measurements, origin)
+        parts = torch.stack(self._expected(self._waves(middles), middles))  # (2, A, M, N)
+        mean = (self.probability[..., None, :] @ parts)[..., 0, :].mT  # (2, N, A)
+        tones, drift = measurements.relative(torch.stack([-0.5 * mean, 0.5 * mean], 2)).split(1)
+        return tones, drift
 
     def _linearised(self, measurements: Measurements, origin: float) -> tuple[Tensor, Tensor]:
         """Derivatives (A, M, N, P) of the offsets between two frames, and their residuals (A, M, N) in px."""
@@ -203,7 +209,7 @@ class ToneFilter:
         parts = torch.stack([amplitude.real, -amplitude.imag, by_rate.real, -by_rate.imag], 3)  # (A, M, K, 4, N)
         parts = parts * (self.coefficients.abs() > 0)[..., None, None]
         drift = _powers(middles).expand(*parts.shape[:2], -1, -1)
-        return torch.cat([parts.flatten(2, 3), drift], 2).mT, offsets[:, None] - self._expected(wave, middles)
+        return torch.cat([parts.flatten(2, 3), drift], 2).mT, offsets[:, None] - sum(self._expected(wave, middles))
 
     def _offsets(self, measurements: Measurements, origin: float) -> tuple[Tensor, Tensor]:
         """Mid-exposures (N, 2) from the reference time in s, and the measured offsets (A, N) in px."""
@@ -215,10 +221,10 @@ class ToneFilter:
         attenuation = torch.sinc(self.rates.imag * (0.5 / math.pi * self.exposure_time))
         return (self.rates[..., None, None] * middles).exp() * attenuation[..., None, None]
 
-    def _expected(self, wave: Tensor, middles: Tensor) -> Tensor:
-        """(A, M, N) px, offsets by the tones with ``_waves`` and by the drift."""
+    def _expected(self, wave: Tensor, middles: Tensor) -> tuple[Tensor, Tensor]:
+        """(A, M, N) px each, offsets by the tones with ``_waves``, and by the drift."""
         tones = (self.coefficients[:, :, None] @ _between(wave))[:, :, 0].real
-        return tones + self.drift @ _powers(middles)
+        return tones, self.drift @ _powers(middles)
 
     def _robust(self, jacobian: Tensor, residual: Tensor, weights: Tensor) -> Tensor:
         """Weights (A, N) in px^-2 by the residual of a fit without prior: outliers have weight 0.
@@ -294,4 +300,4 @@ def _powers(middles: Tensor) -> Tensor:
 def _as_matrix(numbers: Tensor) -> Tensor:
     """Complex numbers (...) as matrices (..., 2, 2) that multiply [Re, Im]."""
     real, imaginary = numbers.real, numbers.imag
-    return torch.stack([torch.stack([real, -imaginary], -1), torch.stack([imaginary, real], -1)], -2)
+    return torch.stack([real, -imaginary, imaginary, real], -1).unflatten(-1, (2, 2))

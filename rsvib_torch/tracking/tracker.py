@@ -39,7 +39,6 @@ from rsvib_torch.detection.tones.fit import (
     MIN_GAIN,
     ToneFit,
     displacement_std,
-    model_displacements,
     motion_of_fit,
     offset_gain,
     residual_of,
@@ -339,13 +338,10 @@ class VibrationTracker:
             motion = displaced(motion_of_fit(fit), (path - anchor)[None])
             measurements, found = measure_group(group, self._rows, motion, gradients)
             corrected = state.updated(measurements, centre, noise_factor)
-            residual = corrected.residual(measurements, centre)
-            change = (
-                measurements.displacements
-                - residual
-                - measurements.relative(
-                    motion.mean_displacement(measurements.exposure_starts, self._rows.exposure_time)
-                )
+            tones, drift = corrected.explained(measurements, centre)
+            change = tones + drift
+            change = change - measurements.relative(
+                motion.mean_displacement(measurements.exposure_starts, self._rows.exposure_time)
             )
             if float(change.abs().amax()) < _MAX_CHANGE:
                 break
@@ -355,7 +351,11 @@ class VibrationTracker:
         apart = before.apart if found is before.gradients and before.apart is not None else differential_motion([found])
         self._reference = _Reference(spectra, time, found, apart, anchor, age)
         self._verdict = self._judged(
-            self._at_middle(time, height).as_fit(time), measurements, residual, apart, centre - time
+            self._at_middle(time, height).as_fit(time),
+            replace(measurements, exposure_starts=measurements.exposure_starts + (centre - time)),
+            tones,
+            measurements.displacements - tones - drift,
+            apart,
         )
         if not float(self._verdict.other_motion.unexplained.amax()) < _MAX_UNEXPLAINED:
             self._filter = self._verdict = None  # rows further away are not measured correctly
@@ -386,18 +386,14 @@ class VibrationTracker:
         return torch.arange(0, height, step, dtype=torch.float64, device=device) * self._rows.row_time
 
     def _judged(
-        self, fit: ToneFit, measurements: Measurements, residual: Tensor, apart: Tensor, shift: float
+        self, fit: ToneFit, measurements: Measurements, tones: Tensor, residual: Tensor, apart: Tensor
     ) -> _Verdict:
-        """Verdict on the tones by the rows of one pair; the time origin moves by ``shift`` s to that of the fit.
+        """Verdict by the rows of one pair, from their displacements (1, N, 2, 2) by the tones and their residuals.
 
         ``apart`` is the ``differential_motion``.
         """
-        measurements = replace(measurements, exposure_starts=measurements.exposure_starts + shift)
         visible = measurements.num_differences > 0
         measured = (visible & (measurements.weights > 0).any(-1)).double().sum(1) / visible.double().sum(1).clamp(min=1)
-        tones = measurements.relative(
-            model_displacements(measurements, replace(fit, drift=torch.zeros_like(fit.drift)))
-        )
         other = OtherMotion(
             size=math.sqrt(2) * measurements.distances(tones).square().nanmean(1).sqrt(),
             unexplained=measurements.unexplained(residual),
