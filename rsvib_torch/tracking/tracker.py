@@ -71,6 +71,8 @@ _DRIFT_STD = (10.0, 500.0)  # px/s and px/s^2, at the start; tones and drift are
 _STARTS: tuple[tuple[DetectionMethod, Literal["auto"] | int], ...] = (("bands", "auto"), ("direct", 1))
 _MIN_CORRELATION = 0.3  # of the typical band with the next frame; bands of independent noise reach 0.1
 _MAX_DOUBLED = 4  # times that the number of frames between two attempts to detect the vibration is doubled
+# The direct method takes up to ten times as long as bands (9 s for eight frames of a flying drone without a tone)
+_DIRECT_ATTEMPTS = 2  # consecutive attempts, after which only bands are tried
 _PATIENCE = 3  # consecutive frames that contradict the tones, before the vibration is detected again
 
 
@@ -440,7 +442,7 @@ class VibrationTracker:
         if self._filter is None:
             new = max(new, self._untried)
         needed = max(2, self.window // 2) * 2 ** min(self._attempts, _MAX_DOUBLED)
-        if new < needed or self._untried < min(needed, self.window) // 2:
+        if new < needed or self._untried < needed // 2:
             return 0
         return min(new, self.window, len(self._last))
 
@@ -458,7 +460,7 @@ class VibrationTracker:
         # too few bands are registered, or the fit diverges: the next frames may be better
         with suppress(ValueError, OverflowError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
             # the filter measures the rows, so that bands are a sufficient start; small frames have too few of them
-            for method, tones in _STARTS:
+            for method, tones in _STARTS[: 2 if self._attempts <= _DIRECT_ATTEMPTS else 1]:
                 found = detect_vibration(
                     stack,
                     timing,
