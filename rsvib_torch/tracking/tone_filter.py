@@ -119,15 +119,14 @@ class ToneFilter:
         for tone in range(tones):
             place = slice(4 * tone, 4 * tone + 2), slice(4 * tone + 2, 4 * tone + 4)
             turned, by_rate = _as_matrix(factor[..., tone]), _as_matrix(moved[..., tone])
-            eye = torch.eye(2, dtype=torch.float64, device=moved.device)
             transition[..., place[0], place[0]] = turned
             transition[..., place[0], place[1]] = step * by_rate
             exists = (moved[..., tone].abs() > 0)[..., None, None] * walk[:, None, None]
             noise[..., place[0], place[0]] = exists * (step**3 / 3) * (by_rate @ by_rate.mT)
-            mixed = exists * (step**2 / 2) * by_rate
-            noise[..., place[0], place[1]] = mixed
-            noise[..., place[1], place[0]] = mixed.mT
-            noise[..., place[1], place[1]] = exists * step * eye
+            of_both = exists * (step**2 / 2) * by_rate
+            noise[..., place[0], place[1]] = of_both
+            noise[..., place[1], place[0]] = of_both.mT
+            noise[..., place[1], place[1]] = exists * step * torch.eye(2, dtype=torch.float64, device=moved.device)
         transition[..., -2, -1] = step
         of_drift = noise.new_tensor([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
         noise[..., -2:, -2:] = jerk[:, None, None] * of_drift
@@ -300,4 +299,5 @@ def _powers(middles: Tensor) -> Tensor:
 def _as_matrix(numbers: Tensor) -> Tensor:
     """Complex numbers (...) as matrices (..., 2, 2) that multiply [Re, Im]."""
     real, imaginary = numbers.real, numbers.imag
-    return torch.stack([real, -imaginary, imaginary, real], -1).unflatten(-1, (2, 2))
+    matrices: Tensor = torch.stack([real, -imaginary, imaginary, real], -1).unflatten(-1, (2, 2))
+    return matrices

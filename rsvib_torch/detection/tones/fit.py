@@ -584,7 +584,7 @@ def _direction(fit: ToneFit) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _propagated(fit: ToneFit, gradient: Tensor) -> Tensor:
-    """Standard deviations (..., B, 2, K) of functions with gradients (..., B, 2, K, 3) by Re C, Im C and f of a tone."""
+    """Standard deviations (..., B, 2, K) of functions with gradients (..., B, 2, K, 3) by Re C, Im C and f of tones."""
     tones = fit.frequencies.shape[-1]
     covariance = _covariance_of_axes(fit)
     blocks = torch.stack([covariance[..., 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(tones)], dim=2)
