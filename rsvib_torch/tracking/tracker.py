@@ -436,7 +436,7 @@ class VibrationTracker:
         """Number of last frames to detect the vibration from; 0 if it is known, or if it is too early to try again.
 
         After a change of the vibration, only frames behind the change are used: half a window first, then whole windows
-        at times that double.
+        at times that double, up to 32 frames apart (with a window of 8).
         """
         new = len(self._last) if self._filter is None and self._attempts == 0 else self._contradictions
         if self._filter is None:
