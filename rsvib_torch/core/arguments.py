@@ -230,11 +230,11 @@ def check_broadcast(**tensors: Any) -> None:
         ...
         ValueError: u and v do not fit together: (3,), (2,)
     """
-    given = {name: tuple(value.shape) for name, value in tensors.items() if isinstance(value, Tensor)}
+    given = {name: value for name, value in tensors.items() if isinstance(value, Tensor)}
     try:
-        torch.broadcast_shapes(*given.values())
+        torch.broadcast_tensors(*given.values())  # torch.broadcast_shapes takes 40 us, and its first call imports sympy
     except RuntimeError as error:
-        shapes = ", ".join(map(str, given.values()))
+        shapes = ", ".join(str(tuple(value.shape)) for value in given.values())
         raise ValueError(f"{' and '.join(given)} do not fit together: {shapes}") from error
 
 

@@ -129,8 +129,8 @@ def rows_showing(
         last_of_three = iteration == 2
         if not last_of_three:
             # derivative of the mean displacement, which differs from the velocity for periods as short as exposures
-            ends = vibration.displacement(starts + exposure_time) - vibration.displacement(starts)
-            slope = ends[..., 1].detach() * (timing.row_time / exposure_time)
+            ends = vibration.displacement(torch.stack([starts, starts + exposure_time], -1))[..., 1].detach()
+            slope = (ends[..., 1] - ends[..., 0]) * (timing.row_time / exposure_time)
         step = residual / (1.0 - slope).clamp(min=0.1)  # the limit keeps steps finite near slope 1
         rows = rows + step
         if last_of_three and bool((step.abs() < 1e-9).all()):  # px, far below any measurement

@@ -206,6 +206,6 @@ class _Writer:
 
 def to_counts(frame: Tensor) -> NDArray[np.uint8]:
     """A frame (H, W) or (C, H, W) of full scale 1 as 8-bit counts (H, W) or (H, W, C)."""
-    counts = frame.nan_to_num(0.0).mul(255.0).round_().clamp_(0.0, 255.0).to(torch.uint8)
+    counts = frame.nan_to_num(0.0).mul_(255.0).round_().clamp_(0.0, 255.0).to(torch.uint8)
     counts = counts if frame.ndim == 2 else counts[0] if frame.shape[0] == 1 else counts.movedim(0, -1)
     return counts.cpu().numpy()

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Self
 
 import torch
@@ -33,6 +34,7 @@ _QUANTITIES = ("amplitude", "frequency", "phase")
 
 # Largest values: beyond the largest image, the fastest row, and what float64 angles and positions resolve.
 _LIMITS = {"amplitude": 1e6, "frequency": 1e9, "phase": 1e9, "image_motion": 1e9, "image_acceleration": 1e12}
+_NOT_NEGATIVE = ("amplitude", "frequency")
 _MAX_BLIND = 10_000_000  # blind frequencies; 80 MB
 
 TensorLike = Tensor | NDArray[Any] | float | Sequence[float] | Sequence[Sequence[float]]
@@ -73,12 +75,23 @@ def _with_trailing(value: float | Tensor, dimensions: int) -> float | Tensor:
     return value[(..., *(None,) * dimensions)] if isinstance(value, Tensor) else value
 
 
+@lru_cache(maxsize=64)
+def _range_of(counts: tuple[tuple[str, int], ...], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Smallest and largest permitted value of each of some numbers of values; cached, do not modify them."""
+    with torch.inference_mode(False):
+        numbers = torch.tensor([count for _, count in counts], device=device)
+        high = torch.tensor([_LIMITS[name] for name, _ in counts], dtype=torch.float64, device=device)
+        low = torch.tensor(
+            [0.0 if name in _NOT_NEGATIVE else -_LIMITS[name] for name, _ in counts], dtype=torch.float64, device=device
+        )
+        return low.repeat_interleave(numbers), high.repeat_interleave(numbers)
+
+
 def _check_values(values: dict[str, Tensor]) -> None:
     """Raise a ValueError for values that are not finite or too large, and for negative amplitudes or frequencies."""
-    not_negative = ("amplitude", "frequency")
-    wrong = [~(tensor.abs() <= _LIMITS[name]).all() for name, tensor in values.items()]
-    wrong += [(values[name] < 0).any() for name in not_negative]
-    if not bool(torch.stack(wrong).any()):  # synchronises the device only once
+    flat = torch.cat([tensor.detach().flatten() for tensor in values.values()])
+    low, high = _range_of(tuple((name, tensor.numel()) for name, tensor in values.items()), flat.device)
+    if bool(((flat >= low) & (flat <= high)).all()):  # of all values at once: the tracker checks many small motions
         return
     for name, tensor in values.items():
         if not bool(torch.isfinite(tensor).all()):
@@ -88,7 +101,7 @@ def _check_values(values: dict[str, Tensor]) -> None:
                 f"{name} must be at most {_LIMITS[name]:g} {_UNITS[name].partition(' at')[0]}, got "
                 f"{tensor.abs().max().item():g}"
             )
-    for name in not_negative:
+    for name in _NOT_NEGATIVE:
         if bool((values[name] < 0).any()):
             raise ValueError(f"{name} must not be negative, got {values[name].min().item():g}")
 
@@ -157,15 +170,18 @@ class Vibration(Motion, units=_UNITS):
         acceleration = _per_axis("image_acceleration", image_acceleration, axes, device)
         try:
             tones = list(torch.broadcast_tensors(*tones))
-            batch = torch.broadcast_shapes(tones[0].shape[:-2], motion.shape[:-1], acceleration.shape[:-1])
+            # torch.broadcast_shapes takes 40 us, and its first call imports sympy (0.3 s)
+            batch = torch.broadcast_tensors(tones[0][..., 0, 0], motion[..., 0], acceleration[..., 0])[0].shape
         except RuntimeError as error:
             shapes = ", ".join(str(tuple(t.shape)) for t in (*tones, motion, acceleration))
             raise ValueError(f"amplitude, frequency, phase and image_motion do not fit together: {shapes}") from error
         _check_values(dict(zip(_LIMITS, (*tones, motion, acceleration), strict=True)))
         tones = [tensor.expand(*batch, *tensor.shape[-2:]) for tensor in tones]
-        order = tones[0].detach().argsort(dim=-1, descending=True, stable=True)
+        if tones[0].shape[-1] > 1:  # sorted
+            order = tones[0].detach().argsort(dim=-1, descending=True, stable=True)
+            tones = [tensor.take_along_dim(order, dim=-1) for tensor in tones]
         for name, tensor in zip(("amplitude", "frequency", "phase"), tones, strict=True):
-            object.__setattr__(self, name, tensor.take_along_dim(order, dim=-1))
+            object.__setattr__(self, name, tensor)
         object.__setattr__(self, "image_motion", motion.expand(*batch, axes))
         object.__setattr__(self, "image_acceleration", acceleration.expand(*batch, axes))
         object.__setattr__(self, "camera", camera)

@@ -16,7 +16,7 @@ from rsvib_torch.restoration.frame_motion import FrameMotion
 __all__ = ["restore_dewarp"]
 
 
-def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 256) -> Tensor:
+def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 128) -> Tensor:
     """Undo the displacement of every row, not its blur: fast, and sufficient for short exposures.
 
     Scene row s is interpolated at frame row r(s) by a quintic B-spline across rows and moved back along the row by the

@@ -123,8 +123,9 @@ class ToneFilter:
             transition[..., place[0], place[1]] = step * by_rate
             exists = (moved[..., tone].abs() > 0)[..., None, None] * walk[:, None, None]
             noise[..., place[0], place[0]] = exists * (step**3 / 3) * (by_rate @ by_rate.mT)
-            noise[..., place[0], place[1]] = exists * (step**2 / 2) * by_rate
-            noise[..., place[1], place[0]] = exists * (step**2 / 2) * by_rate.mT
+            of_both = exists * (step**2 / 2) * by_rate
+            noise[..., place[0], place[1]] = of_both
+            noise[..., place[1], place[0]] = of_both.mT
             noise[..., place[1], place[1]] = exists * step * torch.eye(2, dtype=torch.float64, device=moved.device)
         transition[..., -2, -1] = step
         of_drift = noise.new_tensor([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
@@ -150,11 +151,13 @@ class ToneFilter:
 
     def _moments(self, weight: Tensor) -> tuple[Tensor, Tensor]:
         """Means (A, N, P) and covariances (A, N, P, P) of mixtures with weights (A, M, N) of the filters."""
-        values = self._values()
-        mean = torch.einsum("amn,amp->anp", weight, values)
-        apart = values[:, :, None] - mean[:, None]  # (A, M, N, P)
-        spread = torch.einsum("amn,amnp,amnq->anpq", weight, apart, apart)
-        return mean, torch.einsum("amn,ampq->anpq", weight, self.covariance) + spread
+        # as products of matrices: einsum takes five times as many operations
+        values, share = self._values(), weight.mT
+        mean = share @ values
+        apart = values[:, None] - mean[:, :, None]  # (A, N, M, P)
+        spread = (apart * share[..., None]).mT @ apart
+        covariance = (share @ self.covariance.flatten(-2)).unflatten(-1, self.covariance.shape[-2:])
+        return mean, covariance + spread
 
     # Update
 
@@ -185,33 +188,42 @@ class ToneFilter:
         probability = score.softmax(-1).clamp(min=1e-6)  # a filter that failed must be able to return
         return self._with_values(self._values() + step, posterior, probability / probability.sum(-1, keepdim=True))
 
-    def residual(self, measurements: Measurements, origin: float) -> Tensor:
-        """(1, N, 2, A) px, displacements of rows in two frames relative to their mean, less those of the filters."""
-        _, residual = self._linearised(measurements, origin)
-        mean = (self.probability[..., None] * residual).sum(1).T
-        return measurements.relative(torch.stack([-0.5 * mean, 0.5 * mean], 1)[None])
+    def explained(self, measurements: Measurements, origin: float) -> tuple[Tensor, Tensor]:
+        """Displacements (1, N, 2, A) in px of rows in two frames relative to their mean, by the tones and by the drift.
+
+        They are the means of all filters.
+        """
+        middles, _ = self._offsets(measurements, origin)
+        parts = torch.stack(self._expected(self._waves(middles), middles))  # (2, A, M, N)
+        mean = (self.probability[..., None, :] @ parts)[..., 0, :].mT  # (2, N, A)
+        tones, drift = measurements.relative(torch.stack([-0.5 * mean, 0.5 * mean], 2)).split(1)
+        return tones, drift
 
     def _linearised(self, measurements: Measurements, origin: float) -> tuple[Tensor, Tensor]:
         """Derivatives (A, M, N, P) of the offsets between two frames, and their residuals (A, M, N) in px."""
-        middles = measurements.exposure_starts[0] + (0.5 * self.exposure_time + origin - self.time)  # (N, 2)
-        offsets = (measurements.displacements[0, :, 1] - measurements.displacements[0, :, 0]).T  # (A, N)
-        jacobian, expected = self._jacobian(middles)
-        return jacobian, offsets[:, None] - expected
+        middles, offsets = self._offsets(measurements, origin)
+        wave = self._waves(middles)
+        by_rate = _between(self.coefficients[..., None, None] * wave * middles)
+        amplitude = _between(wave)
+        parts = torch.stack([amplitude.real, -amplitude.imag, by_rate.real, -by_rate.imag], 3)  # (A, M, K, 4, N)
+        parts = parts * (self.coefficients.abs() > 0)[..., None, None]
+        drift = _powers(middles).expand(*parts.shape[:2], -1, -1)
+        return torch.cat([parts.flatten(2, 3), drift], 2).mT, offsets[:, None] - sum(self._expected(wave, middles))
 
-    def _jacobian(self, middles: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivatives (A, M, N, P) of the offsets by the parameters, and the offsets (A, M, N), at times (N, 2)."""
+    def _offsets(self, measurements: Measurements, origin: float) -> tuple[Tensor, Tensor]:
+        """Mid-exposures (N, 2) from the reference time in s, and the measured offsets (A, N) in px."""
+        middles = measurements.exposure_starts[0] + (0.5 * self.exposure_time + origin - self.time)
+        return middles, _between(measurements.displacements[0].permute(2, 0, 1))
+
+    def _waves(self, middles: Tensor) -> Tensor:
+        """(A, M, K, N, 2) displacements by unit tones at times (N, 2)."""
         attenuation = torch.sinc(self.rates.imag * (0.5 / math.pi * self.exposure_time))
-        wave = (self.rates[..., None, None] * middles).exp() * attenuation[..., None, None]  # (A, M, K, N, 2)
-        by_rate = self.coefficients[..., None, None] * wave * middles
-        value = (self.coefficients[..., None, None] * wave).real
-        parts = torch.stack([wave.real, -wave.imag, by_rate.real, -by_rate.imag], 3)  # (A, M, K, 4, N, 2)
-        parts = (parts[..., 1] - parts[..., 0]).flatten(2, 3)
-        exists = (self.coefficients.abs() > 0).repeat_interleave(4, -1)[..., None]
-        powers = torch.stack([middles, 0.5 * middles.square()])
-        powers = (powers[..., 1] - powers[..., 0]).expand(*parts.shape[:2], -1, -1)
-        jacobian = torch.cat([parts * exists, powers], 2).mT
-        tones = (value[..., 1] - value[..., 0]).sum(2)
-        return jacobian, tones + (powers * self.drift[..., None]).sum(2)
+        return (self.rates[..., None, None] * middles).exp() * attenuation[..., None, None]
+
+    def _expected(self, wave: Tensor, middles: Tensor) -> tuple[Tensor, Tensor]:
+        """(A, M, N) px each, offsets by the tones with ``_waves``, and by the drift."""
+        tones = (self.coefficients[:, :, None] @ _between(wave))[:, :, 0].real
+        return tones, self.drift @ _powers(middles)
 
     def _robust(self, jacobian: Tensor, residual: Tensor, weights: Tensor) -> Tensor:
         """Weights (A, N) in px^-2 by the residual of a fit without prior: outliers have weight 0.
@@ -274,7 +286,18 @@ class ToneFilter:
         )
 
 
+def _between(values: Tensor) -> Tensor:
+    """Differences (...) between the two frames of values (..., 2)."""
+    return values[..., 1] - values[..., 0]
+
+
+def _powers(middles: Tensor) -> Tensor:
+    """(2, N), offsets by unit v and a between times (N, 2)."""
+    return _between(torch.stack([middles, 0.5 * middles.square()]))
+
+
 def _as_matrix(numbers: Tensor) -> Tensor:
     """Complex numbers (...) as matrices (..., 2, 2) that multiply [Re, Im]."""
     real, imaginary = numbers.real, numbers.imag
-    return torch.stack([torch.stack([real, -imaginary], -1), torch.stack([imaginary, real], -1)], -2)
+    matrices: Tensor = torch.stack([real, -imaginary, imaginary, real], -1).unflatten(-1, (2, 2))
+    return matrices

@@ -39,7 +39,6 @@ from rsvib_torch.detection.tones.fit import (
     MIN_GAIN,
     ToneFit,
     displacement_std,
-    model_displacements,
     motion_of_fit,
     offset_gain,
     residual_of,
@@ -72,6 +71,8 @@ _DRIFT_STD = (10.0, 500.0)  # px/s and px/s^2, at the start; tones and drift are
 _STARTS: tuple[tuple[DetectionMethod, Literal["auto"] | int], ...] = (("bands", "auto"), ("direct", 1))
 _MIN_CORRELATION = 0.3  # of the typical band with the next frame; bands of independent noise reach 0.1
 _MAX_DOUBLED = 4  # times that the number of frames between two attempts to detect the vibration is doubled
+# The direct method takes up to ten times as long as bands (9 s for eight frames of a flying drone without a tone)
+_DIRECT_ATTEMPTS = 2  # consecutive attempts, after which only bands are tried
 _PATIENCE = 3  # consecutive frames that contradict the tones, before the vibration is detected again
 
 
@@ -132,11 +133,15 @@ class TrackedFrame:
 
 @dataclass(frozen=True, eq=False)
 class _Reference:
-    """The frame before: its spectra and time; the gradients of the scene, their path and age in frames."""
+    """The frame before: its spectra and time; the gradients of the scene, their ``differential_motion``, path and age.
+
+    The age is in frames.
+    """
 
     spectra: RowSpectra
     start: float
     gradients: RowGradients | None = None
+    apart: Tensor | None = None
     path: Tensor | None = None
     age: int = 0
 
@@ -335,19 +340,24 @@ class VibrationTracker:
             motion = displaced(motion_of_fit(fit), (path - anchor)[None])
             measurements, found = measure_group(group, self._rows, motion, gradients)
             corrected = state.updated(measurements, centre, noise_factor)
-            fit = corrected.as_fit(centre)
-            change = model_displacements(measurements, fit) - measurements.relative(
+            tones, drift = corrected.explained(measurements, centre)
+            change = tones + drift
+            change = change - measurements.relative(
                 motion.mean_displacement(measurements.exposure_starts, self._rows.exposure_time)
             )
             if float(change.abs().amax()) < _MAX_CHANGE:
                 break
-            path, gradients = previous - corrected.path(-step), None
+            fit, path, gradients = corrected.as_fit(centre), previous - corrected.path(-step), None
             age, anchor = 0, path
         self._path, self._filter = previous - corrected.path(-step), corrected
-        self._reference = _Reference(spectra, time, found, anchor, age)
-        residual = corrected.residual(measurements, centre)
+        apart = before.apart if found is before.gradients and before.apart is not None else differential_motion([found])
+        self._reference = _Reference(spectra, time, found, apart, anchor, age)
         self._verdict = self._judged(
-            self._at_middle(time, height).as_fit(time), measurements, residual, found, centre - time
+            self._at_middle(time, height).as_fit(time),
+            replace(measurements, exposure_starts=measurements.exposure_starts + (centre - time)),
+            tones,
+            measurements.displacements - tones - drift,
+            apart,
         )
         if not float(self._verdict.other_motion.unexplained.amax()) < _MAX_UNEXPLAINED:
             self._filter = self._verdict = None  # rows further away are not measured correctly
@@ -378,25 +388,24 @@ class VibrationTracker:
         return torch.arange(0, height, step, dtype=torch.float64, device=device) * self._rows.row_time
 
     def _judged(
-        self, fit: ToneFit, measurements: Measurements, residual: Tensor, gradients: RowGradients, shift: float
+        self, fit: ToneFit, measurements: Measurements, tones: Tensor, residual: Tensor, apart: Tensor
     ) -> _Verdict:
-        """Verdict on the tones by the rows of one pair; the time origin moves by ``shift`` s to that of the fit."""
-        measurements = replace(measurements, exposure_starts=measurements.exposure_starts + shift)
+        """Verdict by the rows of one pair, from their displacements (1, N, 2, 2) by the tones and their residuals.
+
+        ``apart`` is the ``differential_motion``.
+        """
         visible = measurements.num_differences > 0
         measured = (visible & (measurements.weights > 0).any(-1)).double().sum(1) / visible.double().sum(1).clamp(min=1)
-        tones = measurements.relative(
-            model_displacements(measurements, replace(fit, drift=torch.zeros_like(fit.drift)))
-        )
         other = OtherMotion(
             size=math.sqrt(2) * measurements.distances(tones).square().nanmean(1).sqrt(),
             unexplained=measurements.unexplained(residual),
             correlated=measurements.correlated(residual),
-            differential=differential_motion([gradients]),
+            differential=apart,
             measured=measured,
             blur=measured.new_tensor([[1.0, 0.0, 0.0]]),
         )[0]
         vibration, std = vibration_of_fit(fit)
-        starts = self._row_starts(gradients.images.shape[1], measured.device)
+        starts = self._row_starts(self._last[-1][0].shape[-2], measured.device)
         own_std = displacement_std(fit, starts, self._rows.exposure_time)
         moved = vibration.mean_displacement(starts[None], self._rows.exposure_time) - vibration.drift(starts[None])
         offsets = measurements.displacements[0, :, 1] - measurements.displacements[0, :, 0]
@@ -427,13 +436,13 @@ class VibrationTracker:
         """Number of last frames to detect the vibration from; 0 if it is known, or if it is too early to try again.
 
         After a change of the vibration, only frames behind the change are used: half a window first, then whole windows
-        at times that double.
+        at times that double, up to 32 frames apart (with a window of 8).
         """
         new = len(self._last) if self._filter is None and self._attempts == 0 else self._contradictions
         if self._filter is None:
             new = max(new, self._untried)
         needed = max(2, self.window // 2) * 2 ** min(self._attempts, _MAX_DOUBLED)
-        if new < needed or self._untried < min(needed, self.window) // 2:
+        if new < needed or self._untried < needed // 2:
             return 0
         return min(new, self.window, len(self._last))
 
@@ -451,7 +460,7 @@ class VibrationTracker:
         # too few bands are registered, or the fit diverges: the next frames may be better
         with suppress(ValueError, OverflowError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
             # the filter measures the rows, so that bands are a sufficient start; small frames have too few of them
-            for method, tones in _STARTS:
+            for method, tones in _STARTS[: 2 if self._attempts <= _DIRECT_ATTEMPTS else 1]:
                 found = detect_vibration(
                     stack,
                     timing,
@@ -517,8 +526,8 @@ class VibrationTracker:
             return self._unchanged(prepared, time, "searching", detected)
         height = prepared.images.shape[-2]
         half = self._half(height)
-        fit = self._at_middle(time, height).as_fit(time + half)
-        motion = motion_of_fit(fit)
+        fit = self._verdict.fit  # its time origin is the first row; that of the motion is the middle of the frame
+        motion = motion_of_fit(replace(fit, centre=fit.centre - half))
         trusted = torch.stack(list(self._trusted)).any(0)
         followed = ~trusted.new_tensor(self._verdict.contradicted) if self.wobble else trusted
         motion = Vibration(

@@ -1,4 +1,8 @@
-"""The video stabiliser vidstab (PyPI), for comparison: features, optical flow, one similarity transform per frame."""
+"""The video stabiliser vidstab (PyPI), for comparison: features, optical flow, one similarity transform per frame.
+
+It depends on ``opencv-python``, which must not replace the headless one, so that it is installed apart:
+``pip install --no-deps --target FOLDER vidstab imutils progress``, and FOLDER in ``PYTHONPATH``.
+"""
 
 from typing import Any
 

@@ -151,6 +151,21 @@ def test_a_camera_at_rest_needs_no_further_detection():
     assert not tracked[-1].motion.moving_axes().any()
 
 
+def test_attempts_to_detect_motion_without_tones_become_rare():
+    random = np.random.default_rng(4)
+    frequencies, phases = random.uniform(35.0, 200.0, (2, 60)), random.uniform(0.0, 2 * np.pi, (2, 60))
+
+    def noise_like(times):
+        angles = 2 * np.pi * frequencies[..., None] * np.ravel(times) + phases[..., None]
+        return tuple((0.15 * np.sin(angles).sum(1)).reshape(2, *np.shape(times)))
+
+    frames = taken(Sines(lambda t: (0 * t, 0 * t), path=noise_like), 112)
+    tracker = rsv.VibrationTracker(TIMING)
+    detected = np.array([index for index, frame in enumerate(frames) if tracker.update(frame).detected])
+    assert 3 <= len(detected) <= 8  # 18 if they are four frames apart after 64 frames
+    assert np.diff(detected)[-1] >= 30
+
+
 def test_slow_motion_is_part_of_the_path_and_not_of_the_tones():
     def path(t):
         return 6 * np.sin(2 * np.pi * 0.8 * t), 20.0 * t

@@ -133,7 +133,9 @@ def stack_spectra(frames: Tensor, valid: Tensor | None, strips: ColumnStrips | N
         strips: Strips (B S) whose spectra are computed; None for whole rows.
     """
     if valid is None:
-        variance, level = torch.var_mean(frames[..., ::4, :], (-2, -1), correction=0, keepdim=True)
+        some = frames[..., ::4, :].flatten(-2)  # copied, so that two passes take a tenth of the time of torch.var_mean
+        level = some.mean(-1)[..., None, None]
+        variance = (some - level[..., 0]).square_().mean(-1)[..., None, None]
     else:
         weight = valid / valid.sum((-2, -1), keepdim=True)
         level = (frames * weight).sum((-2, -1), keepdim=True)

@@ -442,16 +442,26 @@ def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
     """
     centre = fit.centre[:, None, None]
     real, imaginary, amplitude = _direction(fit)
-    zero, one = torch.zeros_like(real), torch.ones_like(real)
-    frequency_std = _propagated(fit, zero, zero, one)
+    zero = torch.zeros_like(real)
+    gradients = [
+        torch.stack([real, imaginary, zero], -1),  # of the amplitude, frequency and phase
+        torch.stack([zero, zero, zero + 1.0], -1),
+        torch.stack([-imaginary / amplitude, real / amplitude, zero - 2 * math.pi * centre], -1),
+    ]
+    deviations = _propagated(fit, torch.stack(gradients))
+    if real.shape[-1] > 1:  # the order of the tones of a Vibration
+        order = fit.amplitude.argsort(dim=-1, descending=True, stable=True)
+        deviations = deviations.take_along_dim(order[None], -1)
+        frequencies, active = (values.take_along_dim(order, -1) for values in (fit.frequencies, fit.active))
+    else:
+        frequencies, active = fit.frequencies, fit.active
+    amplitude_deviation, frequency_deviation, phase_deviation = deviations
     std = {
-        "amplitude": amplitude_std(fit),
-        "frequency": frequency_std,
-        "period": frequency_std / torch.where(fit.active & (fit.frequencies > 0), fit.frequencies, 1.0).square(),
-        "phase": _propagated(fit, -imaginary / amplitude, real / amplitude, -2 * math.pi * centre.expand_as(real)),
+        "amplitude": amplitude_deviation,
+        "frequency": frequency_deviation,
+        "period": frequency_deviation / torch.where(active & (frequencies > 0), frequencies, 1.0).square(),
+        "phase": phase_deviation,
     }
-    order = fit.amplitude.argsort(dim=-1, descending=True, stable=True)  # that of the tones of a Vibration
-    std = {name: value.take_along_dim(order, -1) for name, value in std.items()}
     drift = _covariance_of_axes(fit)[..., 3 * fit.frequencies.shape[-1] :, 3 * fit.frequencies.shape[-1] :]
     motion_variance, acceleration_variance = drift[..., 0, 0], torch.zeros_like(drift[..., 0, 0])
     if fit.drift.shape[-1] > 1:
@@ -460,12 +470,12 @@ def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
         motion_variance = (
             motion_variance - 2 * to_origin * drift[..., 0, 1] + to_origin.square() * acceleration_variance
         )
-    deviations = VibrationStd(
+    of_vibration = VibrationStd(
         **std,
         image_motion=motion_variance.clamp(min=0.0).sqrt(),
         image_acceleration=acceleration_variance.clamp(min=0.0).sqrt(),
     )
-    return motion_of_fit(fit), deviations
+    return motion_of_fit(fit), of_vibration
 
 
 def displacement_std(fit: ToneFit, exposure_starts: Tensor, exposure_time: float) -> Tensor:
@@ -479,7 +489,8 @@ def displacement_std(fit: ToneFit, exposure_starts: Tensor, exposure_time: float
     jacobian = displacement_jacobian(fit, exposure_starts.expand(len(fit.centre), -1), exposure_time)
     jacobian = jacobian - jacobian.mean(1, keepdim=True)
     covariance = _covariance_of_axes(fit)
-    return torch.einsum("bnap,bapq,bnaq->bna", jacobian, covariance, jacobian).clamp(min=0.0).mean(1).sqrt()
+    jacobian = jacobian.transpose(1, 2)  # (B, A, N, P)
+    return ((jacobian @ covariance) * jacobian).sum(-1).clamp(min=0.0).mean(-1).sqrt()
 
 
 def displacement_jacobian(fit: ToneFit, exposure_starts: Tensor, exposure_time: float) -> Tensor:
@@ -505,7 +516,7 @@ def axis_jacobian(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[
 def amplitude_std(fit: ToneFit) -> Tensor:
     """Standard deviation (B, 2, K) of the amplitudes in px; 0 for tones that are not active."""
     real, imaginary, _ = _direction(fit)
-    return _propagated(fit, real, imaginary, torch.zeros_like(real))
+    return _propagated(fit, torch.stack([real, imaginary, torch.zeros_like(real)], -1))
 
 
 def shrunk_motion(fit: ToneFit, intervals: Tensor) -> Vibration:
@@ -572,11 +583,10 @@ def _direction(fit: ToneFit) -> tuple[Tensor, Tensor, Tensor]:
     return fit.coefficients.real / modulus, fit.coefficients.imag / modulus, modulus
 
 
-def _propagated(fit: ToneFit, *gradient: Tensor) -> Tensor:
-    """Standard deviation (B, 2, K) of a function with this gradient (B, 2, K) by Re C, Im C and f of each tone."""
+def _propagated(fit: ToneFit, gradient: Tensor) -> Tensor:
+    """Standard deviations (..., B, 2, K) of functions with gradients (..., B, 2, K, 3) by Re C, Im C and f of tones."""
     tones = fit.frequencies.shape[-1]
     covariance = _covariance_of_axes(fit)
     blocks = torch.stack([covariance[..., 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(tones)], dim=2)
-    vector = torch.stack(gradient, dim=-1)
-    variance = torch.einsum("bakp,bakpq,bakq->bak", vector, blocks, vector).clamp(min=0.0)
+    variance = ((gradient[..., None, :] @ blocks)[..., 0, :] * gradient).sum(-1).clamp(min=0.0)
     return torch.where(fit.active, variance.sqrt(), 0.0)
