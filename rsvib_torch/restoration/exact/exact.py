@@ -127,6 +127,8 @@ def restore_exact(
 
     scenes: list[_Scene] = []  # stack, its frames, the restored one, factor on the prior
     for index in range(B):
+        if index % motion.strips == 0:
+            strengths, certain = Strengths(), noise != "auto" or T > 1
         weights = levels[index].square().reciprocal()
         typical = weights.mean().reciprocal()
         length = scene_period(W, reaches[index], displacement[index])
@@ -146,7 +148,6 @@ def restore_exact(
             missing=None if missing is None else missing[index],
             clipped=None if clipped is None else clipped[index],
         )
-        strengths, certain = Strengths(), noise != "auto" or T > 1
         measured = groups if missing is None else _without_empty_frames(groups, missing[index])
         scenes += [(stack, *group, factor * stack.strength(*group, strengths, certain=certain)) for group in measured]
 
@@ -316,8 +317,13 @@ def _noise_levels(frames: Tensor, motion: FrameMotion, noise: float | Literal["a
     """Noise level of each frame, (B, T)."""
     if noise != "auto":
         return torch.full(frames.shape[:2], _given_level(noise), dtype=frames.dtype, device=frames.device)
-    levels = [
-        noise_levels(stack.detach(), motion, index, None if ignore is None else ignore[index])
-        for index, stack in enumerate(frames)
-    ]
-    return torch.stack(levels).clamp(min=_MIN_LEVEL)
+    # strips of the same frames have one noise: two of them give it as well as all of them, in a fraction of the time
+    chosen = sorted({motion.strips // 4, motion.strips - 1 - motion.strips // 4})
+    powers = []
+    for first in range(0, len(frames), motion.strips):
+        each = [
+            noise_levels(frames[index].detach(), motion, index, None if ignore is None else ignore[index])
+            for index in (first + strip for strip in chosen)
+        ]
+        powers += [torch.stack(each).square().mean(0)] * motion.strips
+    return torch.stack(powers).sqrt().clamp(min=_MIN_LEVEL)
