@@ -19,7 +19,7 @@ from rsvib_torch.restoration.exact.filling import fill_beyond_ends, fill_missing
 from rsvib_torch.restoration.exact.finer_scene import Misfit, finer_scene, warn_of_frames
 from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
 from rsvib_torch.restoration.exact.priors import PRIORS, PriorOptions
-from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem
+from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem, scenes_side_by_side
 from rsvib_torch.restoration.exact.strength import Strengths, prior_strength
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise.policy import noise_levels
@@ -125,13 +125,18 @@ def restore_exact(
     levels = _noise_levels(frames, motion, noise, ignore)
     mean = brightness(frames).mean(1)[..., None, None]
 
+    periods = [
+        max(scene_period(W, reaches[index], displacement[index]) for index in range(first, first + motion.strips))
+        for first in range(0, B, motion.strips)
+    ]
     scenes: list[_Scene] = []  # stack, its frames, the restored one, factor on the prior
     for index in range(B):
         if index % motion.strips == 0:
             strengths, certain = Strengths(), noise != "auto" or T > 1
         weights = levels[index].square().reciprocal()
         typical = weights.mean().reciprocal()
-        length = scene_period(W, reaches[index], displacement[index])
+        # strips of the same frames have one period
+        length = periods[index // motion.strips]
         stack = _Stack(
             frames=frames[index],
             displacement=displacement[index],
@@ -153,15 +158,18 @@ def restore_exact(
 
     misfits: list[Misfit] = []
 
-    def restored(number: int, partition: Partition) -> Tensor:
+    def problem_of(number: int, partition: Partition) -> SceneProblem:
         stack, members, reference, strength = scenes[number]
-        problem = stack.problem(members, reference, strength, partition)
+        return stack.problem(members, reference, strength, partition)
+
+    def restored(number: int, partition: Partition) -> Tensor:
+        problem = problem_of(number, partition)
         if scale == 1:
             scene = PRIORS[prior](problem, PriorOptions(factor))
         else:
             scene, misfit = finer_scene(problem, W, motion.neglected)
             misfits.append(misfit)
-        return scene[..., : scale * W] + stack.mean
+        return scene[..., : scale * W] + scenes[number][0].mean
 
     def check_frames() -> None:
         if scale != 1:
@@ -173,13 +181,26 @@ def restore_exact(
         check_frames()
         return images.view(B, -1, *images.shape[1:])
     images = frames.new_empty(len(scenes), C, scale * H, scale * W)
-    threads = min(Partition.threads(frames.device), len(scenes))
-    advance = steps(len(scenes), "frames")
+    # the strips of a frame together
+    together = motion.strips if prior == "gaussian" and scale == 1 else 1
+    each, count = len(scenes) // B, len(scenes) // together
+    tasks = [
+        [(first * together + strip) * each + group for strip in range(together)]
+        for first in range(B // together)
+        for group in range(each)
+    ]
+    threads = min(Partition.threads(frames.device), count)
+    advance = steps(count, "frames")
 
     def share(thread: int) -> None:
         partition = Partition(chunk, split)
-        for number in range(thread, len(scenes), threads):
-            images[number] = restored(number, partition)
+        for numbers in tasks[thread::threads]:
+            if len(numbers) > 1:
+                found = scenes_side_by_side([problem_of(number, partition) for number in numbers])
+                for number, scene in zip(numbers, found, strict=True):
+                    images[number] = scene[..., :W] + scenes[number][0].mean
+            else:
+                images[numbers[0]] = restored(numbers[0], partition)
             advance()
 
     in_parallel(share, range(threads), frames.device)
