@@ -18,7 +18,7 @@ from rsvib_torch.core.option_types import BandSettings, DetectionMethod, Registr
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.other_timing import period_factor
-from rsvib_torch.detection.reliability import contradicted_axes, judge, rotation_found
+from rsvib_torch.detection.reliability import contradicted_axes, judge, rotation_found, rotation_possible
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, stacked
 from rsvib_torch.detection.rows.direct import AbandonedError, refine_directly
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
@@ -105,6 +105,7 @@ class _Found:
         fitted: (B, P, N, 2) px, the offsets that it predicts for them.
         other_motion: Motion that it does not explain; None if the method does not measure it.
         aliasing: (B,) px, expected size of the bias of the displacements by aliasing; None if it is not known.
+        uneven: (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain; likewise.
     """
 
     fit: ToneFit
@@ -113,6 +114,7 @@ class _Found:
     fitted: Tensor
     other_motion: OtherMotion | None = None
     aliasing: Tensor | None = None
+    uneven: Tensor | None = None
 
 
 _Fit = Callable[[BandStart, Tensor, Tensor | None, RowTiming, _FitOptions], _Found]
@@ -180,7 +182,7 @@ def _fit_direct(
     if options.is_trial and not scale.same_for_all_columns and rows.differently_blurred(motion):
         rows = strip_rows(frames, valid, timing, motion, scale)
         found, offsets, fitted = refine_directly(rows, intervals, found.fit, options.tones)
-    return _Found(found.fit, found.measurements, offsets, fitted, found.other_motion, found.aliasing)
+    return _Found(found.fit, found.measurements, offsets, fitted, found.other_motion, found.aliasing, found.uneven)
 
 
 _METHODS: dict[DetectionMethod, _Method] = {
@@ -492,7 +494,7 @@ def _detect_field(
 ) -> DetectionResult:
     """``_detect`` with as many components as were requested or, with ``"auto"``, as the frames require."""
     alike = _detect(frames, valid, timing, method, options)
-    if field.camera is not None or field.least_axes > 2 or (field.most_axes > 2 and any(alike.rotates)):
+    if field.camera is not None or field.least_axes > 2 or (field.most_axes > 2 and any(alike.rolls)):
         scale = field.scale(field.most_axes, field.camera)
         uncertain = field.camera is None and field.least_axes == 2
         assumed = replace(options, scale=scale, is_trial=uncertain)
@@ -520,6 +522,7 @@ class _Detected:
         fit: Its fit.
         measurements: The measurements of the fit.
         rotates: For each stack, whether the halves of its rows move apart.
+        rolls: For each stack, whether roll or zoom may be the cause.
         contradicted: For each stack, the axes in row order whose measurements contradict the timing.
         bands: Offsets of the row bands.
     """
@@ -528,6 +531,7 @@ class _Detected:
     fit: ToneFit
     measurements: Measurements
     rotates: list[bool]
+    rolls: list[bool]
     contradicted: list[tuple[bool, bool]]
     bands: OffsetCurve
 
@@ -600,8 +604,10 @@ def _detect(
         )
         for index in range(len(frames))
     ]
-    rotates, contradicted = [False] * len(frames), [(False, False)] * len(frames)
-    if other_motion is not None:
+    rotates, rolls, contradicted = [False] * len(frames), [False] * len(frames), [(False, False)] * len(frames)
+    if other_motion is not None and found.uneven is not None:
+        aspect = frames.shape[-2] / frames.shape[-1]
+        rolls = [rotation_possible(other_motion[index], found.uneven[index], aspect) for index in range(len(frames))]
         rotates = [rotation_found(other_motion[index]) for index in range(len(frames))]
         contradicted = [
             contradicted_axes(vibration[index], other_motion[index], max_tones) for index in range(len(frames))
@@ -634,7 +640,7 @@ def _detect(
         ),
         timing=timing,
     )
-    return _Detected(result, fit, found.measurements, rotates, contradicted, start.curve)
+    return _Detected(result, fit, found.measurements, rotates, rolls, contradicted, start.curve)
 
 
 def _with_cause(

@@ -59,6 +59,7 @@ class DirectFit:
         other_motion: Motion in the measurements that the fit does not explain.
         robust_weights: (B, N, 2) weights 0 ... 1 by which the information of each row was multiplied; 0 for outliers.
         aliasing: (B,) px, expected size of the bias of the displacements by aliasing.
+        uneven: (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain.
     """
 
     measurements: Measurements
@@ -66,6 +67,7 @@ class DirectFit:
     other_motion: OtherMotion
     robust_weights: Tensor
     aliasing: Tensor
+    uneven: Tensor
 
 
 class AbandonedError(Exception):
@@ -388,6 +390,7 @@ def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:
         select_stacks(better, other.other_motion, one.other_motion),
         torch.where(better[:, None, None], other.robust_weights, one.robust_weights),
         torch.where(better, other.aliasing, one.aliasing),
+        torch.where(better[:, None], other.uneven, one.uneven),
     )
 
 
@@ -412,4 +415,4 @@ def _conclude(record: RowRecord, fit: ToneFit) -> DirectFit:
     )
     robust_weights = weighted.weights / measurements.weights.clamp(min=1e-300)
     aliasing = torch.stack([own.aliasing for own in record.gradients]).mean(0)
-    return DirectFit(weighted, fit, other, robust_weights, aliasing)
+    return DirectFit(weighted, fit, other, robust_weights, aliasing, record.uneven())

@@ -22,6 +22,7 @@ from rsvib_torch.detection.rows.displacements import (
     measure_strips,
     remove_column_pattern,
     stack_spectra,
+    uneven_motion,
 )
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.frames.column_strips import ColumnStrips
@@ -56,6 +57,10 @@ class RowRecord:
         if self.apart is None:
             return differential_motion(self.gradients)
         return trimmed_mean(self.apart).clamp(min=0.0).sqrt()
+
+    def uneven(self) -> Tensor:
+        """(B, 2) px, the part of the differences along a row that roll and zoom cannot explain."""
+        return uneven_motion(self.gradients) if self.apart is None else self.differential()
 
 
 @dataclass(frozen=True, eq=False)
