@@ -39,7 +39,7 @@ from rsvib_torch.detection.tones.fit import (
     vibration_of_fit,
 )
 from rsvib_torch.detection.tones.further import with_further_tones
-from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE, find_tones
+from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE, find_tones, robust_fit
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.io.files import FramesOrFiles, timing_of_files
@@ -544,6 +544,7 @@ def _detect(
     options: _FitOptions,
     translation: ToneFit | None = None,
     bands_known: OffsetCurve | None = None,
+    frequencies: Tensor | None = None,
 ) -> _Detected:
     """``detect_vibration`` of grey frames (B, T, H, W) in row order.
 
@@ -555,6 +556,7 @@ def _detect(
         options: Its options.
         translation: Fit without roll and zoom, from which a fit with roll or zoom starts.
         bands_known: Offsets of the row bands, if they were measured with another timing.
+        frequencies: (B, 2, 1) Hz of one tone of each axis, if they are known.
 
     Raises:
         AbandonedError: If the options are a trial, and the motion is another one.
@@ -562,6 +564,9 @@ def _detect(
     row_timing, bands, scale = timing.in_row_order(), options.bands, options.scale
     if scale.same_for_all_columns:
         start = band_start(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve, known=bands_known)
+        if frequencies is not None:
+            active = torch.ones_like(frequencies, dtype=torch.bool)
+            start = replace(start, fit=robust_fit(start.measurements, frequencies, active, options.model)[0])
     else:
         start = field_start(frames, valid, row_timing, bands, scale, translation)
     found = method.fit(start, frames, valid, row_timing, options)
@@ -703,26 +708,28 @@ def _wrong_setting(
         other: RowTiming,
         change: Callable[[Tensor], Tensor] | None = None,
         concerned: tuple[bool, bool] = axes,
+        tones: Tensor | None = None,
     ) -> bool:
         changed, pixels, bands = frames, valid, curve if change is None else None
         if change is not None:
             changed, pixels = change(frames), None if valid is None else change(valid)
         try:
-            found = _detect(changed, pixels, other, method, trial, bands_known=bands).result
+            found = _detect(changed, pixels, other, method, trial, bands_known=bands, frequencies=tones).result
         except (ValueError, AbandonedError):  # columns may lack the detail that rows have
             return False
         return all(good or not axis for good, axis in zip(found.reliable[0].tolist(), concerned, strict=True))
 
     row_timing = timing.in_row_order()
-    factor = period_factor(measurements, row_timing, frames.shape[1]) if frames.shape[1] > 2 else None
+    agreeing = period_factor(measurements, row_timing, frames.shape[1]) if frames.shape[1] > 2 else None
+    factor, tones = (None, None) if agreeing is None else agreeing
     if factor is not None and factor < 0:
-        if agrees(row_timing, lambda images: images.flip(-2)):
+        if agrees(row_timing, lambda images: images.flip(-2), tones=tones):
             other = "reverse" if timing.readout_direction == "forward" else "forward"
             return f"the frames agree with readout_direction={other!r}, not with {timing.readout_direction!r}"
     elif factor is not None and timing.frame_start_times is None:
         frame_rows = factor * timing.frame_rows
         changed = replace(row_timing, frame_rows=max(frame_rows, frames.shape[-2], timing.exposure_rows))
-        if changed.frame_rows == frame_rows and agrees(changed):
+        if changed.frame_rows == frame_rows and agrees(changed, tones=tones):
             return (
                 f"the frames agree with frame_rows={frame_rows:.5g}, not with {timing.frame_rows:g}: frame_rows counts "
                 "the blanking rows and is not the image height; if the frame rate is known, row_time is 1 / (frame "
@@ -731,7 +738,7 @@ def _wrong_setting(
     elif factor is not None:
         times = {name: getattr(timing, name) * factor for name in ("frame_rows", "exposure_rows")}
         changed = replace(row_timing, row_time=timing.row_time / factor, **times)
-        if agrees(changed):
+        if agrees(changed, tones=tones):
             return (
                 f"the frames agree with row_time={changed.row_time:.5g} s, not with {timing.row_time:g} s, if the "
                 "start times of the frames are right"
