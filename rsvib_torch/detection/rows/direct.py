@@ -219,7 +219,10 @@ def _refine(
         same_tones = torch.equal(previous.active, fit.active)
         ratio = step.ratio_to(steps[-1]) if steps and same_tones else None
         converged = _converged(previous, fit, ratio) & (number >= search_round)
-        if bool((converged | _stalled(sizes, record, fit)).all()):
+        stalled = _stalled(sizes, record, fit)
+        if bool((converged | stalled).all()):
+            if pattern_rounds == 1 and bool(stalled.all()):  # the first one was not the cause
+                break
             if pattern_rounds == 0 or not rows.remove_column_pattern(motion, gradients):
                 break
             pattern_rounds, search_round = pattern_rounds - 1, number + 1
@@ -274,14 +277,16 @@ class _Step:
 
 
 def _stalled(sizes: list[Tensor], record: RowRecord, fit: ToneFit) -> Tensor:
-    """(B, A) bool, axes whose typical residual did not decrease in two rounds, and which are refused because of it.
+    """(B, A) bool, axes whose typical residual hardly decreased in two rounds, and which are refused because of it.
+
+    A quarter in two rounds is too little to reach what is permitted in the rounds that remain.
 
     Args:
         sizes: Typical residuals of the rounds so far, in standard deviations.
         record: Measurements of this round.
         fit: The fit to them.
     """
-    if len(sizes) < 3 or not bool((stalled := (sizes[-1] > 2.0) & (sizes[-1] > 0.9 * sizes[-3])).any()):
+    if len(sizes) < 3 or not bool((stalled := (sizes[-1] > 2.0) & (sizes[-1] > 0.75 * sizes[-3])).any()):
         return torch.zeros((), dtype=torch.bool, device="cpu")
     other = _conclude(record, fit).other_motion
     return stalled & (other.unexplained > other.permitted)

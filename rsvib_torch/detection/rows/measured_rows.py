@@ -190,7 +190,7 @@ def strip_rows(
     *,
     pairs_if_blurred_differently: bool = True,
     max_slide: float = 0.1,
-    min_pitch: int = 32,
+    min_pitch: int = 48,
 ) -> StripRows:
     """Frames (B, T, H, W) in strips of columns.
 
