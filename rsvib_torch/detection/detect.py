@@ -85,6 +85,7 @@ class _FitOptions:
         scale: Components of the motion.
         is_trial: Whether roll and zoom are assumed only because the halves of the rows move apart, or another timing
             than the stated one is tried.
+        has_pattern: Whether the frames have a pattern of columns; None if it is not known.
     """
 
     tones: int | None
@@ -92,6 +93,7 @@ class _FitOptions:
     bands: RegistrationOptions
     scale: FieldScale
     is_trial: bool = False
+    has_pattern: bool | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +108,7 @@ class _Found:
         other_motion: Motion that it does not explain; None if the method does not measure it.
         aliasing: (B,) px, expected size of the bias of the displacements by aliasing; None if it is not known.
         uneven: (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain; likewise.
+        has_pattern: Whether a pattern of columns was subtracted.
     """
 
     fit: ToneFit
@@ -115,6 +118,7 @@ class _Found:
     other_motion: OtherMotion | None = None
     aliasing: Tensor | None = None
     uneven: Tensor | None = None
+    has_pattern: bool = False
 
 
 _Fit = Callable[[BandStart, Tensor, Tensor | None, RowTiming, _FitOptions], _Found]
@@ -177,12 +181,25 @@ def _fit_direct(
         rows = whole_rows(frames, valid, timing, motion)
     else:  # equal blur takes several times as long, and is not needed to find that there is no roll
         rows = strip_rows(frames, valid, timing, motion, scale, pairs_if_blurred_differently=not options.is_trial)
-    found, offsets, fitted = refine_directly(rows, intervals, fit, options.tones, is_trial=options.is_trial)
+    found, offsets, fitted = refine_directly(
+        rows, intervals, fit, options.tones, is_trial=options.is_trial, has_pattern=options.has_pattern
+    )
     motion = shrunk_motion(found.fit, intervals)
     if options.is_trial and not scale.same_for_all_columns and rows.differently_blurred(motion):
         rows = strip_rows(frames, valid, timing, motion, scale)
-        found, offsets, fitted = refine_directly(rows, intervals, found.fit, options.tones)
-    return _Found(found.fit, found.measurements, offsets, fitted, found.other_motion, found.aliasing, found.uneven)
+        found, offsets, fitted = refine_directly(
+            rows, intervals, found.fit, options.tones, has_pattern=options.has_pattern
+        )
+    return _Found(
+        found.fit,
+        found.measurements,
+        offsets,
+        fitted,
+        found.other_motion,
+        found.aliasing,
+        found.uneven,
+        found.has_pattern,
+    )
 
 
 _METHODS: dict[DetectionMethod, _Method] = {
@@ -497,7 +514,7 @@ def _detect_field(
     if field.camera is not None or field.least_axes > 2 or (field.most_axes > 2 and any(alike.rolls)):
         scale = field.scale(field.most_axes, field.camera)
         uncertain = field.camera is None and field.least_axes == 2
-        assumed = replace(options, scale=scale, is_trial=uncertain)
+        assumed = replace(options, scale=scale, is_trial=uncertain, has_pattern=alike.has_pattern)
         try:
             found = _detect(frames, valid, timing, method, assumed, alike.fit).result
         except (AbandonedError, ValueError):  # parallax; narrow frames, and fits that diverge
@@ -525,6 +542,7 @@ class _Detected:
         rolls: For each stack, whether roll or zoom may be the cause.
         contradicted: For each stack, the axes in row order whose measurements contradict the timing.
         bands: Offsets of the row bands.
+        has_pattern: Whether a pattern of columns was subtracted.
     """
 
     result: DetectionResult
@@ -534,6 +552,7 @@ class _Detected:
     rolls: list[bool]
     contradicted: list[tuple[bool, bool]]
     bands: OffsetCurve
+    has_pattern: bool
 
 
 def _detect(
@@ -645,7 +664,7 @@ def _detect(
         ),
         timing=timing,
     )
-    return _Detected(result, fit, found.measurements, rotates, rolls, contradicted, start.curve)
+    return _Detected(result, fit, found.measurements, rotates, rolls, contradicted, start.curve, found.has_pattern)
 
 
 def _with_cause(

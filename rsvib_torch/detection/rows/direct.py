@@ -60,6 +60,7 @@ class DirectFit:
         robust_weights: (B, N, 2) weights 0 ... 1 by which the information of each row was multiplied; 0 for outliers.
         aliasing: (B,) px, expected size of the bias of the displacements by aliasing.
         uneven: (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain.
+        has_pattern: Whether a pattern of columns was subtracted.
     """
 
     measurements: Measurements
@@ -68,6 +69,7 @@ class DirectFit:
     robust_weights: Tensor
     aliasing: Tensor
     uneven: Tensor
+    has_pattern: bool = False
 
 
 class AbandonedError(Exception):
@@ -86,6 +88,7 @@ def refine_directly(
     max_rounds: int = 12,
     *,
     is_trial: bool = False,
+    has_pattern: bool | None = None,
 ) -> tuple[DirectFit, OffsetCurve, Tensor]:
     """Refine a detected motion on the images.
 
@@ -101,6 +104,8 @@ def refine_directly(
         max_rounds: Largest number of rounds of measuring and fitting; exposures of 400 rows need more than six.
         is_trial: Whether the motion is possibly of another kind than assumed (parallax instead of roll). It is
             abandoned if a large residual remains after three rounds.
+        has_pattern: Whether the frames have a pattern of columns: it is then subtracted after the first round instead
+            of the last, or not looked for. None if it is not known.
 
     Returns:
         The last measurements and the fit to them, the measurements as offsets between consecutive frames, and the
@@ -110,7 +115,7 @@ def refine_directly(
         AbandonedError: If a trial is abandoned.
     """
     motion = shrunk_motion(start, intervals)
-    found = _refine(rows, intervals, start, tones, max_rounds, is_trial)
+    found = _refine(rows, intervals, start, tones, max_rounds, is_trial, has_pattern)
     if rows.differently_blurred(motion):
         tried = torch.zeros_like(start.active[..., 0])
         for _ in range(2):  # one axis after the other
@@ -119,7 +124,8 @@ def refine_directly(
                 break
             tried = tried | mirrored
             other, _ = robust_fit(found.measurements, frequencies, strongest_only(found.fit).active, start.model)
-            found = _better_of_each(found, _refine(rows, intervals, other, tones, max_rounds))
+            again = _refine(rows, intervals, other, tones, max_rounds, has_pattern=has_pattern)
+            found = _better_of_each(found, again)
     if tones is None:
         found = replace(found, fit=significant_only(found.measurements, found.fit, intervals))
     blur = rows.blur_ratio(shrunk_motion(found.fit, intervals))
@@ -183,6 +189,7 @@ def _refine(
     tones: int | None,
     max_rounds: int,
     is_trial: bool = False,
+    has_pattern: bool | None = None,
 ) -> DirectFit:
     """Measure around the motion, fit, repeat."""
     timing, fit, model = rows.timing, start, start.model
@@ -191,7 +198,9 @@ def _refine(
     steps: list[_Step] = []
     sizes: list[Tensor] = []  # (B, A), typical residuals since the search in standard deviations
     search_round = 1  # the first round removes the error of the band offsets; weak tones are significant after it
-    pattern_rounds = 2  # a strong pattern biases the motion by which its first estimate is warped
+    found_pattern = False
+    refused: Tensor | None = None  # (B, A), residuals of axes that were refused before a pattern was subtracted
+    pattern_rounds = 0 if has_pattern is False else 2  # a strong pattern biases its first estimate
     interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)  # exposures average out faster tones
     blind = blind_frequencies(timing, 0.5 / interval).to(motion.device)
     for number in range(max_rounds):
@@ -208,6 +217,9 @@ def _refine(
         else:
             fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual, steps=1)
         warped_by, motion, gradients = motion, shrunk_motion(fit, intervals), record.gradients
+        if number == 0 and has_pattern and rows.remove_column_pattern(motion, gradients):
+            pattern_rounds, gradients, found_pattern = 1, None, True
+            continue
         if number == max_rounds - 1 or not bool((measurements.weights > 0).any()):  # or nothing is visible any more
             break
 
@@ -215,17 +227,20 @@ def _refine(
             other = _conclude(record, fit).other_motion
             if bool((other.unexplained > _MAX_TRIED * other.permitted).any()):
                 raise AbandonedError
+        if refused is not None and number == search_round + 1 and bool((size > 0.5 * refused).all()):
+            break
         step = _Step.between(measurements, warped_by, motion)
         same_tones = torch.equal(previous.active, fit.active)
         ratio = step.ratio_to(steps[-1]) if steps and same_tones else None
         converged = _converged(previous, fit, ratio) & (number >= search_round)
         stalled = _stalled(sizes, record, fit)
         if bool((converged | stalled).all()):
-            if pattern_rounds == 1 and bool(stalled.all()):  # the first one was not the cause
+            if bool(stalled.all()) and refused is not None:  # the first pattern was not the cause
                 break
             if pattern_rounds == 0 or not rows.remove_column_pattern(motion, gradients):
                 break
-            pattern_rounds, search_round = pattern_rounds - 1, number + 1
+            refused = size if bool(stalled.all()) else None
+            pattern_rounds, search_round, found_pattern = pattern_rounds - 1, number + 1, True
             gradients, steps, sizes = None, [], []
             continue
         # steps with other tones do not predict the next one
@@ -238,7 +253,7 @@ def _refine(
             step = _Step.between(measurements, warped_by, motion)
         if float(step.change.abs().amax()) > 0.05:  # px; over smaller distances the gradients of the scene are the same
             gradients = None
-    return _conclude(record, fit)
+    return replace(_conclude(record, fit), has_pattern=found_pattern)
 
 
 # Convergence
@@ -286,7 +301,7 @@ def _stalled(sizes: list[Tensor], record: RowRecord, fit: ToneFit) -> Tensor:
         record: Measurements of this round.
         fit: The fit to them.
     """
-    if len(sizes) < 3 or not bool((stalled := (sizes[-1] > 2.0) & (sizes[-1] > 0.75 * sizes[-3])).any()):
+    if len(sizes) < 3 or not bool((stalled := sizes[-1] > 0.75 * sizes[-3]).any()):
         return torch.zeros((), dtype=torch.bool, device="cpu")
     other = _conclude(record, fit).other_motion
     return stalled & (other.unexplained > other.permitted)

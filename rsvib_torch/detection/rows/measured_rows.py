@@ -169,12 +169,17 @@ class StripRows(MeasuredRows):
         return ColumnMotion.of_columns(field, self.columns, self.timing, self.num_frames, self.scale.height)
 
     def blur_ratio(self, motion: Vibration) -> Tensor:
-        """(B, 3), the weighted mean over the strips.
+        """(B, 3), the weighted mean over every second strip: they contain all columns.
 
         A displacement that changes within a strip acts like blur: with a focal length of 400 px and 5 px, where the
         ends of strips slide by 0.3 px, the ratio was 0 instead of 1. Its size, which counts as evidence, is then 0.
         """
-        ratio, std, size = super().blur_ratio(motion).unflatten(0, (-1, len(self.columns))).unbind(-1)
+        place = torch.arange(len(self.groups[0].starts), device=self.columns.device)
+        index = place[place % len(self.columns) % 2 == 0]
+        groups = [FrameGroup(group.spectra.stacks(index), group.starts[index]) for group in self.groups]
+        some = replace(self, groups=groups, columns=self.columns[::2])
+        each = MeasuredRows.blur_ratio(some, motion)
+        ratio, std, size = each.unflatten(0, (-1, len(some.columns))).unbind(-1)
         weight = torch.where(std > 0, std.square().reciprocal(), 0.0)
         total = weight.sum(1).clamp(min=1e-300)
         size = size.mean(1) if self.slide < _MAX_SLIDE_OF_BLUR else torch.zeros_like(total)
