@@ -451,7 +451,9 @@ def uneven_motion(gradients: list[RowGradients], *, rows: int = 64) -> Tensor:
     excesses = []
     for own in gradients:
         residual, noise, regular = displacements_of_parts(own, rows)
-        curved = residual.new_tensor([[0.5, -0.5, -0.5, 0.5], [-1.0, 3.0, -3.0, 1.0]])  # quadratic and cubic in the column
+        curved = residual.new_tensor(
+            [[0.5, -0.5, -0.5, 0.5], [-1.0, 3.0, -3.0, 1.0]]
+        )  # quadratic and cubic in the column
         curved[1] /= math.sqrt(20)
         excess = (curved @ residual).square() - curved.square() @ noise
         excesses.append(torch.where(regular[..., None], excess.sum(2), torch.nan))
