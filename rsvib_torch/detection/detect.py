@@ -21,7 +21,7 @@ from rsvib_torch.detection.other_timing import period_factor
 from rsvib_torch.detection.reliability import contradicted_axes, judge, rotation_found, rotation_possible
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, stacked
 from rsvib_torch.detection.rows.direct import AbandonedError, refine_directly
-from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
+from rsvib_torch.detection.rows.displacements import BLOCK_ROWS, MAX_GROUP_FRAMES, compared_intervals
 from rsvib_torch.detection.rows.measured_rows import strip_rows, whole_rows
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
 from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
@@ -170,7 +170,7 @@ def _band_offsets(start: BandStart, fit: ToneFit) -> Tensor:
     return offsets
 
 
-# of an exposure. A scene of two waves agreed with 325 and 411 Hz and another timing: one round with 165 nodes took 2.6 s,
+# of an exposure. A scene of two waves agreed with 325 and 411 Hz and another timing, and one round with 165 nodes took
 # 18 times as long as detection in other frames; correct alternatives have 5 to 15
 _MAX_TRIED_NODES = 32
 
@@ -747,7 +747,8 @@ def _wrong_setting(
         return all(good or not axis for good, axis in zip(found.reliable[0].tolist(), concerned, strict=True))
 
     row_timing = timing.in_row_order()
-    agreeing = period_factor(measurements, row_timing, frames.shape[1]) if frames.shape[1] > 2 else None
+    count = frames.shape[1]
+    agreeing = period_factor(measurements, row_timing, count, BLOCK_ROWS) if count > 2 else None
     factor, tones = (None, None) if agreeing is None else agreeing
     if factor is not None and factor < 0:
         if agrees(row_timing, lambda images: images.flip(-2), tones=tones):

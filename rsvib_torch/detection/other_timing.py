@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.tones.fit import MotionModel
 from rsvib_torch.detection.tones.selection import find_tones, robust_fit, typical_size
 from rsvib_torch.motion.timing import RowTiming
@@ -26,7 +25,9 @@ _ITERATIONS = 5  # of fits; most factors are wrong, and their fits converge slow
 _MINIMA, _EQUAL = 4, 4.0  # minima that are refined, and their squared residual over the least to count as equal
 
 
-def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int) -> tuple[float, Tensor] | None:
+def period_factor(
+    measurements: Measurements, timing: RowTiming, num_frames: int, block_rows: int
+) -> tuple[float, Tensor] | None:
     """Factor of the frame start times with which one tone along each axis explains the measurements best.
 
     A row ``i`` of frame ``p`` starts its exposure at ``s_p + i row_time``. With the factor c, it is ``c s_p``: the
@@ -37,13 +38,14 @@ def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int
         measurements: Displacements of one stack (B = 1) of at least three frames, in row order.
         timing: The sensor.
         num_frames: Frames of the stack.
+        block_rows: Rows of a measurement, which limit the frequency of the tones.
 
     Returns:
         c, 0.8 to 1.5, or -1, and the frequencies (1, 2, 1) in Hz of the tones; None if none explains the displacements
         clearly better than 1.
     """
     starts = timing.frame_starts(num_frames, measurements.exposure_starts.device)
-    interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)
+    interval = max(block_rows * timing.row_time, 0.5 * timing.exposure_time)
 
     def fits(factors: Tensor, rows: int, frequencies: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Square of the residual of one tone along each axis and its frequency, for each factor."""

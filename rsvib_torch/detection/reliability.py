@@ -236,8 +236,8 @@ def rotation_found(other: OtherMotion) -> bool:
 
 
 # Limits of roll and zoom as the cause. Of 15 recordings with either, 0.057 px of the differences along a row were not
-# linear in the column, and the rows moved by 4 times the difference of their halves; clouds, parallax and objects had 0.12
-# px and more, motions that are no sums of tones 10 times and more.
+# linear in the column, and the rows moved by 4 times the difference of their halves; clouds, parallax and objects had
+# 0.12 px and more, motions that are no sums of tones 10 times and more.
 _MAX_UNEVEN, _MAX_MOVED = 3.0, 8.0  # of the permitted difference of the halves, of the difference of the halves
 
 

@@ -104,8 +104,8 @@ def rows_showing(
     """Frame rows r(s) that show scene rows s: the solution of ``r = s + Y(t(r))``.
 
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
-    Secant method, with half the evaluations of the motion that Newton's method takes. ``|dY/dt| T_row`` is 0.02 for 5 px
-    at 30 Hz, and must stay below 1: content that moves along the scan as fast as the rows is never passed.
+    Secant method, with half the evaluations of the motion that Newton's method takes. ``|dY/dt| T_row`` is 0.02 for
+    5 px at 30 Hz, and must stay below 1: content that moves along the scan as fast as the rows is never passed.
 
     Args:
         scene_rows: Scene rows s, float64, shape S (batch dimensions of the vibration lead).

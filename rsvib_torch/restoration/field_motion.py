@@ -22,12 +22,12 @@ from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
 
 __all__ = ["judged_strip", "restore_in_strips"]
 
-# px, difference of the displacements of neighbouring strips; frames of 384 x 384 px with roll of 0.5 px at their ends are
-# restored to 53.77 dB, with 0.16 px to 53.83 dB in 1.2 times the time, with 0.25 px to 53.61 dB
+# px, difference of the displacements of neighbouring strips; frames of 384 x 384 px with roll of 0.5 px at their ends
+# are restored to 53.77 dB, with 0.16 px to 53.83 dB in 1.2 times the time, with 0.25 px to 53.61 dB
 _SLIDE = 0.2
 _PITCHES = (48, 160)  # px, bounds on the distance of the strips: narrow ones cost time, wide ones memory
-# px of a strip without weight, beyond the displacement; the restoration is not exact near its ends. With 24 px, restored
-# frames of 384 x 384 px have at most 0.02 dB more, with exposures of 20 to 400 rows
+# px of a strip without weight, beyond the displacement; the restoration is not exact near its ends. With 24 px, the
+# restored frames of 384 x 384 px have at most 0.02 dB more, with exposures of 20 to 400 rows
 _MARGIN = 8
 
 

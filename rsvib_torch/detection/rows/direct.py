@@ -42,7 +42,7 @@ from rsvib_torch.detection.tones.selection import (
     typical_size,
 )
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.vibration import blind_frequencies
+from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.registration.gradients import RowGradients
 
@@ -198,9 +198,7 @@ def _refine(
     steps: list[_Step] = []
     sizes: list[Tensor] = []  # (B, A), typical residuals since the search in standard deviations
     search_round = 1  # the first round removes the error of the band offsets; weak tones are significant after it
-    found_pattern = False
-    refused: Tensor | None = None  # (B, A), residuals of axes that were refused before a pattern was subtracted
-    pattern_rounds = 0 if has_pattern is False else 2  # a strong pattern biases its first estimate
+    patterns = _Patterns(rows, 0 if has_pattern is False else 2)  # a strong pattern biases its first estimate
     interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)  # exposures average out faster tones
     blind = blind_frequencies(timing, 0.5 / interval).to(motion.device)
     for number in range(max_rounds):
@@ -217,17 +215,15 @@ def _refine(
         else:
             fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual, steps=1)
         warped_by, motion, gradients = motion, shrunk_motion(fit, intervals), record.gradients
-        if number == 0 and has_pattern and rows.remove_column_pattern(motion, gradients):
-            pattern_rounds, gradients, found_pattern = 1, None, True
+        if number == 0 and has_pattern and patterns.subtracted(motion, gradients):
+            gradients = None
             continue
         if number == max_rounds - 1 or not bool((measurements.weights > 0).any()):  # or nothing is visible any more
             break
 
         if is_trial and number == _TRIED_ROUNDS - 1:
-            other = _conclude(record, fit).other_motion
-            if bool((other.unexplained > _MAX_TRIED * other.permitted).any()):
-                raise AbandonedError
-        if refused is not None and number == search_round + 1 and bool((size > 0.5 * refused).all()):
+            _abandon_if_large(record, fit)
+        if number == search_round + 1 and patterns.were_not_the_cause(size):
             break
         step = _Step.between(measurements, warped_by, motion)
         same_tones = torch.equal(previous.active, fit.active)
@@ -235,13 +231,9 @@ def _refine(
         converged = _converged(previous, fit, ratio) & (number >= search_round)
         stalled = _stalled(sizes, record, fit)
         if bool((converged | stalled).all()):
-            if bool(stalled.all()) and refused is not None:  # the first pattern was not the cause
+            if not patterns.subtracted(motion, gradients, size if bool(stalled.all()) else None):
                 break
-            if pattern_rounds == 0 or not rows.remove_column_pattern(motion, gradients):
-                break
-            refused = size if bool(stalled.all()) else None
-            pattern_rounds, search_round, found_pattern = pattern_rounds - 1, number + 1, True
-            gradients, steps, sizes = None, [], []
+            search_round, gradients, steps, sizes = number + 1, None, [], []
             continue
         # steps with other tones do not predict the next one
         steps = [*steps[-3:], step] if same_tones and number > search_round else [step]
@@ -253,7 +245,44 @@ def _refine(
             step = _Step.between(measurements, warped_by, motion)
         if float(step.change.abs().amax()) > 0.05:  # px; over smaller distances the gradients of the scene are the same
             gradients = None
-    return replace(_conclude(record, fit), has_pattern=found_pattern)
+    return replace(_conclude(record, fit), has_pattern=patterns.found)
+
+
+def _abandon_if_large(record: RowRecord, fit: ToneFit) -> None:
+    """Raise ``AbandonedError`` if the fit leaves a large residual."""
+    other = _conclude(record, fit).other_motion
+    if bool((other.unexplained > _MAX_TRIED * other.permitted).any()):
+        raise AbandonedError
+
+
+@dataclass(eq=False)
+class _Patterns:
+    """Patterns of columns that are subtracted after some of the rounds.
+
+    Attributes:
+        rows: The frames.
+        remaining: Number of times that a pattern may be subtracted.
+        found: Whether there was a pattern.
+        refused: (B, A) residuals before the last pattern was subtracted, if all axes were refused; else None.
+    """
+
+    rows: MeasuredRows
+    remaining: int
+    found: bool = False
+    refused: Tensor | None = None
+
+    def subtracted(self, motion: Vibration, gradients: list[RowGradients], refused: Tensor | None = None) -> bool:
+        """Subtract a pattern; False if there is none, or if the axes are refused again after the last one."""
+        if self.remaining == 0 or (refused is not None and self.refused is not None):
+            return False
+        if not self.rows.remove_column_pattern(motion, gradients):
+            return False
+        self.remaining, self.found, self.refused = self.remaining - 1, True, refused
+        return True
+
+    def were_not_the_cause(self, size: Tensor) -> bool:
+        """Whether refused axes have residuals (B, A) of more than half the size without the pattern."""
+        return self.refused is not None and bool((size > 0.5 * self.refused).all())
 
 
 # Convergence

@@ -3,6 +3,7 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -124,11 +125,7 @@ def restore_exact(
         )
     levels = _noise_levels(frames, motion, noise, ignore)
     mean = brightness(frames).mean(1)[..., None, None]
-
-    periods = [
-        max(scene_period(W, reaches[index], displacement[index]) for index in range(first, first + motion.strips))
-        for first in range(0, B, motion.strips)
-    ]
+    periods = _periods(W, motion.strips, reaches, displacement)
     scenes: list[_Scene] = []  # stack, its frames, the restored one, factor on the prior
     for index in range(B):
         if index % motion.strips == 0:
@@ -159,8 +156,7 @@ def restore_exact(
     misfits: list[Misfit] = []
 
     def problem_of(number: int, partition: Partition) -> SceneProblem:
-        stack, members, reference, strength = scenes[number]
-        return stack.problem(members, reference, strength, partition)
+        return scenes[number][0].problem(*scenes[number][1:], partition)
 
     def restored(number: int, partition: Partition) -> Tensor:
         problem = problem_of(number, partition)
@@ -181,31 +177,45 @@ def restore_exact(
         check_frames()
         return images.view(B, -1, *images.shape[1:])
     images = frames.new_empty(len(scenes), C, scale * H, scale * W)
+
+    def solve(numbers: list[int], partition: Partition) -> None:
+        if len(numbers) == 1:
+            images[numbers[0]] = restored(numbers[0], partition)
+            return
+        found = scenes_side_by_side([problem_of(number, partition) for number in numbers])
+        for number, scene in zip(numbers, found, strict=True):
+            images[number] = scene[..., :W] + scenes[number][0].mean
+
     # the strips of a frame together
     together = motion.strips if prior == "gaussian" and scale == 1 else 1
-    each, count = len(scenes) // B, len(scenes) // together
-    tasks = [
-        [(first * together + strip) * each + group for strip in range(together)]
-        for first in range(B // together)
-        for group in range(each)
-    ]
-    threads = min(Partition.threads(frames.device), count)
-    advance = steps(count, "frames")
-
-    def share(thread: int) -> None:
-        partition = Partition(chunk, split)
-        for numbers in tasks[thread::threads]:
-            if len(numbers) > 1:
-                found = scenes_side_by_side([problem_of(number, partition) for number in numbers])
-                for number, scene in zip(numbers, found, strict=True):
-                    images[number] = scene[..., :W] + scenes[number][0].mean
-            else:
-                images[numbers[0]] = restored(numbers[0], partition)
-            advance()
-
-    in_parallel(share, range(threads), frames.device)
+    _solve_in_parallel(solve, _tasks(len(scenes), len(scenes) // B, together), Partition(chunk, split), frames.device)
     check_frames()
     return images.view(B, -1, *images.shape[1:])
+
+
+def _tasks(scenes: int, of_stack: int, together: int) -> list[list[int]]:
+    """Numbers of the scenes that are solved together: those of so many neighbouring stacks with the same frames."""
+    return [
+        list(range(first + scene, first + together * of_stack, of_stack))
+        for first in range(0, scenes, together * of_stack)
+        for scene in range(of_stack)
+    ]
+
+
+def _solve_in_parallel(
+    solve: Callable[[list[int], Partition], None], tasks: list[list[int]], partition: Partition, device: torch.device
+) -> None:
+    """Solve tasks side by side, each thread in its own memory."""
+    threads = min(Partition.threads(device), len(tasks))
+    advance = steps(len(tasks), "frames")
+
+    def share(thread: int) -> None:
+        own = Partition(partition.chunk, partition.segments)
+        for task in tasks[thread::threads]:
+            solve(task, own)
+            advance()
+
+    in_parallel(share, range(threads), device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,6 +324,12 @@ def scene_period(width: int, reach: int, displacement: Tensor) -> int:
     along = displacement[..., 0].detach()
     filled = bool((along.amax(-1) - along.amin(-1)).amax() > 2 * _FILLED_REACH)
     return extended_length(width, reach if filled else reach + 8)  # px beyond the displacement that influence the ends
+
+
+def _periods(width: int, strips: int, reaches: Sequence[int], displacement: Tensor) -> list[int]:
+    """Period of the scenes of each stack, the same for all of its strips, which are neighbours in the batch."""
+    each = [scene_period(width, reach, moved) for reach, moved in zip(reaches, displacement, strict=True)]
+    return [max(each[first : first + strips]) for first in range(0, len(each), strips)]
 
 
 def _without_empty_frames(groups: list[tuple[list[int], int]], missing: Tensor) -> list[tuple[list[int], int]]:
