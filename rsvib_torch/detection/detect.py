@@ -18,10 +18,10 @@ from rsvib_torch.core.option_types import BandSettings, DetectionMethod, Registr
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.other_timing import period_factor
-from rsvib_torch.detection.reliability import contradicted_axes, judge, rotation_found
+from rsvib_torch.detection.reliability import contradicted_axes, judge, rotation_found, rotation_possible
 from rsvib_torch.detection.result import DetectionResult, OtherMotion, stacked
 from rsvib_torch.detection.rows.direct import AbandonedError, refine_directly
-from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
+from rsvib_torch.detection.rows.displacements import BLOCK_ROWS, MAX_GROUP_FRAMES, compared_intervals
 from rsvib_torch.detection.rows.measured_rows import strip_rows, whole_rows
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
 from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
@@ -39,9 +39,10 @@ from rsvib_torch.detection.tones.fit import (
     vibration_of_fit,
 )
 from rsvib_torch.detection.tones.further import with_further_tones
-from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE, find_tones
+from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE, find_tones, robust_fit
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
+from rsvib_torch.imaging.trajectory import gauss_node_count
 from rsvib_torch.io.files import FramesOrFiles, timing_of_files
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
@@ -85,6 +86,7 @@ class _FitOptions:
         scale: Components of the motion.
         is_trial: Whether roll and zoom are assumed only because the halves of the rows move apart, or another timing
             than the stated one is tried.
+        has_pattern: Whether the frames have a pattern of columns; None if it is not known.
     """
 
     tones: int | None
@@ -92,6 +94,7 @@ class _FitOptions:
     bands: RegistrationOptions
     scale: FieldScale
     is_trial: bool = False
+    has_pattern: bool | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +108,8 @@ class _Found:
         fitted: (B, P, N, 2) px, the offsets that it predicts for them.
         other_motion: Motion that it does not explain; None if the method does not measure it.
         aliasing: (B,) px, expected size of the bias of the displacements by aliasing; None if it is not known.
+        uneven: (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain; likewise.
+        has_pattern: Whether a pattern of columns was subtracted.
     """
 
     fit: ToneFit
@@ -113,6 +118,8 @@ class _Found:
     fitted: Tensor
     other_motion: OtherMotion | None = None
     aliasing: Tensor | None = None
+    uneven: Tensor | None = None
+    has_pattern: bool = False
 
 
 _Fit = Callable[[BandStart, Tensor, Tensor | None, RowTiming, _FitOptions], _Found]
@@ -163,6 +170,11 @@ def _band_offsets(start: BandStart, fit: ToneFit) -> Tensor:
     return offsets
 
 
+# of an exposure. A scene of two waves agreed with 325 and 411 Hz and another timing, and one round with 165 nodes took
+# 18 times as long as detection in other frames; correct alternatives have 5 to 15
+_MAX_TRIED_NODES = 32
+
+
 def _fit_direct(
     start: BandStart, frames: Tensor, valid: Tensor | None, timing: RowTiming, options: _FitOptions
 ) -> _Found:
@@ -171,16 +183,31 @@ def _fit_direct(
     fit = _fit_bands(start, frames, valid, timing, options, accuracy=0.15).fit
     intervals = compared_intervals(timing, frames.shape[1], MAX_GROUP_FRAMES, frames.device)
     motion, scale = shrunk_motion(fit, intervals), options.scale
+    if options.is_trial and gauss_node_count(motion, timing.exposure_time) > _MAX_TRIED_NODES:
+        raise AbandonedError
     if scale.same_for_all_columns:
         rows = whole_rows(frames, valid, timing, motion)
     else:  # equal blur takes several times as long, and is not needed to find that there is no roll
         rows = strip_rows(frames, valid, timing, motion, scale, pairs_if_blurred_differently=not options.is_trial)
-    found, offsets, fitted = refine_directly(rows, intervals, fit, options.tones, is_trial=options.is_trial)
+    found, offsets, fitted = refine_directly(
+        rows, intervals, fit, options.tones, is_trial=options.is_trial, has_pattern=options.has_pattern
+    )
     motion = shrunk_motion(found.fit, intervals)
     if options.is_trial and not scale.same_for_all_columns and rows.differently_blurred(motion):
         rows = strip_rows(frames, valid, timing, motion, scale)
-        found, offsets, fitted = refine_directly(rows, intervals, found.fit, options.tones)
-    return _Found(found.fit, found.measurements, offsets, fitted, found.other_motion, found.aliasing)
+        found, offsets, fitted = refine_directly(
+            rows, intervals, found.fit, options.tones, has_pattern=options.has_pattern
+        )
+    return _Found(
+        found.fit,
+        found.measurements,
+        offsets,
+        fitted,
+        found.other_motion,
+        found.aliasing,
+        found.uneven,
+        found.has_pattern,
+    )
 
 
 _METHODS: dict[DetectionMethod, _Method] = {
@@ -492,10 +519,10 @@ def _detect_field(
 ) -> DetectionResult:
     """``_detect`` with as many components as were requested or, with ``"auto"``, as the frames require."""
     alike = _detect(frames, valid, timing, method, options)
-    if field.camera is not None or field.least_axes > 2 or (field.most_axes > 2 and any(alike.rotates)):
+    if field.camera is not None or field.least_axes > 2 or (field.most_axes > 2 and any(alike.rolls)):
         scale = field.scale(field.most_axes, field.camera)
         uncertain = field.camera is None and field.least_axes == 2
-        assumed = replace(options, scale=scale, is_trial=uncertain)
+        assumed = replace(options, scale=scale, is_trial=uncertain, has_pattern=alike.has_pattern)
         try:
             found = _detect(frames, valid, timing, method, assumed, alike.fit).result
         except (AbandonedError, ValueError):  # parallax; narrow frames, and fits that diverge
@@ -520,16 +547,20 @@ class _Detected:
         fit: Its fit.
         measurements: The measurements of the fit.
         rotates: For each stack, whether the halves of its rows move apart.
+        rolls: For each stack, whether roll or zoom may be the cause.
         contradicted: For each stack, the axes in row order whose measurements contradict the timing.
         bands: Offsets of the row bands.
+        has_pattern: Whether a pattern of columns was subtracted.
     """
 
     result: DetectionResult
     fit: ToneFit
     measurements: Measurements
     rotates: list[bool]
+    rolls: list[bool]
     contradicted: list[tuple[bool, bool]]
     bands: OffsetCurve
+    has_pattern: bool
 
 
 def _detect(
@@ -540,6 +571,7 @@ def _detect(
     options: _FitOptions,
     translation: ToneFit | None = None,
     bands_known: OffsetCurve | None = None,
+    frequencies: Tensor | None = None,
 ) -> _Detected:
     """``detect_vibration`` of grey frames (B, T, H, W) in row order.
 
@@ -551,6 +583,7 @@ def _detect(
         options: Its options.
         translation: Fit without roll and zoom, from which a fit with roll or zoom starts.
         bands_known: Offsets of the row bands, if they were measured with another timing.
+        frequencies: (B, 2, 1) Hz of one tone of each axis, if they are known.
 
     Raises:
         AbandonedError: If the options are a trial, and the motion is another one.
@@ -558,6 +591,9 @@ def _detect(
     row_timing, bands, scale = timing.in_row_order(), options.bands, options.scale
     if scale.same_for_all_columns:
         start = band_start(frames, valid, row_timing, bands, mere_start=not method.needs_whole_curve, known=bands_known)
+        if frequencies is not None:
+            active = torch.ones_like(frequencies, dtype=torch.bool)
+            start = replace(start, fit=robust_fit(start.measurements, frequencies, active, options.model)[0])
     else:
         start = field_start(frames, valid, row_timing, bands, scale, translation)
     found = method.fit(start, frames, valid, row_timing, options)
@@ -600,8 +636,10 @@ def _detect(
         )
         for index in range(len(frames))
     ]
-    rotates, contradicted = [False] * len(frames), [(False, False)] * len(frames)
-    if other_motion is not None:
+    rotates, rolls, contradicted = [False] * len(frames), [False] * len(frames), [(False, False)] * len(frames)
+    if other_motion is not None and found.uneven is not None:
+        aspect = frames.shape[-2] / frames.shape[-1]
+        rolls = [rotation_possible(other_motion[index], found.uneven[index], aspect) for index in range(len(frames))]
         rotates = [rotation_found(other_motion[index]) for index in range(len(frames))]
         contradicted = [
             contradicted_axes(vibration[index], other_motion[index], max_tones) for index in range(len(frames))
@@ -634,7 +672,7 @@ def _detect(
         ),
         timing=timing,
     )
-    return _Detected(result, fit, found.measurements, rotates, contradicted, start.curve)
+    return _Detected(result, fit, found.measurements, rotates, rolls, contradicted, start.curve, found.has_pattern)
 
 
 def _with_cause(
@@ -697,26 +735,29 @@ def _wrong_setting(
         other: RowTiming,
         change: Callable[[Tensor], Tensor] | None = None,
         concerned: tuple[bool, bool] = axes,
+        tones: Tensor | None = None,
     ) -> bool:
         changed, pixels, bands = frames, valid, curve if change is None else None
         if change is not None:
             changed, pixels = change(frames), None if valid is None else change(valid)
         try:
-            found = _detect(changed, pixels, other, method, trial, bands_known=bands).result
+            found = _detect(changed, pixels, other, method, trial, bands_known=bands, frequencies=tones).result
         except (ValueError, AbandonedError):  # columns may lack the detail that rows have
             return False
         return all(good or not axis for good, axis in zip(found.reliable[0].tolist(), concerned, strict=True))
 
     row_timing = timing.in_row_order()
-    factor = period_factor(measurements, row_timing, frames.shape[1]) if frames.shape[1] > 2 else None
+    count = frames.shape[1]
+    agreeing = period_factor(measurements, row_timing, count, BLOCK_ROWS) if count > 2 else None
+    factor, tones = (None, None) if agreeing is None else agreeing
     if factor is not None and factor < 0:
-        if agrees(row_timing, lambda images: images.flip(-2)):
+        if agrees(row_timing, lambda images: images.flip(-2), tones=tones):
             other = "reverse" if timing.readout_direction == "forward" else "forward"
             return f"the frames agree with readout_direction={other!r}, not with {timing.readout_direction!r}"
     elif factor is not None and timing.frame_start_times is None:
         frame_rows = factor * timing.frame_rows
         changed = replace(row_timing, frame_rows=max(frame_rows, frames.shape[-2], timing.exposure_rows))
-        if changed.frame_rows == frame_rows and agrees(changed):
+        if changed.frame_rows == frame_rows and agrees(changed, tones=tones):
             return (
                 f"the frames agree with frame_rows={frame_rows:.5g}, not with {timing.frame_rows:g}: frame_rows counts "
                 "the blanking rows and is not the image height; if the frame rate is known, row_time is 1 / (frame "
@@ -725,7 +766,7 @@ def _wrong_setting(
     elif factor is not None:
         times = {name: getattr(timing, name) * factor for name in ("frame_rows", "exposure_rows")}
         changed = replace(row_timing, row_time=timing.row_time / factor, **times)
-        if agrees(changed):
+        if agrees(changed, tones=tones):
             return (
                 f"the frames agree with row_time={changed.row_time:.5g} s, not with {timing.row_time:g} s, if the "
                 "start times of the frames are right"

@@ -66,8 +66,11 @@ def displacement_at(components: Tensor, x: Tensor, y: Tensor, camera: Camera | N
         return camera.displacement(components, x, y)
     if components.shape[-1] == 2:
         return components
-    moved: Tensor = (displacement_factors(x, y, components.shape[-1]) @ components[..., None])[..., 0]
-    return moved
+    # products with the matrices of ``displacement_factors`` take twice as long
+    along, across = components[..., 0] - y * components[..., 2], components[..., 1] + x * components[..., 2]
+    if components.shape[-1] > 3:
+        along, across = along + x * components[..., 3], across + y * components[..., 3]
+    return torch.stack([along, across], -1)
 
 
 def _corners(width: float, height: float, like: Tensor) -> tuple[Tensor, Tensor]:

@@ -71,9 +71,9 @@ class RowGradients:
         residual_products: (B, S, A + 1, G) float64 sums of their products with the differences of the frames; of two
             frames (B, S, A + 1, 1), of the first.
         variance: (B, S) float64, noise variance of a pixel in a frame.
-        halves: (B, S, 2, 5) float64, sums gx gx, gx gy, gy gy, gx e and gy e over the left and the right half of each
-            row, with e the residual difference between the last and the first frame. A displacement that depends on
-            the row only is equal in both halves. With further components, parts instead of halves.
+        quarters: (B, S, 4, 5) float64, sums gx gx, gx gy, gy gy, gx e and gy e over the quarters of each row from left
+            to right, with e the residual difference between the last and the first frame. A displacement that depends
+            on the row only is equal in all of them.
         aliasing: (B,) float64 px, expected size of the bias of displacements by aliasing (``_aliasing_bias``).
     """
 
@@ -81,7 +81,7 @@ class RowGradients:
     products: Tensor
     residual_products: Tensor
     variance: Tensor
-    halves: Tensor
+    quarters: Tensor
     aliasing: Tensor
 
 
@@ -93,7 +93,6 @@ def row_gradients(
     visible: Tensor,
     *,
     factors: Callable[[slice], Tensor] | None = None,
-    parts_of_rows: int = 2,
 ) -> RowGradients:
     """Gradients of the scene, noise, and the weight of every pixel, from frames warped by a motion.
 
@@ -105,7 +104,6 @@ def row_gradients(
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
         factors: Displacements (B, s, L, 2, A) of the pixels of some rows by unit components of the motion, x and y
             first; the derivatives by all of them are regressors. None if the displacement depends on the row only.
-        parts_of_rows: Number of parts of the rows for ``RowGradients.halves``.
 
     Returns:
         The gradients.
@@ -137,7 +135,7 @@ def row_gradients(
             weight = weight * functional.pad(valid[:, part], (0, length - width))
         return _Rows(planes, weight, part_visible, regressors)
 
-    edges = [width * number // parts_of_rows for number in range(1, parts_of_rows)]
+    edges = [width * number // 4 for number in range(1, 4)]
     images = inner.new_empty(len(rows), rows.shape[-1], regressors, length)
     fits, blocks = [], []
     for part in parts:
@@ -161,7 +159,7 @@ def row_gradients(
         products=products[..., :-1, :-1] - means * products[..., -1:, :-1],
         residual_products=right[..., :-1, :] - means * right[..., -1:, :],
         variance=square / (products[..., -1, -1] - regressors - 1).clamp(min=1.0),
-        halves=_halves(sums, solution, visible),
+        quarters=_quarters(sums, solution, visible),
         aliasing=aliasing,
     )
 
@@ -338,8 +336,8 @@ def _block_weight(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
     return 1 / (1 + (ratio - 1).clamp(min=0.0).square())
 
 
-def _halves(sums: Tensor, solution: Tensor, visible: Tensor) -> Tensor:
-    """Sums over the parts of each row, as in ``RowGradients.halves``.
+def _quarters(sums: Tensor, solution: Tensor, visible: Tensor) -> Tensor:
+    """Sums over the parts of each row, as in ``RowGradients.quarters``.
 
     Args:
         sums: From ``_sums_of_parts``.

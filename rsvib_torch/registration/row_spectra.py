@@ -87,6 +87,14 @@ class RowSpectra:
         part.valid = None if self.valid is None else self.valid[:, frames]
         return part
 
+    def stacks(self, index: Tensor) -> "RowSpectra":
+        """The spectra of some of the stacks; the values are copied."""
+        part = copy(self)
+        part.values = self.values[index]
+        part.valid = None if self.valid is None else self.valid[index]
+        part._index_rows()
+        return part
+
     def band(self, frequencies: slice) -> "RowSpectra":
         """Some of the frequencies of all frames; the values are copied."""
         part = copy(self)

@@ -22,11 +22,13 @@ from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
 
 __all__ = ["judged_strip", "restore_in_strips"]
 
-# px, difference of the displacements of neighbouring strips; frames of 512 x 512 px with 2 mrad of roll are then
-# restored to 40.24 dB, without roll to 40.18 dB
-_SLIDE = 0.16
+# px, difference of the displacements of neighbouring strips; frames of 384 x 384 px with roll of 0.5 px at their ends
+# are restored to 53.77 dB, with 0.16 px to 53.83 dB in 1.2 times the time, with 0.25 px to 53.61 dB
+_SLIDE = 0.2
 _PITCHES = (48, 160)  # px, bounds on the distance of the strips: narrow ones cost time, wide ones memory
-_MARGIN = 24  # px of a strip without weight, beyond the displacement: the restoration is not exact near its ends
+# px of a strip without weight, beyond the displacement; the restoration is not exact near its ends. With 24 px, the
+# restored frames of 384 x 384 px have at most 0.02 dB more, with exposures of 20 to 400 rows
+_MARGIN = 8
 
 
 def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) -> tuple[ColumnStrips, float]:
@@ -75,7 +77,8 @@ def restore_in_strips(
         name: strips.cut(value) if isinstance(value, Tensor) and value.shape[-2:] == images.shape[-2:] else value
         for name, value in options.items()
     }
-    of_frames = replace(frame_motion(of_strips, timing, count, height), neglected=neglected)
+    of_frames = frame_motion(of_strips, timing, count, height)
+    of_frames = replace(of_frames, neglected=neglected, strips=len(strips.firsts))
     of_frames.check_fits(height, width)
     restored = method(strips.cut(images), of_frames, **cut)
     return strips.finer(restored.shape[-1] // strips.width).joined(restored)

@@ -36,6 +36,7 @@ class FrameMotion:
         frame_starts: (T,) seconds.
         shift: (B, T, 2) whole px, axes (x, y), float64.
         neglected: Standard deviation in px of the differences of the columns, where the motion is that of one of them.
+        strips: Number of neighbouring entries of the batch that are strips of columns of the same frames.
     """
 
     vibration: Motion
@@ -43,6 +44,7 @@ class FrameMotion:
     frame_starts: Tensor
     shift: Tensor
     neglected: float = 0.0
+    strips: int = 1
 
     def frame_rows(self, scene_rows: Tensor) -> Tensor:
         """Frame rows (B, T, S) that contain rows (S,) of the restored frames."""

@@ -11,8 +11,10 @@ import pytest
 import torch
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
+import rsvib_torch as rsv
 from rsvib_torch import SensorTiming, Vibration, detect_vibration
 from rsvib_torch.core.option_types import METHOD_SETTINGS, method_options
+from rsvib_torch.evaluation import city_and_fields
 from rsvib_torch.restoration import (
     RestorationWarning,
     VibrationRestorer,
@@ -351,3 +353,15 @@ def test_unknown_options_are_refused_with_the_valid_names(build, name):
     valid = ", ".join(method_options(name))
     with pytest.raises(TypeError, match=f"method='{name}' has no option 'strength'; its options are {valid}"):
         build(method=name, strength=1.0)
+
+
+def test_strips_of_a_frame_are_solved_together_as_one_by_one():
+    timing = SensorTiming(row_time=4e-5, exposure_rows=8, frame_rows=200)
+    vibration = Vibration([1.5, 1.2, 0.006], [53.0, 65.0, 41.0], [0.4, 1.3, 0.2])
+    noise = rsv.SensorNoise(read_noise=0.005)
+    scene = city_and_fields(220, 240, seed=3)
+    frames = rsv.simulate_frames(scene, timing, vibration, 2, frame_size=(160, 180), noise=noise)
+    together = restore(frames, timing, vibration, check=False)
+    one_by_one = restore(frames.clone().requires_grad_(), timing, vibration, check=False)  # differentiable
+    torch.testing.assert_close(together, one_by_one.detach(), atol=1e-4, rtol=0)
+    assert (together - frames).abs().amax() > 0.1

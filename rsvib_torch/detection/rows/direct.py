@@ -42,7 +42,7 @@ from rsvib_torch.detection.tones.selection import (
     typical_size,
 )
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.vibration import blind_frequencies
+from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.registration.gradients import RowGradients
 
@@ -59,6 +59,8 @@ class DirectFit:
         other_motion: Motion in the measurements that the fit does not explain.
         robust_weights: (B, N, 2) weights 0 ... 1 by which the information of each row was multiplied; 0 for outliers.
         aliasing: (B,) px, expected size of the bias of the displacements by aliasing.
+        uneven: (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain.
+        has_pattern: Whether a pattern of columns was subtracted.
     """
 
     measurements: Measurements
@@ -66,6 +68,8 @@ class DirectFit:
     other_motion: OtherMotion
     robust_weights: Tensor
     aliasing: Tensor
+    uneven: Tensor
+    has_pattern: bool = False
 
 
 class AbandonedError(Exception):
@@ -84,6 +88,7 @@ def refine_directly(
     max_rounds: int = 12,
     *,
     is_trial: bool = False,
+    has_pattern: bool | None = None,
 ) -> tuple[DirectFit, OffsetCurve, Tensor]:
     """Refine a detected motion on the images.
 
@@ -99,6 +104,8 @@ def refine_directly(
         max_rounds: Largest number of rounds of measuring and fitting; exposures of 400 rows need more than six.
         is_trial: Whether the motion is possibly of another kind than assumed (parallax instead of roll). It is
             abandoned if a large residual remains after three rounds.
+        has_pattern: Whether the frames have a pattern of columns: it is then subtracted after the first round instead
+            of the last, or not looked for. None if it is not known.
 
     Returns:
         The last measurements and the fit to them, the measurements as offsets between consecutive frames, and the
@@ -108,7 +115,7 @@ def refine_directly(
         AbandonedError: If a trial is abandoned.
     """
     motion = shrunk_motion(start, intervals)
-    found = _refine(rows, intervals, start, tones, max_rounds, is_trial)
+    found = _refine(rows, intervals, start, tones, max_rounds, is_trial, has_pattern)
     if rows.differently_blurred(motion):
         tried = torch.zeros_like(start.active[..., 0])
         for _ in range(2):  # one axis after the other
@@ -117,7 +124,8 @@ def refine_directly(
                 break
             tried = tried | mirrored
             other, _ = robust_fit(found.measurements, frequencies, strongest_only(found.fit).active, start.model)
-            found = _better_of_each(found, _refine(rows, intervals, other, tones, max_rounds))
+            again = _refine(rows, intervals, other, tones, max_rounds, has_pattern=has_pattern)
+            found = _better_of_each(found, again)
     if tones is None:
         found = replace(found, fit=significant_only(found.measurements, found.fit, intervals))
     blur = rows.blur_ratio(shrunk_motion(found.fit, intervals))
@@ -181,6 +189,7 @@ def _refine(
     tones: int | None,
     max_rounds: int,
     is_trial: bool = False,
+    has_pattern: bool | None = None,
 ) -> DirectFit:
     """Measure around the motion, fit, repeat."""
     timing, fit, model = rows.timing, start, start.model
@@ -189,7 +198,7 @@ def _refine(
     steps: list[_Step] = []
     sizes: list[Tensor] = []  # (B, A), typical residuals since the search in standard deviations
     search_round = 1  # the first round removes the error of the band offsets; weak tones are significant after it
-    pattern_rounds = 2  # a strong pattern biases the motion by which its first estimate is warped
+    patterns = _Patterns(rows, 0 if has_pattern is False else 2)  # a strong pattern biases its first estimate
     interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)  # exposures average out faster tones
     blind = blind_frequencies(timing, 0.5 / interval).to(motion.device)
     for number in range(max_rounds):
@@ -206,22 +215,25 @@ def _refine(
         else:
             fit, _ = robust_fit(measurements, fit.frequencies, fit.active, model, residual, steps=1)
         warped_by, motion, gradients = motion, shrunk_motion(fit, intervals), record.gradients
+        if number == 0 and has_pattern and patterns.subtracted(motion, gradients):
+            gradients = None
+            continue
         if number == max_rounds - 1 or not bool((measurements.weights > 0).any()):  # or nothing is visible any more
             break
 
         if is_trial and number == _TRIED_ROUNDS - 1:
-            other = _conclude(record, fit).other_motion
-            if bool((other.unexplained > _MAX_TRIED * other.permitted).any()):
-                raise AbandonedError
+            _abandon_if_large(record, fit)
+        if number == search_round + 1 and patterns.were_not_the_cause(size):
+            break
         step = _Step.between(measurements, warped_by, motion)
         same_tones = torch.equal(previous.active, fit.active)
         ratio = step.ratio_to(steps[-1]) if steps and same_tones else None
         converged = _converged(previous, fit, ratio) & (number >= search_round)
-        if bool((converged | _stalled(sizes, record, fit)).all()):
-            if pattern_rounds == 0 or not rows.remove_column_pattern(motion, gradients):
+        stalled = _stalled(sizes, record, fit)
+        if bool((converged | stalled).all()):
+            if not patterns.subtracted(motion, gradients, size if bool(stalled.all()) else None):
                 break
-            pattern_rounds, search_round = pattern_rounds - 1, number + 1
-            gradients, steps, sizes = None, [], []
+            search_round, gradients, steps, sizes = number + 1, None, [], []
             continue
         # steps with other tones do not predict the next one
         steps = [*steps[-3:], step] if same_tones and number > search_round else [step]
@@ -233,7 +245,44 @@ def _refine(
             step = _Step.between(measurements, warped_by, motion)
         if float(step.change.abs().amax()) > 0.05:  # px; over smaller distances the gradients of the scene are the same
             gradients = None
-    return _conclude(record, fit)
+    return replace(_conclude(record, fit), has_pattern=patterns.found)
+
+
+def _abandon_if_large(record: RowRecord, fit: ToneFit) -> None:
+    """Raise ``AbandonedError`` if the fit leaves a large residual."""
+    other = _conclude(record, fit).other_motion
+    if bool((other.unexplained > _MAX_TRIED * other.permitted).any()):
+        raise AbandonedError
+
+
+@dataclass(eq=False)
+class _Patterns:
+    """Patterns of columns that are subtracted after some of the rounds.
+
+    Attributes:
+        rows: The frames.
+        remaining: Number of times that a pattern may be subtracted.
+        found: Whether there was a pattern.
+        refused: (B, A) residuals before the last pattern was subtracted, if all axes were refused; else None.
+    """
+
+    rows: MeasuredRows
+    remaining: int
+    found: bool = False
+    refused: Tensor | None = None
+
+    def subtracted(self, motion: Vibration, gradients: list[RowGradients], refused: Tensor | None = None) -> bool:
+        """Subtract a pattern; False if there is none, or if the axes are refused again after the last one."""
+        if self.remaining == 0 or (refused is not None and self.refused is not None):
+            return False
+        if not self.rows.remove_column_pattern(motion, gradients):
+            return False
+        self.remaining, self.found, self.refused = self.remaining - 1, True, refused
+        return True
+
+    def were_not_the_cause(self, size: Tensor) -> bool:
+        """Whether refused axes have residuals (B, A) of more than half the size without the pattern."""
+        return self.refused is not None and bool((size > 0.5 * self.refused).all())
 
 
 # Convergence
@@ -272,14 +321,16 @@ class _Step:
 
 
 def _stalled(sizes: list[Tensor], record: RowRecord, fit: ToneFit) -> Tensor:
-    """(B, A) bool, axes whose typical residual did not decrease in two rounds, and which are refused because of it.
+    """(B, A) bool, axes whose typical residual hardly decreased in two rounds, and which are refused because of it.
+
+    A quarter in two rounds is too little to reach what is permitted in the rounds that remain.
 
     Args:
         sizes: Typical residuals of the rounds so far, in standard deviations.
         record: Measurements of this round.
         fit: The fit to them.
     """
-    if len(sizes) < 3 or not bool((stalled := (sizes[-1] > 2.0) & (sizes[-1] > 0.9 * sizes[-3])).any()):
+    if len(sizes) < 3 or not bool((stalled := sizes[-1] > 0.75 * sizes[-3]).any()):
         return torch.zeros((), dtype=torch.bool, device="cpu")
     other = _conclude(record, fit).other_motion
     return stalled & (other.unexplained > other.permitted)
@@ -388,6 +439,7 @@ def _better_of_each(one: DirectFit, other: DirectFit) -> DirectFit:
         select_stacks(better, other.other_motion, one.other_motion),
         torch.where(better[:, None, None], other.robust_weights, one.robust_weights),
         torch.where(better, other.aliasing, one.aliasing),
+        torch.where(better[:, None], other.uneven, one.uneven),
     )
 
 
@@ -412,4 +464,4 @@ def _conclude(record: RowRecord, fit: ToneFit) -> DirectFit:
     )
     robust_weights = weighted.weights / measurements.weights.clamp(min=1e-300)
     aliasing = torch.stack([own.aliasing for own in record.gradients]).mean(0)
-    return DirectFit(weighted, fit, other, robust_weights, aliasing)
+    return DirectFit(weighted, fit, other, robust_weights, aliasing, record.uneven())

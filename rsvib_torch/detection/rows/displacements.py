@@ -48,6 +48,7 @@ __all__ = [
     "measure_strips",
     "remove_column_pattern",
     "stack_spectra",
+    "uneven_motion",
 ]
 
 BLOCK_ROWS = 8  # rows of one measurement; tones up to 1 / (16 T_row) are resolved
@@ -292,7 +293,6 @@ def measure_strips(
             * (visible > 0),  # a lens may displace invisible rows by any amount
             visible,
             factors=lambda part: factors(x, y[:, part]),
-            parts_of_rows=4,
         )
         products = gradients.residual_products
     else:
@@ -435,22 +435,49 @@ def differential_motion(gradients: list[RowGradients], *, rows: int = 64) -> Ten
     """
     excesses = []
     for own in gradients:
-        residual, noise, regular = displacements_of_parts(own, rows)
+        residual, noise, regular = displacements_of_parts(own, rows, parts=2)
         excess = (residual[:, :, 1] - residual[:, :, 0]).square() - noise.sum(2)
         excesses.append(torch.where(regular[..., None], excess, torch.nan))
     return trimmed_mean(torch.cat(excesses, 1)).clamp(min=0.0).sqrt()
 
 
-def displacements_of_parts(gradients: RowGradients, rows: int) -> tuple[Tensor, Tensor, Tensor]:
+def uneven_motion(gradients: list[RowGradients], *, rows: int = 64) -> Tensor:
+    """(B, 2) px, part of the displacements of the quarters of the rows that is not linear in the column; without noise.
+
+    Parallax, clouds and objects that move by themselves cause it, roll and zoom do not.
+
+    Args:
+        gradients: Gradients of all groups, from ``measure_groups``.
+        rows: Rows over which the sums are taken.
+    """
+    excesses = []
+    for own in gradients:
+        residual, noise, regular = displacements_of_parts(own, rows)
+        curved = residual.new_tensor(
+            [[0.5, -0.5, -0.5, 0.5], [-1.0, 3.0, -3.0, 1.0]]
+        )  # quadratic and cubic in the column
+        curved[1] /= math.sqrt(20)
+        excess = (curved @ residual).square() - curved.square() @ noise
+        excesses.append(torch.where(regular[..., None], excess.sum(2), torch.nan))
+    return trimmed_mean(torch.cat(excesses, 1)).clamp(min=0.0).sqrt()
+
+
+def displacements_of_parts(gradients: RowGradients, rows: int, parts: int = 4) -> tuple[Tensor, Tensor, Tensor]:
     """Residual displacements of the parts of the rows from the first to the last frame, from sums over ``rows`` rows.
+
+    Args:
+        gradients: Gradients of a group.
+        rows: Rows over which the sums are taken.
+        parts: Number of parts, 2 or 4.
 
     Returns:
         The differences of the displacements (B, N, parts, 2) in px, the variance of their noise, and (B, N) whether all
         parts have structure along both directions.
     """
-    count = gradients.halves.shape[1] // rows * rows
+    sums = gradients.quarters.unflatten(2, (parts, -1)).sum(3)
+    count = sums.shape[1] // rows * rows
     weight = torch.where(gradients.variance > 0, 1 / gradients.variance.clamp(min=1e-300), 0.0)[:, :count, None, None]
-    hxx, hxy, hyy, bx, by = (gradients.halves[:, :count] * weight).unflatten(1, (-1, rows)).sum(2).unbind(-1)
+    hxx, hxy, hyy, bx, by = (sums[:, :count] * weight).unflatten(1, (-1, rows)).sum(2).unbind(-1)
     determinant = hxx * hyy - hxy.square()
     regular = determinant > 1e-4 * hxx * hyy
     safe = torch.where(regular, determinant, 1.0)[..., None]

@@ -22,6 +22,7 @@ from rsvib_torch.detection.rows.displacements import (
     measure_strips,
     remove_column_pattern,
     stack_spectra,
+    uneven_motion,
 )
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.frames.column_strips import ColumnStrips
@@ -56,6 +57,10 @@ class RowRecord:
         if self.apart is None:
             return differential_motion(self.gradients)
         return trimmed_mean(self.apart).clamp(min=0.0).sqrt()
+
+    def uneven(self) -> Tensor:
+        """(B, 2) px, the part of the differences along a row that roll and zoom cannot explain."""
+        return uneven_motion(self.gradients) if self.apart is None else self.differential()
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,12 +169,17 @@ class StripRows(MeasuredRows):
         return ColumnMotion.of_columns(field, self.columns, self.timing, self.num_frames, self.scale.height)
 
     def blur_ratio(self, motion: Vibration) -> Tensor:
-        """(B, 3), the weighted mean over the strips.
+        """(B, 3), the weighted mean over every second strip: they contain all columns.
 
         A displacement that changes within a strip acts like blur: with a focal length of 400 px and 5 px, where the
         ends of strips slide by 0.3 px, the ratio was 0 instead of 1. Its size, which counts as evidence, is then 0.
         """
-        ratio, std, size = super().blur_ratio(motion).unflatten(0, (-1, len(self.columns))).unbind(-1)
+        place = torch.arange(len(self.groups[0].starts), device=self.columns.device)
+        index = place[place % len(self.columns) % 2 == 0]
+        groups = [FrameGroup(group.spectra.stacks(index), group.starts[index]) for group in self.groups]
+        some = replace(self, groups=groups, columns=self.columns[::2])
+        each = MeasuredRows.blur_ratio(some, motion)
+        ratio, std, size = each.unflatten(0, (-1, len(some.columns))).unbind(-1)
         weight = torch.where(std > 0, std.square().reciprocal(), 0.0)
         total = weight.sum(1).clamp(min=1e-300)
         size = size.mean(1) if self.slide < _MAX_SLIDE_OF_BLUR else torch.zeros_like(total)
@@ -185,7 +195,7 @@ def strip_rows(
     *,
     pairs_if_blurred_differently: bool = True,
     max_slide: float = 0.1,
-    min_pitch: int = 32,
+    min_pitch: int = 48,
 ) -> StripRows:
     """Frames (B, T, H, W) in strips of columns.
 

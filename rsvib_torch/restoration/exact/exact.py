@@ -3,6 +3,7 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -19,7 +20,7 @@ from rsvib_torch.restoration.exact.filling import fill_beyond_ends, fill_missing
 from rsvib_torch.restoration.exact.finer_scene import Misfit, finer_scene, warn_of_frames
 from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
 from rsvib_torch.restoration.exact.priors import PRIORS, PriorOptions
-from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem
+from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem, scenes_side_by_side
 from rsvib_torch.restoration.exact.strength import Strengths, prior_strength
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise.policy import noise_levels
@@ -124,12 +125,15 @@ def restore_exact(
         )
     levels = _noise_levels(frames, motion, noise, ignore)
     mean = brightness(frames).mean(1)[..., None, None]
-
+    periods = _periods(W, motion.strips, reaches, displacement)
     scenes: list[_Scene] = []  # stack, its frames, the restored one, factor on the prior
     for index in range(B):
+        if index % motion.strips == 0:
+            strengths, certain = Strengths(), noise != "auto" or T > 1
         weights = levels[index].square().reciprocal()
         typical = weights.mean().reciprocal()
-        length = scene_period(W, reaches[index], displacement[index])
+        # strips of the same frames have one period
+        length = periods[index // motion.strips]
         stack = _Stack(
             frames=frames[index],
             displacement=displacement[index],
@@ -146,21 +150,22 @@ def restore_exact(
             missing=None if missing is None else missing[index],
             clipped=None if clipped is None else clipped[index],
         )
-        strengths, certain = Strengths(), noise != "auto" or T > 1
         measured = groups if missing is None else _without_empty_frames(groups, missing[index])
         scenes += [(stack, *group, factor * stack.strength(*group, strengths, certain=certain)) for group in measured]
 
     misfits: list[Misfit] = []
 
+    def problem_of(number: int, partition: Partition) -> SceneProblem:
+        return scenes[number][0].problem(*scenes[number][1:], partition)
+
     def restored(number: int, partition: Partition) -> Tensor:
-        stack, members, reference, strength = scenes[number]
-        problem = stack.problem(members, reference, strength, partition)
+        problem = problem_of(number, partition)
         if scale == 1:
             scene = PRIORS[prior](problem, PriorOptions(factor))
         else:
             scene, misfit = finer_scene(problem, W, motion.neglected)
             misfits.append(misfit)
-        return scene[..., : scale * W] + stack.mean
+        return scene[..., : scale * W] + scenes[number][0].mean
 
     def check_frames() -> None:
         if scale != 1:
@@ -172,18 +177,45 @@ def restore_exact(
         check_frames()
         return images.view(B, -1, *images.shape[1:])
     images = frames.new_empty(len(scenes), C, scale * H, scale * W)
-    threads = min(Partition.threads(frames.device), len(scenes))
-    advance = steps(len(scenes), "frames")
 
-    def share(thread: int) -> None:
-        partition = Partition(chunk, split)
-        for number in range(thread, len(scenes), threads):
-            images[number] = restored(number, partition)
-            advance()
+    def solve(numbers: list[int], partition: Partition) -> None:
+        if len(numbers) == 1:
+            images[numbers[0]] = restored(numbers[0], partition)
+            return
+        found = scenes_side_by_side([problem_of(number, partition) for number in numbers])
+        for number, scene in zip(numbers, found, strict=True):
+            images[number] = scene[..., :W] + scenes[number][0].mean
 
-    in_parallel(share, range(threads), frames.device)
+    # the strips of a frame together
+    together = motion.strips if prior == "gaussian" and scale == 1 else 1
+    _solve_in_parallel(solve, _tasks(len(scenes), len(scenes) // B, together), Partition(chunk, split), frames.device)
     check_frames()
     return images.view(B, -1, *images.shape[1:])
+
+
+def _tasks(scenes: int, of_stack: int, together: int) -> list[list[int]]:
+    """Numbers of the scenes that are solved together: those of so many neighbouring stacks with the same frames."""
+    return [
+        list(range(first + scene, first + together * of_stack, of_stack))
+        for first in range(0, scenes, together * of_stack)
+        for scene in range(of_stack)
+    ]
+
+
+def _solve_in_parallel(
+    solve: Callable[[list[int], Partition], None], tasks: list[list[int]], partition: Partition, device: torch.device
+) -> None:
+    """Solve tasks side by side, each thread in its own memory."""
+    threads = min(Partition.threads(device), len(tasks))
+    advance = steps(len(tasks), "frames")
+
+    def share(thread: int) -> None:
+        own = Partition(partition.chunk, partition.segments)
+        for task in tasks[thread::threads]:
+            solve(task, own)
+            advance()
+
+    in_parallel(share, range(threads), device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,6 +326,12 @@ def scene_period(width: int, reach: int, displacement: Tensor) -> int:
     return extended_length(width, reach if filled else reach + 8)  # px beyond the displacement that influence the ends
 
 
+def _periods(width: int, strips: int, reaches: Sequence[int], displacement: Tensor) -> list[int]:
+    """Period of the scenes of each stack, the same for all of its strips, which are neighbours in the batch."""
+    each = [scene_period(width, reach, moved) for reach, moved in zip(reaches, displacement, strict=True)]
+    return [max(each[first : first + strips]) for first in range(0, len(each), strips)]
+
+
 def _without_empty_frames(groups: list[tuple[list[int], int]], missing: Tensor) -> list[tuple[list[int], int]]:
     """Groups of frames without those with at most 5 % measured pixels, unless they have no others."""
     share = (~missing).double().flatten(1).mean(1).tolist()
@@ -316,8 +354,13 @@ def _noise_levels(frames: Tensor, motion: FrameMotion, noise: float | Literal["a
     """Noise level of each frame, (B, T)."""
     if noise != "auto":
         return torch.full(frames.shape[:2], _given_level(noise), dtype=frames.dtype, device=frames.device)
-    levels = [
-        noise_levels(stack.detach(), motion, index, None if ignore is None else ignore[index])
-        for index, stack in enumerate(frames)
-    ]
-    return torch.stack(levels).clamp(min=_MIN_LEVEL)
+    # strips of the same frames have one noise: two of them give it as well as all of them, in a fraction of the time
+    chosen = sorted({motion.strips // 4, motion.strips - 1 - motion.strips // 4})
+    powers = []
+    for first in range(0, len(frames), motion.strips):
+        each = [
+            noise_levels(frames[index].detach(), motion, index, None if ignore is None else ignore[index])
+            for index in (first + strip for strip in chosen)
+        ]
+        powers += [torch.stack(each).square().mean(0)] * motion.strips
+    return torch.stack(powers).sqrt().clamp(min=_MIN_LEVEL)

@@ -11,7 +11,7 @@ The plain path factors the system of every frequency, and is differentiable. The
 frequencies and interpolates the factors for all others.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import prod
@@ -25,7 +25,7 @@ from rsvib_torch.core.interpolated_factors import InterpolatedFactors, node_freq
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.restoration.scene_model.observation import Observation
 
-__all__ = ["Partition", "SceneProblem", "SceneSolver", "join_windows", "row_windows"]
+__all__ = ["Partition", "SceneProblem", "SceneSolver", "join_windows", "row_windows", "scenes_side_by_side"]
 
 
 def row_windows(rows: int, count: int, overlap: int = 96) -> list[slice]:
@@ -119,6 +119,9 @@ class SceneSolver:
         length: Period L of the data.
         partition: Parts solved at a time.
         keep: Keep the factors, for solving several times.
+
+    Attributes:
+        parts: Frequencies that are solved at a time.
     """
 
     def __init__(
@@ -128,7 +131,7 @@ class SceneSolver:
         self.u = torch.fft.rfftfreq(length, dtype=torch.float64, device=precision.device)
         normal = observation.band(len(precision) - 1)
         self._partition = partition
-        self._parts, self._windows = partition.divide(
+        self.parts, self._windows = partition.divide(
             observation.count,
             normal.width,
             len(self.u),
@@ -142,10 +145,15 @@ class SceneSolver:
         if self._differentiates():
             return
         if keep:
-            self._factors = [factor_banded(self._normal.at(self.u[p], precision[..., p])) for p in self._parts]
+            self._factors = [factor_banded(self._normal.at(self.u[p], precision[..., p])) for p in self.parts]
         elif (nodes := self._nodes()) is not None:
             systems = self._normal.at(self.u[nodes], precision[..., nodes])
             self._interpolated = InterpolatedFactors.of(systems, nodes)
+
+    @property
+    def size(self) -> tuple[int, int, int]:
+        """Rows of a window, half-width of the band, and number of systems."""
+        return self._windows[0].stop, self._normal.width, len(self._windows) * len(self.u)
 
     @property
     def interpolates(self) -> bool:
@@ -176,7 +184,7 @@ class SceneSolver:
     def right_side(self, data: Tensor) -> Tensor:
         """Right sides (K, C, U) of the normal equations for data (M, C, R, L)."""
         spectra = torch.fft.rfft(data)
-        return torch.cat([self._right_side(spectra, part) for part in self._parts], dim=-1)
+        return torch.cat([self._right_side(spectra, part) for part in self.parts], dim=-1)
 
     def _right_side(self, spectra: Tensor, part: slice) -> Tensor:
         return self.observation.adjoint(spectra[..., part], self.u[part], part, self.length)
@@ -185,15 +193,22 @@ class SceneSolver:
         """Solution (K, C, U) of the normal equations for right sides (K, C, U)."""
         return self._solution(lambda part: right[..., part], right)
 
+    def in_windows(self, values: Tensor) -> Tensor:
+        """Windows (R, C, n S) of the rows of values (K, C, S)."""
+        return torch.stack([values[window] for window in self._windows], dim=-2).flatten(-2)
+
+    def joined(self, values: Tensor) -> Tensor:
+        """The opposite of ``in_windows``."""
+        return join_windows(values.unflatten(-1, (len(self._windows), -1)), self._windows)
+
     def _solution(self, right_side: Callable[[slice], Tensor], given: Tensor) -> Tensor:
         """Solution (K, C, U) for right sides (K, C, S) of parts of the frequencies, computed from ``given``."""
         interpolated: dict[int, BandedFactor] = {}  # of each thread, in memory that is used again
 
         def solve(number: int, thread: int | None = None) -> Tensor:
-            part = self._parts[number]
+            part = self.parts[number]
             u = self.u[part]
-            right = right_side(part)
-            right = torch.stack([right[window] for window in self._windows], dim=-2).flatten(-2)
+            right = self.in_windows(right_side(part))
             if self._interpolated is not None:
                 factor = self._interpolated.at(part, None if thread is None else interpolated.get(thread))
                 if thread is not None:
@@ -206,24 +221,32 @@ class SceneSolver:
                 shape = (*left.shape[:2], len(self._windows) * len(u))
                 out = None if thread is None else self._partition.buffer(thread, shape, given)
                 solution = solve_skewed(self._normal.at(u, self.precision[..., part], out), right)
-            return join_windows(solution.unflatten(-1, (-1, len(u))), self._windows)
+            return self.joined(solution)
 
         if self._differentiates(given):
-            return torch.cat([solve(number) for number in range(len(self._parts))], dim=-1)
+            return torch.cat([solve(number) for number in range(len(self.parts))], dim=-1)
         coefficients: Tensor = given.new_empty(self.observation.count, given.shape[1], len(self.u))
-        threads = min(Partition.threads(given.device), len(self._parts))
+        threads = min(Partition.threads(given.device), len(self.parts))
 
         def share(thread: int) -> None:
-            for number in range(thread, len(self._parts), threads):
-                coefficients[..., self._parts[number]] = solve(number, thread)
+            for number in range(thread, len(self.parts), threads):
+                coefficients[..., self.parts[number]] = solve(number, thread)
 
         in_parallel(share, range(threads), given.device)
         return coefficients
 
+    def whole_system(self) -> Tensor:
+        """Skewed bands (R + b, 2 b + 1, n U) of all windows and frequencies."""
+        return self._normal.at(self.u, self.precision)
+
+    def whole_right_side(self, data: Tensor) -> Tensor:
+        """Their right sides (R, C, n U), for data as in ``fit``."""
+        return self.in_windows(self.right_side(data))
+
     def predict(self, coefficients: Tensor) -> Tensor:
         """Noiseless frames (M, C, R, L) of a scene, ``K c``."""
         spectra = [
-            self.observation.forward(coefficients[..., part], self.u[part], part, self.length) for part in self._parts
+            self.observation.forward(coefficients[..., part], self.u[part], part, self.length) for part in self.parts
         ]
         images: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1), n=self.length)
         return images
@@ -260,3 +283,31 @@ class SceneProblem:
         """
         observation = self.observation if weight is None else self.observation.weighted(weight)
         return SceneSolver(observation, self.precision, self.data.shape[-1], self.partition, keep=keep)
+
+
+_SIDE_BY_SIDE = 512  # frequencies from which a step of the elimination takes longer than its call
+
+
+def scenes_side_by_side(problems: Sequence[SceneProblem]) -> list[Tensor]:
+    """Scenes (C, R, L) of problems of narrow frames, whose systems are solved together if they have the same size.
+
+    A step of the elimination for the frequencies of one strip of columns takes less time than its call: seven strips of
+    384 rows and 112 columns take 0.4 of the time together.
+    """
+    solvers = [problem.solver() for problem in problems]
+    coefficients: list[Tensor | None] = [None] * len(problems)
+    alike: dict[tuple[int, ...], list[int]] = {}
+    for number, (problem, solver) in enumerate(zip(problems, solvers, strict=True)):
+        if len(solver.parts) > 1 or solver.interpolates:
+            coefficients[number] = solver.fit(problem.data)
+        else:
+            alike.setdefault((*solver.size, problem.data.shape[1]), []).append(number)
+    for (_, _, systems, _), numbers in alike.items():
+        most = max(1, _SIDE_BY_SIDE // systems)
+        for first in range(0, len(numbers), most):
+            some = numbers[first : first + most]
+            right = torch.cat([solvers[number].whole_right_side(problems[number].data) for number in some], -1)
+            system = torch.cat([solvers[number].whole_system() for number in some], -1)
+            for number, solution in zip(some, solve_skewed(system, right).chunk(len(some), -1), strict=True):
+                coefficients[number] = solvers[number].joined(solution)
+    return [solver.scene(own) for solver, own in zip(solvers, coefficients, strict=True) if own is not None]
