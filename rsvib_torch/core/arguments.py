@@ -231,6 +231,8 @@ def check_broadcast(**tensors: Any) -> None:
         ValueError: u and v do not fit together: (3,), (2,)
     """
     given = {name: value for name, value in tensors.items() if isinstance(value, Tensor)}
+    if len(given) < 2:
+        return
     try:
         torch.broadcast_tensors(*given.values())  # torch.broadcast_shapes takes 40 us, and its first call imports sympy
     except RuntimeError as error:

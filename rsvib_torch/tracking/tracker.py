@@ -72,7 +72,7 @@ _STARTS: tuple[tuple[DetectionMethod, Literal["auto"] | int], ...] = (("bands", 
 _MIN_CORRELATION = 0.3  # of the typical band with the next frame; bands of independent noise reach 0.1
 _MAX_DOUBLED = 4  # times that the number of frames between two attempts to detect the vibration is doubled
 # The direct method takes up to ten times as long as bands (9 s for eight frames of a flying drone without a tone)
-_DIRECT_ATTEMPTS = 2  # consecutive attempts, after which only bands are tried
+_DIRECT_ATTEMPTS, _FEW_ROWS = 2, 256  # consecutive attempts, after which only bands are tried unless there are few
 _PATIENCE = 3  # consecutive frames that contradict the tones, before the vibration is detected again
 
 
@@ -460,7 +460,7 @@ class VibrationTracker:
         # too few bands are registered, or the fit diverges: the next frames may be better
         with suppress(ValueError, OverflowError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
             # the filter measures the rows, so that bands are a sufficient start; small frames have too few of them
-            for method, tones in _STARTS[: 2 if self._attempts <= _DIRECT_ATTEMPTS else 1]:
+            for method, tones in _STARTS[: 2 if self._attempts <= _DIRECT_ATTEMPTS or stack.shape[-2] < _FEW_ROWS else 1]:
                 found = detect_vibration(
                     stack,
                     timing,

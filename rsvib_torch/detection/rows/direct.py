@@ -337,10 +337,10 @@ def _stalled(sizes: list[Tensor], record: RowRecord, fit: ToneFit) -> Tensor:
 
 
 def _converged(previous: ToneFit, fit: ToneFit, ratio: Tensor | None) -> Tensor:
-    """(B, A) bool, whether the next round is expected to change the tones of an axis by a twentieth of their std.
+    """(B, A) bool, whether the next round is expected to change the tones of an axis by 8 % of their std.
 
     Without long exposures a step is a tenth of the previous one or shorter. Changes of up to half a standard deviation
-    are therefore small enough, and up to 1.5 standard deviations if the measured ratio of two steps allows it.
+    are therefore small enough, and up to three standard deviations if the measured ratio of two steps allows it.
 
     Args:
         previous: The fit of the previous round.
@@ -355,7 +355,7 @@ def _converged(previous: ToneFit, fit: ToneFit, ratio: Tensor | None) -> Tensor:
     change = (previous.about(fit.centre).coefficients - fit.coefficients).abs()
     max_change_std = change.new_full((), 0.5)
     if ratio is not None:
-        max_change_std = (0.05 / ratio.clamp(min=1e-3)).clamp(0.5, 1.5)[:, None, None]
+        max_change_std = (0.08 / ratio.clamp(min=1e-3)).clamp(0.5, 3.0)[:, None, None]
     small = (change <= max_change_std * std[..., :2].amax(-1)) & (
         (previous.frequencies - fit.frequencies).abs() <= max_change_std * std[..., 2]
     )

@@ -554,17 +554,16 @@ def blur_ratio(
         change = (0.5 * (moments[:, 1:] - moments[:, :-1]))[:, :, 1:-1, None]
         before, here, after = mean[:, :, :-2], mean[:, :, 1:-1], mean[:, :, 2:]
         by_x = (2j * math.pi * u[low]).to(mean.dtype)
-        expected = change[..., 0, 0] * by_x.square() * here + change[..., 1, 1] * (after - 2 * here + before) / block**2
-        expected = expected + change[..., 0, 1] * by_x * (after - before) / block
+        change = change.to(by_x.dtype)
+        expected = (change[..., 0, 0] * by_x.square()) * here
+        expected += (change[..., 1, 1] / block**2) * (after - 2 * here + before)
+        expected += (change[..., 0, 1] / block * by_x) * (after - before)
         both = (visible[:, 1:] * visible[:, :-1] == 1).double()
-        weight = (both[:, :, 1:-1] * both[:, :, 2:] * both[:, :, :-2])[..., None]
-        columns = torch.view_as_real(torch.stack([expected.to(mean.dtype), here], -1)).movedim(-1, -2)  # (..., 2, 2)
-        values = torch.view_as_real(difference[:, :, 1:-1])
-        columns, values = (part.double().flatten(1, -1 - rank) for part, rank in ((columns, 1), (values, 0)))
-        weight = weight[..., None].expand(*weight.shape[:-1], low.stop - low.start, 2).flatten(1)
-        weighted = (columns * weight[..., None]).mT
-        right = (weighted @ values[..., None])[..., 0]
-        sums.append((weighted @ columns, right, (weight * values.square()).sum(1), weight.sum(1)))
+        weight = both[:, :, 1:-1] * both[:, :, 2:] * both[:, :, :-2]
+        values = torch.view_as_real(torch.stack([expected, here, difference[:, :, 1:-1]], -2)).flatten(-2)
+        of_rows = (values @ values.mT).double()  # (B, G - 1, S, 3, 3)
+        products = torch.einsum("bgs,bgsij->bij", weight, of_rows)
+        sums.append((products[:, :2, :2], products[:, :2, 2], products[:, 2, 2], values.shape[-1] * weight.sum((1, 2))))
     normal, right, square, count = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
     scale = normal.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).sqrt()
     inverse = torch.linalg.inv(
