@@ -460,7 +460,8 @@ class VibrationTracker:
         # too few bands are registered, or the fit diverges: the next frames may be better
         with suppress(ValueError, OverflowError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
             # the filter measures the rows, so that bands are a sufficient start; small frames have too few of them
-            for method, tones in _STARTS[: 2 if self._attempts <= _DIRECT_ATTEMPTS or stack.shape[-2] < _FEW_ROWS else 1]:
+            only_bands = self._attempts > _DIRECT_ATTEMPTS and stack.shape[-2] >= _FEW_ROWS
+            for method, tones in _STARTS[:1] if only_bands else _STARTS:
                 found = detect_vibration(
                     stack,
                     timing,
