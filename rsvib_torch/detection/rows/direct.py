@@ -202,10 +202,9 @@ def _refine(
     interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)  # exposures average out faster tones
     blind = blind_frequencies(timing, 0.5 / interval).to(motion.device)
     for number in range(max_rounds):
-        record = rows.measure(motion, gradients)
+        record, previous = rows.measure(motion, gradients), fit
         measurements = record.measurements
         residual = residual_of(measurements, fit)
-        previous = fit
         size = measurements.sizes(residual).nanmedian(1).values
         sizes = [*sizes, size] if number != search_round else []  # fewer tones before the search
         if number == search_round:
@@ -245,7 +244,21 @@ def _refine(
             step = _Step.between(measurements, warped_by, motion)
         if float(step.change.abs().amax()) > 0.05:  # px; over smaller distances the gradients of the scene are the same
             gradients = None
-    return replace(_conclude(record, fit), has_pattern=patterns.found)
+    found = replace(_conclude(record, fit), has_pattern=patterns.found)
+    return found if number < max_rounds - 1 else _with_last_step(found, warped_by, motion)
+
+
+def _with_last_step(found: DirectFit, warped_by: Motion, motion: Motion) -> DirectFit:
+    """The fit after the largest number of rounds: what the last one changed counts as motion that is not explained.
+
+    The axes count alike, because the displacement along one determines which rows are compared along the other. Tones
+    of 10 to 40 px in three frames with a long exposure did not converge: they were wrong, with a permitted residual.
+    """
+    change = _Step.between(found.measurements, warped_by, motion).change
+    distance = found.measurements.distances(change).square().nanmean(1).nan_to_num(0.0).sqrt()
+    other = found.other_motion
+    least = (distance / other.permitted).amax(-1, keepdim=True) * other.permitted
+    return replace(found, other_motion=replace(other, unexplained=torch.maximum(other.unexplained, least)))
 
 
 def _abandon_if_large(record: RowRecord, fit: ToneFit) -> None:
