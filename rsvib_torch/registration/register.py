@@ -211,8 +211,7 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     coarse = torch.cat([_coarse_offsets(grey[:, pair.start : pair.stop + 1]) for pair in at_once], 1).flatten(0, 1)
     bytes_of_pair = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4
     offsets, quality = [], []
-    # 128 MiB of windows at a time; 256 MiB take a fifth longer
-    parts = runs(len(first), max(1, 2**27 // bytes_of_pair))
+    parts = runs(len(first), max(1, 2**27 // bytes_of_pair))  # 128 MiB of windows; 256 MiB take a fifth longer
     advance = steps(len(first), "pairs")
     for pair in parts:
         task = BandTask(first[pair], second[pair], coarse[pair], tops, band_rows, search)

@@ -324,9 +324,9 @@ def tone_fit(coefficients, frequencies):
         (0.6, 0.5, False),  # slow convergence: as without a ratio
         (0.4, 0.9, True),
         (0.6, 0.05, True),  # fast convergence: the next change is a twentieth of this one
-        (1.4, 0.05, False),
+        (1.4, 0.07, False),
         (1.4, 0.02, True),
-        (1.6, 0.001, False),
+        (3.1, 0.001, False),
     ],
 )
 def test_convergence_follows_from_the_change_and_the_ratio_of_steps(change, ratio, converged):
