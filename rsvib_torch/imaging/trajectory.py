@@ -104,8 +104,8 @@ def rows_showing(
     """Frame rows r(s) that show scene rows s: the solution of ``r = s + Y(t(r))``.
 
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
-    Secant method, with half the evaluations of the motion that Newton's method takes. ``|dY/dt| T_row`` is 0.02 for
-    5 px at 30 Hz, and must stay below 1: content that moves along the scan as fast as the rows is never passed.
+    Newton's method; ``|dY/dt| T_row`` is 0.02 for 5 px at 30 Hz, and must stay below 1: content that moves along the
+    scan as fast as the rows is never passed.
 
     Args:
         scene_rows: Scene rows s, float64, shape S (batch dimensions of the vibration lead).
@@ -121,16 +121,18 @@ def rows_showing(
     exposure_time = timing.exposure_time if exposure_time is None else exposure_time
     scene_rows = scene_rows.to(torch.float64)
     rows = scene_rows + torch.zeros_like(frame_start)
-    slope, earlier = torch.zeros_like(rows), None
-    for iteration in range(16):
-        places = scene_rows + vibration.mean_displacement(frame_start + rows * timing.row_time, exposure_time)[..., 1]
-        if earlier is not None:  # over shorter distances than 1e-6 px the difference is rounding
-            passed, moved = rows.detach() - earlier[0], places.detach() - earlier[1]
-            far = passed.abs() > 1e-6
-            slope = torch.where(far, moved / torch.where(far, passed, 1.0), slope)
-        earlier = rows.detach(), places.detach()
-        step = (places - rows) / (1.0 - slope).clamp(min=0.1)  # the limit keeps steps finite near slope 1
+    slope = torch.zeros_like(rows)
+    for iteration in range(8):
+        starts = frame_start + rows * timing.row_time
+        residual = scene_rows + vibration.mean_displacement(starts, exposure_time)[..., 1] - rows
+        # three steps are enough for most motions; the third keeps the slope of the second
+        last_of_three = iteration == 2
+        if not last_of_three:
+            # derivative of the mean displacement, which differs from the velocity for periods as short as exposures
+            ends = vibration.displacement(torch.stack([starts, starts + exposure_time], -1))[..., 1].detach()
+            slope = (ends[..., 1] - ends[..., 0]) * (timing.row_time / exposure_time)
+        step = residual / (1.0 - slope).clamp(min=0.1)  # the limit keeps steps finite near slope 1
         rows = rows + step
-        if iteration > 1 and bool((step.abs() < 1e-6).all()):  # px; the error is then below 1e-9 px
+        if last_of_three and bool((step.abs() < 1e-9).all()):  # px, far below any measurement
             break
     return rows
