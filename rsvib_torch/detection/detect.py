@@ -42,7 +42,6 @@ from rsvib_torch.detection.tones.further import with_further_tones
 from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE, find_tones, robust_fit
 from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.orientation import offsets_from_row_order
-from rsvib_torch.imaging.trajectory import gauss_node_count
 from rsvib_torch.io.files import FramesOrFiles, timing_of_files
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
@@ -170,11 +169,6 @@ def _band_offsets(start: BandStart, fit: ToneFit) -> Tensor:
     return offsets
 
 
-# of an exposure. A scene of two waves agreed with 325 and 411 Hz and another timing, and one round with 165 nodes took
-# 18 times as long as detection in other frames; correct alternatives have 5 to 15
-_MAX_TRIED_NODES = 32
-
-
 def _fit_direct(
     start: BandStart, frames: Tensor, valid: Tensor | None, timing: RowTiming, options: _FitOptions
 ) -> _Found:
@@ -183,8 +177,6 @@ def _fit_direct(
     fit = _fit_bands(start, frames, valid, timing, options, accuracy=0.15).fit
     intervals = compared_intervals(timing, frames.shape[1], MAX_GROUP_FRAMES, frames.device)
     motion, scale = shrunk_motion(fit, intervals), options.scale
-    if options.is_trial and gauss_node_count(motion, timing.exposure_time) > _MAX_TRIED_NODES:
-        raise AbandonedError
     if scale.same_for_all_columns:
         rows = whole_rows(frames, valid, timing, motion)
     else:  # equal blur takes several times as long, and is not needed to find that there is no roll
