@@ -1,5 +1,6 @@
 """``torch.set_default_dtype`` and ``torch.set_default_device`` do not change results."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -78,6 +79,8 @@ def assert_same(expected, got, name):
     if isinstance(expected, torch.Tensor):
         assert (got.device, got.dtype) == (expected.device, expected.dtype), name
         torch.testing.assert_close(got, expected, rtol=0, atol=0, equal_nan=True, msg=lambda text: f"{name}: {text}")
+    elif dataclasses.is_dataclass(expected):
+        assert_same(vars(expected), vars(got), name)
     elif isinstance(expected, dict):
         assert expected.keys() == got.keys()
         for key, value in expected.items():
