@@ -18,7 +18,7 @@ __all__ = ["period_factor"]
 _ROWS = (32, 128)  # measured rows that are used in the search and its refinement; more rows take longer only
 _SHORTEST, _LONGEST, _STEP = 0.8, 1.5, 0.02  # frame periods that are tried, over the stated one
 _LEVELS, _POINTS = 4, 9  # refinement of the best one, each level in steps four times smaller
-# of the square of the residual with the stated timing: 41 correct alternatives reached 0.1 or less, 0.1 after the first
+# of the square of the residual with the stated timing: 41 correct alternatives reached 0.1 or less after the first
 # level. Of 17 wrong ones between 0.2 and 0.5, detection agreed with none
 _SMALLER = 0.2
 _ITERATIONS = 5  # of fits; most factors are wrong, and their fits converge slowly

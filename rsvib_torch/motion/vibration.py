@@ -76,22 +76,20 @@ def _with_trailing(value: float | Tensor, dimensions: int) -> float | Tensor:
 
 
 @lru_cache(maxsize=64)
-def _range_of(counts: tuple[tuple[str, int], ...], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Smallest and largest permitted value of each of some numbers of values; cached, do not modify them."""
+def _ranges(counts: tuple[tuple[str, int], ...], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Number of values of each quantity, and its smallest and largest permitted value (2, n); do not modify them."""
     with torch.inference_mode(False):
         numbers = torch.tensor([count for _, count in counts], device=device)
-        high = torch.tensor([_LIMITS[name] for name, _ in counts], dtype=torch.float64, device=device)
-        low = torch.tensor(
-            [0.0 if name in _NOT_NEGATIVE else -_LIMITS[name] for name, _ in counts], dtype=torch.float64, device=device
-        )
-        return low.repeat_interleave(numbers), high.repeat_interleave(numbers)
+        high = [_LIMITS[name] for name, _ in counts]
+        low = [0.0 if name in _NOT_NEGATIVE else -_LIMITS[name] for name, _ in counts]
+        return numbers, torch.tensor([low, high], dtype=torch.float64, device=device)
 
 
 def _check_values(values: dict[str, Tensor]) -> None:
     """Raise a ValueError for values that are not finite or too large, and for negative amplitudes or frequencies."""
     flat = torch.cat([tensor.detach().flatten() for tensor in values.values()])
-    range_of = _range_of if len(flat) <= 1024 else _range_of.__wrapped__  # large ranges are not kept
-    low, high = range_of(tuple((name, tensor.numel()) for name, tensor in values.items()), flat.device)
+    numbers, ranges = _ranges(tuple((name, tensor.numel()) for name, tensor in values.items()), flat.device)
+    low, high = ranges.repeat_interleave(numbers, dim=1, output_size=len(flat))
     if bool(((flat >= low) & (flat <= high)).all()):  # of all values at once: the tracker checks many small motions
         return
     for name, tensor in values.items():

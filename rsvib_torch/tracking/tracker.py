@@ -133,9 +133,15 @@ class TrackedFrame:
 
 @dataclass(frozen=True, eq=False)
 class _Reference:
-    """The frame before: its spectra and time; the gradients of the scene, their ``differential_motion``, path and age.
+    """The frame before.
 
-    The age is in frames.
+    Attributes:
+        spectra: Its spectra.
+        start: s, exposure start of its first row.
+        gradients: Gradients of the scene; None if they are not known.
+        apart: Their ``differential_motion``.
+        path: Path at which they were computed.
+        age: Number of frames since then.
     """
 
     spectra: RowSpectra
@@ -342,7 +348,7 @@ class VibrationTracker:
             corrected = state.updated(measurements, centre, noise_factor)
             tones, drift = corrected.explained(measurements, centre)
             change = tones + drift
-            change = change - measurements.relative(
+            change -= measurements.relative(
                 motion.mean_displacement(measurements.exposure_starts, self._rows.exposure_time)
             )
             if float(change.abs().amax()) < _MAX_CHANGE:

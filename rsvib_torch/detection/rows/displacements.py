@@ -433,12 +433,7 @@ def differential_motion(gradients: list[RowGradients], *, rows: int = 64) -> Ten
         gradients: Gradients of all groups, from ``measure_groups``.
         rows: Rows over which the sums are taken.
     """
-    excesses = []
-    for own in gradients:
-        residual, noise, regular = displacements_of_parts(own, rows, parts=2)
-        excess = (residual[:, :, 1] - residual[:, :, 0]).square() - noise.sum(2)
-        excesses.append(torch.where(regular[..., None], excess, torch.nan))
-    return trimmed_mean(torch.cat(excesses, 1)).clamp(min=0.0).sqrt()
+    return _rms_of_contrasts(gradients, rows, [[-1.0, 1.0]])
 
 
 def uneven_motion(gradients: list[RowGradients], *, rows: int = 64) -> Tensor:
@@ -450,15 +445,24 @@ def uneven_motion(gradients: list[RowGradients], *, rows: int = 64) -> Tensor:
         gradients: Gradients of all groups, from ``measure_groups``.
         rows: Rows over which the sums are taken.
     """
+    quadratic, cubic = [0.5, -0.5, -0.5, 0.5], [value / math.sqrt(20) for value in (-1.0, 3.0, -3.0, 1.0)]
+    return _rms_of_contrasts(gradients, rows, [quadratic, cubic])
+
+
+def _rms_of_contrasts(gradients: list[RowGradients], rows: int, weights: list[list[float]]) -> Tensor:
+    """(B, 2) px, root of the trimmed mean of the sum of squared contrasts between the parts of the rows; without noise.
+
+    Args:
+        gradients: Gradients of all groups.
+        rows: Rows over which the sums are taken.
+        weights: Weights of the parts in each contrast.
+    """
     excesses = []
     for own in gradients:
-        residual, noise, regular = displacements_of_parts(own, rows)
-        curved = residual.new_tensor(
-            [[0.5, -0.5, -0.5, 0.5], [-1.0, 3.0, -3.0, 1.0]]
-        )  # quadratic and cubic in the column
-        curved[1] /= math.sqrt(20)
-        excess = (curved @ residual).square() - curved.square() @ noise
-        excesses.append(torch.where(regular[..., None], excess.sum(2), torch.nan))
+        residual, noise, regular = displacements_of_parts(own, rows, len(weights[0]))
+        contrasts = residual.new_tensor(weights)
+        excess = ((contrasts @ residual).square() - contrasts.square() @ noise).sum(2)
+        excesses.append(torch.where(regular[..., None], excess, torch.nan))
     return trimmed_mean(torch.cat(excesses, 1)).clamp(min=0.0).sqrt()
 
 
