@@ -57,7 +57,7 @@ def results():
     edge = (0.2 + 0.6 / (1 + np.exp(-(columns - 24 - 0.1 * (rows - 32)) / 0.7))).astype(np.float32)
     edge = torch.from_numpy(edge).clone()  # aligned as all tensors are: sums depend on it
     found["mtf"] = rsv.slanted_edge_mtf(edge).to_dict()
-    found["edges"] = [str(one) for one in rsv.find_slanted_edges(edge)]
+    found["edges"] = rsv.find_slanted_edges(edge)
     light = [0.5 + 0.3 * np.sin(rows * 0.6283 + phase) for phase in (0.3, 1.1)]
     found["row time"] = rsv.calibrate_row_time(torch.from_numpy(np.stack(light)).clone(), 1000.0).to_dict()
     psf = rsv.row_psf(VIBRATION, TIMING.row_starts(1, 96)[0], TIMING, interpolation="cubic", quadrature="gauss")
@@ -90,8 +90,9 @@ def assert_same(expected, got, name):
         for first, second in zip(expected, got, strict=True):
             assert_same(first, second, name)
     elif isinstance(expected, float):
-        # the alignment of NumPy arrays in memory changes the last bit of sums in libraries
-        assert math.isclose(got, expected, rel_tol=1e-12) or repr(expected) == repr(got), name
+        # the alignment of NumPy arrays in memory changes the last bits of sums in libraries, and a fit changes with
+        # them (1.5e-11 was measured); a default of float32 would change 1e-7
+        assert math.isclose(got, expected, rel_tol=1e-9) or repr(expected) == repr(got), name
     else:
         assert repr(expected) == repr(got), name
 
