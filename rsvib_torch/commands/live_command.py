@@ -282,6 +282,8 @@ def _answer(source: str, report: LiveReport, files: list[Path], *, drops: bool) 
         f"dropped {report.dropped}, not delivered {report.lost}, unusable {report.unusable}; vibration detected "
         f"{number_of(report.detections, 'time')}",
     ]
+    if report.predicted:
+        lines.append(f"{number_of(report.predicted, 'late frame')} predicted instead of measured")
     if drops:
         lines.append(
             f"delay: {report.latency(0.5)} frame periods in the median, {report.latency(0.99)} in 99 % of the frames"
@@ -290,6 +292,7 @@ def _answer(source: str, report: LiveReport, files: list[Path], *, drops: bool) 
     data = {
         "frames": report.frames,
         "tracked": report.tracked,
+        "predicted": report.predicted,
         "unusable": report.unusable,
         "dropped": report.dropped,
         "lost": report.lost,

@@ -259,6 +259,15 @@ class ToneFilter:
         drift = (self.probability[..., None] * self.drift).sum(1)
         return step * drift[:, 0] + 0.5 * step**2 * drift[:, 1]
 
+    def path_std(self, step: float) -> float:
+        """px, standard deviation of ``path`` by the most probable filter; of the worse axis."""
+        best = self.probability.argmax(-1)
+        covariance = self.covariance[..., -2:, -2:].take_along_dim(best[:, None, None, None], 1)[:, 0]
+        jerk = covariance.new_tensor(PROCESS_NOISE)[best, 1]
+        powers = covariance.new_tensor([step, 0.5 * step**2])
+        variance = (covariance @ powers) @ powers + jerk.square() * (abs(step) ** 5 / 20)
+        return float(variance.clamp(min=0.0).amax().sqrt())
+
     def displacement_std(self) -> float:
         """px, standard deviation of the tones at the reference time, by the most probable filter; of the worse axis."""
         best = self.probability.argmax(-1)[:, None, None]

@@ -155,9 +155,11 @@ def session(pixels: NDArray[np.uint8], size: int, minutes: float) -> dict[str, A
         "delay_99": report.latency(0.99),
         "within_two": sum(report.latencies[:3]) / max(report.frames, 1),
         "cpu": 1e3 * (cpu.user + cpu.system - begin.user - begin.system) / max(report.frames, 1),
-        "memory": memory[-1] / 2**20,
-        "drift": float(np.mean(memory[half:]) / np.mean(memory[min(5, half - 1) : half]) - 1),
+        "memory": max(memory) / 2**20,
+        # of the largest values: the C library returns freed memory in steps of tens of MiB
+        "drift": max(memory[half:]) / max(memory[min(5, half - 1) : half]) - 1,
         "tracked": report.tracked / max(report.frames, 1),
+        "predicted": report.predicted,
         "detections": report.detections,
     }
 
@@ -288,8 +290,9 @@ def lines(rows: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
         f"| delay of the written frames in frame periods: median, 99 % | {one['delay_median']}, {one['delay_99']} |",
         f"| frames with a delay of at most 2 frame periods | {one['within_two']:.1%} |",
         f"| processor time per frame | {one['cpu']:.0f} ms |",
-        f"| resident memory at the end, change between the halves | {one['memory']:.0f} MiB, {one['drift']:+.1%} |",
-        f"| frames with known motion, detections | {one['tracked']:.1%}, {one['detections']} |",
+        f"| largest resident memory, change between the halves | {one['memory']:.0f} MiB, {one['drift']:+.1%} |",
+        f"| frames with known motion, late ones that were predicted, detections | {one['tracked']:.1%}, "
+        f"{one['predicted']}, {one['detections']} |",
     ]
     for place, (quantity, unit) in enumerate((("amplitude", "px"), ("frequency", "Hz"))):
         ours, batch = (math.hypot(*errors_of[name][place]) / math.sqrt(2) for name in ("errors", "batch_errors"))

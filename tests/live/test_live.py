@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from truth import draw_scene
 
 import rsvib_torch as rsv
 from rsvib_torch import live
@@ -263,6 +264,42 @@ def test_frames_before_an_error_of_the_source_are_not_lost(tmp_path):
         live.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False)
     assert rsv.read_stack_info(tmp_path / "video.mkv").shape == (3, 1, 1)
     assert source.closed
+
+
+class Shaking:
+    """Frames of a vibrating camera at its rate."""
+
+    full_scale, lost = None, 0
+
+    def __init__(self, pixels):
+        self.pixels = pixels
+
+    def frames(self):
+        begin = time.perf_counter()
+        for index, pixels in enumerate(self.pixels):
+            time.sleep(max(0.0, begin + index * TIMING.frame_period - time.perf_counter()))
+            yield live.TimedFrame(pixels, index * TIMING.frame_period, time.perf_counter())
+
+    def close(self):
+        pass
+
+
+class SlowTracker(rsv.VibrationTracker):
+    """A tracker that needs 1.2 frame periods to measure a frame."""
+
+    def _follow(self, *arguments):
+        begin = time.perf_counter()
+        super()._follow(*arguments)
+        time.sleep(max(0.0, begin + 1.2 * TIMING.frame_period - time.perf_counter()))
+
+
+@pytest.mark.parametrize("drops", [True, False])
+def test_the_motion_of_late_frames_is_predicted(drops):
+    vibration = rsv.Vibration([2.1, 1.6], [0.37 / TIMING.frame_period] * 2, [0.5, 1.0])
+    frames = rsv.simulate_frames(draw_scene(200, 200, seed=3), TIMING, vibration, 40, frame_size=(160, 160)).numpy()
+    report = live.run_live(Shaking(frames), SlowTracker(TIMING, columns=None), [], drops=drops)
+    assert (report.frames, report.dropped) == (40, 0)
+    assert (report.predicted > 5) == drops
 
 
 def test_an_error_of_an_output_ends_the_session(tmp_path):

@@ -132,6 +132,32 @@ def test_dropped_frames_are_handled_by_their_times(steady):
     assert max(abs(errors(one.detection)).max() for one in untold[8:] if one.detection is not None) > 0.03
 
 
+def test_the_motion_of_late_frames_is_predicted(steady):
+    frames, measured = steady
+    tracker, still = rsv.VibrationTracker(TIMING, columns=None), crop(SCENE)
+    for index, frame in enumerate(frames):
+        is_late = index >= 12 and index % 2 > 0
+        tracked = tracker.update(frame, measure=not is_late)
+        assert tracked.state == measured[index].state
+        if not is_late:
+            continue
+        assert tracked.measurements is None
+        assert decibel(tracked.restored, still) > decibel(measured[index].restored, still) - 0.3
+        found = tracked.detection
+        assert np.abs(errors(found)).max() < 0.01
+        truth = 2 * np.pi * F * (index / RATE) + np.array([0.5, 1.0])
+        assert np.abs(np.angle(np.exp(1j * (found.vibration.phase[:, 0].numpy() - truth)))).max() < 0.01
+
+
+def test_a_late_frame_whose_motion_is_uncertain_is_measured():
+    def path(t):
+        return 8.0 * np.sin(2 * np.pi * 3.1 * t), 6.0 * np.sin(2 * np.pi * 2.3 * t + 1.0)
+
+    tracker = rsv.VibrationTracker(TIMING, columns=None)
+    late = [tracker.update(frame, measure=index % 2 == 0) for index, frame in enumerate(taken(Sines(path=path), 24))]
+    assert all(one.measurements is not None for one in late[5::2])
+
+
 def test_the_number_of_tones_changes():
     def path(t):
         return 0.9 * (t > 0.25) * np.sin(2 * np.pi * 97.0 * t), 0 * t
