@@ -19,8 +19,8 @@ from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.other_timing import period_factor
 from rsvib_torch.detection.reliability import contradicted_axes, judge, rotation_found, rotation_possible
-from rsvib_torch.detection.result import DetectionResult, OtherMotion, stacked
-from rsvib_torch.detection.rows.direct import AbandonedError, refine_directly
+from rsvib_torch.detection.result import DetectionResult, stacked
+from rsvib_torch.detection.rows.direct import AbandonedError, DirectFit, refine_directly
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS, MAX_GROUP_FRAMES, compared_intervals
 from rsvib_torch.detection.rows.measured_rows import strip_rows, whole_rows
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
@@ -105,20 +105,14 @@ class _Found:
         measurements: The measurements with the weights of the fit.
         offsets: The same as offsets between consecutive frames.
         fitted: (B, P, N, 2) px, the offsets that it predicts for them.
-        other_motion: Motion that it does not explain; None if the method does not measure it.
-        aliasing: (B,) px, expected size of the bias of the displacements by aliasing; None if it is not known.
-        uneven: (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain; likewise.
-        has_pattern: Whether a pattern of columns was subtracted.
+        direct: The complete result of the direct method; None for bands.
     """
 
     fit: ToneFit
     measurements: Measurements
     offsets: OffsetCurve
     fitted: Tensor
-    other_motion: OtherMotion | None = None
-    aliasing: Tensor | None = None
-    uneven: Tensor | None = None
-    has_pattern: bool = False
+    direct: DirectFit | None = None
 
 
 _Fit = Callable[[BandStart, Tensor, Tensor | None, RowTiming, _FitOptions], _Found]
@@ -190,16 +184,7 @@ def _fit_direct(
         found, offsets, fitted = refine_directly(
             rows, intervals, found.fit, options.tones, has_pattern=options.has_pattern
         )
-    return _Found(
-        found.fit,
-        found.measurements,
-        offsets,
-        fitted,
-        found.other_motion,
-        found.aliasing,
-        found.uneven,
-        found.has_pattern,
-    )
+    return _Found(found.fit, found.measurements, offsets, fitted, found)
 
 
 _METHODS: dict[DetectionMethod, _Method] = {
@@ -589,14 +574,14 @@ def _detect(
     else:
         start = field_start(frames, valid, row_timing, bands, scale, translation)
     found = method.fit(start, frames, valid, row_timing, options)
-    other_motion, measured = found.other_motion, found.offsets
+    direct, measured = found.direct, found.offsets
     starts = row_timing.frame_starts(frames.shape[1], frames.device)[:, None]
     starts = (
         starts + torch.arange(frames.shape[-2], dtype=torch.float64, device=frames.device)[::8] * row_timing.row_time
     ).flatten()
     fit = found.fit
-    if found.aliasing is not None:
-        fit = without_aliasing(found.measurements, fit, found.aliasing)
+    if direct is not None:
+        fit = without_aliasing(found.measurements, fit, direct.aliasing)
     own_std = displacement_std(fit, starts, row_timing.exposure_time)
     fit, total_std = with_further_tones(found.measurements, fit, starts, number_is_known=options.tones is not None)
     vibration, std = vibration_of_fit(fit)
@@ -622,20 +607,21 @@ def _detect(
             displacement=moved[index].std(0, correction=0),
             own_std=own_std[index],
             timing=row_timing,
-            other_motion=None if other_motion is None else other_motion[index],
+            other_motion=None if direct is None else direct.other_motion[index],
             max_tones=max_tones,
             radius=scale.radius,
         )
         for index in range(len(frames))
     ]
     rotates, rolls, contradicted = [False] * len(frames), [False] * len(frames), [(False, False)] * len(frames)
-    if other_motion is not None and found.uneven is not None:
-        aspect = frames.shape[-2] / frames.shape[-1]
-        rolls = [rotation_possible(other_motion[index], found.uneven[index], aspect) for index in range(len(frames))]
-        rotates = [rotation_found(other_motion[index]) for index in range(len(frames))]
-        contradicted = [
-            contradicted_axes(vibration[index], other_motion[index], max_tones) for index in range(len(frames))
-        ]
+    if direct is not None:
+        aspect, others = (
+            frames.shape[-2] / frames.shape[-1],
+            [direct.other_motion[index] for index in range(len(frames))],
+        )
+        rolls = [rotation_possible(other, uneven, aspect) for other, uneven in zip(others, direct.uneven, strict=True)]
+        rotates = [rotation_found(other) for other in others]
+        contradicted = [contradicted_axes(vibration[index], other, max_tones) for index, other in enumerate(others)]
     reliable = torch.stack([verdict[0] for verdict in verdicts])
     swap = timing.scan_axis == -1
     order = ([1, 0, 2, 3] if swap else [0, 1, 2, 3])[: scale.axes]
@@ -664,7 +650,8 @@ def _detect(
         ),
         timing=timing,
     )
-    return _Detected(result, fit, found.measurements, rotates, rolls, contradicted, start.curve, found.has_pattern)
+    has_pattern = direct is not None and direct.has_pattern
+    return _Detected(result, fit, found.measurements, rotates, rolls, contradicted, start.curve, has_pattern)
 
 
 def _with_cause(

@@ -125,7 +125,7 @@ def refine_directly(
             tried = tried | mirrored
             other, _ = robust_fit(found.measurements, frequencies, strongest_only(found.fit).active, start.model)
             again = _refine(rows, intervals, other, tones, max_rounds, has_pattern=has_pattern)
-            found = _better_of_each(found, again)
+            found = replace(_better_of_each(found, again), has_pattern=found.has_pattern)  # it was subtracted before
     if tones is None:
         found = replace(found, fit=significant_only(found.measurements, found.fit, intervals))
     blur = rows.blur_ratio(shrunk_motion(found.fit, intervals))
