@@ -422,7 +422,11 @@ def _check_of_union(members: tuple[Any, ...], finite: bool) -> _Check | None:
     if any(getattr(member, "_is_protocol", False) for member in members):
         return None  # the function names what it accepts, and the remedy
 
+    accepts_none = types.NoneType in members
+
     def check(name: str, value: Any) -> None:
+        if value is None and accepts_none:
+            return
         errors = []
         for member in checks:
             try:
@@ -430,7 +434,8 @@ def _check_of_union(members: tuple[Any, ...], finite: bool) -> _Check | None:
                     member(name, value)
                 return
             except (TypeError, ValueError) as error:
-                errors.append(error)
+                # with its traceback, it would keep the tensors of all callers in memory until the garbage collection
+                errors.append(error.with_traceback(None))
         refused = [error for error in errors if isinstance(error, ValueError)]
         if len(errors) == 1 or refused:
             raise (refused or errors)[0]

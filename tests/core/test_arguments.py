@@ -1,5 +1,6 @@
 """Arguments of public functions: the message names the argument, whatever the value."""
 
+import gc
 import math
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import torch
 
 import rsvib_torch as rsv
 from rsvib_torch.core.arguments import as_numbers, check_device, check_shapes, check_tensor, checks_arguments
+from rsvib_torch.evaluation.scenes import city_and_fields
 
 TIMING = rsv.SensorTiming(1e-4, 6, 104)
 LONG = rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 2.0])
@@ -223,6 +225,35 @@ def test_checks_leave_calls_unchanged():
         scaled(values, names=("a",))
     with pytest.raises(TypeError, match=r"names\[1\] must be text"):
         scaled(values, names=("a", 1))
+
+
+def test_tensors_are_freed_without_garbage_collection():
+    """No cycle of references holds them, such as an exception that a check has caught, with its traceback."""
+    frames = rsv.simulate_frames(city_and_fields(160, 160, seed=3), TIMING, VIBRATION, 3, frame_size=(96, 96))
+
+    def work():
+        found = rsv.detect_vibration(frames, TIMING)
+        restored = rsv.restore(frames, TIMING, VIBRATION)
+        rsv.judge_restoration(frames, restored, TIMING, VIBRATION)
+        rsv.detect_motion(frames, TIMING)
+        tracker = rsv.VibrationTracker(TIMING, window=3)
+        for frame in frames:
+            tracked = tracker.update(frame)
+            _ = tracked.restored, tracked.detection
+        return found
+
+    work()  # tables that are kept
+    gc.collect()
+    gc.disable()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        work()
+        gc.collect()
+        assert not [one for one in gc.garbage if isinstance(one, torch.Tensor)]
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
 
 
 def test_helpers_return_the_values():
