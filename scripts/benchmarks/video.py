@@ -58,7 +58,7 @@ CODECS = "decoding, encoding and the rest"
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this section."""
-    parser.add_argument("--video-frames", type=int, default=60, help="frames of the video (default: 60)")
+    parser.add_argument("--video-frames", type=int, default=300, help="frames of the video (default: 300)")
     parser.add_argument("--video-rows", type=int, default=1080, help="rows of the video, 16:9 (default: 1080)")
 
 
