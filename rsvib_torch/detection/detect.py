@@ -615,10 +615,8 @@ def _detect(
     ]
     rotates, rolls, contradicted = [False] * len(frames), [False] * len(frames), [(False, False)] * len(frames)
     if direct is not None:
-        aspect, others = (
-            frames.shape[-2] / frames.shape[-1],
-            [direct.other_motion[index] for index in range(len(frames))],
-        )
+        aspect = frames.shape[-2] / frames.shape[-1]
+        others = [direct.other_motion[index] for index in range(len(frames))]
         rolls = [rotation_possible(other, uneven, aspect) for other, uneven in zip(others, direct.uneven, strict=True)]
         rotates = [rotation_found(other) for other in others]
         contradicted = [contradicted_axes(vibration[index], other, max_tones) for index, other in enumerate(others)]

@@ -62,9 +62,7 @@ __all__ = ["TrackedFrame", "TrackingState", "VibrationTracker", "displaced"]
 TrackingState = Literal["searching", "tracking", "unusable"]
 
 _MAX_PREDICTED_STD = 0.5  # px; the gradients of rows reach a few tenths of a pixel, and there are several rounds
-_MAX_UNMEASURED_STD = (
-    0.1  # px; predicted paths of hand-held cameras are wrong by up to 0.25 px, with 1 px by up to 0.6 px
-)
+_MAX_UNMEASURED_STD = 0.1  # px; paths of hand-held cameras are predicted within 0.25 px, with 1 px within 0.6 px
 _MAX_UNEXPLAINED = 1.0  # px, residual displacement of rows; they are not measured correctly over larger distances
 _MAX_CHANGE = 0.2  # px, by which a round may change the displacement of a row; otherwise the frame is measured again
 _MAX_ROUNDS = 3
