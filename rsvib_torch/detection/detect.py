@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.option_types import BandSettings, DetectionMethod, Registration, ToneSettings
-from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.other_timing import period_factor
 from rsvib_torch.detection.reliability import contradicted_axes, judge, rotation_found, rotation_possible
@@ -218,7 +218,7 @@ def detect_vibration(
 ) -> SweptTone: ...
 @outside_graphs
 @full_precision
-@torch.no_grad()
+@without_gradients
 @checks_arguments
 def detect_vibration(
     frames: FramesOrFiles,

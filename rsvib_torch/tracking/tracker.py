@@ -22,7 +22,7 @@ from torch import Tensor
 from rsvib_torch.core.arguments import as_numbers, checks_arguments
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.option_types import DetectionMethod
-from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.precision import full_precision, outside_graphs, outside_inference, without_gradients
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.reliability import contradicted_axes, judge
@@ -112,17 +112,17 @@ class TrackedFrame:
 
         Another thread may use it while the next frame is tracked.
         """
-        return self._restore(self.motion)
+        return outside_inference(self._restore(self.motion))
 
     @cached_property
     def detection(self) -> DetectionResult | None:
         """The vibration at this frame, with its time origin at the first row of this frame; None if none is known."""
-        return self._result()
+        return outside_inference(self._result())
 
     @cached_property
     def visible(self) -> Tensor:
         """(H, W) bool, pixels of the restored frame that the sensor recorded; the others are extrapolated."""
-        return self._visible(self.motion)
+        return outside_inference(self._visible(self.motion))
 
     def moved_to(self, place: Tensor) -> "TrackedFrame":
         """The same frame with its content at another place (2,) of the path in px, to stabilise a video.
@@ -259,7 +259,7 @@ class VibrationTracker:
 
     @outside_graphs
     @full_precision
-    @torch.no_grad()
+    @without_gradients
     @checks_arguments
     def update(self, frame: ArrayLike, time: float | None = None, *, measure: bool = True) -> TrackedFrame:
         """Process the next frame.

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text, wrapped
 from rsvib_torch.detection.measurements import Measurements
@@ -140,7 +140,7 @@ def align_motion(
 ) -> RotationAlignment: ...
 @outside_graphs
 @full_precision
-@torch.no_grad()
+@without_gradients
 @checks_arguments
 def align_motion(
     frames: FramesOrFiles,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.core.text import measured_text, text_table
@@ -80,7 +80,7 @@ class MotionCheck(
 
 @outside_graphs
 @full_precision
-@torch.no_grad()
+@without_gradients
 @checks_arguments
 def check_motion(
     frames: FramesOrFiles,

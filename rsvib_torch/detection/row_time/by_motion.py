@@ -7,12 +7,10 @@ import math
 from dataclasses import replace
 from typing import Literal
 
-import torch
-
 from rsvib_torch.calibration import RowTimeCalibration
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice, check_number
-from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.detection.row_time.by_free_motion import row_time_of_splines
 from rsvib_torch.detection.row_time.by_recording import row_time_of_recording
 from rsvib_torch.detection.row_time.by_tones import CameraClock, RowTimeFit, bands_of_frames, row_time_of_tones
@@ -33,7 +31,7 @@ SHORTEST_READOUT = 0.1  # of the frame period, if no row times are given
 
 @outside_graphs
 @full_precision
-@torch.no_grad()
+@without_gradients
 @checks_arguments
 def calibrate_row_time_by_motion(
     frames: FramesOrFiles,

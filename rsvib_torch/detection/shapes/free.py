@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.presentation import Result, axis_rows, verdict_table
 from rsvib_torch.core.splines import bspline_weights, gauss_legendre
 from rsvib_torch.core.text import measured_text
@@ -138,7 +138,7 @@ class MotionDetection(
 
 @outside_graphs
 @full_precision
-@torch.no_grad()
+@without_gradients
 @checks_arguments
 def detect_motion(
     frames: FramesOrFiles,

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.presentation import Result, axis_rows, verdict_lines, verdict_table
 from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.core.text import measured_text, text_table
@@ -132,7 +132,7 @@ class SweptTone(
 
 @outside_graphs
 @full_precision
-@torch.no_grad()
+@without_gradients
 @checks_arguments
 def detect_swept_tone(
     frames: FramesOrFiles,

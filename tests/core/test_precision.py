@@ -1,0 +1,67 @@
+"""Results of functions that run in inference mode: they can be differentiated and changed."""
+
+import dataclasses
+
+import pytest
+import torch
+
+import rsvib_torch as rsv
+from rsvib_torch.core.precision import outside_inference
+from rsvib_torch.evaluation.scenes import city_and_fields
+
+TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
+VIBRATION = rsv.Vibration([1.2, 0.8], [130.0, 170.0], [0.3, 0.9])
+
+
+@pytest.fixture(scope="module", name="frames")
+def make_frames():
+    return rsv.simulate_frames(city_and_fields(160, 160, seed=3), TIMING, VIBRATION, 3, frame_size=(96, 96))
+
+
+def inference_tensors(value, name):
+    """Names of the tensors of inference mode in a result."""
+    if isinstance(value, torch.Tensor):
+        return [name] if value.is_inference() else []
+    if dataclasses.is_dataclass(value):
+        value = vars(value)
+    entries = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, (list, tuple)) else ()
+    return [found for key, entry in entries for found in inference_tensors(entry, f"{name}.{key}")]
+
+
+def test_results_are_tensors_like_all_others(frames):
+    found, free = rsv.detect_vibration(frames, TIMING), rsv.detect_motion(frames, TIMING)
+    tracker = rsv.VibrationTracker(TIMING, window=3)
+    tracked = [tracker.update(frame) for frame in frames]
+    results = {
+        "tones": found,
+        "free": free,
+        "swept": rsv.detect_swept_tone(frames, TIMING),
+        "check": rsv.check_motion(frames, TIMING, free.motion),
+        "tracked": [(one, one.restored, one.detection, one.visible) for one in tracked],
+    }
+    assert inference_tensors(results, "results") == []
+    tracked[0].restored.add_(1.0)
+
+
+def test_restoration_with_a_detected_motion_is_differentiable(frames):
+    found = rsv.detect_vibration(frames, TIMING).vibration
+    found.amplitude.requires_grad_()
+    given = frames.clone().requires_grad_()
+    rsv.restore(given, TIMING, found).square().mean().backward()
+    assert float(given.grad.abs().max()) > 0
+    assert float(found.amplitude.grad.abs().max()) > 0
+
+
+def test_all_tensors_of_a_value_are_copied():
+    @dataclasses.dataclass(frozen=True)
+    class Pair:
+        one: torch.Tensor
+        others: tuple
+
+    with torch.inference_mode():
+        value = Pair(torch.ones(1), ({"a": torch.zeros(1)}, [torch.ones(2)], "text"))
+    assert len(inference_tensors(value, "")) == 3
+    copied = outside_inference(value)
+    assert inference_tensors(copied, "") == []
+    assert copied.others[0]["a"].tolist() == [0.0]
+    assert copied.others[2] == "text"
