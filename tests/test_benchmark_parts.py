@@ -354,7 +354,7 @@ def test_live(tmp_path):
     angle = 2 * live.np.pi * (52.0 * 1.3 + 1.0) + 0.5  # 2 Hz/s during one second: one cycle more
     assert changing.displacement(times)[0, -1] == pytest.approx(4.2 * live.np.sin(angle))
     session = {"name": "session", "frames": 300, "dropped": 0, "delay_median": 0, "delay_99": 1, "within_two": 1.0}
-    session |= {"cpu": 40.0, "memory": 500.0, "drift": 0.01, "tracked": 0.99, "detections": 1}
+    session |= {"cpu": 40.0, "memory": 500.0, "drift": 0.01, "tracked": 0.99, "predicted": 5, "detections": 1}
     accuracy = {
         "name": "accuracy",
         "errors": [[3e-4, 3e-4], [1e-3, 1e-3]],
