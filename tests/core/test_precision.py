@@ -43,6 +43,14 @@ def test_results_are_tensors_like_all_others(frames):
     tracked[0].restored.add_(1.0)
 
 
+def test_standard_deviations_in_inference_mode(frames):
+    expected = rsv.detect_swept_tone(frames, TIMING).std
+    with torch.inference_mode():
+        found = rsv.detect_swept_tone(frames, TIMING).std
+    assert all(torch.equal(found[name], expected[name]) for name in expected)
+    assert float(expected["amplitude"].max()) > 0
+
+
 def test_restoration_with_a_detected_motion_is_differentiable(frames):
     found = rsv.detect_vibration(frames, TIMING).vibration
     found.amplitude.requires_grad_()

@@ -467,7 +467,8 @@ def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
     for axis, (fit, covariance) in enumerate(zip(fitted.fits, fitted.covariances, strict=True)):
         present = bool(fit[:2].abs().sum() > 0)
         value = _at_origin(fit, middle)
-        slope = torch.autograd.functional.jacobian(lambda p: _at_origin(p, middle), fit)
+        with torch.inference_mode(False):  # which has no derivatives
+            slope = torch.autograd.functional.jacobian(lambda p: _at_origin(p, middle), fit.clone())
         std = (slope @ covariance @ slope.mT).diagonal().clamp(min=0.0).sqrt()
         turned = math.pi if reverse and axis == 1 else 0.0  # displacement along the scan changes its sign
         value[4] = torch.remainder(value[4] + turned + math.pi, 2 * math.pi) - math.pi
