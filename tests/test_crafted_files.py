@@ -1,5 +1,6 @@
 """The attack with crafted files: it notices every kind of failure, and no file of it causes one."""
 
+import os
 import time
 from importlib import import_module
 from pathlib import Path
@@ -46,6 +47,23 @@ def test_outcomes(module, monkeypatch, tmp_path):
     monkeypatch.setattr(module, "_BYTES", 5 * 10**7)
     monkeypatch.setattr(module.resource, "setrlimit", lambda *_: None)
     assert outcome(module, monkeypatch, tmp_path, allocate) == "memory"
+
+
+class WaitsInOtherProcesses:
+    """Garbage whose finaliser waits for a thread that a forked process does not have."""
+
+    def __init__(self):
+        self.own, self.process = self, os.getpid()
+
+    def __del__(self):
+        while os.getpid() != self.process:
+            time.sleep(1)
+
+
+def test_garbage_of_this_process_does_not_block_the_child(module, monkeypatch, tmp_path):
+    monkeypatch.setattr(module, "_SECONDS", 10.0)
+    WaitsInOtherProcesses()
+    assert module.crafted("TOML: nested lists", tmp_path).outcome == "refused"
 
 
 @pytest.mark.parametrize(

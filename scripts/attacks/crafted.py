@@ -1,5 +1,6 @@
 """Files that were crafted to exhaust memory or time: each is opened in a child process with limits for both."""
 
+import gc
 import io
 import json
 import multiprocessing
@@ -633,21 +634,14 @@ def _child(path: Path, sender: multiprocessing.connection.Connection) -> None:
 
 
 def crafted(name: str, folder: Path) -> Trial:
-    """Write one file, and read it in a child process that is forked from this one.
-
-    A lock that another thread holds during the fork blocks the child (one of some thousand trials), so that a trial
-    that ends as a hang is repeated once.
-    """
+    """Write one file, and read it in a child process that is forked from this one."""
     path = CASES[name](folder)
-    trial = _read_in_child(name, path)
-    return _read_in_child(name, path) if trial.outcome == "hang" else trial
-
-
-def _read_in_child(name: str, path: Path) -> Trial:
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
     child = context.Process(target=_child, args=(path, sender))
+    gc.freeze()  # a collection in the child must not finalise objects of this process, which may wait for its threads
     child.start()
+    gc.unfreeze()
     sender.close()
     begin, inherited = time.monotonic(), receiver.recv()
     watched, peak, cpu = psutil.Process(child.pid), 0, 0.0
