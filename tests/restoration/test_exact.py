@@ -343,6 +343,31 @@ def test_gradients_through_filled_pixels_and_ends(joint):
     assert torch.autograd.gradcheck(run, values, fast_mode=True)
 
 
+def test_only_strips_at_the_ends_of_the_rows_are_filled(monkeypatch):
+    timing = SensorTiming(row_time=1e-4, exposure_rows=75, frame_rows=400)
+    motion = Vibration([1.5, 1.2, 2.6e-3], [53.0, 65.0, 41.0], [0.4, 1.3, 0.2])
+    scene = city_and_fields(256, 400, seed=5)
+    noise = 0.005 * torch.randn(192, 336, generator=torch.Generator().manual_seed(5))
+    still = Vibration([0.0, 0.0], [1.0, 1.0])
+    frame, expected = (simulate_frames(scene, timing, each, 1, frame_size=(192, 336)) for each in (motion, still))
+    fill, filled = exact_module.fill_beyond_ends, []
+
+    def at_ends(images):
+        return torch.cat([images[..., 24:-24, :24], images[..., 24:-24, -24:]], -1)
+
+    def restored(extension):
+        def replaced(problem, width, *args, **options):
+            filled.append(width)
+            return extension(problem, width, *args, **options)
+
+        monkeypatch.setattr(exact_module, "fill_beyond_ends", replaced)
+        return restore_by_any_method(frame + noise, timing, motion, noise=0.005)
+
+    quality = psnr(at_ends(restored(fill)), at_ends(expected), 1.0)
+    assert len(filled) == 2  # of five strips
+    assert quality > psnr(at_ends(restored(lambda problem, *_: problem.data)), at_ends(expected), 1.0) + 0.5
+
+
 def test_prior_added_to_the_table(short, monkeypatch):
     _, frames, motion = short
     frames = with_noise(frames[:1, :96, :80], 0.005, dtype=torch.float64)

@@ -236,8 +236,8 @@ class _Stack:
         scale: Points of the restored scenes per px.
         missing: (T, C, H, W) bool, missing and saturated pixels; None for none.
         clipped: Likewise, the saturated ones.
-        at_ends: Whether a strip of columns contains an end of the rows; both ends of the others lie within the frame,
-            beyond the columns with weight, and their extension does not matter (0.00 dB; half the time).
+        at_ends: Whether the frames contain an end of the rows: whole frames, the first and the last strip of columns.
+            The others end beyond their columns with weight; to fill their extension takes half the time, for 0.00 dB.
     """
 
     frames: Tensor
