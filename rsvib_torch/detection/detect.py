@@ -37,6 +37,7 @@ from rsvib_torch.detection.tones.fit import (
     residual_of,
     shrunk_motion,
     vibration_of_fit,
+    with_unknown_errors,
 )
 from rsvib_torch.detection.tones.further import with_further_tones
 from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE, find_tones, robust_fit
@@ -580,7 +581,9 @@ def _detect(
         starts + torch.arange(frames.shape[-2], dtype=torch.float64, device=frames.device)[::8] * row_timing.row_time
     ).flatten()
     fit = found.fit
-    if direct is not None:
+    if direct is None:
+        fit = with_unknown_errors(found.measurements, fit)
+    else:
         fit = without_aliasing(found.measurements, fit, direct.aliasing)
     own_std = displacement_std(fit, starts, row_timing.exposure_time)
     fit, total_std = with_further_tones(found.measurements, fit, starts, number_is_known=options.tones is not None)

@@ -20,7 +20,7 @@ sigma = 0.4
 pixel = 1.0
 
 [stack]
-window = 2
+window = 3
 """
 OPTIONS = ("--scale", 2, "--joint", "all", "--mosaic", "RGGB", "--optics-sigma", 0.4)
 
@@ -32,7 +32,7 @@ def run(*arguments):
 @pytest.fixture(scope="module", name="place")
 def make_place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mosaic")
-    write_small(folder / "raw.tif", frames=3)  # of a grey scene
+    write_small(folder / "raw.tif", frames=5)  # of a grey scene
     (folder / "camera.toml").write_text(CAMERA)
     (folder / "mosaic.toml").write_text(CONFIG)
     assert run("detect", folder / "raw.tif", "--config", folder / "camera.toml", "--out", folder / "found") == 0

@@ -9,7 +9,7 @@ from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, detect_vibration, register_bands, simulate_frames
 from rsvib_torch.detection.rows import direct, measured_rows
-from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
+from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, shrunk_motion
 from rsvib_torch.evaluation import resolution_chart
 from rsvib_torch.registration.gradients import residual_products, row_equations, row_gradients
 from rsvib_torch.registration.row_spectra import RowSpectra, differences, inner_columns
@@ -210,6 +210,14 @@ def test_amplitude_of_a_blind_tone_caused_by_blur_does_not_diverge():
     assert found.reliable.all()
     assert found.vibration.amplitude[:, 0].tolist() == pytest.approx([3.1, 5.2], rel=0.01)
     assert found.vibration.frequency[:, 0].tolist() == pytest.approx([50.0, 30.0], rel=0.001)
+
+
+@pytest.mark.parametrize("size", [2.0, 59.0])
+def test_large_tones_of_blind_frequencies_do_not_displace_frames(size):
+    """Offsets contain next to nothing of such tones, and a fit of small errors may have any amplitude."""
+    fit = tone_fit([2.4, size], [47.0, 30.005])
+    warped_by = shrunk_motion(fit, torch.tensor([1 / 30, 2 / 30], dtype=torch.float64))
+    assert warped_by.amplitude[0, :, 0].tolist() == pytest.approx([2.4, size if size < 30 else 0.0], rel=1e-3)
 
 
 def test_two_tones_over_four_frames_are_detected(paper_camera):

@@ -8,7 +8,7 @@ import torch
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones import periodogram, selection
-from rsvib_torch.detection.tones.fit import fit_tones
+from rsvib_torch.detection.tones.fit import amplitude_std, fit_tones, with_unknown_errors
 
 ROWS, ROW_TIME, FRAME_PERIOD = 120, 16 * 20.52e-6, 2048 * 20.52e-6
 
@@ -27,6 +27,30 @@ def as_measurements(offsets):
     starts = (torch.arange(ROWS, dtype=torch.float64) * ROW_TIME).expand(len(offsets), -1)
     information = torch.eye(2, dtype=torch.float64).expand(len(offsets), ROWS, 2, 2)
     return Measurements.of_pairs(starts, starts + FRAME_PERIOD, offsets, information, 0.0)
+
+
+@pytest.mark.parametrize(("rows", "known"), [(4, False), (5, True)])
+def test_errors_are_unknown_with_as_many_parameters_as_measurements(rows, known):
+    """Three parameters of a tone and the drift fit four rows exactly; their residual is 0 for any errors."""
+    offsets = offsets_of([3.1, 5.2], [50.0, 30.0], torch.Generator().manual_seed(3))[:, :: ROWS // rows][:, :rows]
+    starts = (torch.arange(ROWS, dtype=torch.float64) * ROW_TIME)[None, :: ROWS // rows][:, :rows]
+    information = torch.eye(2, dtype=torch.float64).expand(1, rows, 2, 2)
+    measurements = Measurements.of_pairs(starts, starts + FRAME_PERIOD, offsets, information, 0.0)
+    start = torch.tensor([[[50.0], [30.0]]], dtype=torch.float64)
+    fit = with_unknown_errors(measurements, fit_tones(measurements, start, torch.ones(1, 2, 1, dtype=torch.bool)))
+    significance = fit.amplitude / amplitude_std(fit)
+    assert ((significance > selection.MIN_SIGNIFICANCE) == known).all()
+
+
+def test_the_amplitude_of_a_blind_tone_is_bounded():
+    """Without motion along the scan, frames do not depend on a tone of a blind frequency."""
+    offsets = offsets_of([3.1, 5.2], [50.0, 30.0], torch.Generator().manual_seed(3))
+    measurements = as_measurements(offsets)
+    blind = torch.arange(1, 5, dtype=torch.float64) / FRAME_PERIOD
+    frequencies = torch.tensor([[[50.0, 30.0 + 1 / FRAME_PERIOD], [30.0, 0.0]]], dtype=torch.float64)
+    fit = fit_tones(measurements, frequencies, frequencies > 0)  # a weak side tone of the first blind frequency along x
+    with_blind = selection._with_blind_tones(measurements, measurements, fit, blind)
+    assert with_blind.amplitude.max() < 30
 
 
 def test_only_disturbed_rows_are_excluded(monkeypatch):

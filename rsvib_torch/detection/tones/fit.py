@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 __all__ = [
+    "LARGEST",
     "MIN_GAIN",
     "MotionModel",
     "ToneFit",
@@ -41,12 +42,13 @@ __all__ = [
     "tone_response",
     "vibration_of_fit",
     "with_axes",
+    "with_unknown_errors",
 ]
 
 MIN_GAIN = 0.1  # px of offset per px of displacement; below it, amplitudes are ten times noisier than offsets
-# px (roll: rad; zoom: 1): rows of frames without a solution were fitted by tones of 8815 px and a zoom of 10, whose
-# exposures need thousands of quadrature nodes
-_LARGEST = (100.0, 100.0, 0.1, 0.1)
+# px (roll: rad; zoom: 1), of tones near blind frequencies. A clip with a blind vibration along y was fitted by a tone
+# of 59 px; after warping by it, the known motion along x was not measurable in 13 of 24 repetitions
+LARGEST = (30.0, 30.0, 0.1, 0.1)
 
 Result = TypeVar("Result", bound="DataclassInstance")
 
@@ -277,6 +279,20 @@ class _Problem:
         tones = _jacobian_of_tones(measurements.smearing_times, measurements.middles, self.tones_of(values))
         return torch.cat([measurements.relative(tones), self.drift_columns], dim=-1)
 
+    @property
+    def num_spare(self) -> Tensor:
+        """(B, 2) number of independent measurements of each axis, less that of its free parameters."""
+        # `num_measurements` counts independent measurements only: overlapping bands repeat each other
+        spare: Tensor = self.measurements.num_measurements - self.free.unflatten(1, (self.axes, -1)).sum(-1)
+        return spare
+
+    def variances(self, state: _Estimate) -> Tensor:
+        """(B, 2) variance of the errors of each axis, in units of those of the measurements, from the residual."""
+        spare = self.num_spare.clamp(min=1.0)
+        if self.axes > 2:  # unequal variances would not keep the precise combinations of correlated components
+            return (state.cost / spare.sum(-1))[:, None].expand_as(spare)
+        return self.measurements.square(state.residual) / spare
+
     def covariance(self, state: _Estimate, deviation: Tensor) -> Tensor:
         """Covariance (B, 2 P, 2 P) for errors of a row of the covariance ``S W^-1 S``, S the deviations (B, 2)."""
         matrix, scale = _scaled(state, self.free, torch.zeros_like(state.cost))
@@ -414,13 +430,29 @@ def fit_tones(
     """
     problem = _Problem(measurements, active, model or MotionModel())
     state = problem.solve(start, iterations, tolerance=1e-7)
-    spent = problem.free.unflatten(1, (problem.axes, -1)).sum(-1)
-    # `num_measurements` counts independent measurements only: overlapping bands repeat each other
-    spare = (measurements.num_measurements - spent).clamp(min=1.0)
-    variance = measurements.square(state.residual) / spare
-    if problem.axes > 2:  # unequal variances would not keep the precise combinations of correlated components
-        variance = (state.cost / spare.sum(-1))[:, None].expand_as(variance)
-    return problem.fit(state.values, problem.covariance(state, variance.sqrt()))
+    return problem.fit(state.values, problem.covariance(state, problem.variances(state).sqrt()))
+
+
+def with_unknown_errors(measurements: Measurements, fit: ToneFit) -> ToneFit:
+    """The fit with the largest possible errors on axes with hardly more independent measurements than parameters.
+
+    Such a fit is exact for any errors, and its residual contains nothing of them. They may be as large as the
+    displacements.
+
+    Args:
+        measurements: The measurements of the fit, with its weights.
+        fit: With the covariance of its parameters.
+    """
+    problem = _Problem(measurements, fit.active, fit.model)
+    unknown = problem.num_spare <= 0.0
+    if not bool(unknown.any()):
+        return fit
+    fit = fit.about(measurements.centre)
+    state = problem.evaluate(torch.cat([fit.tones.flatten(-2), fit.drift], -1))
+    whole = measurements.square(measurements.relative(measurements.displacements))
+    largest = whole / measurements.num_measurements.clamp(min=1.0)
+    variances = torch.where(unknown, largest, problem.variances(state))
+    return replace(fit, covariance=problem.covariance(state, variances.sqrt()))
 
 
 # --- Inversion ---
@@ -537,7 +569,7 @@ def shrunk_motion(fit: ToneFit, intervals: Tensor) -> Vibration:
 
     An amplitude A of standard deviation s becomes ``A max(0, 1 - s^2 / A^2)`` (positive-part James-Stein estimate)
     where the gain is small. Where the gain is large, the tone moves the frames by what was measured, and stays.
-    Tones that hardly move the frames against each other, but through ``_LARGEST`` of their size, are left out.
+    Tones that hardly move the frames against each other, but through ``LARGEST`` of their size, are left out.
 
     Args:
         fit: With its covariance.
@@ -546,7 +578,7 @@ def shrunk_motion(fit: ToneFit, intervals: Tensor) -> Vibration:
     blindness = 1 / (1 + (offset_gain(fit.frequencies, intervals) / MIN_GAIN).square())
     noise = (amplitude_std(fit) / fit.coefficients.abs().clamp(min=1e-30)).square()
     share = (1 - blindness * noise).clamp(min=0.0)
-    largest = share.new_tensor(_LARGEST)[: share.shape[1], None]
+    largest = share.new_tensor(LARGEST)[: share.shape[1], None]
     share = torch.where(blindness * (fit.amplitude / largest).square() < 1, share, 0.0)
     return motion_of_fit(replace(fit, coefficients=fit.coefficients * share))
 

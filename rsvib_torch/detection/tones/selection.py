@@ -7,6 +7,7 @@ from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import (
+    LARGEST,
     MIN_GAIN,
     MotionModel,
     ToneFit,
@@ -282,6 +283,8 @@ def _with_blind_tones(measurements: Measurements, weighed: Measurements, fit: To
     spare = measurements.num_measurements - 3 * fit.active.sum(-1)
     fewer = 3 * (fit.active.sum(-1) - active.sum(-1))
     better = suspected & (after / (spare + fewer).clamp(min=1.0) <= before / spare.clamp(min=1.0))
+    # frames without motion along the scan contain nothing of a blind tone: its fitted amplitude was 3e16 px
+    better = better & (other.amplitude < other.amplitude.new_tensor(LARGEST)[: size.shape[1], None]).all(-1)
     if not bool(better.any()):
         return fit
     frequencies, active = replaced(better)
