@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-__all__ = ["BandedFactor", "factor_banded", "skew_band", "solve_banded", "solve_skewed"]
+__all__ = ["BandedFactor", "extend_system", "factor_banded", "skew_band", "solve_banded", "solve_skewed"]
 
 
 class _Solution(NamedTuple):
@@ -126,6 +126,29 @@ def skew_band(band: Tensor) -> Tensor:
         skewed[d:count, width - d] = band[: count - d, d]
         skewed[: count - d, width + d] = band[: count - d, d].conj()
     return skewed
+
+
+def extend_system(skewed: Tensor, count: int, width: int) -> Tensor:
+    """Systems (K + b, 2 b + 1, S) as from ``skew_band`` with further rows, those of the identity matrix.
+
+    Args:
+        skewed: The systems.
+        count: Number of rows of the result, at least K.
+        width: Half-width of its band, at least b.
+
+    Returns:
+        (count + width, 2 width + 1, S).
+    """
+    b = skewed.shape[1] // 2
+    rows = len(skewed) - b
+    if (rows, b) == (count, width):
+        return skewed
+    extended = skewed.new_zeros(count + width, 2 * width + 1, skewed.shape[2])
+    extended[:rows, width - b : width + b + 1] = skewed[:rows]
+    for d in range(1, b + 1):  # entries beyond the last column may have any value
+        extended[rows - d : rows, width + d] = 0
+    extended[rows:count, width] = 1
+    return extended
 
 
 class _Solve(torch.autograd.Function):

@@ -1,4 +1,4 @@
-"""Time of detection and restoration of 30 difficult inputs, over the time of a plain vibration of the same size.
+"""Time of detection and restoration of difficult inputs, over the time of a plain vibration of the same size.
 
 The recordings are those of ``honesty_cases`` and some of other shapes and numbers of frames. An input and its plain
 counterpart alternate, and the shortest times are compared, because other load on the machine can only increase them.
@@ -167,6 +167,9 @@ def inputs() -> dict[str, Callable[[int], Input]]:
     built["six tones, 8 frames"] = partial(_of_number, count=8, build=_many_tones)
     built["30 frames"] = partial(_of_number, count=30, build=partial(plain, num_frames=30, scene="texture"))
     built["periodic scene"] = lambda size: _of_scene(size, _two_waves(size))
+    built["exposure 200, 3 and 5 px"] = lambda size: _of_scene(
+        size, city_and_fields(size + 64, size + 64, seed=SEED), 200.0, (3.1, 5.2)
+    )
     built["roll, exposure 200"] = lambda size: _of_scene(
         size, city_and_fields(size + 64, size + 64, seed=SEED), 200.0, (1.5, 1.2, 1 / size)
     )

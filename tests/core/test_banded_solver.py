@@ -3,7 +3,7 @@ import pytest
 import torch
 from scipy.linalg import solveh_banded
 
-from rsvib_torch.core.banded_solver import factor_banded, skew_band, solve_banded, solve_skewed
+from rsvib_torch.core.banded_solver import extend_system, factor_banded, skew_band, solve_banded, solve_skewed
 
 
 def random_system(count, width, *, dtype=torch.complex128, batch=(3,), columns=2, seed=0):
@@ -23,6 +23,21 @@ def test_agrees_with_scipy(count, width, dtype):
         matrix = band[:, : min(width + 1, count), index].numpy().T.copy()
         expected = solveh_banded(matrix, right_side[..., index].numpy(), lower=True)
         np.testing.assert_allclose(found[..., index].numpy(), expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("width", [0, 4])
+def test_extended_systems_have_the_same_solution(width):
+    band, right_side = random_system(20, width)
+    skewed = skew_band(band)
+    skewed[20:] = torch.nan  # entries beyond the last column may have any value
+    for d in range(1, width + 1):
+        skewed[20 - d : 20, width + d] = torch.nan
+    extended = extend_system(skewed, 24, 6)
+    assert extended.shape == (30, 13, 3)
+    further = torch.ones(4, *right_side.shape[1:], dtype=right_side.dtype)
+    found = solve_skewed(extended, torch.cat([right_side, further]))
+    torch.testing.assert_close(found[:20], solve_banded(band, right_side), rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(found[20:], further)
 
 
 def test_pivots_give_the_determinant():

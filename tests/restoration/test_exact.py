@@ -13,6 +13,7 @@ from rsvib_torch.evaluation.scenes import city_and_fields
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
 from rsvib_torch.restoration.exact import scene_solver
+from rsvib_torch.restoration.exact.filling import Extended
 from rsvib_torch.restoration.exact.priors import PRIORS
 from rsvib_torch.restoration.exact.scene_solver import Partition
 
@@ -350,22 +351,49 @@ def test_only_strips_at_the_ends_of_the_rows_are_filled(monkeypatch):
     noise = 0.005 * torch.randn(192, 336, generator=torch.Generator().manual_seed(5))
     still = Vibration([0.0, 0.0], [1.0, 1.0])
     frame, expected = (simulate_frames(scene, timing, each, 1, frame_size=(192, 336)) for each in (motion, still))
-    fill, filled = exact_module.fill_beyond_ends, []
+    fill, extended = exact_module.filled, []
 
     def at_ends(images):
         return torch.cat([images[..., 24:-24, :24], images[..., 24:-24, -24:]], -1)
 
     def restored(extension):
-        def replaced(problem, width, *args, **options):
-            filled.append(width)
-            return extension(problem, width, *args, **options)
+        def replaced(scenes):
+            extended.append([isinstance(scene, Extended) for scene in scenes])
+            return extension(scenes)
 
-        monkeypatch.setattr(exact_module, "fill_beyond_ends", replaced)
+        monkeypatch.setattr(exact_module, "filled", replaced)
         return restore_by_any_method(frame + noise, timing, motion, noise=0.005)
 
     quality = psnr(at_ends(restored(fill)), at_ends(expected), 1.0)
-    assert len(filled) == 2  # of five strips
-    assert quality > psnr(at_ends(restored(lambda problem, *_: problem.data)), at_ends(expected), 1.0) + 0.5
+    assert extended == [[True, False, False, False, True]]
+    not_filled = restored(lambda scenes: [getattr(scene, "problem", scene) for scene in scenes])
+    assert quality > psnr(at_ends(not_filled), at_ends(expected), 1.0) + 0.5
+
+
+@pytest.mark.parametrize(("amplitude", "shapes"), [(3.0, 1), (8.0, 2)])
+def test_scenes_filled_together_equal_single_ones(monkeypatch, amplitude, shapes):
+    """Two stacks of three frames; larger amplitudes need longer periods."""
+    timing = SensorTiming(row_time=1e-4, exposure_rows=75, frame_rows=200)
+    motions = [Vibration([size, 1.2], [53.0, 65.0], [0.4, 1.3]) for size in (3.0, amplitude)]
+    scene = city_and_fields(176, 176, seed=5)
+    frames = torch.stack([simulate_frames(scene, timing, motion, 3, frame_size=(96, 96)) for motion in motions])
+    frames = (frames + 0.01 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(5)))[:, :, None]
+    motion = Vibration([[[3.0], [1.2]], [[amplitude], [1.2]]], [[53.0], [65.0]], [[0.4], [1.3]])
+    fill, together = exact_module.filled, []
+
+    def counted(scenes):
+        together.append(len({scene.problem.data.shape for scene in scenes}))
+        return fill(scenes)
+
+    monkeypatch.setattr(exact_module, "filled", counted)
+    monkeypatch.setattr(exact_module.Partition, "threads", staticmethod(lambda device: 1))
+    monkeypatch.setattr(exact_module, "_FILLED_TOGETHER", 6)
+    found = restore_by_any_method(frames, timing, motion, noise=0.01)
+    assert together == [shapes]
+    monkeypatch.setattr(exact_module, "_FILLED_TOGETHER", 1)
+    single = restore_by_any_method(frames, timing, motion, noise=0.01)
+    assert len(together) == 7
+    torch.testing.assert_close(found, single, rtol=0, atol=2e-5)
 
 
 def test_prior_added_to_the_table(short, monkeypatch):

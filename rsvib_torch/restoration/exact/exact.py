@@ -4,23 +4,29 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import MAX_NUMBER, check_choice, check_number, check_whole_number
-from rsvib_torch.core.fourier import extend_rows, extended_length
+from rsvib_torch.core.fourier import extend_rows, extended_length, fast_length
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.restoration.exact.filling import fill_beyond_ends, fill_missing, measured_values
+from rsvib_torch.restoration.exact.filling import (
+    FILLED_REACH,
+    Extended,
+    Incomplete,
+    filled,
+    measured_values,
+)
 from rsvib_torch.restoration.exact.finer_scene import Misfit, finer_scene, warn_of_frames
 from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
 from rsvib_torch.restoration.exact.priors import PRIORS, PriorOptions
-from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem, scenes_side_by_side
+from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem, SolversSideBySide
 from rsvib_torch.restoration.exact.strength import Strengths, prior_strength
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise.policy import noise_levels
@@ -31,7 +37,6 @@ from rsvib_torch.restoration.scene_model.row_prior import RowPrior, brightness, 
 
 __all__ = ["restore_exact", "scene_period"]
 
-_FILLED_REACH = 1.0  # px along the row from its middle; above, the boundary extension is filled: a larger blur mixes it
 _MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
 
 
@@ -156,42 +161,39 @@ def restore_exact(
 
     misfits: list[Misfit] = []
 
-    def problem_of(number: int, partition: Partition) -> SceneProblem:
+    def problem_of(number: int, partition: Partition) -> SceneProblem | Incomplete | Extended:
         return scenes[number][0].problem(*scenes[number][1:], partition)
 
-    def restored(number: int, partition: Partition) -> Tensor:
-        problem = problem_of(number, partition)
+    def restored(numbers: list[int], problems: list[SceneProblem]) -> list[Tensor]:
+        """Images of scenes that are solved together."""
         if scale == 1:
-            scene = PRIORS[prior](problem, PriorOptions(factor))
+            solved = _solved(problems, prior, factor)
         else:
-            scene, misfit = finer_scene(problem, W, motion.neglected)
+            finer, misfit = finer_scene(problems[0], W, motion.neglected)
+            solved = [finer]
             misfits.append(misfit)
-        return scene[..., : scale * W] + scenes[number][0].mean
-
-    def check_frames() -> None:
-        if scale != 1:
-            warn_of_frames(misfits, (stack.places(members) for stack, members, _, _ in scenes))
+        means = [scenes[number][0].mean for number in numbers]
+        return [scene[..., : scale * W] + mean for scene, mean in zip(solved, means, strict=True)]
 
     if torch.is_grad_enabled() and (frames.requires_grad or displacement.requires_grad):
         partition = Partition(chunk, split)
-        images = torch.stack([restored(number, partition) for number in range(len(scenes))])
-        check_frames()
-        return images.view(B, -1, *images.shape[1:])
-    images = frames.new_empty(len(scenes), C, scale * H, scale * W)
-
-    def solve(numbers: list[int], partition: Partition) -> None:
-        if len(numbers) == 1:
-            images[numbers[0]] = restored(numbers[0], partition)
-            return
-        found = scenes_side_by_side([problem_of(number, partition) for number in numbers])
-        for number, scene in zip(numbers, found, strict=True):
-            images[number] = scene[..., :W] + scenes[number][0].mean
-
-    # the strips of a frame together
-    together = motion.strips if prior == "gaussian" and scale == 1 else 1
-    _solve_in_parallel(solve, _tasks(len(scenes), len(scenes) // B, together), Partition(chunk, split), frames.device)
-    check_frames()
+        images = torch.stack([restored([n], filled([problem_of(n, partition)]))[0] for n in range(len(scenes))])
+    else:
+        images = frames.new_empty(len(scenes), C, scale * H, scale * W)
+        # scenes whose systems are solved together: the strips of a frame
+        together = motion.strips if prior == "gaussian" and scale == 1 else 1
+        tasks = _tasks(len(scenes), len(scenes) // B, together)
+        _solve_in_parallel(problem_of, restored, tasks, Partition(chunk, split), images)
+    if scale != 1:
+        warn_of_frames(misfits, (stack.places(members) for stack, members, _, _ in scenes))
     return images.view(B, -1, *images.shape[1:])
+
+
+def _solved(problems: list[SceneProblem], prior: str, regularisation: float) -> list[Tensor]:
+    """Scenes without missing values; several are those of strips, with a Gaussian prior."""
+    if len(problems) > 1:
+        return SolversSideBySide(problems).scenes([problem.data for problem in problems])
+    return [PRIORS[prior](problem, PriorOptions(regularisation)) for problem in problems]
 
 
 def _tasks(scenes: int, of_stack: int, together: int) -> list[list[int]]:
@@ -203,20 +205,39 @@ def _tasks(scenes: int, of_stack: int, together: int) -> list[list[int]]:
     ]
 
 
+_FILLED_TOGETHER = 8  # tasks
+
+
 def _solve_in_parallel(
-    solve: Callable[[list[int], Partition], None], tasks: list[list[int]], partition: Partition, device: torch.device
+    problem_of: Callable[[int, Partition], SceneProblem | Incomplete | Extended],
+    restored: Callable[[list[int], list[SceneProblem]], list[Tensor]],
+    tasks: list[list[int]],
+    partition: Partition,
+    images: Tensor,
 ) -> None:
-    """Solve tasks side by side, each thread in its own memory."""
+    """Write the images of the scenes of all tasks, which are solved side by side, each thread in its own memory."""
+    device = images.device
     threads = min(Partition.threads(device), len(tasks))
+    partitions = [Partition(partition.chunk, partition.segments) for _ in range(threads)]
     advance = steps(len(tasks), "frames")
 
-    def share(thread: int) -> None:
-        own = Partition(partition.chunk, partition.segments)
-        for task in tasks[thread::threads]:
-            solve(task, own)
+    def build(share: tuple[Partition, list[list[int]]]) -> list[SceneProblem | Incomplete | Extended]:
+        return [problem_of(number, share[0]) for numbers in share[1] for number in numbers]
+
+    def solve(share: tuple[list[SceneProblem], list[list[int]]]) -> None:
+        problems = iter(share[0])
+        for numbers in share[1]:
+            for number, image in zip(numbers, restored(numbers, [next(problems) for _ in numbers]), strict=True):
+                images[number] = image
             advance()
 
-    in_parallel(share, range(threads), device)
+    for first in range(0, len(tasks), _FILLED_TOGETHER):
+        shares = [tasks[first : first + _FILLED_TOGETHER][thread::threads] for thread in range(threads)]
+        built = in_parallel(build, zip(partitions, shares, strict=True), device)
+        with torch.no_grad():
+            complete = iter(filled([scene for scenes in built for scene in scenes]))
+        problems = [[next(complete) for _ in scenes] for scenes in built]
+        in_parallel(solve, zip(problems, shares, strict=True), device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,8 +304,10 @@ class _Stack:
 
         return strengths.of(power / self.weights[alike].mean() + prior.interpolation_power.mean(), choose)
 
-    def problem(self, members: list[int], reference: int, strength: float, partition: Partition) -> SceneProblem:
-        """The problem of one scene, with all missing values and boundary extensions filled."""
+    def problem(
+        self, members: list[int], reference: int, strength: float, partition: Partition
+    ) -> SceneProblem | Incomplete | Extended:
+        """The problem of one scene, with the values that are missing."""
         height, width = self.frames.shape[-2:]
         kernels = self.kernels(members, reference)
         if isinstance(self.prior, PolynomialPrior):
@@ -298,12 +321,11 @@ class _Stack:
         observe = Observation if self.scale == 1 else FinerObservation
         problem = SceneProblem(data, observe(kernels, height, data.dtype), precision, self.level, partition)
         missing = None if self.missing is None else self.missing[members]
-        ends = (kernels.reach > _FILLED_REACH and self.at_ends) or self.scale > 1
+        ends = (kernels.reach > FILLED_REACH and self.at_ends) or self.scale > 1
         if missing is None and ends and not bool(along.any()):
             # on the finer grid, extensions of different frames contradict each other beyond half a cycle per px:
-            # filled, 49.9 dB become 53.9 dB (8 frames of 256 px, noise 0.002); more columns and iterations gain 0.01 dB
-            effort = {} if self.scale == 1 or kernels.reach > _FILLED_REACH else {"near": 24, "iterations": 6}
-            return replace(problem, data=fill_beyond_ends(problem, width, kernels.reach, **effort))
+            # filled, 49.9 dB become 53.9 dB (8 frames of 256 px, noise 0.002)
+            return Extended(problem, width)
         measured = measured_values(along, missing, data.shape, width, ends=ends)
         if measured is None:
             return problem
@@ -311,7 +333,7 @@ class _Stack:
         if self.clipped is not None:  # saturated pixels are at least as bright as their value
             floor = torch.full_like(data, -torch.inf)
             floor[..., :width] = torch.where(self.clipped[members], data[..., :width], -torch.inf)
-        return replace(problem, data=fill_missing(problem, measured, floor))
+        return Incomplete(problem, measured, floor)
 
 
 _Scene = tuple[_Stack, list[int], int, float]  # stack, its frames, the restored one, factor on the prior
@@ -326,8 +348,9 @@ def scene_period(width: int, reach: int, displacement: Tensor) -> int:
         displacement: (..., N, 2) during the exposures.
     """
     along = displacement[..., 0].detach()
-    filled = bool((along.amax(-1) - along.amin(-1)).amax() > 2 * _FILLED_REACH)
-    return extended_length(width, reach if filled else reach + 8)  # px beyond the displacement that influence the ends
+    extended = bool((along.amax(-1) - along.amin(-1)).amax() > 2 * FILLED_REACH)
+    # px beyond the displacement that influence the ends
+    return fast_length(width + 2 * (8 + reach)) if extended else extended_length(width, reach + 8)
 
 
 def _periods(width: int, strips: int, reaches: Sequence[int], displacement: Tensor) -> list[int]:

@@ -13,19 +13,21 @@ frequencies and interpolates the factors for all others.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from math import prod
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from rsvib_torch.core.banded_solver import BandedFactor, factor_banded, solve_skewed
+from rsvib_torch.core.banded_solver import BandedFactor, extend_system, factor_banded, solve_skewed
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.interpolated_factors import InterpolatedFactors, node_frequencies
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.restoration.scene_model.observation import Observation
 
-__all__ = ["Partition", "SceneProblem", "SceneSolver", "join_windows", "row_windows", "scenes_side_by_side"]
+__all__ = ["Partition", "SceneProblem", "SceneSolver", "SolversSideBySide", "join_windows", "row_windows"]
 
 
 def row_windows(rows: int, count: int, overlap: int = 96) -> list[slice]:
@@ -90,6 +92,10 @@ class Partition:
         # values of the bands in memory: 64 MB on a CPU, 2 GB on a GPU, or 8 times the spectrum of a large scene,
         # for two chunks at a time on a CPU, so that results do not depend on the number of threads
         values = max(1 << (23 if cpu else 28), 8 * rows * frequencies) // (2 if cpu else 1)
+        if blurred:
+            # the rows are not divided, and a step of the elimination has fewer values: twice the memory saves 18 % of the
+            # time for frames of 1024 and 2048 rows, four times the memory 30 %
+            values *= 2
         most = frequencies if keep else max(1, values // (rows * (2 * width + 1)))
         rounds = -(-frequencies // most)
         chunk = self.chunk or -(-frequencies // (8 * rounds)) * 8  # rows begin at full cache lines
@@ -140,25 +146,26 @@ class SceneSolver:
             keep=keep,
         )
         self._normal = normal.in_windows(self._windows)
-        self._factors: list[BandedFactor] = []
+        self._keep = keep
         self._interpolated: InterpolatedFactors | None = None
-        if self._differentiates():
-            return
-        if keep:
-            self._factors = [factor_banded(self._normal.at(self.u[p], precision[..., p])) for p in self.parts]
-        elif (nodes := self._nodes()) is not None:
+        if not keep and not self._differentiates() and (nodes := self._nodes()) is not None:
             systems = self._normal.at(self.u[nodes], precision[..., nodes])
             self._interpolated = InterpolatedFactors.of(systems, nodes)
 
     @property
-    def size(self) -> tuple[int, int, int]:
-        """Rows of a window, half-width of the band, and number of systems."""
-        return self._windows[0].stop, self._normal.width, len(self._windows) * len(self.u)
+    def num_systems(self) -> int:
+        """Number of systems: that of the frequencies of all windows of rows."""
+        return len(self._windows) * len(self.u)
 
     @property
     def interpolates(self) -> bool:
         """Whether the factors are interpolated between some frequencies."""
         return self._interpolated is not None
+
+    @cached_property
+    def _factors(self) -> list[BandedFactor]:
+        """Factors of all parts, where they are kept."""
+        return [factor_banded(self._normal.at(self.u[p], self.precision[..., p])) for p in self.parts]
 
     def _nodes(self) -> Tensor | None:
         """Frequencies whose systems are factored; None: all.
@@ -204,6 +211,7 @@ class SceneSolver:
     def _solution(self, right_side: Callable[[slice], Tensor], given: Tensor) -> Tensor:
         """Solution (K, C, U) for right sides (K, C, S) of parts of the frequencies, computed from ``given``."""
         interpolated: dict[int, BandedFactor] = {}  # of each thread, in memory that is used again
+        factors = self._factors if self._keep and not self._differentiates(given) else []
 
         def solve(number: int, thread: int | None = None) -> Tensor:
             part = self.parts[number]
@@ -214,8 +222,8 @@ class SceneSolver:
                 if thread is not None:
                     interpolated[thread] = factor
                 solution = solve_skewed(factor, right)
-            elif self._factors:
-                solution = solve_skewed(self._factors[number], right)
+            elif factors:
+                solution = solve_skewed(factors[number], right)
             else:
                 left = self._normal.left
                 shape = (*left.shape[:2], len(self._windows) * len(u))
@@ -274,40 +282,73 @@ class SceneProblem:
     level: Tensor
     partition: Partition
 
-    def solver(self, weight: Tensor | None = None, *, keep: bool = False) -> SceneSolver:
-        """The solver for complete data.
-
-        Args:
-            weight: (M, R) of the rows, by default that of the kernels.
-            keep: Keep the factors, for solving several times.
-        """
-        observation = self.observation if weight is None else self.observation.weighted(weight)
-        return SceneSolver(observation, self.precision, self.data.shape[-1], self.partition, keep=keep)
+    def solver(self, *, keep: bool = False) -> SceneSolver:
+        """The solver for complete data; ``keep`` its factors, for solving several times."""
+        return SceneSolver(self.observation, self.precision, self.data.shape[-1], self.partition, keep=keep)
 
 
 _SIDE_BY_SIDE = 512  # frequencies from which a step of the elimination takes longer than its call
 
 
-def scenes_side_by_side(problems: Sequence[SceneProblem]) -> list[Tensor]:
-    """Scenes (C, R, L) of problems of narrow frames, whose systems are solved together if they have the same size.
+class SolversSideBySide:
+    """Solvers of scenes of few columns, whose systems are solved together.
 
-    A step of the elimination for the frequencies of one strip of columns takes less time than its call: seven strips of
-    384 rows and 112 columns take 0.4 of the time together.
+    A step of the elimination for the frequencies of few columns takes less time than its call: seven strips of 384 rows
+    and 112 columns take 0.4 of the time together.
+
+    Args:
+        problems: The scenes, with as many channels each.
+        keep: Keep the factors, for solving several times.
+
+    Attributes:
+        solvers: The solver of each scene.
     """
-    solvers = [problem.solver() for problem in problems]
-    coefficients: list[Tensor | None] = [None] * len(problems)
-    alike: dict[tuple[int, ...], list[int]] = {}
-    for number, (problem, solver) in enumerate(zip(problems, solvers, strict=True)):
-        if len(solver.parts) > 1 or solver.interpolates:
-            coefficients[number] = solver.fit(problem.data)
-        else:
-            alike.setdefault((*solver.size, problem.data.shape[1]), []).append(number)
-    for (_, _, systems, _), numbers in alike.items():
-        most = max(1, _SIDE_BY_SIDE // systems)
-        for first in range(0, len(numbers), most):
-            some = numbers[first : first + most]
-            right = torch.cat([solvers[number].whole_right_side(problems[number].data) for number in some], -1)
-            system = torch.cat([solvers[number].whole_system() for number in some], -1)
-            for number, solution in zip(some, solve_skewed(system, right).chunk(len(some), -1), strict=True):
-                coefficients[number] = solvers[number].joined(solution)
-    return [solver.scene(own) for solver, own in zip(solvers, coefficients, strict=True) if own is not None]
+
+    def __init__(self, problems: Sequence[SceneProblem], *, keep: bool = False) -> None:
+        self.solvers = [problem.solver(keep=keep) for problem in problems]
+        self._groups: list[list[int]] = []
+        room = 0
+        for number, solver in enumerate(self.solvers):
+            alone = len(solver.parts) > 1 or solver.interpolates
+            if alone or solver.num_systems > room:
+                self._groups.append([])
+                room = _SIDE_BY_SIDE
+            self._groups[-1].append(number)
+            room = 0 if alone else room - solver.num_systems
+        # a scene alone is solved by its solver
+        self._factors = {
+            number: factor_banded(self._system(group))
+            for number, group in enumerate(self._groups)
+            if keep and len(group) > 1
+        }
+
+    def _system(self, group: list[int]) -> Tensor:
+        """Systems of scenes behind each other, extended to equal numbers of rows."""
+        bands = [self.solvers[number].whole_system() for number in group]
+        width = max(band.shape[1] // 2 for band in bands)
+        rows = max(len(band) - band.shape[1] // 2 for band in bands)
+        return torch.cat([extend_system(band, rows, width) for band in bands], -1)
+
+    def fit(self, data: Sequence[Tensor] | Tensor) -> list[Tensor]:
+        """Coefficients of every scene for its data, as from ``SceneSolver.fit``."""
+        found: list[Tensor] = []
+        for place, group in enumerate(self._groups):
+            solvers = [self.solvers[number] for number in group]
+            if len(group) == 1:
+                found.append(solvers[0].fit(data[group[0]]))
+                continue
+            rights = [solver.whole_right_side(data[number]) for solver, number in zip(solvers, group, strict=True)]
+            rows = max(map(len, rights))
+            right = torch.cat([functional.pad(one, (0, 0, 0, 0, 0, rows - len(one))) for one in rights], -1)
+            solutions = solve_skewed(self._factors.get(place) or self._system(group), right)
+            parts = solutions.split([solver.num_systems for solver in solvers], -1)
+            found += [solver.joined(part[: len(one)]) for solver, part, one in zip(solvers, parts, rights, strict=True)]
+        return found
+
+    def scenes(self, data: Sequence[Tensor]) -> list[Tensor]:
+        """The scenes (C, R, L) for their data."""
+        return [solver.scene(own) for solver, own in zip(self.solvers, self.fit(data), strict=True)]
+
+    def predictions(self, data: Sequence[Tensor] | Tensor) -> list[Tensor]:
+        """Noiseless frames of the scenes for their data."""
+        return [solver.predict(own) for solver, own in zip(self.solvers, self.fit(data), strict=True)]
