@@ -93,8 +93,8 @@ class Partition:
         # for two chunks at a time on a CPU, so that results do not depend on the number of threads
         values = max(1 << (23 if cpu else 28), 8 * rows * frequencies) // (2 if cpu else 1)
         if blurred:
-            # the rows are not divided, and a step of the elimination has fewer values: twice the memory saves 18 % of the
-            # time for frames of 1024 and 2048 rows, four times the memory 30 %
+            # the rows are not divided, and a step of the elimination has fewer values: twice the memory saves 18 % of
+            # the time for frames of 1024 and 2048 rows, four times the memory 30 %
             values *= 2
         most = frequencies if keep else max(1, values // (rows * (2 * width + 1)))
         rounds = -(-frequencies // most)
