@@ -9,7 +9,7 @@ from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, detect_vibration, register_bands, simulate_frames
 from rsvib_torch.detection.rows import direct, measured_rows
-from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, shrunk_motion
+from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, amplitude_std, shrunk_motion
 from rsvib_torch.evaluation import resolution_chart
 from rsvib_torch.registration.gradients import residual_products, row_equations, row_gradients
 from rsvib_torch.registration.row_spectra import RowSpectra, differences, inner_columns
@@ -210,6 +210,22 @@ def test_amplitude_of_a_blind_tone_caused_by_blur_does_not_diverge():
     assert found.reliable.all()
     assert found.vibration.amplitude[:, 0].tolist() == pytest.approx([3.1, 5.2], rel=0.01)
     assert found.vibration.frequency[:, 0].tolist() == pytest.approx([50.0, 30.0], rel=0.001)
+
+
+def test_changes_of_the_last_rounds_count_as_errors(paper_camera, monkeypatch):
+    """Of a refinement that did not converge: here, fits whose amplitude along y was 0.3 and 0.4 px larger."""
+    refine, found = direct._refine, []
+    monkeypatch.setattr(direct, "_refine", lambda *given, **more: found.append(refine(*given, **more)) or found[-1])
+    detect_vibration(noisy_frames(paper_camera, Motion(phase=(0.9, 2.2)), 42, 0.005, rows=512), paper_camera)
+    fit = found[0].fit
+    along_y = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
+    fits = [
+        replace(fit, coefficients=fit.coefficients * (1 + more * along_y / fit.amplitude)) for more in (0.3, 0.4, 0)
+    ]
+    motion = shrunk_motion(fit, torch.tensor([0.04], dtype=torch.float64))
+    std = amplitude_std(direct._not_converged(found[0], motion, motion, fits).fit)
+    expected = (amplitude_std(fit).square() + 0.5**2 * along_y).sqrt()
+    torch.testing.assert_close(std, expected, rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("size", [2.0, 59.0])
