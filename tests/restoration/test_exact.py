@@ -150,13 +150,13 @@ def test_results_do_not_depend_on_threads_and_gradients(short, joint, monkeypatc
     options = {"joint": joint, "check": False}
     found = []
     parts = []
-    solver = exact_module._Stack.problem
+    solved = exact_module._solved
 
-    def recorded_call(stack, members, reference, *others):
+    def recorded_call(*given):
         parts.append((threading.current_thread(), torch.is_grad_enabled()))
-        return solver(stack, members, reference, *others)
+        return solved(*given)
 
-    monkeypatch.setattr(exact_module._Stack, "problem", recorded_call)
+    monkeypatch.setattr(exact_module, "_solved", recorded_call)
     try:
         for threads, workers in ((2, 2), (1, 1)):
             parts.clear()

@@ -83,7 +83,8 @@ def restore_exact(
         colours: Colour that each pixel of a mosaic measures, 0 red, 1 green, 2 blue, shaped like the frames, which have
             one channel; the result has three, see ``restore_mosaic``.
         chunk_frequencies: Frequencies solved at a time; bounds the memory, does not change the result. None: as many
-            as take 8 times the memory of the spectrum of the scene.
+            as take 8 times the memory of the spectrum of the scene, or 16 times where the displacement changes by more
+            than a pixel during an exposure.
         segments: Overlapping segments of rows that are solved side by side, which changes the result by about 1e-5;
             None: segments of at least 512 rows on a CPU, 256 on a GPU.
             Always one where the displacement changes by more than a pixel during an exposure: rows then depend on
@@ -205,7 +206,7 @@ def _tasks(scenes: int, of_stack: int, together: int) -> list[list[int]]:
     ]
 
 
-_FILLED_TOGETHER = 8  # tasks
+_FILLED_TOGETHER = 8  # tasks; four frames of 1024 rows take 0.79 s together, 1.19 s two by two in two threads
 
 
 def _solve_in_parallel(
