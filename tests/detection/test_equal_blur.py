@@ -73,3 +73,19 @@ def test_rows_far_outside_the_frames_do_not_lengthen_the_record():
     measured, _ = measure_groups(frame_groups(stack_spectra(frames, None), camera, far), camera, far)
     assert float(measured.duration) <= 3 * 64 * camera.row_time
     assert not bool(measured.visible.any())
+
+
+def test_rows_between_scene_rows_are_those_of_the_exact_solution():
+    timing = SensorTiming(row_time=2e-5, exposure_rows=200, frame_rows=2048).in_row_order()
+    motion = Vibration([[[3.1], [5.2]]], [[[53.0], [65.0]]], [[[0.4], [1.3]]], [[20.0, -30.0]])
+    rows = torch.arange(300, dtype=torch.float64)[None, None]
+    columns, starts = torch.zeros(1, 1, 1, dtype=torch.float64), torch.tensor([[[0.0], [0.04]]], dtype=torch.float64)
+    positions = displacements._Positions.of_rows(rows, columns, starts, timing, motion)
+    away = 12 * torch.rand(1, 2, 300, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) - 6
+    expected = displacements._Positions.of_rows(
+        rows[..., None] + away, columns[..., None], starts[..., None], timing, motion
+    )
+    found = displacements._between_rows(positions, timing, motion, away)
+    torch.testing.assert_close(found, (expected.rows, expected.shift), rtol=0, atol=2e-6)
+    far, _ = displacements._between_rows(positions, timing, motion, 1e12 * away)  # of a fit that diverged
+    assert far.isfinite().all()

@@ -592,9 +592,10 @@ def _between_rows(positions: _Positions, timing: RowTiming, motion: Motion, away
     They are interpolated between whole scene rows by cubic polynomials, with an error of 1e-5 px for 3 px and periods
     of 60 rows. To solve for them takes a tenth to a third of the time of a detection behind long exposures.
     """
+    height = positions.scene_rows.shape[-1]
+    away = away.clamp(-height, height)  # the path of a fit that diverges may have any length
     margin = math.ceil(float(away.abs().amax())) + 2
-    count = positions.scene_rows.shape[-1] + 2 * margin
-    steps_of_rows = torch.arange(count, dtype=away.dtype, device=away.device)
+    steps_of_rows = torch.arange(height + 2 * margin, dtype=away.dtype, device=away.device)
     first = positions.scene_rows[..., :1] - margin
     starts = (positions.exposure_starts - positions.rows * timing.row_time)[..., :1]
     table = _Positions.of_rows(first + steps_of_rows, positions.columns, starts, timing, motion)
