@@ -205,7 +205,7 @@ def inner_columns(width: int, shift: Tensor, like: Tensor) -> Tensor:
 EVERY = 4  # rows; every fourth row is enough to estimate a column pattern
 # mean square of the slope of a pattern over that of the scene. A pattern of 4e-4 (0.001 with noise of 0.005) changed
 # amplitudes by a tenth of their standard deviation; errors of interpolation of up to 6e-5 were subtracted as a pattern
-# in 5 of 36 recordings without one, which took up to 1.5 times as long
+# in 5 of 36 recordings without one, which took up to 1.6 times as long
 _LEAST_PATTERN = 3e-4
 _Group = tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor]
 
@@ -256,6 +256,6 @@ def _pattern_of(groups: list[_Group], step: int) -> Tensor | None:
     share = torch.where(strength > 3.0, 1 - 1 / strength.clamp(min=1.0), 0.0)
     found: Tensor = pattern * share
     u = groups[0][0].frequencies.to(power.dtype)
-    scene = sum((squared_modulus(spectra.values[:, :, ::16]).mean((1, 2)) for spectra, *_ in groups), start=power * 0)
-    slopes, of_scene = ((u.square() * values).sum(-1) for values in (squared_modulus(found), scene / len(groups)))
+    scene = torch.stack([squared_modulus(spectra.values[:, :, ::16]).mean((1, 2)) for spectra, *_ in groups]).mean(0)
+    slopes, of_scene = ((u.square() * values).sum(-1) for values in (squared_modulus(found), scene))
     return found if bool((slopes > _LEAST_PATTERN * of_scene).any()) else None

@@ -263,11 +263,7 @@ def _not_converged(found: DirectFit, warped_by: Motion, motion: Motion, fits: li
     other, fit = found.other_motion, found.fit
     least = (distance / other.permitted).amax(-1, keepdim=True) * other.permitted
     other = replace(other, unexplained=torch.maximum(other.unexplained, least))
-    last, *before = (
-        torch.cat([one.tones.flatten(-2), one.drift], -1).flatten(1)
-        for one in (fit, *(f.about(fit.centre) for f in fits))
-    )
-    changes = torch.stack(before, -1) - last[..., None]
+    changes = torch.stack([one.about(fit.centre).parameters - fit.parameters for one in fits], -1).flatten(1, 2)
     return replace(found, other_motion=other, fit=replace(fit, covariance=fit.covariance + changes @ changes.mT))
 
 

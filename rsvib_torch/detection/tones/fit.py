@@ -99,6 +99,11 @@ class ToneFit:
         return torch.stack([self.coefficients.real, self.coefficients.imag, self.frequencies], -1)
 
     @property
+    def parameters(self) -> Tensor:
+        """(B, 2, P) parameters of each axis, in the order of the covariance."""
+        return torch.cat([self.tones.flatten(-2), self.drift], -1)
+
+    @property
     def amplitude(self) -> Tensor:
         """(B, 2, K) px, 0 for tones that are not active."""
         return torch.where(self.active, self.coefficients.abs(), 0.0)
@@ -448,7 +453,7 @@ def with_unknown_errors(measurements: Measurements, fit: ToneFit) -> ToneFit:
     if not bool(unknown.any()):
         return fit
     fit = fit.about(measurements.centre)
-    state = problem.evaluate(torch.cat([fit.tones.flatten(-2), fit.drift], -1))
+    state = problem.evaluate(fit.parameters)
     whole = measurements.square(measurements.relative(measurements.displacements))
     largest = whole / measurements.num_measurements.clamp(min=1.0)
     variances = torch.where(unknown, largest, problem.variances(state))
@@ -552,7 +557,7 @@ def displacement_jacobian(fit: ToneFit, exposure_starts: Tensor, exposure_time: 
 def axis_jacobian(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Tensor, Tensor]:
     """Derivatives (B, N, G, M) of the displacements of an axis by its free parameters, and the matrix (P, M) to all."""
     problem = _Problem(measurements, fit.active, fit.model)
-    jacobian = problem.jacobian(torch.cat([fit.tones.flatten(-2), fit.drift], -1))[..., axis, :]
+    jacobian = problem.jacobian(fit.parameters)[..., axis, :]
     free = problem.free.unflatten(1, (problem.axes, -1))[:, axis]
     to_all = _constraints(fit.model, fit.active.shape[-1], 1, fit.active.device)
     return (jacobian @ to_all) * free[:, None, None], to_all
