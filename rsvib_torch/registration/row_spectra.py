@@ -142,10 +142,12 @@ class RowSpectra:
         """exp(2 pi i u shift) for all frequencies u, (..., U)."""
         return shift_phases(shift, self.length, self._band, self.values.dtype)
 
-    def subtract(self, pattern: Tensor) -> None:
-        """Subtract a pattern (B, U) from every row of these frames; the spectra of other parts stay unchanged."""
-        self.values = self.values - pattern[:, None, None].to(self.values.dtype)
-        self._index_rows()
+    def without(self, pattern: Tensor) -> "RowSpectra":
+        """The spectra less a pattern (B, U) that every row of these frames contains."""
+        part = copy(self)
+        part.values = self.values - pattern[:, None, None].to(self.values.dtype)
+        part._index_rows()
+        return part
 
     def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None:
         """(B, S, W) bool, pixels of the scene that are valid in all frames; None for all."""

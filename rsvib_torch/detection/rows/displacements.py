@@ -46,9 +46,9 @@ __all__ = [
     "measure_group",
     "measure_groups",
     "measure_strips",
-    "remove_column_pattern",
     "stack_spectra",
     "uneven_motion",
+    "without_column_pattern",
 ]
 
 BLOCK_ROWS = 8  # rows of one measurement; tones up to 1 / (16 T_row) are resolved
@@ -404,24 +404,22 @@ def joined_groups(parts: list[Measurements]) -> Measurements:
     )
 
 
-def remove_column_pattern(
+def without_column_pattern(
     groups: list[FrameGroup], timing: RowTiming, motion: Motion, gradients: list[RowGradients]
-) -> bool:
-    """Subtract a pattern of columns that is fixed to the sensor from the spectra of all frames; False if there is none.
+) -> list[FrameGroup] | None:
+    """The frames without a pattern of columns that is fixed to the sensor; None if there is none.
 
     The pattern would pull all displacements to zero.
     """
     parts = []
-    for group, own in zip(groups, gradients, strict=True):
+    for group, of_group in zip(groups, gradients, strict=True):
         positions = _Positions.of(group, timing, motion, EVERY)
         visible = positions.visible(group.spectra.height, BLOCK_ROWS // EVERY)
-        parts.append((group.spectra, positions.rows, positions.shift, visible, own.variance[:, ::EVERY]))
+        parts.append((group.spectra, positions.rows, positions.shift, visible, of_group.variance[:, ::EVERY]))
     pattern = column_pattern(parts)
     if pattern is None:
-        return False
-    for group in groups:
-        group.spectra.subtract(pattern)
-    return True
+        return None
+    return [replace(group, spectra=group.spectra.without(pattern)) for group in groups]
 
 
 def differential_motion(gradients: list[RowGradients], *, rows: int = 64) -> Tensor:

@@ -5,6 +5,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md), in e
 
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -20,9 +21,9 @@ from rsvib_torch.detection.rows.displacements import (
     joined_groups,
     measure_groups,
     measure_strips,
-    remove_column_pattern,
     stack_spectra,
     uneven_motion,
+    without_column_pattern,
 )
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.frames.column_strips import ColumnStrips
@@ -83,9 +84,10 @@ class MeasuredRows:
         """The motion of the stacks that are measured, with two components."""
         return motion
 
-    def remove_column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> bool:
-        """Subtract a pattern of columns that is fixed to the sensor; False if there is none."""
-        return remove_column_pattern(self.groups, self.timing, self.view(motion), gradients)
+    def without_column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> Self | None:
+        """The rows without a pattern of columns that is fixed to the sensor; None if there is none."""
+        groups = without_column_pattern(self.groups, self.timing, self.view(motion), gradients)
+        return None if groups is None else replace(self, groups=groups)
 
     def blur_ratio(self, motion: Vibration) -> Tensor:
         """(B, 3) ratio, standard deviation and size as in ``displacements.blur_ratio``."""
@@ -158,10 +160,11 @@ class StripRows(MeasuredRows):
             excesses.append(torch.where(regular[..., None], excess, torch.nan))
         return torch.cat(excesses, 1)
 
-    def remove_column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> bool:
+    def without_column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> Self | None:
         """As for whole rows: all strips of a row have the same noise."""
-        of_strips = [replace(own, variance=own.variance.repeat_interleave(len(self.columns), 0)) for own in gradients]
-        return super().remove_column_pattern(motion, of_strips)
+        count = len(self.columns)
+        of_strips = [replace(part, variance=part.variance.repeat_interleave(count, 0)) for part in gradients]
+        return super().without_column_pattern(motion, of_strips)
 
     def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motions of the strips (B S)."""

@@ -32,6 +32,7 @@ __all__ = [
     "drift_response",
     "fit_roughly",
     "fit_tones",
+    "is_bounded",
     "model_displacements",
     "motion_of_fit",
     "offset_gain",
@@ -458,6 +459,28 @@ def with_unknown_errors(measurements: Measurements, fit: ToneFit) -> ToneFit:
     largest = whole / measurements.num_measurements.clamp(min=1.0)
     variances = torch.where(unknown, largest, problem.variances(state))
     return replace(fit, covariance=problem.covariance(state, variances.sqrt()))
+
+
+# px, motion during an exposure; px and px/s, amplitude and drift; Hz. Fits beyond diverge: frames are smaller
+_MAX_PATH, _MAX_SIZE, _MAX_FREQUENCY = 1e3, 1e6, 1e9
+
+
+def is_bounded(fit: ToneFit, exposure_time: float) -> Tensor:
+    """(B,) bool, fits whose parameters are finite and of a size that frames can be warped by.
+
+    Args:
+        fit: With its covariance.
+        exposure_time: T_e in seconds.
+    """
+    amplitude, drift = fit.amplitude, fit.drift.abs().amax(-1)
+    cycles = (fit.frequencies * exposure_time).nan_to_num(0.0)
+    path = (amplitude * torch.minimum(2 * math.pi * cycles, 4 * cycles + 2)).sum(-1) + drift * exposure_time  # (B, A)
+    variances = fit.covariance.diagonal(dim1=-2, dim2=-1)
+    return (
+        ((path <= _MAX_PATH) & (amplitude.amax(-1) <= _MAX_SIZE) & (fit.frequencies.amax(-1) <= _MAX_FREQUENCY)).all(-1)
+        & (drift <= _MAX_SIZE * _MAX_PATH).all(-1)
+        & torch.isfinite(variances).all(-1)
+    )
 
 
 # --- Inversion ---

@@ -1,0 +1,319 @@
+"""One attempt to detect the vibration of B stacks, under one hypothesis on the motion and the timing.
+
+``attempt`` reads from top to bottom: start, fit, uncertainty, verdict. It works in row order, with all components of the
+motion in px. It does not raise an error if the hypothesis is wrong, but returns a status for each stack.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.option_types import DetectionMethod
+from rsvib_torch.detection.assemble import offset_curve
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.refinement import FittedRows, refine
+from rsvib_torch.detection.reliability import judge
+from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
+from rsvib_torch.detection.rows.measured_rows import strip_rows, whole_rows
+from rsvib_torch.detection.start import BandStart, GreyFrames, band_start, field_start
+from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.tones.aliasing import without_aliasing
+from rsvib_torch.detection.tones.fit import (
+    MotionModel,
+    ToneFit,
+    displacement_std,
+    model_displacements,
+    residual_of,
+    shrunk_motion,
+    vibration_of_fit,
+    with_unknown_errors,
+)
+from rsvib_torch.detection.tones.further import with_further_tones
+from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones, robust_fit
+from rsvib_torch.motion.timing import RowTiming
+from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
+from rsvib_torch.registration import OffsetCurve, RegistrationOptions
+from rsvib_torch.registration.register import fits_frame
+
+__all__ = ["METHODS", "Attempt", "DetectionOptions", "Hypothesis", "Method", "Status", "attempt"]
+
+Status = Literal["fitted", "abandoned", "too small"]
+
+
+@dataclass(frozen=True)
+class DetectionOptions:
+    """Options of all attempts.
+
+    Attributes:
+        method: How tones are fitted.
+        tones: Number of tones of each axis; None to select it by significance.
+        model: Harmonics and order of the image motion.
+        bands: Registration of the row bands.
+    """
+
+    method: DetectionMethod
+    tones: int | None
+    model: MotionModel
+    bands: RegistrationOptions
+
+    @property
+    def max_tones(self) -> float:
+        """Largest number of tones that are tried on an axis; infinite if the number is given."""
+        return MAX_TONES if self.tones is None and self.model.harmonics == 1 else math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """What an attempt assumes about the motion, and what earlier attempts have found.
+
+    Attributes:
+        scale: Components of the motion.
+        is_doubtful: Whether the motion is assumed only because something contradicts a simpler one: roll and zoom
+            because the halves of the rows move apart, another timing because tones do not explain the rows. The
+            attempt is then abandoned early if a large residual remains.
+        has_pattern: Whether the frames have a pattern of columns; None if it is not known.
+        translation: Fit without roll and zoom, from which a fit with roll or zoom starts.
+        bands: Offsets of the row bands of these frames, measured with another timing.
+        frequencies: (B, A, 1) Hz of one tone of each axis.
+    """
+
+    scale: FieldScale
+    is_doubtful: bool = False
+    has_pattern: bool | None = None
+    translation: ToneFit | None = None
+    bands: OffsetCurve | None = None
+    frequencies: Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Result of a method of detection.
+
+    Attributes:
+        fit: The fit of all B stacks, with the covariance of its parameters.
+        measurements: The measurements with the weights of the fit.
+        offsets: The same as offsets (B, P, N, A) between consecutive frames.
+        predicted: (B, P, N, A) px, the offsets that the fit predicts.
+        rows: The complete result of the direct method; None if the fit is to bands.
+    """
+
+    fit: ToneFit
+    measurements: Measurements
+    offsets: OffsetCurve
+    predicted: Tensor
+    rows: FittedRows | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """What an attempt found, for B stacks in row order.
+
+    Attributes:
+        statuses: For each stack, ``"fitted"``; ``"abandoned"``: the hypothesis is wrong; ``"too small"``: a frame is
+            smaller than a band and its search range.
+        options: The options.
+        scale: Components of the motion.
+        start: Offsets of the row bands.
+        fitted: Measurements and the fit to them.
+        fit: The same with all uncertainties in its covariance.
+        vibration: Its vibration, in px.
+        std: Standard deviations of the vibration, in px.
+        reasons: For each stack and each axis the reasons against it.
+        interval: Seconds between the first two frames.
+    """
+
+    statuses: tuple[Status, ...]
+    options: DetectionOptions
+    scale: FieldScale
+    start: BandStart
+    fitted: Fitted
+    fit: ToneFit
+    vibration: Vibration
+    std: VibrationStd
+    reasons: tuple[tuple[tuple[str, ...], ...], ...]
+    interval: float
+
+
+def attempt(
+    stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis
+) -> Attempt | Literal["too small"]:
+    """Detect the vibration of B stacks under a hypothesis.
+
+    Args:
+        stacks: The frames.
+        timing: The sensor, in row order.
+        options: Options of all attempts.
+        hypothesis: What is assumed.
+    """
+    method, scale = METHODS[options.method], hypothesis.scale
+    frames = stacks.images
+    num_frames, height, width = frames.shape[1:]
+    if not fits_frame(height, width, options.bands):
+        return "too small"
+
+    # 1. Start: the offsets of row bands between consecutive frames, and the tones that are known.
+    if scale.same_for_all_columns:
+        start = band_start(stacks, timing, options.bands, mere_start=not method.needs_whole_curve, known=hypothesis.bands)
+    else:
+        start = field_start(stacks, timing, options.bands, scale, hypothesis.translation)
+    if hypothesis.frequencies is not None:
+        active = torch.ones_like(hypothesis.frequencies, dtype=torch.bool)
+        known, _ = robust_fit(start.measurements, hypothesis.frequencies, active, options.model)
+        start = replace(start, fit=known)
+
+    # 2. Fit: tones and image motion, to the bands or to the rows.
+    fitted = method.fit(start, stacks, timing, options, hypothesis)
+
+    # 3. Uncertainty: what the residual does not contain. Fits with hardly more measurements than parameters are exact
+    # for any errors; aliasing biases the displacements; the record may contain a further tone.
+    starts = _starts_of_rows(timing, num_frames, height, frames.device)
+    if fitted.rows is None:
+        fit = with_unknown_errors(fitted.measurements, fitted.fit)
+    else:
+        fit = without_aliasing(fitted.measurements, fitted.fit, fitted.rows.aliasing)
+    known_std = displacement_std(fit, starts, timing.exposure_time)
+    fit, total_std = with_further_tones(fitted.measurements, fit, starts, number_is_known=options.tones is not None)
+    vibration, std = vibration_of_fit(fit)
+    std = replace(std, displacement=total_std)
+
+    # 4. Verdict: for each axis, the reasons against it.
+    intervals = compared_intervals(timing, num_frames, method.max_group_frames, frames.device)
+    reasons = _judged(start, fitted, fit, vibration, std, known_std, starts, intervals, timing, options, scale)
+    abandoned = [False] * len(frames) if fitted.rows is None else fitted.rows.abandoned.tolist()
+    return Attempt(
+        statuses=tuple("abandoned" if stack else "fitted" for stack in abandoned),
+        options=options,
+        scale=scale,
+        start=start,
+        fitted=fitted,
+        fit=fit,
+        vibration=vibration,
+        std=std,
+        reasons=reasons,
+        interval=float(intervals[0]),
+    )
+
+
+def _starts_of_rows(timing: RowTiming, num_frames: int, height: int, device: torch.device) -> Tensor:
+    """(N,) s, exposure starts of every eighth row of all frames."""
+    return timing.row_starts(num_frames, height, device)[:, ::8].flatten()
+
+
+def _judged(
+    start: BandStart,
+    fitted: Fitted,
+    fit: ToneFit,
+    vibration: Vibration,
+    std: VibrationStd,
+    known_std: Tensor,
+    starts: Tensor,
+    intervals: Tensor,
+    timing: RowTiming,
+    options: DetectionOptions,
+    scale: FieldScale,
+) -> tuple[tuple[tuple[str, ...], ...], ...]:
+    """For each stack and each axis the reasons against it."""
+    tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
+    moved = tones.mean_displacement(starts.expand(len(fit.centre), -1), timing.exposure_time)
+    curve, predicted = start.curve, start.predicted(fit)
+    # an image motion may carry bands out of the later frame
+    later, half = curve.rows + predicted[..., 1], 0.5 * options.bands.band_rows
+    visible = (later >= half) & (later <= scale.height - 1 - half)
+    verdicts = [
+        judge(
+            vibration[index],
+            std[index],
+            offsets=curve.offsets[index].flatten(0, 1),
+            fitted=predicted[index].flatten(0, 1),
+            visible=visible[index].flatten(),
+            intervals=intervals,
+            displacement=moved[index].std(0, correction=0),
+            own_std=known_std[index],
+            timing=timing,
+            other_motion=None if fitted.rows is None else fitted.rows.other_motion[index],
+            max_tones=options.max_tones,
+            radius=scale.radius,
+        )[1]
+        for index in range(len(fit.centre))
+    ]
+    return tuple(verdicts)
+
+
+# Methods of detection
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method of detection: ``fit(start, stacks, timing, options, hypothesis)`` -> ``Fitted``.
+
+    The arguments of ``fit`` are the offset curve (B, P, N) of row bands with its measurements, the grey frames
+    (B, T, H, W) in row order, the sensor in row order, and the options. Stacks of a batch must not affect each other.
+
+    Attributes:
+        fit: The function.
+        max_group_frames: Number of frames that are compared with each other; it decides which tones have a gain.
+        needs_whole_curve: Whether the accuracy depends on the offset curve, or the curve is only a start.
+    """
+
+    fit: Callable[[BandStart, GreyFrames, RowTiming, DetectionOptions, Hypothesis], Fitted]
+    max_group_frames: int
+    needs_whole_curve: bool
+
+
+def fit_bands(
+    start: BandStart, stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis
+) -> Fitted:
+    """The paper's method: tones are fitted to the offsets of row bands."""
+    fit = _tones_of_bands(start, timing, options)
+    weighted = start.measurements.reweighted(residual_of(start.measurements, fit))
+    return Fitted(fit, weighted, start.curve, start.predicted(fit))
+
+
+def fit_directly(
+    start: BandStart, stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis
+) -> Fitted:
+    """The fit to bands, refined on the images row by row."""
+    # The gradients of rows reach a few tenths of a pixel, so that a start with an error of 0.15 px converges.
+    fit = _tones_of_bands(start, timing, options, accuracy=0.15)
+    intervals = compared_intervals(timing, stacks.images.shape[1], MAX_GROUP_FRAMES, stacks.images.device)
+    motion, scale, doubtful = shrunk_motion(fit, intervals), hypothesis.scale, hypothesis.is_doubtful
+    if scale.same_for_all_columns:
+        rows = whole_rows(stacks.images, stacks.valid, timing, motion)
+    else:  # equal blur takes several times as long, and is not needed to find that there is no roll
+        rows = strip_rows(stacks.images, stacks.valid, timing, motion, scale, pairs_if_blurred_differently=not doubtful)
+    refined = refine(
+        rows, intervals, fit, options.tones, may_abandon=doubtful, has_pattern=hypothesis.has_pattern
+    )
+    # Roll and zoom that were confirmed are fitted again with equal blur, if the exposures blur the frames differently.
+    if doubtful and not scale.same_for_all_columns and not bool(refined.abandoned.all()):
+        motion = shrunk_motion(refined.fit, intervals)
+        if rows.differently_blurred(motion):
+            rows = strip_rows(stacks.images, stacks.valid, timing, motion, scale)
+            again = refine(rows, intervals, refined.fit, options.tones, has_pattern=hypothesis.has_pattern)
+            refined = replace(again, abandoned=refined.abandoned)
+    group_frames = [group.starts.shape[1] for group in refined.rows.groups]
+    offsets, predicted = offset_curve(refined.measurements, refined.fit, refined.robust_weights, group_frames)
+    return Fitted(refined.fit, refined.measurements, offsets, predicted, refined)
+
+
+def _tones_of_bands(
+    start: BandStart, timing: RowTiming, options: DetectionOptions, accuracy: float = 0.0
+) -> ToneFit:
+    """Tones and image motion of the offsets of row bands; further tones until residuals are below ``accuracy`` px."""
+    interval = options.bands.band_step * timing.row_time
+    blind = blind_frequencies(timing, 0.5 / interval).to(start.measurements.centre.device)
+    return find_tones(
+        start.measurements, interval, options.tones, options.model, start=start.fit, blind=blind, accuracy=accuracy
+    )
+
+
+METHODS: dict[DetectionMethod, Method] = {
+    "direct": Method(fit_directly, MAX_GROUP_FRAMES, needs_whole_curve=False),
+    "bands": Method(fit_bands, 2, needs_whole_curve=True),
+}

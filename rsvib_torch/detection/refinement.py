@@ -1,0 +1,469 @@
+"""Refinement of a detected motion on the images: rounds of measuring the rows and fitting the motion to them.
+
+``Refinement.step`` is one round:
+
+1. warp the frames to the scene by the current motion, and measure the residual displacement and the information matrix
+   of every scene row (``rows.displacements``), with roll and zoom in strips of columns (``rows.measured_rows``),
+2. fit tones and image motion to the measurements by weighted least squares (``tones``),
+3. decide: stop, subtract a pattern of columns and begin again, or continue, possibly with a faster step.
+
+Step 1 does not depend on the model of the motion, step 2 does not depend on images. All B stacks take part in every
+round, until each of them is finished.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from rsvib_torch.detection.convergence import Acceleration, Step, is_converged
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.result import OtherMotion
+from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
+from rsvib_torch.detection.rows.measured_rows import MeasuredRows, RowRecord
+from rsvib_torch.detection.tones.fit import (
+    ToneFit,
+    fit_tones,
+    is_bounded,
+    model_displacements,
+    residual_of,
+    select_stacks,
+    shrunk_motion,
+    strongest_only,
+)
+from rsvib_torch.detection.tones.selection import find_tones, robust_fit, significant_only, typical_size
+from rsvib_torch.motion.vibration import Vibration, blind_frequencies
+from rsvib_torch.registration.gradients import RowGradients
+
+__all__ = ["FittedRows", "Refinement", "mirrored_frequencies", "refine", "with_unknown_changes"]
+
+
+@dataclass(frozen=True, eq=False)
+class FittedRows:
+    """Displacements of the rows of B stacks, and the motion that was fitted to them.
+
+    Attributes:
+        measurements: Displacements of blocks of scene rows, measured around the fit, with its weights.
+        fit: The fit to them.
+        other_motion: Motion in the measurements that the fit does not explain.
+        robust_weights: (B, N, A) weights 0 ... 1 by which the information of each row was multiplied; 0 for outliers.
+        aliasing: (B,) px, expected size of the bias of the displacements by aliasing.
+        uneven: (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain.
+        rows: The frames; without a pattern of columns if there was one.
+        has_pattern: Whether a pattern of columns was subtracted.
+        abandoned: (B,) bool, stacks whose large residual ended the rounds early.
+    """
+
+    measurements: Measurements
+    fit: ToneFit
+    other_motion: OtherMotion
+    robust_weights: Tensor
+    aliasing: Tensor
+    uneven: Tensor
+    rows: MeasuredRows
+    has_pattern: bool
+    abandoned: Tensor
+
+
+def refine(
+    rows: MeasuredRows,
+    intervals: Tensor,
+    start: ToneFit,
+    tones: int | None,
+    *,
+    may_abandon: bool = False,
+    has_pattern: bool | None = None,
+) -> FittedRows:
+    """Refine a detected motion on the images.
+
+    Args:
+        rows: The frames.
+        intervals: (M,) s, times between the frames that are compared.
+        start: Fit to the offsets of row bands.
+        tones: Number of tones of each axis; None to select it by significance.
+        may_abandon: As in ``Refinement``.
+        has_pattern: As in ``Refinement``.
+
+    Returns:
+        The last measurements and the fit to them.
+    """
+    # Rounds of measuring and fitting from the given start.
+    refined = _rounds(rows, intervals, start, tones, may_abandon, has_pattern)
+    # A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well.
+    if rows.differently_blurred(shrunk_motion(start, intervals)):
+        tried = torch.zeros_like(start.active[..., 0])
+        for _ in range(2):  # one axis after the other
+            frequencies, mirrored = mirrored_frequencies(refined.measurements, refined.fit, start, tried)
+            if not bool(mirrored.any()):
+                break
+            tried = tried | mirrored
+            active = strongest_only(refined.fit).active
+            other, _ = robust_fit(refined.measurements, frequencies, active, start.model)
+            # a pattern that was subtracted does not appear again
+            again = _rounds(refined.rows, intervals, other, tones, False, has_pattern)
+            refined = _better_of_both(refined, again)
+    # Tones that the exact fit does not confirm are left out.
+    if tones is None:
+        refined = replace(refined, fit=significant_only(refined.measurements, refined.fit, intervals))
+    # The difference of the blur of the frames, by the final motion, contradicts a wrong exposure time.
+    blur = refined.rows.blur_ratio(shrunk_motion(refined.fit, intervals))
+    return replace(refined, other_motion=replace(refined.other_motion, blur=blur))
+
+
+def _rounds(
+    rows: MeasuredRows,
+    intervals: Tensor,
+    start: ToneFit,
+    tones: int | None,
+    may_abandon: bool,
+    has_pattern: bool | None,
+) -> FittedRows:
+    """All rounds of a ``Refinement``."""
+    refinement = Refinement(rows, intervals, start, tones, may_abandon=may_abandon, has_pattern=has_pattern)
+    while not refinement.is_finished:
+        refinement.step()
+    return refinement.result()
+
+
+@dataclass(eq=False)
+class ColumnPatterns:
+    """Patterns of columns that are fixed to the sensor, and subtracted after some of the rounds.
+
+    Attributes:
+        remaining: Number of times that a pattern may be subtracted.
+        subtracted: Whether a pattern was subtracted.
+        refused: (B, A) residuals before the last pattern was subtracted, if all axes were refused; else None.
+    """
+
+    remaining: int
+    subtracted: bool = False
+    refused: Tensor | None = None
+
+    def without(
+        self, rows: MeasuredRows, motion: Vibration, gradients: list[RowGradients], refused: Tensor | None = None
+    ) -> MeasuredRows | None:
+        """The rows without their pattern; None if there is none, or if axes are refused again after the last one."""
+        if self.remaining == 0 or (refused is not None and self.refused is not None):
+            return None
+        cleared = rows.without_column_pattern(motion, gradients)
+        if cleared is not None:
+            self.remaining, self.subtracted, self.refused = self.remaining - 1, True, refused
+        return cleared
+
+    def were_not_the_cause(self, size: Tensor) -> bool:
+        """Whether refused axes have residuals (B, A) of more than half the size without the pattern."""
+        return self.refused is not None and bool((size > 0.5 * self.refused).all())
+
+
+class Refinement:
+    """State of the rounds that refine the motion of B stacks.
+
+    Args:
+        rows: The frames.
+        intervals: (M,) s, times between the frames that are compared.
+        start: Fit to the offsets of row bands.
+        tones: Number of tones of each axis; None to select it by significance.
+        max_rounds: Largest number of rounds; exposures of 400 rows need more than six.
+        may_abandon: Whether the motion is possibly of another kind than assumed (parallax instead of roll). Stacks with
+            a large residual after three rounds are then abandoned.
+        has_pattern: Whether the frames have a pattern of columns: it is then subtracted after the first round instead
+            of the last, or not looked for. None if it is not known.
+
+    Attributes:
+        rows: The frames, without a pattern of columns that was subtracted.
+        fit: The fit of the last round.
+        motion: The motion of the fit, around which the next round measures.
+        warped_by: The motion around which the last round measured.
+        round: Number of the next round.
+        search_round: Round in which further tones are searched for. The first round removes the error of the band
+            offsets; weak tones are significant after it.
+        is_finished: Whether the last round has been made.
+        converged: (B,) bool, stacks whose next round would change little.
+        abandoned: (B,) bool, stacks that are abandoned.
+    """
+
+    def __init__(
+        self,
+        rows: MeasuredRows,
+        intervals: Tensor,
+        start: ToneFit,
+        tones: int | None,
+        *,
+        max_rounds: int = 12,
+        may_abandon: bool = False,
+        has_pattern: bool | None = None,
+    ) -> None:
+        self.rows, self.fit = rows, start
+        self.motion = self.warped_by = shrunk_motion(start, intervals)
+        self.round, self.search_round, self.is_finished = 0, 1, False
+        self.converged = self.abandoned = torch.zeros_like(start.centre, dtype=torch.bool)
+        self._intervals, self._tones, self._max_rounds = intervals, tones, max_rounds
+        self._may_abandon, self._has_pattern = may_abandon, has_pattern
+        # exposures average out faster tones
+        self._sample_interval = max(BLOCK_ROWS * rows.timing.row_time, 0.5 * rows.timing.exposure_time)
+        self._blind = blind_frequencies(rows.timing, 0.5 / self._sample_interval).to(start.centre.device)
+        self._record: RowRecord  # of the last round
+        self._gradients: list[RowGradients] | None = None  # of the scene; None: compute them from the warped frames
+        self._acceleration = Acceleration()
+        # a strong pattern biases its first estimate, so that it is subtracted twice
+        self._patterns = ColumnPatterns(remaining=0 if has_pattern is False else 2)
+        # of the rounds since the search: (B, A) typical residuals in standard deviations, and fits of the same tones
+        self._sizes: list[Tensor] = []
+        self._fits: list[ToneFit] = []
+
+    def step(self) -> None:
+        """One round: measure the rows around the motion, fit the motion to them, decide how to continue."""
+        number, previous = self.round, self.fit
+        self.round += 1
+
+        # 1. Measure the displacements of the rows around the motion.
+        record = self._record = self.rows.measure(self.motion, self._gradients)
+        measurements = record.measurements
+        residual = residual_of(measurements, previous)
+        size = measurements.sizes(residual).nanmedian(1).values
+        self._sizes = [] if number == self.search_round else [*self._sizes, size]  # fewer tones before the search
+
+        # 2. Fit the motion to them, and keep the last fit of a stack whose fit diverges.
+        fit = self._searched(measurements, residual) if number == self.search_round else None
+        if fit is None:
+            fit = robust_fit(measurements, previous.frequencies, previous.active, previous.model, residual, steps=1)[0]
+        fit = self.fit = self._bounded(fit, previous)
+        same_tones = torch.equal(previous.active, fit.active)
+        self._fits = [*self._fits, fit] if same_tones and number > self.search_round else [fit]
+        self.warped_by, self.motion = self.motion, shrunk_motion(fit, self._intervals)
+        self._gradients = record.gradients
+
+        # 3. Decide. A known pattern of columns is subtracted as soon as the motion is known roughly.
+        if number == 0 and self._has_pattern and self._subtract_pattern():
+            return
+        if self.round == self._max_rounds or not bool((measurements.weights > 0).any()):  # or no row is visible any more
+            self.is_finished = True
+            return
+        if self._may_abandon and self.round == _TRIED_ROUNDS:
+            self.abandoned = _large_residual(self.rows, record, fit)
+        if bool(self.abandoned.all()) or (
+            self.round == self.search_round + 2 and self._patterns.were_not_the_cause(size)
+        ):
+            self.is_finished = True
+            return
+        # Stop if the next round would change the motion by much less than its standard deviation, or if the residual
+        # of an axis that is refused hardly decreases: unless a pattern of columns is the cause.
+        step = Step.between(measurements, self.warped_by, self.motion)
+        converged = is_converged(previous, fit, self._acceleration.ratio(step) if same_tones else None)
+        converged = converged & (number >= self.search_round)
+        stalled = self._stalled(record)
+        self.converged = converged.all(-1)
+        if bool((converged | stalled | self.abandoned[:, None]).all()):
+            if not self._subtract_pattern(size if bool(stalled.all()) else None):
+                self.is_finished = True
+            return
+        # Continue with a faster step where the last one was too long or too short.
+        self._acceleration.add(step, same_tones=len(self._fits) > 1)
+        faster = self._acceleration.applied(measurements, fit)
+        if faster is not None:
+            self.fit = self._bounded(faster, fit)
+            self.motion = shrunk_motion(self.fit, self._intervals)
+            step = Step.between(measurements, self.warped_by, self.motion)
+        if float(step.change.abs().amax()) > _SAME_GRADIENTS:
+            self._gradients = None
+
+    def result(self) -> FittedRows:
+        """The last measurements, with the exact fit to them."""
+        fitted = conclude(self.rows, self._record, self.fit)
+        converged = self.converged | self.abandoned
+        if not bool(converged.all()):
+            fitted = with_unknown_changes(fitted, self.warped_by, self.motion, self._fits, ~converged)
+        has_pattern = self._patterns.subtracted
+        return replace(fitted, has_pattern=has_pattern, abandoned=self.abandoned)
+
+    def _searched(self, measurements: Measurements, residual: Tensor) -> ToneFit:
+        """Fit with further tones. The noise of rows is nearly white: a tone that explains 2 % is significant."""
+        independent = replace(measurements, independent=measurements.independent_fraction(residual))
+        start = strongest_only(self.fit)
+        return find_tones(independent, self._sample_interval, self._tones, start.model, 0.02, start, self._blind)
+
+    def _subtract_pattern(self, refused: Tensor | None = None) -> bool:
+        """Subtract a pattern of columns, and begin again; False if there is none.
+
+        Args:
+            refused: (B, A) residuals of the axes, if all of them are refused.
+        """
+        assert self._gradients is not None
+        cleared = self._patterns.without(self.rows, self.motion, self._gradients, refused)
+        if cleared is None:
+            return False
+        self.rows, self._gradients = cleared, None
+        self.converged = torch.zeros_like(self.converged)
+        if self.round > 1:  # after the first round, the search is still to come
+            self.search_round = self.round
+            self._sizes = []
+            self._acceleration.clear()
+        return True
+
+    def _bounded(self, fit: ToneFit, previous: ToneFit) -> ToneFit:
+        """The fit, with the previous one for stacks whose fit diverges."""
+        bounded = is_bounded(fit, self.rows.timing.exposure_time)
+        if bool(bounded.all()):
+            return fit
+        if fit.active.shape != previous.active.shape:  # of a search: all stacks keep the tones that they had
+            return previous
+        return select_stacks(bounded, fit, previous)
+
+    def _stalled(self, record: RowRecord) -> Tensor:
+        """(B, A) bool, axes whose typical residual hardly decreased in two rounds, and which are refused because of it.
+
+        A quarter in two rounds is too little to reach what is permitted in the rounds that remain.
+        """
+        sizes = self._sizes
+        nothing = torch.zeros_like(self.fit.active[..., 0])
+        if len(sizes) < 3:
+            return nothing
+        stalled = sizes[-1] > 0.75 * sizes[-3]
+        if not bool(stalled.any()):
+            return nothing
+        other = conclude(self.rows, record, self.fit).other_motion
+        return stalled & (other.unexplained > other.permitted)
+
+
+# rounds; multiple of the residual that the verdict permits. Roll and zoom leave 0.1 of it, parallax 2 to 10 times it
+_TRIED_ROUNDS, _MAX_TRIED = 3, 2.0
+_SAME_GRADIENTS = 0.05  # px; over smaller distances the gradients of the scene are the same
+
+
+def _large_residual(rows: MeasuredRows, record: RowRecord, fit: ToneFit) -> Tensor:
+    """(B,) bool, whether the fit leaves a residual that no further round would reduce enough."""
+    other = conclude(rows, record, fit).other_motion
+    return (other.unexplained > _MAX_TRIED * other.permitted).any(-1)
+
+
+# Conclusion
+
+
+def conclude(rows: MeasuredRows, record: RowRecord, fit: ToneFit) -> FittedRows:
+    """The exact fit to the measurements themselves, with a covariance that accounts for correlated residuals."""
+    measurements = record.measurements
+    residual = residual_of(measurements, fit)
+    weighted = measurements.reweighted(residual)
+    share = weighted.independent_fraction(residual) * measurements.share_counted(residual)
+    weighted = replace(weighted, independent=share)
+    fit = fit_tones(weighted, fit, fit.active, fit.model)
+    visible = measurements.num_differences > 0
+    measured = (visible & (measurements.weights > 0).any(-1)).double().sum(1) / visible.double().sum(1).clamp(min=1.0)
+    tones = measurements.relative(model_displacements(measurements, replace(fit, drift=torch.zeros_like(fit.drift))))
+    other = OtherMotion(
+        size=math.sqrt(2) * measurements.distances(tones).square().nanmean(1).sqrt(),
+        unexplained=measurements.unexplained(residual),
+        correlated=measurements.correlated(residual),
+        differential=record.differential(),
+        measured=measured,
+        blur=measured.new_tensor([1.0, 0.0, 0.0]).expand(len(measured), 3),  # replaced once the motion is final
+    )
+    return FittedRows(
+        weighted,
+        fit,
+        other,
+        robust_weights=weighted.weights / measurements.weights.clamp(min=1e-300),
+        aliasing=torch.stack([gradients.aliasing for gradients in record.gradients]).mean(0),
+        uneven=record.uneven(),
+        rows=rows,
+        has_pattern=False,
+        abandoned=torch.zeros_like(fit.centre, dtype=torch.bool),
+    )
+
+
+def with_unknown_changes(
+    fitted: FittedRows, warped_by: Vibration, motion: Vibration, fits: Sequence[ToneFit], where: Tensor
+) -> FittedRows:
+    """The fit of stacks whose rounds did not converge: what the last rounds changed is not known.
+
+    The change of the displacements by the last round counts as motion that is not explained, for all axes, because the
+    displacement along one determines which rows are compared along the other. Tones of 10 to 40 px in three frames with
+    a long exposure did not converge: they were wrong, with a permitted residual.
+
+    The changes of the parameters by the last rounds count as errors. Tones near blind frequencies with long exposures
+    had errors of 4 to 18 standard deviations without them.
+
+    Args:
+        fitted: The fit of the last round.
+        warped_by: Motion that the frames were warped by.
+        motion: Motion that was fitted.
+        fits: Fits of the last rounds with the same tones.
+        where: (B,) bool, stacks that did not converge.
+    """
+    measurements, fit, other = fitted.measurements, fitted.fit, fitted.other_motion
+    change = Step.between(measurements, warped_by, motion).change
+    distance = measurements.distances(change).square().nanmean(1).nan_to_num(0.0).sqrt() * where[:, None]
+    least = (distance / other.permitted).amax(-1, keepdim=True) * other.permitted
+    other = replace(other, unexplained=torch.maximum(other.unexplained, least))
+    changes = torch.stack([one.about(fit.centre).parameters - fit.parameters for one in fits], -1).flatten(1, 2)
+    changes = changes * where[:, None, None]
+    return replace(fitted, other_motion=other, fit=replace(fit, covariance=fit.covariance + changes @ changes.mT))
+
+
+# Mirrored frequencies
+
+
+def mirrored_frequencies(
+    measurements: Measurements, fit: ToneFit, start: ToneFit, tried: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Frequencies of the strongest tones, that of the less explained axis mirrored at the nearest blind frequency.
+
+    With two frames, tones equally far above and below a blind frequency ``j / (m T_row)`` have the same gain and differ
+    only within a frame.
+
+    Args:
+        measurements: The measurements of the fit.
+        fit: Fit that may be at the wrong side of a blind frequency.
+        start: Fit that it was refined from.
+        tried: (B, A) bool, axes that were mirrored before.
+
+    Returns:
+        Frequencies (B, A, 1) in Hz and the axes (B, A) that are mirrored, at most one of each stack: those with a
+        residual of three standard deviations in the typical row, and frequencies that a frame does not resolve.
+    """
+    strongest = strongest_only(fit)
+    residual = measurements.sizes(residual_of(measurements, fit)).nanmedian(1).values.nan_to_num(0.0)  # (B, A)
+    exposure_starts = measurements.exposure_starts
+    duration = (exposure_starts.amax(1) - exposure_starts.amin(1)).amax(-1)[:, None]
+    interval = (exposure_starts[:, :, 1] - exposure_starts[:, :, 0]).mean(1)[:, None]
+    frequency = strongest_only(start).frequencies[..., 0]
+    mirrored = 2 * (frequency * interval).round() / interval - frequency
+    unresolved = ((mirrored - frequency).abs() * duration < 0.35) & (mirrored > 0) & strongest.active[..., 0]
+    where = unresolved & ~tried & (residual > 3.0) & (residual == residual.amax(-1, keepdim=True))
+    if fit.model.harmonics > 1 or exposure_starts.shape[2] > 2:
+        where = torch.zeros_like(where)
+    return torch.where(where, mirrored, strongest.frequencies[..., 0])[..., None], where
+
+
+def _better_of_both(first: FittedRows, second: FittedRows) -> FittedRows:
+    """For every stack the result with the smaller residual in the typical row."""
+    better = typical_size(second.measurements, second.fit) < typical_size(first.measurements, first.fit)
+    first = replace(first, rows=second.rows)
+    if not bool(better.any()):
+        return first
+    if bool(better.all()):
+        return replace(second, has_pattern=first.has_pattern, abandoned=first.abandoned)
+    # Tones of both fits side by side, where one has more than the other, are fitted to the chosen measurements.
+    count = max(first.fit.active.shape[-1], second.fit.active.shape[-1])
+
+    def tones(one: Tensor, other: Tensor) -> Tensor:
+        one, other = (functional.pad(values, (0, count - values.shape[-1])) for values in (one, other))
+        return torch.where(better[:, None, None], one, other)
+
+    measurements = select_stacks(better, second.measurements, first.measurements)
+    frequencies = tones(second.fit.frequencies, first.fit.frequencies)
+    active = tones(second.fit.active, first.fit.active)
+    return replace(
+        first,
+        measurements=measurements,
+        fit=fit_tones(measurements, frequencies, active, first.fit.model),
+        other_motion=select_stacks(better, second.other_motion, first.other_motion),
+        robust_weights=torch.where(better[:, None, None], second.robust_weights, first.robust_weights),
+        aliasing=torch.where(better, second.aliasing, first.aliasing),
+        uneven=torch.where(better[:, None], second.uneven, first.uneven),
+    )
