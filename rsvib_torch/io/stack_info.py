@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.arguments import check_fields, checks_arguments
+from rsvib_torch.core.arrays import channels_appear_last
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import one_line
-from rsvib_torch.frames.arrays import channels_appear_last
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.time_metadata import orientation_of, times_of_attributes
 
