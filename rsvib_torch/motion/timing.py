@@ -234,3 +234,24 @@ def check_timing(value: object) -> None:
     """Raise a ``TypeError`` unless ``value`` is a ``SensorTiming``."""
     if not isinstance(value, SensorTiming):
         raise TypeError(f"timing must be a SensorTiming, got {type(value).__name__}")
+
+
+def row_axes(timing: SensorTiming, num_axes: int) -> tuple[list[int], list[float]]:
+    """Order and signs of the components of a motion when frames are turned to row order.
+
+    Transposing frames exchanges x and y; flipping them along the rows changes the sign of y. Both are reflections and
+    change the sign of roll. Component i in row order is component ``order[i]`` in image axes times ``signs[i]``.
+
+    Args:
+        timing: The sensor.
+        num_axes: Number of components (x, y, roll, zoom), 2 to 4.
+
+    Example:
+        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")
+        >>> row_axes(timing, 3)
+        ([1, 0, 2], [1.0, 1.0, -1.0])
+    """
+    transposed, reverse = timing.scan_axis == -1, timing.readout_direction == "reverse"
+    order = [1, 0, 2, 3] if transposed else [0, 1, 2, 3]
+    signs = [1.0, -1.0 if reverse else 1.0, -1.0 if transposed != reverse else 1.0, 1.0]
+    return order[:num_axes], signs[:num_axes]

@@ -20,7 +20,7 @@ from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import fast_length
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
-from rsvib_torch.frames.orientation import offsets_from_row_order
+from rsvib_torch.frames.orientation import offsets_from_row_order, sequence_from_row_order
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
@@ -164,8 +164,8 @@ def register_bands(
     )
     batch = register_rows(prepared.images.mean(2), prepared.timing, options)
     curve = batch if prepared.batched else batch[0]
-    heights = (curve.heights[1], curve.heights[0]) if timing.scan_axis == -1 else curve.heights
-    return replace(curve, offsets=offsets_from_row_order(curve.offsets, prepared.image_timing), heights=heights)
+    height_x, height_y = sequence_from_row_order(curve.heights, timing)
+    return replace(curve, offsets=offsets_from_row_order(curve.offsets, timing), heights=(height_x, height_y))
 
 
 def check_frame_size(num_rows: int, width: int, options: RegistrationOptions) -> None:
