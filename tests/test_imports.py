@@ -65,7 +65,7 @@ def imported_modules(source, module):
     """Modules of rsvib_torch that a module imports anywhere in its file, with the line: [(line, dotted name)].
 
     Functions, classes, ``if TYPE_CHECKING`` and ``try`` are included, imports by name, and modules that the table of
-    file formats names (``in_module``).
+    file formats names (``packaged_format``).
     """
     package = module.split(".")
     found = []
@@ -77,10 +77,11 @@ def imported_modules(source, module):
             base = package[: -node.level] if node.level else []
             origin = ".".join([*base, *([node.module] if node.module else [])])
             names = [f"{origin}.{alias.name}" for alias in node.names]
-        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+        elif isinstance(node, ast.Call):
             called = getattr(node.func, "id", getattr(node.func, "attr", ""))
-            if called in {"import_module", "__import__", "in_module"} and isinstance(node.args[0].value, str):
-                names = [node.args[0].value]
+            if called in {"import_module", "__import__", "packaged_format"}:
+                texts = [entry.value for entry in node.args if isinstance(entry, ast.Constant)]
+                names = [text for text in texts if isinstance(text, str)]
         found += [(node.lineno, resolved(name)) for name in names if name.split(".")[0] == "rsvib_torch"]
     return found
 
@@ -183,7 +184,7 @@ def test_modules_that_use_a_displacement_per_row_state_the_invariant():
         ("if TYPE_CHECKING:\n    import rsvib_torch.registration", "rsvib_torch.imaging.simulate"),
         ("try:\n    from rsvib_torch import report\nexcept ImportError:\n    pass", "rsvib_torch.stacks.job"),
         ("module = importlib.import_module('rsvib_torch.config')", "rsvib_torch.evaluation.quality"),
-        ("TABLE = (in_module('rsvib_torch.stacks.output', 'Output'),)", "rsvib_torch.io.formats"),
+        ("FORM = packaged_format('a', ('.a',), 'rsvib_torch.stacks.output', 'Output')", "rsvib_torch.io.formats"),
         ("from rsvib_torch.detection.rows import direct", "rsvib_torch.detection.tones.fit"),
         ("from rsvib_torch.restoration.exact.exact import restore_exact", "rsvib_torch.restoration.dewarp"),
     ],

@@ -1,10 +1,9 @@
 """The table of stack formats, and the choice of a format by the ending of a file name.
 
 The table is data. The module that reads and writes a format is imported when a stack of that format is opened, checked
-or written: see ``in_module``.
+or written (``packaged_format``).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 
 from rsvib_torch.io.stack_format import StackFormat
 
-__all__ = ["FORMATS", "find_format", "in_module", "register_format", "target_format"]
+__all__ = ["FORMATS", "find_format", "packaged_format", "register_format", "target_format"]
 
 
 @dataclass(frozen=True)
@@ -26,110 +25,79 @@ class _InModule:
         return getattr(import_module(self.module), self.name)(*arguments)
 
 
-def in_module(module: str, name: str) -> Callable[..., Any]:
-    """A function that imports its module when it is called: reading a TIFF file imports no other format.
+def packaged_format(
+    name: str,
+    endings: tuple[str, ...],
+    module: str,
+    open: str,
+    *,
+    create: str | None = None,
+    write_all: str | None = None,
+    check: str | None = None,
+    **stated: Any,
+) -> StackFormat:
+    """A format whose functions are imported when they are called: reading a TIFF file imports no other format.
 
-    ``tests/test_imports.py`` reads the calls of this function as imports.
+    ``tests/test_imports.py`` reads the names of the modules in the calls of this function as imports.
 
     Args:
-        module: Full name of the module.
-        name: Name of the function or class.
-
-    Example:
-        >>> in_module("math", "sqrt")(9.0)
-        3.0
+        name: As in ``StackFormat``.
+        endings: As in ``StackFormat``.
+        module: Full name of the module that has the functions.
+        open: Name of the function ``StackFormat.open``.
+        create: Name of the function ``StackFormat.create``, if there is one.
+        write_all: Name of the function ``StackFormat.write_all``, if there is one.
+        check: Name of the function ``StackFormat.check``, if there is one.
+        **stated: Further attributes of ``StackFormat``.
     """
-    return _InModule(module, name)
+    functions = {"open": open, "create": create, "write_all": write_all, "check": check}
+    loaded: dict[str, Any] = {
+        use: _InModule(module, function) for use, function in functions.items() if function is not None
+    }
+    return StackFormat(name, endings, **loaded, **stated)
 
 
 _KEPT = ("full_scale", "frame_times", "orientation", "resolution")
 _KEPT_BY_PNG = ("full_scale", "orientation", "resolution")
 _KEPT_BY_VIDEO = ("full_scale", "frame_times", "orientation")
+_READ_ONLY_VIDEO = (".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
 
-# Entries: name, endings, and functions of the contract in ``stack_format.py``. The order is that of error messages.
+# The order is that of error messages.
 _FORMATS_OF_THE_PACKAGE = (
-    StackFormat(
-        "npy",
-        (".npy",),
-        in_module("rsvib_torch.io.npy", "open_npy"),
-        in_module("rsvib_torch.io.npy", "create_npy"),
-        check=in_module("rsvib_torch.io.npy", "check_npy"),
+    packaged_format("npy", (".npy",), "rsvib_torch.io.npy", "open_npy", create="create_npy", check="check_npy"),
+    packaged_format(
+        "hdf5", (".h5", ".hdf5", ".hdf"), "rsvib_torch.io.hdf5", "open_hdf5", create="create_hdf5", keeps=_KEPT
     ),
-    StackFormat(
-        "hdf5",
-        (".h5", ".hdf5", ".hdf"),
-        in_module("rsvib_torch.io.hdf5", "open_hdf5"),
-        in_module("rsvib_torch.io.hdf5", "create_hdf5"),
-        keeps=_KEPT,
+    packaged_format("jpeg", (".jpg", ".jpeg"), "rsvib_torch.io.image_folder", "ImagesReader"),
+    packaged_format(
+        "png", (".png",), "rsvib_torch.io.image_folder", "ImagesReader", create="create_image", check="check_image",
+        dtypes=("uint8", "uint16"), keeps=_KEPT_BY_PNG,
     ),
-    StackFormat("jpeg", (".jpg", ".jpeg"), in_module("rsvib_torch.io.image_folder", "ImagesReader")),
-    StackFormat(
-        "png",
-        (".png",),
-        in_module("rsvib_torch.io.image_folder", "ImagesReader"),
-        in_module("rsvib_torch.io.image_folder", "create_image"),
-        dtypes=("uint8", "uint16"),
-        check=in_module("rsvib_torch.io.image_folder", "check_image"),
-        keeps=_KEPT_BY_PNG,
+    packaged_format(
+        "image folder", ("",), "rsvib_torch.io.image_folder", "ImagesReader", create="create_folder",
+        check="check_folder", kind="folder", keeps=_KEPT_BY_PNG,
     ),
-    StackFormat(
-        "image folder",
-        ("",),
-        in_module("rsvib_torch.io.image_folder", "ImagesReader"),
-        in_module("rsvib_torch.io.image_folder", "create_folder"),
-        check=in_module("rsvib_torch.io.image_folder", "check_folder"),
-        kind="folder",
-        keeps=_KEPT_BY_PNG,
+    packaged_format(
+        "raw", (".raw",), "rsvib_torch.io.raw", "open_raw", create="create_raw", companions=(".json",), keeps=_KEPT
     ),
-    StackFormat(
-        "raw",
-        (".raw",),
-        in_module("rsvib_torch.io.raw", "open_raw"),
-        in_module("rsvib_torch.io.raw", "create_raw"),
-        companions=(".json",),
-        keeps=_KEPT,
+    packaged_format(
+        "tiff", (".tif", ".tiff"), "rsvib_torch.io.tiff", "open_tiff", create="create_tiff", write_all="write_tiff",
+        compressions=("zlib", "lzma"), keeps=(*_KEPT, "metadata"),
     ),
-    StackFormat(
-        "tiff",
-        (".tif", ".tiff"),
-        in_module("rsvib_torch.io.tiff", "open_tiff"),
-        in_module("rsvib_torch.io.tiff", "create_tiff"),
-        in_module("rsvib_torch.io.tiff", "write_tiff"),
-        compressions=("zlib", "lzma"),
-        keeps=(*_KEPT, "metadata"),
+    packaged_format(
+        "FFV1 video", (".mkv", ".avi"), "rsvib_torch.io.video", "VideoReader", write_all="write_video",
+        check="check_video", dtypes=("uint8", "uint16"), keeps=_KEPT_BY_VIDEO,
     ),
-    StackFormat(
-        "FFV1 video",
-        (".mkv", ".avi"),
-        in_module("rsvib_torch.io.video", "VideoReader"),
-        write_all=in_module("rsvib_torch.io.video", "write_video"),
-        dtypes=("uint8", "uint16"),
-        check=in_module("rsvib_torch.io.video", "check_video"),
-        keeps=_KEPT_BY_VIDEO,
+    packaged_format(
+        "H.264 video", (".mp4", ".mov", ".m4v"), "rsvib_torch.io.video", "VideoReader", write_all="write_video",
+        check="check_video", keeps=_KEPT_BY_VIDEO,
     ),
-    StackFormat(
-        "H.264 video",
-        (".mp4", ".mov", ".m4v"),
-        in_module("rsvib_torch.io.video", "VideoReader"),
-        write_all=in_module("rsvib_torch.io.video", "write_video"),
-        check=in_module("rsvib_torch.io.video", "check_video"),
-        keeps=_KEPT_BY_VIDEO,
+    packaged_format("webm, mpeg, 3gp and wmv", _READ_ONLY_VIDEO, "rsvib_torch.io.video", "VideoReader"),
+    packaged_format(
+        "zarr", (".zarr",), "rsvib_torch.io.zarr_store", "open_zarr", create="create_zarr", kind="tree",
+        marker="zarr.json", keeps=_KEPT,
     ),
-    StackFormat(
-        "webm, mpeg, 3gp and wmv",
-        (".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv"),
-        in_module("rsvib_torch.io.video", "VideoReader"),
-    ),
-    StackFormat(
-        "zarr",
-        (".zarr",),
-        in_module("rsvib_torch.io.zarr_store", "open_zarr"),
-        in_module("rsvib_torch.io.zarr_store", "create_zarr"),
-        kind="tree",
-        marker="zarr.json",
-        keeps=_KEPT,
-    ),
-)
+)  # fmt: skip
 FORMATS: dict[str, StackFormat] = {ending: form for form in _FORMATS_OF_THE_PACKAGE for ending in form.endings}
 """Format of every file ending."""
 

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import ArrayReader
 from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_format import needed_package
-from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_from_attributes, readable_stack
+from rsvib_torch.io.stack_info import StackInfo, readable_stack
 from rsvib_torch.io.time_metadata import time_attributes, times_of_attributes
 
 __all__ = ["create_hdf5", "open_hdf5"]

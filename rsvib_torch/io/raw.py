@@ -9,8 +9,9 @@ from pydantic import Field
 
 from rsvib_torch.core.atomic import sync
 from rsvib_torch.core.validation import Section, read_json, validate
+from rsvib_torch.io.array_attributes import info_from_attributes
 from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
-from rsvib_torch.io.stack_info import StackInfo, info_from_attributes, readable_stack
+from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
 __all__ = ["create_raw", "open_raw"]
 

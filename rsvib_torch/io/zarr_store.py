@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import sync
 from rsvib_torch.core.validation import read_json
+from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import ArrayReader
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_format import FrameWriter, needed_package
-from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_from_attributes, readable_stack
+from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
 __all__ = ["create_zarr", "open_zarr"]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number, described
 
@@ -202,6 +202,18 @@ class SensorTiming:
                 f"row times from one frame to the next, including blanking rows, 1 / (frame rate x row time): with "
                 f"{self.frame_rate:g} frames/s, row_time is at most {self.frame_period / num_rows:.6g} s"
             )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The arguments that make this timing, as plain numbers and texts."""
+        starts = self.frame_start_times
+        return {
+            "row_time": float(self.row_time),
+            "exposure_rows": float(self.exposure_rows),
+            "frame_rows": float(self.frame_rows),
+            "scan_axis": "x" if self.scan_axis == -1 else "y",
+            "readout_direction": self.readout_direction,
+            "frame_start_times": None if starts is None else [float(start) for start in starts],
+        }
 
     def in_row_order(self) -> RowTiming:
         """The same timing for frames already turned to row order (rows on axis -2, first row read first)."""
