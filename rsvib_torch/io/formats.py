@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from rsvib_torch.core.reading import check_regular
 from rsvib_torch.io.stack_format import StackFormat
 
 __all__ = ["FORMATS", "find_format", "packaged_format", "register_format", "target_format"]
@@ -129,8 +130,12 @@ def find_format(path: Path) -> StackFormat:
     """The format of an existing stack: by its ending, of a folder also by its marker file, else a folder of images.
 
     Raises:
-        ValueError: If the ending is not registered.
+        FileNotFoundError: If it does not exist.
+        ValueError: If the ending is not registered, or the path is a pipe, a socket or a device.
     """
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist")
+    check_regular(path)
     if not path.is_dir():
         return target_format(path)
     by_ending = FORMATS.get(path.suffix.lower())

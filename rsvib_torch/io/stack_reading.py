@@ -16,7 +16,6 @@ from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import FramesLike
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.progress import steps
-from rsvib_torch.core.reading import check_regular
 from rsvib_torch.io.formats import find_format
 from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts
 from rsvib_torch.io.stack_format import FrameReader
@@ -66,9 +65,6 @@ def open_stack(path: PathLike) -> FrameReader:
         >>> reader.close()
     """
     path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist")
-    check_regular(path)
     reader = find_format(path).open(path)
     reader.info = replace(reader.info, path=path)
     if reader.info.shape[0] > _MAX_FRAMES:
