@@ -37,8 +37,9 @@ ARCHITECTURE = (
     ),
     (("detection", "offsets → motion, std, verdict"), ("restoration", "frames + motion → frames, verdict")),
     (("registration", "offsets of bands and rows"), ("calibration", "row time, exposure")),
-    (("imaging", "PSF, blur, simulator"), ("io", "file formats")),
-    (("frames", "input preparation: dtype, masks, orientation"),),
+    (("imaging", "PSF, blur, simulator"),),
+    (("frames", "input preparation: files, dtype, masks, orientation"),),
+    (("io", "file formats"),),
     (("motion", "timing, vibration, spline, recorded motion"),),
     (("core", "FFT, splines, banded systems, parallel, checks"),),
 )

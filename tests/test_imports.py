@@ -14,8 +14,9 @@ PACKAGE = Path(rsvib_torch.__file__).parent
 LAYERS = (
     {"core"},
     {"motion"},
+    {"io"},
     {"frames"},
-    {"imaging", "io"},
+    {"imaging"},
     {"registration", "calibration"},
     {"detection", "restoration"},
     {"evaluation", "augmentation", "tracking"},
@@ -63,7 +64,8 @@ def layer_of(part, layers):
 def imported_modules(source, module):
     """Modules of rsvib_torch that a module imports anywhere in its file, with the line: [(line, dotted name)].
 
-    Functions, classes, ``if TYPE_CHECKING`` and ``try`` are included, and imports by name.
+    Functions, classes, ``if TYPE_CHECKING`` and ``try`` are included, imports by name, and modules that the table of
+    file formats names (``packaged_format``).
     """
     package = module.split(".")
     found = []
@@ -75,10 +77,11 @@ def imported_modules(source, module):
             base = package[: -node.level] if node.level else []
             origin = ".".join([*base, *([node.module] if node.module else [])])
             names = [f"{origin}.{alias.name}" for alias in node.names]
-        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+        elif isinstance(node, ast.Call):
             called = getattr(node.func, "id", getattr(node.func, "attr", ""))
-            if called in {"import_module", "__import__"} and isinstance(node.args[0].value, str):
-                names = [node.args[0].value]
+            if called in {"import_module", "__import__", "packaged_format"}:
+                texts = [entry.value for entry in node.args if isinstance(entry, ast.Constant)]
+                names = [text for text in texts if isinstance(text, str)]
         found += [(node.lineno, resolved(name)) for name in names if name.split(".")[0] == "rsvib_torch"]
     return found
 
@@ -133,6 +136,12 @@ def test_modules_do_not_import_each_other_in_a_cycle():
     assert len(order) >= len(uses)
 
 
+def test_modules_of_file_formats_are_read_as_imports():
+    source = (PACKAGE / "io" / "formats.py").read_text()
+    named = {name for _, name in imported_modules(source, "rsvib_torch.io.formats")}
+    assert {f"rsvib_torch.io.{name}" for name in ("tiff", "npy", "hdf5", "raw", "video", "zarr_store")} <= named
+
+
 def test_every_part_has_a_layer():
     def parts(folder):
         return {path.stem for path in folder.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
@@ -165,7 +174,7 @@ def test_modules_that_use_a_displacement_per_row_state_the_invariant():
     ("source", "module"),
     [
         ("from rsvib_torch.imaging import blur_rows", "rsvib_torch.motion.vibration"),
-        ("import rsvib_torch.commands.main", "rsvib_torch.io.files"),
+        ("import rsvib_torch.commands.main", "rsvib_torch.io.formats"),
         ("from rsvib_torch import detection", "rsvib_torch.imaging.psf"),
         ("import rsvib_torch", "rsvib_torch.motion.timing"),
         ("from rsvib_torch import SensorTiming", "rsvib_torch.imaging.psf"),
@@ -175,6 +184,7 @@ def test_modules_that_use_a_displacement_per_row_state_the_invariant():
         ("if TYPE_CHECKING:\n    import rsvib_torch.registration", "rsvib_torch.imaging.simulate"),
         ("try:\n    from rsvib_torch import report\nexcept ImportError:\n    pass", "rsvib_torch.stacks.job"),
         ("module = importlib.import_module('rsvib_torch.config')", "rsvib_torch.evaluation.quality"),
+        ("FORM = packaged_format('a', ('.a',), 'rsvib_torch.stacks.output', 'Output')", "rsvib_torch.io.formats"),
         ("from rsvib_torch.detection.rows import direct", "rsvib_torch.detection.tones.fit"),
         ("from rsvib_torch.restoration.exact.exact import restore_exact", "rsvib_torch.restoration.dewarp"),
     ],

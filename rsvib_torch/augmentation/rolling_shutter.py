@@ -15,10 +15,10 @@ from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_tensor, checks_arguments
+from rsvib_torch.core.arrays import channels_appear_last
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.core.precision import full_precision
 from rsvib_torch.core.splines import gauss_legendre, mirrored
-from rsvib_torch.frames.arrays import channels_appear_last
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging import blur_rows, gauss_node_count, rows_showing, trajectory_psf

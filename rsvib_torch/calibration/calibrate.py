@@ -11,11 +11,11 @@ from torch import Tensor
 from rsvib_torch.calibration.flicker import BandFit, Profiles, find_bands, row_profiles
 from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import Channels
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text, wrapped
-from rsvib_torch.frames.arrays import Channels
-from rsvib_torch.io.files import FramesOrFiles
+from rsvib_torch.io.stack_reading import FramesOrFiles
 
 __all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_exposure"]
 

@@ -11,10 +11,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arrays import Channels, channel_axis
 from rsvib_torch.core.checks import check_choice, check_number
-from rsvib_torch.frames.arrays import Channels, channel_axis
 from rsvib_torch.frames.prepare import as_float_frames
-from rsvib_torch.io.files import FramesOrFiles, load_frames
+from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 
 __all__ = ["BandFit", "Profiles", "SceneModel", "find_bands", "row_profiles"]
 
@@ -53,8 +53,8 @@ def row_profiles(
     """
     check_choice("scan_axis", scan_axis, (-2, "y", -1, "x"))
     check_number("gamma", gamma, above=0.0, at_most=4.0)
-    frames, full_scale = load_frames(frames, full_scale)
-    images = as_float_frames(frames, full_scale, channels=channels).detach()
+    loaded = load_frames(frames, full_scale)
+    images = as_float_frames(loaded.frames, loaded.full_scale, channels=channels).detach()
     if images.ndim == 5:
         raise ValueError(f"calibration takes one stack, got a batch of shape {tuple(images.shape)}")
     images = images.mean(channel_axis("frames", images.shape, channels)) if images.ndim == 4 else images

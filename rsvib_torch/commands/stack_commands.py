@@ -53,7 +53,8 @@ from rsvib_torch.core.atomic import check_writable, whole_folder
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames, BorderName
 from rsvib_torch.core.reading import check_regular
-from rsvib_torch.core.text import number_of, printable, write_json
+from rsvib_torch.core.result_files import write_json
+from rsvib_torch.core.text import number_of, printable
 from rsvib_torch.core.validation import validate
 
 if TYPE_CHECKING:

@@ -265,7 +265,7 @@ def check_device(name: str, value: object) -> torch.device:
 def checks_arguments(function: Callable[P, R]) -> Callable[P, R]:
     """Check the arguments of a function against its annotations before each call.
 
-    Arguments that accept arrays are left to ``frames.as_tensor``, which the function calls. Compiled graphs omit the
+    Arguments that accept arrays are left to ``as_tensor``, which the function calls. Compiled graphs omit the
     checks.
 
     Example:

@@ -1,4 +1,4 @@
-"""What all results have: a summary as text and HTML, dictionaries, JSON files, a figure, and moves between devices.
+"""What all results have: a summary as text and HTML, a dictionary, a figure, and moves between devices.
 
 A result is a dataclass of tensors, numbers, texts and other results. ``Result`` gives it the methods; the class writes
 its own ``summary`` with the functions below.
@@ -10,21 +10,18 @@ import io
 import itertools
 import math
 import os
-import types
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_fields, check_shapes, checks_arguments
-from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.text import text_table, wrapped, write_json
-from rsvib_torch.core.validation import read_json
+from rsvib_torch.core.text import text_table, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,6 +43,10 @@ __all__ = [
 # batch). The module _PLOTS fills the table; it is imported when the first figure is drawn.
 FIGURES: dict[tuple[type, int], Callable[[Any], "Figure"]] = {}
 _PLOTS = "rsvib_torch.report.plots"
+
+# Files of results: ``save_result``, ``load_result`` and ``save_figure`` of this module, imported at the first call. An
+# algorithm that returns a result imports neither atomic writes nor the checks of files.
+_FILES = "rsvib_torch.core.result_files"
 
 
 # Text
@@ -109,7 +110,7 @@ def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
     return lines
 
 
-# Dictionaries and files
+# Dictionaries
 
 
 def plain_values(value: Any) -> Any:
@@ -130,57 +131,6 @@ def plain_values(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain_values(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _restored(kind: Any, value: Any, path: str, missing: float) -> Any:
-    """Inverse of ``plain_values`` for an annotated type; ``missing`` takes the place of None in a tensor."""
-    if get_origin(kind) in (Union, types.UnionType):
-        if value is None:
-            return None
-        kind = next(member for member in get_args(kind) if member is not types.NoneType)
-    if kind is Tensor:
-        return _tensor(value, path, missing)
-    if get_origin(kind) is dict:
-        if not isinstance(value, dict):
-            raise ValueError(f"{path}: expected a table, got {value!r}")
-        return {key: _restored(get_args(kind)[1], entry, f"{path}.{key}", missing) for key, entry in value.items()}
-    if is_dataclass(kind) and isinstance(kind, type):
-        return _dataclass(kind, value, path)
-    if kind in (float, int, str, bool) and not isinstance(value, (float, int) if kind is float else kind):
-        raise ValueError(f"{path}: expected {kind.__name__}, got {value!r}")
-    return _tuples(value)
-
-
-def _dataclass(kind: type[Any], value: Any, path: str = "") -> Any:
-    if not isinstance(value, dict):
-        raise ValueError(f"{path}: expected a table, got {value!r}")
-    # SensorTiming does not import torch, whose Tensor its annotations name
-    hints, start = get_type_hints(kind, localns={"Tensor": torch.Tensor}), f"{path}." if path else ""
-    # files of earlier versions lack fields that were added later with a default
-    needed = [field.name for field in fields(kind) if field.default is MISSING and field.default_factory is MISSING]
-    if absent := [name for name in needed if name not in value]:
-        raise ValueError(f"{start}{absent[0]}: missing key")
-    names = [field.name for field in fields(kind) if field.name in value]
-    missing = getattr(kind, "_MISSING", math.nan)
-    return kind(**{name: _restored(hints[name], value[name], start + name, missing) for name in names})
-
-
-def _tensor(value: Any, path: str, missing: float) -> Tensor:
-    def filled(entry: Any) -> Any:
-        return [filled(part) for part in entry] if isinstance(entry, list) else missing if entry is None else entry
-
-    values = filled(value)
-    try:
-        tensor = torch.tensor(values, device="cpu")
-        if tensor.is_floating_point() or not tensor.numel():
-            tensor = torch.tensor(values, dtype=torch.float64, device="cpu")
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected numbers in lists of equal lengths: {error}") from error
-    return tensor
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 # Results
@@ -264,7 +214,7 @@ class Result(Summarised):
         Raises:
             OSError: If the file cannot be written.
         """
-        write_json(path, {"format": self.file_format, "version": 1, **self.to_dict(), "units": dict(self.units)})
+        import_module(_FILES).save_result(self, Path(path))
 
     @classmethod
     @checks_arguments
@@ -278,17 +228,7 @@ class Result(Summarised):
             OSError: If the file cannot be opened.
             ValueError: If it does not contain a result of this class.
         """
-        source = Path(path)
-        data = read_json(source, f"file of {cls.__name__}.save")
-        if data.get("format") != cls.file_format or data.get("version") != 1:
-            raise ValueError(
-                f"{source}: expected format {cls.file_format!r} of version 1, as {cls.__name__}.save writes it, got "
-                f"{data.get('format')!r} of version {data.get('version')!r}"
-            )
-        try:
-            result: Self = _dataclass(cls, data)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{source}: {error}") from error
+        result: Self = import_module(_FILES).load_result(cls, Path(path))
         return result
 
     def mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
@@ -337,8 +277,7 @@ class Result(Summarised):
             raise TypeError(f"{type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
         figure = draw(self)
         if path is not None:
-            with whole_file(path) as part:
-                figure.savefig(part, dpi=150, facecolor="white")
+            import_module(_FILES).save_figure(figure, Path(path))
         return figure
 
     def _repr_html_(self) -> str:

@@ -2,18 +2,15 @@
 
 import json
 import math
-import os
 import shutil
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from rsvib_torch.core.atomic import whole_file
-
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["json_text", "measured_text", "one_line", "printable", "text_table", "wrapped", "write_json"]
+__all__ = ["json_text", "measured_text", "one_line", "printable", "text_table", "wrapped"]
 
 
 # Marks that change the direction of the text after them, and separators of lines.
@@ -123,16 +120,6 @@ def wrapped(text: str) -> str:
     """Text in lines of the width of the terminal, at most 100 characters; all but the first are indented."""
     width = min(100, shutil.get_terminal_size((100, 24)).columns) - 2  # an answer of the program is indented by 2
     return textwrap.fill(text, width, subsequent_indent="   ", break_long_words=False, break_on_hyphens=False)
-
-
-def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
-    """Write a table as JSON with one key per line, atomically.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
-    with whole_file(path) as part:
-        part.write_text(json_text(content) + "\n", encoding="utf-8")
 
 
 def json_text(content: Mapping[str, Any]) -> str:

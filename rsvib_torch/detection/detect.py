@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.option_types import BandSettings, DetectionMethod, Registration, ToneSettings
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
@@ -26,7 +27,7 @@ from rsvib_torch.detection.rows.measured_rows import strip_rows, whole_rows
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
 from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
-from rsvib_torch.detection.start import BandStart, band_start, field_start, grey_frames
+from rsvib_torch.detection.start import BandStart, band_start, field_start
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.detection.tones.aliasing import without_aliasing
 from rsvib_torch.detection.tones.fit import (
@@ -41,9 +42,9 @@ from rsvib_torch.detection.tones.fit import (
 )
 from rsvib_torch.detection.tones.further import with_further_tones
 from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE, find_tones, robust_fit
-from rsvib_torch.frames.arrays import ArrayLike, Channels
+from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.frames.orientation import offsets_from_row_order
-from rsvib_torch.io.files import FramesOrFiles, timing_of_files
+from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
@@ -327,7 +328,6 @@ def detect_vibration(
         [True, False]
     """
     check_choice("model", model, ("tones", *_OTHER_MODELS))
-    timing = timing_of_files(frames, timing)
     if model != "tones":
         tone_options = (
             ("method", method, "direct"),
@@ -373,6 +373,7 @@ def detect_vibration(
         check_whole_number("columns", columns, at_least=64)  # px; narrower bands are often registered wrongly
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
+    timing = stacks.timing
     height, width = stacks.images.shape[-2:]
     camera = camera_in_row_order(focal_length, principal_point, distortion, (height, width), timing)
     field = _Field.of(roll, zoom, columns, width, height, camera)

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows, plain_values
 from rsvib_torch.core.text import measured_text, text_table
-from rsvib_torch.io.schema import TimingRecord, detection_summary
+from rsvib_torch.motion.detected_vibration import detection_summary
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
@@ -255,7 +255,6 @@ class DetectionResult(
     def to_dict(self) -> dict[str, Any]:
         """All values as nested lists, numbers and texts, as in a ``vibration.json``; None for unknown numbers."""
         values = super().to_dict()
-        values["timing"] = None if self.timing is None else TimingRecord.from_timing(self.timing).model_dump()
         values["period"] = plain_values(self.vibration.period)
         curve = {name: values.pop(name) for name in ("offsets", "fitted")}  # long, therefore last
         return values | curve

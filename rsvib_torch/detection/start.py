@@ -1,4 +1,4 @@
-"""The start of every detection: grey frames, the offsets of their row bands, and the measurements these give.
+"""The start of every detection: the offsets of row bands of grey frames, and the measurements these give.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -12,145 +12,18 @@ from torch.nn import functional
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
 from rsvib_torch.detection.tones.fit import ToneFit, with_axes
-from rsvib_torch.frames.arrays import Channels
-from rsvib_torch.frames.mosaic import is_mosaic, mosaic_free
-from rsvib_torch.frames.pixels import detailed_columns
-from rsvib_torch.frames.prepare import prepare_frames
-from rsvib_torch.io.files import FramesOrFiles, load_frames
-from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.frames.pixels import cut_columns, detailed_parts
+from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
 from rsvib_torch.registration.register import check_frame_size, register_rows
 
 __all__ = [
     "BandStart",
-    "GreyFrames",
     "band_curve",
     "band_start",
-    "constant_frame",
     "field_start",
-    "grey_frames",
     "measurements_of_curve",
 ]
-
-
-@dataclass(frozen=True, eq=False)
-class GreyFrames:
-    """Stacks of frames as detection uses them.
-
-    Attributes:
-        images: (B, T, H, W) grey, in row order; missing pixels hold local means.
-        valid: (B, T, H, W) bool, False at missing pixels; None if there are none.
-        batched: Whether the user gave a batch.
-    """
-
-    images: Tensor
-    valid: Tensor | None
-    batched: bool
-
-    def _with(self, images: Tensor, valid: Tensor | None, batched: bool) -> "GreyFrames":
-        return GreyFrames(images, None if valid is None or bool(valid.all()) else valid, batched)
-
-    def narrowed(self, columns: int) -> "GreyFrames":
-        """The given number of neighbouring columns of each stack, those with the most detail."""
-        if columns >= self.images.shape[-1]:
-            return self
-        parts = _detailed(self.images, columns)
-
-        def cut(values: Tensor) -> Tensor:
-            return _cut(values, parts)
-
-        return self._with(cut(self.images), None if self.valid is None else cut(self.valid), self.batched)
-
-    def one(self, index: int) -> "GreyFrames":
-        """One stack out of the batch, as a batch of one."""
-        part = slice(index, index + 1)
-        return self._with(self.images[part], None if self.valid is None else self.valid[part], False)
-
-
-def _detailed(images: Tensor, columns: int) -> list[slice]:
-    """The given number of neighbouring columns with the most detail of each stack (B, T, H, W)."""
-    return [detailed_columns(stack[0], columns) for stack in images]
-
-
-def _cut(values: Tensor, parts: list[slice]) -> Tensor:
-    """Columns of each stack."""
-    return torch.stack([stack[..., part] for stack, part in zip(values, parts, strict=True)])
-
-
-def grey_frames(
-    frames: FramesOrFiles,
-    timing: SensorTiming,
-    full_scale: float | None,
-    ignore: object,
-    channels: Channels,
-    *,
-    min_valid_fraction: float = 0.1,
-) -> GreyFrames:
-    """Check stacks of frames and convert them to grey frames in row order.
-
-    Args:
-        frames: (T, H, W), (T, C, H, W) or (B, T, C, H, W); tensor, array, list of these, or files; NaN marks missing
-            pixels.
-        timing: The sensor.
-        full_scale: Count that means 1.0, for integer frames.
-        ignore: Bool tensor or array, broadcastable to (..., H, W) of the frames: True for missing pixels.
-        channels: As in ``prepare_frames``.
-        min_valid_fraction: Fraction of the pixels of each frame that must not be missing.
-
-    Raises:
-        TypeError: If frames are not numbers or ``ignore`` is not bool.
-        ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or
-            ``ignore`` does not fit; or a frame is a copy of the one before.
-    """
-    frames, full_scale = load_frames(frames, full_scale)
-    prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, minimum_frames=2)
-    images, valid = prepared.filled, None
-    if prepared.missing is not None:
-        valid = ~prepared.missing.any(2)
-        fraction = valid.float().mean((-2, -1))
-        if bool((fraction < min_valid_fraction).any()):
-            where = (fraction < min_valid_fraction).nonzero()[0].tolist()
-            raise ValueError(
-                f"frame {where[-1]} has only {fraction[*where]:.1%} of pixels with data, {min_valid_fraction:.0%} are "
-                "needed; mark fewer pixels by NaN or ignore"
-            )
-    # some rows are enough to find that a frame is not constant
-    if bool(_constant(images[..., ::16, :]).any()) and bool((constant := _constant(images)).any()):
-        raise ValueError(constant_frame(constant.nonzero()[0].tolist()[-1]))
-    repeated = _repeated(images[..., ::16, :])
-    if bool(repeated.any()) and bool((repeated := _repeated(images)).any()):
-        first = repeated.nonzero()[0].tolist()[-1]
-        raise ValueError(
-            f"frames {first} and {first + 1} are identical: one of them is a copy (video converters repeat frames), "
-            "and its time is wrong; remove copies and state the times of the others in frame_start_times"
-        )
-    images = images.mean(2) if images.shape[2] > 1 else without_mosaic(images[:, :, 0])
-    return GreyFrames(images, valid, prepared.batched)
-
-
-def without_mosaic(images: Tensor) -> Tensor:
-    """Grey frames (B, T, H, W), of colour mosaics without the pattern of the colours, which does not move."""
-    mosaic = torch.stack([is_mosaic(stack[0]) for stack in images])
-    if not bool(mosaic.any()):
-        return images
-    return torch.where(mosaic[:, None, None, None], mosaic_free(images), images)
-
-
-def constant_frame(index: int) -> str:
-    """Message for a frame whose pixels are equal."""
-    return f"frame {index} is constant and cannot be registered; remove this frame"
-
-
-def _constant(frames: Tensor) -> Tensor:
-    """(B, T) bool, frames (B, T, C, H, W) with equal pixels, to rounding."""
-    low, high = frames.amin((-3, -2, -1)), frames.amax((-3, -2, -1))
-    return high - low <= 1e-6 * torch.maximum(low.abs(), high.abs())
-
-
-def _repeated(frames: Tensor) -> Tensor:
-    """(B, T - 1) bool: frames (B, T, C, H, W) that equal the next one; none in stacks whose frames are all equal."""
-    equal = (frames[:, 1:] == frames[:, :-1]).flatten(2).all(-1)
-    return equal & ~equal.all(-1, keepdim=True)
 
 
 def band_curve(
@@ -176,7 +49,7 @@ def band_curve(
     check_frame_size(frames.shape[-2], frames.shape[-1], options)  # of the user's frames, not of the columns in use
     curve = None
     if mere_start and frames.shape[-1] > start_columns:
-        curve = register_rows(_cut(frames, _detailed(frames, start_columns)), timing, options)
+        curve = register_rows(cut_columns(frames, detailed_parts(frames, start_columns)), timing, options)
     if curve is None or float(curve.good.double().mean((1, 2)).amin()) <= 0.8:
         curve = register_rows(frames, timing, options)
     if valid is None:

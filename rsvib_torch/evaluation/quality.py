@@ -7,8 +7,8 @@ from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import FramesLike, as_tensor
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
-from rsvib_torch.frames.arrays import FramesLike, as_tensor
 
 __all__ = ["offset_endpoint_error", "psnr", "ssim"]
 

@@ -1,15 +1,25 @@
 """Row order: any scan axis and readout direction become rows on axis -2 with the row read first at index 0.
 
 A transpose swaps the x and y components of displacements; a flip along the rows changes the sign of y. Both change the
-sign of roll.
+sign of roll. This is the only place outside of motions (``Motion.from_row_order``) where components are permuted.
 """
 
-import torch
+from collections.abc import Sequence
+from typing import TypeVar
+
 from torch import Tensor
 
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import SensorTiming, row_axes
 
-__all__ = ["frames_from_row_order", "frames_to_row_order", "offsets_from_row_order"]
+__all__ = [
+    "frames_from_row_order",
+    "frames_to_row_order",
+    "magnitudes_from_row_order",
+    "offsets_from_row_order",
+    "sequence_from_row_order",
+]
+
+Entry = TypeVar("Entry")
 
 
 def frames_to_row_order(frames: Tensor, timing: SensorTiming) -> Tensor:
@@ -26,8 +36,38 @@ def frames_from_row_order(frames: Tensor, timing: SensorTiming) -> Tensor:
 
 def offsets_from_row_order(offsets: Tensor, timing: SensorTiming) -> Tensor:
     """Turn displacements or offsets (..., A) in row order back to image axes (x, y) and, if A > 2, roll and zoom."""
-    transposed, reverse = timing.scan_axis == -1, timing.readout_direction == "reverse"
-    signs = [1.0, -1.0 if reverse else 1.0, -1.0 if transposed != reverse else 1.0, 1.0][: offsets.shape[-1]]
+    _, signs = row_axes(timing, offsets.shape[-1])
     if min(signs) < 0:
-        offsets = offsets * torch.tensor(signs, dtype=offsets.dtype, device=offsets.device)
-    return offsets[..., [1, 0, 2, 3][: offsets.shape[-1]]] if transposed else offsets
+        offsets = offsets * offsets.new_tensor(signs)
+    return magnitudes_from_row_order(offsets, timing)
+
+
+def magnitudes_from_row_order(values: Tensor, timing: SensorTiming, axis: int = -1) -> Tensor:
+    """Turn values without a sign back to image axes: standard deviations, gains, residuals, verdicts.
+
+    Args:
+        values: (..., A) for ``axis=-1``, (..., A, K) for ``axis=-2``, with components in row order; of any dtype.
+        timing: The sensor.
+        axis: Axis of the components.
+
+    Example:
+        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")
+        >>> magnitudes_from_row_order(Tensor([[1, 2, 3]]), timing).tolist()
+        [[2.0, 1.0, 3.0]]
+    """
+    order, _ = row_axes(timing, values.shape[axis])
+    if order == sorted(order):
+        return values
+    return values[..., order] if axis == -1 else values[..., order, :]
+
+
+def sequence_from_row_order(values: Sequence[Entry], timing: SensorTiming) -> tuple[Entry, ...]:
+    """Turn one entry for each component, e.g. the reasons against it, back to image axes.
+
+    Example:
+        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")
+        >>> sequence_from_row_order(["along the row", "along the scan"], timing)
+        ('along the scan', 'along the row')
+    """
+    order, _ = row_axes(timing, len(values))
+    return tuple(values[axis] for axis in order)

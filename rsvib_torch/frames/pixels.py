@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["detailed_columns", "enlarged", "fill_with_means"]
+__all__ = ["cut_columns", "detailed_columns", "detailed_parts", "enlarged", "fill_with_means"]
 
 
 def fill_with_means(frames: Tensor, missing: Tensor) -> Tensor:
@@ -90,3 +90,13 @@ def detailed_columns(images: Tensor, count: int) -> slice:
     total = functional.pad(detail.flatten(0, -2).sum(0).to(torch.float64).cumsum(0), (1, 0))
     first = int((total[count:] - total[:-count]).argmax())
     return slice(first, first + count)
+
+
+def detailed_parts(images: Tensor, count: int) -> list[slice]:
+    """``detailed_columns`` of the first frame of each stack (B, T, H, W)."""
+    return [detailed_columns(stack[0], count) for stack in images]
+
+
+def cut_columns(values: Tensor, parts: list[slice]) -> Tensor:
+    """Columns of each stack (B, ..., W), equally many of all stacks."""
+    return torch.stack([stack[..., part] for stack, part in zip(values, parts, strict=True)])

@@ -1,9 +1,9 @@
-"""Input preparation, once for all entry points: from the user's frames to floating-point images in row order.
+"""Input preparation, once for all entry points: from frames or files to floating-point images in row order.
 
-``prepare_frames`` is the only place that converts dtypes, applies the full scale, builds masks, turns images and adds
-batch and channel axes; ``PreparedFrames.from_row_order`` is the way back. Two of the three invariants
-(docs/architecture.md) begin here: rows lie on axis -2 in readout order, and images are float32 (float64 if the user
-gave float64).
+``prepare_frames`` is the only place that reads files given as frames, converts dtypes, applies the full scale, builds
+masks, turns images and adds batch and channel axes; ``PreparedFrames.from_row_order`` is the way back. Two of the three
+invariants (docs/architecture.md) begin here: rows lie on axis -2 in readout order, and images are float32 (float64 if
+the user gave float64).
 """
 
 from dataclasses import dataclass, replace
@@ -14,11 +14,13 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_pixels
+from rsvib_torch.core.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.frames.mosaic import check_mosaic, colours_of, fill_by_colour, luminance, mosaic_free
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import fill_with_means
+from rsvib_torch.io.frame_times import timing_from_first_frame
+from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 
 __all__ = ["PreparedFrames", "Saturation", "as_float_frames", "prepare_frames"]
@@ -35,10 +37,11 @@ class PreparedFrames:
         missing: Bool of that shape, True at pixels without data; None if there are none.
         saturated: Bool of that shape, True at pixels at or above the saturation level; None if there are none.
         timing: The sensor in row order.
-        image_timing: The sensor as given by the user, in image orientation.
+        image_timing: The sensor in image orientation, with the frame times of the file if frames were given by a path.
         shape: Shape of the user's frames.
         channel_axis: Their axis of the channels, -3 or -1, if they have one.
         dtype: Floating-point dtype of results for the user.
+        full_scale: Count that means 1.0 in the user's frames, as given or stated by their file; None if not stated.
         colours: (B, T, 1, H, W), colour that each pixel of a mosaic measures: 0 red, 1 green, 2 blue; None for frames
             whose pixels measure all channels.
     """
@@ -51,6 +54,7 @@ class PreparedFrames:
     shape: tuple[int, ...]
     channel_axis: int
     dtype: torch.dtype
+    full_scale: float | None
     colours: Tensor | None = None
 
     @property
@@ -102,7 +106,7 @@ class PreparedFrames:
 
 
 def prepare_frames(
-    frames: FramesLike,
+    frames: FramesOrFiles,
     timing: SensorTiming,
     *,
     full_scale: float | None = None,
@@ -114,12 +118,13 @@ def prepare_frames(
     mosaic: str | None = None,
     name: str = "frames",
 ) -> PreparedFrames:
-    """Check frames and turn them into floating-point images (B, T, C, H, W) in row order, with their masks.
+    """Read and check frames; turn them into floating-point images (B, T, C, H, W) in row order, with their masks.
 
     Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation; tensor, array or list of these.
-        timing: The sensor.
-        full_scale: Count that means 1.0, for integer frames other than uint8.
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation; tensor, array, list of these, a
+            path or a list of paths.
+        timing: The sensor. The frame times of a file that is given by its path are used.
+        full_scale: Count that means 1.0, for integer frames other than uint8; by default that of the file.
         channels: ``"last"`` for frames (T, H, W, C) or (B, T, H, W, C); None for channels before the image axes, with a
             check of the shape; ``"first"`` without this check.
         ignore: Boolean mask of the frames' shape, or one that broadcasts to that shape without the channel axis: True
@@ -135,6 +140,9 @@ def prepare_frames(
     Returns:
         The prepared frames.
 
+    Warns:
+        TimingWarning: As ``timing_from_first_frame``, if the file states another frame rate than the sensor has.
+
     Raises:
         TypeError: If an argument has the wrong type.
         ValueError: If the shape is not that of a stack, there are too few frames or more rows than the sensor reads,
@@ -149,17 +157,25 @@ def prepare_frames(
         (2, 48, 64)
     """
     check_timing(timing)
-    given = as_tensor(name, frames)
+    # files: their pixels as stored, with the full scale and the times that they state
+    loaded = load_frames(frames, full_scale)
+    full_scale = loaded.full_scale
+    if loaded.info is not None:
+        timing = timing_from_first_frame(timing, loaded.info)
+    given = as_tensor(name, loaded.frames)
+    # missing pixels become 0 and are marked, so that all further steps compute with finite numbers
     axis = channel_axis(name, given.shape, channels)
     missing = _missing_pixels(given, ignore, allow_missing, axis)
     if missing is not None:
         if bool(missing.all()):
             raise ValueError(f"{name} have no pixel with data: all are NaN or in ignore")
         given = given.masked_fill(missing, 0)
+    # full scale 1, in float32 or float64
     images = as_float_frames(given, full_scale, channels=channels, minimum_frames=minimum_frames, name=name)
     saturated = _saturated_pixels(given, saturation, full_scale)
     dtype = given.dtype if given.dtype.is_floating_point else images.dtype
 
+    # a batch of stacks with channels, whose rows lie on axis -2 in readout order
     def in_row_order(values: Tensor) -> Tensor:
         values = values[:, None] if values.ndim == 3 else values.movedim(axis, -3)
         return frames_to_row_order(values if values.ndim == 5 else values[None], timing)
@@ -174,7 +190,9 @@ def prepare_frames(
         size = images.shape[-2:] if timing.scan_axis == -2 else images.shape[:-3:-1]
         pattern = frames_to_row_order(colours_of(mosaic, *size), timing)
         colours = pattern.to(images.device).expand(images.shape)
-    return PreparedFrames(images, missing, saturated, row_timing, timing, tuple(given.shape), axis, dtype, colours)
+    return PreparedFrames(
+        images, missing, saturated, row_timing, timing, tuple(given.shape), axis, dtype, full_scale, colours
+    )
 
 
 def as_float_frames(

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import as_numbers, check_broadcast, check_images, check_pixels, checks_arguments
+from rsvib_torch.core.arrays import ArrayLike
 from rsvib_torch.core.checks import check_number, check_whole_number, described
-from rsvib_torch.frames.arrays import ArrayLike
 
 __all__ = ["Optics", "SensorNoise", "filtered"]
 

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_pixels, checks_arguments
+from rsvib_torch.core.arrays import ArrayLike, as_tensor, channels_appear_last
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
-from rsvib_torch.frames.arrays import ArrayLike, as_tensor, channels_appear_last
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.sensor_model import SensorNoise

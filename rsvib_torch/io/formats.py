@@ -1,137 +1,113 @@
-"""The registry of stack formats: their contract, and the choice of a format by the ending of a file name."""
+"""The table of stack formats, and the choice of a format by the ending of a file name.
 
-from collections.abc import Callable, Iterator
+The table is data. The module that reads and writes a format is imported when a stack of that format is opened, checked
+or written (``packaged_format``).
+"""
+
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any
 
-from numpy.typing import NDArray
+from rsvib_torch.core.reading import check_regular
+from rsvib_torch.io.stack_format import StackFormat
 
-from rsvib_torch.io.stack_info import StackInfo
-
-__all__ = [
-    "FORMATS",
-    "FrameReader",
-    "FrameWriter",
-    "StackFormat",
-    "find_format",
-    "needed_package",
-    "register_format",
-    "target_format",
-]
-
-Frame = NDArray[Any]
+__all__ = ["FORMATS", "find_format", "packaged_format", "register_format", "target_format"]
 
 
-class FrameReader(Protocol):
-    """An open stack; frames are read one at a time, in any order."""
-
-    info: StackInfo
-
-    def frame(self, index: int) -> Frame:
-        """Pixels of a frame as stored: (H, W) or (C, H, W), in ``info.dtype``; ``FrameError`` if it is damaged."""
-
-    def close(self) -> None:
-        """Close the file, if it is open between frames."""
-        return
-
-
-class FrameWriter(Protocol):
-    """A stack being written; any frame may be written at any time, and again."""
-
-    def write(self, index: int, frame: Frame) -> None:
-        """Write a frame, (H, W) or (C, H, W)."""
-
-    def sync(self) -> None:
-        """Return when all written frames, and the names of their files, are on the disk (``core.atomic.sync``)."""
-        return
-
-    def stored(self, index: int | None) -> Iterator[bytes]:
-        """Bytes on the disk that hold a frame, or everything else (headers) for None; fewer if the file is damaged.
-
-        An interrupted run is resumed with the frames for which they are unchanged. Without this method it starts again.
-        """
-
-    def close(self) -> None:
-        """Finish the file, if it is open between frames."""
-        return
-
-
-# Contract of a format. All functions are called with the path of the stack; ``create`` and ``write_all`` with that of a
-# temporary file or folder, which the caller renames when it is complete (``rsvib_torch/io/atomic.py``).
-#
-# Shapes:      frames are (H, W) or (C, H, W), channels RGB or RGBA; ``StackInfo.shape`` is (T, H, W) or (T, C, H, W),
-#              also if the file stores channels last (``StackInfo.from_stored``, ``to_stored``).
-# Data types:  one of ``dtypes`` in native byte order; pixels are returned as stored, without scaling.
-# Full scale:  ``info.full_scale`` is the count that corresponds to 1.0, or None if the file does not state it; formats
-#              that have room for it store it (``known_full_scale`` supplies 255 for uint8).
-# Frame times: exposure starts in seconds, or None; times that are not exact need ``time_error`` and ``time_source``.
-# Orientation: frames have the rows and columns of the file; ``info.orientation`` states how they are displayed.
-# Metadata:    ``keeps`` states what the format stores besides pixels; users are told what their file loses.
-# Reading:     ``open`` must not allocate memory by sizes in a header before it has compared them with the size of the
-#              file, must not decode pixels, execute code or follow links to other files, and raises an ``OSError`` if
-#              the file cannot be opened, a one-line ``ValueError`` that names the file if it is not a stack
-#              (``readable_stack``), and ``ModuleNotFoundError`` if a package is missing (``needed_package``). A reader
-#              raises ``FrameError`` for a damaged frame (``readable_frame``); opening fails if more than half of the
-#              frames are missing. Frames that are stored together are decoded once (``io/blocks.py``);
-#              ``info.decoding_bytes`` is the memory that this needs.
-# Writing:     a format defines ``create``, ``write_all``, or neither (it is then only read).
-#              After ``create(path, info, False)`` on an unfinished stack all frames that were synced are still there,
-#              also after a loss of power; it must not change the files of a damaged stack before a frame is written.
 @dataclass(frozen=True)
-class StackFormat:
-    """How stacks are stored in files with certain endings.
+class _InModule:
+    """Function of a module of this package that is imported at the first call."""
 
-    Attributes:
-        name: Name in messages.
-        endings: File endings, lower case with the dot; ``""`` is a name without an ending.
-        open: Opens a stack for reading.
-        create: ``create(path, info, fresh)`` makes a file of full size whose frames are then written in any order
-            (``fresh=True``), or opens an unfinished one to continue it (``fresh=False``); None if frames can only be
-            written one after another.
-        write_all: ``write_all(path, info, frames, compression)`` writes a stack from an iterator of its frames; None if
-            ``create`` writes every stack.
-        dtypes: NumPy names of the data types that can be written.
-        check: Raises an error if a stack cannot be written to a path.
-        kind: ``"file"``; ``"folder"``, which may contain other files; or ``"tree"``, a folder that is replaced as one.
-        marker: File that identifies a folder of any name as a stack of this format.
-        companions: Endings of additional files, which are appended to the file name.
-        compressions: Values of ``compression`` besides None.
-        keeps: What is stored besides pixels: ``"full_scale"``, ``"frame_times"``, ``"orientation"``, ``"resolution"``
-            and ``"metadata"``, attributes of ``StackInfo``.
-    """
-
+    module: str
     name: str
-    endings: tuple[str, ...]
-    open: Callable[[Path], FrameReader]
-    create: Callable[[Path, StackInfo, bool], FrameWriter] | None = None
-    write_all: Callable[[Path, StackInfo, Iterator[Frame], str | None], None] | None = None
-    dtypes: tuple[str, ...] = (
-        "uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64",
-    )  # fmt: skip
-    check: Callable[[Path, StackInfo], None] | None = None
-    kind: Literal["file", "folder", "tree"] = "file"
-    marker: str = ""
-    companions: tuple[str, ...] = ()
-    compressions: tuple[str, ...] = ()
-    keeps: tuple[str, ...] = ()
 
-    @property
-    def writable(self) -> bool:
-        """Whether stacks of this format can be written."""
-        return self.create is not None or self.write_all is not None
+    def __call__(self, *arguments: Any) -> Any:
+        return getattr(import_module(self.module), self.name)(*arguments)
 
 
-FORMATS: dict[str, StackFormat] = {}
-"""Format of every file ending; ``rsvib_torch/io/files.py`` registers those of the package."""
+def packaged_format(
+    name: str,
+    endings: tuple[str, ...],
+    module: str,
+    open: str,
+    *,
+    create: str | None = None,
+    write_all: str | None = None,
+    check: str | None = None,
+    **stated: Any,
+) -> StackFormat:
+    """A format whose functions are imported when they are called: reading a TIFF file imports no other format.
+
+    ``tests/test_imports.py`` reads the names of the modules in the calls of this function as imports.
+
+    Args:
+        name: As in ``StackFormat``.
+        endings: As in ``StackFormat``.
+        module: Full name of the module that has the functions.
+        open: Name of the function ``StackFormat.open``.
+        create: Name of the function ``StackFormat.create``, if there is one.
+        write_all: Name of the function ``StackFormat.write_all``, if there is one.
+        check: Name of the function ``StackFormat.check``, if there is one.
+        **stated: Further attributes of ``StackFormat``.
+    """
+    functions = {"open": open, "create": create, "write_all": write_all, "check": check}
+    loaded: dict[str, Any] = {
+        use: _InModule(module, function) for use, function in functions.items() if function is not None
+    }
+    return StackFormat(name, endings, **loaded, **stated)
+
+
+_KEPT = ("full_scale", "frame_times", "orientation", "resolution")
+_KEPT_BY_PNG = ("full_scale", "orientation", "resolution")
+_KEPT_BY_VIDEO = ("full_scale", "frame_times", "orientation")
+_READ_ONLY_VIDEO = (".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
+
+# The order is that of error messages.
+_FORMATS_OF_THE_PACKAGE = (
+    packaged_format("npy", (".npy",), "rsvib_torch.io.npy", "open_npy", create="create_npy", check="check_npy"),
+    packaged_format(
+        "hdf5", (".h5", ".hdf5", ".hdf"), "rsvib_torch.io.hdf5", "open_hdf5", create="create_hdf5", keeps=_KEPT
+    ),
+    packaged_format("jpeg", (".jpg", ".jpeg"), "rsvib_torch.io.image_folder", "ImagesReader"),
+    packaged_format(
+        "png", (".png",), "rsvib_torch.io.image_folder", "ImagesReader", create="create_image", check="check_image",
+        dtypes=("uint8", "uint16"), keeps=_KEPT_BY_PNG,
+    ),
+    packaged_format(
+        "image folder", ("",), "rsvib_torch.io.image_folder", "ImagesReader", create="create_folder",
+        check="check_folder", kind="folder", keeps=_KEPT_BY_PNG,
+    ),
+    packaged_format(
+        "raw", (".raw",), "rsvib_torch.io.raw", "open_raw", create="create_raw", companions=(".json",), keeps=_KEPT
+    ),
+    packaged_format(
+        "tiff", (".tif", ".tiff"), "rsvib_torch.io.tiff", "open_tiff", create="create_tiff", write_all="write_tiff",
+        compressions=("zlib", "lzma"), keeps=(*_KEPT, "metadata"),
+    ),
+    packaged_format(
+        "FFV1 video", (".mkv", ".avi"), "rsvib_torch.io.video", "VideoReader", write_all="write_video",
+        check="check_video", dtypes=("uint8", "uint16"), keeps=_KEPT_BY_VIDEO,
+    ),
+    packaged_format(
+        "H.264 video", (".mp4", ".mov", ".m4v"), "rsvib_torch.io.video", "VideoReader", write_all="write_video",
+        check="check_video", keeps=_KEPT_BY_VIDEO,
+    ),
+    packaged_format("webm, mpeg, 3gp and wmv", _READ_ONLY_VIDEO, "rsvib_torch.io.video", "VideoReader"),
+    packaged_format(
+        "zarr", (".zarr",), "rsvib_torch.io.zarr_store", "open_zarr", create="create_zarr", kind="tree",
+        marker="zarr.json", keeps=_KEPT,
+    ),
+)  # fmt: skip
+FORMATS: dict[str, StackFormat] = {ending: form for form in _FORMATS_OF_THE_PACKAGE for ending in form.endings}
+"""Format of every file ending."""
 
 
 def register_format(form: StackFormat) -> None:
     """Register a format for reading and writing stacks; it replaces earlier formats of the same endings.
 
     Args:
-        form: The format; see the contract above ``StackFormat``.
+        form: The format; see the contract in ``stack_format.py``.
 
     Raises:
         ValueError: If it has no ending, or one without a dot or in upper case.
@@ -154,8 +130,12 @@ def find_format(path: Path) -> StackFormat:
     """The format of an existing stack: by its ending, of a folder also by its marker file, else a folder of images.
 
     Raises:
-        ValueError: If the ending is not registered.
+        FileNotFoundError: If it does not exist.
+        ValueError: If the ending is not registered, or the path is a pipe, a socket or a device.
     """
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist")
+    check_regular(path)
     if not path.is_dir():
         return target_format(path)
     by_ending = FORMATS.get(path.suffix.lower())
@@ -177,24 +157,3 @@ def target_format(path: Path) -> StackFormat:
     raise ValueError(
         f"{path}: unknown file ending {path.suffix!r}; expected {known} or a folder of PNG, TIFF or JPEG files"
     )
-
-
-def needed_package(name: str, purpose: str, extra: str) -> Any:
-    """Import an optional package.
-
-    Args:
-        name: Module to import.
-        purpose: What needs it, for the message.
-        extra: Extra of this package that installs it.
-
-    Raises:
-        ModuleNotFoundError: If it is missing, naming the extra to install.
-    """
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name is not None and error.name.partition(".")[0] != name.partition(".")[0]:
-            raise
-        raise ModuleNotFoundError(
-            f"{purpose} needs the package {name.partition('.')[0]}: pip install rsvib_torch[{extra}]", name=error.name
-        ) from error

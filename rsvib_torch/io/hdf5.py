@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import ArrayReader
 from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
-from rsvib_torch.io.formats import StackFormat, needed_package
 from rsvib_torch.io.full_scale import check_dtype
-from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_from_attributes, readable_stack
+from rsvib_torch.io.stack_format import needed_package
+from rsvib_torch.io.stack_info import StackInfo, readable_stack
 from rsvib_torch.io.time_metadata import time_attributes, times_of_attributes
 
-__all__ = ["FORMAT"]
+__all__ = ["create_hdf5", "open_hdf5"]
 
 _DATASET = "frames"  # name of the dataset that is written
 _MAX_MEMBERS = 10_000  # groups and datasets; each takes about 0.1 ms
@@ -92,7 +93,8 @@ def _times_beside(file: Any, dataset: Any, count: int) -> dict[str, Any]:
     return times_of_attributes(found, count)
 
 
-def _open(path: Path) -> ArrayReader | ContiguousReader:
+def open_hdf5(path: Path) -> ArrayReader | ContiguousReader:
+    """Open the dataset of a file that has the shape of a stack."""
     h5py = _h5py()
     with readable_stack(path, "HDF5"):
         file = h5py.File(path, "r", locking=False)
@@ -116,7 +118,7 @@ def _open(path: Path) -> ArrayReader | ContiguousReader:
                 file.close()
 
 
-def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
+def create_hdf5(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
     """Create a file whose dataset is contiguous, or open one; h5py's high-level interface cannot allocate it early."""
     h5py = _h5py()
     if fresh:
@@ -133,8 +135,3 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
     with h5py.File(path, "r", locking=False) as file:
         offset = int(file[_DATASET].id.get_offset())
     return ContiguousWriter(path, info, offset, fresh=fresh)
-
-
-FORMAT = StackFormat(
-    "hdf5", (".h5", ".hdf5", ".hdf"), _open, _create, keeps=("full_scale", "frame_times", "orientation", "resolution")
-)

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import sync
-from rsvib_torch.io.formats import FrameReader, FrameWriter, StackFormat
 from rsvib_torch.io.jpeg import decode_jpeg, jpeg_info
 from rsvib_torch.io.png import decode_png, encode_png, png_info
+from rsvib_torch.io.stack_format import FrameReader, FrameWriter
 from rsvib_torch.io.stack_info import FrameError, StackInfo, Tag
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.io.time_metadata import merged_times
 
-__all__ = ["FOLDER_FORMAT", "JPEG_FORMAT", "PNG_FORMAT"]
+__all__ = ["ImagesReader", "check_folder", "check_image", "create_folder", "create_image"]
 
 _PNG, _TIFF, _JPEG = (".png",), (".tif", ".tiff"), (".jpg", ".jpeg")
 _KINDS = {"PNG": _PNG, "TIFF": _TIFF, "JPEG": _JPEG}
@@ -94,7 +94,7 @@ def _without_position(info: StackInfo) -> StackInfo:
     return replace(info, resolution=None, frame_times=None)
 
 
-class _ImagesReader(FrameReader):
+class ImagesReader(FrameReader):
     """Frames of files that are decoded on access."""
 
     def __init__(self, path: Path) -> None:
@@ -173,7 +173,13 @@ class _ImagesWriter(FrameWriter):
             yield self._files[index].read_bytes()
 
 
-def _create_folder(path: Path, info: StackInfo, fresh: bool) -> _ImagesWriter:
+def create_image(path: Path, info: StackInfo, fresh: bool) -> _ImagesWriter:
+    """Create a PNG file of one frame; arguments as in ``StackFormat.create``."""
+    return _ImagesWriter([path], info)
+
+
+def create_folder(path: Path, info: StackInfo, fresh: bool) -> _ImagesWriter:
+    """Create a folder for one file per frame, or continue it."""
     path.mkdir(exist_ok=True)
     return _ImagesWriter([path / name for name in _frame_names(info)], info)
 
@@ -183,13 +189,15 @@ def _check_channels(path: Path, info: StackInfo) -> None:
         raise ValueError(f"{path}: PNG files hold 1, 3 or 4 channels, got {info.shape[1]}; write .tif")
 
 
-def _check_image(path: Path, info: StackInfo) -> None:
+def check_image(path: Path, info: StackInfo) -> None:
+    """Refuse a stack that is not one frame of a PNG file."""
     _check_channels(path, info)
     if info.shape[0] != 1:
         raise ValueError(f"{path}: a PNG file holds one frame, got {info.shape[0]}; write a folder")
 
 
-def _check_folder(path: Path, info: StackInfo) -> None:
+def check_folder(path: Path, info: StackInfo) -> None:
+    """Refuse a folder that contains images of other stacks."""
     _check_channels(path, info)
     if path.is_dir():
         images = {f.name for f in path.iterdir() if f.suffix.lower() in _ENDINGS and not f.name.startswith(".")}
@@ -199,24 +207,3 @@ def _check_folder(path: Path, info: StackInfo) -> None:
             raise ValueError(
                 f"{path}: the folder contains other {kind} files, e.g. {min(others)}; choose another folder"
             )
-
-
-PNG_FORMAT = StackFormat(
-    "png",
-    _PNG,
-    _ImagesReader,
-    lambda path, info, _: _ImagesWriter([path], info),
-    dtypes=_PNG_TYPES,
-    check=_check_image,
-    keeps=("full_scale", "orientation", "resolution"),
-)
-FOLDER_FORMAT = StackFormat(
-    "image folder",
-    ("",),
-    _ImagesReader,
-    _create_folder,
-    check=_check_folder,
-    kind="folder",
-    keeps=("full_scale", "orientation", "resolution"),
-)
-JPEG_FORMAT = StackFormat("jpeg", _JPEG, _ImagesReader)

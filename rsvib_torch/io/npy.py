@@ -6,13 +6,12 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from rsvib_torch.frames.arrays import channels_appear_last
+from rsvib_torch.core.arrays import channels_appear_last
 from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter, InterleavedReader
-from rsvib_torch.io.formats import StackFormat
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
-__all__ = ["FORMAT"]
+__all__ = ["check_npy", "create_npy", "open_npy"]
 
 _MAX_HEADER_BYTES = 10_000  # as in numpy, which reads the header before it compares
 
@@ -34,7 +33,7 @@ def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any], 
     return shape, fortran_order, dtype, file.tell()
 
 
-def _open(path: Path) -> ContiguousReader | InterleavedReader:
+def open_npy(path: Path) -> ContiguousReader | InterleavedReader:
     """Open (H, W), (T, H, W) or (T, C, H, W). Pickled objects are refused."""
     with readable_stack(path, ".npy"):
         with path.open("rb") as file:
@@ -52,7 +51,8 @@ def _open(path: Path) -> ContiguousReader | InterleavedReader:
         return ContiguousReader(path, info, offset, dtype)
 
 
-def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
+def create_npy(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
+    """Create a file of full size, or open one to continue it."""
     if fresh:
         header = {"descr": np.lib.format.dtype_to_descr(np.dtype(info.dtype)), "fortran_order": False}
         with path.open("wb") as file:
@@ -63,9 +63,7 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
     return ContiguousWriter(path, replace(info, channels_last=False), offset, fresh=fresh)
 
 
-def _check(path: Path, info: StackInfo) -> None:
+def check_npy(path: Path, info: StackInfo) -> None:
+    """Refuse a shape that would be read as another one."""
     if channels_appear_last(info.shape):
         raise ValueError(f"{path}: array of shape {info.shape} would be read as one with channels last; write .tif")
-
-
-FORMAT = StackFormat("npy", (".npy",), _open, _create, check=_check)

@@ -1,6 +1,5 @@
 """Frames in PNG files: decoding, encoding, and what the file states."""
 
-import math
 import struct
 import zlib
 from dataclasses import replace
@@ -87,49 +86,11 @@ def png_info(path: Path) -> StackInfo:
     return replace(_info(chunks, path.stat().st_size, path), **exif_fields(chunks.get(b"eXIf", b"")))
 
 
-# Bit depths of each colour type.
-_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
-# First column, first row and steps of the passes of an interlaced image (Adam7).
-_PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
-
-
-def _checked_pixels(data: bytes, chunks: dict[bytes, bytes], path: Path) -> bytes:
-    """The file with the chunks that decoding needs; a ``ValueError`` where libpng would print a message.
-
-    OpenCV decodes with libpng, which prints warnings and errors to the terminal.
-    """
-    width, height, bits, colour, compression, filtering, interlaced = struct.unpack(">IIBBBBB", chunks[b"IHDR"])
-    palette, transparent = chunks.get(b"PLTE", b""), chunks.get(b"tRNS")
-    sizes = {0: range(2, 3), 2: range(6, 7), 3: range(1, len(palette) // 3 + 1)}  # of tRNS
-    if bits not in _DEPTHS.get(colour, ()) or compression or filtering or interlaced > 1:
-        raise ValueError(f"{path}: damaged PNG file (header)")
-    if len(palette) % 3 or (colour == 3 and not 3 <= len(palette) <= 3 << bits):
-        raise ValueError(f"{path}: damaged PNG file (palette)")
-    if transparent is not None and len(transparent) not in sizes.get(colour, ()):
-        raise ValueError(f"{path}: damaged PNG file (transparency)")
-    passes = _PASSES if interlaced else ((0, 0, 1, 1),)
-    samples = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}[colour]
-    rows = [
-        (math.ceil((height - top) / down), 1 + math.ceil(math.ceil((width - left) / right) * bits * samples / 8))
-        for left, top, right, down in passes
-        if left < width and top < height
-    ]
-    unpacking, size = zlib.decompressobj(), sum(count * stride for count, stride in rows)
-    pixels = _bodies(data, b"IDAT")
-    try:
-        filtered = np.frombuffer(unpacking.decompress(pixels, size + 1), np.uint8)
-    except zlib.error as error:
-        raise ValueError(f"{path}: damaged PNG file (pixels: {error})") from error
-    if len(filtered) != size or not unpacking.eof:
-        raise ValueError(f"{path}: damaged PNG file (the pixels do not fill {width} x {height} px)")
-    for count, stride in rows:
-        if filtered[: count * stride : stride].max() > 4:
-            raise ValueError(f"{path}: damaged PNG file (unknown filter of a row)")
-        filtered = filtered[count * stride :]
-    parts = [_chunk(b"IHDR", chunks[b"IHDR"])]
-    parts += [_chunk(b"PLTE", palette)] if colour == 3 else []
-    parts += [] if transparent is None else [_chunk(b"tRNS", transparent)]
-    return b"".join([data[:8], *parts, _chunk(b"IDAT", pixels), _chunk(b"IEND", b"")])
+def _needed_for_pixels(data: bytes, chunks: dict[bytes, bytes]) -> bytes:
+    """The file with the chunks that decoding needs: animations and colour profiles do not change the pixels."""
+    kept = [(kind, chunks[kind]) for kind in (b"IHDR", b"PLTE", b"tRNS") if kind in chunks]
+    kept += [(b"IDAT", _bodies(data, b"IDAT")), (b"IEND", b"")]
+    return data[:8] + b"".join(_chunk(kind, body) for kind, body in kept)
 
 
 def _bodies(data: bytes, kind: bytes) -> bytes:
@@ -150,9 +111,8 @@ def decode_png(path: Path) -> NDArray[Any]:
     data = path.read_bytes()
     chunks = _chunks(data, path, b"IEND")
     _info(chunks, len(data), path)
-    data = _checked_pixels(data, chunks, path)
     try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        pixels = cv2.imdecode(np.frombuffer(_needed_for_pixels(data, chunks), np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise ValueError(f"{path}: the PNG file cannot be decoded ({error.err})") from error
     if pixels is None:

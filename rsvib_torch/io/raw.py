@@ -9,11 +9,11 @@ from pydantic import Field
 
 from rsvib_torch.core.atomic import sync
 from rsvib_torch.core.validation import Section, read_json, validate
+from rsvib_torch.io.array_attributes import info_from_attributes
 from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
-from rsvib_torch.io.formats import StackFormat
-from rsvib_torch.io.stack_info import StackInfo, info_from_attributes, readable_stack
+from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
-__all__ = ["FORMAT"]
+__all__ = ["create_raw", "open_raw"]
 
 
 class _Sidecar(Section):
@@ -37,7 +37,8 @@ def _sidecar_path(path: Path) -> Path:
     return path.with_name(path.name + ".json")
 
 
-def _open(path: Path) -> ContiguousReader:
+def open_raw(path: Path) -> ContiguousReader:
+    """Open a file of pixels whose layout its sidecar states."""
     beside = _sidecar_path(path)
     if not beside.exists():
         raise FileNotFoundError(f"{path}: raw frames need the sidecar {beside.name}, which does not exist")
@@ -51,7 +52,8 @@ def _open(path: Path) -> ContiguousReader:
         return ContiguousReader(path, info, sidecar.offset, dtype.newbyteorder(sidecar.byte_order))
 
 
-def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
+def create_raw(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
+    """Create a file of full size with its sidecar, or open one to continue it."""
     if fresh:
         content = {
             "format": "rsvib raw",
@@ -71,13 +73,3 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
         sync(_sidecar_path(path))
         path.write_bytes(b"")
     return ContiguousWriter(path, info, 0, fresh=fresh, beside=[_sidecar_path(path)])
-
-
-FORMAT = StackFormat(
-    "raw",
-    (".raw",),
-    _open,
-    _create,
-    companions=(".json",),
-    keeps=("full_scale", "frame_times", "orientation", "resolution"),
-)

@@ -6,28 +6,25 @@ stands for a value that is unknown or not finite.
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol, Self, runtime_checkable
+from typing import Any, Literal, Self
 
 import torch
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from torch import Tensor
 
-from rsvib_torch.core.presentation import Result, plain_values, verdict_table
-from rsvib_torch.core.text import wrapped
+from rsvib_torch.core.presentation import plain_values
 from rsvib_torch.core.validation import Section, checked
 from rsvib_torch.motion.camera import Camera
+from rsvib_torch.motion.detected_vibration import DetectedVibration, Detection
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration, VibrationStd, image_motion_line, tone_head, tone_rows
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
 __all__ = [
-    "DetectedVibration",
     "DetectionRecord",
     "StdRecord",
     "TimingRecord",
     "VibrationRecord",
     "check_same_timing",
-    "detection_summary",
     "detection_to_json",
 ]
 
@@ -62,15 +59,7 @@ class TimingRecord(Section):
     @classmethod
     def from_timing(cls, timing: SensorTiming) -> Self:
         """The record of a timing."""
-        starts = timing.frame_start_times
-        return cls(
-            row_time=timing.row_time,
-            exposure_rows=timing.exposure_rows,
-            frame_rows=timing.frame_rows,
-            scan_axis="x" if timing.scan_axis == -1 else "y",
-            readout_direction=timing.readout_direction,
-            frame_start_times=None if starts is None else [float(start) for start in starts],
-        )
+        return cls(**timing.to_dict())
 
     def to_timing(self) -> SensorTiming:
         """The timing."""
@@ -156,64 +145,6 @@ class StdRecord(Section):
         return VibrationStd(
             **{name: _to_tensor(value, math.inf) for name, value in values.items() if value is not None}
         )
-
-
-@runtime_checkable
-class Detection(Protocol):
-    """The attributes of ``DetectedVibration``; a ``DetectionResult`` that is not a batch has them as well."""
-
-    @property
-    def vibration(self) -> Vibration: ...
-    @property
-    def std(self) -> VibrationStd: ...
-    @property
-    def gain(self) -> Tensor: ...
-    @property
-    def residual(self) -> Tensor: ...
-    @property
-    def reliable(self) -> Tensor: ...
-    @property
-    def reasons(self) -> tuple[Any, ...]: ...
-    @property
-    def assumptions(self) -> tuple[Any, ...]: ...
-
-
-def detection_summary(detection: Detection) -> str:
-    """Tones of each axis with standard deviations, then the verdict; of a batch, a table with one row per axis."""
-    vibration, std = detection.vibration, detection.std
-    rows = [cells for _, cells in tone_rows(vibration, std)]
-    head = tone_head(axes=vibration.num_axes)
-    table, *verdict = verdict_table(head, rows, vibration.batch_shape, detection.reliable, detection.reasons)
-    if not vibration.batch_shape:
-        verdict += [wrapped(f"assumed: {text}") for text in detection.assumptions]
-    return "\n".join([table, *image_motion_line(vibration, std), *verdict])
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class DetectedVibration(Result):
-    """A detection without its offset curve: everything that restoration needs.
-
-    Attributes:
-        vibration: The vibration in image axes.
-        std: Standard deviations of its parameters, infinite where unknown.
-        gain: (2, K) offset gain of Eq. (7) from displacement to offset.
-        residual: (2,) px, mean absolute difference of measured and fitted offsets.
-        reliable: (2,) bool, verdict for each axis (x, y).
-        reasons: Why an axis is not reliable, for each axis.
-        assumptions: What the frames cannot contradict, one sentence for each.
-    """
-
-    vibration: Vibration
-    std: VibrationStd
-    gain: Tensor
-    residual: Tensor
-    reliable: Tensor
-    reasons: tuple[Any, ...]
-    assumptions: tuple[Any, ...] = ()
-
-    def summary(self) -> str:
-        """Tones of each axis with standard deviations, then the verdict."""
-        return detection_summary(self)
 
 
 class DetectionRecord(Section):

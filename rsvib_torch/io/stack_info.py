@@ -13,17 +13,12 @@ from numpy.typing import NDArray
 from rsvib_torch.core.arguments import check_fields, checks_arguments
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import one_line
-from rsvib_torch.frames.arrays import channels_appear_last
-from rsvib_torch.io.full_scale import known_full_scale
-from rsvib_torch.io.time_metadata import orientation_of, times_of_attributes
 
 __all__ = [
     "FrameError",
     "Scope",
     "StackInfo",
     "Tag",
-    "attributes_of",
-    "info_from_attributes",
     "readable_frame",
     "readable_stack",
 ]
@@ -242,66 +237,3 @@ def readable_frame(path: Path, index: int) -> Iterator[None]:
         raise
     except Exception as error:
         raise FrameError(f"{path}: frame {index} cannot be read: {one_line(error)}") from error
-
-
-def attributes_of(info: StackInfo) -> dict[str, Any]:
-    """Attributes of an HDF5 dataset or Zarr array that state ``info``; unknown values are omitted."""
-    attributes: dict[str, Any] = {"axes": info.stored_axes}
-    if info.full_scale is not None:
-        attributes["full_scale"] = float(info.full_scale)
-    if info.frame_times is not None:
-        attributes["frame_times"] = [float(time) for time in info.frame_times]
-    elif info.frame_rate is not None:
-        attributes["frame_rate"] = float(info.frame_rate)
-    if info.orientation != 1:
-        attributes["orientation"] = info.orientation
-    if info.resolution is not None:
-        attributes["resolution"] = [float(value) for value in info.resolution[:2]]
-        attributes["resolution_unit"] = info.resolution[2]
-    return attributes
-
-
-def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> StackInfo:
-    """Interpret a stored array as a stack.
-
-    Args:
-        attributes: As made by ``attributes_of``, or times of other programs; all may be missing.
-        shape: Shape of the array in the file: (H, W), (T, H, W), (T, C, H, W), or (T, H, W, C) if ``axes`` states it.
-        dtype: Data type in the file.
-
-    Raises:
-        ValueError: If shape and attributes contradict each other.
-    """
-    axes = str(attributes.get("axes", {2: "HW", 3: "THW", 4: "TCHW"}.get(len(shape), "")))
-    if len(axes) != len(shape) or axes not in ("HW", "THW", "TCHW", "THWC") or min(shape) < 1:
-        raise ValueError(f"array of shape {shape} with axes {axes!r}; expected HW, THW, TCHW or THWC")
-    if "axes" not in attributes and channels_appear_last(shape):
-        raise ValueError(
-            f"array of shape {shape} appears to have its channels last; store (T, C, H, W), or (T, H, W, C) with the "
-            "attribute axes='THWC'"
-        )
-    if axes == "HW":
-        shape = (1, *shape)
-    elif axes == "THWC":
-        shape = (shape[0], shape[3], shape[1], shape[2])
-    stated: dict[str, Any] = {}
-    if attributes.get("frame_times") is not None:
-        times = np.asarray(attributes["frame_times"], dtype=np.float64).ravel()
-        stated["frame_times"] = tuple(float(time) for time in times)
-    else:
-        stated = times_of_attributes(attributes, shape[0])
-    resolution = attributes.get("resolution")
-    if resolution is not None:
-        x, y = (float(value) for value in resolution)
-        resolution = (x, y, str(attributes.get("resolution_unit", "centimeter")))
-    full_scale = attributes.get("full_scale")
-    full_scale = known_full_scale(dtype, None if full_scale is None else float(full_scale))
-    return StackInfo(
-        shape,
-        dtype.name,
-        full_scale,
-        resolution=resolution,
-        channels_last=axes == "THWC",
-        orientation=orientation_of(attributes.get("orientation")),
-        **stated,
-    )

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from rsvib_torch.io.blocks import BlockReader
 from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter, InterleavedReader
-from rsvib_torch.io.formats import FrameReader, StackFormat
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
+from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_frame, readable_stack
 from rsvib_torch.io.tiff_metadata import json_description, read_metadata, writer_options
 from rsvib_torch.io.time_metadata import orientation_of, tiff_times
 
-__all__ = ["FORMAT", "open_tiff", "write_tiff"]
+__all__ = ["create_tiff", "open_tiff", "write_tiff"]
 
 
 # Tags on which the decoded pixels of a page depend, besides their position: subfile type, width, length, bits,
@@ -464,7 +464,8 @@ def _layout(info: StackInfo) -> tuple[StackInfo, dict[str, Any]]:
     return stored, {"shape": stored.stored_shape, "dtype": info.dtype, **options}
 
 
-def _create(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
+def create_tiff(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
+    """Create a file of full size, or open one to continue it."""
     stored, options = _layout(info)
     if fresh:
         tifffile.imwrite(path, data=None, **options)
@@ -480,14 +481,3 @@ def write_tiff(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], comp
     if stored.stored_axes == "TCHW":
         pages = (plane for frame in pages for plane in frame)
     tifffile.imwrite(path, data=pages, compression=compression, maxworkers=1, **options)
-
-
-FORMAT = StackFormat(
-    "tiff",
-    (".tif", ".tiff"),
-    open_tiff,
-    _create,
-    write_tiff,
-    compressions=("zlib", "lzma"),
-    keeps=("full_scale", "frame_times", "orientation", "resolution", "metadata"),
-)

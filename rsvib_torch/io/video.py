@@ -19,26 +19,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.free_memory import check_fits
-from rsvib_torch.io.formats import StackFormat, needed_package
+from rsvib_torch.io.stack_format import needed_package
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 
 __all__ = [
     "CONTAINERS",
     "ENDINGS",
-    "FFV1_FORMAT",
     "H264",
-    "H264_FORMAT",
-    "READ_ONLY_FORMAT",
     "Picture",
     "Sound",
     "VideoReader",
     "add_video",
+    "check_video",
     "open_container",
     "open_output",
     "open_source",
     "picture_of",
     "presentation_times",
     "scanned",
+    "write_video",
 ]
 
 _LOSSLESS, H264 = (".mkv", ".avi"), (".mp4", ".mov", ".m4v")
@@ -379,7 +378,8 @@ def open_source(info: StackInfo, opened: ExitStack) -> Any:
     return None if path is None else opened.enter_context(open_container(path))
 
 
-def _check(path: Path, info: StackInfo) -> None:
+def check_video(path: Path, info: StackInfo) -> None:
+    """Refuse a stack that the codec or the container cannot hold."""
     av, ending = _av(), path.suffix.lower()
     if info.axes == "TCHW" and info.shape[1] not in (1, 3):
         raise ValueError(f"{path}: videos hold 1 or 3 channels, got {info.shape[1]}; write .tif")
@@ -421,7 +421,8 @@ def open_output(path: Path, opened: ExitStack) -> Any:
     return opened.enter_context(_av().open(str(path), "w", format=CONTAINERS[path.suffix.lower()], options=options))
 
 
-def _write(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+def write_video(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+    """Write a video frame by frame; arguments as in ``StackFormat.write_all``."""
     unit, ticks, start = presentation_times(path, info)
     with ExitStack() as opened:
         source, output = open_source(info, opened), open_output(path, opened)
@@ -448,11 +449,3 @@ def _packets(source: Any, streams: dict[Any, Any], start: Fraction | None) -> It
             packet.stream = streams[packet.stream]
             if start is None or packet.pts >= 0:
                 yield packet
-
-
-_KEEPS = ("full_scale", "frame_times", "orientation")
-FFV1_FORMAT = StackFormat(
-    "FFV1 video", _LOSSLESS, VideoReader, write_all=_write, dtypes=("uint8", "uint16"), check=_check, keeps=_KEEPS
-)
-H264_FORMAT = StackFormat("H.264 video", H264, VideoReader, write_all=_write, check=_check, keeps=_KEEPS)
-READ_ONLY_FORMAT = StackFormat("webm, mpeg, 3gp and wmv", _READ_ONLY, VideoReader)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.formats import FrameReader, needed_package
+from rsvib_torch.io.stack_format import FrameReader, needed_package
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.video import (
     CONTAINERS,

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import sync
 from rsvib_torch.core.validation import read_json
+from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import ArrayReader
-from rsvib_torch.io.formats import FrameWriter, StackFormat, needed_package
 from rsvib_torch.io.full_scale import check_dtype
-from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_from_attributes, readable_stack
+from rsvib_torch.io.stack_format import FrameWriter, needed_package
+from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
-__all__ = ["FORMAT"]
+__all__ = ["create_zarr", "open_zarr"]
 
 _HEADER = "zarr.json"
 _MAX_CHUNKS = 1 << 14  # per frame; each takes about 0.3 ms
@@ -73,7 +74,8 @@ def _check_sizes(array: Any, info: StackInfo, folder: Path) -> None:
         )
 
 
-def _open(path: Path) -> ArrayReader:
+def open_zarr(path: Path) -> ArrayReader:
+    """Open the array of a folder that has the shape of a stack."""
     zarr = _zarr()
     with readable_stack(path, "Zarr"):
         if not (path / _HEADER).is_file():
@@ -127,7 +129,8 @@ class _ZarrWriter(FrameWriter):
         yield (self._path / _HEADER if index is None else self._chunk(index)).read_bytes()
 
 
-def _create(path: Path, info: StackInfo, fresh: bool) -> _ZarrWriter:
+def create_zarr(path: Path, info: StackInfo, fresh: bool) -> _ZarrWriter:
+    """Create an array with one chunk per frame, or open one to continue it."""
     zarr = _zarr()
     if not fresh:
         for incomplete in path.rglob("*.partial"):  # chunks that a killed process did not complete
@@ -145,14 +148,3 @@ def _create(path: Path, info: StackInfo, fresh: bool) -> _ZarrWriter:
         dimension_names=list(info.stored_axes),
     )
     return _ZarrWriter(path, array, info)
-
-
-FORMAT = StackFormat(
-    "zarr",
-    (".zarr",),
-    _open,
-    _create,
-    kind="tree",
-    marker=_HEADER,
-    keeps=("full_scale", "frame_times", "orientation", "resolution"),
-)

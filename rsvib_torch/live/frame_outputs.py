@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.io.formats import needed_package
+from rsvib_torch.io.stack_format import needed_package
 
 __all__ = ["FrameOutput", "PipeOutput", "PreviewOutput", "VideoOutput"]
 

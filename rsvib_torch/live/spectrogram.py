@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.core.atomic import whole_folder
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.io.formats import needed_package
+from rsvib_torch.io.stack_format import needed_package
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.report.plots import plain_axes, save_figure
 from rsvib_torch.tracking import TrackedFrame

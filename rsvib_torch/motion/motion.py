@@ -13,7 +13,7 @@ from rsvib_torch.core.arguments import check_broadcast, checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming
+from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming, row_axes
 
 __all__ = ["Motion"]
 
@@ -182,32 +182,15 @@ class Motion(Result, ABC):
 
     @checks_arguments
     def to_row_order(self, timing: SensorTiming) -> Self:
-        """The motion, given in image axes, as it appears in frames in row order.
-
-        Transposing frames exchanges x and y; flipping them along the rows changes the sign of y. Both are reflections
-        and change the sign of roll.
-        """
-        order, signs = self._row_axes(timing)
+        """The motion, given in image axes, as it appears in frames in row order, see ``row_axes``."""
+        order, signs = row_axes(timing, self.num_axes)
         return self.with_axes(order, signs)
 
     @checks_arguments
     def from_row_order(self, timing: SensorTiming) -> Self:
         """The motion, given in row order, in image axes: the inverse of ``to_row_order``."""
-        order, signs = self._row_axes(timing)
+        order, signs = row_axes(timing, self.num_axes)
         return self.with_axes(order, [signs[axis] for axis in order])
-
-    def _row_axes(self, timing: SensorTiming) -> tuple[list[int], list[float]]:
-        order, signs = list(range(self.num_axes)), [1.0] * self.num_axes
-        reflections = 0
-        if timing.scan_axis == -1:
-            order[:2] = [1, 0]
-            reflections += 1
-        if timing.readout_direction == "reverse":
-            signs[1] = -1.0
-            reflections += 1
-        if self.num_axes > 2:  # a reflection changes the direction of rotation
-            signs[2] = (-1.0) ** reflections
-        return order, signs
 
     def _check_axes(self, order: Sequence[int], signs: Sequence[float]) -> None:
         """Raise a ``ValueError`` unless ``order`` is a permutation of the axes and ``signs`` are 1 or -1."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number, described
 
@@ -203,6 +203,18 @@ class SensorTiming:
                 f"{self.frame_rate:g} frames/s, row_time is at most {self.frame_period / num_rows:.6g} s"
             )
 
+    def to_dict(self) -> dict[str, Any]:
+        """The arguments that make this timing, as plain numbers and texts."""
+        starts = self.frame_start_times
+        return {
+            "row_time": float(self.row_time),
+            "exposure_rows": float(self.exposure_rows),
+            "frame_rows": float(self.frame_rows),
+            "scan_axis": "x" if self.scan_axis == -1 else "y",
+            "readout_direction": self.readout_direction,
+            "frame_start_times": None if starts is None else [float(start) for start in starts],
+        }
+
     def in_row_order(self) -> RowTiming:
         """The same timing for frames already turned to row order (rows on axis -2, first row read first)."""
         return RowTiming(self.row_time, self.exposure_rows, self.frame_rows, frame_start_times=self.frame_start_times)
@@ -234,3 +246,24 @@ def check_timing(value: object) -> None:
     """Raise a ``TypeError`` unless ``value`` is a ``SensorTiming``."""
     if not isinstance(value, SensorTiming):
         raise TypeError(f"timing must be a SensorTiming, got {type(value).__name__}")
+
+
+def row_axes(timing: SensorTiming, num_axes: int) -> tuple[list[int], list[float]]:
+    """Order and signs of the components of a motion when frames are turned to row order.
+
+    Transposing frames exchanges x and y; flipping them along the rows changes the sign of y. Both are reflections and
+    change the sign of roll. Component i in row order is component ``order[i]`` in image axes times ``signs[i]``.
+
+    Args:
+        timing: The sensor.
+        num_axes: Number of components (x, y, roll, zoom), 2 to 4.
+
+    Example:
+        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")
+        >>> row_axes(timing, 3)
+        ([1, 0, 2], [1.0, 1.0, -1.0])
+    """
+    transposed, reverse = timing.scan_axis == -1, timing.readout_direction == "reverse"
+    order = [1, 0, 2, 3] if transposed else [0, 1, 2, 3]
+    signs = [1.0, -1.0 if reverse else 1.0, -1.0 if transposed != reverse else 1.0, 1.0]
+    return order[:num_axes], signs[:num_axes]

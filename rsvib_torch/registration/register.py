@@ -15,14 +15,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import Channels
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import fast_length
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
-from rsvib_torch.frames.arrays import Channels
-from rsvib_torch.frames.orientation import offsets_from_row_order
+from rsvib_torch.frames.orientation import offsets_from_row_order, sequence_from_row_order
 from rsvib_torch.frames.prepare import prepare_frames
-from rsvib_torch.io.files import FramesOrFiles, load_frames, timing_of_files
+from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.registration.bands import BandTask
 from rsvib_torch.registration.methods import BAND_METHODS, Registration, RegistrationOptions
@@ -159,15 +159,13 @@ def register_bands(
         [4.0, 0.0]
     """
     options = RegistrationOptions(method, band_rows, band_step, search)
-    timing = timing_of_files(frames, timing)
-    frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(
         frames, timing, full_scale=full_scale, channels=channels, minimum_frames=2, allow_missing=False
     )
     batch = register_rows(prepared.images.mean(2), prepared.timing, options)
     curve = batch if prepared.batched else batch[0]
-    heights = (curve.heights[1], curve.heights[0]) if timing.scan_axis == -1 else curve.heights
-    return replace(curve, offsets=offsets_from_row_order(curve.offsets, timing), heights=heights)
+    height_x, height_y = sequence_from_row_order(curve.heights, timing)
+    return replace(curve, offsets=offsets_from_row_order(curve.offsets, timing), heights=(height_x, height_y))
 
 
 def check_frame_size(num_rows: int, width: int, options: RegistrationOptions) -> None:

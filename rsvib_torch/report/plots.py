@@ -34,7 +34,7 @@ from rsvib_torch.detection import (
 from rsvib_torch.evaluation import MtfCurve
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
-from rsvib_torch.io.schema import Detection
+from rsvib_torch.motion.detected_vibration import Detection
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import Channels
 from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.frames.arrays import Channels
 from rsvib_torch.frames.prepare import prepare_frames
-from rsvib_torch.io.files import FramesOrFiles, load_frames
+from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.noise.high_pass import estimate_noise
@@ -59,7 +59,6 @@ def predict_noise_gain(
     """
     rim = 16  # px at the borders that are excluded
     count = check_whole_number("columns", columns, at_least=4 * rim)
-    frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, allow_missing=False)
     first = max(0, (prepared.images.shape[-1] - count) // 2)
     strip = prepared.images[..., first : first + count].to(torch.float64)

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.fourier import waves
 from rsvib_torch.core.presentation import AXIS_NAMES, Result
 from rsvib_torch.core.text import text_table
-from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.prepare import Saturation, prepare_frames
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.io.files import FramesOrFiles, load_frames, timing_of_files
+from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
@@ -169,11 +169,10 @@ def restoration_mtf(
     """
     if options.get("method", "exact") != "exact" or options.get("prior", "gaussian") != "gaussian":
         raise ValueError("restoration_mtf requires a linear restoration: method='exact' with prior='gaussian'")
-    timing = timing_of_files(frames, timing)
-    frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(
         frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, saturation=saturation
     )
+    timing = prepared.image_timing
     _, count, colours, *size = prepared.images.shape
     if prepared.batched or min(size) < 32:
         raise ValueError(f"one stack of frames of at least 32 x 32 px required, got shape {prepared.shape}")

@@ -8,6 +8,7 @@ from typing import Any, Literal, Required, TypedDict, Unpack, overload
 from torch import Tensor, nn
 
 from rsvib_torch.core.arguments import check_options, checks_arguments
+from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.option_types import (
     METHOD_SETTINGS,
     BandedSettings,
@@ -18,12 +19,11 @@ from rsvib_torch.core.option_types import (
     method_options,
 )
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.frames.arrays import ArrayLike, Channels
 from rsvib_torch.frames.mosaic import interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
 from rsvib_torch.imaging.sensor_model import Optics
-from rsvib_torch.io.files import FramesOrFiles, load_frames, timing_of_files
+from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.banded import restore_banded
@@ -238,11 +238,10 @@ def restore(
     """
     check_method_options(method, options)
     camera = check_optics(optics, method)
-    timing = timing_of_files(frames, timing)
-    frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(
         frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, saturation=saturation, mosaic=mosaic
     )
+    timing = prepared.image_timing
     _, count, _, height, _ = prepared.images.shape
     vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
     for note in left_alone:

@@ -17,12 +17,13 @@ from rsvib_torch.core.presentation import Summarised, plain_values
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
-from rsvib_torch.io.files import PathLike, open_stack, read_stack_info
-from rsvib_torch.io.formats import FrameReader
 from rsvib_torch.io.frame_times import timing_of_stack
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts, required_full_scale
-from rsvib_torch.io.schema import DetectedVibration, detection_to_json
+from rsvib_torch.io.schema import detection_to_json
+from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import FrameError, StackInfo
+from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.sharpening import check_optics
 from rsvib_torch.stacks.memory import windows_at_once

@@ -16,7 +16,8 @@ from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.presentation import AXIS_NAMES, Summarised
 from rsvib_torch.core.text import measured_text, number_of, text_table, wrapped
 from rsvib_torch.core.validation import Section, read_json, validate
-from rsvib_torch.io.schema import DetectedVibration, DetectionRecord, TimingRecord, detection_to_json
+from rsvib_torch.io.schema import DetectionRecord, TimingRecord, detection_to_json
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.stacks.job import StackJob
 
 __all__ = ["StackManifest", "WindowRecord", "fingerprint", "manifest_header", "read_manifest", "write_manifest"]

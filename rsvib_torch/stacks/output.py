@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import move_into_place, sync
 from rsvib_torch.core.validation import read_json
-from rsvib_torch.io.files import write_frames
-from rsvib_torch.io.formats import FrameWriter, StackFormat
+from rsvib_torch.io.stack_format import FrameWriter, StackFormat
 from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stack_writing import write_frames
 from rsvib_torch.stacks.private_folder import PrivateFolder
 
 __all__ = ["Journal", "Sink", "describe_difference", "digest_of_file", "disk_errors_named", "work_folder"]

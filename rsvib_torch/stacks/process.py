@@ -15,9 +15,10 @@ from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import number_of
 from rsvib_torch.core.unexpected import unexpected_errors_in_one_line
-from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.io.frame_times import exposure_times
-from rsvib_torch.io.schema import DetectedVibration
+from rsvib_torch.io.stack_reading import PathLike
+from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import (

@@ -21,10 +21,11 @@ from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.unexpected import unexpected_errors_in_one_line
-from rsvib_torch.io.files import PathLike, check_info_target, metadata_not_kept, open_stack, stack_files
-from rsvib_torch.io.formats import FrameReader
 from rsvib_torch.io.frame_times import exposure_times
+from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stack_reading import PathLike, open_stack
+from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.io.video import CONTAINERS
 from rsvib_torch.io.video_parts import planes_of
 from rsvib_torch.motion.timing import SensorTiming

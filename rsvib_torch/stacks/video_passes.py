@@ -16,10 +16,10 @@ from rsvib_torch.core.text import number_of
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import prepare_frames
-from rsvib_torch.io.files import open_stack
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.schema import detection_to_json
 from rsvib_torch.io.stack_info import FrameError
+from rsvib_torch.io.stack_reading import open_stack
 from rsvib_torch.io.video_parts import planes_of
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.restore import restore_prepared

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import Channels, channel_axis
 from rsvib_torch.core.checks import MAX_NUMBER
 from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.detection import detect_vibration
-from rsvib_torch.detection.start import constant_frame
-from rsvib_torch.frames.arrays import Channels, channel_axis
+from rsvib_torch.frames.grey import constant_frame
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import (
     beyond_full_scale,

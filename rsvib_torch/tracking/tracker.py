@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import as_numbers, checks_arguments
+from rsvib_torch.core.arrays import ArrayLike, Channels, as_tensor
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.option_types import DetectionMethod
 from rsvib_torch.core.precision import full_precision, outside_graphs, outside_inference, without_gradients
@@ -45,7 +46,6 @@ from rsvib_torch.detection.tones.fit import (
     vibration_of_fit,
 )
 from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE
-from rsvib_torch.frames.arrays import ArrayLike, Channels, as_tensor
 from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames

@@ -14,7 +14,7 @@ import rsvib_torch as rsv
 from rsvib_torch.detection.recorded import rotation_alignment
 from rsvib_torch.detection.recorded.band_vectors import band_vectors
 from rsvib_torch.detection.recorded.rotation_search import ORIENTATIONS, search_orientations
-from rsvib_torch.detection.start import grey_frames
+from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.registration import RegistrationOptions
 
 FOCAL_LENGTH, SIZE, COUNT = 380.0, (200, 216), 4

@@ -7,7 +7,9 @@ from rsvib_torch import SensorTiming, Vibration
 from rsvib_torch.frames.orientation import (
     frames_from_row_order,
     frames_to_row_order,
+    magnitudes_from_row_order,
     offsets_from_row_order,
+    sequence_from_row_order,
 )
 
 ORIENTATIONS = list(itertools.product((-2, -1), ("forward", "reverse")))
@@ -60,3 +62,18 @@ def test_vibration_and_offsets_agree(scan_axis, direction):
     for name in ("amplitude", "frequency", "phase", "image_motion"):
         torch.testing.assert_close(getattr(back, name), getattr(VIBRATION, name), rtol=0, atol=1e-12)
     assert bool((turned.amplitude >= 0).all())
+
+
+@pytest.mark.parametrize(("scan_axis", "direction"), ORIENTATIONS)
+@pytest.mark.parametrize("num_axes", [2, 3, 4])
+def test_values_without_a_sign_turn_with_the_displacements(scan_axis, direction, num_axes):
+    camera = timing(scan_axis, direction)
+    in_rows = torch.tensor([[3.0, 5.0, 7.0, 9.0], [2.0, 4.0, 6.0, 8.0]], dtype=torch.float64)[:, :num_axes]
+    in_image = offsets_from_row_order(in_rows, camera).abs()
+    assert torch.equal(magnitudes_from_row_order(in_rows, camera), in_image)
+    of_tones = torch.stack([in_rows, 10 * in_rows], -1)
+    assert torch.equal(magnitudes_from_row_order(of_tones, camera, axis=-2), torch.stack([in_image, 10 * in_image], -1))
+    assert sequence_from_row_order(in_rows[0].tolist(), camera) == tuple(in_image[0].tolist())
+    reasons = [f"component {axis}" for axis in range(num_axes)]
+    expected = [1, 0, 2, 3] if scan_axis == -1 else [0, 1, 2, 3]
+    assert sequence_from_row_order(reasons, camera) == tuple(reasons[axis] for axis in expected[:num_axes])

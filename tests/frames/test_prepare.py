@@ -90,7 +90,7 @@ def test_masks_that_broadcast(shape):
         ({"saturation": -1.0}, ValueError, "saturation must be larger than 0"),
         ({"saturation": 1e-9}, ValueError, "every pixel is saturated"),
         ({"timing": "camera"}, TypeError, "timing must be a SensorTiming, got str"),
-        ({"frames": "stack.tif", "name": "restored"}, TypeError, "restored must be a tensor or array of numbers"),
+        ({"frames": object(), "name": "restored"}, TypeError, "restored must be a tensor or array of numbers"),
     ],
 )
 def test_bad_input(options, error, message):

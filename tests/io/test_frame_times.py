@@ -15,8 +15,8 @@ from truth import decibel
 import rsvib_torch as rsv
 from rsvib_torch import StackInfo, read_stack_info
 from rsvib_torch.commands.main import run_command
+from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io import TimingWarning, describe_stack, exposure_times, timing_from_first_frame, write_stack
-from rsvib_torch.io.files import timing_of_files
 
 KEPT = [0, 1, 2, 4, 5, 9, 10]  # the other frames were dropped
 START = 100.25  # s
@@ -226,4 +226,4 @@ def test_missing_numbers_in_file_names_are_missing_frames(tmp_path, names, numbe
         missing = numbers[-1] + 1 - len(numbers)
         stated = "1 frame is missing" if missing == 1 else f"{missing} frames are missing"
         assert f"{stated} according to the numbers in the file names" in notes[0]
-        assert timing_of_files(tmp_path, timing).frame_start_times == starts
+        assert prepare_frames(tmp_path, timing).image_timing.frame_start_times == starts

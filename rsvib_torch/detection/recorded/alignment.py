@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text, wrapped
@@ -19,9 +20,9 @@ from rsvib_torch.detection.recorded.clock_range import offset_range
 from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment, align_rates
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
-from rsvib_torch.detection.start import grey_frames, measurements_of_curve
-from rsvib_torch.frames.arrays import ArrayLike, Channels
-from rsvib_torch.io.files import FramesOrFiles, timing_of_files
+from rsvib_torch.detection.start import measurements_of_curve
+from rsvib_torch.frames.grey import grey_frames
+from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.spline import FreeMotion
@@ -222,8 +223,8 @@ def align_motion(
         raise ValueError("align_motion takes one motion, not a batch")
     if isinstance(recorded, FreeMotion) and (camera is not None or fit_row_time):
         raise ValueError("camera and fit_row_time are for angular rates (read_gyroscope); omit them for a FreeMotion")
-    timing = timing_of_files(frames, timing)
     stack = grey_frames(frames, timing, full_scale, ignore, channels)
+    timing = stack.timing
     if stack.batched:
         raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")
     grey = stack.images

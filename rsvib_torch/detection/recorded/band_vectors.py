@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.detection.start import GreyFrames, band_curve
+from rsvib_torch.detection.start import band_curve
 from rsvib_torch.detection.strips import cut_into_strips
+from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.motion.field import displacement_factors
 from rsvib_torch.motion.timing import SensorTiming

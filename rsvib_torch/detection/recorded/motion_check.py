@@ -10,16 +10,17 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.shapes.free import start_curve
-from rsvib_torch.detection.start import grey_frames, measurements_of_curve
-from rsvib_torch.frames.arrays import ArrayLike, Channels
+from rsvib_torch.detection.start import measurements_of_curve
+from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.frames.orientation import offsets_from_row_order
-from rsvib_torch.io.files import FramesOrFiles, timing_of_files
+from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
@@ -129,8 +130,8 @@ def check_motion(
         >>> check.helps, bool((check.after < 0.2 * check.before).all())
         (True, True)
     """
-    timing = timing_of_files(frames, timing)
     stack = grey_frames(frames, timing, full_scale, ignore, channels)
+    timing = stack.timing
     if stack.batched or motion.batch_shape:
         raise ValueError("check_motion takes one stack and one motion, not a batch")
     bands = RegistrationOptions(registration, band_rows, band_step, search)

@@ -9,6 +9,7 @@ from typing import Literal
 
 from rsvib_torch.calibration import RowTimeCalibration
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.detection.row_time.by_free_motion import row_time_of_splines
@@ -16,9 +17,8 @@ from rsvib_torch.detection.row_time.by_recording import row_time_of_recording
 from rsvib_torch.detection.row_time.by_tones import CameraClock, RowTimeFit, bands_of_frames, row_time_of_tones
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces, rows_of_frames
 from rsvib_torch.detection.shapes.free import measure_freely, residual_of_motion
-from rsvib_torch.detection.start import GreyFrames, grey_frames
-from rsvib_torch.frames.arrays import ArrayLike, Channels
-from rsvib_torch.io.files import FramesOrFiles
+from rsvib_torch.frames.grey import GreyFrames, grey_frames
+from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOptions

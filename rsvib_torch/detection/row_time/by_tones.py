@@ -22,9 +22,10 @@ from rsvib_torch.detection.row_time.row_tones import (
 from rsvib_torch.detection.rows.direct import refine_directly
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
 from rsvib_torch.detection.rows.measured_rows import whole_rows
-from rsvib_torch.detection.start import GreyFrames, band_curve, measurements_of_curve
+from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, residual_of, shrunk_motion
 from rsvib_torch.detection.tones.selection import MAX_TONES, robust_fit
+from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
 

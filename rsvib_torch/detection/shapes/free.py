@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.presentation import Result, axis_rows, verdict_table
@@ -31,11 +32,11 @@ from rsvib_torch.detection.rows.displacements import (
     stack_spectra,
 )
 from rsvib_torch.detection.rows.measured_rows import strip_rows
-from rsvib_torch.detection.start import GreyFrames, band_curve, grey_frames, measurements_of_curve
+from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
-from rsvib_torch.frames.arrays import ArrayLike, Channels
+from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import offsets_from_row_order
-from rsvib_torch.io.files import FramesOrFiles, timing_of_files
+from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
@@ -216,8 +217,8 @@ def detect_motion(
     check_whole_number("knot_rows", knot_rows, at_least=4)
     check_whole_number("iterations", iterations, at_least=1, at_most=100)
     axes = 4 if zoom else 3 if roll else 2
-    timing = timing_of_files(frames, timing)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
+    timing = stacks.timing
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     height, width = stacks.images.shape[-2:]
     camera = camera_in_row_order(focal_length, principal_point, distortion, (height, width), timing)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_shapes, checks_arguments
+from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.presentation import Result, axis_rows, verdict_lines, verdict_table
@@ -24,9 +25,9 @@ from rsvib_torch.detection.shapes.free import (
     start_curve,
     unexplained_reason,
 )
-from rsvib_torch.detection.start import GreyFrames, grey_frames, measurements_of_curve
-from rsvib_torch.frames.arrays import ArrayLike, Channels
-from rsvib_torch.io.files import FramesOrFiles, timing_of_files
+from rsvib_torch.detection.start import measurements_of_curve
+from rsvib_torch.frames.grey import GreyFrames, grey_frames
+from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration import Registration, RegistrationOptions
@@ -190,8 +191,8 @@ def detect_swept_tone(
         [105.0, 20.0]
     """
     check_whole_number("iterations", iterations, at_least=1, at_most=100)
-    timing = timing_of_files(frames, timing)
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
+    timing = stacks.timing
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     fitted = [_detect(stacks.one(index), timing, bands, iterations) for index in range(len(stacks.images))]
     step = min(_step(one.fits, one.record, timing) for one in fitted)  # motions of a batch have common knots

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.frames.arrays import as_tensor
+from rsvib_torch.core.arrays import as_tensor
 
 __all__ = [
     "EdgeFit",

@@ -9,6 +9,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_fields, check_shapes, checks_arguments
+from rsvib_torch.core.arrays import ArrayLike, as_tensor
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.evaluation.mtf.edge import (
     EdgeFit,
@@ -21,7 +22,6 @@ from rsvib_torch.evaluation.mtf.edge import (
     straighten,
     uneven_patches,
 )
-from rsvib_torch.frames.arrays import ArrayLike, as_tensor
 
 __all__ = ["SlantedEdge", "find_slanted_edges"]
 

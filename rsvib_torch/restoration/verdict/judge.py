@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import ArrayLike, Channels, as_tensor
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
 from rsvib_torch.core.text import measured_text, text_table, wrapped
-from rsvib_torch.frames.arrays import ArrayLike, Channels, as_tensor
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
-from rsvib_torch.io.files import FramesOrFiles, load_frames, timing_of_files
+from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.field_motion import judged_strip
@@ -356,22 +356,21 @@ def judge_restoration(
         ('helps',)
         ('worse',)
     """
-    given_scale = full_scale
-    timing = timing_of_files(frames, timing)
-    frames, full_scale = load_frames(frames, full_scale)
     prepared = prepare_frames(
         frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, mosaic=mosaic, minimum_frames=2
     )
     if prepared.batched:
         raise ValueError(f"frames must be one stack (T, H, W) or (T, C, H, W), got shape {prepared.shape}")
-    restored, restored_scale = load_frames(restored, given_scale)
-    restored = _at_pixels(as_tensor("restored", restored), prepared, 1 if joint is True else prepared.images.shape[1])
+    timing = prepared.image_timing
+    loaded = load_frames(restored, full_scale)
+    expected = 1 if joint is True else prepared.images.shape[1]
+    restored = _at_pixels(as_tensor("restored", loaded.frames), prepared, expected)
     count, height = prepared.images.shape[1], prepared.images.shape[-2]
     vibration, _ = vibration_to_undo(vibration, timing, count, height)
     images = prepare_frames(
         restored,
         timing,
-        full_scale=restored_scale or full_scale,
+        full_scale=loaded.full_scale or prepared.full_scale,
         channels=channels,
         allow_missing=False,
         name="restored",

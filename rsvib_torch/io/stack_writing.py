@@ -1,18 +1,16 @@
-"""Reading and writing whole stacks: the file ending selects the format."""
+"""Writing of stacks of frames, and checks of the file before frames are computed."""
 
-import math
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.core.atomic import (
     check_kind,
     check_name,
@@ -24,266 +22,22 @@ from rsvib_torch.core.atomic import (
     temporary_folder,
 )
 from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.progress import steps
-from rsvib_torch.core.reading import check_regular
-from rsvib_torch.frames.arrays import Channels, FramesLike, as_tensor, channel_axis
-from rsvib_torch.io import hdf5, image_folder, npy, raw, tiff, video, zarr_store
-from rsvib_torch.io.formats import FORMATS, FrameReader, StackFormat, find_format, register_format, target_format
-from rsvib_torch.io.frame_times import timing_from_first_frame
-from rsvib_torch.io.full_scale import (
-    check_dtype,
-    counts_to_frames,
-    frames_to_counts,
-    full_scale_of_counts,
-    known_full_scale,
-    required_full_scale,
-)
+from rsvib_torch.io.formats import FORMATS, target_format
+from rsvib_torch.io.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
+from rsvib_torch.io.stack_format import StackFormat
 from rsvib_torch.io.stack_info import StackInfo
-from rsvib_torch.motion.timing import SensorTiming, check_timing
+from rsvib_torch.io.stack_reading import PathLike
 
 __all__ = [
-    "FramesOrFiles",
-    "PathLike",
     "check_info_target",
     "check_stack_target",
-    "load_frames",
     "metadata_not_kept",
-    "open_stack",
-    "read_stack",
-    "read_stack_info",
-    "register_format",
     "stack_files",
-    "timing_of_files",
     "write_frames",
     "write_stack",
 ]
-
-PathLike = str | os.PathLike[str]
-_FRAME_COPIES = 24  # bytes per pixel of one frame while it is decoded and converted
-_MAX_FRAMES = 10**7  # reading that many frames of one pixel takes a minute
-FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]
-
-for _form in (
-    npy.FORMAT,
-    hdf5.FORMAT,
-    image_folder.JPEG_FORMAT,
-    image_folder.PNG_FORMAT,
-    image_folder.FOLDER_FORMAT,
-    raw.FORMAT,
-    tiff.FORMAT,
-    video.FFV1_FORMAT,
-    video.H264_FORMAT,
-    video.READ_ONLY_FORMAT,
-    zarr_store.FORMAT,
-):
-    register_format(_form)
-
-
-@checks_arguments
-def open_stack(path: PathLike) -> FrameReader:
-    """Open a stack to read its frames one at a time; call ``close`` on the result.
-
-    Args:
-        path: As in ``read_stack``.
-
-    Returns:
-        An object with ``info``, ``frame(index)`` and ``close()``.
-
-    Raises:
-        OSError: If the file cannot be opened.
-        ModuleNotFoundError: If an optional package is missing, with the extra to install.
-        ValueError: If it is not a readable stack. Damage of single frames is detected when they are read.
-
-    Example:
-        >>> import tempfile
-        >>> import torch
-        >>> import rsvib_torch as rsv
-        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
-        >>> path = tempfile.mkdtemp() + "/frames.npy"
-        >>> rsv.write_stack(path, frames)
-        >>> reader = rsv.open_stack(path)
-        >>> reader.info.shape, reader.frame(2).shape  # reads one frame
-        ((3, 64, 48), (64, 48))
-        >>> reader.close()
-    """
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist")
-    check_regular(path)
-    reader = find_format(path).open(path)
-    reader.info = replace(reader.info, path=path)
-    if reader.info.shape[0] > _MAX_FRAMES:
-        reader.close()
-        raise ValueError(f"{path}: {reader.info.shape[0]} frames; a stack has at most {_MAX_FRAMES}, split the file")
-    return reader
-
-
-@checks_arguments
-def read_stack_info(path: PathLike) -> StackInfo:
-    """Read shape, data type and full scale of a stack without its pixels.
-
-    Args:
-        path: As in ``read_stack``.
-
-    Returns:
-        What the file states; unknown values are None.
-
-    Raises:
-        OSError: If the file cannot be opened.
-        ModuleNotFoundError: If an optional package is missing, with the extra to install.
-        ValueError: If it is not a readable stack.
-
-    Example:
-        >>> import tempfile
-        >>> import torch
-        >>> import rsvib_torch as rsv
-        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
-        >>> path = tempfile.mkdtemp() + "/frames.tif"
-        >>> rsv.write_stack(path, frames, dtype="uint16", full_scale=4095)
-        >>> info = rsv.read_stack_info(path)
-        >>> info.shape, info.dtype, info.full_scale
-        ((3, 64, 48), 'uint16', 4095.0)
-    """
-    reader = open_stack(path)
-    reader.close()
-    return reader.info
-
-
-@checks_arguments
-def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None = None) -> Tensor:
-    """Read a stack of frames from a file, or from several files one after another.
-
-    The ending selects the format: TIFF (``.tif``, ``.tiff``; also BigTIFF and compressed), ``.npy`` with (H, W),
-    (T, H, W) or (T, C, H, W), HDF5 (``.h5``, ``.hdf5``), Zarr v3 (``.zarr``), raw frames with a sidecar (``.raw``),
-    video (``.mp4``, ``.mov``, ``.mkv``, ``.avi`` and others; grey or RGB, with 8 to 16 bits), a single ``.png`` or
-    ``.jpg``, or a folder of PNG, TIFF or JPEG files in natural order (frame9 before frame10). Channels keep the order
-    of the file, RGB or RGBA. Frames have the stored rows and columns: an orientation that the file states for display
-    (``read_stack_info(path).orientation``) is not applied.
-
-    Integers are divided by the full scale: ``full_scale`` if given, else the value stated in the file, else 255 for
-    ``uint8``. The full scale of other integers is unknown (16 bits may hold 12-bit counts). Floats keep their values
-    and may be NaN or infinite here.
-
-    Args:
-        path: The file or folder, or a list of them whose frames have the same shape, data type and full scale.
-        full_scale: Count that corresponds to 1.0.
-
-    Returns:
-        float32 frames, (T, H, W) or (T, C, H, W); NaN at pixels that have the value of the tag GDAL_NODATA.
-
-    Raises:
-        OSError: If the file cannot be opened.
-        ModuleNotFoundError: If an optional package is missing, with the extra to install.
-        ValueError: If it is damaged, its frames differ in size, the full scale is unknown or exceeded, or the frames do
-            not fit into the free memory.
-
-    Example:
-        >>> import tempfile
-        >>> import torch
-        >>> import rsvib_torch as rsv
-        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
-        >>> path = tempfile.mkdtemp() + "/frames.tif"
-        >>> rsv.write_stack(path, frames, dtype="uint16", full_scale=4095)  # 12 bits in a 16-bit file
-        >>> rsv.read_stack(path).shape, rsv.read_stack(path).max() <= 1.0  # the file states its full scale
-        (torch.Size([3, 64, 48]), tensor(True))
-    """
-    paths = [path] if isinstance(path, (str, os.PathLike)) else list(path)
-    return torch.from_numpy(_read_pixels(paths, full_scale, as_counts=False)[0])
-
-
-def _read_pixels(
-    paths: Sequence[PathLike], full_scale: float | None, *, as_counts: bool
-) -> tuple[NDArray[Any], float | None]:
-    """Frames of all files, (T, H, W) or (T, C, H, W), and their full scale.
-
-    Args:
-        paths: The files.
-        full_scale: As in ``read_stack``.
-        as_counts: Whether integers are returned as stored instead of as float32; those of files with a nodata value
-            are always float32, with NaN where pixels have no data.
-    """
-    if not paths:
-        raise ValueError("path must contain at least one file, got an empty list")
-    parts: list[NDArray[Any]] = []
-    first: StackInfo | None = None
-    count = 0  # frames of all files
-    for path in paths:
-        reader = open_stack(path)
-        try:
-            info = reader.info
-            first = first or info
-            if info.kind != first.kind:
-                raise ValueError(f"frames of different size or kind: {paths[0]} is {first.kind}, {path} is {info.kind}")
-            stated = first.full_scale if full_scale is None else full_scale
-            stored = as_counts and info.is_integer and first.nodata is None
-            dtype = np.dtype(info.dtype if stored else np.float32)
-            count += info.shape[0]
-            joined = count if len(paths) > 1 else 0  # the frames of all files are copied into one array
-            frame_bytes = _FRAME_COPIES * math.prod(info.shape[1:])
-            check_fits(
-                f"{path}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px",
-                (info.shape[0] + joined) * math.prod(info.shape[1:]) * dtype.itemsize
-                + frame_bytes
-                + info.decoding_bytes,
-                "process the stack in windows (iterate_stack, process_stack, rsvib run)",
-            )
-            pixels = np.empty(info.shape, dtype)
-            advance = steps(len(pixels), "frames")
-            for index in range(len(pixels)):
-                frame = reader.frame(index)
-                pixels[index] = frame if stored else counts_to_frames(frame, stated, str(path), first.nodata)
-                advance()
-        finally:
-            reader.close()
-        parts.append(pixels)
-    return parts[0] if len(parts) == 1 else np.concatenate(parts), stated
-
-
-def load_frames(frames: FramesOrFiles, full_scale: float | None) -> tuple[FramesLike, float | None]:
-    """Read frames that are given by the paths of their files; other frames are returned unchanged.
-
-    Args:
-        frames: Frames in memory, a path, or a list of paths.
-        full_scale: Count that corresponds to 1.0, as in ``read_stack``.
-
-    Returns:
-        The frames, integers as stored unless the file has a nodata value, and their full scale.
-
-    Example:
-        >>> load_frames([[[0.5]]], None)
-        ([[[0.5]]], None)
-    """
-    if isinstance(frames, (str, os.PathLike)):
-        paths: list[PathLike] = [frames]
-    elif isinstance(frames, (list, tuple)) and frames and all(isinstance(item, (str, os.PathLike)) for item in frames):
-        paths = list(frames)
-    else:
-        return cast(FramesLike, frames), full_scale
-    pixels, full_scale = _read_pixels(paths, full_scale, as_counts=True)
-    if pixels.dtype.kind == "f":
-        return torch.from_numpy(pixels), None
-    return pixels, full_scale_of_counts(pixels, full_scale, str(paths[0]))
-
-
-def timing_of_files(frames: FramesOrFiles, timing: SensorTiming) -> SensorTiming:
-    """The timing of frames that may be given by the path of their file, with the frame times that the file states.
-
-    Args:
-        frames: Frames in memory, a path, or a list of paths.
-        timing: The sensor.
-
-    Warns:
-        TimingWarning: As ``timing_from_first_frame``, if the file states another frame rate than the sensor has.
-
-    Raises:
-        TypeError: If ``timing`` is not a ``SensorTiming``.
-    """
-    check_timing(timing)
-    if isinstance(frames, (str, os.PathLike)):
-        return timing_from_first_frame(timing, read_stack_info(frames))
-    return timing
 
 
 def stack_files(path: PathLike) -> list[Path]:

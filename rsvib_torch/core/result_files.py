@@ -1,0 +1,107 @@
+"""Files of results: JSON, which ``Result.load`` reads again, and pictures of figures; all replace a file as a whole."""
+
+import math
+import os
+import types
+from collections.abc import Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.text import json_text
+from rsvib_torch.core.validation import read_json
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["load_result", "save_figure", "save_result", "write_json"]
+
+
+def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
+    """Write a table as JSON with one key per line, atomically.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    with whole_file(path) as part:
+        part.write_text(json_text(content) + "\n", encoding="utf-8")
+
+
+def save_result(result: Any, path: Path) -> None:
+    """Write a ``Result`` as JSON, see ``Result.save``."""
+    write_json(path, {"format": result.file_format, "version": 1, **result.to_dict(), "units": dict(result.units)})
+
+
+def load_result(kind: type[Any], path: Path) -> Any:
+    """Read a result of a class from a file that ``save_result`` wrote, see ``Result.load``."""
+    data = read_json(path, f"file of {kind.__name__}.save")
+    if data.get("format") != kind.file_format or data.get("version") != 1:
+        raise ValueError(
+            f"{path}: expected format {kind.file_format!r} of version 1, as {kind.__name__}.save writes it, got "
+            f"{data.get('format')!r} of version {data.get('version')!r}"
+        )
+    try:
+        return _dataclass(kind, data)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Write a figure as a picture; the ending selects PNG, SVG or PDF."""
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=150, facecolor="white")
+
+
+def _restored(kind: Any, value: Any, path: str, missing: float) -> Any:
+    """Inverse of ``plain_values`` for an annotated type; ``missing`` takes the place of None in a tensor."""
+    if get_origin(kind) in (Union, types.UnionType):
+        if value is None:
+            return None
+        kind = next(member for member in get_args(kind) if member is not types.NoneType)
+    if kind is Tensor:
+        return _tensor(value, path, missing)
+    if get_origin(kind) is dict:
+        if not isinstance(value, dict):
+            raise ValueError(f"{path}: expected a table, got {value!r}")
+        return {key: _restored(get_args(kind)[1], entry, f"{path}.{key}", missing) for key, entry in value.items()}
+    if is_dataclass(kind) and isinstance(kind, type):
+        return _dataclass(kind, value, path)
+    if kind in (float, int, str, bool) and not isinstance(value, (float, int) if kind is float else kind):
+        raise ValueError(f"{path}: expected {kind.__name__}, got {value!r}")
+    return _tuples(value)
+
+
+def _dataclass(kind: type[Any], value: Any, path: str = "") -> Any:
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: expected a table, got {value!r}")
+    # SensorTiming does not import torch, whose Tensor its annotations name
+    hints, start = get_type_hints(kind, localns={"Tensor": torch.Tensor}), f"{path}." if path else ""
+    # files of earlier versions lack fields that were added later with a default
+    needed = [field.name for field in fields(kind) if field.default is MISSING and field.default_factory is MISSING]
+    if absent := [name for name in needed if name not in value]:
+        raise ValueError(f"{start}{absent[0]}: missing key")
+    names = [field.name for field in fields(kind) if field.name in value]
+    missing = getattr(kind, "_MISSING", math.nan)
+    return kind(**{name: _restored(hints[name], value[name], start + name, missing) for name in names})
+
+
+def _tensor(value: Any, path: str, missing: float) -> Tensor:
+    def filled(entry: Any) -> Any:
+        return [filled(part) for part in entry] if isinstance(entry, list) else missing if entry is None else entry
+
+    values = filled(value)
+    try:
+        tensor = torch.tensor(values, device="cpu")
+        if tensor.is_floating_point() or not tensor.numel():
+            tensor = torch.tensor(values, dtype=torch.float64, device="cpu")
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected numbers in lists of equal lengths: {error}") from error
+    return tensor
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value

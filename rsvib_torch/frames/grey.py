@@ -1,0 +1,137 @@
+"""Grey frames in row order, as every detection and alignment uses them."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.arrays import Channels
+from rsvib_torch.frames.mosaic import is_mosaic, mosaic_free
+from rsvib_torch.frames.pixels import cut_columns, detailed_parts
+from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.io.stack_reading import FramesOrFiles
+from rsvib_torch.motion.timing import SensorTiming
+
+__all__ = ["GreyFrames", "constant_frame", "grey_frames"]
+
+
+@dataclass(frozen=True, eq=False)
+class GreyFrames:
+    """Stacks of frames as detection uses them.
+
+    Attributes:
+        images: (B, T, H, W) grey, in row order; missing pixels hold local means.
+        valid: (B, T, H, W) bool, False at missing pixels; None if there are none.
+        batched: Whether the user gave a batch.
+        timing: The sensor in image orientation, with the frame times of the file if frames were given by a path.
+    """
+
+    images: Tensor
+    valid: Tensor | None
+    batched: bool
+    timing: SensorTiming
+
+    def narrowed(self, columns: int) -> "GreyFrames":
+        """The given number of neighbouring columns of each stack, those with the most detail."""
+        if columns >= self.images.shape[-1]:
+            return self
+        parts = detailed_parts(self.images, columns)
+        valid = None if self.valid is None else cut_columns(self.valid, parts)
+        return replace(self, images=cut_columns(self.images, parts), valid=_unless_complete(valid))
+
+    def one(self, index: int) -> "GreyFrames":
+        """One stack out of the batch, as a batch of one."""
+        part = slice(index, index + 1)
+        valid = None if self.valid is None else self.valid[part]
+        return replace(self, images=self.images[part], valid=_unless_complete(valid), batched=False)
+
+
+def _unless_complete(valid: Tensor | None) -> Tensor | None:
+    """The mask of valid pixels; None if all are valid."""
+    return None if valid is None or bool(valid.all()) else valid
+
+
+def grey_frames(
+    frames: FramesOrFiles,
+    timing: SensorTiming,
+    full_scale: float | None,
+    ignore: object,
+    channels: Channels,
+    *,
+    min_valid_fraction: float = 0.1,
+) -> GreyFrames:
+    """Read and check stacks of frames, and convert them to grey frames in row order.
+
+    Args:
+        frames: (T, H, W), (T, C, H, W) or (B, T, C, H, W); tensor, array, list of these, or files; NaN marks missing
+            pixels.
+        timing: The sensor.
+        full_scale: Count that means 1.0, for integer frames.
+        ignore: Bool tensor or array, broadcastable to (..., H, W) of the frames: True for missing pixels.
+        channels: As in ``prepare_frames``.
+        min_valid_fraction: Fraction of the pixels of each frame that must not be missing.
+
+    Warns:
+        TimingWarning: As ``prepare_frames``.
+
+    Raises:
+        TypeError: If frames are not numbers or ``ignore`` is not bool.
+        ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or
+            ``ignore`` does not fit; or a frame is a copy of the one before.
+    """
+    prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, minimum_frames=2)
+    images, valid = prepared.filled, None
+    # registration needs measured pixels in every frame
+    if prepared.missing is not None:
+        valid = ~prepared.missing.any(2)
+        fraction = valid.float().mean((-2, -1))
+        if bool((fraction < min_valid_fraction).any()):
+            where = (fraction < min_valid_fraction).nonzero()[0].tolist()
+            raise ValueError(
+                f"frame {where[-1]} has only {fraction[*where]:.1%} of pixels with data, {min_valid_fraction:.0%} are "
+                "needed; mark fewer pixels by NaN or ignore"
+            )
+    # a frame without detail has no displacement; every 16th row is enough to find that a frame is not constant
+    constant = _constant(images[..., ::16, :])
+    if bool(constant.any()):
+        constant = _constant(images)
+        if bool(constant.any()):
+            raise ValueError(constant_frame(constant.nonzero()[0].tolist()[-1]))
+    # a copy of a frame was exposed at another time than its place in the stack states
+    repeated = _repeated(images[..., ::16, :])
+    if bool(repeated.any()):
+        repeated = _repeated(images)
+        if bool(repeated.any()):
+            first = repeated.nonzero()[0].tolist()[-1]
+            raise ValueError(
+                f"frames {first} and {first + 1} are identical: one of them is a copy (video converters repeat "
+                "frames), and its time is wrong; remove copies and state the times of the others in frame_start_times"
+            )
+    # all channels show the same displacement; the pattern of a colour mosaic does not move with the scene
+    images = images.mean(2) if images.shape[2] > 1 else _without_mosaic(images[:, :, 0])
+    return GreyFrames(images, valid, prepared.batched, prepared.image_timing)
+
+
+def _without_mosaic(images: Tensor) -> Tensor:
+    """Grey frames (B, T, H, W), of colour mosaics without the pattern of the colours, which does not move."""
+    mosaic = torch.stack([is_mosaic(stack[0]) for stack in images])
+    if not bool(mosaic.any()):
+        return images
+    return torch.where(mosaic[:, None, None, None], mosaic_free(images), images)
+
+
+def constant_frame(index: int) -> str:
+    """Message for a frame whose pixels are equal."""
+    return f"frame {index} is constant and cannot be registered; remove this frame"
+
+
+def _constant(frames: Tensor) -> Tensor:
+    """(B, T) bool, frames (B, T, C, H, W) with equal pixels, to rounding."""
+    low, high = frames.amin((-3, -2, -1)), frames.amax((-3, -2, -1))
+    return high - low <= 1e-6 * torch.maximum(low.abs(), high.abs())
+
+
+def _repeated(frames: Tensor) -> Tensor:
+    """(B, T - 1) bool: frames (B, T, C, H, W) that equal the next one; none in stacks whose frames are all equal."""
+    equal = (frames[:, 1:] == frames[:, :-1]).flatten(2).all(-1)
+    return equal & ~equal.all(-1, keepdim=True)

@@ -1,0 +1,233 @@
+"""Reading of stacks of frames: whole, frame by frame, and as the argument ``frames`` of a function."""
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import FramesLike
+from rsvib_torch.core.free_memory import check_fits
+from rsvib_torch.core.progress import steps
+from rsvib_torch.io.formats import find_format
+from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts
+from rsvib_torch.io.stack_format import FrameReader
+from rsvib_torch.io.stack_info import StackInfo
+
+__all__ = [
+    "FramesOrFiles",
+    "LoadedFrames",
+    "PathLike",
+    "load_frames",
+    "open_stack",
+    "read_stack",
+    "read_stack_info",
+]
+
+PathLike = str | os.PathLike[str]
+FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]
+_FRAME_COPIES = 24  # bytes per pixel of one frame while it is decoded and converted
+_MAX_FRAMES = 10**7  # frames; reading that many frames of one pixel takes a minute
+
+
+@checks_arguments
+def open_stack(path: PathLike) -> FrameReader:
+    """Open a stack to read its frames one at a time; call ``close`` on the result.
+
+    Args:
+        path: As in ``read_stack``.
+
+    Returns:
+        An object with ``info``, ``frame(index)`` and ``close()``.
+
+    Raises:
+        OSError: If the file cannot be opened.
+        ModuleNotFoundError: If an optional package is missing, with the extra to install.
+        ValueError: If it is not a readable stack. Damage of single frames is detected when they are read.
+
+    Example:
+        >>> import tempfile
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
+        >>> path = tempfile.mkdtemp() + "/frames.npy"
+        >>> rsv.write_stack(path, frames)
+        >>> reader = rsv.open_stack(path)
+        >>> reader.info.shape, reader.frame(2).shape  # reads one frame
+        ((3, 64, 48), (64, 48))
+        >>> reader.close()
+    """
+    path = Path(path)
+    reader = find_format(path).open(path)
+    reader.info = replace(reader.info, path=path)
+    if reader.info.shape[0] > _MAX_FRAMES:
+        reader.close()
+        raise ValueError(f"{path}: {reader.info.shape[0]} frames; a stack has at most {_MAX_FRAMES}, split the file")
+    return reader
+
+
+@checks_arguments
+def read_stack_info(path: PathLike) -> StackInfo:
+    """Read shape, data type and full scale of a stack without its pixels.
+
+    Args:
+        path: As in ``read_stack``.
+
+    Returns:
+        What the file states; unknown values are None.
+
+    Raises:
+        OSError: If the file cannot be opened.
+        ModuleNotFoundError: If an optional package is missing, with the extra to install.
+        ValueError: If it is not a readable stack.
+
+    Example:
+        >>> import tempfile
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
+        >>> path = tempfile.mkdtemp() + "/frames.tif"
+        >>> rsv.write_stack(path, frames, dtype="uint16", full_scale=4095)
+        >>> info = rsv.read_stack_info(path)
+        >>> info.shape, info.dtype, info.full_scale
+        ((3, 64, 48), 'uint16', 4095.0)
+    """
+    reader = open_stack(path)
+    reader.close()
+    return reader.info
+
+
+@checks_arguments
+def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None = None) -> Tensor:
+    """Read a stack of frames from a file, or from several files one after another.
+
+    The ending selects the format: TIFF (``.tif``, ``.tiff``; also BigTIFF and compressed), ``.npy`` with (H, W),
+    (T, H, W) or (T, C, H, W), HDF5 (``.h5``, ``.hdf5``), Zarr v3 (``.zarr``), raw frames with a sidecar (``.raw``),
+    video (``.mp4``, ``.mov``, ``.mkv``, ``.avi`` and others; grey or RGB, with 8 to 16 bits), a single ``.png`` or
+    ``.jpg``, or a folder of PNG, TIFF or JPEG files in natural order (frame9 before frame10). Channels keep the order
+    of the file, RGB or RGBA. Frames have the stored rows and columns: an orientation that the file states for display
+    (``read_stack_info(path).orientation``) is not applied.
+
+    Integers are divided by the full scale: ``full_scale`` if given, else the value stated in the file, else 255 for
+    ``uint8``. The full scale of other integers is unknown (16 bits may hold 12-bit counts). Floats keep their values
+    and may be NaN or infinite here.
+
+    Args:
+        path: The file or folder, or a list of them whose frames have the same shape, data type and full scale.
+        full_scale: Count that corresponds to 1.0.
+
+    Returns:
+        float32 frames, (T, H, W) or (T, C, H, W); NaN at pixels that have the value of the tag GDAL_NODATA.
+
+    Raises:
+        OSError: If the file cannot be opened.
+        ModuleNotFoundError: If an optional package is missing, with the extra to install.
+        ValueError: If it is damaged, its frames differ in size, the full scale is unknown or exceeded, or the frames do
+            not fit into the free memory.
+
+    Example:
+        >>> import tempfile
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
+        >>> path = tempfile.mkdtemp() + "/frames.tif"
+        >>> rsv.write_stack(path, frames, dtype="uint16", full_scale=4095)  # 12 bits in a 16-bit file
+        >>> rsv.read_stack(path).shape, rsv.read_stack(path).max() <= 1.0  # the file states its full scale
+        (torch.Size([3, 64, 48]), tensor(True))
+    """
+    paths = [path] if isinstance(path, (str, os.PathLike)) else list(path)
+    return torch.from_numpy(_read_pixels(paths, full_scale, as_counts=False)[0])
+
+
+def _read_pixels(
+    paths: Sequence[PathLike], full_scale: float | None, *, as_counts: bool
+) -> tuple[NDArray[Any], float | None, StackInfo]:
+    """Frames of all files, (T, H, W) or (T, C, H, W), their full scale, and what the first file states.
+
+    Args:
+        paths: The files.
+        full_scale: As in ``read_stack``.
+        as_counts: Whether integers are returned as stored instead of as float32; those of files with a nodata value
+            are always float32, with NaN where pixels have no data.
+    """
+    if not paths:
+        raise ValueError("path must contain at least one file, got an empty list")
+    parts: list[NDArray[Any]] = []
+    infos: list[StackInfo] = []
+    count = 0  # frames of all files
+    for path in paths:
+        reader = open_stack(path)
+        try:
+            info = reader.info
+            infos.append(info)
+            first = infos[0]
+            if info.kind != first.kind:
+                raise ValueError(f"frames of different size or kind: {paths[0]} is {first.kind}, {path} is {info.kind}")
+            stated = first.full_scale if full_scale is None else full_scale
+            stored = as_counts and info.is_integer and first.nodata is None
+            dtype = np.dtype(info.dtype if stored else np.float32)
+            count += info.shape[0]
+            joined = count if len(paths) > 1 else 0  # the frames of all files are copied into one array
+            frame_bytes = _FRAME_COPIES * math.prod(info.shape[1:])
+            check_fits(
+                f"{path}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px",
+                (info.shape[0] + joined) * math.prod(info.shape[1:]) * dtype.itemsize
+                + frame_bytes
+                + info.decoding_bytes,
+                "process the stack in windows (iterate_stack, process_stack, rsvib run)",
+            )
+            pixels = np.empty(info.shape, dtype)
+            advance = steps(len(pixels), "frames")
+            for index in range(len(pixels)):
+                frame = reader.frame(index)
+                pixels[index] = frame if stored else counts_to_frames(frame, stated, str(path), first.nodata)
+                advance()
+        finally:
+            reader.close()
+        parts.append(pixels)
+    return parts[0] if len(parts) == 1 else np.concatenate(parts), stated, first
+
+
+class LoadedFrames(NamedTuple):
+    """Frames in memory, from the argument ``frames`` of a function.
+
+    Attributes:
+        frames: Tensor, array or list of these; integers as stored, unless the file has a nodata value.
+        full_scale: Count that corresponds to 1.0; None if it is unknown, and for floats of a file.
+        info: What the file states, if the frames were given by one path.
+    """
+
+    frames: FramesLike
+    full_scale: float | None
+    info: StackInfo | None
+
+
+def load_frames(frames: FramesOrFiles, full_scale: float | None) -> LoadedFrames:
+    """Read frames that are given by the paths of their files; other frames are returned unchanged.
+
+    Args:
+        frames: Frames in memory, a path, or a list of paths.
+        full_scale: Count that corresponds to 1.0, as in ``read_stack``.
+
+    Example:
+        >>> load_frames([[[0.5]]], None)
+        LoadedFrames(frames=[[[0.5]]], full_scale=None, info=None)
+    """
+    if isinstance(frames, (str, os.PathLike)):
+        paths: list[PathLike] = [frames]
+    elif isinstance(frames, (list, tuple)) and frames and all(isinstance(item, (str, os.PathLike)) for item in frames):
+        paths = list(frames)
+    else:
+        return LoadedFrames(cast(FramesLike, frames), full_scale, None)
+    pixels, full_scale, first = _read_pixels(paths, full_scale, as_counts=True)
+    info = None if isinstance(frames, (list, tuple)) else first  # several files have no common time
+    if pixels.dtype.kind == "f":
+        return LoadedFrames(torch.from_numpy(pixels), None, info)
+    return LoadedFrames(pixels, full_scale_of_counts(pixels, full_scale, str(paths[0])), info)
