@@ -29,8 +29,14 @@ from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem, 
 from rsvib_torch.restoration.exact.strength import Strengths, prior_strength
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
-from rsvib_torch.restoration.scene_model.finer_rows import SCALE, FinerObservation, finer_kernels
-from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels, row_kernels
+from rsvib_torch.restoration.scene_model.observation import (
+    SCALE,
+    FinerObservation,
+    Observation,
+    RowKernels,
+    finer_kernels,
+    row_kernels,
+)
 from rsvib_torch.restoration.scene_model.polynomial_prior import PolynomialPrior, fit_polynomial_prior
 from rsvib_torch.restoration.scene_model.row_prior import RowPrior, brightness, fit_prior
 
