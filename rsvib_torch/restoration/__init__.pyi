@@ -1,5 +1,5 @@
 from .frame_motion import visible_pixels
-from .noise.high_pass import estimate_noise
+from .noise import estimate_noise
 from .noise_gain import predict_noise_gain
 from .restoration_mtf import RestorationMtf, restoration_mtf
 from .restore import VibrationRestorer, restore

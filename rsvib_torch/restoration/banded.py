@@ -17,7 +17,7 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.core.splines import bspline_weights, mirrored
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.noise.high_pass import estimate_noise
+from rsvib_torch.restoration.noise import estimate_noise
 
 __all__ = ["restore_banded"]
 

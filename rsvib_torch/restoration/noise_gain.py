@@ -12,7 +12,7 @@ from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration.noise.high_pass import estimate_noise
+from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 

@@ -21,7 +21,7 @@ from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
-from rsvib_torch.restoration.noise.high_pass import estimate_noise
+from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 

@@ -29,6 +29,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact.exact import restore_exact
+from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
 from rsvib_torch.restoration.field_motion import judged_strip, restore_in_strips
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
@@ -90,12 +91,13 @@ class RestorationMethod:
 
     Attributes:
         function: The method, see the contract above ``METHODS``.
-        masks: Masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels), ``"colours"``
-            (colours of the pixels of a mosaic).
+        masks: Masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels).
+        of_mosaic: The method for colour mosaics with the same options and masks, and ``colours``; None for none.
     """
 
     function: Callable[..., Tensor]
-    masks: tuple[Literal["ignore", "clipped", "colours"], ...] = ()
+    masks: tuple[Literal["ignore", "clipped"], ...] = ()
+    of_mosaic: Callable[..., Tensor] | None = None
 
 
 # Restoration methods. A method is called as
@@ -106,8 +108,8 @@ class RestorationMethod:
 #     motion: FrameMotion of the B stacks.
 #     ignore, clipped: bool tensors shaped like the frames, passed only if listed in ``masks`` and such pixels exist.
 #         Without ``"ignore"``, missing pixels hold local means; without ``"clipped"``, saturated ones count.
-#     colours: integer tensor shaped like the frames, the colour that each pixel of a mosaic measures; a method that
-#         does not list it has no option ``mosaic``.
+#     colours: integer tensor shaped like the frames, the colour that each pixel of a mosaic measures; passed
+#         to ``of_mosaic`` only. A method without it has no option ``mosaic``.
 #     returns: frames at rest, of the same shape and dtype, in the coordinates of ``motion.shift``; (B, 1, C, H, W) for
 #         option ``joint=True``, and (..., S H, S W) for option ``scale=S``, with point (S i, S j) at pixel (i, j).
 #
@@ -115,7 +117,7 @@ class RestorationMethod:
 # and motion. A new method is one module, its options in core/option_types.py, one line here, and one TypedDict
 # and overload of ``restore`` and of ``VibrationRestorer``.
 METHODS: dict[str, RestorationMethod] = {
-    "exact": RestorationMethod(restore_exact, ("ignore", "clipped", "colours")),
+    "exact": RestorationMethod(restore_exact, ("ignore", "clipped"), restore_mosaic),
     "banded": RestorationMethod(restore_banded),
     "dewarp": RestorationMethod(restore_dewarp),
     "richardson-lucy": RestorationMethod(restore_richardson_lucy, ("ignore",)),
@@ -275,13 +277,16 @@ def restore_prepared(
     options = dict(options or {})
     check_method_options(method, options)
     chosen = METHODS[method]
-    if frames.colours is not None and "colours" not in chosen.masks:
+    function = chosen.function if frames.colours is None else chosen.of_mosaic
+    if function is None:
         raise ValueError(f"mosaic goes with method='exact', not with method={method!r}; demosaic the frames before")
-    masks = {"ignore": frames.missing, "clipped": frames.saturated, "colours": frames.colours}
+    masks = {"ignore": frames.missing, "clipped": frames.saturated}
     options |= {name: masks[name] for name in chosen.masks if masks[name] is not None}
+    if frames.colours is not None:
+        options["colours"] = frames.colours
     images = frames.images if "ignore" in chosen.masks else frames.filled
     motion = _motion_in_row_order(frames, vibration)
-    return restore_in_strips(chosen.function, images, motion, frames.timing, options)
+    return restore_in_strips(function, images, motion, frames.timing, options)
 
 
 def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) -> Tensor:

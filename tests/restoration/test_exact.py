@@ -1,4 +1,5 @@
 import threading
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,7 +15,7 @@ from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
 from rsvib_torch.restoration.exact import scene_solver
 from rsvib_torch.restoration.exact.filling import Extended
-from rsvib_torch.restoration.exact.priors import PRIORS
+from rsvib_torch.restoration.exact.priors import PRIORS, Prior
 from rsvib_torch.restoration.exact.scene_solver import Partition
 
 restore = partial(restore_by_any_method, method="exact")
@@ -150,13 +151,13 @@ def test_results_do_not_depend_on_threads_and_gradients(short, joint, monkeypatc
     options = {"joint": joint, "check": False}
     found = []
     parts = []
-    solved = exact_module._solved
+    gaussian = PRIORS["gaussian"]
 
-    def recorded_call(*given):
+    def recorded_prior(problem, options):
         parts.append((threading.current_thread(), torch.is_grad_enabled()))
-        return solved(*given)
+        return gaussian.function(problem, options)
 
-    monkeypatch.setattr(exact_module, "_solved", recorded_call)
+    monkeypatch.setitem(PRIORS, "gaussian", replace(gaussian, function=recorded_prior))
     try:
         for threads, workers in ((2, 2), (1, 1)):
             parts.clear()
@@ -406,10 +407,13 @@ def test_prior_added_to_the_table(short, monkeypatch):
         options.append(chosen)
         return torch.zeros_like(problem.data[0])
 
-    monkeypatch.setitem(PRIORS, "toy", toy)
+    monkeypatch.setitem(PRIORS, "toy", Prior(toy))
     restored = restore(frames, TIMING, motion.vibration(), prior="toy", regularisation=2.0)
     assert options[0].regularisation == 2.0
     assert (restored - restored.mean()).abs().max() < 1e-12
+    for option in ({"scale": 2}, {"mosaic": "RGGB"}):  # not declared
+        with pytest.raises(ValueError, match="has prior='gaussian' only, got 'toy'"):
+            restore(frames, TIMING, motion.vibration(), prior="toy", **option)
     monkeypatch.delitem(PRIORS, "toy")
     with pytest.raises(ValueError, match=r"prior must be one of .*; got 'toy'"):
         restore(frames, TIMING, motion.vibration(), prior="toy")

@@ -8,10 +8,14 @@ from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.restoration.frame_motion import frame_motion
-from rsvib_torch.restoration.noise.high_pass import estimate_noise
-from rsvib_torch.restoration.noise.motion_blur import _fit_noise, noise_of_blurred_frames
-from rsvib_torch.restoration.noise.policy import ESTIMATORS, noise_levels
-from rsvib_torch.restoration.noise.spectral_floor import noise_floor
+from rsvib_torch.restoration.noise import (
+    ESTIMATORS,
+    estimate_noise,
+    fit_noise,
+    noise_floor,
+    noise_levels,
+    noise_of_blurred_frames,
+)
 from rsvib_torch.restoration.scene_model.observation import (
     interpolation_error,
     kernel_spectrum,
@@ -271,4 +275,4 @@ def test_fisher_scoring_recovers_the_parameters_of_exact_powers():
     power[:, 3] = 100.0  # not usable
     usable = torch.ones(2, 12, dtype=torch.bool)
     usable[:, 3] = False
-    torch.testing.assert_close(_fit_noise(power, transfer, usable), noise, rtol=1e-7, atol=0)
+    torch.testing.assert_close(fit_noise(power, transfer, usable), noise, rtol=1e-7, atol=0)

@@ -330,12 +330,18 @@ def test_arrays_and_orientation(scene_and_frames):
     torch.testing.assert_close(found.transpose(-2, -1), expected, rtol=0, atol=1e-6)
 
 
+def keyword_annotations(function):
+    parameters = inspect.signature(function).parameters.values()
+    return {p.name: p.annotation for p in parameters if p.kind is p.KEYWORD_ONLY}
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_typed_options_are_those_of_the_function(name):
     method = METHODS[name]
-    parameters = inspect.signature(method.function).parameters.values()
-    keywords = {p.name: p.annotation for p in parameters if p.kind is p.KEYWORD_ONLY}
-    assert set(method.masks) == {"ignore", "clipped", "colours"} & set(keywords)
+    keywords = keyword_annotations(method.function)
+    if method.of_mosaic is not None:
+        assert keyword_annotations(method.of_mosaic) == {"colours": torch.Tensor, **keywords}
+    assert set(method.masks) == {"ignore", "clipped"} & set(keywords)
     assert {*method_options(name), *method.masks} == set(keywords)
     for option in method_options(name):
         assert METHOD_SETTINGS[name].__annotations__[option] == keywords[option]

@@ -84,35 +84,22 @@ def test_slabs_are_fitted_independently(slab_data, monkeypatch, slab):
             assert found.freedom[index, place].item() == pytest.approx(freedom, rel=0.01)
 
 
-def test_weak_priors_are_tried_only_if_the_third_is_selected(monkeypatch):
-    tried = []
-
-    class Sample:
-        def explain(self, precisions):
-            tried.append(len(precisions))
-            begin = sum(tried[:-1])
-            errors = torch.tensor(self.errors[begin : begin + len(precisions)], dtype=torch.float64)[:, None]
-            return Explained(errors.exp(), torch.zeros_like(errors), 100)
-
-    class Prior:
-        power, interpolation_power = torch.ones(65), torch.full((65,), 1e-9)
-
-        def precision(self, noise_power, factor, reach):
-            return torch.zeros(3, 3, 65)
-
-    class Kernels:
-        reach = 0.0
-
-        def rows(self, top, count):
-            return self
-
-    sample = Sample()
-    monkeypatch.setattr(strength, "sample_rows", lambda *arguments: sample)
-    for errors, expected, calls in (
+@pytest.mark.parametrize(
+    ("errors", "expected", "calls"),
+    [
         ([0.3, 0.0, 0.2, 0.5, 0.7, 0.9, 1.0], 1.0, [3]),
         ([0.9, 0.8, 0.6, 0.4, 0.1, 0.3, 0.5], 0.12, [3, 4]),
-    ):
-        tried.clear()
-        sample.errors = errors
-        chosen = strength.prior_strength(torch.zeros(1, 1, 128, 128), Kernels(), Prior(), torch.tensor(1.0))
-        assert (chosen, tried) == (expected, calls)
+    ],
+)
+def test_weak_priors_are_tried_only_if_the_third_is_selected(errors, expected, calls):
+    strengths = [2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03]
+    precisions = list(torch.arange(7))
+    tried = []
+
+    def explain(some):
+        tried.append(len(some))
+        power = torch.tensor([errors[int(number)] for number in some], dtype=torch.float64)[:, None].exp()
+        return Explained(power, torch.zeros_like(power), 100)
+
+    assert strength.select_strength(strengths, precisions, explain) == expected
+    assert tried == calls

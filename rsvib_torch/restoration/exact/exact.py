@@ -3,14 +3,14 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import MAX_NUMBER, check_choice, check_number, check_whole_number
+from rsvib_torch.core.checks import MAX_NUMBER, check_choice, check_number
 from rsvib_torch.core.fourier import extend_rows, extended_length, fast_length
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.core.progress import steps
@@ -24,18 +24,23 @@ from rsvib_torch.restoration.exact.filling import (
     measured_values,
 )
 from rsvib_torch.restoration.exact.finer_scene import Misfit, finer_scene, warn_of_frames
-from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
-from rsvib_torch.restoration.exact.priors import PRIORS, PriorOptions
+from rsvib_torch.restoration.exact.priors import PRIORS, PriorOptions, check_prior
 from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem, SolversSideBySide
 from rsvib_torch.restoration.exact.strength import Strengths, prior_strength
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
-from rsvib_torch.restoration.noise.policy import noise_levels
-from rsvib_torch.restoration.scene_model.finer_rows import SCALE, FinerObservation, finer_kernels
-from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels, row_kernels
+from rsvib_torch.restoration.noise import noise_levels
+from rsvib_torch.restoration.scene_model.observation import (
+    SCALE,
+    FinerObservation,
+    Observation,
+    RowKernels,
+    finer_kernels,
+    row_kernels,
+)
 from rsvib_torch.restoration.scene_model.polynomial_prior import PolynomialPrior, fit_polynomial_prior
 from rsvib_torch.restoration.scene_model.row_prior import RowPrior, brightness, fit_prior
 
-__all__ = ["restore_exact", "scene_period"]
+__all__ = ["given_level", "restore_exact", "row_exposures", "scene_period"]
 
 _MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
 
@@ -50,7 +55,6 @@ def restore_exact(
     regularisation: float = 1.0,
     ignore: Tensor | None = None,
     clipped: Tensor | None = None,
-    colours: Tensor | None = None,
     chunk_frequencies: int | None = None,
     segments: int | None = None,
     scale: Literal[1, 2] = 1,
@@ -80,8 +84,6 @@ def restore_exact(
         ignore: Boolean mask shaped like the frames of missing pixels; their values are not used, and are estimated from
             all others.
         clipped: Boolean mask of saturated pixels, whose values are lower bounds.
-        colours: Colour that each pixel of a mosaic measures, 0 red, 1 green, 2 blue, shaped like the frames, which have
-            one channel; the result has three, see ``restore_mosaic``.
         chunk_frequencies: Frequencies solved at a time; bounds the memory, does not change the result. None: as many
             as take 8 times the memory of the spectrum of the scene, or 16 times where the displacement changes by more
             than a pixel during an exposure.
@@ -89,7 +91,6 @@ def restore_exact(
             None: segments of at least 512 rows on a CPU, 256 on a GPU.
             Always one where the displacement changes by more than a pixel during an exposure: rows then depend on
             distant rows.
-
         scale: Points of the restored frames per pixel along both axes, 1 or 2. With 2, the unknown is the scene after
             optics and pixel on a grid of half pixels, and aliasing is part of the model: several frames that sample
             between each other's pixels contain detail beyond half a cycle per px, one frame does not. The prior is then
@@ -100,45 +101,33 @@ def restore_exact(
         Restored frames of the same shape, or (B, 1, C, H, W); with ``scale=2``, of twice the rows and columns, point
         (2 i, 2 j) at pixel (i, j).
     """
-    B, T, C, H, W = frames.shape
+    # 1. Options. Missing pixels hold local means until step 6.
+    B, T, _, H, W = frames.shape
     factor = check_number("regularisation", regularisation, above=0.0)
-    _check_prior(prior, scale, colours)
+    check_choice("scale", scale, (1, SCALE))
+    check_prior(prior, scale=scale)
     groups = joint_groups(T, joint)
-    chunk, split = (
-        None if value is None else check_whole_number(name, value, at_least=1)
-        for name, value in (("chunk_frequencies", chunk_frequencies), ("segments", segments))
-    )
-    if ignore is not None and colours is None:
+    partition = Partition.of_options(chunk_frequencies, segments)
+    if ignore is not None:
         frames = fill_with_means(frames, ignore)
     missing = ignore if clipped is None else clipped if ignore is None else ignore | clipped
-    starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device)).expand(B, T, H)
-    displacement, node_weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
-    reaches = motion.reaches(H)
-    if colours is not None:
-        return restore_mosaic(
-            frames,
-            motion,
-            colours,
-            groups,
-            (displacement, node_weights),
-            [scene_period(W, reach, moved) for reach, moved in zip(reaches, displacement, strict=True)],
-            noise=noise if noise == "auto" else _given_level(noise),
-            regularisation=factor,
-            ignore=ignore,
-            clipped=clipped,
-            partition=Partition(chunk, split),
-            scale=scale,
-        )
+
+    # 2. Displacement of each row during its exposure, and the period of the scene that it requires.
+    displacement, node_weights = row_exposures(motion, frames)
+    periods = _periods(W, motion.strips, motion.reaches(H), displacement)
+
+    # 3. Noise level of each frame, which determines the weights of the frames.
     levels = _noise_levels(frames, motion, noise, ignore)
     mean = brightness(frames).mean(1)[..., None, None]
-    periods = _periods(W, motion.strips, reaches, displacement)
-    scenes: list[_Scene] = []  # stack, its frames, the restored one, factor on the prior
+
+    # 4. Prior of each stack, fitted to its frames, and the scenes that are restored from the stack.
+    fit = fit_prior if scale == 1 else fit_polynomial_prior
+    scenes: list[_Scene] = []
     for index in range(B):
         if index % motion.strips == 0:
-            strengths, certain = Strengths(), noise != "auto" or T > 1
+            strengths = Strengths()  # strips of the same frames share them
         weights = levels[index].square().reciprocal()
         typical = weights.mean().reciprocal()
-        # strips of the same frames have one period
         length = periods[index // motion.strips]
         stack = _Stack(
             frames=frames[index],
@@ -148,53 +137,63 @@ def restore_exact(
             weights=weights * typical,
             level=typical.sqrt(),
             mean=mean[index],
-            prior=(fit_prior if scale == 1 else fit_polynomial_prior)(
-                frames[index], motion, index, levels[index], length
-            ),
+            prior=fit(frames[index], motion, index, levels[index], length),
             length=length,
             scale=scale,
             missing=None if missing is None else missing[index],
             clipped=None if clipped is None else clipped[index],
             at_ends=index % motion.strips in (0, motion.strips - 1),
         )
-        measured = groups if missing is None else _without_empty_frames(groups, missing[index])
-        scenes += [(stack, *group, factor * stack.strength(*group, strengths, certain=certain)) for group in measured]
+        # 5. Strength of the prior of each scene, by cross-validation.
+        for members, reference in groups if missing is None else _without_empty_frames(groups, missing[index]):
+            strength = stack.strength(members, reference, strengths, certain=noise != "auto" or T > 1)
+            scenes.append(_Scene(stack, members, reference, factor * strength))
 
-    misfits: list[Misfit] = []
-
-    def problem_of(number: int, partition: Partition) -> SceneProblem | Incomplete | Extended:
-        return scenes[number][0].problem(*scenes[number][1:], partition)
-
-    def restored(numbers: list[int], problems: list[SceneProblem]) -> list[Tensor]:
-        """Images of scenes that are solved together."""
-        if scale == 1:
-            solved = _solved(problems, prior, factor)
-        else:
-            finer, misfit = finer_scene(problems[0], W, motion.neglected)
-            solved = [finer]
-            misfits.append(misfit)
-        means = [scenes[number][0].mean for number in numbers]
-        return [scene[..., : scale * W] + mean for scene, mean in zip(solved, means, strict=True)]
-
+    # 6. Missing values are filled, and the banded systems of all frequencies solved.
+    solve = _Solution(prior, factor, motion.neglected)
     if torch.is_grad_enabled() and (frames.requires_grad or displacement.requires_grad):
-        partition = Partition(chunk, split)
-        images = torch.stack([restored([n], filled([problem_of(n, partition)]))[0] for n in range(len(scenes))])
+        images = torch.stack([solve([scene], filled([scene.problem(partition)]))[0] for scene in scenes])
     else:
-        images = frames.new_empty(len(scenes), C, scale * H, scale * W)
-        # scenes whose systems are solved together: the strips of a frame
-        together = motion.strips if prior == "gaussian" and scale == 1 else 1
-        tasks = _tasks(len(scenes), len(scenes) // B, together)
-        _solve_in_parallel(problem_of, restored, tasks, Partition(chunk, split), images)
+        together = motion.strips if PRIORS[prior].is_precision and scale == 1 else 1
+        images = _solve_in_parallel(scenes, solve, _tasks(len(scenes), len(scenes) // B, together), partition)
+
+    # 7. On the finer grid, frames that contradict their scene show that the motion is wrong.
     if scale != 1:
-        warn_of_frames(misfits, (stack.places(members) for stack, members, _, _ in scenes))
+        warn_of_frames(solve.misfits, (scene.stack.places(scene.members) for scene in scenes))
     return images.view(B, -1, *images.shape[1:])
 
 
-def _solved(problems: list[SceneProblem], prior: str, regularisation: float) -> list[Tensor]:
-    """Scenes without missing values; several are those of strips, with a Gaussian prior."""
-    if len(problems) > 1:
-        return SolversSideBySide(problems).scenes([problem.data for problem in problems])
-    return [PRIORS[prior](problem, PriorOptions(regularisation)) for problem in problems]
+class _Solution:
+    """Images of scenes without missing values.
+
+    Args:
+        prior: Name in ``PRIORS``.
+        regularisation: Factor on the prior.
+        neglected: As in ``FrameMotion``.
+
+    Attributes:
+        misfits: Of the scenes solved so far on the finer grid.
+    """
+
+    def __init__(self, prior: str, regularisation: float, neglected: float) -> None:
+        self._prior, self._options, self._neglected = PRIORS[prior], PriorOptions(regularisation), neglected
+        self.misfits: list[Misfit] = []
+
+    def __call__(self, scenes: list["_Scene"], problems: list[SceneProblem]) -> list[Tensor]:
+        """Images (C, scale R, scale W) of scenes that are solved together; several are those of strips."""
+        stack = scenes[0].stack
+        if stack.scale != 1:
+            finer, misfit = finer_scene(problems[0], stack.width, self._neglected)
+            solved = [finer]
+            self.misfits.append(misfit)
+        elif len(problems) > 1:
+            solved = SolversSideBySide(problems).scenes([problem.data for problem in problems])
+        else:
+            solved = [self._prior.function(problems[0], self._options)]
+        return [
+            image[..., : stack.scale * stack.width] + scene.stack.mean
+            for image, scene in zip(solved, scenes, strict=True)
+        ]
 
 
 def _tasks(scenes: int, of_stack: int, together: int) -> list[list[int]]:
@@ -210,25 +209,25 @@ _FILLED_TOGETHER = 8  # tasks; four frames of 1024 rows take 0.79 s together, 1.
 
 
 def _solve_in_parallel(
-    problem_of: Callable[[int, Partition], SceneProblem | Incomplete | Extended],
-    restored: Callable[[list[int], list[SceneProblem]], list[Tensor]],
-    tasks: list[list[int]],
-    partition: Partition,
-    images: Tensor,
-) -> None:
-    """Write the images of the scenes of all tasks, which are solved side by side, each thread in its own memory."""
+    scenes: list["_Scene"], solve: _Solution, tasks: list[list[int]], partition: Partition
+) -> Tensor:
+    """Images of the scenes of all tasks, which are solved side by side, each thread in its own memory."""
+    stack = scenes[0].stack
+    _, channels, height, width = stack.frames.shape
+    images = stack.frames.new_empty(len(scenes), channels, stack.scale * height, stack.scale * width)
     device = images.device
     threads = min(Partition.threads(device), len(tasks))
     partitions = [Partition(partition.chunk, partition.segments) for _ in range(threads)]
     advance = steps(len(tasks), "frames")
 
     def build(share: tuple[Partition, list[list[int]]]) -> list[SceneProblem | Incomplete | Extended]:
-        return [problem_of(number, share[0]) for numbers in share[1] for number in numbers]
+        return [scenes[number].problem(share[0]) for numbers in share[1] for number in numbers]
 
-    def solve(share: tuple[list[SceneProblem], list[list[int]]]) -> None:
+    def solve_share(share: tuple[list[SceneProblem], list[list[int]]]) -> None:
         problems = iter(share[0])
         for numbers in share[1]:
-            for number, image in zip(numbers, restored(numbers, [next(problems) for _ in numbers]), strict=True):
+            solved = solve([scenes[number] for number in numbers], [next(problems) for _ in numbers])
+            for number, image in zip(numbers, solved, strict=True):
                 images[number] = image
             advance()
 
@@ -236,9 +235,10 @@ def _solve_in_parallel(
         shares = [tasks[first : first + _FILLED_TOGETHER][thread::threads] for thread in range(threads)]
         built = in_parallel(build, zip(partitions, shares, strict=True), device)
         with torch.no_grad():
-            complete = iter(filled([scene for scenes in built for scene in scenes]))
-        problems = [[next(complete) for _ in scenes] for scenes in built]
-        in_parallel(solve, zip(problems, shares, strict=True), device)
+            complete = iter(filled([scene for part in built for scene in part]))
+        problems = [[next(complete) for _ in part] for part in built]
+        in_parallel(solve_share, zip(problems, shares, strict=True), device)
+    return images
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,6 +275,11 @@ class _Stack:
     missing: Tensor | None
     clipped: Tensor | None
     at_ends: bool
+
+    @property
+    def width(self) -> int:
+        """W, the columns of the frames."""
+        return self.frames.shape[-1]
 
     @property
     def noise_power(self) -> Tensor:
@@ -337,7 +342,33 @@ class _Stack:
         return Incomplete(problem, measured, floor)
 
 
-_Scene = tuple[_Stack, list[int], int, float]  # stack, its frames, the restored one, factor on the prior
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """A scene that is restored from frames of one stack.
+
+    Attributes:
+        stack: The stack.
+        members: Its frames that contribute.
+        reference: The frame in whose coordinates the scene is restored.
+        strength: Factor on the prior.
+    """
+
+    stack: _Stack
+    members: list[int]
+    reference: int
+    strength: float
+
+    def problem(self, partition: Partition) -> SceneProblem | Incomplete | Extended:
+        """The problem of the scene, with the values that are missing."""
+        return self.stack.problem(self.members, self.reference, self.strength, partition)
+
+
+def row_exposures(motion: FrameMotion, frames: Tensor) -> tuple[Tensor, Tensor]:
+    """Displacement (B, T, H, N, 2) in px of the rows of frames (B, T, C, H, W) at N nodes, and the weights (N,)."""
+    batch, count, _, height, _ = frames.shape
+    rows = torch.arange(height, dtype=torch.float64, device=frames.device)
+    starts = motion.row_starts(rows).expand(batch, count, height)
+    return exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
 
 
 def scene_period(width: int, reach: int, displacement: Tensor) -> int:
@@ -366,22 +397,15 @@ def _without_empty_frames(groups: list[tuple[list[int], int]], missing: Tensor) 
     return [([m for m in members if share[m] > 0.05] or members, reference) for members, reference in groups]
 
 
-def _check_prior(prior: str, scale: int, colours: Tensor | None) -> None:
-    """Refuse priors that do not exist, and those that the finer grid and mosaics do not have."""
-    check_choice("prior", prior, tuple(PRIORS))
-    check_choice("scale", scale, (1, SCALE))
-    if prior != "gaussian" and (scale != 1 or colours is not None):
-        raise ValueError(f"{f'scale={scale}' if scale != 1 else 'mosaic'} has prior='gaussian' only, got {prior!r}")
-
-
-def _given_level(noise: float) -> float:
+def given_level(noise: float) -> float:
+    """A stated noise level, at least the lowest that single precision supports."""
     return max(check_number("noise", noise, at_least=0.0, at_most=MAX_NUMBER), _MIN_LEVEL)
 
 
 def _noise_levels(frames: Tensor, motion: FrameMotion, noise: float | Literal["auto"], ignore: Tensor | None) -> Tensor:
     """Noise level of each frame, (B, T)."""
     if noise != "auto":
-        return torch.full(frames.shape[:2], _given_level(noise), dtype=frames.dtype, device=frames.device)
+        return torch.full(frames.shape[:2], given_level(noise), dtype=frames.dtype, device=frames.device)
     # strips of the same frames have one noise: two of them give it as well as all of them, in a fraction of the time
     chosen = sorted({motion.strips // 4, motion.strips - 1 - motion.strips // 4})
     powers = []

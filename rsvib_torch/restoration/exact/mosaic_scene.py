@@ -10,17 +10,20 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
+from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.fourier import extend_rows
 from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.mosaic import fill_by_colour, interpolated_colours, measures
+from rsvib_torch.restoration.exact.exact import given_level, row_exposures, scene_period
 from rsvib_torch.restoration.exact.filling import measured_values
 from rsvib_torch.restoration.exact.finer_scene import phase_spread
+from rsvib_torch.restoration.exact.priors import check_prior
 from rsvib_torch.restoration.exact.scene_solver import Partition, SceneSolver
 from rsvib_torch.restoration.exact.similar_patches import similar_patches
-from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.noise.policy import noise_levels
+from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
+from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
-from rsvib_torch.restoration.scene_model.finer_rows import SCALE, FinerObservation, finer_kernels
+from rsvib_torch.restoration.scene_model.observation import SCALE, FinerObservation, finer_kernels
 from rsvib_torch.restoration.scene_model.polynomial_prior import fit_polynomial_prior
 
 __all__ = ["restore_mosaic"]
@@ -150,17 +153,17 @@ class MosaicSolver:
 def restore_mosaic(
     frames: Tensor,
     motion: FrameMotion,
-    colours: Tensor,
-    groups: list[tuple[list[int], int]],
-    exposures: tuple[Tensor, Tensor],
-    lengths: list[int],
     *,
-    noise: float | Literal["auto"],
-    regularisation: float,
-    ignore: Tensor | None,
-    clipped: Tensor | None,
-    partition: Partition,
-    scale: int,
+    colours: Tensor,
+    joint: bool | int = False,
+    prior: str = "gaussian",
+    noise: float | Literal["auto"] = "auto",
+    regularisation: float = 1.0,
+    ignore: Tensor | None = None,
+    clipped: Tensor | None = None,
+    chunk_frequencies: int | None = None,
+    segments: int | None = None,
+    scale: Literal[1, 2] = 1,
 ) -> Tensor:
     """Colour images from mosaics, all frames of a group and all three colours together.
 
@@ -173,23 +176,33 @@ def restore_mosaic(
         frames: (B, T, 1, H, W) in row order.
         motion: Motion of the frames.
         colours: (B, T, 1, H, W), the colour that each pixel measures, 0 to 2.
-        groups: Frames that are restored together, and the reference of each.
-        exposures: Displacement (B, T, H, N, 2) in px during the exposures, and weights (N,) of its nodes.
-        lengths: Period of the rows of each stack in px.
+        joint: As in ``restore_exact``.
+        prior: One that declares ``mosaic`` in ``PRIORS``.
         noise: As in ``restore_exact``; ``"auto"`` is estimated from the residual of the frames of a group. With one
             frame it is hardly known, and too low rather than too high.
         regularisation: Factor on the priors.
         ignore: (B, T, 1, H, W) bool, missing pixels; None for none.
         clipped: Likewise, saturated pixels, whose values are lower bounds.
-        partition: Parts solved at a time.
+        chunk_frequencies: As in ``restore_exact``, and likewise the next one.
+        segments: Segments of rows solved side by side.
         scale: Points of the result per pixel.
 
     Returns:
         (B, groups, 3, scale H, scale W).
     """
-    height = frames.shape[-2]
+    height, width = frames.shape[-2:]
+    factor = check_number("regularisation", regularisation, above=0.0)
+    check_choice("scale", scale, (1, SCALE))
+    check_prior(prior, scale=scale, mosaic=True)
+    groups = joint_groups(frames.shape[1], joint)
+    partition = Partition.of_options(chunk_frequencies, segments)
+    stated = None if noise == "auto" else given_level(noise)
+    # displacement of each row during its exposure, and the period that it requires
+    displacement, node_weights = row_exposures(motion, frames)
+    lengths = [
+        scene_period(width, reach, moved) for reach, moved in zip(motion.reaches(height), displacement, strict=True)
+    ]
     filled = frames if ignore is None else fill_by_colour(frames, ignore)
-    displacement, node_weights = exposures
     advance = steps(len(frames) * len(groups), "frames")
     images: list[Tensor] = []
     for stack, mosaic in enumerate(filled):
@@ -200,10 +213,10 @@ def restore_mosaic(
             floor = torch.where(measured & clipped[stack], frames[stack], -torch.inf)
         if ignore is not None:
             measured = measured & ~ignore[stack]
-        if noise == "auto":  # of colours whose noise was halved by interpolation
+        if stated is None:  # of colours whose noise was halved by interpolation
             level = 2 * noise_levels(linear.detach(), motion, stack).square().mean().sqrt()
         else:
-            level = torch.as_tensor(noise, dtype=frames.dtype, device=frames.device)
+            level = torch.as_tensor(stated, dtype=frames.dtype, device=frames.device)
         for members, reference in groups:
             shift = motion.shift[stack, members] - motion.shift[stack, reference]
             moved = displacement[stack, members] - motion.shift[stack, reference]
@@ -220,7 +233,7 @@ def restore_mosaic(
                 part = part.demosaiced(mosaic[members], measures(colours[stack][:1])[0])
             kernels = finer_kernels(moved, node_weights, frames.new_ones(len(members)), height, 16)
             observation = FinerObservation(kernels, height, frames.dtype)
-            images.append(part.restored(observation, shift[:, 0], noise == "auto", regularisation, partition, scale))
+            images.append(part.restored(observation, shift[:, 0], stated is None, factor, partition, scale))
             advance()
     restored: Tensor = torch.stack(images).unflatten(0, (-1, len(groups)))
     return restored

@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
 from rsvib_torch.restoration.scene_model.observation import REACH, kernel_samples
 
-__all__ = ["PRIORS", "Prior", "PriorOptions", "shrink_patches"]
+__all__ = ["PRIORS", "Prior", "PriorOptions", "check_prior", "shrink_patches"]
 
 _PATCH, _STEP = 8, 2  # px, size and distance of patches; chosen together with the stages of the prior
 _NEIGHBOURS = _PATCH // _STEP  # patches that begin before the next one that shares no pixel
@@ -33,7 +34,22 @@ class PriorOptions:
     regularisation: float = 1.0
 
 
-Prior = Callable[[SceneProblem, PriorOptions], Tensor]
+@dataclass(frozen=True)
+class Prior:
+    """An entry of ``PRIORS``.
+
+    Attributes:
+        function: The prior, see the contract above ``PRIORS``.
+        is_precision: Whether the precision of the problem is the whole prior. Scenes are then solved without the
+            function where several, as the strips of a frame, are solved together.
+        finer_grid: Whether it exists with ``scale=2``, whose solution does not call the function.
+        mosaic: Whether it exists for colour mosaics, whose solution does not call the function.
+    """
+
+    function: Callable[[SceneProblem, PriorOptions], Tensor]
+    is_precision: bool = False
+    finer_grid: bool = False
+    mosaic: bool = False
 
 
 def gaussian(problem: SceneProblem, options: PriorOptions) -> Tensor:
@@ -74,14 +90,27 @@ def edges(problem: SceneProblem, options: PriorOptions) -> Tensor:
     return solver.scene(coefficients)
 
 
-# A prior is a function (problem, options) -> scene. It returns the deviation of the scene from the mean brightness of
-# the frames, (C, R, L) real: rows 0 ... R - 1 in the coordinates of the restored frame, L the period of problem.data,
-# in units of full scale. problem.data (M, C, R, L) are complete (missing values are filled) and have zero mean
-# brightness. It may solve with problem.solver(), and with replace(problem, precision=...).solver(): products
-# (p + 1, p + 1, U) as from RowPrior.precision define P in c^H P c, which is added to sum_m w_m |g_m - K_m c|^2, so in
-# units of the noise power of data of weight 1 (standard deviation problem.level). It must be differentiable with
-# respect to the data and the precision, must not write to its arguments, and is called from several threads at a time.
-PRIORS: dict[str, Prior] = {"gaussian": gaussian, "edges": edges}
+# The function of a prior is called as function(problem, options) -> scene. It returns the deviation of the scene from
+# the mean brightness of the frames, (C, R, L) real: rows 0 ... R - 1 in the coordinates of the restored frame, L the
+# period of problem.data, in units of full scale. problem.data (M, C, R, L) are complete (missing values are filled) and
+# have zero mean brightness. It may solve with problem.solver(), and with replace(problem, precision=...).solver():
+# products (p + 1, p + 1, U) as from RowPrior.precision define P in c^H P c, which is added to
+# sum_m w_m |g_m - K_m c|^2, so in units of the noise power of data of weight 1 (standard deviation problem.level). It
+# must be differentiable with respect to the data and the precision, must not write to its arguments, and is called from
+# several threads at a time.
+PRIORS: dict[str, Prior] = {
+    "gaussian": Prior(gaussian, is_precision=True, finer_grid=True, mosaic=True),
+    "edges": Prior(edges),
+}
+
+
+def check_prior(prior: str, *, scale: int = 1, mosaic: bool = False) -> None:
+    """Refuse a prior that does not exist, or that does not declare the finer grid or mosaics where they are used."""
+    check_choice("prior", prior, tuple(PRIORS))
+    for property_name, used, option in (("finer_grid", scale != 1, f"scale={scale}"), ("mosaic", mosaic, "mosaic")):
+        if used and not getattr(PRIORS[prior], property_name):
+            names = ", ".join(repr(name) for name, entry in PRIORS.items() if getattr(entry, property_name))
+            raise ValueError(f"{option} has prior={names} only, got {prior!r}")
 
 
 def _cosines_of_neighbours(like: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.banded_solver import BandedFactor, extend_system, factor_banded, solve_skewed
+from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.interpolated_factors import InterpolatedFactors, node_frequencies
 from rsvib_torch.core.parallel import in_parallel
@@ -68,6 +69,15 @@ class Partition:
     chunk: int | None = None
     segments: int | None = None
     _buffers: dict[int, Tensor] = field(default_factory=dict)
+
+    @classmethod
+    def of_options(cls, chunk_frequencies: int | None, segments: int | None) -> "Partition":
+        """The partition that options of ``restore_exact`` state; None lets the size of the scene decide."""
+        chunk, windows = (
+            None if value is None else check_whole_number(name, value, at_least=1)
+            for name, value in (("chunk_frequencies", chunk_frequencies), ("segments", segments))
+        )
+        return cls(chunk, windows)
 
     @staticmethod
     def threads(device: torch.device) -> int:

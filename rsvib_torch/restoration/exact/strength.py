@@ -9,7 +9,7 @@ from rsvib_torch.restoration.scene_model.observation import RowKernels
 from rsvib_torch.restoration.scene_model.row_prior import RowPrior
 from rsvib_torch.restoration.scene_model.sampled_rows import Explained, sample_rows
 
-__all__ = ["Strengths", "prior_strength"]
+__all__ = ["Strengths", "prior_strength", "select_strength"]
 
 _STRENGTHS = (2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # factors on the prior, from strong to weak
 
@@ -67,12 +67,26 @@ def prior_strength(
     certain = certain and bool(noise_power > 200.0 * prior.interpolation_power.mean())
     strengths = [strength for strength in _STRENGTHS if certain or strength <= 1]
     reach = kernels.reach
-    precisions = [prior.precision(noise_power, strength, reach)[..., place] for strength in strengths]
-    first = 3  # weaker priors are rarely selected
-    tried = sample.explain(precisions[:first])
+    return select_strength(
+        strengths, [prior.precision(noise_power, strength, reach)[..., place] for strength in strengths], sample.explain
+    )
+
+
+def select_strength(
+    strengths: list[float], precisions: list[Tensor], explain: Callable[[list[Tensor]], Explained]
+) -> float:
+    """The strength that cross-validation selects.
+
+    Args:
+        strengths: From strong to weak.
+        precisions: Of the prior with each strength.
+        explain: Residual power and degrees of freedom of the data for some of the precisions.
+    """
+    first = 3  # weaker priors are rarely selected: they are tried only if the weakest of these is
+    tried = explain(precisions[:first])
     choice = _cross_validation(tried, tried.power.new_tensor(strengths[:first]))
     if choice == first - 1:
-        tried = tried.joined(sample.explain(precisions[first:]))
+        tried = tried.joined(explain(precisions[first:]))
         choice = _cross_validation(tried, tried.power.new_tensor(strengths))
     return strengths[choice]
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.scene_model.finer_rows import SCALE, spline_transfer
+from rsvib_torch.restoration.scene_model.observation import SCALE, spline_transfer
 from rsvib_torch.restoration.scene_model.row_prior import observed_spectrum, smeared
 
 __all__ = ["PolynomialPrior", "fit_polynomial_prior"]

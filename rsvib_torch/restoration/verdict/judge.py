@@ -24,7 +24,7 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.field_motion import judged_strip
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
-from rsvib_torch.restoration.noise.high_pass import estimate_noise
+from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restoration_warning import RestorationWarning
 from rsvib_torch.restoration.verdict.pairs import FramePair, equally_bright, misfit, pairs_to_judge, shared_part
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo

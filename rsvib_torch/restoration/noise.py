@@ -1,0 +1,550 @@
+"""Noise level of every frame of a stack: four estimators, and the order in which they are preferred.
+
+``noise_levels`` (at the end of the file) is the entry. ``estimate_noise`` measures single images and counts fine
+texture as noise; the estimators of the table ``ESTIMATORS`` separate noise from texture by motion blur, by a second
+frame, or by the floor of the power spectrum.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from statistics import NormalDist
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.fourier import squared_modulus, waves
+from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.restoration.frame_motion import FrameMotion
+from rsvib_torch.restoration.scene_model.observation import row_kernels
+from rsvib_torch.restoration.scene_model.row_prior import RowPrior
+from rsvib_torch.restoration.scene_model.sampled_rows import sample_rows
+
+__all__ = ["ESTIMATORS", "estimate_noise", "fit_noise", "noise_floor", "noise_levels", "noise_of_blurred_frames"]
+
+# Squares for power spectra, and which parts of images count
+
+_SIDE = 64  # px; side of the squares whose power spectra are computed
+
+
+def _spread_squares(shape: Sequence[int], counts: Sequence[int], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Rows (n, _SIDE) and columns (m, _SIDE) of n x m squares spread evenly over an image of that shape."""
+    inside = torch.arange(_SIDE, device=device)
+    rows, columns = (
+        torch.linspace(0, extent - _SIDE, count, device=device, dtype=torch.float32).round().to(torch.int64)[:, None]
+        + inside
+        for extent, count in zip(shape, counts, strict=True)
+    )
+    return rows, columns
+
+
+def _cut_squares(images: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """The squares (..., n, m, _SIDE, _SIDE) of images (..., H, W)."""
+    return images[..., rows[:, None, :, None], columns[None, :, None, :]]
+
+
+def _tapered(squares: Tensor) -> Tensor:
+    """Squares minus their means, times a Hann window under which the power of white noise is its variance."""
+    window = torch.hann_window(_SIDE + 2, periodic=False, dtype=squares.dtype, device=squares.device)[1:-1]
+    window = window / window.square().sum().sqrt()
+    return (squares - squares.mean((-2, -1), keepdim=True)) * window * window[:, None]
+
+
+def _mostly_measured(missing: Tensor, dims: tuple[int, ...], *, max_missing: float = 0.1) -> Tensor:
+    """Parts of images that count, by the share of their pixels that is missing.
+
+    A part counts up to ``max_missing``; if all parts of an image along ``dims`` miss more, those that miss least count.
+    """
+    return (missing <= missing.amin(dims, keepdim=True).clamp(min=max_missing)) & (missing < 1)
+
+
+# Single images: the quietest blocks of a high-pass residual
+
+_ELEMENTS = {"cpu": 1 << 16}  # values filtered at a time; they fit into the cache (speed only)
+
+
+def estimate_noise(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
+    """Standard deviation of white noise in each image.
+
+    The outer product of two differences of eighth order passes the corner of the spectrum, where optics pass least.
+    The 15 % quantile of its energy in blocks of 16 x 16 px excludes blocks with texture. A scene that has texture up to
+    the corner everywhere counts as noise. Of large images, strips spread over all rows are used.
+
+    Args:
+        frames: (..., H, W).
+        ignore: Boolean mask of the same shape of pixels without noise of their own. Blocks with many of them do not
+            count.
+
+    Returns:
+        Standard deviation, shape (...), in the unit of the frames; NaN for an image without a usable block.
+
+    Example:
+        >>> import torch
+        >>> noise = torch.randn(200, 300, generator=torch.Generator().manual_seed(0))
+        >>> round(estimate_noise(0.1 * noise).item(), 2)
+        0.1
+    """
+    shape = (frames.shape[-2], frames.shape[-1])
+    orders = [min(8, (extent - 1) // 2 + 1, extent - 1) for extent in shape]
+    inner = [extent - difference for extent, difference in zip(shape, orders, strict=True)]
+    block = min(16, *inner)
+    height, width = (extent // block * block for extent in inner)
+    stride = max(1, height * width // (block**2 * 2048))  # 2048 blocks determine the quantile well enough
+    windows = [block + difference for difference in orders]
+
+    def strips_of(images: Tensor) -> Tensor:
+        inside = images[..., : height + orders[0], : width + orders[1]]
+        return inside.unfold(-2, windows[0], stride * block).movedim(-3, 0)  # (strips, ..., columns, rows)
+
+    strips = strips_of(frames)
+    across = torch.eye(windows[0], dtype=frames.dtype, device=frames.device).diff(orders[0], dim=0)
+
+    def residual(part: Tensor) -> Tensor:
+        differences = part @ across.T
+        for _ in range(orders[1]):
+            differences = differences.diff(dim=-2)
+        return differences
+
+    strip_size = frames[..., 0, :].numel() * block
+    blocks = [
+        residual(strips[part]).square().unflatten(-2, (-1, block)).mean((-2, -1))
+        for part in runs(len(strips), max(1, _ELEMENTS.get(frames.device.type, frames.numel()) // strip_size))
+    ]
+    energy = torch.cat(blocks) / math.prod(math.comb(2 * difference, difference) for difference in orders)
+    if ignore is not None:
+        missing = strips_of(ignore.to(frames.dtype)).mean(-1).unfold(-1, windows[1], block).mean(-1)
+        energy = energy.masked_fill(~_mostly_measured(missing, (0, -1)), math.nan)
+    energy = energy.movedim(0, -1).flatten(-2)
+    # Means of squares of pure noise scatter, so that their low quantile lies below the true mean, by as much as that of
+    # a chi-squared variable (Wilson and Hilferty 1931).
+    quantile = 0.15
+    variance = min(2.0 * math.prod(_correlation_area(difference) for difference in orders) / (9.0 * block**2), 0.2)
+    expected = (1.0 - variance + NormalDist().inv_cdf(quantile) * variance**0.5) ** 3
+    quiet = (energy.quantile if ignore is None else energy.nanquantile)(quantile, dim=-1) / expected
+    few = (~energy.isnan()).sum(-1) < 8  # too few blocks for a quantile
+    deviation: Tensor = torch.where(few, energy.nanmean(-1), quiet).sqrt()
+    return deviation
+
+
+def _correlation_area(order: int) -> float:
+    """Sum of the squared autocorrelation of differenced white noise over all lags."""
+    total = math.comb(2 * order, order)
+    return sum((math.comb(2 * order, order + lag) / total) ** 2 for lag in range(-order, order + 1))
+
+
+# Motion blur: it attenuates the scene, row by row, and leaves noise as it is
+
+
+@torch.no_grad()
+def noise_of_blurred_frames(
+    frames: Tensor,
+    motion: FrameMotion,
+    stack: int,
+    ignore: Tensor | None = None,
+    high_pass: Tensor | None = None,
+    *,
+    min_frequency: float = 0.12,
+    max_transfer: float = 0.05,
+    min_share: float = 0.02,
+    row_step: int = 8,
+) -> Tensor:
+    """Noise power of each frame from its motion blur.
+
+    At frequency k, square p of a frame has the power ``a_p T_pk S_k + noise``: T is the power transfer of the blur of
+    its rows, S the spectrum of the scene, and a the strength of the texture in the square. Where T is near zero, the
+    power is that of the noise, whatever the texture. Fisher scoring estimates a, S and the noise together, for powers
+    with exponential distributions about their means (Whittle 1953).
+
+    Args:
+        frames: As in ``ESTIMATORS``, and likewise the next four.
+        motion: Motion of the batch.
+        stack: Index in the batch.
+        ignore: Pixels that were not measured; squares with many of them do not count.
+        high_pass: Not used.
+        min_frequency: Cycles per px; below, scenes are too strong to be informative about noise.
+        max_transfer: T below which the blur counts as blocking the scene.
+        min_share: Share of such values of T below which the estimator does not apply.
+        row_step: T is computed for one of so many rows.
+
+    Returns:
+        (T,), float64; NaN for a frame with fewer than four usable squares, for all frames if the estimator does not
+        apply.
+    """
+    shape, device = frames.shape[-2:], frames.device
+    nothing = torch.full((len(frames),), math.nan, dtype=torch.float64, device=device)
+    if min(shape) < 2 * _SIDE:
+        return nothing
+    counts = _square_counts(shape, min(max(256 // len(frames), 25), 64))
+    rows, columns = _spread_squares(shape, counts, device)
+    u = torch.fft.rfftfreq(_SIDE, dtype=torch.float64, device=device)
+    v = torch.fft.fftfreq(_SIDE, dtype=torch.float64, device=device)
+    used = _pooled_before_last(torch.hypot(u[:, None], v)) > min_frequency
+    times = motion.frame_starts[:, None, None] + rows * motion.timing.row_time
+    transfer = _pooled_before_last(_power_transfer(motion, stack, times[..., row_step // 2 :: row_step], u, v))[
+        ..., used
+    ]
+    if float((transfer < max_transfer).double().mean()) < min_share:
+        return nothing
+    squares = _tapered(_cut_squares(frames, rows, columns))  # (T, C, n, m, rows, columns)
+    mean = motion.vibration[stack].mean_displacement(times, motion.timing.exposure_time)[..., 0]
+    unshift = waves(mean, -u).to(frames.dtype.to_complex())  # aligns neighbouring rows along the row axis
+    power = squared_modulus(torch.fft.fft(torch.fft.rfft(squares) * unshift[:, None, :, None], dim=-2)).mean(1)
+    power = _pooled_before_last(power.transpose(-2, -1).to(torch.float64))[..., used]
+    power, transfer = power.flatten(1, 2), transfer[:, :, None].expand_as(power).flatten(1, 2)
+    usable = (power > 0).any(-1)
+    if ignore is not None:
+        missing = _cut_squares(ignore.any(1), rows, columns).double().mean((-2, -1)).flatten(1)
+        usable = usable & _mostly_measured(missing, (-1,))
+    enough = usable.sum(-1) >= min(4, usable.shape[-1])
+    noise = fit_noise(power.where(enough[:, None, None], 1.0), transfer, usable | ~enough[:, None])
+    return noise.masked_fill(~enough, math.nan)
+
+
+def fit_noise(
+    power: Tensor, transfer: Tensor, usable: Tensor, *, iterations: int = 12, max_decrease: float = 0.5
+) -> Tensor:
+    """Noise power (T,) by Fisher scoring of ``texture_p transfer_pk scene_k + noise``.
+
+    Args:
+        power: (T, P, K) of P squares at K frequencies.
+        transfer: (T, P, K).
+        usable: (T, P) bool, squares that count.
+        iterations: Scoring steps, each for scene and noise first, then for the texture.
+        max_decrease: Largest relative decrease of a parameter in one step; keeps the powers positive.
+    """
+    share = usable.to(power.dtype)[..., None]
+    share = share / share.sum(-2, keepdim=True)
+
+    def mean(values: Tensor) -> Tensor:
+        return (share * values).sum(-2, keepdim=True)
+
+    noise = mean(power).amin(-1, keepdim=True)
+    texture = torch.ones_like(power[..., :1])
+    scene = mean(power - noise).clamp(min=0.1 * noise) / mean(transfer)
+    for _ in range(iterations):
+        by_scene = texture * transfer  # derivative of the model with respect to the scene
+        model = by_scene * scene + noise
+        weight, residual = share / model.square(), power - model
+        curvature = (by_scene.square() * weight).sum(-2, keepdim=True)
+        gradient = (by_scene * weight * residual).sum(-2, keepdim=True)
+        mixed = (by_scene * weight).sum(-2, keepdim=True)
+        # normal equations of scene and noise with the scene eliminated
+        reduced = (weight * residual).sum((-2, -1), keepdim=True) - (mixed * gradient / curvature).sum(-1, keepdim=True)
+        step = reduced / (weight.sum((-2, -1), keepdim=True) - (mixed.square() / curvature).sum(-1, keepdim=True))
+        step = step.clamp(min=-max_decrease * noise, max=noise)
+        scene = torch.maximum(scene + (gradient - mixed * step) / curvature, max_decrease * scene)
+        noise = noise + step
+        by_texture = transfer * scene
+        model = texture * by_texture + noise
+        weight, residual = model.square().reciprocal(), power - model
+        change = (by_texture * weight * residual).sum(-1, keepdim=True)
+        change = change / (by_texture.square() * weight).sum(-1, keepdim=True)
+        texture = torch.maximum(texture + change, max_decrease * texture)
+        typical = mean(texture)
+        texture, scene = texture / typical, scene * typical
+    return noise[:, 0, 0]
+
+
+def _square_counts(shape: torch.Size, most: int) -> list[int]:
+    """Squares along each axis, about ``most`` in all; they overlap by half if that is fewer."""
+    counts = [2 * extent // _SIDE - 1 for extent in shape]
+    excess = max(1.0, math.sqrt(math.prod(counts) / most))
+    return [max(1, round(count / excess)) for count in counts]
+
+
+def _power_transfer(motion: FrameMotion, stack: int, times: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Power transfer (..., U, V) of the blur of rows exposed from ``times`` (..., R) on, weighted by the window."""
+    displacement, weights = exposure_trajectory(motion.vibration[stack], times, motion.timing, "gauss")
+    along = waves(displacement[..., 0], u) * weights[:, None]
+    across = waves(displacement[..., 1], v)
+    window = torch.hann_window(2 * times.shape[-1] + 1, periodic=False, dtype=u.dtype, device=u.device)[1::2].square()
+    transfer = squared_modulus(along.transpose(-2, -1) @ across)
+    return (transfer * (window / window.sum())[:, None, None]).sum(-3)
+
+
+def _pooled_before_last(values: Tensor) -> Tensor:
+    """Mean over 2 x 2 neighbouring frequencies of (..., U, V), without the lowest and the highest u."""
+    inner = values[..., 1 : (values.shape[-2] - 2) // 2 * 2 + 1, :]
+    pooled: Tensor = inner.unflatten(-2, (-1, 2)).unflatten(-1, (-1, 2)).mean((-3, -1))
+    return pooled
+
+
+# Two frames: the residual after the scene that explains both best is subtracted
+
+_MIN_SIDE = 64  # px that two frames must share along each axis, or the whole frame if it is smaller
+
+
+def noise_of_frame_pair(
+    frames: Tensor,
+    motion: FrameMotion,
+    stack: int,
+    ignore: Tensor | None,
+    high_pass: Tensor,
+    *,
+    max_missing: float = 0.1,
+) -> Tensor:
+    """Noise power of each frame from the two middle ones that have content.
+
+    The least-squares scene of both frames leaves a residual without texture. What texture adds to ``high_pass`` is
+    measured as the difference between that estimate and the residual, and assumed equal in all frames.
+
+    Args:
+        frames: As in ``ESTIMATORS``, and likewise the next four.
+        motion: Motion of the batch.
+        stack: Index in the batch.
+        ignore: Pixels that were not measured.
+        high_pass: (T,) noise power, texture included.
+        max_missing: Share of the compared pixels that may be missing.
+
+    Returns:
+        (T,); NaN if fewer than two frames have content, or share too few pixels.
+    """
+    nothing = torch.full_like(high_pass, torch.nan)
+    height, width = frames.shape[-2:]
+    usable = (~high_pass.isnan()).nonzero().flatten().tolist()
+    middle = (len(usable) - 1) // 2
+    members = usable[middle : middle + 2]
+    if len(members) < 2:
+        return nothing
+    x, y = (int(step) for step in (motion.shift[stack, members[1]] - motion.shift[stack, members[0]]).tolist())
+    columns, rows = width - abs(x), height - abs(y)
+    if min(columns, rows) < max(min(_MIN_SIDE, height, width), 8):
+        return nothing
+    num_rows = min(rows, 256)  # from the middle: more rows cost time and hardly lower the variance
+    first_rows = [max(-y, 0) + (rows - num_rows) // 2, max(y, 0) + (rows - num_rows) // 2]
+    first_columns = [max(-x, 0), max(x, 0)]
+
+    def shared(values: Tensor) -> Tensor:
+        places = zip(members, first_rows, first_columns, strict=True)
+        return torch.stack([values[m, :, i : i + num_rows, j : j + columns] for m, i, j in places])
+
+    images, missing = shared(frames), None if ignore is None else shared(ignore)
+    measured_share = 1.0 if missing is None else 1.0 - float(missing.any(0).double().mean())
+    if measured_share < 1.0 - max_missing:
+        return nothing
+    rows_of_both = torch.tensor(first_rows, device=frames.device)
+    noise = _residual_power(images, motion, stack, rows_of_both, members) / measured_share
+    alone = estimate_noise(images, missing).square().mean(-1)
+    texture = (alone.mean() - noise).clamp(min=0.0)
+    # neither frame has more noise than both together; blur may leave one of them more texture than the other
+    upper = 2.0 * noise + (high_pass - alone.amax()).clamp(min=0.0)
+    return torch.maximum(high_pass - texture, 0.5 * torch.minimum(high_pass, noise)).minimum(upper)
+
+
+@torch.no_grad()
+def _residual_power(
+    images: Tensor,
+    motion: FrameMotion,
+    stack: int,
+    first_rows: Tensor,
+    members: list[int],
+    *,
+    num_frequencies: int = 24,
+    prior_weight: float = 1e-4,
+) -> Tensor:
+    """Residual power per degree of freedom of two images (2, C, R, W) after their least-squares scene is subtracted.
+
+    Only ``num_frequencies`` horizontal frequencies of the upper half are used, where scenes are weakest. A smoothness
+    prior of ``prior_weight``, relative to the data, fills in rows of the scene that neither frame contains.
+    """
+    num_rows, width = images.shape[-2:]
+    rows = first_rows[:, None] + torch.arange(num_rows, dtype=torch.float64, device=images.device)
+    starts = motion.frame_starts[members][:, None] + rows * motion.timing.row_time
+    displacement, node_weights = exposure_trajectory(motion.vibration[stack], starts, motion.timing, "gauss")
+    displacement = displacement - motion.shift[stack, members][:, None, None]
+    kernels = row_kernels(displacement, node_weights, images.new_ones(2), num_rows, 4 * _MIN_SIDE)
+    count = min(num_frequencies, width // 4)
+    chosen = torch.linspace(width // 4, width // 2, count, device=images.device, dtype=torch.float32).long()
+    sample = sample_rows(images, kernels, chosen)
+    explained = sample.explain([RowPrior.smooth(sample.u).precision(sample.u.new_ones(()), prior_weight)])
+    power: Tensor = explained.power.sum() / (explained.count * len(chosen) - explained.freedom.sum())
+    return power.to(images.dtype)
+
+
+# One frame: noise is white, the spectrum of a scene falls
+
+_SECTORS = 6  # directions, with one power law each
+
+
+def noise_of_spectral_floor(
+    frames: Tensor,
+    motion: FrameMotion,
+    stack: int,
+    ignore: Tensor | None,
+    high_pass: Tensor,
+    *,
+    max_reduction: float = 9.0,
+    min_reduction: float = 1.25,
+) -> Tensor:
+    """Noise power of each frame from ``noise_floor``, within bounds.
+
+    Args:
+        frames: As in ``ESTIMATORS``, and likewise the next four.
+        motion: Not used.
+        stack: Not used.
+        ignore: Pixels that were not measured.
+        high_pass: (T,) noise power, texture included.
+        max_reduction: Largest factor between ``high_pass`` and the result; a noise level that is far too low amplifies
+            noise more than one that is too high blurs.
+        min_reduction: Factor below which ``high_pass`` is kept, because the floor is the less accurate of the two.
+
+    Returns:
+        (T,); NaN for a frame whose floor is not clearly lower than ``high_pass``.
+    """
+    floor = noise_floor(frames, ignore).mean(-1).to(high_pass.dtype)
+    bounded = torch.maximum(floor, high_pass / max_reduction)
+    return torch.where(floor < high_pass / min_reduction, bounded, math.nan)
+
+
+@torch.no_grad()
+def noise_floor(frames: Tensor, ignore: Tensor | None = None, *, min_frequency: float = 0.2) -> Tensor:
+    """Power of the white noise below the texture of each image, from its power spectrum.
+
+    At frequency f in direction d the power is ``n + c_d f^(-a_d) exp(-b f^2)``: a power law for the scene in every
+    direction, Gaussian optics, and one floor. Fisher scoring estimates all of them, for powers with exponential
+    distributions about their means (Whittle 1953). The floor is uncertain if texture exceeds it up to the highest
+    frequencies.
+
+    Args:
+        frames: (..., H, W).
+        ignore: Boolean mask of the same shape; squares with many such pixels do not count.
+        min_frequency: Cycles per px; below, spectra are steeper than the power law.
+
+    Returns:
+        Power, shape (...), float64; NaN for an image of less than one square, or without a usable one.
+    """
+    height, width = frames.shape[-2:]
+    images = frames.reshape(-1, height, width)
+    if min(height, width) < _SIDE:
+        return images.new_full(frames.shape[:-2], math.nan, dtype=torch.float64)
+    power = _pooled_last(_spectrum(images, None if ignore is None else ignore.reshape(images.shape)))  # (N, V, U)
+    u = _pooled_last(torch.fft.rfftfreq(_SIDE, dtype=torch.float64, device=frames.device).expand(2, -1))[0]
+    v = torch.fft.fftfreq(_SIDE, dtype=torch.float64, device=frames.device).unflatten(0, (-1, 2)).mean(-1)
+    frequency, direction = torch.hypot(u, v[:, None]), torch.atan2(v[:, None], u)
+    used = frequency > min_frequency
+    sector = ((direction[used] / math.pi + 0.5) * _SECTORS).long().clamp(0, _SECTORS - 1)
+    return _fit_floor(power[:, used], frequency[used], sector).reshape(frames.shape[:-2])
+
+
+def _spectrum(images: Tensor, ignore: Tensor | None, *, squares_per_axis: int = 6) -> Tensor:
+    """Mean power (N, V, U) of squares of images (N, H, W); the power of white noise is its variance."""
+    counts = [min(2 * extent // _SIDE - 1, squares_per_axis) for extent in images.shape[-2:]]
+    rows, columns = _spread_squares(images.shape[-2:], counts, images.device)
+    squares = _tapered(_cut_squares(images, rows, columns).flatten(1, 2))
+    power = squared_modulus(torch.fft.rfft2(squares)).to(torch.float64)
+    if ignore is None:
+        return power.mean(1)
+    missing = _cut_squares(ignore, rows, columns).double().mean((-2, -1)).flatten(1)
+    usable = _mostly_measured(missing, (-1,))
+    return (power * usable[..., None, None]).sum(1) / usable.sum(1)[:, None, None]
+
+
+def _pooled_last(values: Tensor) -> Tensor:
+    """Means over 2 x 2 neighbouring frequencies of (..., V, U), without the lowest and the two highest u."""
+    pooled: Tensor = values[..., 1:-2].unflatten(-1, (-1, 2)).unflatten(-3, (-1, 2)).mean((-3, -1))
+    return pooled
+
+
+def _fit_floor(
+    power: Tensor,
+    frequency: Tensor,
+    sector: Tensor,
+    *,
+    steepness_mean: float = 3.0,
+    steepness_std: float = 8.0,
+    iterations: int = 16,
+    max_step: float = 0.7,
+) -> Tensor:
+    """Floor (N,) by Fisher scoring of ``n + c_d f^(-a_d) exp(-b f^2)`` in the logarithms of n and c.
+
+    Args:
+        power: (N, K) at K frequencies.
+        frequency: (K,) cycles per px.
+        sector: (K,) index of the direction.
+        steepness_mean: Mean of the weak prior of the exponents a.
+        steepness_std: Its standard deviation.
+        iterations: Scoring steps.
+        max_step: Largest change of a parameter in one step.
+    """
+    inside = torch.nn.functional.one_hot(sector, _SECTORS).to(torch.float64)  # (K, D)
+    frequency = frequency / 0.4  # in units of a typical one, so that levels and exponents are nearly independent
+    scale = power.mean(-1, keepdim=True)
+    power = (power / scale).nan_to_num(nan=1.0)
+    low = power.amin(-1, keepdim=True).clamp(min=1e-9)
+    typical = ((power @ inside) / inside.sum(0)).clamp(min=1e-9)
+    log_level, exponent = (0.5 * typical).log(), torch.full_like(typical, 2.0)
+    parameters = torch.cat([(0.5 * low).log(), torch.zeros_like(low), log_level, exponent], dim=-1)
+    expected = parameters.new_tensor([0.0] * (2 + _SECTORS) + [steepness_mean] * _SECTORS)
+    prior = parameters.new_tensor([1e-3] * (2 + _SECTORS) + [steepness_std**-2] * _SECTORS)
+    log_frequency, square = frequency.log(), frequency.square()
+    for _ in range(iterations):
+        floor, blur, log_level, exponent = parameters.split([1, 1, _SECTORS, _SECTORS], dim=-1)
+        scene = (log_level[:, sector] - exponent[:, sector] * log_frequency - blur * square).exp()
+        model = floor.exp() + scene
+        share = scene / model
+        parts = share[..., None] * inside
+        slope = torch.cat(
+            [(floor.exp() / model)[..., None], -(share * square)[..., None], parts, -parts * log_frequency[:, None]],
+            dim=-1,
+        )
+        normal = slope.transpose(-2, -1) @ slope + torch.diag(prior)
+        gradient = (slope.transpose(-2, -1) @ (power / model - 1.0)[..., None])[..., 0]
+        gradient[:, 1:] += ((expected - parameters) * prior)[:, 1:]
+        parameters = parameters + torch.linalg.solve(normal, gradient).clamp(-max_step, max_step)
+        parameters[:, 1].clamp_(min=0.0)  # optics attenuate
+    return parameters[:, 0].exp() * scale[:, 0]
+
+
+# Choice of the estimator
+
+# Estimators that separate noise from texture, in order of preference. An estimator is called as
+#
+#     estimator(frames, motion, stack, ignore, high_pass) -> Tensor
+#
+#     frames: (T, C, H, W) floating point in row order; ignored pixels hold local means.
+#     motion: FrameMotion of the batch; ``stack`` is the index of these frames in it.
+#     ignore: (T, C, H, W) bool, pixels that were not measured; None for none.
+#     high_pass: (T,) noise power of ``estimate_noise``, texture included; NaN for a frame without content.
+#     returns: (T,) noise power (variance per pixel in squared units of the frames); NaN for a frame that it cannot
+#         estimate, for all frames if the estimator does not apply to the recording.
+#
+# It must not change its arguments, and must not raise for small, constant or masked frames.
+Estimator = Callable[[Tensor, FrameMotion, int, Tensor | None, Tensor], Tensor]
+ESTIMATORS: dict[str, Estimator] = {
+    "motion blur": noise_of_blurred_frames,
+    "frame pair": noise_of_frame_pair,
+    "spectral floor": noise_of_spectral_floor,
+}
+
+
+def noise_levels(frames: Tensor, motion: FrameMotion, stack: int, ignore: Tensor | None = None) -> Tensor:
+    """Standard deviation of the noise of each frame of a stack.
+
+    ``estimate_noise`` counts fine texture as noise, which makes it an upper bound. The first estimator of
+    ``ESTIMATORS`` that applies to the recording lowers it. A frame without content, or with too few measured pixels,
+    is assigned the median noise power of the others.
+
+    Args:
+        frames: (T, C, H, W) in row order; ignored pixels hold local means.
+        motion: Motion of the batch of stacks.
+        stack: Index of the stack in the batch.
+        ignore: Boolean mask shaped like the frames of pixels that were not measured.
+
+    Returns:
+        (T,), in the dtype and unit of the frames; 0 if no frame has content.
+    """
+    power = estimate_noise(frames, ignore).square().nanmean(-1).masked_fill(_constant(frames), torch.nan)
+    for estimator in ESTIMATORS.values():
+        estimated = estimator(frames, motion, stack, ignore, power)
+        if not bool(estimated.isnan().all()):
+            power = torch.minimum(power, estimated.to(power.dtype).nan_to_num(nan=torch.inf))
+            break
+    return torch.where(power.isnan(), power.nanmedian(), power).nan_to_num(nan=0.0).sqrt()
+
+
+def _constant(frames: Tensor, row_step: int = 8, tolerance: float = 1e-6) -> Tensor:
+    """Frames (T,) whose values, in every eighth row, are equal to within rounding: they hold not even noise."""
+    low, high = frames[..., ::row_step, :].flatten(1).aminmax(dim=-1)
+    return high - low <= tolerance * torch.maximum(-low, high)

@@ -1,1 +1,0 @@
-"""Noise level of frames: a policy, and one module per estimator."""
