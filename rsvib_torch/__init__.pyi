@@ -20,6 +20,7 @@ from .detection import (
     MotionDetection,
     RotationAlignment,
     SweptTone,
+    TimingDiagnosis,
     VibrationDetector,
     align_motion,
     calibrate_row_time_by_motion,
@@ -27,6 +28,7 @@ from .detection import (
     detect_motion,
     detect_swept_tone,
     detect_vibration,
+    diagnose_timing,
 )
 from .evaluation import (
     MtfCurve,
@@ -115,6 +117,7 @@ __all__ = [
     "StackInfo",
     "StackReport",
     "SweptTone",
+    "TimingDiagnosis",
     "TimingWarning",
     "TrackedFrame",
     "Vibration",
@@ -134,6 +137,7 @@ __all__ = [
     "detect_motion",
     "detect_swept_tone",
     "detect_vibration",
+    "diagnose_timing",
     "find_slanted_edges",
     "gain_figure",
     "iterate_stack",

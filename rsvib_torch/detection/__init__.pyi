@@ -1,4 +1,5 @@
 from .detect import DetectionMethod, VibrationDetector, detect_vibration
+from .diagnosis import TimingDiagnosis, diagnose_timing
 from .recorded.alignment import ClockAlignment, align_motion
 from .recorded.motion_check import MotionCheck, check_motion
 from .recorded.rotation_alignment import RotationAlignment
@@ -15,6 +16,7 @@ __all__ = [
     "MotionDetection",
     "RotationAlignment",
     "SweptTone",
+    "TimingDiagnosis",
     "VibrationDetector",
     "align_motion",
     "calibrate_row_time_by_motion",
@@ -22,4 +24,5 @@ __all__ = [
     "detect_motion",
     "detect_swept_tone",
     "detect_vibration",
+    "diagnose_timing",
 ]

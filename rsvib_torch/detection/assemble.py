@@ -1,7 +1,7 @@
 """From row order to the user's layout: the only place of detection where axes are exchanged and units are changed.
 
-Detection works in row order with all components of the motion in px. A ``DetectionResult`` has image axes (x, y), roll in
-rad and zoom relative.
+Detection works in row order with all components of the motion in px. A ``DetectionResult`` has image axes (x, y), roll
+in rad and zoom relative.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,11 @@ from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, motion_of_fit
-from rsvib_torch.frames.orientation import offsets_from_row_order
+from rsvib_torch.frames.orientation import (
+    magnitudes_from_row_order,
+    offsets_from_row_order,
+    sequence_from_row_order,
+)
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import VibrationStd
 from rsvib_torch.registration import OffsetCurve
@@ -49,13 +53,12 @@ def assembled(
         num_frames: Frames of a stack.
         interval: Seconds between two frames, for the gain.
     """
-    row_timing, axes = timing.in_row_order(), scale.axes
-    swap = timing.scan_axis == -1
-    order = ([1, 0, 2, 3] if swap else [0, 1, 2, 3])[:axes]
+    row_timing = timing.in_row_order()
     units = scale.units(fitted)
     vibration = scale.motion(motion_of_fit(fit)).from_row_order(timing)
     sensitivity = timing_sensitivity(fit, row_timing, num_frames, scale.height)
-    sensitivity = sensitivity.mapped(lambda values: values[..., order, :])
+    sensitivity = sensitivity.mapped(lambda values: magnitudes_from_row_order(values, timing, -2))
+    heights = sequence_from_row_order(curve.heights, timing)
     residual = (curve.offsets - fitted).abs().nanmean(dim=(1, 2))
     reliable = [[not of_axis for of_axis in of_stack] for of_stack in reasons]
     return DetectionResult(
@@ -64,14 +67,14 @@ def assembled(
         offsets=replace(
             curve,
             offsets=offsets_from_row_order(curve.offsets * units, timing),
-            std=None if curve.std is None else (curve.std * units)[..., order],
-            heights=(curve.heights[1], curve.heights[0]) if swap else curve.heights,
+            std=None if curve.std is None else magnitudes_from_row_order(curve.std * units, timing),
+            heights=(heights[0], heights[1]),
         ),
         fitted=offsets_from_row_order(fitted * units, timing),
         gain=vibration.gain(interval),
-        residual=(residual * units)[..., order],
-        reliable=torch.tensor(reliable, device=fitted.device)[..., order],
-        reasons=tuple(tuple(of_stack[axis] for axis in order) for of_stack in reasons),
+        residual=magnitudes_from_row_order(residual * units, timing),
+        reliable=magnitudes_from_row_order(torch.tensor(reliable, device=fitted.device), timing),
+        reasons=tuple(sequence_from_row_order(of_stack, timing) for of_stack in reasons),
         sensitivity=sensitivity,
         assumptions=tuple(
             assumptions(vibration[index], sensitivity[index], row_timing, num_frames, scale.height)

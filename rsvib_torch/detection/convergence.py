@@ -18,7 +18,7 @@ from rsvib_torch.motion.motion import Motion
 __all__ = ["Acceleration", "Step", "is_converged"]
 
 _KEPT = 4  # steps that are combined; more change results of long exposures by less than their standard deviations
-# A round is inexact if it corrects more than this part of the step before. Plain rounds reach 0.1 without long exposures
+# A step was inexact if the next round corrects more than this part of it. Without long exposures, 0.1 is corrected
 _INEXACT = 0.3
 _MAX_EXTRAPOLATION = 4.0  # steps
 
@@ -130,4 +130,5 @@ class Acceleration:
         eye = torch.eye(len(pairs), dtype=torch.float32, device="cpu").to(gram)
         share = torch.linalg.solve(gram + ridge[:, None, None] * eye, right)[..., 0]
         share = share.clamp(-_MAX_EXTRAPOLATION, _MAX_EXTRAPOLATION) * where[:, None]
-        return (fitted * share[:, None, None, None]).sum(-1)
+        correction: Tensor = (fitted * share[:, None, None, None]).sum(-1)
+        return correction

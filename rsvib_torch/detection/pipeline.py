@@ -1,7 +1,7 @@
 """One attempt to detect the vibration of B stacks, under one hypothesis on the motion and the timing.
 
-``attempt`` reads from top to bottom: start, fit, uncertainty, verdict. It works in row order, with all components of the
-motion in px. It does not raise an error if the hypothesis is wrong, but returns a status for each stack.
+``attempt`` reads from top to bottom: start, fit, uncertainty, verdict. It works in row order, with all components of
+the motion in px. It does not raise an error if the hypothesis is wrong, but returns a status for each stack.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -21,14 +21,13 @@ from rsvib_torch.detection.refinement import FittedRows, refine
 from rsvib_torch.detection.reliability import judge
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
 from rsvib_torch.detection.rows.measured_rows import strip_rows, whole_rows
-from rsvib_torch.detection.start import BandStart, GreyFrames, band_start, field_start
+from rsvib_torch.detection.start import BandStart, band_start, field_start
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.aliasing import without_aliasing
 from rsvib_torch.detection.tones.fit import (
     MotionModel,
     ToneFit,
     displacement_std,
-    model_displacements,
     residual_of,
     shrunk_motion,
     vibration_of_fit,
@@ -36,14 +35,14 @@ from rsvib_torch.detection.tones.fit import (
 )
 from rsvib_torch.detection.tones.further import with_further_tones
 from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones, robust_fit
+from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
-from rsvib_torch.registration.register import fits_frame
 
 __all__ = ["METHODS", "Attempt", "DetectionOptions", "Hypothesis", "Method", "Status", "attempt"]
 
-Status = Literal["fitted", "abandoned", "too small"]
+Status = Literal["converged", "not converged", "abandoned", "not visible"]
 
 
 @dataclass(frozen=True)
@@ -115,8 +114,8 @@ class Attempt:
     """What an attempt found, for B stacks in row order.
 
     Attributes:
-        statuses: For each stack, ``"fitted"``; ``"abandoned"``: the hypothesis is wrong; ``"too small"``: a frame is
-            smaller than a band and its search range.
+        statuses: For each stack, ``"converged"``; ``"not converged"``: the last rounds changed the motion, which counts
+            as an error; ``"abandoned"``: the hypothesis is wrong; ``"not visible"``: no row was measured.
         options: The options.
         scale: Components of the motion.
         start: Offsets of the row bands.
@@ -139,10 +138,13 @@ class Attempt:
     reasons: tuple[tuple[tuple[str, ...], ...], ...]
     interval: float
 
+    @property
+    def has_pattern(self) -> bool:
+        """Whether a pattern of columns was subtracted."""
+        return self.fitted.rows is not None and self.fitted.rows.has_pattern
 
-def attempt(
-    stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis
-) -> Attempt | Literal["too small"]:
+
+def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis) -> Attempt:
     """Detect the vibration of B stacks under a hypothesis.
 
     Args:
@@ -153,13 +155,13 @@ def attempt(
     """
     method, scale = METHODS[options.method], hypothesis.scale
     frames = stacks.images
-    num_frames, height, width = frames.shape[1:]
-    if not fits_frame(height, width, options.bands):
-        return "too small"
+    num_frames, height = frames.shape[1:3]
 
     # 1. Start: the offsets of row bands between consecutive frames, and the tones that are known.
     if scale.same_for_all_columns:
-        start = band_start(stacks, timing, options.bands, mere_start=not method.needs_whole_curve, known=hypothesis.bands)
+        start = band_start(
+            stacks, timing, options.bands, mere_start=not method.needs_whole_curve, known=hypothesis.bands
+        )
     else:
         start = field_start(stacks, timing, options.bands, scale, hypothesis.translation)
     if hypothesis.frequencies is not None:
@@ -185,9 +187,8 @@ def attempt(
     # 4. Verdict: for each axis, the reasons against it.
     intervals = compared_intervals(timing, num_frames, method.max_group_frames, frames.device)
     reasons = _judged(start, fitted, fit, vibration, std, known_std, starts, intervals, timing, options, scale)
-    abandoned = [False] * len(frames) if fitted.rows is None else fitted.rows.abandoned.tolist()
     return Attempt(
-        statuses=tuple("abandoned" if stack else "fitted" for stack in abandoned),
+        statuses=_statuses(fitted),
         options=options,
         scale=scale,
         start=start,
@@ -198,6 +199,24 @@ def attempt(
         reasons=reasons,
         interval=float(intervals[0]),
     )
+
+
+def _statuses(fitted: Fitted) -> tuple[Status, ...]:
+    """Status of each stack."""
+    rows = fitted.rows
+    statuses: list[Status] = ["converged"] * len(fitted.fit.centre)
+    if rows is None:
+        return tuple(statuses)
+    for index, (converged, measured, abandoned) in enumerate(
+        torch.stack([rows.converged, rows.other_motion.measured > 0, rows.abandoned], -1).tolist()
+    ):
+        if abandoned:
+            statuses[index] = "abandoned"
+        elif not measured:
+            statuses[index] = "not visible"
+        elif not converged:
+            statuses[index] = "not converged"
+    return tuple(statuses)
 
 
 def _starts_of_rows(timing: RowTiming, num_frames: int, height: int, device: torch.device) -> Tensor:
@@ -287,9 +306,7 @@ def fit_directly(
         rows = whole_rows(stacks.images, stacks.valid, timing, motion)
     else:  # equal blur takes several times as long, and is not needed to find that there is no roll
         rows = strip_rows(stacks.images, stacks.valid, timing, motion, scale, pairs_if_blurred_differently=not doubtful)
-    refined = refine(
-        rows, intervals, fit, options.tones, may_abandon=doubtful, has_pattern=hypothesis.has_pattern
-    )
+    refined = refine(rows, intervals, fit, options.tones, may_abandon=doubtful, has_pattern=hypothesis.has_pattern)
     # Roll and zoom that were confirmed are fitted again with equal blur, if the exposures blur the frames differently.
     if doubtful and not scale.same_for_all_columns and not bool(refined.abandoned.all()):
         motion = shrunk_motion(refined.fit, intervals)
@@ -302,9 +319,7 @@ def fit_directly(
     return Fitted(refined.fit, refined.measurements, offsets, predicted, refined)
 
 
-def _tones_of_bands(
-    start: BandStart, timing: RowTiming, options: DetectionOptions, accuracy: float = 0.0
-) -> ToneFit:
+def _tones_of_bands(start: BandStart, timing: RowTiming, options: DetectionOptions, accuracy: float = 0.0) -> ToneFit:
     """Tones and image motion of the offsets of row bands; further tones until residuals are below ``accuracy`` px."""
     interval = options.bands.band_step * timing.row_time
     blind = blind_frequencies(timing, 0.5 / interval).to(start.measurements.centre.device)

@@ -56,6 +56,7 @@ class FittedRows:
         uneven: (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain.
         rows: The frames; without a pattern of columns if there was one.
         has_pattern: Whether a pattern of columns was subtracted.
+        converged: (B,) bool, stacks whose next round would change little.
         abandoned: (B,) bool, stacks whose large residual ended the rounds early.
     """
 
@@ -67,6 +68,7 @@ class FittedRows:
     uneven: Tensor
     rows: MeasuredRows
     has_pattern: bool
+    converged: Tensor
     abandoned: Tensor
 
 
@@ -241,7 +243,9 @@ class Refinement:
         # 3. Decide. A known pattern of columns is subtracted as soon as the motion is known roughly.
         if number == 0 and self._has_pattern and self._subtract_pattern():
             return
-        if self.round == self._max_rounds or not bool((measurements.weights > 0).any()):  # or no row is visible any more
+        if self.round == self._max_rounds or not bool(
+            (measurements.weights > 0).any()
+        ):  # or no row is visible any more
             self.is_finished = True
             return
         if self._may_abandon and self.round == _TRIED_ROUNDS:
@@ -279,7 +283,7 @@ class Refinement:
         if not bool(converged.all()):
             fitted = with_unknown_changes(fitted, self.warped_by, self.motion, self._fits, ~converged)
         has_pattern = self._patterns.subtracted
-        return replace(fitted, has_pattern=has_pattern, abandoned=self.abandoned)
+        return replace(fitted, has_pattern=has_pattern, converged=self.converged, abandoned=self.abandoned)
 
     def _searched(self, measurements: Measurements, residual: Tensor) -> ToneFit:
         """Fit with further tones. The noise of rows is nearly white: a tone that explains 2 % is significant."""
@@ -372,6 +376,7 @@ def conclude(rows: MeasuredRows, record: RowRecord, fit: ToneFit) -> FittedRows:
         uneven=record.uneven(),
         rows=rows,
         has_pattern=False,
+        converged=torch.zeros_like(fit.centre, dtype=torch.bool),
         abandoned=torch.zeros_like(fit.centre, dtype=torch.bool),
     )
 
@@ -465,5 +470,6 @@ def _better_of_both(first: FittedRows, second: FittedRows) -> FittedRows:
         other_motion=select_stacks(better, second.other_motion, first.other_motion),
         robust_weights=torch.where(better[:, None, None], second.robust_weights, first.robust_weights),
         aliasing=torch.where(better, second.aliasing, first.aliasing),
+        converged=torch.where(better, second.converged, first.converged),
         uneven=torch.where(better[:, None], second.uneven, first.uneven),
     )

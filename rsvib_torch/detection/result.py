@@ -259,6 +259,13 @@ class DetectionResult(
         curve = {name: values.pop(name) for name in ("offsets", "fitted")}  # long, therefore last
         return values | curve
 
+    def refused(self, index: int, reason: str) -> "DetectionResult":
+        """The results of a batch with a further reason against all axes of one stack."""
+        reliable, reasons = self.reliable.clone(), list(self.reasons)
+        reliable[index] = False
+        reasons[index] = tuple((reason, *of_axis) for of_axis in reasons[index])
+        return replace(self, reliable=reliable, reasons=tuple(reasons))
+
     def with_axes(self, count: int) -> "DetectionResult":
         """The result with the first axes of (x, y, roll, zoom) only."""
         batch = len(self.batch_shape)

@@ -11,11 +11,12 @@ from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
-from rsvib_torch.detection.tones.fit import ToneFit, with_axes
+from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, with_axes
+from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
-from rsvib_torch.registration.register import check_frame_size, register_rows
+from rsvib_torch.registration.register import check_frame_size, fits_frame, register_rows
 
 __all__ = [
     "BandStart",
@@ -79,10 +80,15 @@ class BandStart:
     measurements: Measurements
     fit: ToneFit | None = None
 
+    def predicted(self, fit: ToneFit) -> Tensor:
+        """Offsets (B, P, N, A) in px of the row bands that a fit predicts."""
+        displacements = model_displacements(self.measurements, fit)
+        offsets: Tensor = (displacements[:, :, 1] - displacements[:, :, 0]).unflatten(1, self.curve.quality.shape[1:])
+        return offsets
+
 
 def band_start(
-    frames: Tensor,
-    valid: Tensor | None,
+    stacks: GreyFrames,
     timing: RowTiming,
     options: RegistrationOptions,
     *,
@@ -91,16 +97,26 @@ def band_start(
 ) -> BandStart:
     """``band_curve`` with its measurements; ``known`` are the offsets of these frames with another timing."""
     if known is None:
-        curve = band_curve(frames, valid, timing, options, mere_start=mere_start)
+        curve = band_curve(stacks.images, stacks.valid, timing, options, mere_start=mere_start)
     else:
-        times = timing.frame_starts(frames.shape[1], frames.device)[:, None] + known.rows * timing.row_time
+        starts = timing.frame_starts(stacks.images.shape[1], stacks.images.device)
+        times = starts[:, None] + known.rows * timing.row_time
         curve = replace(known, times=times[:-1], later_times=times[1:])
     return BandStart(curve, measurements_of_curve(curve, timing, options.band_step))
 
 
+def _num_strips(width: int) -> int:
+    """Parts of the columns from which roll and zoom are measured at the start."""
+    return min(4, max(2, width // 128))
+
+
+def strips_fit(num_rows: int, width: int, options: RegistrationOptions) -> bool:
+    """Whether parts of the columns are wide enough for a motion with roll or zoom."""
+    return fits_frame(num_rows, round(width / _num_strips(width)), options)
+
+
 def field_start(
-    frames: Tensor,
-    valid: Tensor | None,
+    stacks: GreyFrames,
     timing: RowTiming,
     options: RegistrationOptions,
     scale: FieldScale,
@@ -112,15 +128,17 @@ def field_start(
     without roll and zoom, which has smaller errors.
 
     Args:
-        frames: As in ``band_curve``.
-        valid: As in ``band_curve``.
+        stacks: The frames.
         timing: As in ``band_curve``.
         options: As in ``band_curve``.
         scale: Components of the motion.
         translation: Fit without roll and zoom.
+
+    Raises:
+        ValueError: If the parts are too narrow, see ``strips_fit``.
     """
-    check_frame_size(frames.shape[-2], frames.shape[-1], options)
-    count = min(4, max(2, frames.shape[-1] // 128))
+    frames, valid = stacks.images, stacks.valid
+    count = _num_strips(frames.shape[-1])
     parts, columns = cut_into_strips(frames, count)
     valid_parts = None if valid is None else cut_into_strips(valid, count)[0]
     each = band_curve(parts, valid_parts, timing, options, mere_start=False)

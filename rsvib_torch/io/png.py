@@ -88,7 +88,7 @@ def png_info(path: Path) -> StackInfo:
 
 def _needed_for_pixels(data: bytes, chunks: dict[bytes, bytes]) -> bytes:
     """The file with the chunks that decoding needs: animations and colour profiles do not change the pixels."""
-    kept = [(kind, chunks[kind]) for kind in (b"IHDR", b"PLTE", b"tRNS") if kind in chunks]
+    kept: list[tuple[bytes, bytes]] = [(kind, chunks[kind]) for kind in (b"IHDR", b"PLTE", b"tRNS") if kind in chunks]
     kept += [(b"IDAT", _bodies(data, b"IDAT")), (b"IEND", b"")]
     return data[:8] + b"".join(_chunk(kind, body) for kind, body in kept)
 

@@ -27,7 +27,7 @@ from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.registration.bands import BandTask
 from rsvib_torch.registration.methods import BAND_METHODS, Registration, RegistrationOptions
 
-__all__ = ["OffsetCurve", "check_frame_size", "register_bands", "register_rows"]
+__all__ = ["OffsetCurve", "check_frame_size", "fits_frame", "register_bands", "register_rows"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -168,19 +168,29 @@ def register_bands(
     return replace(curve, offsets=offsets_from_row_order(curve.offsets, timing), heights=(height_x, height_y))
 
 
+def fits_frame(num_rows: int, width: int, options: RegistrationOptions) -> bool:
+    """Whether frames of ``num_rows`` rows of ``width`` px contain a band and its search range."""
+    needed = _needed_size(options)
+    return num_rows >= needed[0] and width >= needed[1]
+
+
+def _needed_size(options: RegistrationOptions) -> tuple[int, int]:
+    """Least rows, and least px in a row."""
+    return options.band_rows + 2 * options.search, 4 * (options.search + 8)
+
+
 def check_frame_size(num_rows: int, width: int, options: RegistrationOptions) -> None:
     """Refuse frames that are smaller than a band and its search range.
 
     Raises:
         ValueError: If there are too few rows in readout order, or too few px in a row.
     """
-    band_rows, search = options.band_rows, options.search
-    needed = (band_rows + 2 * search, 4 * (search + 8))
-    if num_rows < needed[0] or width < needed[1]:
+    needed = _needed_size(options)
+    if not fits_frame(num_rows, width, options):
         raise ValueError(
             f"frames of {num_rows} x {width} px (rows in readout order x px per row) are too small for bands of "
-            f"{band_rows} rows searched over {search} px: at least {needed[0]} x {needed[1]} are needed; reduce "
-            "band_rows or search"
+            f"{options.band_rows} rows searched over {options.search} px: at least {needed[0]} x {needed[1]} are needed; "
+            "reduce band_rows or search"
         )
 
 

@@ -25,10 +25,10 @@ from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.option_types import DetectionMethod
 from rsvib_torch.core.precision import full_precision, outside_graphs, outside_inference, without_gradients
 from rsvib_torch.detection import DetectionResult, detect_vibration
+from rsvib_torch.detection.assemble import offset_curve
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.reliability import contradicted_axes, judge
 from rsvib_torch.detection.result import OtherMotion
-from rsvib_torch.detection.rows.direct import offset_curve
 from rsvib_torch.detection.rows.displacements import (
     FrameGroup,
     differential_motion,

@@ -8,9 +8,21 @@ from scipy import ndimage
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, detect_vibration, register_bands, simulate_frames
-from rsvib_torch.detection.rows import direct, measured_rows
-from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, amplitude_std, shrunk_motion
+from rsvib_torch.detection.convergence import is_converged
+from rsvib_torch.detection.pipeline import DetectionOptions, Hypothesis, attempt
+from rsvib_torch.detection.refinement import Refinement, with_unknown_changes
+from rsvib_torch.detection.rows.measured_rows import whole_rows
+from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.tones.fit import (
+    MotionModel,
+    ToneFit,
+    amplitude_std,
+    shrunk_motion,
+    vibration_of_fit,
+)
 from rsvib_torch.evaluation import resolution_chart
+from rsvib_torch.frames.grey import grey_frames
+from rsvib_torch.registration import RegistrationOptions
 from rsvib_torch.registration.gradients import residual_products, row_equations, row_gradients
 from rsvib_torch.registration.row_spectra import RowSpectra, differences, inner_columns
 
@@ -212,20 +224,24 @@ def test_amplitude_of_a_blind_tone_caused_by_blur_does_not_diverge():
     assert found.vibration.frequency[:, 0].tolist() == pytest.approx([50.0, 30.0], rel=0.001)
 
 
-def test_changes_of_the_last_rounds_count_as_errors(paper_camera, monkeypatch):
+def test_changes_of_the_last_rounds_count_as_errors(paper_camera):
     """Of a refinement that did not converge: here, fits whose amplitude along y was 0.3 and 0.4 px larger."""
-    refine, found = direct._refine, []
-    monkeypatch.setattr(direct, "_refine", lambda *given, **more: found.append(refine(*given, **more)) or found[-1])
-    detect_vibration(noisy_frames(paper_camera, Motion(phase=(0.9, 2.2)), 42, 0.005, rows=512), paper_camera)
-    fit = found[0].fit
+    frames = noisy_frames(paper_camera, Motion(phase=(0.9, 2.2)), 42, 0.005, rows=512)
+    options = DetectionOptions("direct", 1, MotionModel(), RegistrationOptions("ncc", 32, 16, 16))
+    stacks = grey_frames(frames, paper_camera, None, None, None)
+    translation = Hypothesis(FieldScale(2, frames.shape[-1], 512))
+    rows = attempt(stacks, paper_camera.in_row_order(), options, translation).fitted.rows
+    fit = rows.fit
     along_y = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
     fits = [
         replace(fit, coefficients=fit.coefficients * (1 + more * along_y / fit.amplitude)) for more in (0.3, 0.4, 0)
     ]
-    motion = shrunk_motion(fit, torch.tensor([0.04], dtype=torch.float64))
-    std = amplitude_std(direct._not_converged(found[0], motion, motion, fits).fit)
+    motion, not_converged = shrunk_motion(fit, torch.tensor([0.04], dtype=torch.float64)), torch.tensor([True])
+    std = amplitude_std(with_unknown_changes(rows, motion, motion, fits, not_converged).fit)
     expected = (amplitude_std(fit).square() + 0.5**2 * along_y).sqrt()
     torch.testing.assert_close(std, expected, rtol=1e-6, atol=0)
+    unchanged = with_unknown_changes(rows, motion, motion, fits, ~not_converged)
+    assert torch.equal(unchanged.fit.covariance, fit.covariance)
 
 
 @pytest.mark.parametrize("size", [2.0, 59.0])
@@ -310,20 +326,27 @@ def test_differences_from_the_mean_of_the_frames_in_which_a_row_is_visible(num_f
         np.testing.assert_allclose(-found[:, 0], expected[:, 1], atol=1e-12)
 
 
-def test_further_rounds_change_the_result_by_less_than_its_std(paper_camera, monkeypatch):
-    """Compared with a detection that uses all rounds."""
+def test_further_rounds_change_the_result_by_less_than_its_std(paper_camera):
+    """Compared with a refinement that is continued after it has converged."""
     frames = noisy_frames(paper_camera, Motion((3.1, 5.2), (50.0, 30.0), (0.4, -1.1)), 91, 0.005)
-    rounds = []
-    measure = measured_rows.measure_groups
-    monkeypatch.setattr(measured_rows, "measure_groups", lambda *given: (rounds.append(1), measure(*given))[1])
-    found = detect_vibration(frames, paper_camera)
-    few = len(rounds)
-    monkeypatch.setattr(direct, "_converged", lambda *given: False)
-    whole = detect_vibration(frames, paper_camera)
-    assert few <= 3 < len(rounds) - few
+    timing = paper_camera.in_row_order()
+    stacks = grey_frames(frames, paper_camera, None, None, None)
+    options = DetectionOptions("bands", 1, MotionModel(), RegistrationOptions("ncc", 32, 16, 16))
+    start = attempt(stacks, timing, options, Hypothesis(FieldScale(2, *frames.shape[:-3:-1]))).fitted.fit
+    intervals = torch.tensor([timing.frame_period], dtype=torch.float64)
+    rows = whole_rows(stacks.images, None, timing, shrunk_motion(start, intervals))
+    refinement = Refinement(rows, intervals, start, None)
+    while not refinement.is_finished:
+        refinement.step()
+    assert refinement.round <= 3
+    assert refinement.converged.all()
+    vibration, std = vibration_of_fit(refinement.result().fit)
+    for _ in range(4):
+        refinement.step()
+    continued, _ = vibration_of_fit(refinement.result().fit)
     for name in ("amplitude", "frequency", "phase"):
-        change = (getattr(found.vibration, name) - getattr(whole.vibration, name)).abs()
-        assert bool((change < 0.1 * getattr(found.std, name)).all())
+        change = (getattr(vibration, name) - getattr(continued, name)).abs()
+        assert bool((change < 0.1 * getattr(std, name)).all())
 
 
 def tone_fit(coefficients, frequencies):
@@ -360,7 +383,7 @@ def test_convergence_follows_from_the_change_and_the_ratio_of_steps(change, rati
         tone_fit([1.0 + 0.01 * change, 2.0], [50.0, 30.0]),
         tone_fit([1.0, 2.0], [50.0, 30.0 - 0.02 * change]),
     ):
-        assert bool(direct._converged(before, after, ratio).all()) is converged
+        assert bool(is_converged(before, after, ratio).all()) is converged
 
 
 @pytest.mark.parametrize("remaining", [0.0, 0.05, -0.3])

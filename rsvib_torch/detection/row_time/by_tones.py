@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from rsvib_torch.detection.refinement import refine
 from rsvib_torch.detection.result import OtherMotion
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces, fit_row_time, rows_of_frames
 from rsvib_torch.detection.row_time.row_tones import (
@@ -19,7 +20,6 @@ from rsvib_torch.detection.row_time.row_tones import (
     find_row_tones,
     fit_row_tones,
 )
-from rsvib_torch.detection.rows.direct import refine_directly
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
 from rsvib_torch.detection.rows.measured_rows import whole_rows
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
@@ -222,7 +222,7 @@ def _measured_with(
     exposure = None
     for _ in range(4):
         rows = whole_rows(stack.images, stack.valid, timing, shrunk_motion(start, intervals))
-        found, _, _ = refine_directly(rows, intervals, start, None)
+        found = refine(rows, intervals, start, None)
         if found.measurements.independent <= 0:  # too few rows agree with each other
             return None
         places = rows_of_frames(found.measurements, clock.period, size, clock.num_rows)

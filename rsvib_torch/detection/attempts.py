@@ -1,0 +1,185 @@
+"""The hypotheses that detection tries, one after the other; the only place of detection that repeats an attempt.
+
+1. The motion is a translation: all columns of a row are displaced alike.
+2. If the halves of the rows move apart as roll and zoom cause it, or if roll and zoom are requested: a motion with
+   roll and zoom.
+3. If the tones do not explain the rows: another timing (``diagnosis``), which then is the reason against the axes.
+
+Attempts return statuses (``pipeline``), by which the next hypothesis is chosen. Windows of a long stack are detected
+one after the other, with the same components of the motion.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.detection.assemble import assembled
+from rsvib_torch.detection.diagnosis import other_timings
+from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
+from rsvib_torch.detection.reliability import rotation_possible
+from rsvib_torch.detection.result import DetectionResult, stacked
+from rsvib_torch.detection.start import strips_fit
+from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE
+from rsvib_torch.frames.grey import GreyFrames
+from rsvib_torch.motion.camera import Camera
+from rsvib_torch.motion.timing import SensorTiming
+
+__all__ = ["FieldOptions", "detect_tones", "detect_windows", "windows_of"]
+
+
+@dataclass(frozen=True)
+class FieldOptions:
+    """Whether roll and zoom are measured (True, False or ``"auto"``), and the camera in row order.
+
+    Attributes:
+        roll: Rotation about the optical axis.
+        zoom: Change of scale; includes roll.
+        camera: Focal length and lens; None for an infinite focal length.
+    """
+
+    roll: bool | Literal["auto"]
+    zoom: bool | Literal["auto"]
+    camera: Camera | None
+
+    @property
+    def most_axes(self) -> int:
+        """Number of components, if roll and zoom are found."""
+        return 4 if self.zoom else 3 if self.roll else 2
+
+    @property
+    def least_axes(self) -> int:
+        """Number of components that were requested."""
+        return 4 if self.zoom is True else 3 if self.roll is True else 2
+
+
+def detect_tones(
+    stacks: GreyFrames,
+    timing: SensorTiming,
+    options: DetectionOptions,
+    field: FieldOptions,
+    *,
+    diagnose: bool = True,
+) -> DetectionResult:
+    """Detect the tones of B stacks, with as many components as were requested or as the frames require.
+
+    Args:
+        stacks: The frames.
+        timing: The sensor, in image order.
+        options: Options of all attempts.
+        field: Roll, zoom and camera.
+        diagnose: Whether another timing is tried for stacks whose rows the tones do not explain.
+    """
+    height, width = stacks.images.shape[-2:]
+    row_timing, num_frames = timing.in_row_order(), stacks.images.shape[1]
+
+    # 1. Translation.
+    translation = attempt(stacks, row_timing, options, Hypothesis(FieldScale(2, width, height)))
+
+    # 2. Roll and zoom. A requested component is measured in any case; frames that are too narrow for strips of columns
+    # are refused by an error then.
+    requested = field.camera is not None or field.least_axes > 2
+    possible = field.most_axes > 2 and _any_rolls(translation) and strips_fit(height, width, options.bands)
+    if requested or possible:
+        hypothesis = Hypothesis(
+            FieldScale(field.most_axes, width, height, field.camera),
+            is_doubtful=not requested,
+            has_pattern=translation.has_pattern,
+            translation=translation.fit,
+        )
+        rotation = attempt(stacks, row_timing, options, hypothesis)
+        if requested or any(status != "abandoned" for status in rotation.statuses):  # parallax otherwise
+            axes = _moving_axes(rotation, field.least_axes)
+            if requested or axes > 2:
+                return assembled_attempt(rotation, timing, num_frames).with_axes(axes)
+
+    # 3. Another timing.
+    result = assembled_attempt(translation, timing, num_frames)
+    if not diagnose:
+        return result
+    diagnoses = other_timings(stacks, timing, translation)
+    for index, diagnosis in diagnoses.items():
+        # the axes have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong
+        result = result.refused(index, diagnosis.reason)
+    return result
+
+
+def assembled_attempt(found: Attempt, timing: SensorTiming, num_frames: int) -> DetectionResult:
+    """The results of an attempt in image axes."""
+    return assembled(
+        found.fit,
+        found.std,
+        found.fitted.offsets,
+        found.fitted.predicted,
+        found.reasons,
+        timing,
+        scale=found.scale,
+        num_frames=num_frames,
+        interval=found.interval,
+    )
+
+
+def _any_rolls(found: Attempt) -> bool:
+    """Whether roll or zoom may be the cause of what the translation of any stack does not explain."""
+    rows = found.fitted.rows
+    if rows is None:
+        return False
+    aspect = found.scale.height / found.scale.width
+    return any(rotation_possible(rows.other_motion[i], rows.uneven[i], aspect) for i in range(len(found.statuses)))
+
+
+def _moving_axes(found: Attempt, least: int) -> int:
+    """Number of components up to the last one with a significant tone in any stack, at least ``least``.
+
+    A given number of tones is fitted to all components, also to those that do not move.
+    """
+    significant = found.vibration.amplitude > MIN_SIGNIFICANCE * found.std.amplitude
+    moving = significant.any(0).any(-1).tolist()
+    return max([least, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
+
+
+# Windows
+
+
+def windows_of(
+    num_frames: int, window: int, step: int | None, timing: SensorTiming
+) -> list[tuple[slice, SensorTiming]]:
+    """Windows of frames, the last one flush with the end, each with the start times of its frames."""
+    check_whole_number("window", window, at_least=2)
+    if window > num_frames:
+        raise ValueError(f"window of {window} frames is longer than the stack of {num_frames}")
+    step = max(1, window // 2) if step is None else step
+    check_whole_number("window_step", step, at_least=1)
+    firsts = list(range(0, num_frames - window + 1, step))
+    if firsts[-1] + window < num_frames:
+        firsts.append(num_frames - window)
+    starts = timing.frame_starts(num_frames)
+    return [
+        (slice(first, first + window), replace(timing, frame_start_times=starts[first : first + window]))
+        for first in firsts
+    ]
+
+
+def detect_windows(
+    stacks: GreyFrames,
+    windows: list[tuple[slice, SensorTiming]],
+    options: DetectionOptions,
+    field: FieldOptions,
+) -> DetectionResult:
+    """Results of all windows, with the same components."""
+
+    def of_window(number: int, field: FieldOptions) -> DetectionResult:
+        part, timing = windows[number]
+        valid = None if stacks.valid is None else stacks.valid[:, part]
+        frames = replace(stacks, images=stacks.images[:, part], valid=valid)
+        return detect_tones(frames, timing, options, field, diagnose=False)
+
+    results = [of_window(number, field) for number in range(len(windows))]
+    axes = max(result.vibration.num_axes for result in results)
+    if axes > 2:
+        same = replace(field, roll=True, zoom=axes > 3)
+        results = [
+            result if result.vibration.num_axes == axes else of_window(number, same)
+            for number, result in enumerate(results)
+        ]
+    return stacked(results)

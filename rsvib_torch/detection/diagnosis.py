@@ -1,0 +1,334 @@
+"""Diagnosis of a wrong setting: another timing with which the frames agree, unlike the stated one.
+
+``period_factor`` finds the frame period or the readout direction with which one tone along each axis explains the
+measured displacements of the rows. ``other_timings`` confirms it by a detection with that timing, and ``diagnose_timing`` is the
+same for users.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from operator import itemgetter
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import ArrayLike, Channels
+from rsvib_torch.core.option_types import Registration
+from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
+from rsvib_torch.detection.reliability import contradicted_axes, rotation_found
+from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
+from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.tones.fit import MotionModel
+from rsvib_torch.detection.tones.selection import find_tones, robust_fit, typical_size
+from rsvib_torch.frames.grey import GreyFrames, grey_frames
+from rsvib_torch.io.stack_reading import FramesOrFiles
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.registration import RegistrationOptions
+from rsvib_torch.registration.register import fits_frame
+
+__all__ = ["TimingDiagnosis", "diagnose_timing", "other_timings", "period_factor"]
+
+
+@dataclass(frozen=True)
+class TimingDiagnosis:
+    """A setting of the sensor that the frames contradict, and the value that they agree with.
+
+    Attributes:
+        setting: ``"frame_rows"``, ``"row_time"``, ``"readout_direction"`` or ``"scan_axis"``.
+        stated: The stated value.
+        agreeing: The value that the frames agree with.
+        timing: The sensor with this value.
+    """
+
+    setting: Literal["frame_rows", "row_time", "readout_direction", "scan_axis"]
+    stated: float | str
+    agreeing: float | str
+    timing: SensorTiming
+
+    @property
+    def reason(self) -> str:
+        """Sentence with both values and the remedy."""
+        if self.setting == "frame_rows":
+            stated = replace(self.timing, frame_rows=float(self.stated))
+            row_time = stated.row_time * stated.frame_rows / float(self.agreeing)
+            return (
+                f"the frames agree with frame_rows={self.agreeing:.5g}, not with {self.stated:g}: frame_rows counts "
+                "the blanking rows and is not the image height; if the frame rate is known, row_time is 1 / (frame "
+                f"rate x frame_rows), with {stated.frame_rate:.5g} frames/s {row_time:.5g} s"
+            )
+        if self.setting == "row_time":
+            return (
+                f"the frames agree with row_time={self.agreeing:.5g} s, not with {self.stated:g} s, if the start times "
+                "of the frames are right"
+            )
+        return f"the frames agree with {self.setting}={self.agreeing!r}, not with {self.stated!r}"
+
+
+@outside_graphs
+@full_precision
+@without_gradients
+@checks_arguments
+def diagnose_timing(
+    frames: FramesOrFiles,
+    timing: SensorTiming,
+    *,
+    registration: Registration = "ncc",
+    band_rows: int = 32,
+    band_step: int = 16,
+    search: int = 16,
+    ignore: ArrayLike | None = None,
+    full_scale: float | None = None,
+    channels: Channels = None,
+) -> TimingDiagnosis | None:
+    """Find the setting of the sensor that the frames contradict.
+
+    A row ``i`` of frame ``p`` starts its exposure at ``p frame_rows row_time + i row_time``. The rows of a frame and
+    the phase from frame to frame must agree with the same frequency, which determines ``frame_rows`` and the readout
+    direction from three frames on. With the wrong scan axis, the halves of the rows move apart. ``detect_vibration``
+    does the same for axes that it refuses.
+
+    Args:
+        frames: Stack (T, H, W) or (T, C, H, W), as in ``detect_vibration``.
+        timing: The sensor as stated.
+        registration: As in ``detect_vibration``.
+        band_rows: As in ``detect_vibration``.
+        band_step: As in ``detect_vibration``.
+        search: As in ``detect_vibration``.
+        ignore: As in ``detect_vibration``.
+        full_scale: As in ``detect_vibration``.
+        channels: As in ``detect_vibration``.
+
+    Returns:
+        The setting with the value that the frames agree with; None if they do not contradict the stated timing, or
+        agree with no other one.
+
+    Raises:
+        TypeError: If frames are not numbers.
+        ValueError: If frames are a batch, or too small, see ``detect_vibration``.
+
+    Example:
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=8, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=4)
+        >>> stated = rsv.SensorTiming(row_time=40e-6, exposure_rows=8, frame_rows=280)
+        >>> diagnosis = rsv.diagnose_timing(frames, stated)
+        >>> diagnosis.setting, round(diagnosis.agreeing)
+        ('frame_rows', 300)
+    """
+    stacks = grey_frames(frames, timing, full_scale, ignore, channels)
+    if stacks.batched:
+        raise ValueError("diagnose_timing takes one stack, not a batch")
+    options = DetectionOptions(
+        "direct", None, MotionModel(), RegistrationOptions(registration, band_rows, band_step, search)
+    )
+    height, width = stacks.images.shape[-2:]
+    translation = Hypothesis(FieldScale(2, width, height))
+    found = attempt(stacks, stacks.timing.in_row_order(), options, translation)
+    return other_timings(stacks, stacks.timing, found).get(0)
+
+
+def other_timings(stacks: GreyFrames, timing: SensorTiming, found: Attempt) -> dict[int, TimingDiagnosis]:
+    """The settings that stacks contradict, by the index of the stack; without stacks that contradict none.
+
+    Args:
+        stacks: The frames.
+        timing: The sensor as stated, in image order.
+        found: The attempt with this timing.
+    """
+    if found.fitted.rows is None:
+        return {}
+    diagnoses = {}
+    for index in range(len(found.statuses)):
+        other = found.fitted.rows.other_motion[index]
+        axes = contradicted_axes(found.vibration[index], other, found.options.max_tones)
+        if any(axes):
+            diagnosis = _Diagnosis.of_stack(stacks, timing, found, index, axes).result(rotates=rotation_found(other))
+            if diagnosis is not None:
+                diagnoses[index] = diagnosis
+    return diagnoses
+
+
+@dataclass(frozen=True, eq=False)
+class _Diagnosis:
+    """The timings that are tried for one stack.
+
+    Attributes:
+        stack: The frames, (1, T, H, W) in row order.
+        timing: The sensor as stated, in image order.
+        found: The attempt with this timing, of all stacks.
+        index: The stack.
+        axes: Axes (x, y) in row order that contradict the stated timing.
+    """
+
+    stack: GreyFrames
+    timing: SensorTiming
+    found: Attempt
+    index: int
+    axes: tuple[bool, bool]
+
+    @classmethod
+    def of_stack(
+        cls, stacks: GreyFrames, timing: SensorTiming, found: Attempt, index: int, axes: tuple[bool, bool]
+    ) -> "_Diagnosis":
+        return cls(stacks.one(index), timing, found, index, axes)
+
+    def result(self, *, rotates: bool) -> TimingDiagnosis | None:
+        """The setting with the value that the stack agrees with; None if it agrees with no other timing.
+
+        Args:
+            rotates: Whether the halves of the rows move apart, as they do with the wrong scan axis.
+        """
+        timing, row_timing = self.timing, self.timing.in_row_order()
+        num_frames, height, width = self.stack.images.shape[1:]
+        # The rows of a frame and the phase from frame to frame agree with one period of the frames.
+        part = slice(self.index, self.index + 1)
+        measurements = self.found.fitted.measurements.mapped(itemgetter(part))
+        agreeing = period_factor(measurements, row_timing, num_frames, BLOCK_ROWS) if num_frames > 2 else None
+        factor, tones = (None, None) if agreeing is None else agreeing
+        if factor is not None and factor < 0:
+            if self._agrees(row_timing, change=lambda images: images.flip(-2), tones=tones):
+                other: Literal["forward", "reverse"] = "reverse" if timing.readout_direction == "forward" else "forward"
+                changed = replace(timing, readout_direction=other)
+                return TimingDiagnosis("readout_direction", timing.readout_direction, other, changed)
+        elif factor is not None and timing.frame_start_times is None:
+            frame_rows = factor * timing.frame_rows
+            if frame_rows >= max(height, timing.exposure_rows) and self._agrees(
+                replace(row_timing, frame_rows=frame_rows), tones=tones
+            ):
+                return TimingDiagnosis(
+                    "frame_rows", timing.frame_rows, frame_rows, replace(timing, frame_rows=frame_rows)
+                )
+        elif factor is not None:
+            times = {name: getattr(timing, name) * factor for name in ("frame_rows", "exposure_rows")}
+            times["row_time"] = timing.row_time / factor
+            if self._agrees(replace(row_timing, **times), tones=tones):
+                return TimingDiagnosis("row_time", timing.row_time, times["row_time"], replace(timing, **times))
+        # With the wrong scan axis, the halves of a row are exposed at different times and move apart.
+        swapped = (self.axes[1], self.axes[0])
+        if (
+            rotates
+            and width <= timing.frame_rows
+            and fits_frame(width, height, self.found.options.bands)
+            and self._agrees(row_timing, change=lambda images: images.mT, concerned=swapped)
+        ):
+            if timing.scan_axis == -2:
+                return TimingDiagnosis("scan_axis", "y", "x", replace(timing, scan_axis="x"))
+            return TimingDiagnosis("scan_axis", "x", "y", replace(timing, scan_axis="y"))
+        return None
+
+    def _agrees(
+        self,
+        timing: RowTiming,
+        *,
+        change: Callable[[Tensor], Tensor] | None = None,
+        concerned: tuple[bool, bool] | None = None,
+        tones: Tensor | None = None,
+    ) -> bool:
+        """Whether detection with another timing is reliable along the axes that contradict the stated one.
+
+        Args:
+            timing: The other timing, in row order.
+            change: Change of the frames from the stated to the other order of rows; None for none.
+            concerned: The axes; None for those that contradict the stated timing.
+            tones: (1, 2, 1) Hz of one tone of each axis, if they are known.
+        """
+        stack, bands = self.stack, None
+        if change is None:
+            curve, part = self.found.start.curve, slice(self.index, self.index + 1)
+            bands = replace(curve, offsets=curve.offsets[part], quality=curve.quality[part])
+        else:
+            valid = None if stack.valid is None else change(stack.valid)
+            stack = replace(stack, images=change(stack.images), valid=valid)
+        height, width = stack.images.shape[-2:]
+        hypothesis = Hypothesis(FieldScale(2, width, height), is_doubtful=True, bands=bands, frequencies=tones)
+        other = attempt(stack, timing, self.found.options, hypothesis)
+        if other.statuses[0] == "abandoned":
+            return False
+        axes = zip(other.reasons[0], self.axes if concerned is None else concerned, strict=True)
+        return all(not against or not axis for against, axis in axes)
+
+
+# Frame period
+
+_ROWS = (32, 128)  # measured rows that are used in the search and its refinement; more rows take longer only
+_SHORTEST, _LONGEST, _STEP = 0.8, 1.5, 0.02  # frame periods that are tried, over the stated one
+_LEVELS, _POINTS = 4, 9  # refinement of the best one, each level in steps four times smaller
+# of the square of the residual with the stated timing: 41 correct alternatives reached 0.1 or less after the first
+# level. Of 17 wrong ones between 0.2 and 0.5, detection agreed with none
+_SMALLER = 0.2
+_ITERATIONS = 5  # of fits; most factors are wrong, and their fits converge slowly
+_MINIMA, _EQUAL = 4, 4.0  # minima that are refined, and their squared residual over the least to count as equal
+
+
+def period_factor(
+    measurements: Measurements, timing: RowTiming, num_frames: int, block_rows: int
+) -> tuple[float, Tensor] | None:
+    """Factor of the frame start times with which one tone along each axis explains the measurements best.
+
+    A row ``i`` of frame ``p`` starts its exposure at ``s_p + i row_time``. With the factor c, it is ``c s_p``: the
+    rows of a frame and the phase from frame to frame must agree with the same frequency, which determines c. Reversed
+    readout is c = -1, because a vibration in reversed time is a vibration.
+
+    Args:
+        measurements: Displacements of one stack (B = 1) of at least three frames, in row order.
+        timing: The sensor.
+        num_frames: Frames of the stack.
+        block_rows: Rows of a measurement, which limit the frequency of the tones.
+
+    Returns:
+        c, 0.8 to 1.5, or -1, and the frequencies (1, 2, 1) in Hz of the tones; None if none explains the displacements
+        clearly better than 1.
+    """
+    starts = timing.frame_starts(num_frames, measurements.exposure_starts.device)
+    interval = max(block_rows * timing.row_time, 0.5 * timing.exposure_time)
+
+    def fits(factors: Tensor, rows: int, frequencies: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Square of the residual of one tone along each axis and its frequency, for each factor."""
+        every = max(1, measurements.exposure_starts.shape[1] // rows)
+        trial = measurements.mapped(lambda values: values[:, ::every]).repeated(len(factors))
+        frame = torch.searchsorted(starts, trial.exposure_starts.contiguous(), right=True).clamp(min=1) - 1
+        moved = (factors[:, None, None] - 1.0) * (starts - starts[0])[frame]
+        trial = replace(trial, exposure_starts=trial.exposure_starts + moved)
+        if frequencies is None:
+            fit = find_tones(trial, interval, 1, stretches=False, iterations=_ITERATIONS)
+        else:
+            active = torch.ones_like(frequencies, dtype=torch.bool)
+            fit, _ = robust_fit(trial, frequencies, active, MotionModel(), iterations=_ITERATIONS)
+        return typical_size(trial, fit), fit.frequencies
+
+    ends = starts.new_tensor([1.0, -1.0])
+    coarse = torch.arange(_SHORTEST, _LONGEST, _STEP, dtype=starts.dtype, device=starts.device)
+    sizes, frequencies = fits(torch.cat([ends, coarse]), _ROWS[0])
+    (stated, reverse), reversed_tones, sizes, frequencies = sizes[:2], frequencies[1:2], sizes[2:], frequencies[2:]
+    if bool(reverse < torch.minimum(sizes.min(), _SMALLER * stated)):
+        return -1.0, reversed_tones
+    # a tone has the same phase after 1 / f more, so that several frame periods may agree: the next to 1 is probable
+    inner = (sizes[1:-1] < sizes[:-2]) & (sizes[1:-1] < sizes[2:])
+    minima = (inner.nonzero()[:, 0] + 1).tolist()
+    minima = sorted(minima, key=sizes.tolist().__getitem__)[:_MINIMA]
+    if not minima:
+        return None
+    factors, frequencies, step = coarse[minima], frequencies[minima], _STEP
+    for _ in range(_LEVELS):
+        around = step * torch.linspace(-1.0, 1.0, _POINTS, dtype=starts.dtype, device=starts.device)
+        near = factors[:, None] + around
+        sizes, found = fits(near.flatten(), _ROWS[1], frequencies.repeat_interleave(_POINTS, 0))
+        least, best = sizes.unflatten(0, near.shape).min(1)
+        factors = near.gather(1, best[:, None])[:, 0]
+        frequencies = found.unflatten(0, near.shape)[torch.arange(len(best), device=best.device), best]
+        step /= 4.0
+        if bool((least >= _SMALLER * stated).all()):
+            return None
+    distance = torch.where(least <= _EQUAL * least.min(), (factors - 1.0).abs(), torch.inf)
+    chosen = int(distance.argmin())
+    if bool(least[chosen] >= _SMALLER * stated):
+        return None
+    return float(factors[chosen]), frequencies[chosen : chosen + 1]
