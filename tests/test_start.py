@@ -19,7 +19,7 @@ from rsvib_torch.core.option_types import (
     PriorName,
     Registration,
 )
-from rsvib_torch.detection import detect
+from rsvib_torch.detection import pipeline
 from rsvib_torch.motion import recorded
 from rsvib_torch.registration.methods import BAND_METHODS
 from rsvib_torch.restoration.exact.priors import PRIORS
@@ -97,7 +97,7 @@ def test_names_of_options_are_those_of_the_tables():
     assert list(METHOD_SETTINGS) == list(METHODS)
     assert set(get_args(PriorName)) == set(PRIORS)
     assert set(get_args(Registration)) == set(BAND_METHODS)
-    assert set(get_args(DetectionMethod)) == set(detect._METHODS)
+    assert set(get_args(DetectionMethod)) == set(pipeline.METHODS)
     assert set(get_args(MotionUnit)) == {"px", *recorded._RADIANS}
     assert get_args(BadFrames) == ("pass", "skip")
 

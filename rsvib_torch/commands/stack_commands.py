@@ -49,11 +49,10 @@ from rsvib_torch.commands.options import (
 from rsvib_torch.commands.terminal import Answer, counting, error_line, note, running_command, working
 from rsvib_torch.commands.video_command import check_followed, followed_figure, is_followed, run_followed
 from rsvib_torch.config import Config
-from rsvib_torch.core.atomic import check_writable, whole_folder
+from rsvib_torch.core.atomic import check_writable, whole_folder, write_json
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames, BorderName
 from rsvib_torch.core.reading import check_regular
-from rsvib_torch.core.result_files import write_json
 from rsvib_torch.core.text import number_of, printable
 from rsvib_torch.core.validation import validate
 

@@ -5,15 +5,17 @@ import glob
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 try:
     import fcntl
 except ImportError:  # without it temporary folders of killed processes are not removed
     fcntl = None  # type: ignore[assignment]
+
+from rsvib_torch.core.text import json_text
 
 __all__ = [
     "check_kind",
@@ -28,6 +30,7 @@ __all__ = [
     "temporary_folder",
     "whole_file",
     "whole_folder",
+    "write_json",
 ]
 
 _SUFFIX = ".part"
@@ -212,6 +215,16 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         sync(part)
         os.replace(part, target)
         sync(target.absolute().parent)
+
+
+def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
+    """Write a table as JSON with one key per line, atomically.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    with whole_file(path) as part:
+        part.write_text(json_text(content) + "\n", encoding="utf-8")
 
 
 @contextmanager

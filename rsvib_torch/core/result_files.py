@@ -1,9 +1,7 @@
 """Files of results: JSON, which ``Result.load`` reads again, and pictures of figures; all replace a file as a whole."""
 
 import math
-import os
 import types
-from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
@@ -11,24 +9,13 @@ from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hin
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.text import json_text
+from rsvib_torch.core.atomic import whole_file, write_json
 from rsvib_torch.core.validation import read_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["load_result", "save_figure", "save_result", "write_json"]
-
-
-def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
-    """Write a table as JSON with one key per line, atomically.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
-    with whole_file(path) as part:
-        part.write_text(json_text(content) + "\n", encoding="utf-8")
+__all__ = ["load_result", "save_figure", "save_result"]
 
 
 def save_result(result: Any, path: Path) -> None:

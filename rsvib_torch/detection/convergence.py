@@ -2,6 +2,8 @@
 
 A round measures the rows around a motion and fits a motion to the measurements. ``Step`` is the difference of the two
 motions at the measured rows.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import itertools

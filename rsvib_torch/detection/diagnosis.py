@@ -1,8 +1,8 @@
 """Diagnosis of a wrong setting: another timing with which the frames agree, unlike the stated one.
 
 ``period_factor`` finds the frame period or the readout direction with which one tone along each axis explains the
-measured displacements of the rows. ``other_timings`` confirms it by a detection with that timing, and ``diagnose_timing`` is the
-same for users.
+measured displacements of the rows. ``other_timings`` confirms it by a detection with that timing, and
+``diagnose_timing`` is the same for users.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """

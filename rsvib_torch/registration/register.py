@@ -189,8 +189,8 @@ def check_frame_size(num_rows: int, width: int, options: RegistrationOptions) ->
     if not fits_frame(num_rows, width, options):
         raise ValueError(
             f"frames of {num_rows} x {width} px (rows in readout order x px per row) are too small for bands of "
-            f"{options.band_rows} rows searched over {options.search} px: at least {needed[0]} x {needed[1]} are needed; "
-            "reduce band_rows or search"
+            f"{options.band_rows} rows searched over {options.search} px: at least {needed[0]} x {needed[1]} are "
+            "needed; reduce band_rows or search"
         )
 
 

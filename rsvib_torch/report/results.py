@@ -10,9 +10,8 @@ from typing import Any, Literal
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.atomic import whole_file, write_json
 from rsvib_torch.core.presentation import AXIS_NAMES, plain_values
-from rsvib_torch.core.result_files import write_json
 from rsvib_torch.core.validation import read_json, validate
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.io.schema import DetectionRecord, TimingRecord, check_same_timing
