@@ -295,7 +295,7 @@ class VibrationDetector(nn.Module):
         >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
         >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
         >>> detector = rsv.VibrationDetector(timing, method="bands", tones=1)
-        >>> found = detector(torch.stack([frames, 0.5 * frames])[:, :, None])  # two stacks (B, T, C, H, W)
+        >>> found = detector(frames.expand(2, 1, *frames.shape).transpose(1, 2))  # two stacks (B, T, C, H, W)
         >>> found.vibration.frequency[..., 0].round(decimals=0).tolist()  # Hz, (B, 2)
         [[111.0, 90.0], [111.0, 90.0]]
     """

@@ -118,7 +118,7 @@ def diagnose_timing(
         >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=8, frame_rows=300)
         >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
         >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=4)
-        >>> stated = rsv.SensorTiming(row_time=40e-6, exposure_rows=8, frame_rows=280)
+        >>> stated = rsv.SensorTiming(row_time=40e-6, exposure_rows=8, frame_rows=310)
         >>> diagnosis = rsv.diagnose_timing(frames, stated)
         >>> diagnosis.setting, round(diagnosis.agreeing)
         ('frame_rows', 300)
