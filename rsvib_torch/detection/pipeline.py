@@ -23,7 +23,6 @@ from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_
 from rsvib_torch.detection.rows.measured_rows import strip_rows, whole_rows
 from rsvib_torch.detection.start import BandStart, band_start, field_start
 from rsvib_torch.detection.strips import FieldScale
-from rsvib_torch.detection.tones.aliasing import without_aliasing
 from rsvib_torch.detection.tones.fit import (
     MotionModel,
     ToneFit,
@@ -33,8 +32,8 @@ from rsvib_torch.detection.tones.fit import (
     vibration_of_fit,
     with_unknown_errors,
 )
-from rsvib_torch.detection.tones.further import with_further_tones
 from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones, robust_fit
+from rsvib_torch.detection.tones.uncertainty import with_further_tones, without_aliasing
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies

@@ -9,9 +9,8 @@ import torch
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
-from rsvib_torch.detection.tones.aliasing import without_aliasing
 from rsvib_torch.detection.tones.fit import displacement_std, fit_tones, vibration_of_fit
-from rsvib_torch.detection.tones.further import with_further_tones
+from rsvib_torch.detection.tones.uncertainty import with_further_tones, without_aliasing
 from rsvib_torch.motion.timing import RowTiming
 
 TIMING = RowTiming(row_time=1 / 24 / 110, exposure_rows=20, frame_rows=110)
