@@ -114,7 +114,7 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
         values: Tensors by name; None and names without a stated shape are omitted.
         shapes: Axes of a tensor: a size; a name for a size of at least 1 that is the same in all tensors, with its
             limits if there are any (``A=2-4``); ``...`` for leading dimensions that are the same in all tensors, or
-            ``[...]`` for these or none.
+            ``[...]`` for these or none. ``...`` alone, for values that are not tensors, is not checked.
 
     Example:
         >>> check_shapes({"scene": torch.zeros(3)}, {"scene": "... H W"})
@@ -125,7 +125,7 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
     known: dict[str, Any] = {}
     for name, stated in shapes.items():
         value = values.get(name)
-        if value is None:
+        if value is None or stated == "...":
             continue
         lead, axes = _stated_axes(stated)
         shape = tuple(value.shape)

@@ -159,7 +159,8 @@ class Result(Summarised):
 
     The decorator of the class needs ``repr=False``, so that objects print as their summary. Arguments of the class:
     ``units``, the units of its fields, which are written into files; ``shapes``, the axes of its tensors as in
-    ``check_shapes``; and ``file_format``, the first entry of its files, by default the name of the class.
+    ``check_shapes``, where ``"..."`` alone marks a tuple or table with one entry for each result of a batch; and
+    ``file_format``, the first entry of its files, by default the name of the class.
     """
 
     units: ClassVar[Mapping[str, str]] = {}
@@ -197,8 +198,49 @@ class Result(Summarised):
 
     @property
     def batch_shape(self) -> Sequence[int]:
-        """Leading dimensions of a batch of results; empty for one result."""
+        """Leading dimensions: empty for one result, (B,) for a batch of stacks."""
+        for name, stated in self.shapes.items():
+            value = getattr(self, name)
+            if stated.startswith("... ") and isinstance(value, Tensor):
+                return value.shape[: value.ndim + 1 - len(stated.split())]
         return ()
+
+    def _fields_of_batch(self) -> dict[str, Any]:
+        """Fields that have one entry for each result of a batch, by the leading dimensions that their shapes state."""
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if isinstance(value, Result)
+            or (value is not None and self.shapes.get(name, "").split(" ")[0] in ("...", "[...]"))
+        }
+
+    def __getitem__(self, index: int) -> Self:
+        """One result of a batch."""
+        if not self.batch_shape:
+            raise IndexError(f"this {type(self).__name__} is not a batch")
+        result = copy(self)
+        for name, value in self._fields_of_batch().items():
+            if isinstance(value, Tensor) and value.ndim < len(self.shapes[name].split()):
+                continue  # all results have it in common
+            selected = {k: v[index] for k, v in value.items()} if isinstance(value, dict) else value[index]
+            object.__setattr__(result, name, selected)
+        return result
+
+    @classmethod
+    def stacked(cls, results: Sequence[Self]) -> Self:
+        """Results of the same shape as a batch; the new dimension is the first. Other values are those of the first."""
+        result = copy(results[0])
+        for name, first in result._fields_of_batch().items():
+            values = [getattr(one, name) for one in results]
+            joined: Any = tuple(values)
+            if isinstance(first, Tensor):
+                joined = torch.stack(values)
+            elif isinstance(first, Result):
+                joined = type(first).stacked(values)
+            elif isinstance(first, dict):
+                joined = {key: torch.stack([value[key] for value in values]) for key in first}
+            object.__setattr__(result, name, joined)
+        return result
 
     def to_dict(self) -> dict[str, Any]:
         """All values as nested lists, numbers and texts, which JSON can store; None for numbers that are not finite."""

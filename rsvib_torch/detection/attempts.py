@@ -17,7 +17,7 @@ from rsvib_torch.detection.assemble import assembled
 from rsvib_torch.detection.diagnosis import other_timings
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
 from rsvib_torch.detection.reliability import rotation_possible
-from rsvib_torch.detection.result import DetectionResult, stacked
+from rsvib_torch.detection.result import DetectionResult
 from rsvib_torch.detection.start import strips_fit
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE
@@ -174,7 +174,9 @@ def detect_windows(
         frames = replace(stacks, images=stacks.images[:, part], valid=valid)
         return detect_tones(frames, timing, options, field, diagnose=False)
 
+    # 1. Each window by itself.
     results = [of_window(number, field) for number in range(len(windows))]
+    # 2. Windows with fewer components are detected again with those of the others.
     axes = max(result.vibration.num_axes for result in results)
     if axes > 2:
         same = replace(field, roll=True, zoom=axes > 3)
@@ -182,4 +184,8 @@ def detect_windows(
             result if result.vibration.num_axes == axes else of_window(number, same)
             for number, result in enumerate(results)
         ]
-    return stacked(results)
+    # 3. Tones that are missing in some windows have amplitude 0 there; the windows follow the stacks of the batch.
+    count = max(result.gain.shape[-1] for result in results)
+    results = [result.with_tones(count) for result in results]
+    of_stacks = [DetectionResult.stacked([result[i] for result in results]) for i in range(len(stacks.images))]
+    return DetectionResult.stacked(of_stacks)

@@ -15,7 +15,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
 
-__all__ = ["AttitudeTones", "DetectionResult", "OtherMotion", "TimingSensitivity", "stacked"]
+__all__ = ["AttitudeTones", "DetectionResult", "OtherMotion", "TimingSensitivity"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +80,6 @@ class TimingSensitivity(Result, shapes=_SENSITIVITY_SHAPES):
     frequency_by_frame_rows: Tensor
     frequency_by_exposure_rows: Tensor
 
-    @property
-    def batch_shape(self) -> torch.Size:
-        """Leading dimensions: empty for one result, (B,) for a batch of stacks or windows."""
-        return self.amplitude_by_row_time.shape[:-2]
-
     def summary(self) -> str:
         """Changes of the strongest tone of each axis if a time is stated 1 % larger."""
         rows = [
@@ -93,10 +88,6 @@ class TimingSensitivity(Result, shapes=_SENSITIVITY_SHAPES):
             for name in ("row_time", "frame_rows", "exposure_rows")
         ]
         return text_table([*axis_head(self.batch_shape), "1 % of", *(f"{of} (%)" for of in _TONE_VALUES)], rows)
-
-    def __getitem__(self, index: int) -> "TimingSensitivity":
-        """The part of one stack out of a batch."""
-        return TimingSensitivity(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -152,11 +143,6 @@ class AttitudeTones(
             turned(std.phase, ones, math.inf),
         )
 
-    @property
-    def batch_shape(self) -> torch.Size:
-        """Leading dimensions: empty for one result, (B,) for a batch of stacks or windows."""
-        return self.amplitude.shape[:-2]
-
     def summary(self) -> str:
         """The tones as a table; of a batch, the strongest of each axis."""
         shown = self.amplitude[..., : 1 if self.batch_shape else None]
@@ -178,7 +164,12 @@ class AttitudeTones(
 class DetectionResult(
     Result,
     units={**Vibration.units, "residual": "px", "gain": "px of offset per px of displacement", "offsets": "s and px"},
-    shapes={"gain": "... A K", "residual": "... A", "reliable": "... A", "fitted": "... P N A"},
+    shapes={
+        "gain": "... A K",
+        **dict.fromkeys(("residual", "reliable"), "... A"),
+        "fitted": "... P N A",
+        **dict.fromkeys(("reasons", "assumptions"), "..."),
+    },
     file_format="rsvib vibration",
 ):
     """A detected vibration with its uncertainty and verdict. Batches of stacks or windows lead all tensors.
@@ -238,11 +229,6 @@ class DetectionResult(
         if not shape and not all(isinstance(sentence, str) for sentence in self.assumptions):
             raise TypeError("assumptions must be texts")
 
-    @property
-    def batch_shape(self) -> torch.Size:
-        """Leading dimensions: empty for one result, (B,) for a batch of stacks or windows."""
-        return self.vibration.batch_shape
-
     def summary(self) -> str:
         """Tones of each axis with standard deviations, then the verdict; of a batch, a table with one row per axis."""
         return detection_summary(self)
@@ -301,68 +287,17 @@ class DetectionResult(
             sensitivity=of_tones(self.sensitivity),
         )
 
-    def __getitem__(self, index: int) -> "DetectionResult":
-        """The result of one stack out of a batch."""
-        return DetectionResult(
-            self.vibration[index],
-            self.std[index],
-            self.offsets[index],
-            self.fitted[index],
-            self.gain[index],
-            self.residual[index],
-            self.reliable[index],
-            self.reasons[index],
-            self.sensitivity[index],
-            self.assumptions[index],
-            self.timing,
+    def with_tones(self, count: int) -> "DetectionResult":
+        """The result with ``count`` tones on each axis; those that it does not have are 0."""
+
+        def padded(values: Tensor) -> Tensor:
+            missing = count - self.gain.shape[-1]
+            return functional.pad(values, (0, missing)) if values.shape == self.gain.shape else values
+
+        return replace(
+            self,
+            vibration=self.vibration.mapped(padded),
+            std=self.std.mapped(padded),
+            gain=padded(self.gain),
+            sensitivity=self.sensitivity.mapped(padded),
         )
-
-
-def stacked(results: list[DetectionResult]) -> DetectionResult:
-    """Results of the windows of a batch of stacks as one result (B, number of windows, ...).
-
-    Tones that are missing in some windows have amplitude 0 there.
-    """
-    tones = max(result.gain.shape[-1] for result in results)
-
-    def joined(values: list[Tensor]) -> Tensor:
-        return torch.stack(values, dim=1)
-
-    def padded(values: list[Tensor]) -> Tensor:
-        return joined([functional.pad(value, (0, tones - value.shape[-1])) for value in values])
-
-    def parameters(parts: list[Any], kind: type[Any]) -> dict[str, Tensor]:
-        values = {
-            field.name: [getattr(part, field.name) for part in parts]
-            for field in fields(kind)
-            if field.name != "camera"
-        }
-        of_axes = ("image_motion", "image_acceleration", "displacement")  # the others have an entry for each tone
-        return {name: joined(v) if name in of_axes else padded(v) for name, v in values.items()}
-
-    curves = [result.offsets for result in results]
-    batch = curves[0].offsets.shape[0]
-    return DetectionResult(
-        vibration=Vibration(
-            **parameters([result.vibration for result in results], Vibration), camera=results[0].vibration.camera
-        ),
-        std=VibrationStd(**parameters([result.std for result in results], VibrationStd)),
-        offsets=OffsetCurve(
-            curves[0].pairs,
-            curves[0].rows,
-            joined([curve.times.expand(batch, -1, -1) for curve in curves]),
-            joined([curve.later_times.expand(batch, -1, -1) for curve in curves]),
-            joined([curve.offsets for curve in curves]),
-            joined([curve.quality for curve in curves]),
-            curves[0].heights,
-            joined([curve.std for curve in curves if curve.std is not None]) if curves[0].std is not None else None,
-        ),
-        fitted=joined([result.fitted for result in results]),
-        gain=padded([result.gain for result in results]),
-        residual=joined([result.residual for result in results]),
-        reliable=joined([result.reliable for result in results]),
-        reasons=tuple(tuple(result.reasons[index] for result in results) for index in range(batch)),
-        sensitivity=TimingSensitivity(**parameters([result.sensitivity for result in results], TimingSensitivity)),
-        assumptions=tuple(tuple(result.assumptions[index] for result in results) for index in range(batch)),
-        timing=results[0].timing,
-    )

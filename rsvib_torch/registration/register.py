@@ -83,11 +83,6 @@ class OffsetCurve(
     heights: tuple[int, int]
     std: Tensor | None = None
 
-    @property
-    def batch_shape(self) -> torch.Size:
-        """Leading dimensions: empty for one curve."""
-        return self.offsets.shape[:-3]
-
     def summary(self) -> str:
         """Number of offsets, and their range along each axis."""
         pairs, rows = self.quality.shape[-2:]
@@ -106,14 +101,6 @@ class OffsetCurve(
     def good(self) -> Tensor:
         """(..., P, N) bool: bands whose offset was measured."""
         return torch.isfinite(self.offsets).all(-1)
-
-    def __getitem__(self, index: int) -> "OffsetCurve":
-        """The curve of one stack of a batch."""
-        if self.offsets.ndim == 3:
-            raise IndexError("this offset curve is not a batch")
-        names = ["offsets", "quality"] + ["times", "later_times"] * (self.times.ndim > 2)
-        names += ["std"] * (self.std is not None)
-        return replace(self, **{name: getattr(self, name)[index] for name in names})
 
 
 @checks_arguments

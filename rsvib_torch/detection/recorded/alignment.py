@@ -22,6 +22,11 @@ from rsvib_torch.detection.rows.displacements import frame_groups, measure_group
 from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
 from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.frames.grey import grey_frames
+from rsvib_torch.frames.orientation import (
+    magnitudes_from_row_order,
+    offsets_from_row_order,
+    sequence_from_row_order,
+)
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.gyroscope_rates import AngularRates
@@ -265,14 +270,9 @@ def align_motion(
     offset_std = float((gradient @ covariance[:2, :2] @ gradient / independent).clamp(min=0.0).sqrt())
     rest = measured.unexplained(residual)[0]
     reasons = _reasons(rest, rms_motion(measured, aligned), other)
-    swap = timing.scan_axis == -1
-    sign = -1.0 if timing.readout_direction == "reverse" else 1.0
-    drift = (clock.drift[0], sign * clock.drift[1])
-    in_image = replace(
-        clock,
-        gain=(clock.gain[1], clock.gain[0]) if swap else clock.gain,
-        drift=(drift[1], drift[0]) if swap else drift,
-    )
+    drift = offsets_from_row_order(torch.tensor(clock.drift, dtype=torch.float64, device="cpu"), timing)
+    gain_x, gain_y = sequence_from_row_order(clock.gain, timing)
+    in_image = replace(clock, gain=(gain_x, gain_y), drift=(float(drift[0]), float(drift[1])))
     return ClockAlignment(
         motion=in_image.motion(recorded),
         offset=clock.offset,
@@ -280,8 +280,8 @@ def align_motion(
         scale=clock.scale,
         scale_std=float(std[1]),
         gain=in_image.gain,
-        drift=torch.tensor(in_image.drift, dtype=torch.float64, device="cpu"),
-        unexplained=rest.flip(-1) if swap else rest,
+        drift=drift,
+        unexplained=magnitudes_from_row_order(rest, timing),
         reliable=not reasons,
         reasons=tuple(reasons),
     )

@@ -35,7 +35,7 @@ from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.row_spectra import MARGIN
 
-__all__ = ["MeasuredRows", "RowRecord", "strip_rows", "whole_rows"]
+__all__ = ["MeasuredRows", "RowRecord", "StripRows", "strip_rows", "whole_rows"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,17 +25,16 @@ from rsvib_torch.core.splines import bspline_weights, gauss_legendre
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.reliability import against_rotation
-from rsvib_torch.detection.rows.displacements import (
-    differential_motion,
-    frame_groups,
-    measure_groups,
-    stack_spectra,
-)
-from rsvib_torch.detection.rows.measured_rows import strip_rows
+from rsvib_torch.detection.rows.displacements import frame_groups, stack_spectra
+from rsvib_torch.detection.rows.measured_rows import MeasuredRows, RowRecord, StripRows, strip_rows
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
-from rsvib_torch.frames.orientation import offsets_from_row_order
+from rsvib_torch.frames.orientation import (
+    magnitudes_from_row_order,
+    offsets_from_row_order,
+    sequence_from_row_order,
+)
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
@@ -68,6 +67,7 @@ class MotionDetection(
         "times": "T R",
         **dict.fromkeys(("displacement", "std"), "... T R A"),
         **dict.fromkeys(("std_seen", "unseen", "unexplained", "reliable"), "... A"),
+        "reasons": "...",
     },
 ):
     """A motion of any shape with its uncertainty. A batch of stacks leads all tensors but ``times``.
@@ -115,11 +115,6 @@ class MotionDetection(
     reliable: Tensor
     reasons: tuple[Any, ...]
 
-    @property
-    def batch_shape(self) -> torch.Size:
-        """Leading dimensions: empty for one result, (B,) for a batch of stacks."""
-        return self.std_seen.shape[:-1]
-
     def summary(self) -> str:
         """Size of the motion of each axis with its standard deviations, and the verdict."""
         size = self.displacement.square().mean((-3, -2)).sqrt()
@@ -130,11 +125,6 @@ class MotionDetection(
         unit = ("px", "px; roll: rad", "px; roll: rad; zoom: 1")[size.shape[-1] - 2]
         head = (f"displacement ({unit}, rms)", f"± between frames ({unit})", f"± common to all ({unit})")
         return "\n".join(verdict_table(head, rows, self.batch_shape, self.reliable, self.reasons))
-
-    def __getitem__(self, index: int) -> "MotionDetection":
-        """The result of one stack out of a batch."""
-        rest = {name: getattr(self, name)[index] for name in self.__dataclass_fields__ if name != "times"}
-        return replace(self, **rest)
 
 
 @outside_graphs
@@ -224,15 +214,7 @@ def detect_motion(
     camera = camera_in_row_order(focal_length, principal_point, distortion, (height, width), timing)
     scale = FieldScale(axes, width, height, camera)
     results = [_detect(stacks.one(i), timing, bands, knot_rows, iterations, scale) for i in range(len(stacks.images))]
-    if not stacks.batched:
-        return results[0]
-    names = ("displacement", "std", "std_seen", "unseen", "unexplained", "reliable")
-    return MotionDetection(
-        motion=FreeMotion.stacked([one.motion for one in results]),
-        times=results[0].times,
-        reasons=tuple(one.reasons for one in results),
-        **{name: torch.stack([getattr(one, name) for one in results]) for name in names},
-    )
+    return MotionDetection.stacked(results) if stacks.batched else results[0]
 
 
 def _detect(
@@ -248,23 +230,23 @@ def _detect(
     longest = math.floor((record[1] - record[0]) / rowwise.row_time)
     if knot_rows > longest:
         raise ValueError(f"knot_rows must be at most {longest}, the row times of the stack, got {knot_rows}")
-    size, axes = (scale.height, scale.width), scale.axes
-    measured, motion, spacing, apart = measure_freely(stack, rowwise, curve, record, bands, knot_rows, iterations)
+    rows, motion, spacing = measure_freely(stack, rowwise, curve, record, bands, knot_rows, iterations)
     if not scale.same_for_all_columns:
-        measured, motion, apart = _measure_field(stack, rowwise, motion, spacing, record, scale, iterations)
+        rows, motion = _measure_field(stack, rowwise, motion, spacing, record, scale, iterations)
+    measured = rows.measurements
     residual = residual_of_motion(measured, motion[0])
     weighed = measured.reweighted(residual)
     share = weighed.independent_fraction(residual) * measured.share_counted(residual)
     fit = _fit_spline(replace(weighed, independent=share), spacing, record, learn=True)
-    motion = _motion(fit, size, 0.25)
+    motion = _motion(fit, (0.25 * scale.width, 0.25 * scale.height))  # px; beyond, frames share too little
     starts = rowwise.frame_starts(stack.images.shape[1], stack.images.device)
     banded = measurements_of_curve(curve, rowwise, bands.band_step)
     of_middle: Motion = motion
     if not scale.same_for_all_columns:
         middle = torch.zeros(1, dtype=torch.float64, device=starts.device)
-        of_middle = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), size[0])
-    of_bands = [*bands_reasons(banded, of_middle[0]), [], []][:axes]
-    return _report(motion[0], fit, measured, timing, starts, scale, of_bands, apart)
+        of_middle = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), scale.height)
+    of_bands = [*bands_reasons(banded, of_middle[0]), [], []][: scale.axes]
+    return _report(motion[0], fit, measured, timing, starts, scale, of_bands, rows.differential()[0])
 
 
 def _measure_field(
@@ -275,28 +257,53 @@ def _measure_field(
     record: tuple[float, float],
     scale: FieldScale,
     iterations: int,
-) -> tuple[Measurements, FreeMotion, Tensor]:
-    """``measure_freely`` with roll and zoom, from a motion without them; all components in px.
+) -> tuple[RowRecord, FreeMotion]:
+    """``measure_freely`` with roll and zoom, from a motion without them; all components in px."""
+    still = torch.zeros_like(start.coefficients[:, :1]).expand(-1, scale.axes - 2, -1)
+    drift = torch.cat([start.image_motion, start.image_motion.new_zeros(1, scale.axes - 2)], -1)
+    tones = Vibration(torch.zeros(1, scale.axes, 1), 0.0, 0.0, drift)
+    motion = FreeMotion(torch.cat([start.coefficients, still], 1), start.start, start.spacing, tones)
+
+    def strips_for(motion: FreeMotion) -> StripRows:
+        return strip_rows(stack.images, stack.valid, timing, motion, scale, pairs_if_blurred_differently=False)
+
+    # strips follow the size of roll and zoom, which are unknown in the first round
+    rows, motion = _rounds(strips_for(motion), motion, spacing, record, 1)
+    if iterations == 1:
+        return rows, motion
+    return _rounds(strips_for(motion), motion, spacing, record, iterations - 1, weighted=True)
+
+
+def _rounds(
+    rows: MeasuredRows,
+    motion: FreeMotion,
+    spacing: float,
+    record: tuple[float, float],
+    count: int,
+    *,
+    weighted: bool = False,
+) -> tuple[RowRecord, FreeMotion]:
+    """Rounds of measuring the rows of one stack around a spline and fitting the spline to them.
+
+    Args:
+        rows: The frames.
+        motion: The first motion, a batch of one.
+        spacing: Seconds between knots.
+        record: Start and end of the record in seconds.
+        count: Number of rounds.
+        weighted: Whether objects that move by themselves get less weight in the first round; they do in the others.
 
     Returns:
-        The measurements, the motion, and the rms difference (2,) in px of the displacements along a row that it does
-        not explain.
+        The measurements of the last round with their weights, and the motion.
     """
-    motion, size = start, (scale.height, scale.width)
-    for number in range(iterations):
-        if motion.num_axes == 2:
-            still = torch.zeros_like(motion.coefficients[:, :1]).expand(-1, scale.axes - 2, -1)
-            drift = torch.cat([motion.image_motion, motion.image_motion.new_zeros(1, scale.axes - 2)], -1)
-            tones = Vibration(torch.zeros(1, scale.axes, 1), 0.0, 0.0, drift)
-            motion = FreeMotion(torch.cat([motion.coefficients, still], 1), motion.start, motion.spacing, tones)
-        if number < 2:  # strips follow the size of roll and zoom, which are unknown in the first round
-            rows = strip_rows(stack.images, stack.valid, timing, motion, scale, pairs_if_blurred_differently=False)
-        rows_record = rows.measure(motion)
-        measured = rows_record.measurements
-        if number:
-            measured = measured.reweighted(residual_of_motion(measured, motion[0]))
-        motion = _motion(_fit_spline(measured, spacing, record), size, 0.0)
-    return measured, motion, rows_record.differential()[0]
+    for number in range(count):
+        measured = rows.measure(motion)
+        measurements = measured.measurements
+        if number or weighted:
+            measurements = measurements.reweighted(residual_of_motion(measurements, motion[0]))
+        # while iterating, any drift is an image motion, which the scene rows of the groups follow
+        motion = _motion(_fit_spline(measurements, spacing, record))
+    return replace(measured, measurements=measurements), motion
 
 
 def measure_freely(
@@ -307,7 +314,7 @@ def measure_freely(
     bands: RegistrationOptions,
     knot_rows: int,
     iterations: int,
-) -> tuple[Measurements, FreeMotion, float, Tensor]:
+) -> tuple[RowRecord, FreeMotion, float]:
     """Displacements of the rows of one stack, measured around a spline that is fitted to them again in every round.
 
     Args:
@@ -320,24 +327,14 @@ def measure_freely(
         iterations: Rounds of measuring and fitting.
 
     Returns:
-        The measurements, the motion (a batch of one), its knot spacing in seconds, and the rms difference (2,) in px of
-        the displacements of the halves of the rows.
+        The measurements, the motion (a batch of one), and its knot spacing in seconds.
     """
-    grey = stack.images
     spacing = max(knot_rows * timing.row_time, (record[1] - record[0]) / 3000)  # the cost grows with knots^3
-    size = (grey.shape[-2], grey.shape[-1])
     measured = measurements_of_curve(curve, timing, bands.band_step)
     fit = _fit_spline(measured, max(spacing, 0.5 * bands.band_rows * timing.row_time), record)
-    # while iterating, any drift is an image motion, which the scene rows of the groups follow
-    motion = _motion(fit, size, 0.0)
-    groups = frame_groups(stack_spectra(grey, stack.valid), timing, motion)
-    for step in range(iterations):
-        measured, gradients = measure_groups(groups, timing, motion)
-        if step:  # objects that move by themselves get less weight
-            measured = measured.reweighted(residual_of_motion(measured, motion[0]))
-        fit = _fit_spline(measured, spacing, record)
-        motion = _motion(fit, size, 0.0)
-    return measured, motion, spacing, differential_motion(gradients)[0]
+    motion = _motion(fit)
+    rows = MeasuredRows(frame_groups(stack_spectra(stack.images, stack.valid), timing, motion), timing)
+    return *_rounds(rows, motion, spacing, record, iterations), spacing
 
 
 def start_curve(
@@ -407,13 +404,12 @@ def unexplained_reason(residual: Tensor, moved: Tensor, model: str) -> list[str]
     return [f"rows move by {float(residual):.3g} px that no {model} explains"]
 
 
-def _motion(fit: "_SplineFit", size: tuple[int, int], frames: float) -> FreeMotion:
-    """The spline as a batch of one motion; a drift by more than ``frames`` frame sizes becomes its image motion."""
+def _motion(fit: "_SplineFit", largest_drift: tuple[float, float] = (0.0, 0.0)) -> FreeMotion:
+    """The spline as a batch of one motion; a drift by more than ``largest_drift`` px becomes its image motion."""
     knots = fit.knots
     centred = knots - knots.mean()
     speed = (fit.coefficients * centred).sum(-1) / centred.square().sum()
-    extent = torch.tensor([size[1], size[0]], dtype=torch.float64, device=knots.device)
-    large = speed[:2].abs() * float(knots[-1] - knots[0]) > frames * extent
+    large = speed[:2].abs() * float(knots[-1] - knots[0]) > speed.new_tensor(largest_drift)
     speed = torch.where(functional.pad(large, (0, len(speed) - 2)), speed, 0.0)  # none of roll and zoom
     drift = Vibration(torch.zeros_like(speed)[None, :, None], 0.0, 0.0, speed[None])
     return FreeMotion((fit.coefficients - speed[:, None] * knots)[None], fit.start, fit.spacing, drift)
@@ -647,18 +643,17 @@ def _report(
             )
         reasons.append(tuple(against))
     reliable = torch.tensor([not against for against in reasons], device=rest.device)
-    order = ([1, 0, 2, 3] if timing.scan_axis == -1 else [0, 1, 2, 3])[: scale.axes]
     units = scale.units(value)
     return MotionDetection(
         motion=scale.free_motion(motion).from_row_order(timing),
         times=times,
         displacement=offsets_from_row_order(value * units, timing),
-        std=(std * units)[..., order],
-        std_seen=(std_seen * units)[order],
-        unseen=(unseen * units)[order],
-        unexplained=(rest * units)[order],
-        reliable=reliable[order],
-        reasons=tuple(reasons[axis] for axis in order),
+        std=magnitudes_from_row_order(std * units, timing),
+        std_seen=magnitudes_from_row_order(std_seen * units, timing),
+        unseen=magnitudes_from_row_order(unseen * units, timing),
+        unexplained=magnitudes_from_row_order(rest * units, timing),
+        reliable=magnitudes_from_row_order(reliable, timing),
+        reasons=sequence_from_row_order(reasons, timing),
     )
 
 

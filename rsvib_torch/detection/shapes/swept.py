@@ -27,6 +27,11 @@ from rsvib_torch.detection.shapes.free import (
 )
 from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
+from rsvib_torch.frames.orientation import (
+    magnitudes_from_row_order,
+    offsets_from_row_order,
+    sequence_from_row_order,
+)
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -56,7 +61,8 @@ class SweptTone(
         "image_motion": "px/s",
         "unexplained": "px",
     },
-    shapes=dict.fromkeys((*_TONE, "image_motion", "unexplained", "reliable"), "... 2"),
+    shapes=dict.fromkeys((*_TONE, "image_motion", "unexplained", "reliable"), "... 2")
+    | {"std": "...", "reasons": "..."},
 ):
     """One tone an axis that decays and sweeps: ``A exp(-g t) sin(2 pi (f t + c t^2 / 2) + phi) + v t``.
 
@@ -107,11 +113,6 @@ class SweptTone(
             raise ValueError(f"std must have the keys {', '.join(_TONE)}, got {', '.join(map(str, self.std))}")
         check_shapes({"amplitude": self.amplitude, **{f"std[{name!r}]": self.std[name] for name in _TONE}}, _STD_SHAPES)
 
-    @property
-    def batch_shape(self) -> torch.Size:
-        """Leading dimensions: empty for one result, (B,) for a batch of stacks."""
-        return self.amplitude.shape[:-1]
-
     def summary(self) -> str:
         """The tone of each axis with standard deviations, and the verdict; of a batch, amplitudes and frequencies."""
 
@@ -124,11 +125,6 @@ class SweptTone(
         rows = [[*labels, text("amplitude", at), text("frequency", at)] for at, labels in axis_rows(self.batch_shape)]
         head = ("amplitude (px)", "frequency (Hz)")
         return "\n".join(verdict_table(head, rows, self.batch_shape, self.reliable, self.reasons))
-
-    def __getitem__(self, index: int) -> "SweptTone":
-        """The result of one stack out of a batch."""
-        rest = {name: getattr(self, name)[index] for name in self.__dataclass_fields__ if name != "std"}
-        return SweptTone(**rest, std={name: value[index] for name, value in self.std.items()})
 
 
 @outside_graphs
@@ -197,15 +193,7 @@ def detect_swept_tone(
     fitted = [_detect(stacks.one(index), timing, bands, iterations) for index in range(len(stacks.images))]
     step = min(_step(one.fits, one.record, timing) for one in fitted)  # motions of a batch have common knots
     tones = [_report(one, timing, step) for one in fitted]
-    if not stacks.batched:
-        return tones[0]
-    names = (*_TONE, "image_motion", "unexplained", "reliable")
-    return SweptTone(
-        **{name: torch.stack([getattr(tone, name) for tone in tones]) for name in names},
-        std={name: torch.stack([tone.std[name] for tone in tones]) for name in tones[0].std},
-        motion=FreeMotion.stacked([tone.motion for tone in tones]),
-        reasons=tuple(tone.reasons for tone in tones),
-    )
+    return SweptTone.stacked(tones) if stacks.batched else tones[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -492,15 +480,14 @@ def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
         against += fitted.against[axis] if present else []
         against += unexplained_reason(fitted.unexplained[axis], fitted.moved[axis], "swept tone")
         reasons.append(tuple(against))
-    drift = fitted.fits[:, 5] * fitted.fits.new_tensor([1.0, -1.0 if reverse else 1.0])
-    order = [1, 0] if timing.scan_axis == -1 else [0, 1]
-    reliable = torch.tensor([not against for against in reasons], device=drift.device)
+    reliable = torch.tensor([not against for against in reasons], device=fitted.fits.device)
+    parameters, deviations = (magnitudes_from_row_order(torch.stack(x, -1), timing) for x in (values, stds))
     return SweptTone(
-        **dict(zip(_TONE, torch.stack(values)[order].unbind(-1), strict=True)),
-        image_motion=drift[order],
-        std=dict(zip(_TONE, torch.stack(stds)[order].unbind(-1), strict=True)),
+        **dict(zip(_TONE, parameters, strict=True)),
+        image_motion=offsets_from_row_order(fitted.fits[:, 5], timing),
+        std=dict(zip(_TONE, deviations, strict=True)),
         motion=_motion(fitted.fits, fitted.record, step).from_row_order(timing),
-        unexplained=fitted.unexplained[order],
-        reliable=reliable[order],
-        reasons=tuple(reasons[axis] for axis in order),
+        unexplained=magnitudes_from_row_order(fitted.unexplained, timing),
+        reliable=magnitudes_from_row_order(reliable, timing),
+        reasons=sequence_from_row_order(reasons, timing),
     )

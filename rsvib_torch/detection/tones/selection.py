@@ -1,7 +1,5 @@
 """Number of tones: added one by one, strongest first, while they are significant, with weights against outliers."""
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -67,8 +65,8 @@ def robust_fit(
     for _ in range(steps - 1):
         rough, residual = fit_roughly(measurements.reweighted(residual), frequencies, active, model)
         frequencies = rough.frequencies
-    weighed = measurements.reweighted(residual)
-    return fit_tones(weighed, frequencies, active, model, iterations), weighed
+    weighted = measurements.reweighted(residual)
+    return fit_tones(weighted, frequencies, active, model, iterations), weighted
 
 
 def typical_size(measurements: Measurements, fit: ToneFit) -> Tensor:
@@ -109,69 +107,103 @@ def find_tones(
     Returns:
         The fit, with K the largest number of tones of any axis (at least 1).
     """
-    model = model or MotionModel()
     search = _Search(
-        measurements, sample_interval, model, least_gain, accuracy, stretches and start is None, iterations
+        measurements,
+        sample_interval,
+        tones,
+        model or MotionModel(),
+        least_gain,
+        start,
+        accuracy,
+        stretches=stretches and start is None,
+        iterations=iterations,
     )
-    axes = measurements.displacements.shape[-1]
-    shape = (len(measurements.exposure_starts), axes, model.harmonics)
-    none = measurements.exposure_starts.new_zeros(shape, dtype=torch.bool)
-    open_axes = torch.ones_like(none[..., 0])  # (B, 2), those that may need a further tone
-    if start is None:
-        accepted, (fit, weighed) = none[..., :0], search.refitted(none.double(), none)
-    else:
-        accepted, given = start.active, residual_of(measurements, start)
-        fit, weighed = search.refitted(start.frequencies, accepted, given)
-        if accuracy:  # a tone of roll in bands of strips is found as a tone of x or y otherwise
-            open_axes = ~accepted.any(-1)
-
-    def with_one_more(axes: Tensor) -> Tensor:
-        """Accepted tones and a further one (or family) of the axes (B, 2) that need it."""
-        return torch.cat([accepted, axes[..., None].expand(-1, -1, model.harmonics)], -1)
-
-    for _ in range(MAX_TONES if tones is not None else MAX_TONES - accepted.shape[-1] // model.harmonics):
-        if tones is not None:  # roll and zoom may have fewer tones than x and y to start with
-            open_axes = accepted.sum(-1) < tones * model.harmonics
-        residual = residual_of(measurements, fit)
-        if accepted.shape[-1] > 0:
-            open_axes = open_axes & search.inexact(residual)
-        if not bool(open_axes.any()):
-            break
-        active = with_one_more(open_axes)
-        candidate = search.candidate(weighed, fit, residual, active)
-        if tones is None and start is not None and accepted.shape[-1] > 0:
-            # most further tones fail the F-test by far, and are not fitted exactly; offsets of bands need exact fits
-            open_axes = open_axes & search.decreases(weighed, active, residual, candidate[1], share=0.25)
-            if not bool(open_axes.any()):
-                break
-            active = with_one_more(open_axes)
-        trial, trial_weighed = search.trial(weighed, fit, residual, active, candidate)
-        if tones is None:
-            # both fits are compared with the weights of the richer one
-            passed = search.decreases(trial_weighed, active, residual, residual_of(measurements, trial))
-            first = accepted.shape[-1] == 0  # kept even if nearly blind, for the verdict
-            passed = open_axes & passed & _resolved(measurements, trial) & (search.visible(trial) | first)
-            while bool(passed.any()) and not bool((passed == open_axes).all()):
-                open_axes = passed
-                trial, trial_weighed = search.refitted(trial.frequencies, with_one_more(open_axes))
-                passed = passed & (search.visible(trial) | first)
-            if not bool(passed.any()):
-                break
-        fit, weighed, accepted = trial, trial_weighed, trial.active
-    return fit if blind is None or tones is not None else _with_blind_tones(measurements, weighed, fit, blind)
+    while search.step():
+        pass
+    if blind is None or tones is not None:
+        return search.fit
+    return _with_blind_tones(measurements, search.weighted, search.fit, blind)
 
 
-@dataclass(frozen=True, eq=False)
 class _Search:
-    """What all steps of ``find_tones`` share; see its arguments."""
+    """State of ``find_tones``, whose arguments it has.
 
-    measurements: Measurements
-    sample_interval: float
-    model: MotionModel
-    least_gain: float
-    accuracy: float
-    stretches: bool
-    iterations: int
+    Attributes:
+        fit: The fit with the tones that are accepted.
+        weighted: The measurements with its weights.
+        open_axes: (B, 2) bool, axes that may need a further tone.
+    """
+
+    def __init__(
+        self,
+        measurements: Measurements,
+        sample_interval: float,
+        tones: int | None,
+        model: MotionModel,
+        least_gain: float,
+        start: ToneFit | None,
+        accuracy: float,
+        *,
+        stretches: bool,
+        iterations: int,
+    ) -> None:
+        self.measurements, self.sample_interval, self.tones, self.model = measurements, sample_interval, tones, model
+        self.least_gain, self.accuracy = least_gain, accuracy
+        self.stretches, self.iterations, self.has_start = stretches, iterations, start is not None
+        stacks, axes = len(measurements.exposure_starts), measurements.displacements.shape[-1]
+        if start is None:
+            none = measurements.exposure_starts.new_zeros((stacks, axes, model.harmonics), dtype=torch.bool)
+            self.accepted = none[..., :0]
+            self.fit, self.weighted = self.refitted(none.double(), none)
+        else:
+            self.accepted = start.active
+            residual = residual_of(measurements, start)
+            self.fit, self.weighted = self.refitted(start.frequencies, start.active, residual)
+        self.open_axes = torch.ones_like(self.fit.active[..., 0])
+        if start is not None and accuracy:  # a tone of roll in bands of strips is found as a tone of x or y otherwise
+            self.open_axes = ~start.active.any(-1)
+        self._remaining = MAX_TONES - (self.accepted.shape[-1] // model.harmonics if tones is None else 0)
+
+    def step(self) -> bool:
+        """Add a tone to the axes that need it; False if no axis does, or none is significant."""
+        self._remaining -= 1
+        if self._remaining < 0:
+            return False
+        # 1. The axes that need a further tone: those with fewer tones than requested, or with a large residual.
+        first = self.accepted.shape[-1] == 0
+        if self.tones is not None:  # roll and zoom may have fewer tones than x and y to start with
+            self.open_axes = self.accepted.sum(-1) < self.tones * self.model.harmonics
+        residual = residual_of(self.measurements, self.fit)
+        if not first:
+            self.open_axes = self.open_axes & self.is_inexact(residual)
+        if not bool(self.open_axes.any()):
+            return False
+        # 2. The best candidate, fitted roughly. Most further tones fail the F-test by far, and are not fitted exactly;
+        # offsets of bands need exact fits.
+        rough = self.candidate(residual, self.with_one_more())
+        if self.tones is None and self.has_start and not first:
+            self.open_axes = self.open_axes & self.decreases(self.weighted, residual, rough[1], share=0.25)
+            if not bool(self.open_axes.any()):
+                return False
+        # 3. The exact fit with it.
+        fit, weighted = self.fitted(residual, rough)
+        # 4. Accept it on the axes where it is significant, resolved and visible; the first one is kept even if it is
+        # nearly blind, for the verdict. Both fits are compared with the weights of the richer one.
+        if self.tones is None:
+            passed = self.decreases(weighted, residual, residual_of(self.measurements, fit))
+            passed = self.open_axes & passed & _resolved(self.measurements, fit) & (self.is_visible(fit) | first)
+            while bool(passed.any()) and not bool((passed == self.open_axes).all()):
+                self.open_axes = passed
+                fit, weighted = self.refitted(fit.frequencies, self.with_one_more())
+                passed = passed & (self.is_visible(fit) | first)
+            if not bool(passed.any()):
+                return False
+        self.fit, self.weighted, self.accepted = fit, weighted, fit.active
+        return True
+
+    def with_one_more(self) -> Tensor:
+        """(B, 2, K) bool, the accepted tones and a further one (or family) of the axes that need it."""
+        return torch.cat([self.accepted, self.open_axes[..., None].expand(-1, -1, self.model.harmonics)], -1)
 
     def refitted(
         self, frequencies: Tensor, active: Tensor, residual: Tensor | None = None
@@ -179,50 +211,41 @@ class _Search:
         """``robust_fit`` of all measurements."""
         return robust_fit(self.measurements, frequencies, active, self.model, residual, iterations=self.iterations)
 
-    def candidate(
-        self, weighed: Measurements, fit: ToneFit, residual: Tensor, active: Tensor, *, leave_out: bool = False
-    ) -> tuple[ToneFit, Tensor]:
+    def candidate(self, residual: Tensor, active: Tensor, *, leave_out: bool = False) -> tuple[ToneFit, Tensor]:
         """``best_candidate``: a rough fit with a further tone, and its residual."""
-        interval = self.sample_interval
-        return best_candidate(self.measurements, weighed, fit, residual, active, interval, leave_out=leave_out)
+        return best_candidate(
+            self.measurements, self.weighted, self.fit, residual, active, self.sample_interval, leave_out=leave_out
+        )
 
-    def trial(
-        self,
-        weighed: Measurements,
-        fit: ToneFit,
-        residual: Tensor,
-        active: Tensor,
-        candidate: tuple[ToneFit, Tensor],
-    ) -> tuple[ToneFit, Measurements]:
+    def fitted(self, residual: Tensor, rough: tuple[ToneFit, Tensor]) -> tuple[ToneFit, Measurements]:
         """The fit with a further tone, of all rows or without a stretch, and the measurements with its weights."""
-        trial, trial_weighed = self.refitted(candidate[0].frequencies, active, candidate[1])
+        active = self.with_one_more()
+        fit, weighted = self.refitted(rough[0].frequencies, active, rough[1])
         if not self.stretches:
-            return trial, trial_weighed
-        after = residual_of(self.measurements, trial)
-        disturbed = _disturbed(self.measurements, after) & self.inexact(after).any(-1)
+            return fit, weighted
+        after = residual_of(self.measurements, fit)
+        disturbed = _disturbed(self.measurements, after) & self.is_inexact(after).any(-1)
         if not bool(disturbed.any()):
-            return trial, trial_weighed
-        candidate = self.candidate(weighed, fit, residual, active, leave_out=True)
-        other, other_weighed = self.refitted(candidate[0].frequencies, active, candidate[1])
-        better = disturbed & (typical_size(self.measurements, other) < typical_size(self.measurements, trial))
-        return select_stacks(better, other, trial), select_stacks(better, other_weighed, trial_weighed)
+            return fit, weighted
+        rough = self.candidate(residual, active, leave_out=True)
+        other, other_weighted = self.refitted(rough[0].frequencies, active, rough[1])
+        better = disturbed & (typical_size(self.measurements, other) < typical_size(self.measurements, fit))
+        return select_stacks(better, other, fit), select_stacks(better, other_weighted, weighted)
 
-    def visible(self, fit: ToneFit) -> Tensor:
+    def is_visible(self, fit: ToneFit) -> Tensor:
         """(B, 2) bool, whether the last tone (or family) of each axis is visible."""
         return visibility(self.measurements, fit.frequencies[..., -self.model.harmonics :]) > 0.5
 
-    def inexact(self, residual: Tensor) -> Tensor:
+    def is_inexact(self, residual: Tensor) -> Tensor:
         """(B, 2) bool, axes with residuals above the accuracy that is needed."""
         most = self.measurements.distances(residual).nanquantile(0.9, dim=1).nan_to_num(torch.inf)
         return (most > self.accuracy) | (self.accuracy == 0)
 
-    def decreases(
-        self, weighed: Measurements, active: Tensor, before: Tensor, after: Tensor, *, share: float = 1.0
-    ) -> Tensor:
+    def decreases(self, weighted: Measurements, before: Tensor, after: Tensor, *, share: float = 1.0) -> Tensor:
         """(B, 2) bool, whether the residual decreases by a share of what is needed for a further tone."""
-        first, second = weighed.square(before), weighed.square(after)
-        parameters = 2 * self.model.harmonics + 1
-        spare = self.measurements.num_measurements - parameters * active.sum(-1) // self.model.harmonics - 1
+        first, second = weighted.square(before), weighted.square(after)
+        parameters, families = 2 * self.model.harmonics + 1, self.with_one_more().sum(-1) // self.model.harmonics
+        spare = self.measurements.num_measurements - parameters * families - 1
         needed = torch.maximum(_F_THRESHOLD * parameters * second / spare.clamp(min=1.0), self.least_gain * first)
         return first - second > share * needed
 
@@ -241,7 +264,7 @@ def _resolved(measurements: Measurements, fit: ToneFit) -> Tensor:
     return ~((order[..., 1:] - order[..., :-1]) * span[:, None, None] < 0.7).any(-1)
 
 
-def _with_blind_tones(measurements: Measurements, weighed: Measurements, fit: ToneFit, blind: Tensor) -> ToneFit:
+def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: ToneFit, blind: Tensor) -> ToneFit:
     """The fit with a tone of a blind frequency in place of its side tones, where that explains no less.
 
     With motion of frequency f_m along the scan, rows are not exactly one frame apart when they are compared. A tone of
@@ -277,9 +300,9 @@ def _with_blind_tones(measurements: Measurements, weighed: Measurements, fit: To
         return frequencies, fit.active & ~(side & ~place & changed)
 
     frequencies, active = replaced(suspected)
-    other = fit_tones(weighed, frequencies, active, fit.model)
-    before = weighed.square(residual_of(measurements, fit))
-    after = weighed.square(residual_of(measurements, other))
+    other = fit_tones(weighted, frequencies, active, fit.model)
+    before = weighted.square(residual_of(measurements, fit))
+    after = weighted.square(residual_of(measurements, other))
     spare = measurements.num_measurements - 3 * fit.active.sum(-1)
     fewer = 3 * (fit.active.sum(-1) - active.sum(-1))
     better = suspected & (after / (spare + fewer).clamp(min=1.0) <= before / spare.clamp(min=1.0))

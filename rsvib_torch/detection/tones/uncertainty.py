@@ -272,15 +272,15 @@ def _added(
         C = torch.linalg.inv(information + limit * eye)
         v = (C @ right[..., None])[..., 0]
         evidence = 0.5 * (right * v).sum(-1) - 0.5 * torch.logdet(eye + information / precision)
-        # 3. Displacement S of the rows by unit tones, and by the change of the parameters m that they cause: mean product
-        # over the rows n for each frequency f and axis a.
+        # 3. Displacement S of the rows by unit tones, and by the change of the parameters m that they cause: mean
+        # product over the rows n for each frequency f and axis a.
         S = _without_trend(_wave(fit, rows, chunk, measurements.exposure_time), rows)
         changes = back.unflatten(1, (len(axes), -1))  # (B, A, M, F, 2)
         S = S[:, :, None] * of_tone - torch.einsum("bnam,bamfq->bnafq", of_displacement, changes)
         moved = torch.einsum("bnafp,bnafq->bfapq", S, S) / S.shape[1]
         parts.append((evidence, C + v[..., :, None] * v[..., None, :], back.movedim(1, 2), moved))
     evidence, second, back, moved = (torch.cat(values, 1) for values in zip(*parts, strict=True))
-    # 4. Probability of a tone of each frequency. One tone more, of any frequency, and none have equal prior probabilities.
+    # 4. Probability of a tone of each frequency. One tone more, of any frequency, has the prior probability of none.
     counted = counted & (size > 0)[:, None]
     prior = torch.where(counted, -counted.sum(1, keepdim=True).to(evidence.dtype).log(), -math.inf)
     probability = functional.pad(evidence + prior, (1, 0)).softmax(-1)[:, 1:]
