@@ -126,8 +126,8 @@ class Measurements:
         axes = self.information.shape[-1]
         # the last pivot of a Cholesky factor belongs to an axis that is conditioned on none
         orders = [[*(other for other in range(axes) if other != axis), axis] for axis in range(axes)]
-        each = torch.stack([self.information[..., order, :][..., order] for order in orders], 2)
-        return cholesky_root(each)[..., -1, -1].square()
+        reordered = torch.stack([self.information[..., order, :][..., order] for order in orders], 2)
+        return cholesky_root(reordered)[..., -1, -1].square()
 
     @property
     def _expected(self) -> Tensor:

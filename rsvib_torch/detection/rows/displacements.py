@@ -134,9 +134,9 @@ def stack_spectra(frames: Tensor, valid: Tensor | None, strips: ColumnStrips | N
         strips: Strips (B S) whose spectra are computed; None for whole rows.
     """
     if valid is None:
-        some = frames[..., ::4, :].flatten(-2)  # copied, so that two passes take a tenth of the time of torch.var_mean
-        level = some.mean(-1)[..., None, None]
-        variance = (some - level[..., 0]).square_().mean(-1)[..., None, None]
+        sample = frames[..., ::4, :].flatten(-2)  # a copy: two passes take a tenth of the time of torch.var_mean
+        level = sample.mean(-1)[..., None, None]
+        variance = (sample - level[..., 0]).square_().mean(-1)[..., None, None]
     else:
         weight = valid / valid.sum((-2, -1), keepdim=True)
         level = (frames * weight).sum((-2, -1), keepdim=True)
@@ -349,9 +349,9 @@ def _solved(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
     determinant = xx * yy - information[..., 0, 1].square()
     measured = (determinant > 1e-4 * xx * yy) & (determinant > 0)
     if (axes := information.shape[-1]) > 2:
-        own = information.diagonal(dim1=-2, dim2=-1)
-        measured = measured & (own > 1e-12 * own.amax(-1, keepdim=True)).all(-1)
-        unit = torch.where(measured[..., None], own, 1.0).rsqrt()
+        size = information.diagonal(dim1=-2, dim2=-1)
+        measured = measured & (size > 1e-12 * size.amax(-1, keepdim=True)).all(-1)
+        unit = torch.where(measured[..., None], size, 1.0).rsqrt()
         normal = torch.where(measured[..., None, None], information * unit[..., None] * unit[..., None, :], 0.0)
         measured = measured & (torch.linalg.eigvalsh(normal)[..., 0] > 1e-6)  # detail in one place: no roll
     eye = torch.eye(axes, dtype=information.dtype, device=information.device)
@@ -375,12 +375,12 @@ def measure_groups(
     gradients: list[RowGradients] | None = None,
 ) -> tuple[Measurements, list[RowGradients]]:
     """``measure_group`` of all groups, the measurements as one record."""
-    each = [None] * len(groups) if gradients is None else gradients
+    known = [None] * len(groups) if gradients is None else gradients
     measured, advance = [], steps(len(groups), "groups")
-    for group, own in zip(groups, each, strict=True):
-        measured.append(measure_group(group, timing, motion, own))
+    for group, of_group in zip(groups, known, strict=True):
+        measured.append(measure_group(group, timing, motion, of_group))
         advance()
-    return joined_groups([part for part, _ in measured]), [own for _, own in measured]
+    return joined_groups([part for part, _ in measured]), [of_group for _, of_group in measured]
 
 
 def joined_groups(parts: list[Measurements]) -> Measurements:
@@ -456,8 +456,8 @@ def _rms_of_contrasts(gradients: list[RowGradients], rows: int, weights: list[li
         weights: Weights of the parts in each contrast.
     """
     excesses = []
-    for own in gradients:
-        residual, noise, regular = displacements_of_parts(own, rows, len(weights[0]))
+    for of_group in gradients:
+        residual, noise, regular = displacements_of_parts(of_group, rows, len(weights[0]))
         contrasts = residual.new_tensor(weights)
         excess = ((contrasts @ residual).square() - contrasts.square() @ noise).sum(2)
         excesses.append(torch.where(regular[..., None], excess, torch.nan))

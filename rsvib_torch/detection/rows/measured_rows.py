@@ -143,18 +143,20 @@ class StripRows(MeasuredRows):
 
     def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
         """Components of the motion of every row (B, N, G, A)."""
-        each = [None] * len(self.groups) if gradients is None else gradients
-        view, measured = self.view(motion), []
-        for group, own in zip(self.groups, each, strict=True):
-            measured.append(measure_strips(group, self.timing, motion, view, self.strips, self.scale.factors, own))
-        of_groups = [own for _, own in measured]
-        return RowRecord(joined_groups([part for part, _ in measured]), of_groups, self._apart(of_groups))
+        known = [None] * len(self.groups) if gradients is None else gradients
+        view, factors = self.view(motion), self.scale.factors
+        measured = [
+            measure_strips(group, self.timing, motion, view, self.strips, factors, of_group)
+            for group, of_group in zip(self.groups, known, strict=True)
+        ]
+        gradients = [of_group for _, of_group in measured]
+        return RowRecord(joined_groups([part for part, _ in measured]), gradients, self._apart(gradients))
 
     def _apart(self, gradients: list[RowGradients], *, rows: int = 64) -> Tensor:
         """``RowRecord.apart``, from sums over parts of ``rows`` rows."""
         excesses = []
-        for own in gradients:
-            residual, noise, regular = displacements_of_parts(own, rows)
+        for of_group in gradients:
+            residual, noise, regular = displacements_of_parts(of_group, rows)
             share = 1 - 0.5 * self.scale.axes / residual.shape[2]  # the fit of the components takes part of both
             excess = 0.5 * (residual.square() - share * noise).mean(2) / share
             excesses.append(torch.where(regular[..., None], excess, torch.nan))
@@ -180,9 +182,9 @@ class StripRows(MeasuredRows):
         place = torch.arange(len(self.groups[0].starts), device=self.columns.device)
         index = place[place % len(self.columns) % 2 == 0]
         groups = [FrameGroup(group.spectra.stacks(index), group.starts[index]) for group in self.groups]
-        some = replace(self, groups=groups, columns=self.columns[::2])
-        each = MeasuredRows.blur_ratio(some, motion)
-        ratio, std, size = each.unflatten(0, (-1, len(some.columns))).unbind(-1)
+        every_second = replace(self, groups=groups, columns=self.columns[::2])
+        of_strips = MeasuredRows.blur_ratio(every_second, motion)
+        ratio, std, size = of_strips.unflatten(0, (-1, len(every_second.columns))).unbind(-1)
         weight = torch.where(std > 0, std.square().reciprocal(), 0.0)
         total = weight.sum(1).clamp(min=1e-300)
         size = size.mean(1) if self.slide < _MAX_SLIDE_OF_BLUR else torch.zeros_like(total)

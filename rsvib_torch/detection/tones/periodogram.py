@@ -46,34 +46,40 @@ def _power(measurements: Measurements, grid: tuple[float, int, int], weights: Te
     Returns:
         Weighted squares (B, S, A, F).
     """
+    # 1. Weights of rows and frames, and the normal equations of the image motion.
     seen, time = measurements.visible, measurements.middles[..., 0, 0]
     of_rows = weights.transpose(2, 3)  # (B, S, A, N)
-    each = of_rows[..., None] * seen[:, None, None]  # (B, S, A, N, G)
+    frame_weights = of_rows[..., None] * seen[:, None, None]  # (B, S, A, N, G)
     drift = measurements.drifts[:, None, None, ..., 0]
     values = measurements.displacements.movedim(-1, 1)[:, None]  # (B, 1, A, N, G)
-    drift_drift, drift_value = ((each * drift * other).sum((-2, -1))[..., None] for other in (drift, values))
+    of_drift = frame_weights * drift
+    drift_drift, drift_value = ((of_drift * factor).sum((-2, -1))[..., None] for factor in (drift, values))
     drift_drift = drift_drift * (1 + 1e-12) + _TINY
     most = (of_rows * measurements.num_differences[:, None, None]).sum(-1)[..., None]
     prior = 0.5 * MIN_GAIN**2 * most + _TINY
 
+    # 2. Q and R from transforms of the pairs of frames, each pair once, with the attenuation by the exposure.
     step, first, count = grid
     frequencies = step * torch.arange(first, first + count, dtype=torch.float64, device=time.device)
     attenuation = torch.sinc(frequencies * measurements.smearing_times[:, 0]).prod(0)  # (A, F)
-    one, other = torch.triu_indices(*[time.shape[2]] * 2, device=time.device)  # pairs of frames, each once
-    share = seen[..., one] * seen[..., other] / seen.sum(2, keepdim=True).clamp(min=1.0)
-    of_squares = torch.where(one == other, seen[..., one] - share, -2 * share)
-    Q = _transform(time[..., one] + time[..., other], of_rows[..., None] * of_squares[:, None, None], grid)
-    apart = one != other
+    earlier, later = torch.triu_indices(*[time.shape[2]] * 2, device=time.device)
+    share = seen[..., earlier] * seen[..., later] / seen.sum(2, keepdim=True).clamp(min=1.0)
+    of_squares = torch.where(earlier == later, seen[..., earlier] - share, -2 * share)
+    Q = _transform(time[..., earlier] + time[..., later], of_rows[..., None] * of_squares[:, None, None], grid)
+    apart = earlier != later
     of_moduli = of_rows[..., None] * (2 * share[..., apart])[:, None, None]
-    R = most - _transform(time[..., other[apart]] - time[..., one[apart]], of_moduli, grid).real
-    of_drift, of_values = _transform(time, torch.stack([each * drift, each * values], 1), grid).unbind(1)
+    R = most - _transform(time[..., later[apart]] - time[..., earlier[apart]], of_moduli, grid).real
     Q, R = Q * attenuation.square(), R * attenuation.square()
-    of_drift, of_values = of_drift * attenuation, of_values * attenuation
-    # normal equations of cosine and sine after elimination of the drift
-    cosine = 0.5 * (R + Q.real) + prior - of_drift.real.square() / drift_drift
-    sine = 0.5 * (R - Q.real) + prior - of_drift.imag.square() / drift_drift
-    cross = 0.5 * Q.imag - of_drift.real * of_drift.imag / drift_drift
-    right = of_values - of_drift * (drift_value / drift_drift)
+
+    # 3. Products of the waves with the image motion and with the displacements.
+    products = _transform(time, torch.stack([of_drift, frame_weights * values], 1), grid) * attenuation
+    with_drift, with_values = products.unbind(1)
+
+    # 4. Normal equations of cosine and sine after elimination of the image motion, and the decrease by their solution.
+    cosine = 0.5 * (R + Q.real) + prior - with_drift.real.square() / drift_drift
+    sine = 0.5 * (R - Q.real) + prior - with_drift.imag.square() / drift_drift
+    cross = 0.5 * Q.imag - with_drift.real * with_drift.imag / drift_drift
+    right = with_values - with_drift * (drift_value / drift_drift)
     decrease = sine * right.real.square() - 2 * cross * right.real * right.imag + cosine * right.imag.square()
     determinant = (cosine * sine - cross.square()).clamp(min=_TINY)
     return decrease / determinant + drift_value.square() / drift_drift
@@ -215,14 +221,18 @@ def best_candidate(
         parts = measurements.repeated(len(kept)).only(kept.repeat(len(measurements.exposure_starts), 1))
         weights, peaks = torch.cat([weights, kept[1:, :, None] * measurements.weights[:, None]], 1), 2
     unexplained = replace(measurements, displacements=residual)
-    found = strongest_frequencies(unexplained, sample_interval, harmonics, peaks, weights)  # (B, S, 2, C)
-    multiples = torch.arange(1, harmonics + 1, dtype=torch.float64, device=found.device)
-    further = (found.flatten(0, 1)[..., None] * multiples).transpose(1, 2).flatten(0, 1)  # (B S C, 2, H)
-    count = len(further) // len(found)
+    peaks_of_parts = strongest_frequencies(unexplained, sample_interval, harmonics, peaks, weights)  # (B, S, 2, C)
+    multiples = torch.arange(1, harmonics + 1, dtype=torch.float64, device=peaks_of_parts.device)
+    further = (peaks_of_parts.flatten(0, 1)[..., None] * multiples).transpose(1, 2).flatten(0, 1)  # (B S C, 2, H)
+    count = len(further) // len(peaks_of_parts)
     earlier = before.frequencies[..., : active.shape[-1] - harmonics].repeat_interleave(count, 0)
-    tried = torch.cat([earlier, further], -1)
-    each_active = active.repeat_interleave(count, 0)
-    rough, residuals = fit_roughly(parts.repeated(found.shape[-1]), tried, each_active, model, iterations=5)
+    rough, residuals = fit_roughly(
+        parts.repeated(peaks_of_parts.shape[-1]),
+        torch.cat([earlier, further], -1),
+        active.repeat_interleave(count, 0),
+        model,
+        iterations=5,
+    )
     several = measurements.repeated(count)
     # 65 % of the rows count: outliers may be all others
     size = several.sizes(residuals).nanquantile(0.65, dim=1).nan_to_num(0.0).unflatten(0, (-1, count))
@@ -230,9 +240,9 @@ def best_candidate(
     best = ((size.amax(1, keepdim=True) - size) * visible).argmax(1)  # (B, 2)
 
     def chosen(values: Tensor, axis: int) -> Tensor:
-        each = values.unflatten(0, (-1, count)).movedim(axis + 1, 2)  # (B, C, 2, ...)
-        place = best.reshape(-1, 1, best.shape[-1], *(1,) * (each.ndim - 3)).expand(-1, 1, -1, *each.shape[3:])
-        picked: Tensor = each.gather(1, place)[:, 0].movedim(1, axis)
+        tried = values.unflatten(0, (-1, count)).movedim(axis + 1, 2)  # (B, C, 2, ...)
+        place = best.reshape(-1, 1, best.shape[-1], *(1,) * (tried.ndim - 3)).expand(-1, 1, -1, *tried.shape[3:])
+        picked: Tensor = tried.gather(1, place)[:, 0].movedim(1, axis)
         return picked
 
     of_best = (chosen(values, 1) for values in (rough.coefficients, rough.frequencies, rough.drift))
