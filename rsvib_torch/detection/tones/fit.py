@@ -353,6 +353,7 @@ class _Problem:
             iterations: At most.
             tolerance: Relative decrease of the cost that a step must promise.
         """
+        # 1. Start values.
         if isinstance(start, ToneFit):
             start = start.about(self.measurements.centre)
             tones = torch.where(self.active[..., None], start.tones, 0.0)
@@ -361,6 +362,7 @@ class _Problem:
             values = start.new_zeros(len(start), self.axes, len(self.is_frequency))
             values[..., self.is_frequency] = torch.where(self.active, start, 0.0)
             state = self.with_best_amplitudes(self.evaluate(values))
+        # 2. Damped steps. A step that decreases the cost is taken, and the damping of a stack decreases or increases.
         damping = torch.full_like(state.cost, 1e-3)
         done = torch.zeros_like(state.cost, dtype=torch.bool)
         for _ in range(iterations):

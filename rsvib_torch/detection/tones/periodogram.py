@@ -214,12 +214,14 @@ def best_candidate(
     Returns:
         A rough fit, and its residual (B, N, G, 2).
     """
+    # 1. The parts of the record that are searched: all rows, and the rows without a stretch.
     model, harmonics = before.model, before.model.harmonics
     parts, weights, peaks = measurements, weighed.weights[:, None], 4  # outliers may raise a wrong peak
     if leave_out:
         kept = without_stretches(measurements)
         parts = measurements.repeated(len(kept)).only(kept.repeat(len(measurements.exposure_starts), 1))
         weights, peaks = torch.cat([weights, kept[1:, :, None] * measurements.weights[:, None]], 1), 2
+    # 2. The highest peaks of each part, for the two axes, each fitted roughly with the tones of the earlier fit.
     unexplained = replace(measurements, displacements=residual)
     peaks_of_parts = strongest_frequencies(unexplained, sample_interval, harmonics, peaks, weights)  # (B, S, 2, C)
     multiples = torch.arange(1, harmonics + 1, dtype=torch.float64, device=peaks_of_parts.device)
@@ -233,8 +235,9 @@ def best_candidate(
         model,
         iterations=5,
     )
+    # 3. For each axis the fit that explains most, of which 65 % of the rows count: outliers may be all others. A tone
+    # that is nearly blind counts less.
     several = measurements.repeated(count)
-    # 65 % of the rows count: outliers may be all others
     size = several.sizes(residuals).nanquantile(0.65, dim=1).nan_to_num(0.0).unflatten(0, (-1, count))
     visible = visibility(several, rough.frequencies[..., -harmonics:]).unflatten(0, (-1, count))
     best = ((size.amax(1, keepdim=True) - size) * visible).argmax(1)  # (B, 2)
@@ -245,12 +248,14 @@ def best_candidate(
         picked: Tensor = tried.gather(1, place)[:, 0].movedim(1, axis)
         return picked
 
-    of_best = (chosen(values, 1) for values in (rough.coefficients, rough.frequencies, rough.drift))
-    coefficients, frequencies, drift = of_best
+    coefficients, frequencies, drift = (
+        chosen(values, 1) for values in (rough.coefficients, rough.frequencies, rough.drift)
+    )
     fit, residual = (
         ToneFit(coefficients, frequencies, active, drift, rough.covariance[:0], before.centre, model),
         chosen(residuals, 3),
     )
-    for _ in range(3 if leave_out else 0):  # towards the least absolute residuals
+    # 4. Without a stretch: steps towards the least absolute residuals of all rows.
+    for _ in range(3 if leave_out else 0):
         fit, residual = fit_roughly(measurements.for_least_absolute(residual), fit, active, model)
     return fit, residual

@@ -259,9 +259,8 @@ def _disturbed(measurements: Measurements, residual: Tensor) -> Tensor:
 
 def _resolved(measurements: Measurements, fit: ToneFit) -> Tensor:
     """(B, 2) bool: all tones of an axis are at least 0.7 of 1 / duration apart; closer ones fit one tone and noise."""
-    span = measurements.exposure_starts.amax((1, 2)) - measurements.exposure_starts.amin((1, 2))
     order = torch.where(fit.active, fit.frequencies, torch.nan).sort(dim=-1).values
-    return ~((order[..., 1:] - order[..., :-1]) * span[:, None, None] < 0.7).any(-1)
+    return ~((order[..., 1:] - order[..., :-1]) * measurements.span[:, None, None] < 0.7).any(-1)
 
 
 def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: ToneFit, blind: Tensor) -> ToneFit:
@@ -273,20 +272,18 @@ def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: T
     """
     if fit.model.harmonics > 1 or len(blind) == 0:
         return fit
+    # 1. Weak tones near the side frequencies of a blind frequency and a large tone along the scan.
     size = fit.amplitude
-    weak_limit = 0.2 * size[:, 1].amax(
-        -1, keepdim=True
-    )  # px, of the largest tone along the scan: side tones are smaller
+    weak_limit = 0.2 * size[:, 1].amax(-1, keepdim=True)  # px; side tones are weaker
     carrier = torch.where(size[:, 1] > weak_limit, fit.frequencies[:, 1], torch.nan)[:, None, None, None]  # (B,1,1,1,K)
-    span = (measurements.exposure_starts.amax((1, 2)) - measurements.exposure_starts.amin((1, 2)))[
-        :, None, None, None, None
-    ]
     tone, middle = fit.frequencies[..., None, None], blind[:, None]
     sides = torch.stack([middle + carrier, (middle - carrier).abs()], -1)  # (B, 1, 1, F, K, 2)
-    distance = ((tone[..., None] - sides).abs() * span[..., None]).nan_to_num(torch.inf).amin((-2, -1))  # (B, 2, K, F)
+    distance = (tone[..., None] - sides).abs() * measurements.span.view(-1, 1, 1, 1, 1, 1)
+    distance = distance.nan_to_num(torch.inf).amin((-2, -1))  # (B, 2, K, F) cycles in the record
     weak = fit.active & (size > 0) & (size < weak_limit[:, None])
-    near = (distance < 1.0) & weak[..., None]  # within 1 / duration
-    score = near.sum(2) + 0.5 / (1 + distance.amin(2))  # most side tones first, then the nearest
+    near = (distance < 1.0) & weak[..., None]
+    # 2. For each axis the blind frequency with most side tones, then the nearest.
+    score = near.sum(2) + 0.5 / (1 + distance.amin(2))
     best = score.argmax(-1)  # (B, 2)
     side = near.gather(-1, best[:, :, None, None].expand(-1, -1, near.shape[2], 1))[..., 0]  # (B, 2, K)
     suspected = side.any(-1)
@@ -299,6 +296,7 @@ def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: T
         frequencies = torch.where(place & changed, blind[best][..., None], fit.frequencies)
         return frequencies, fit.active & ~(side & ~place & changed)
 
+    # 3. The tone of this frequency instead of its side tones, kept where it explains no less per parameter.
     frequencies, active = replaced(suspected)
     other = fit_tones(weighted, frequencies, active, fit.model)
     before = weighted.square(residual_of(measurements, fit))
@@ -330,6 +328,7 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor
     harmonics = fit.model.harmonics
     needed = torch.zeros_like(fit.active)
     while True:
+        # 1. The weakest tone (or family) of each axis that is neither significant nor needed.
         size, std = fit.amplitude, amplitude_std(fit)
         gain = offset_gain(fit.frequencies, intervals)
         attenuation = torch.sinc(fit.frequencies * measurements.exposure_time).abs()
@@ -343,6 +342,7 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor
         if not bool(dropped.any()):
             return fit
         dropped = dropped.repeat_interleave(harmonics, -1) & fit.active
+        # 2. The fit without it. It is needed if the residual then increases significantly.
         other = fit_tones(measurements, fit, fit.active & ~dropped, fit.model)
         after = measurements.square(residual_of(measurements, fit))
         before = measurements.square(residual_of(measurements, other))
@@ -350,8 +350,7 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor
         worse = before - after > _F_THRESHOLD * 3 * harmonics * after / spare.clamp(min=1.0)
         keep = dropped & worse[..., None] & ~small
         needed = needed | keep
-        fit = (
-            other
-            if not bool(keep.any())
-            else fit_tones(measurements, fit.frequencies, fit.active & ~dropped | keep, fit.model)
-        )
+        if bool(keep.any()):
+            fit = fit_tones(measurements, fit.frequencies, fit.active & ~dropped | keep, fit.model)
+        else:
+            fit = other
