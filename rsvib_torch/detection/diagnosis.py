@@ -293,7 +293,7 @@ def period_factor(
     def fits(factors: Tensor, rows: int, frequencies: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Square of the residual of one tone along each axis and its frequency, for each factor."""
         every = max(1, measurements.exposure_starts.shape[1] // rows)
-        trial = measurements.mapped(lambda values: values[:, ::every]).repeated(len(factors))
+        trial = measurements.thinned(every).repeated(len(factors))
         frame = torch.searchsorted(starts, trial.exposure_starts.contiguous(), right=True).clamp(min=1) - 1
         moved = (factors[:, None, None] - 1.0) * (starts - starts[0])[frame]
         trial = replace(trial, exposure_starts=trial.exposure_starts + moved)

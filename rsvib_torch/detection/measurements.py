@@ -35,7 +35,7 @@ class Measurements:
         exposure_time: T_e in seconds.
         average_times: Duration over which each displacement (x, y) is an average: rows of a band times the row time.
             Roll and zoom have that of x.
-        independent: Fraction of the measurements that are independent (bands may overlap).
+        independent: Fraction of the measurements that are independent (bands may overlap), one for all stacks or (B,).
     """
 
     exposure_starts: Tensor
@@ -44,7 +44,7 @@ class Measurements:
     information: Tensor
     exposure_time: float
     average_times: tuple[float, float] = (0.0, 0.0)
-    independent: float = 1.0
+    independent: float | Tensor = 1.0
 
     @classmethod
     def of_pairs(
@@ -146,21 +146,28 @@ class Measurements:
     @property
     def num_measurements(self) -> Tensor:
         """(B, 2) number of independent measurements of each axis."""
-        return ((self.weights > 0) * self.num_differences[..., None]).sum(1) * self.independent
+        count = ((self.weights > 0) * self.num_differences[..., None]).sum(1)
+        return count * torch.as_tensor(self.independent, dtype=count.dtype, device=count.device)[..., None]
 
     def repeated(self, count: int) -> "Measurements":
         """Every stack ``count`` times in a row."""
         return self.mapped(lambda values: values.repeat_interleave(count, dim=0))
 
     def mapped(self, function: Callable[[Tensor], Tensor]) -> "Measurements":
-        """The measurements with a function applied to all tensors."""
+        """The measurements with a function of the stacks, their first axis, applied to all tensors."""
         return replace(
             self,
             exposure_starts=function(self.exposure_starts),
             displacements=function(self.displacements),
             visible=function(self.visible),
             information=function(self.information),
+            independent=function(self.independent) if isinstance(self.independent, Tensor) else self.independent,
         )
+
+    def thinned(self, every: int) -> "Measurements":
+        """Every n-th row."""
+        names = ("exposure_starts", "displacements", "visible", "information")
+        return replace(self, **{name: getattr(self, name)[:, ::every] for name in names})
 
     def only(self, counts: Tensor) -> "Measurements":
         """The measurements with information 0 in the rows where ``counts`` (B, N) is False."""
@@ -224,16 +231,16 @@ class Measurements:
         total, deviation = (weight * product).sum(1), (weight * product).square().sum(1).sqrt()
         return torch.where(total > significance * deviation, total / weight.sum(1).clamp(min=1e-300), 0.0).sqrt()
 
-    def independent_fraction(self, residual: Tensor, *, lags: int = 4) -> float:
-        """Fraction of the rows that are independent, from the correlation rho(k) of residuals k rows apart.
+    def independent_fraction(self, residual: Tensor, *, lags: int = 4) -> Tensor:
+        """(B,) fraction of the rows that are independent, from the correlation rho(k) of residuals k rows apart.
 
         Errors of the model correlate the residuals of neighbouring rows, and the variance of a mean is larger by
         ``1 + 2 sum rho(k)``, k = 1 ... ``lags``.
         """
         scaled = residual * self._expected.sqrt()[:, :, None]
-        energy = scaled.square().sum()
-        total = sum((scaled[:, lag:] * scaled[:, :-lag]).sum() / energy for lag in range(1, lags + 1))
-        return 1.0 / max(1.0, 1.0 + 2.0 * float(total))
+        energy = scaled.square().sum((1, 2, 3)).clamp(min=1e-300)
+        products = [(scaled[:, lag:] * scaled[:, :-lag]).sum((1, 2, 3)) for lag in range(1, lags + 1)]
+        return 1.0 / (1.0 + 2.0 * torch.stack(products).sum(0) / energy).clamp(min=1.0)
 
     # Robust weights
 
@@ -260,8 +267,8 @@ class Measurements:
         """The measurements with Tukey's biweight of their residual on each axis: outliers have weight 0."""
         return self.scaled((1 - self._biweight_argument(residual).square()).square())
 
-    def share_counted(self, residual: Tensor) -> float:
-        """Correction (0 to 1) of the number of measurements after ``reweighted``, for the covariance of the fit.
+    def share_counted(self, residual: Tensor) -> Tensor:
+        """(B,) correction (0 to 1) of the number of measurements after ``reweighted``, for the covariance of the fit.
 
         Weights that depend on the residuals make these look smaller than the errors are: the variance of an M-estimator
         is ``E psi^2 / (E psi')^2`` with ``psi = w z``, not ``E w z^2 / E w`` (Huber 1981, ch. 6).
@@ -269,9 +276,9 @@ class Measurements:
         z = self._biweight_argument(residual)
         weight = (1 - z.square()).square()
         slope = (1 - z.square()) * (1 - 5 * z.square())
-        apparent = (weight * z.square()).sum() / (weight.sum() * (z < 1).sum()).clamp(min=1e-300)
-        actual = (weight * z).square().sum() / slope.sum().square().clamp(min=1e-300)
-        return min(1.0, float(apparent / actual.clamp(min=1e-300)))
+        apparent = (weight * z.square()).sum((1, 2)) / (weight.sum((1, 2)) * (z < 1).sum((1, 2))).clamp(min=1e-300)
+        actual = (weight * z).square().sum((1, 2)) / slope.sum((1, 2)).square().clamp(min=1e-300)
+        return (apparent / actual.clamp(min=1e-300)).clamp(max=1.0)
 
     def _biweight_argument(self, residual: Tensor) -> Tensor:
         """(B, N, 2) rms residual over 6 robust standard deviations, at most 1; 1 where nothing was measured.

@@ -20,11 +20,17 @@ __all__ = [
     "integer_peak",
     "subpixel_peak",
     "take_windows",
+    "template_margin",
     "whole_pixel_peak",
 ]
 
 BINNING = 4  # columns that are averaged in the search for whole pixels; a parabola recovers the single pixel
 LAGS = 4  # px, reach of a fine correlation surface to either side: 9 samples fix the peak to 0.001 px (subpixel_peak)
+
+
+def template_margin(search: int) -> int:
+    """Columns kept free on either side of a template, so that no lag of a search range in px leaves the frame."""
+    return search + LAGS + BINNING
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,19 +54,14 @@ class BandTask:
     search: int
 
     @property
-    def margin(self) -> int:
-        """Columns kept free on either side of a template, so that no lag leaves the frame."""
-        return self.search + LAGS + BINNING
-
-    @property
     def width(self) -> int:
         """Columns of the templates: the overlap of every pair less the margins."""
-        return self.first.shape[-1] - int(self.coarse[:, 0].abs().amax()) - 2 * self.margin
+        return self.first.shape[-1] - int(self.coarse[:, 0].abs().amax()) - 2 * template_margin(self.search)
 
     @property
     def left(self) -> Tensor:
         """First column of the templates of each pair, (L,)."""
-        return (-self.coarse[:, 0]).clamp(min=0) + self.margin
+        return (-self.coarse[:, 0]).clamp(min=0) + template_margin(self.search)
 
     @property
     def places(self) -> Tensor:

@@ -24,7 +24,7 @@ from rsvib_torch.frames.orientation import offsets_from_row_order, sequence_from
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.registration.bands import BandTask
+from rsvib_torch.registration.bands import BandTask, template_margin
 from rsvib_torch.registration.methods import BAND_METHODS, Registration, RegistrationOptions
 
 __all__ = ["OffsetCurve", "check_frame_size", "fits_frame", "register_bands", "register_rows"]
@@ -202,20 +202,24 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     grey = _without_row_means(gaussian_blur2d(grey.contiguous(), (7, 7), sigma))
     tops = torch.arange(0, num_rows - band_rows + 1, options.band_step, device=grey.device)
     first, second = grey[:, :-1].flatten(0, 1), grey[:, 1:].flatten(0, 1)
-    at_once = runs(num_frames - 1, max(1, 64 // batch))  # pairs; they need 5 MB each
-    coarse = torch.cat([_coarse_offsets(grey[:, pair.start : pair.stop + 1]) for pair in at_once], 1).flatten(0, 1)
+    parts = runs(num_frames - 1, max(1, 64 // batch))  # pairs; they need 5 MB each
+    coarse = torch.cat([_coarse_offsets(grey[:, pair.start : pair.stop + 1]) for pair in parts], 1).flatten(0, 1)
     bytes_of_pair = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4
-    offsets, quality = [], []
-    parts = runs(len(first), max(1, 2**27 // bytes_of_pair))  # 128 MiB of windows; 256 MiB take a fifth longer
+    # Templates are as wide as the least overlap of pairs that are registered together: pairs of similar overlap are,
+    # so that none affects the others. Pairs that overlap too little are not measured.
+    overlap = width - coarse[:, 0].abs() - 2 * template_margin(search)
+    coarse = torch.where((overlap < search)[:, None], 0, coarse)
+    quarter = 4 * coarse[:, 0].abs() // width
+    at_once = max(1, 2**27 // bytes_of_pair)  # pairs; 128 MiB of windows, because 256 MiB take a fifth longer
+    offsets = grey.new_full((len(first), len(tops), 2), torch.nan, dtype=torch.float64)
+    quality = offsets.new_zeros(offsets.shape[:2])
     advance = steps(len(first), "pairs")
-    for pair in parts:
-        task = BandTask(first[pair], second[pair], coarse[pair], tops, band_rows, search)
-        if task.width < search:
-            raise ValueError(f"frames {width} px wide overlap too little after their whole-frame offset")
+    for pairs in [part for value in quarter.unique() for part in (quarter == value).nonzero()[:, 0].split(at_once)]:
+        task = BandTask(first[pairs], second[pairs], coarse[pairs], tops, band_rows, search)
         measured, correlation = BAND_METHODS[options.method](task)
-        failed = ~(correlation > 0.1)  # chance reaches correlations of 0.1
-        offsets.append(torch.where(failed[..., None], torch.nan, measured))
-        quality.append(torch.where(failed, 0.0, correlation))
+        good = (correlation > 0.1) & (overlap[pairs, None] >= search)  # chance reaches correlations of 0.1
+        offsets[pairs] = torch.where(good[..., None], measured, torch.nan).double()
+        quality[pairs] = torch.where(good, correlation, 0.0).double()
         advance(len(correlation))
     rows = tops.to(torch.float64) + 0.5 * (band_rows - 1)
     starts = timing.frame_starts(num_frames, grey.device)[:, None] + rows * timing.row_time
@@ -225,8 +229,8 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
         rows=rows,
         times=starts[:-1],
         later_times=starts[1:],
-        offsets=torch.cat(offsets).to(torch.float64).unflatten(0, (batch, num_frames - 1)),
-        quality=torch.cat(quality).to(torch.float64).unflatten(0, (batch, num_frames - 1)),
+        offsets=offsets.unflatten(0, (batch, num_frames - 1)),
+        quality=quality.unflatten(0, (batch, num_frames - 1)),
         heights=(band_rows, band_rows),
     )
 

@@ -5,7 +5,6 @@ A row is displaced by a phase factor of its spectrum. Frames have rows on axis -
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-import math
 from copy import copy
 
 import torch
@@ -196,12 +195,11 @@ def differences(spectra: Tensor, visible: Tensor) -> Tensor:
 
 
 def inner_columns(width: int, shift: Tensor, like: Tensor) -> Tensor:
-    """(1, 1, W) weight of columns: 1 where all frames of the group show the scene, falling to 0 over 8 px."""
-    largest = float(shift.abs().amax())
-    edge = (math.ceil(largest) if largest < width else width) + MARGIN  # that of a fit that diverges may be infinite
+    """(B, 1, W) weight of columns: 1 where all frames of a group show the scene, falling to 0 over 8 px."""
+    largest = shift.abs().amax((1, 2)).nan_to_num(width).clamp(max=width)  # that of a fit that diverges may be infinite
     place = torch.arange(width, dtype=like.dtype, device=like.device)
-    inside = torch.minimum(place, width - 1 - place) - edge
-    return (inside / MARGIN).clamp(0.0, 1.0)[None, None]
+    inside = torch.minimum(place, width - 1 - place) - (largest.ceil() + MARGIN).to(like.dtype)[:, None]
+    return (inside / MARGIN).clamp(0.0, 1.0)[:, None]
 
 
 EVERY = 4  # rows; every fourth row is enough to estimate a column pattern
@@ -241,7 +239,8 @@ def _pattern_of(groups: list[_Group], step: int) -> Tensor | None:
         typical = torch.where(variance > 0, variance, torch.nan).nanmedian(dim=-1, keepdim=True).values
         visible = visible * ((variance > 0) & (variance < 3.0 * typical))[:, None]
         visible = visible * (visible.sum(1, keepdim=True) > 1)
-        inner = inner_columns(spectra.width, shift, spectra.values.real)[0]  # the ends of rows stay in place as well
+        # the ends of rows stay in place as well
+        inner = inner_columns(spectra.width, shift, spectra.values.real)[:, None]
         for run in spectra.runs(rows.shape[-1], 5):
             warped, ramp = spectra.warped(rows[..., run], shift[..., run]), spectra.ramp(shift[..., run])
             pixels = torch.fft.irfft(differences(warped, visible[..., run]), n=spectra.length)

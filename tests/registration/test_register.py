@@ -257,7 +257,7 @@ def test_bad_options(paper_camera, options, error, message):
 
 def test_single_curve_is_not_a_batch(pair, paper_camera):
     curve = register_bands(pair[0][:, :256], paper_camera)
-    with pytest.raises(IndexError, match="this offset curve is not a batch"):
+    with pytest.raises(IndexError, match="this OffsetCurve is not a batch"):
         curve[0]
 
 

@@ -144,9 +144,9 @@ class _Problem:
             residual = values - columns @ solution
             by_row_time = (root * record.relative((slope @ solution) * record.rows)).flatten()
             own = by_row_time - columns @ torch.cholesky_solve((columns.mT @ by_row_time)[:, None], factor)[:, 0]
-            cost += float(residual.square().sum()) * record.independent
-            step += float(own @ residual) * record.independent
-            information += float(own @ own) * record.independent
+            cost += float(residual.square().sum()) * float(record.independent)
+            step += float(own @ residual) * float(record.independent)
+            information += float(own @ own) * float(record.independent)
         information = max(information, 1e-300)
         return _Evaluation(cost, 2 * (cells + DEGREE), step / information, information)
 

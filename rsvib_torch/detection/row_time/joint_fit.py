@@ -48,7 +48,7 @@ class FramePlaces:
             measured.displacements[0, ..., axis],
             measured.visible[0],
             measured.inverse_variances[0, :, axis],
-            measured.independent,
+            float(measured.independent),
             row_time / self.period,
         )
 
@@ -112,7 +112,7 @@ def fit_row_time(
         eye = torch.diag(1e-13 + (gram.diagonal() <= 0).double())
         inverse = torch.linalg.inv(gram * scale * scale[:, None] + eye) * scale * scale[:, None]
         step = float((inverse @ right)[-1])
-        std = float(inverse[-1, -1].clamp(min=0.0).sqrt()) / measured.independent**0.5
+        std = float(inverse[-1, -1].clamp(min=0.0).sqrt()) / float(measured.independent) ** 0.5
         row_time = row_time + min(max(step, -0.02 * row_time), 0.02 * row_time)
         if abs(step) < 1e-2 * std:
             break

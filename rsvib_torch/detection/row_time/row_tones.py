@@ -53,7 +53,7 @@ class RowRecord:
     def num_measurements(self) -> float:
         """Number of independent differences."""
         differences = (self.visible.sum(1) - 1).clamp(min=0.0)
-        return float(((self.weights > 0) * differences).sum()) * self.independent
+        return float(((self.weights > 0) * differences).sum()) * float(self.independent)
 
 
 @dataclass(frozen=True, eq=False)
