@@ -337,7 +337,12 @@ def stacked(results: list[DetectionResult]) -> DetectionResult:
             for field in fields(kind)
             if field.name != "camera"
         }
-        of_axes = ("image_motion", "image_acceleration", "displacement")  # the others have an entry for each tone
+        of_axes = (
+            "image_motion",
+            "image_acceleration",
+            "image_shift",
+            "displacement",
+        )  # the others have an entry for each tone
         return {name: joined(v) if name in of_axes else padded(v) for name, v in values.items()}
 
     curves = [result.offsets for result in results]

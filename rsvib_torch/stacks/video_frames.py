@@ -159,10 +159,10 @@ class VideoRestorer:
 
 def _halved(motion: Vibration) -> Vibration:
     """The motion in pixels of twice the size."""
-    return Vibration(
-        0.5 * motion.amplitude,
-        motion.frequency,
-        motion.phase,
-        0.5 * motion.image_motion,
-        0.5 * motion.image_acceleration,
+    return replace(
+        motion,
+        amplitude=0.5 * motion.amplitude,
+        image_motion=0.5 * motion.image_motion,
+        image_acceleration=0.5 * motion.image_acceleration,
+        image_shift=0.5 * motion.image_shift,
     )

@@ -1,6 +1,7 @@
 """The part of a detected vibration that is accurate enough to be undone, from its standard deviations."""
 
 import math
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -129,13 +130,12 @@ def trusted_vibration(
                     f"deviation of {float(error[here]):.2g} {unit}; detect it from more frames"
                 )
     keep = reliable & accurate
-    trusted = Vibration(
-        vibration.amplitude * keep[..., None],
-        vibration.frequency,
-        vibration.phase,
-        vibration.image_motion * keep,
-        vibration.image_acceleration * keep,
-        vibration.camera,
+    trusted = replace(
+        vibration,
+        amplitude=vibration.amplitude * keep[..., None],
+        image_motion=vibration.image_motion * keep,
+        image_acceleration=vibration.image_acceleration * keep,
+        image_shift=vibration.image_shift * keep,
     )
     return trusted, tuple(notes)
 
