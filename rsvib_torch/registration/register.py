@@ -223,10 +223,10 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     advance = steps(len(first), "pairs")
     for pair in parts:
         task = BandTask(first[pair], second[pair], coarse[pair], tops, band_rows, search)
-        if task.width < search:
-            raise ValueError(f"frames {width} px wide overlap too little after their whole-frame offset")
+        overlapping = task.overlapping[:, None]  # pairs without a common part as wide as the search range fail
+        task = replace(task, coarse=torch.where(overlapping, task.coarse, 0))
         measured, correlation = BAND_METHODS[options.method](task)
-        failed = ~(correlation > 0.1)  # chance reaches correlations of 0.1
+        failed = ~((correlation > 0.1) & overlapping)  # chance reaches correlations of 0.1
         offsets.append(torch.where(failed[..., None], torch.nan, measured))
         quality.append(torch.where(failed, 0.0, correlation))
         advance(len(correlation))

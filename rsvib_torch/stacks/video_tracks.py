@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.tracking.tracker import VibrationTracker, displaced
+from rsvib_torch.tracking.tracker import VibrationTracker
 
 __all__ = ["FrameTrack", "followed"]
 
@@ -45,7 +45,7 @@ class FrameTrack:
     @property
     def removed(self) -> Vibration:
         """All that is removed: the motion and the shift."""
-        return self.motion if self.shift is None else displaced(self.motion, self.shift)
+        return self.motion if self.shift is None else replace(self.motion, image_shift=self.shift)
 
     def moved_to(self, place: Tensor) -> "FrameTrack":
         """The frame with its content at another place (2,) of the path in px."""
@@ -129,8 +129,7 @@ def _followed_backwards(frames: Sequence[_Given], tracker: VibrationTracker) -> 
 def _reversed(track: FrameTrack, time: float) -> FrameTrack:
     """What was found backwards in time, for a frame that starts at ``time`` in s."""
     motion = track.motion
-    phase, velocity = torch.pi - motion.phase, -motion.image_motion
-    forwards = Vibration(motion.amplitude, motion.frequency, phase, velocity, motion.image_acceleration)
+    forwards = replace(motion, phase=torch.pi - motion.phase, image_motion=-motion.image_motion)
     return replace(track, time=time, motion=forwards)
 
 
