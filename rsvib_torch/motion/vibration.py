@@ -432,20 +432,15 @@ class VibrationStd(
 
     def __getitem__(self, index: int) -> "VibrationStd":
         """The standard deviations of one stack of a batch."""
-        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return VibrationStd(**{name: value[index] for name, value in values.items() if value is not None})
+        return self.mapped(lambda values: values[index])
 
     @checks_arguments
     def from_row_order(self, timing: SensorTiming) -> "VibrationStd":
         """The standard deviations, given in row order, in image axes: as ``Motion.from_row_order`` without signs."""
         if timing.scan_axis == -2:
             return self
-        order = [1, 0, 2, 3][: self.amplitude.shape[-2]]
-        tones = (self.amplitude, self.frequency, self.period, self.phase)
-        amplitude, frequency, period, phase = (values[..., order, :] for values in tones)
-        motion, acceleration = self.image_motion[..., order], self.image_acceleration[..., order]
-        displacement = None if self.displacement is None else self.displacement[..., order]
-        return VibrationStd(amplitude, frequency, period, phase, motion, acceleration, displacement)
+        order, axes = [1, 0, 2, 3][: self.amplitude.shape[-2]], self.image_motion.ndim
+        return self.mapped(lambda values: values[..., order] if values.ndim == axes else values[..., order, :])
 
 
 # Text

@@ -58,7 +58,6 @@ class TrackedFrame:
 
     Attributes:
         time: s, exposure start of its first row.
-        latency: Number of frames that were given after this one.
         state: ``"tracking"``: the motion is known; ``"searching"``: it is not, or the rows contradict it;
             ``"unusable"``: the frame is constant, or a copy of the frame before.
         motion: The motion to remove, in image axes; its time origin is the middle of the frame. Axes whose vibration is
@@ -73,10 +72,10 @@ class TrackedFrame:
         window: Number of frames of a detection, for the sensitivity to the timing.
         method: Method of ``restore``.
         options: Options of the method.
+        latency: Number of frames that were given after this one.
     """
 
     time: float
-    latency: int
     state: TrackingState
     motion: Vibration
     path: Tensor
@@ -87,6 +86,7 @@ class TrackedFrame:
     window: int
     method: str
     options: Mapping[str, Any]
+    latency: int = 0
 
     def moved_to(self, place: Tensor) -> "TrackedFrame":
         """The same frame with its content at another place (2,) of the path in px, to stabilise a video.

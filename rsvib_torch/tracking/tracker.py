@@ -79,17 +79,11 @@ _PATIENCE = 3  # consecutive frames that contradict the tones, before the state 
 
 @dataclass(frozen=True, eq=False)
 class _GreyFrame:
-    """A frame as it is measured.
+    """A frame as it is measured."""
 
-    Attributes:
-        images: (1, 1, H, W) grey, in row order; missing pixels hold local means.
-        valid: Bool of that shape, False at missing pixels; None if there are none.
-        time: s, exposure start of its first row.
-    """
-
-    images: Tensor
-    valid: Tensor | None
-    time: float
+    images: Tensor  # (1, 1, H, W) grey, in row order; missing pixels hold local means
+    valid: Tensor | None  # bool of that shape, False at missing pixels; None if there are none
+    time: float  # s, exposure start of its first row
 
     @classmethod
     def of(cls, prepared: PreparedFrames, time: float) -> Self:
@@ -98,13 +92,13 @@ class _GreyFrame:
         return cls(grey, None if prepared.missing is None else ~prepared.missing.any(2), time)
 
     def shows_nothing_new(self, before: "_GreyFrame | None") -> bool:
-        """Whether the frame is constant, or a copy of the frame before; some rows are enough to find that it is not."""
-        grey, some = self.images, self.images[..., ::16, :]
-        if bool(some.amax() - some.amin() <= 1e-6 * some.abs().amax()):
-            return bool((grey.amax() - grey.amin()) <= 1e-6 * grey.abs().amax())
-        if before is None or not torch.equal(before.images[..., ::16, :], some):
-            return False
-        return torch.equal(before.images, grey)
+        """Whether the frame is constant, or a copy of the frame before."""
+        for step in (16, 1):  # some rows are enough to find that it is not
+            grey = self.images[..., ::step, :]
+            is_constant = bool(grey.amax() - grey.amin() <= 1e-6 * grey.abs().amax())
+            if not is_constant and (before is None or not torch.equal(before.images[..., ::step, :], grey)):
+                return False
+        return True
 
     def spectra(self, columns: slice) -> RowSpectra:
         """Spectra of the rows in some columns."""
@@ -114,67 +108,41 @@ class _GreyFrame:
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """The scene that rows are compared with.
+    """The scene that rows are compared with."""
 
-    Attributes:
-        gradients: Gradients of its rows.
-        differential: Their ``differential_motion``.
-        path: (2,) px, place on the path where they were computed.
-        age: Number of frames that they have been used for since then.
-    """
-
-    gradients: RowGradients
-    differential: Tensor
-    path: Tensor
-    age: int = 0
+    gradients: RowGradients  # of its rows
+    differential: Tensor  # (1, 2) px, their ``differential_motion``
+    path: Tensor  # (2,) px, place on the path where they were computed
+    age: int = 0  # frames that they have been used for since then
 
 
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """The motion that is followed.
+    """The motion that is followed."""
 
-    Attributes:
-        filter: The tones and the image motion.
-        spectra: Spectra of the last frame that was measured, which the next one is compared with.
-        start: s, exposure start of that frame.
-        columns: The columns that are measured.
-        scene: The scene; None if it is not known yet.
-        tones: The tones at the last frame; None before a frame has been measured.
-        trusted: (2,) bool for each of the last frames, axes whose tones were reliable.
-    """
-
-    filter: ToneFilter
-    spectra: RowSpectra
-    start: float
-    columns: slice
-    scene: _Scene | None = None
-    tones: TrackedTones | None = None
-    trusted: tuple[Tensor, ...] = ()
+    filter: ToneFilter  # tones and image motion
+    spectra: RowSpectra  # of the last frame that was measured, which the next one is compared with
+    start: float  # s, exposure start of that frame
+    columns: slice  # that are measured
+    scene: _Scene | None = None  # None before a frame has been measured, as are the tones
+    tones: TrackedTones | None = None  # at the last frame
+    trusted: tuple[Tensor, ...] = ()  # (2,) bool for each of the last frames: axes whose tones were reliable
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """All that the tracker knows after a frame. It is never changed: a step returns another one.
+    """All that the tracker knows after a frame. It is never changed: a step returns another one."""
 
-    Attributes:
-        time: s, exposure start of the last frame.
-        frames: The last frames that could be used, at most a window.
-        track: The motion that is followed; None if it is not known.
-        path: (2,) px, image motion from the first tracked frame to the reference time of the filter.
-        places: Time in s and path (2,) in px, in image axes, of the frames that the steady image follows.
-        untried: Frames since the last attempt to detect the vibration.
-        attempts: Number of attempts since the rows last agreed with the tones.
-        contradictions: Number of consecutive frames, and of starts of the filter, whose rows contradict the tones.
-    """
-
-    time: float = -math.inf
-    frames: tuple[_GreyFrame, ...] = ()
-    track: _Track | None = None
-    path: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))
-    places: tuple[tuple[float, Tensor], ...] = ()
-    untried: int = 0
-    attempts: int = 0
-    contradictions: int = 0
+    time: float = -math.inf  # s, exposure start of the last frame
+    frames: tuple[_GreyFrame, ...] = ()  # the last ones that could be used, at most a window
+    track: _Track | None = None  # the motion that is followed; None if it is not known
+    path: Tensor = field(  # (2,) px, image motion from the first tracked frame to the reference time of the filter
+        default_factory=lambda: torch.zeros(2, dtype=torch.float64)
+    )
+    places: tuple[tuple[float, Tensor], ...] = ()  # times and paths of the frames that the steady image follows
+    untried: int = 0  # frames since the last attempt to detect the vibration
+    attempts: int = 0  # to detect the vibration, since the rows last agreed with the tones
+    contradictions: int = 0  # consecutive frames, and starts of the filter, whose rows contradict the tones
 
 
 class VibrationTracker:
@@ -252,6 +220,7 @@ class VibrationTracker:
 
     @outside_graphs
     @full_precision
+    @without_gradients
     @checks_arguments
     def update(self, frame: ArrayLike, time: float | None = None, *, measure: bool = True) -> TrackedFrame:
         """Process the next frame.
@@ -269,8 +238,9 @@ class VibrationTracker:
             TypeError: If the frame is not numbers.
             ValueError: If the frame has another shape than the frames before, or its time is not later.
         """
+        # 1. Input. Frames that show nothing new do not count, except for the time of the next one.
         time = self._checked_time(time)
-        with torch.no_grad():  # the result keeps the frame: tensors of inference mode would be copied
+        with torch.inference_mode(mode=False), torch.no_grad():  # the result keeps the frame, not a copy of it
             prepared = prepare_frames(
                 as_tensor("frame", frame)[None],
                 self.timing,
@@ -278,15 +248,38 @@ class VibrationTracker:
                 channels=self.channels,
                 saturation="auto" if "clipped" in METHODS[self.method].masks else None,
             )
-            grey = _GreyFrame.of(prepared, time)
-        if self._state.frames:
-            rows, columns = self._state.frames[-1].images.shape[-2:]
-            if grey.images.shape[-2:] != (rows, columns):
-                raise ValueError(
-                    f"frame has {grey.images.shape[-2]} rows of {grey.images.shape[-1]} px, the frames before had "
-                    f"{rows} of {columns}; call reset() before another size"
-                )
-        return self._updated(prepared, grey, measure)
+            latest = _GreyFrame.of(prepared, time)
+        before = self._state.frames[-1] if self._state.frames else None
+        if before is not None and before.images.shape != latest.images.shape:
+            (rows, columns), (rows_before, columns_before) = latest.images.shape[-2:], before.images.shape[-2:]
+            raise ValueError(
+                f"frame has {rows} rows of {columns} px, the frames before had {rows_before} of {columns_before}; "
+                "call reset() before another size"
+            )
+        state = replace(self._state, time=time)
+        if latest.shows_nothing_new(before):
+            self._state = state
+            return self._result(prepared, replace(state, track=None), "unusable")
+        state = replace(state, frames=(*state.frames, latest)[-self.window :], untried=state.untried + 1)
+
+        # 2. Predict the motion of a late frame, measure that of any other; detect the vibration if it is not known, or
+        # if the rows contradict it.
+        predicted, count = None if measure else self._predicted(state), 0
+        if predicted is None:
+            state = self._measured(state)
+            count = self._frames_to_detect(state)
+            state = self._detected(state, count) if count else state
+        else:
+            state = predicted
+
+        # 3. The result, moved to where the steady image is.
+        tracked = self._result(prepared, state, detected=count > 0, is_measured=predicted is None)
+        if self.steady and tracked.tones is not None:
+            places = (*state.places, (time, tracked.path))
+            state = replace(state, places=tuple(place for place in places if place[0] >= time - self.steady))
+            tracked = tracked.moved_to(_end_of_line(state.places))
+        self._state = state
+        return tracked
 
     def _checked_time(self, time: float | None) -> float:
         before = self._state.time
@@ -297,38 +290,6 @@ class VibrationTracker:
             raise ValueError(f"time must be later than that of the frame before, {before:.6g} s, got {value:.6g} s")
         return value
 
-    @without_gradients
-    def _updated(self, prepared: PreparedFrames, frame: _GreyFrame, measure: bool) -> TrackedFrame:
-        """The steps of ``update`` for a frame of the right size."""
-        # 1. Frames that show nothing new do not count, except for the time of the next one.
-        state = replace(self._state, time=frame.time)
-        if frame.shows_nothing_new(state.frames[-1] if state.frames else None):
-            self._state = state
-            return self._unknown(prepared, "unusable", frame.time)
-        state = replace(state, frames=(*state.frames, frame)[-self.window :], untried=state.untried + 1)
-
-        # 2. Predict the motion of a late frame, measure that of any other.
-        predicted = None if measure else self._predicted(state)
-        state = self._measured(state) if predicted is None else predicted
-
-        # 3. Detect the vibration if it is not known, or if the rows contradict it.
-        count = self._frames_to_detect(state) if predicted is None else 0
-        if count:
-            state = self._detected(state, count)
-
-        # 4. The result, moved to where the steady image is.
-        track = state.track
-        if track is None or track.tones is None:
-            self._state = state
-            return self._unknown(prepared, "searching", frame.time, detected=count > 0)
-        tracked = self._result(prepared, state, track, track.tones, is_measured=predicted is None, detected=count > 0)
-        if self.steady:
-            places = (*state.places, (tracked.time, tracked.path))
-            places = tuple((time, path) for time, path in places if time >= tracked.time - self.steady)
-            state, tracked = replace(state, places=places), tracked.moved_to(_end_of_line(places))
-        self._state = state
-        return tracked
-
     # Tracking
 
     def _measured(self, state: _State) -> _State:
@@ -337,13 +298,13 @@ class VibrationTracker:
         if track is None:
             return state
         frame = state.frames[-1]
-        height, lost = frame.images.shape[-2], replace(state, track=None)
+        height = frame.images.shape[-2]
 
         # 1. Predict the motion in the middle of the two frames.
         centre = 0.5 * (track.start + frame.time) + 0.5 * height * self._rows.row_time
         prediction = track.filter.predicted(centre)
         if not prediction.displacement_std() < _MAX_PREDICTED_STD:  # also if it is not a number
-            return lost
+            return replace(state, track=None)
         fit, step = prediction.as_fit(centre), centre - track.filter.time
         path = state.path + track.filter.path(step)
 
@@ -379,43 +340,32 @@ class VibrationTracker:
         state = replace(state, path=state.path - corrected.path(-step))
 
         # 4. Judge the tones by the rows. Rows far from where the motion places them are not measured correctly.
-        other_motion = _other_motion(measurements, by_tones, by_drift, scene.differential)
-        if not float(other_motion.unexplained.amax()) < _MAX_UNEXPLAINED:
+        residual = measurements.displacements - by_tones - by_drift
+        other = OtherMotion.of(measurements, by_tones, residual, scene.differential)[0]
+        if not float(other.unexplained.amax()) < _MAX_UNEXPLAINED:
             return replace(state, track=None)
         fit = corrected.predicted(frame.time + time_to_middle(height, self._rows), mixed=False).as_fit(frame.time)
         measurements = replace(measurements, exposure_starts=measurements.exposure_starts + (centre - frame.time))
-        tones = self._judged(frame.time, fit, measurements, other_motion, height)
+        tones = self._judged(frame, fit, measurements, other)
         trusted = torch.tensor([not against for against in tones.reasons], device=path.device)
-        contradicted = any(tones.contradicted)
-        track = _Track(
-            filter=corrected,
-            spectra=spectra,
-            start=frame.time,
-            columns=track.columns,
-            scene=scene,
-            tones=tones,
-            trusted=(*track.trusted, trusted)[-self.window :],
-        )
-        return replace(
-            state,
-            track=track,
-            contradictions=state.contradictions + 1 if contradicted else 0,
-            attempts=state.attempts if contradicted else 0,
-        )
+        trusted_axes = (*track.trusted, trusted)[-self.window :]
+        track = _Track(corrected, spectra, frame.time, track.columns, scene, tones, trusted_axes)
+        if any(tones.contradicted):
+            return replace(state, track=track, contradictions=state.contradictions + 1)
+        return replace(state, track=track, contradictions=0, attempts=0)
 
     def _judged(
-        self, time: float, fit: ToneFit, measurements: Measurements, other_motion: OtherMotion, height: int
+        self, frame: _GreyFrame, fit: ToneFit, measurements: Measurements, other_motion: OtherMotion
     ) -> TrackedTones:
-        """The verdict on the tones of a frame that starts at ``time`` in s, by the rows of one pair of frames."""
-        exposure_time = self._rows.exposure_time
-        starts = self._rows.row_starts(1, height, fit.centre.device)[0, ::8]
-        exposure_starts = measurements.exposure_starts
+        """The tones of a frame, whose first row is the time origin, with the verdict of its rows."""
+        exposure_starts, exposure_time = measurements.exposure_starts, self._rows.exposure_time
         interval = (exposure_starts[..., 1] - exposure_starts[..., 0]).mean(1)
-        # Displacement of the rows by the tones, and its standard deviation.
-        vibration, std = vibration_of_fit(fit)
-        own_std = displacement_std(fit, starts, exposure_time)
-        moved = vibration.mean_displacement(starts[None], exposure_time) - vibration.drift(starts[None])
         offsets = measurements.displacements[0, :, 1] - measurements.displacements[0, :, 0]
+        # Displacement of the rows of the frame by the tones, and its standard deviation.
+        vibration, std = vibration_of_fit(fit)
+        starts = self._rows.row_starts(1, frame.images.shape[-2], offsets.device)[:, ::8]
+        moved = vibration.mean_displacement(starts, exposure_time) - vibration.drift(starts)
+        own_std = displacement_std(fit, starts[0], exposure_time)
         _, reasons = judge(
             vibration[0],
             replace(std, displacement=own_std)[0],
@@ -430,7 +380,7 @@ class VibrationTracker:
             max_tones=MAX_TONES,
         )
         contradicted = contradicted_axes(vibration[0], other_motion, MAX_TONES)
-        return TrackedTones(time, fit, measurements, interval, reasons, contradicted)
+        return TrackedTones(frame.time, fit, measurements, interval, reasons, contradicted)
 
     def _predicted(self, state: _State) -> _State | None:
         """The state with predicted tones of the last frame; None if the frame must be measured.
@@ -502,16 +452,14 @@ class VibrationTracker:
     def _stacked(self, frames: tuple[_GreyFrame, ...]) -> GreyFrames | None:
         """Frames as one stack for a detection; None if they are too small for bands, or have too few valid pixels."""
         images = torch.cat([frame.images for frame in frames], 1)
+        everywhere = torch.ones_like(frames[0].images, dtype=torch.bool)
+        valid = torch.cat([everywhere if frame.valid is None else frame.valid for frame in frames], 1)
         height, width = images.shape[-2:]
-        if not fits_frame(height, width if self.columns is None else min(width, self.columns), _BANDS):
+        is_large_enough = fits_frame(height, width if self.columns is None else min(width, self.columns), _BANDS)
+        if not is_large_enough or bool((valid.float().mean((-2, -1)) < _MIN_VALID).any()):
             return None
-        valid = None
-        if any(frame.valid is not None for frame in frames):
-            all_valid = torch.ones_like(frames[0].images, dtype=torch.bool)
-            valid = torch.cat([all_valid if frame.valid is None else frame.valid for frame in frames], 1)
-            if bool((valid.float().mean((-2, -1)) < _MIN_VALID).any()):
-                return None
-        stacks = GreyFrames(without_mosaic(images), valid, batched=False, timing=self._rows)
+        valid_or_none = None if bool(valid.all()) else valid
+        stacks = GreyFrames(without_mosaic(images), valid_or_none, batched=False, timing=self._rows)
         return stacks if self.columns is None else stacks.narrowed(self.columns)
 
     def _started(self, state: _State, found: Attempt, chosen: Tensor, middle: float, record: float) -> _State:
@@ -544,15 +492,9 @@ class VibrationTracker:
         growth_std = torch.full_like(size_std, _GROWTH_STD)
         parts = torch.stack([size_std, size_std, growth_std, 2 * math.pi * std.frequency], -1)
         tone_std = torch.where((tones.abs() > 0)[..., None], 2.0 * parts, 0.0).flatten(-2)
-        drift_std = tone_std.new_tensor(_DRIFT_STD).expand(2, -1)
-        started = ToneFilter.started(
-            middle,
-            tones,
-            vibration.frequency,
-            drift,
-            torch.cat([tone_std, drift_std], -1),
-            self._rows.exposure_time,
-        )
+        all_std = torch.cat([tone_std, tone_std.new_tensor(_DRIFT_STD).expand(2, -1)], -1)
+        exposure_time = self._rows.exposure_time
+        started = ToneFilter.started(middle, tones, vibration.frequency, drift, all_std, exposure_time)
         # 3. The last frame is compared with the one before.
         before, last = state.frames[-2:]
         columns = slice(None) if self.columns is None else detailed_columns(last.images[0, 0], self.columns)
@@ -565,81 +507,44 @@ class VibrationTracker:
         self,
         prepared: PreparedFrames,
         state: _State,
-        track: _Track,
-        tones: TrackedTones,
+        label: TrackingState = "searching",
         *,
-        is_measured: bool,
-        detected: bool,
+        detected: bool = False,
+        is_measured: bool = False,
     ) -> TrackedFrame:
-        """The result for a frame whose motion is known."""
-        # The time origin of the tones is the first row, that of the motion the middle of the frame.
-        half = time_to_middle(prepared.images.shape[-2], self._rows)
-        motion = motion_of_fit(replace(tones.fit, centre=tones.fit.centre - half))[0]
-        # An axis moves if its tones were reliable in one of the last frames.
-        trusted = torch.stack(track.trusted).any(0)
-        followed = ~trusted.new_tensor(tones.contradicted) if self.wobble else trusted
-        motion = replace(
-            motion,
-            amplitude=motion.amplitude * trusted[:, None],
-            image_motion=motion.image_motion * followed,
-            image_acceleration=motion.image_acceleration * followed,
-        )
-        path = state.path + track.filter.path(tones.time + half - track.filter.time)
+        """The result for the last frame; with ``label`` if its motion is not known."""
+        track, tones, device = state.track, None, prepared.images.device
+        motion, path = Vibration.still(device=device), torch.full((2,), math.nan, dtype=torch.float64, device=device)
+        if track is not None and track.tones is not None:
+            tones = track.tones
+            # The time origin of the tones is the first row, that of the motion the middle of the frame.
+            half = time_to_middle(prepared.images.shape[-2], self._rows)
+            motion = motion_of_fit(replace(tones.fit, centre=tones.fit.centre - half))[0]
+            # An axis moves if its tones were reliable in one of the last frames.
+            trusted = torch.stack(track.trusted).any(0)
+            followed = ~trusted.new_tensor(tones.contradicted) if self.wobble else trusted
+            motion = replace(
+                motion,
+                amplitude=motion.amplitude * trusted[:, None],
+                image_motion=motion.image_motion * followed,
+                image_acceleration=motion.image_acceleration * followed,
+            ).from_row_order(self.timing)
+            path = state.path + track.filter.path(state.time + half - track.filter.time)
+            path = offsets_from_row_order(path, self.timing)
+            label = "searching" if state.contradictions >= _PATIENCE else "tracking"
         return TrackedFrame(
-            time=tones.time,
-            latency=0,
-            state="searching" if state.contradictions >= _PATIENCE else "tracking",
-            motion=motion.from_row_order(self.timing),
-            path=offsets_from_row_order(path, self.timing),
+            time=state.time,
+            state=label,
+            motion=motion,
+            path=path,
             detected=detected,
-            measurements=tones.measurements if is_measured else None,
+            measurements=tones.measurements if tones is not None and is_measured else None,
             frame=prepared,
             tones=tones,
             window=self.window,
             method=self.method,
             options=self.options,
         )
-
-    def _unknown(
-        self, prepared: PreparedFrames, state: TrackingState, time: float, *, detected: bool = False
-    ) -> TrackedFrame:
-        """The result for a frame whose motion is not known."""
-        device = prepared.images.device
-        return TrackedFrame(
-            time=time,
-            latency=0,
-            state=state,
-            motion=Vibration.still(device=device),
-            path=torch.full((2,), math.nan, dtype=torch.float64, device=device),
-            detected=detected,
-            measurements=None,
-            frame=prepared,
-            tones=None,
-            window=self.window,
-            method=self.method,
-            options=self.options,
-        )
-
-
-def _other_motion(measurements: Measurements, by_tones: Tensor, by_drift: Tensor, differential: Tensor) -> OtherMotion:
-    """Motion of the rows of one pair of frames that the tones and the drift do not explain.
-
-    Args:
-        measurements: Displacements (1, N, 2, 2) of the rows.
-        by_tones: Displacements by the tones, of that shape.
-        by_drift: Displacements by the drift.
-        differential: (1, 2) px, the ``differential_motion``.
-    """
-    visible, residual = measurements.num_differences > 0, measurements.displacements - by_tones - by_drift
-    measured = visible & (measurements.weights > 0).any(-1)
-    return OtherMotion(
-        size=math.sqrt(2) * measurements.distances(by_tones).square().nanmean(1).sqrt(),
-        unexplained=measurements.unexplained(residual),
-        correlated=measurements.correlated(residual),
-        differential=differential,
-        measured=measured.double().sum(1) / visible.double().sum(1).clamp(min=1),
-        blur=residual.new_tensor([[1.0, 0.0, 0.0]]),  # as expected: it is not measured
-    )[0]
 
 
 def _plausible(found: Attempt) -> Tensor:
