@@ -59,15 +59,7 @@ class FieldScale:
 
     def motion(self, fitted: Vibration) -> Vibration:
         """The vibration with roll in rad and relative zoom, of one whose components are all in px."""
-        factor = self.units(fitted.amplitude)
-        return replace(
-            fitted,
-            amplitude=fitted.amplitude * factor[:, None],
-            image_motion=fitted.image_motion * factor,
-            image_acceleration=fitted.image_acceleration * factor,
-            image_shift=fitted.image_shift * factor,
-            camera=self.camera,
-        )
+        return replace(fitted.scaled(self.units(fitted.amplitude)), camera=self.camera)
 
     def free_motion(self, fitted: FreeMotion) -> FreeMotion:
         """The same for a free motion."""

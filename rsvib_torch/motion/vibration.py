@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Self
 
@@ -226,6 +226,12 @@ class Vibration(Motion, units=_UNITS):
             raise ValueError(f"vibrations differ in shape: {sorted({tuple(v.amplitude.shape) for v in vibrations})}")
         values = {name: torch.stack([getattr(one, name) for one in vibrations]) for name in _LIMITS}
         return cls(**values, camera=first.camera)
+
+    def scaled(self, factor: Tensor | float) -> "Vibration":
+        """The vibration with its components multiplied by factors (..., A), or one factor, that are not negative."""
+        factors = torch.as_tensor(factor, dtype=torch.float64, device=self.device)
+        polynomial = {name: getattr(self, name) * factors for name in _POLYNOMIAL}
+        return replace(self, amplitude=self.amplitude * factors[..., None], **polynomial)
 
     def translation(self) -> "Vibration":
         """The components x and y: the motion of the centre of the frame, without roll and zoom.

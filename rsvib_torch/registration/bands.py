@@ -58,11 +58,6 @@ class BandTask:
         return self.first.shape[-1] - int(self.coarse[:, 0].abs().amax()) - 2 * self.margin
 
     @property
-    def overlapping(self) -> Tensor:
-        """(L,) bool, pairs whose overlap less the margins is at least as wide as the search range."""
-        return self.first.shape[-1] - self.coarse[:, 0].abs() - 2 * self.margin >= self.search
-
-    @property
     def left(self) -> Tensor:
         """First column of the templates of each pair, (L,)."""
         return (-self.coarse[:, 0]).clamp(min=0) + self.margin

@@ -223,7 +223,8 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     advance = steps(len(first), "pairs")
     for pair in parts:
         task = BandTask(first[pair], second[pair], coarse[pair], tops, band_rows, search)
-        overlapping = task.overlapping[:, None]  # pairs without a common part as wide as the search range fail
+        # pairs fail without a common part that is as wide as the search range
+        overlapping = (width - task.coarse[:, :1].abs() - 2 * task.margin) >= search
         task = replace(task, coarse=torch.where(overlapping, task.coarse, 0))
         measured, correlation = BAND_METHODS[options.method](task)
         failed = ~((correlation > 0.1) & overlapping)  # chance reaches correlations of 0.1

@@ -16,7 +16,6 @@ from typing import Self
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
@@ -263,16 +262,15 @@ class ToneFilter:
     def as_fit(self, origin: float) -> ToneFit:
         """The mean of all filters as a fit whose time origin is ``origin`` in s; the growth is left out."""
         values, covariance = (part[:, 0] for part in self._moments(self.probability[..., None]))
-        place = torch.arange(values.shape[-1] - 2, device=values.device)
-        keep = functional.pad(place % 4 != 2, (0, 2), value=True)
-        unit = functional.pad(torch.where(place % 4 == 3, 0.5 / math.pi, 1.0), (0, 2), value=1.0).to(values)
+        unit, keep = torch.ones_like(values[0]), torch.ones_like(values[0], dtype=torch.bool)
+        unit[3:-2:4], keep[2:-2:4] = 0.5 / math.pi, False
         covariance = (covariance * unit[:, None] * unit)[:, keep][:, :, keep]
         coefficients = torch.complex(values[:, :-2:4], values[:, 1:-2:4])
         return ToneFit(
             coefficients[None],
-            values[:, 3:-2:4][None] / (2 * math.pi),
+            values[None, :, 3:-2:4] / (2 * math.pi),
             (coefficients.abs() > 0)[None],
-            values[:, -2:][None],
+            values[None, :, -2:],
             torch.block_diag(*covariance)[None],
             values.new_tensor([self.time - origin]),
             MotionModel(1, 2),

@@ -39,7 +39,6 @@ class TrackedTones:
         fit: The tones; the time origin is ``time``.
         measurements: Displacements of the rows of the last frame that was measured and of the one before, with the
             same time origin.
-        interval: (1,) s, mean time between the exposures of a row in these two frames.
         reasons: Against each axis.
         contradicted: Whether the rows of each axis move in a way that the tones do not explain.
     """
@@ -47,7 +46,6 @@ class TrackedTones:
     time: float
     fit: ToneFit
     measurements: Measurements
-    interval: Tensor
     reasons: tuple[tuple[str, ...], ...]
     contradicted: tuple[bool, bool]
 
@@ -133,17 +131,12 @@ class TrackedFrame:
         robust = measurements.reweighted(residual_of(measurements, fit))
         weights = robust.weights / measurements.weights.clamp(min=1e-300)
         curve, fitted = offset_curve(robust, fit, weights, [2])
-        return assembled(
-            fit,
-            std,
-            curve,
-            fitted,
-            (self.tones.reasons,),
-            self.frame.image_timing,
-            scale=FieldScale(2, width, height),
-            num_frames=self.window,
-            interval=float(self.tones.interval),
-        )[0]
+        interval, scale = float(measurements.exposure_starts.diff(dim=-1).mean()), FieldScale(2, width, height)
+        user_timing, reasons = self.frame.image_timing, (self.tones.reasons,)
+        results = assembled(
+            fit, std, curve, fitted, reasons, user_timing, scale=scale, num_frames=self.window, interval=interval
+        )
+        return results[0]
 
     @property
     def _timed_from_middle(self) -> PreparedFrames:

@@ -259,21 +259,16 @@ class VibrationTracker:
         state = replace(self._state, time=time)
         if latest.shows_nothing_new(before):
             self._state = state
-            return self._result(prepared, replace(state, track=None), "unusable")
+            return self._result(prepared, state, usable=False)
         state = replace(state, frames=(*state.frames, latest)[-self.window :], untried=state.untried + 1)
 
         # 2. Predict the motion of a late frame, measure that of any other; detect the vibration if it is not known, or
         # if the rows contradict it.
-        predicted, count = None if measure else self._predicted(state), 0
-        if predicted is None:
-            state = self._measured(state)
-            count = self._frames_to_detect(state)
-            state = self._detected(state, count) if count else state
-        else:
-            state = predicted
+        predicted = None if measure else self._predicted(state)
+        state = self._detected(self._measured(state)) if predicted is None else predicted
 
         # 3. The result, moved to where the steady image is.
-        tracked = self._result(prepared, state, detected=count > 0, is_measured=predicted is None)
+        tracked = self._result(prepared, state)
         if self.steady and tracked.tones is not None:
             places = (*state.places, (time, tracked.path))
             state = replace(state, places=tuple(place for place in places if place[0] >= time - self.steady))
@@ -358,8 +353,7 @@ class VibrationTracker:
         self, frame: _GreyFrame, fit: ToneFit, measurements: Measurements, other_motion: OtherMotion
     ) -> TrackedTones:
         """The tones of a frame, whose first row is the time origin, with the verdict of its rows."""
-        exposure_starts, exposure_time = measurements.exposure_starts, self._rows.exposure_time
-        interval = (exposure_starts[..., 1] - exposure_starts[..., 0]).mean(1)
+        exposure_time = self._rows.exposure_time
         offsets = measurements.displacements[0, :, 1] - measurements.displacements[0, :, 0]
         # Displacement of the rows of the frame by the tones, and its standard deviation.
         vibration, std = vibration_of_fit(fit)
@@ -372,7 +366,7 @@ class VibrationTracker:
             offsets=offsets,
             fitted=offsets,
             visible=measurements.num_differences[0] > 0,
-            intervals=interval,
+            intervals=measurements.exposure_starts.diff(dim=-1).mean((1, 2)),
             displacement=moved[0].std(0, correction=0),
             own_std=own_std[0],
             timing=self._rows,
@@ -380,7 +374,7 @@ class VibrationTracker:
             max_tones=MAX_TONES,
         )
         contradicted = contradicted_axes(vibration[0], other_motion, MAX_TONES)
-        return TrackedTones(frame.time, fit, measurements, interval, reasons, contradicted)
+        return TrackedTones(frame.time, fit, measurements, reasons, contradicted)
 
     def _predicted(self, state: _State) -> _State | None:
         """The state with predicted tones of the last frame; None if the frame must be measured.
@@ -416,8 +410,11 @@ class VibrationTracker:
             return 0
         return min(new, len(state.frames))
 
-    def _detected(self, state: _State, count: int) -> _State:
-        """Detect the vibration in the last ``count`` frames, and follow its tones from the last one."""
+    def _detected(self, state: _State) -> _State:
+        """Detect the vibration in the last frames if that is due, and follow its tones from the last frame."""
+        count = self._frames_to_detect(state)
+        if count == 0:
+            return state
         state = replace(state, untried=0, attempts=state.attempts + 1)
         frames = state.frames[-count:]
         stacks = self._stacked(frames)
@@ -433,9 +430,8 @@ class VibrationTracker:
         for method, number in _STARTS[:1] if only_bands else _STARTS:
             found = attempt(stacks, timing, DetectionOptions(method, number, model, _BANDS), hypothesis)
             quality = found.fitted.offsets.quality
-            if method == "bands" and float(quality.median()) < _MIN_CORRELATION:
-                break  # the frames do not show the same scene
-            if found.statuses[0] == "not visible":
+            other_scene = method == "bands" and float(quality.median()) < _MIN_CORRELATION
+            if other_scene or found.statuses[0] == "not visible":
                 break
             # Tones that the last frame contradicts are not used: without tones, the path is followed at least.
             plausible = _plausible(found)
@@ -503,32 +499,24 @@ class VibrationTracker:
 
     # Results
 
-    def _result(
-        self,
-        prepared: PreparedFrames,
-        state: _State,
-        label: TrackingState = "searching",
-        *,
-        detected: bool = False,
-        is_measured: bool = False,
-    ) -> TrackedFrame:
-        """The result for the last frame; with ``label`` if its motion is not known."""
-        track, tones, device = state.track, None, prepared.images.device
+    def _result(self, prepared: PreparedFrames, state: _State, *, usable: bool = True) -> TrackedFrame:
+        """The result for the last frame."""
+        label: TrackingState = "searching" if usable else "unusable"
+        device, measurements = prepared.images.device, None
         motion, path = Vibration.still(device=device), torch.full((2,), math.nan, dtype=torch.float64, device=device)
-        if track is not None and track.tones is not None:
-            tones = track.tones
+        track = state.track if usable else None
+        tones = None if track is None else track.tones
+        if track is not None and tones is not None:
+            if track.start == state.time:  # the frame was measured
+                measurements = tones.measurements
             # The time origin of the tones is the first row, that of the motion the middle of the frame.
             half = time_to_middle(prepared.images.shape[-2], self._rows)
             motion = motion_of_fit(replace(tones.fit, centre=tones.fit.centre - half))[0]
             # An axis moves if its tones were reliable in one of the last frames.
             trusted = torch.stack(track.trusted).any(0)
             followed = ~trusted.new_tensor(tones.contradicted) if self.wobble else trusted
-            motion = replace(
-                motion,
-                amplitude=motion.amplitude * trusted[:, None],
-                image_motion=motion.image_motion * followed,
-                image_acceleration=motion.image_acceleration * followed,
-            ).from_row_order(self.timing)
+            motion = replace(motion.scaled(followed), amplitude=motion.amplitude * trusted[:, None])
+            motion = motion.from_row_order(self.timing)
             path = state.path + track.filter.path(state.time + half - track.filter.time)
             path = offsets_from_row_order(path, self.timing)
             label = "searching" if state.contradictions >= _PATIENCE else "tracking"
@@ -537,8 +525,8 @@ class VibrationTracker:
             state=label,
             motion=motion,
             path=path,
-            detected=detected,
-            measurements=tones.measurements if tones is not None and is_measured else None,
+            detected=usable and state.untried == 0,
+            measurements=measurements,
             frame=prepared,
             tones=tones,
             window=self.window,

@@ -1,7 +1,6 @@
 """The part of a detected vibration that is accurate enough to be undone, from its standard deviations."""
 
 import math
-from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -129,15 +128,7 @@ def trusted_vibration(
                     f"{where}{name} is not restored: its displacement of {float(size[here]):.2g} {unit} has a standard "
                     f"deviation of {float(error[here]):.2g} {unit}; detect it from more frames"
                 )
-    keep = reliable & accurate
-    trusted = replace(
-        vibration,
-        amplitude=vibration.amplitude * keep[..., None],
-        image_motion=vibration.image_motion * keep,
-        image_acceleration=vibration.image_acceleration * keep,
-        image_shift=vibration.image_shift * keep,
-    )
-    return trusted, tuple(notes)
+    return vibration.scaled(reliable & accurate), tuple(notes)
 
 
 def vibration_to_undo(
