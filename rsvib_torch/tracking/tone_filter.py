@@ -147,7 +147,7 @@ class ToneFilter:
         Args:
             measurements: Displacements (1, N, 2, 2) of the rows of two frames.
             origin: Time origin of the measurements in s.
-            noise_factor: (A,) factor of the variance of the offsets, see ``VibrationTracker``.
+            noise_factor: (A,) factor of the variance of the offsets, because neighbouring pairs share a frame.
         """
         # 1. The offsets, linear in the parameters, with robust weights.
         jacobian, residual = self._linearised(measurements, origin)

@@ -108,12 +108,11 @@ class TrackedFrame:
     @cached_property
     def visible(self) -> Tensor:
         """(H, W) bool, pixels of the restored frame that the sensor recorded; the others are extrapolated."""
-        mask = frames_from_row_order(
-            torch.ones_like(self.frame.images[0, 0, 0], dtype=torch.bool), self.frame.image_timing
-        )
+        everything = torch.ones_like(self.frame.images[0, 0, 0], dtype=torch.bool)
+        everything = frames_from_row_order(everything, self.frame.image_timing)
         if self.tones is None:
-            return mask
-        height, width = mask.shape
+            return everything
+        height, width = everything.shape
         return visible_pixels(self._timed_from_middle.image_timing, self.motion, (height, width), 1)[0][0]
 
     @cached_property

@@ -60,7 +60,7 @@ _MAX_PREDICTED_STD = 0.5  # px; the gradients of rows reach a few tenths of a pi
 _MAX_UNMEASURED_STD = 0.1  # px; paths of hand-held cameras are predicted within 0.25 px, with 1 px within 0.6 px
 _MAX_UNEXPLAINED = 1.0  # px, residual displacement of rows; they are not measured correctly over larger distances
 _MAX_CHANGE = 0.2  # px, by which a round may change the displacement of a row; otherwise the frame is measured again
-_MAX_ROUNDS = 3
+_MAX_ROUNDS = 3  # measurements of one frame
 _MAX_PATH = 4.0  # px; the scene may move so far before its gradients are computed again
 _MAX_AGE = 30  # frames; then gradients are computed again, because the scene may have changed
 _DRIFT_STD = (10.0, 500.0)  # px/s and px/s^2, at the start; tones and drift are correlated, their sum is more accurate
@@ -113,7 +113,7 @@ class _Scene:
     gradients: RowGradients  # of its rows
     differential: Tensor  # (1, 2) px, their ``differential_motion``
     path: Tensor  # (2,) px, place on the path where they were computed
-    age: int = 0  # frames that they have been used for since then
+    age: int = 0  # number of frames that they have been used for
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,9 +201,7 @@ class VibrationTracker:
         **options: Any,
     ) -> None:
         if timing.frame_start_times is not None:
-            raise ValueError(
-                "timing must not have frame_start_times: pass the time of each frame to update(frame, time)"
-            )
+            raise ValueError("timing must not have frame_start_times: pass the time of each frame to update")
         check_method_options(method, options)
         self.timing, self.method, self.options = timing, method, options
         self.window = check_whole_number("window", window, at_least=2)
@@ -305,7 +303,7 @@ class VibrationTracker:
 
         # 2. The gradients of the scene are used again unless they are old or the scene has moved.
         scene = track.scene
-        if scene is not None and (scene.age >= _MAX_AGE or float((path - scene.path).abs().amax()) > _MAX_PATH):
+        if scene is not None and (scene.age > _MAX_AGE or float((path - scene.path).abs().amax()) > _MAX_PATH):
             scene = None
 
         # 3. Measure the rows around the prediction and correct it; again if the correction is large. Neighbouring pairs
@@ -328,10 +326,8 @@ class VibrationTracker:
             if float(change.abs().amax()) < _MAX_CHANGE:
                 break
             fit, path, scene = corrected.as_fit(centre), state.path - corrected.path(-step), None
-        if scene is None:
-            scene = _Scene(gradients, differential_motion([gradients]), path)
-        else:
-            scene = replace(scene, age=scene.age + 1)
+        scene = scene or _Scene(gradients, differential_motion([gradients]), path)
+        scene = replace(scene, age=scene.age + 1)
         state = replace(state, path=state.path - corrected.path(-step))
 
         # 4. Judge the tones by the rows. Rows far from where the motion places them are not measured correctly.
@@ -454,8 +450,8 @@ class VibrationTracker:
         is_large_enough = fits_frame(height, width if self.columns is None else min(width, self.columns), _BANDS)
         if not is_large_enough or bool((valid.float().mean((-2, -1)) < _MIN_VALID).any()):
             return None
-        valid_or_none = None if bool(valid.all()) else valid
-        stacks = GreyFrames(without_mosaic(images), valid_or_none, batched=False, timing=self._rows)
+        mask = None if bool(valid.all()) else valid
+        stacks = GreyFrames(without_mosaic(images), mask, batched=False, timing=self._rows)
         return stacks if self.columns is None else stacks.narrowed(self.columns)
 
     def _started(self, state: _State, found: Attempt, chosen: Tensor, middle: float, record: float) -> _State:
@@ -489,8 +485,7 @@ class VibrationTracker:
         parts = torch.stack([size_std, size_std, growth_std, 2 * math.pi * std.frequency], -1)
         tone_std = torch.where((tones.abs() > 0)[..., None], 2.0 * parts, 0.0).flatten(-2)
         all_std = torch.cat([tone_std, tone_std.new_tensor(_DRIFT_STD).expand(2, -1)], -1)
-        exposure_time = self._rows.exposure_time
-        started = ToneFilter.started(middle, tones, vibration.frequency, drift, all_std, exposure_time)
+        started = ToneFilter.started(middle, tones, vibration.frequency, drift, all_std, self._rows.exposure_time)
         # 3. The last frame is compared with the one before.
         before, last = state.frames[-2:]
         columns = slice(None) if self.columns is None else detailed_columns(last.images[0, 0], self.columns)
@@ -540,8 +535,7 @@ def _plausible(found: Attempt) -> Tensor:
 
     The verdict on a record may be that the motion changes, which the filter follows. It has its own verdict.
     """
-    vibration = found.vibration[0]
-    amplitude, std = vibration.amplitude, found.std[0].amplitude
+    vibration, amplitude, std = found.vibration[0], found.vibration[0].amplitude, found.std[0].amplitude
     strongest = amplitude == amplitude.amax(-1, keepdim=True)
     plausible = (amplitude > MIN_SIGNIFICANCE * std) | (strongest & (amplitude > std))
     return plausible & (vibration.gain(found.interval).abs() > MIN_GAIN)  # blind tones may have any amplitude
