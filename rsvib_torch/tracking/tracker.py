@@ -323,7 +323,10 @@ class VibrationTracker:
             by_tones, by_drift = corrected.explained(measurements, centre)
             around = motion.mean_displacement(measurements.exposure_starts, self._rows.exposure_time)
             change = by_tones + by_drift - measurements.relative(around)
-            if float(change.abs().amax()) < _MAX_CHANGE:
+            largest = float(change.abs().amax())
+            if not math.isfinite(largest):  # no row was measured
+                return replace(state, track=None)
+            if largest < _MAX_CHANGE:
                 break
             fit, path, scene = corrected.as_fit(centre), state.path - corrected.path(-step), None
         scene = scene or _Scene(gradients, differential_motion([gradients]), path)

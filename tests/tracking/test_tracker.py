@@ -272,6 +272,17 @@ def test_frames_without_a_common_scene_or_with_few_rows_are_searched_in_vain(ste
         assert all(one.detection is None and one.path.isnan().all() for one in tracked)
 
 
+def test_a_frame_with_almost_no_detail_is_survived(steady):
+    frames = steady[0][:16].clone()
+    frames[8] = 0.3
+    frames[8, 1::2] += 1e-5
+    frames[8, 7, 9] = 0.4  # between the rows of which the contrast is a sample
+    tracked = track(frames)
+    assert all(torch.isfinite(one.restored).all() for one in tracked)
+    assert tracked[-1].state == "tracking"
+    assert np.abs(errors(tracked[-1].detection)).max() < 0.004
+
+
 def test_columns_as_rows_and_the_reverse_readout(steady):
     frames, tracked = steady
     timing = replace(TIMING, scan_axis="x", readout_direction="reverse")
