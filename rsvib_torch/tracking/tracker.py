@@ -290,8 +290,7 @@ class VibrationTracker:
         track = state.track
         if track is None:
             return state
-        frame = state.frames[-1]
-        height = frame.images.shape[-2]
+        frame, height = state.frames[-1], state.frames[-1].images.shape[-2]
 
         # 1. Predict the motion in the middle of the two frames.
         centre = 0.5 * (track.start + frame.time) + 0.5 * height * self._rows.row_time
@@ -314,17 +313,15 @@ class VibrationTracker:
         gain = offset_gain(fit.frequencies, (starts[1] - starts[0])[None])[0] * fit.active[0]
         noise_factor = (0.5 * gain.amax(-1).square()).clamp(min=1.0)
         for _ in range(_MAX_ROUNDS):
-            anchor = path if scene is None else scene.path
+            anchor, known = (path, None) if scene is None else (scene.path, scene.gradients)
             motion = replace(motion_of_fit(fit), image_shift=(path - anchor)[None])
-            measurements, gradients = measure_group(
-                group, self._rows, motion, None if scene is None else scene.gradients
-            )
+            measurements, gradients = measure_group(group, self._rows, motion, known)
             corrected = prediction.updated(measurements, centre, noise_factor)
             by_tones, by_drift = corrected.explained(measurements, centre)
             around = motion.mean_displacement(measurements.exposure_starts, self._rows.exposure_time)
             change = by_tones + by_drift - measurements.relative(around)
             largest = float(change.abs().amax())
-            if not math.isfinite(largest):  # no row was measured
+            if not math.isfinite(largest):  # the rows were not measured
                 return replace(state, track=None)
             if largest < _MAX_CHANGE:
                 break
