@@ -29,7 +29,8 @@ LAYERS = (
 )
 INNER_LAYERS = {
     "detection": (
-        {"measurements", "result"},
+        {"measurements"},
+        {"result"},
         {"strips"},
         {"tones"},
         {"start"},

@@ -13,7 +13,6 @@ round, until each of them is finished.
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -356,17 +355,8 @@ def conclude(rows: MeasuredRows, record: RowRecord, fit: ToneFit) -> FittedRows:
     share = weighted.independent_fraction(residual) * measurements.share_counted(residual)
     weighted = replace(weighted, independent=share)
     fit = fit_tones(weighted, fit, fit.active, fit.model)
-    visible = measurements.num_differences > 0
-    measured = (visible & (measurements.weights > 0).any(-1)).double().sum(1) / visible.double().sum(1).clamp(min=1.0)
     tones = measurements.relative(model_displacements(measurements, replace(fit, drift=torch.zeros_like(fit.drift))))
-    other = OtherMotion(
-        size=math.sqrt(2) * measurements.distances(tones).square().nanmean(1).sqrt(),
-        unexplained=measurements.unexplained(residual),
-        correlated=measurements.correlated(residual),
-        differential=record.differential(),
-        measured=measured,
-        blur=measured.new_tensor([1.0, 0.0, 0.0]).expand(len(measured), 3),  # replaced once the motion is final
-    )
+    other = OtherMotion.of(measurements, tones, residual, record.differential())
     return FittedRows(
         weighted,
         fit,

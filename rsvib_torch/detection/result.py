@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows, plain_values
 from rsvib_torch.core.text import measured_text, text_table
+from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.detected_vibration import detection_summary
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
@@ -38,6 +39,20 @@ class OtherMotion:
     differential: Tensor
     measured: Tensor
     blur: Tensor
+
+    @classmethod
+    def of(cls, measurements: Measurements, by_tones: Tensor, residual: Tensor, differential: Tensor) -> "OtherMotion":
+        """From displacements (B, N, G, 2) of rows by the tones, and those left; the blur counts as expected."""
+        visible = measurements.num_differences > 0
+        measured = visible & (measurements.weights > 0).any(-1)
+        return cls(
+            size=math.sqrt(2) * measurements.distances(by_tones).square().nanmean(1).sqrt(),
+            unexplained=measurements.unexplained(residual),
+            correlated=measurements.correlated(residual),
+            differential=differential,
+            measured=measured.double().sum(1) / visible.double().sum(1).clamp(min=1.0),
+            blur=residual.new_tensor([1.0, 0.0, 0.0]).expand(len(residual), 3),
+        )
 
     @property
     def permitted(self) -> Tensor:

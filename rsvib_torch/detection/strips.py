@@ -59,15 +59,7 @@ class FieldScale:
 
     def motion(self, fitted: Vibration) -> Vibration:
         """The vibration with roll in rad and relative zoom, of one whose components are all in px."""
-        factor = self.units(fitted.amplitude)
-        return Vibration(
-            fitted.amplitude * factor[:, None],
-            fitted.frequency,
-            fitted.phase,
-            fitted.image_motion * factor,
-            fitted.image_acceleration * factor,
-            self.camera,
-        )
+        return replace(fitted.scaled(self.units(fitted.amplitude)), camera=self.camera)
 
     def free_motion(self, fitted: FreeMotion) -> FreeMotion:
         """The same for a free motion."""

@@ -12,7 +12,7 @@ from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import SensorTiming
 
-__all__ = ["GreyFrames", "constant_frame", "grey_frames"]
+__all__ = ["GreyFrames", "constant_frame", "grey_frames", "without_mosaic"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +108,11 @@ def grey_frames(
                 "frames), and its time is wrong; remove copies and state the times of the others in frame_start_times"
             )
     # all channels show the same displacement; the pattern of a colour mosaic does not move with the scene
-    images = images.mean(2) if images.shape[2] > 1 else _without_mosaic(images[:, :, 0])
+    images = images.mean(2) if images.shape[2] > 1 else without_mosaic(images[:, :, 0])
     return GreyFrames(images, valid, prepared.batched, prepared.image_timing)
 
 
-def _without_mosaic(images: Tensor) -> Tensor:
+def without_mosaic(images: Tensor) -> Tensor:
     """Grey frames (B, T, H, W), of colour mosaics without the pattern of the colours, which does not move."""
     mosaic = torch.stack([is_mosaic(stack[0]) for stack in images])
     if not bool(mosaic.any()):

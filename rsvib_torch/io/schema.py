@@ -85,6 +85,7 @@ class VibrationRecord(Section):
     phase: Tones
     image_motion: list[float]
     image_acceleration: list[float] = Field(default_factory=lambda: [0.0, 0.0])
+    image_shift: list[float] = Field(default_factory=lambda: [0.0, 0.0])
     camera: CameraRecord | None = None
 
     @model_validator(mode="after")
@@ -105,10 +106,11 @@ class VibrationRecord(Section):
         return cls(**{name: plain_values(getattr(vibration, name)) for name in VibrationRecord.model_fields})
 
     @model_serializer(mode="wrap")
-    def _without_unknown(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit an unknown camera: files written before this field was added keep their hash."""
+    def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Omit an unknown camera and a shift of 0: files written before these fields were added keep their hash."""
         values: dict[str, Any] = handler(self)
-        return {name: value for name, value in values.items() if name != "camera" or value is not None}
+        is_set = {"camera": self.camera is not None, "image_shift": any(self.image_shift)}
+        return {name: value for name, value in values.items() if is_set.get(name, True)}
 
     def to_vibration(self) -> Vibration:
         """The vibration."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -258,12 +258,14 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         check_number("offset", offset)
         check_number("scale", scale, above=0.0)
         size = self.coefficients.new_tensor(gain)
-        tones = Vibration(
-            self.amplitude * size[:, None],
-            self.frequency * scale,
-            self.phase + 2 * math.pi * self.frequency * offset,
-            size * (self.image_motion + self.image_acceleration * offset) * scale,
-            size * self.image_acceleration * scale**2,
+        tones = replace(
+            self.tones,
+            amplitude=self.amplitude * size[:, None],
+            frequency=self.frequency * scale,
+            phase=self.phase + 2 * math.pi * self.frequency * offset,
+            image_motion=size * (self.image_motion + self.image_acceleration * offset) * scale,
+            image_acceleration=size * self.image_acceleration * scale**2,
+            image_shift=size * self.tones.image_shift,
         )
         moved = self.image_motion * offset + 0.5 * self.image_acceleration * offset**2
         rest = (self.coefficients + moved[..., None]) * size[:, None]

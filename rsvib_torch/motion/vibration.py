@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Self
 
@@ -28,12 +28,21 @@ _UNITS = {
     "phase": "rad at the first row of frame 0",
     "image_motion": "px/s; of roll rad/s, of zoom 1/s",
     "image_acceleration": "px/s^2; of roll rad/s^2, of zoom 1/s^2",
+    "image_shift": "px; of roll rad, of zoom 1",
 }
 _COLUMNS = {"amplitude": ("px", 1.0), "frequency": ("Hz", 1.0), "period": ("ms", 1e3), "phase": ("rad", 1.0)}
 _QUANTITIES = ("amplitude", "frequency", "phase")
+_POLYNOMIAL = ("image_motion", "image_acceleration", "image_shift")
 
 # Largest values: beyond the largest image, the fastest row, and what float64 angles and positions resolve.
-_LIMITS = {"amplitude": 1e6, "frequency": 1e9, "phase": 1e9, "image_motion": 1e9, "image_acceleration": 1e12}
+_LIMITS = {
+    "amplitude": 1e6,
+    "frequency": 1e9,
+    "phase": 1e9,
+    "image_motion": 1e9,
+    "image_acceleration": 1e12,
+    "image_shift": 1e6,
+}
 _NOT_NEGATIVE = ("amplitude", "frequency")
 _MAX_BLIND = 10_000_000  # blind frequencies; 80 MB
 
@@ -109,8 +118,8 @@ def _check_values(values: dict[str, Tensor]) -> None:
 class Vibration(Motion, units=_UNITS):
     """Sinusoidal displacement of the image on the sensor, with an image motion.
 
-    ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t + a t^2 / 2`` per axis (Eq. 1 of Liu et al. 2023, several tones,
-    Sec. 2.3; the paper's image motion is uniform, a = 0): scene content at ``s`` appears at ``s + D(t)``. Axes are
+    ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t + a t^2 / 2 + c`` per axis (Eq. 1 of Liu et al. 2023, several
+    tones, Sec. 2.3; in the paper a = c = 0): scene content at ``s`` appears at ``s + D(t)``. Axes are
     ordered (x, y). Tones are sorted by amplitude, largest first; an axis with fewer tones than the other has
     amplitude 0 for the remaining ones.
 
@@ -126,6 +135,8 @@ class Vibration(Motion, units=_UNITS):
         image_motion: v in px/s at the time origin, ``(2,)`` or ``(..., 2)``; with roll and zoom also one value for
             each axis, in rad/s and 1/s.
         image_acceleration: a in px/s^2, same shape.
+        image_shift: c in px, same shape: a constant displacement. Frames do not determine it, so that detected
+            vibrations have none.
         camera: Focal length and lens, for displacements that follow a rotation of the camera exactly; X and Y are then
             those at the principal point.
 
@@ -149,6 +160,7 @@ class Vibration(Motion, units=_UNITS):
     phase: Tensor
     image_motion: Tensor
     image_acceleration: Tensor
+    image_shift: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))  # in files without it
     camera: Camera | None = None
 
     @checks_arguments
@@ -159,30 +171,31 @@ class Vibration(Motion, units=_UNITS):
         phase: TensorLike = 0.0,
         image_motion: TensorLike = (0.0, 0.0),
         image_acceleration: TensorLike = (0.0, 0.0),
+        image_shift: TensorLike = (0.0, 0.0),
         camera: Camera | None = None,
     ) -> None:
-        given = (amplitude, frequency, phase, image_motion, image_acceleration)
+        given = (amplitude, frequency, phase, image_motion, image_acceleration, image_shift)
         device = next((value.device for value in given if isinstance(value, Tensor)), None)
         tones = _per_tone({"amplitude": amplitude, "frequency": frequency, "phase": phase}, device)
         axes = tones[0].shape[-2]
-        motion = _per_axis("image_motion", image_motion, axes, device)
-        acceleration = _per_axis("image_acceleration", image_acceleration, axes, device)
+        polynomial = [_per_axis(name, value, axes, device) for name, value in zip(_POLYNOMIAL, given[3:], strict=True)]
         try:
             tones = list(torch.broadcast_tensors(*tones))
             # torch.broadcast_shapes takes 40 us, and its first call imports sympy (0.3 s)
-            batch = torch.broadcast_tensors(tones[0][..., 0, 0], motion[..., 0], acceleration[..., 0])[0].shape
+            firsts = [tones[0][..., 0, 0], *(values[..., 0] for values in polynomial)]
+            batch = torch.broadcast_tensors(*firsts)[0].shape
         except RuntimeError as error:
-            shapes = ", ".join(str(tuple(t.shape)) for t in (*tones, motion, acceleration))
+            shapes = ", ".join(str(tuple(values.shape)) for values in (*tones, *polynomial))
             raise ValueError(f"amplitude, frequency, phase and image_motion do not fit together: {shapes}") from error
-        _check_values(dict(zip(_LIMITS, (*tones, motion, acceleration), strict=True)))
+        _check_values(dict(zip(_LIMITS, (*tones, *polynomial), strict=True)))
         tones = [tensor.expand(*batch, *tensor.shape[-2:]) for tensor in tones]
         if tones[0].shape[-1] > 1:  # sorted
             order = tones[0].detach().argsort(dim=-1, descending=True, stable=True)
             tones = [tensor.take_along_dim(order, dim=-1) for tensor in tones]
-        for name, tensor in zip(("amplitude", "frequency", "phase"), tones, strict=True):
+        for name, tensor in zip(
+            _LIMITS, (*tones, *(values.expand(*batch, axes) for values in polynomial)), strict=True
+        ):
             object.__setattr__(self, name, tensor)
-        object.__setattr__(self, "image_motion", motion.expand(*batch, axes))
-        object.__setattr__(self, "image_acceleration", acceleration.expand(*batch, axes))
         object.__setattr__(self, "camera", camera)
 
     @classmethod
@@ -193,7 +206,7 @@ class Vibration(Motion, units=_UNITS):
         if math.prod(sizes) > MAX_BATCH:
             raise ValueError(f"batch_shape must have at most {MAX_BATCH} motions, got {tuple(sizes)}")
         zeros = torch.zeros(*sizes, axes, 1, dtype=torch.float64, device=device)
-        return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0])
+        return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0], zeros[..., 0])
 
     @classmethod
     @checks_arguments
@@ -211,14 +224,14 @@ class Vibration(Motion, units=_UNITS):
             raise ValueError("motions of different cameras cannot be stacked")
         if len({one.amplitude.shape for one in vibrations}) > 1:
             raise ValueError(f"vibrations differ in shape: {sorted({tuple(v.amplitude.shape) for v in vibrations})}")
-        return cls(
-            torch.stack([one.amplitude for one in vibrations]),
-            torch.stack([one.frequency for one in vibrations]),
-            torch.stack([one.phase for one in vibrations]),
-            torch.stack([one.image_motion for one in vibrations]),
-            torch.stack([one.image_acceleration for one in vibrations]),
-            first.camera,
-        )
+        values = {name: torch.stack([getattr(one, name) for one in vibrations]) for name in _LIMITS}
+        return cls(**values, camera=first.camera)
+
+    def scaled(self, factor: Tensor | float) -> "Vibration":
+        """The vibration with its components multiplied by factors (..., A), or one factor, that are not negative."""
+        factors = torch.as_tensor(factor, dtype=torch.float64, device=self.device)
+        polynomial = {name: getattr(self, name) * factors for name in _POLYNOMIAL}
+        return replace(self, amplitude=self.amplitude * factors[..., None], **polynomial)
 
     def translation(self) -> "Vibration":
         """The components x and y: the motion of the centre of the frame, without roll and zoom.
@@ -227,13 +240,8 @@ class Vibration(Motion, units=_UNITS):
             >>> Vibration((3.1, 5.2, 1e-3), (90.0, 61.0, 70.0)).translation().amplitude.flatten().tolist()
             [3.1, 5.2]
         """
-        return Vibration(
-            self.amplitude[..., :2, :],
-            self.frequency[..., :2, :],
-            self.phase[..., :2, :],
-            self.image_motion[..., :2],
-            self.image_acceleration[..., :2],
-        )
+        tones = {name: getattr(self, name)[..., :2, :] for name in _QUANTITIES}
+        return Vibration(**tones, **{name: getattr(self, name)[..., :2] for name in _POLYNOMIAL})
 
     def summary(self) -> str:
         """The tones of each axis as a table; of a batch, the strongest tone of each axis."""
@@ -268,16 +276,16 @@ class Vibration(Motion, units=_UNITS):
         amplitude, frequency, phase = (t.reshape(shape) for t in (self.amplitude, self.frequency, self.phase))
         return 2 * math.pi * frequency * times[..., None, None] + phase, amplitude, frequency
 
-    def _image_motion(self, times: Tensor) -> tuple[Tensor, Tensor]:
-        """Velocity and acceleration (S, A) of the image motion at the time origin, to broadcast with times (S, 1)."""
+    def _at(self, times: Tensor, values: Tensor) -> Tensor:
+        """Values (..., A) for each motion, to broadcast with times (S, 1)."""
         shape = (*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), self.amplitude.shape[-2])
-        return self.image_motion.reshape(shape), self.image_acceleration.reshape(shape)
+        return values.reshape(shape)
 
     @checks_arguments
     def drift(self, times: Tensor) -> Tensor:
         """Displacement v t + a t^2 / 2 of the image motion alone in px; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)[..., None]
-        velocity, acceleration = self._image_motion(times)
+        velocity, acceleration = self._at(times, self.image_motion), self._at(times, self.image_acceleration)
         return (velocity + 0.5 * acceleration * times) * times
 
     @checks_arguments
@@ -292,7 +300,7 @@ class Vibration(Motion, units=_UNITS):
         """
         times = times.to(dtype=torch.float64, device=self.device)
         angle, amplitude, _ = self._angle(times)
-        return (amplitude * angle.sin()).sum(-1) + self.drift(times)
+        return (amplitude * angle.sin()).sum(-1) + self.drift(times) + self._at(times[..., None], self.image_shift)
 
     @checks_arguments
     def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
@@ -311,18 +319,18 @@ class Vibration(Motion, units=_UNITS):
         middle = starts.to(dtype=torch.float64, device=self.device) + 0.5 * exposure_time
         angle, amplitude, frequency = self._angle(middle)
         attenuation = torch.sinc(frequency * _with_trailing(exposure_time, 2))
-        _, acceleration = self._image_motion(middle[..., None])
-        curvature = acceleration * (_with_trailing(exposure_time, 1) ** 2 / 24.0)
-        return (amplitude * attenuation * angle.sin()).sum(-1) + self.drift(middle) + curvature
+        tones = (amplitude * attenuation * angle.sin()).sum(-1)
+        curvature = self._at(middle[..., None], self.image_acceleration) * (_with_trailing(exposure_time, 1) ** 2 / 24)
+        return tones + self.drift(middle) + curvature + self._at(middle[..., None], self.image_shift)
 
     @checks_arguments
     def velocity(self, times: Tensor) -> Tensor:
         """Velocity dD/dt in px/s; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
         angle, amplitude, frequency = self._angle(times)
-        velocity, acceleration = self._image_motion(times[..., None])
+        times = times[..., None]
         oscillation = (2 * math.pi * frequency * amplitude * angle.cos()).sum(-1)
-        return oscillation + velocity + acceleration * times[..., None]
+        return oscillation + self._at(times, self.image_motion) + self._at(times, self.image_acceleration) * times
 
     @checks_arguments
     def gain(self, interval: float) -> Tensor:
@@ -333,8 +341,8 @@ class Vibration(Motion, units=_UNITS):
         return 2.0 * torch.sin(math.pi * self.frequency * interval)
 
     def largest_oscillation(self) -> Tensor:
-        """Sum of the amplitudes of the tones, (..., 2), in px."""
-        return self.amplitude.detach().sum(-1)
+        """Sum of the amplitudes of the tones and of the constant displacement, (..., 2), in px."""
+        return self.amplitude.detach().sum(-1) + self.image_shift.detach().abs()
 
     @checks_arguments
     def displacement_within(self, duration: float) -> Tensor:
@@ -373,9 +381,8 @@ class Vibration(Motion, units=_UNITS):
             self.amplitude[..., axes, :],
             self.frequency[..., axes, :],
             torch.where(sign[:, None] < 0, opposite, phase),
-            self.image_motion[..., axes] * sign,
-            self.image_acceleration[..., axes] * sign,
-            None if self.camera is None else self.camera.with_axes(order, signs),
+            **{name: getattr(self, name)[..., axes] * sign for name in _POLYNOMIAL},
+            camera=None if self.camera is None else self.camera.with_axes(order, signs),
         )
 
 
@@ -431,20 +438,15 @@ class VibrationStd(
 
     def __getitem__(self, index: int) -> "VibrationStd":
         """The standard deviations of one stack of a batch."""
-        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return VibrationStd(**{name: value[index] for name, value in values.items() if value is not None})
+        return self.mapped(lambda values: values[index])
 
     @checks_arguments
     def from_row_order(self, timing: SensorTiming) -> "VibrationStd":
         """The standard deviations, given in row order, in image axes: as ``Motion.from_row_order`` without signs."""
         if timing.scan_axis == -2:
             return self
-        order = [1, 0, 2, 3][: self.amplitude.shape[-2]]
-        tones = (self.amplitude, self.frequency, self.period, self.phase)
-        amplitude, frequency, period, phase = (values[..., order, :] for values in tones)
-        motion, acceleration = self.image_motion[..., order], self.image_acceleration[..., order]
-        displacement = None if self.displacement is None else self.displacement[..., order]
-        return VibrationStd(amplitude, frequency, period, phase, motion, acceleration, displacement)
+        order, axes = [1, 0, 2, 3][: self.amplitude.shape[-2]], self.image_motion.ndim
+        return self.mapped(lambda values: values[..., order] if values.ndim == axes else values[..., order, :])
 
 
 # Text

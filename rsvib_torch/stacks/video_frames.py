@@ -117,16 +117,16 @@ class VideoRestorer:
         planes = self.layout.planes(frame)
         if track.fault is not None or not track.known:
             return RestoredFrame(planes, None, track.fault)
-        motions = [(self.timing_of(0), track.removed), (self.timing_of(1), _halved(track.removed))]
+        motions = [(self.timing_of(0), track.motion), (self.timing_of(1), track.motion.scaled(0.5))]
         results = [self._plane(plane, number, *motions[number]) for number, plane in enumerate(planes)]
         return RestoredFrame(results, self.visible(track) if self.masks else None)
 
     def visible(self, track: FrameTrack, *, luma_only: bool = False) -> list[NDArray[np.bool_]]:
         """For each plane, the pixels of the restored frame that the sensor recorded."""
         height, width = self.layout.size
-        parts = [(self.timing_of(0), track.removed, (height, width))]
+        parts = [(self.timing_of(0), track.motion, (height, width))]
         if self.layout.planar and not luma_only:
-            parts.append((self.timing_of(1), _halved(track.removed), (height // 2, width // 2)))
+            parts.append((self.timing_of(1), track.motion.scaled(0.5), (height // 2, width // 2)))
         return [visible_pixels(timing, motion, size, 1)[0][0].numpy() for timing, motion, size in parts]
 
     def timing_of(self, plane: int) -> SensorTiming:
@@ -155,14 +155,3 @@ class VideoRestorer:
         with torch.no_grad():
             restored = restore_prepared(prepared, motion, method, self.options if number == 0 else {})
         return frames_to_counts(prepared.from_row_order(restored)[0], self.layout.dtype, scale)
-
-
-def _halved(motion: Vibration) -> Vibration:
-    """The motion in pixels of twice the size."""
-    return Vibration(
-        0.5 * motion.amplitude,
-        motion.frequency,
-        motion.phase,
-        0.5 * motion.image_motion,
-        0.5 * motion.image_acceleration,
-    )

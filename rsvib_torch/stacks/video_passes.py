@@ -147,11 +147,12 @@ class VideoPasses:
         assert start is not None
         starts = (float(start[0]), float(start[0]) + frames[1][0].time - first.time)
         prepared = prepare_frames(images, replace(timing, frame_start_times=starts), channels="first")
-        if not bool(first.motion.moving_axes().any()):
+        motion = replace(first.motion, image_shift=torch.zeros_like(first.motion.image_shift))
+        if not bool(motion.moving_axes().any()):
             return None
         with suppress(TooLittleInCommonError), torch.no_grad():
-            restored = restore_prepared(prepared, first.motion, self.restorer.method, self.restorer.options)
-            return judge_prepared(prepared, restored, first.motion, most_pairs=1)
+            restored = restore_prepared(prepared, motion, self.restorer.method, self.restorer.options)
+            return judge_prepared(prepared, restored, motion, most_pairs=1)
         return None
 
     def record(self, part: int, tracks: list[FrameTrack], verdict: RestorationVerdict | None) -> dict[str, Any]:
@@ -166,7 +167,7 @@ class VideoPasses:
             "last": tracks[-1].index,
             "start_time": (reported or tracks[0]).time,
             "written": len(tracks),
-            "frames": "restored" if any(track.removed.moving_axes().any() for track in known) else "as taken",
+            "frames": "restored" if any(track.motion.moving_axes().any() for track in known) else "as taken",
             "detection": None if reported is None else detection_to_json(reported.detection),
             "left_alone": _left_alone(known, None if reported is None else reported.detection),
             "outcome": None if verdict is None else verdict.overall,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.tracking.tracker import VibrationTracker, displaced
+from rsvib_torch.tracking.tracker import VibrationTracker
 
 __all__ = ["FrameTrack", "followed"]
 
@@ -25,12 +25,11 @@ class FrameTrack:
     Attributes:
         index: Number of the frame.
         time: s, exposure start of its first row, from the first frame.
-        motion: The motion of the rows to remove, in image axes; its time origin is the middle of the frame.
+        motion: The motion to remove, in image axes; its time origin is the middle of the frame.
         path: (2,) px, place on the path of the image motion; NaN if it is not known.
         known: Whether the motion is known.
         fault: Why the frame could not be used; None if it was used.
         detection: The vibration at this frame, with the time origin at its first row; None if it is not known.
-        shift: (2,) px, by which the restored frame is moved back in addition; None for none.
     """
 
     index: int
@@ -40,16 +39,10 @@ class FrameTrack:
     known: bool
     fault: str | None = None
     detection: DetectionResult | None = None
-    shift: Tensor | None = None
-
-    @property
-    def removed(self) -> Vibration:
-        """All that is removed: the motion and the shift."""
-        return self.motion if self.shift is None else displaced(self.motion, self.shift)
 
     def moved_to(self, place: Tensor) -> "FrameTrack":
         """The frame with its content at another place (2,) of the path in px."""
-        return replace(self, shift=self.path - place)
+        return replace(self, motion=replace(self.motion, image_shift=self.path - place))
 
 
 def followed(
@@ -129,8 +122,7 @@ def _followed_backwards(frames: Sequence[_Given], tracker: VibrationTracker) -> 
 def _reversed(track: FrameTrack, time: float) -> FrameTrack:
     """What was found backwards in time, for a frame that starts at ``time`` in s."""
     motion = track.motion
-    phase, velocity = torch.pi - motion.phase, -motion.image_motion
-    forwards = Vibration(motion.amplitude, motion.frequency, phase, velocity, motion.image_acceleration)
+    forwards = replace(motion, phase=torch.pi - motion.phase, image_motion=-motion.image_motion)
     return replace(track, time=time, motion=forwards)
 
 

@@ -65,17 +65,16 @@ def steadied(frames: Iterator[tuple[Placed, Item]], duration: float) -> Iterator
         return (around[-1].time - around[0].time) / max(len(around) - 1, 1) or 1.0
 
     def placed() -> tuple[Placed, Item]:
-        tracked = around[len(around) - len(items)]
-        if not bool(torch.isfinite(tracked.path).all()):
-            return tracked, items.popleft()
+        frame, paths = around[len(around) - len(items)], torch.stack([other.path for other in around])
+        known = torch.isfinite(paths).all(1)
+        if not bool(torch.isfinite(frame.path).all()):
+            return frame, items.popleft()
         # the same distance on both sides, so that a uniform motion is kept at the ends as well
-        reach = min(half, tracked.time - around[0].time, around[-1].time - tracked.time)
-        known = [one for one in around if bool(torch.isfinite(one.path).all())]
-        distances = torch.tensor([abs(one.time - tracked.time) for one in known], dtype=torch.float64)
+        reach = min(half, frame.time - around[0].time, around[-1].time - frame.time)
+        distances = paths.new_tensor([abs(other.time - frame.time) for other in around])
         # a frame stands for the time of one interval; half of it counts at the end of the time around the frame
-        weights = ((reach - distances) / interval() + 0.5).clamp(0.0, 1.0).to(tracked.path.device)
-        paths = torch.stack([one.path for one in known])
-        return tracked.moved_to((weights[:, None] * paths).sum(0) / weights.sum()), items.popleft()
+        weights = ((reach - distances) / interval() + 0.5).clamp(0.0, 1.0)[known]
+        return frame.moved_to((weights[:, None] * paths[known]).sum(0) / weights.sum()), items.popleft()
 
     for latest, item in frames:
         around.append(latest)

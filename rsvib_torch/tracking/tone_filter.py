@@ -35,18 +35,14 @@ class ToneFilter:
 
     Attributes:
         time: Reference time in s.
-        coefficients: (A, M, K) complex128 C in px at the reference time.
-        rates: (A, M, K) complex128 ``g + 2 pi i f`` in 1/s.
-        drift: (A, M, 2) float64 v and a.
-        covariance: (A, M, P, P) float64 of the P = 4 K + 2 parameters [Re C, Im C, g, 2 pi f of each tone, v, a].
+        values: (A, M, P) float64, the P = 4 K + 2 parameters [Re C, Im C, g, 2 pi f of each tone, v, a].
+        covariance: (A, M, P, P) float64 of the parameters.
         probability: (A, M) float64 of each process noise.
         exposure_time: T_e in s.
     """
 
     time: float
-    coefficients: Tensor
-    rates: Tensor
-    drift: Tensor
+    values: Tensor
     covariance: Tensor
     probability: Tensor
     exposure_time: float
@@ -66,39 +62,27 @@ class ToneFilter:
             exposure_time: T_e in s.
         """
         models = len(PROCESS_NOISE)
-
-        def repeated(values: Tensor) -> Tensor:
-            return values[:, None].expand(-1, models, *values.shape[1:]).clone()
-
-        rates = torch.complex(torch.zeros_like(frequencies), 2 * math.pi * frequencies)
         probability = torch.full((len(std), models), (1 - _STAY) / (models - 1), dtype=std.dtype, device=std.device)
         probability[:, 0] = _STAY
-        covariance = torch.diag_embed(std.square())
-        coefficients, rates, drift, covariance = map(repeated, (coefficients, rates, drift, covariance))
-        return cls(time, coefficients, rates, drift, covariance, probability, exposure_time)
+        rates = torch.complex(torch.zeros_like(frequencies), 2 * math.pi * frequencies)
+        values = _packed(coefficients, rates, drift)[:, None].repeat(1, models, 1)
+        covariance = torch.diag_embed(std.square())[:, None].repeat(1, models, 1, 1)
+        return cls(time, values, covariance, probability, exposure_time)
 
     @property
-    def tones(self) -> int:
-        """Number K of tones."""
-        return self.coefficients.shape[-1]
+    def coefficients(self) -> Tensor:
+        """(A, M, K) complex128 C in px at the reference time."""
+        return torch.complex(self.values[..., :-2:4], self.values[..., 1:-2:4])
 
-    def _values(self) -> Tensor:
-        """(A, M, P) parameters."""
-        parts = torch.stack(
-            [self.coefficients.real, self.coefficients.imag, self.rates.real, self.rates.imag], -1
-        ).flatten(-2)
-        return torch.cat([parts, self.drift], -1)
+    @property
+    def rates(self) -> Tensor:
+        """(A, M, K) complex128 ``g + 2 pi i f`` in 1/s."""
+        return torch.complex(self.values[..., 2:-2:4], self.values[..., 3:-2:4])
 
-    def _with_values(self, values: Tensor, covariance: Tensor, probability: Tensor) -> Self:
-        tones = values[..., :-2].unflatten(-1, (-1, 4))
-        return replace(
-            self,
-            coefficients=torch.complex(tones[..., 0], tones[..., 1]),
-            rates=torch.complex(tones[..., 2], tones[..., 3].abs()),
-            drift=values[..., -2:],
-            covariance=covariance,
-            probability=probability,
-        )
+    @property
+    def drift(self) -> Tensor:
+        """(A, M, 2) float64 v and a."""
+        return self.values[..., -2:]
 
     # Prediction
 
@@ -112,32 +96,28 @@ class ToneFilter:
         before, step = self._mixed() if mixed else self, time - self.time
         factor = (before.rates * step).exp()
         moved = before.coefficients * factor
-        tones, size = self.tones, before.covariance.shape[-1]
-        transition = torch.eye(size, dtype=torch.float64, device=moved.device).expand_as(before.covariance).clone()
+        eye = torch.eye(self.values.shape[-1], dtype=torch.float64, device=moved.device)
+        transition = eye.expand_as(before.covariance).clone()
         noise = torch.zeros_like(transition)
-        walk, jerk = torch.tensor(PROCESS_NOISE, dtype=torch.float64, device=moved.device).square().unbind(-1)
-        for tone in range(tones):
-            place = slice(4 * tone, 4 * tone + 2), slice(4 * tone + 2, 4 * tone + 4)
-            turned, by_rate = _as_matrix(factor[..., tone]), _as_matrix(moved[..., tone])
-            transition[..., place[0], place[0]] = turned
-            transition[..., place[0], place[1]] = step * by_rate
-            exists = (moved[..., tone].abs() > 0)[..., None, None] * walk[:, None, None]
-            noise[..., place[0], place[0]] = exists * (step**3 / 3) * (by_rate @ by_rate.mT)
-            of_both = exists * (step**2 / 2) * by_rate
-            noise[..., place[0], place[1]] = of_both
-            noise[..., place[1], place[0]] = of_both.mT
-            noise[..., place[1], place[1]] = exists * step * torch.eye(2, dtype=torch.float64, device=moved.device)
+        walk, jerk = eye.new_tensor(PROCESS_NOISE).square()[..., None, None].unbind(1)  # (M, 1, 1)
+        # Tones: C turns and grows by g and 2 pi f, whose random walk is integrated once.
+        for tone in range(moved.shape[-1]):
+            size, rate = slice(4 * tone, 4 * tone + 2), slice(4 * tone + 2, 4 * tone + 4)
+            by_rate = _as_matrix(moved[..., tone])  # derivative of C by the rate, per second
+            transition[..., size, size] = _as_matrix(factor[..., tone])
+            transition[..., size, rate] = step * by_rate
+            exists = (moved[..., tone].abs() > 0)[..., None, None] * walk
+            noise[..., size, size] = exists * (step**3 / 3) * (by_rate @ by_rate.mT)
+            noise[..., size, rate] = exists * (step**2 / 2) * by_rate
+            noise[..., rate, size] = noise[..., size, rate].mT
+            noise[..., rate, rate] = exists * step * eye[:2, :2]
+        # Image motion: v grows by a, whose random walk is integrated once.
         transition[..., -2, -1] = step
-        of_drift = noise.new_tensor([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
-        noise[..., -2:, -2:] = jerk[:, None, None] * of_drift
+        noise[..., -2:, -2:] = jerk * eye.new_tensor([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
         velocity, acceleration = before.drift.unbind(-1)
-        return replace(
-            before,
-            time=time,
-            coefficients=moved,
-            drift=torch.stack([velocity + step * acceleration, acceleration], -1),
-            covariance=transition @ before.covariance @ transition.mT + noise,
-        )
+        drift = torch.stack([velocity + step * acceleration, acceleration], -1)
+        covariance = transition @ before.covariance @ transition.mT + noise
+        return replace(before, time=time, values=_packed(moved, before.rates, drift), covariance=covariance)
 
     def _mixed(self) -> Self:
         """Every filter starts from the mean of all, weighted by how probable a change to its process noise is."""
@@ -147,14 +127,14 @@ class ToneFilter:
         joint = self.probability[..., None] * change  # (A, from, to)
         probability = joint.sum(1)
         values, covariance = self._moments(joint / probability[:, None])
-        return self._with_values(values, covariance, probability)
+        return replace(self, values=values, covariance=covariance, probability=probability)
 
     def _moments(self, weight: Tensor) -> tuple[Tensor, Tensor]:
         """Means (A, N, P) and covariances (A, N, P, P) of mixtures with weights (A, M, N) of the filters."""
         # as products of matrices: einsum takes five times as many operations
-        values, share = self._values(), weight.mT
-        mean = share @ values
-        apart = values[:, None] - mean[:, :, None]  # (A, N, M, P)
+        share = weight.mT
+        mean = share @ self.values
+        apart = self.values[:, None] - mean[:, :, None]  # (A, N, M, P)
         spread = (apart * share[..., None]).mT @ apart
         covariance = (share @ self.covariance.flatten(-2)).unflatten(-1, self.covariance.shape[-2:])
         return mean, covariance + spread
@@ -167,26 +147,32 @@ class ToneFilter:
         Args:
             measurements: Displacements (1, N, 2, 2) of the rows of two frames.
             origin: Time origin of the measurements in s.
-            noise_factor: (A,) factor of the variance of the offsets, see ``VibrationTracker``.
+            noise_factor: (A,) factor of the variance of the offsets, because neighbouring pairs share a frame.
         """
+        # 1. The offsets, linear in the parameters, with robust weights.
         jacobian, residual = self._linearised(measurements, origin)
         weights = 0.5 * measurements.weights[0].T * (measurements.num_differences[0] > 0)  # (A, N) of an offset
         weights = self._robust(jacobian, residual, weights) / noise_factor[:, None]
         weighted = jacobian * weights[:, None, :, None]
         normal, right = weighted.mT @ jacobian, (weighted.mT @ residual[..., None])[..., 0]
+        # 2. Posterior (P^-1 + N)^-1 = (I + P N)^-1 P of the covariance P and the normal matrix N, in units of the
+        # standard deviations: their sizes differ by many orders of magnitude, and fixed parameters have none.
         scale = self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
         inverse_scale = torch.where(scale > 0, 1 / scale.clamp(min=1e-300), 0.0)
         correlation = self.covariance * inverse_scale[..., None] * inverse_scale[..., None, :]
-        normal = normal * scale[..., None] * scale[..., None, :]
         eye = torch.eye(scale.shape[-1], dtype=torch.float64, device=scale.device)
-        system = eye + correlation @ normal
+        system = eye + correlation @ (normal * scale[..., None] * scale[..., None, :])
         posterior = torch.linalg.solve(system, correlation)
         posterior = 0.5 * (posterior + posterior.mT) * scale[..., None] * scale[..., None, :]
         step = (posterior @ right[..., None])[..., 0]
+        values = self.values + step
+        values[..., 3:-2:4] = values[..., 3:-2:4].abs()  # frequencies stay positive
+        # 3. Probabilities of the process noise, from how well each filter predicted the offsets.
         fit = (weights[:, None] * residual.square()).sum(-1) - (step * right).sum(-1)
         score = self.probability.log() - 0.5 * (fit + torch.linalg.slogdet(system).logabsdet)
         probability = score.softmax(-1).clamp(min=1e-6)  # a filter that failed must be able to return
-        return self._with_values(self._values() + step, posterior, probability / probability.sum(-1, keepdim=True))
+        probability = probability / probability.sum(-1, keepdim=True)
+        return replace(self, values=values, covariance=posterior, probability=probability)
 
     def explained(self, measurements: Measurements, origin: float) -> tuple[Tensor, Tensor]:
         """Displacements (1, N, 2, A) in px of rows in two frames relative to their mean, by the tones and by the drift.
@@ -233,16 +219,14 @@ class ToneFilter:
         best = self.probability.argmax(-1)[:, None]
         jacobian = jacobian.take_along_dim(best[..., None, None], 1)[:, 0]
         residual = residual.take_along_dim(best[..., None], 1)[:, 0]
-        size = jacobian.square().mean(1, keepdim=True).sqrt().clamp(min=1e-300)
-        columns, root = jacobian / size, weights.sqrt()[..., None]
-        eye = 1e-9 * weights.sum(-1)[:, None, None] * torch.eye(columns.shape[-1], dtype=torch.float64).to(columns)
+        columns = jacobian / jacobian.square().mean(1, keepdim=True).sqrt().clamp(min=1e-300)
+        eye = torch.eye(columns.shape[-1], dtype=columns.dtype, device=columns.device)
+        ridge = (1e-9 * weights.sum(-1)[:, None, None] + 1e-300) * eye
         robust = weights
         for _ in range(2):
             weighted = columns * robust[..., None]
-            solution = torch.linalg.solve(
-                weighted.mT @ columns + eye + 1e-300 * torch.eye(len(eye[0])).to(eye), weighted.mT @ residual[..., None]
-            )
-            apart = (residual - (columns @ solution)[..., 0]) * root[..., 0]
+            solution = torch.linalg.solve(weighted.mT @ columns + ridge, weighted.mT @ residual[..., None])
+            apart = (residual - (columns @ solution)[..., 0]) * weights.sqrt()
             measured = torch.where(weights > 0, apart.abs(), torch.nan)
             spread = 1.4826 * measured.nanmedian(-1, keepdim=True).values.nan_to_num(1.0).clamp(min=1e-9)
             share = (1 - (apart / (6 * spread)).square()).clamp(min=0.0).square()
@@ -277,22 +261,26 @@ class ToneFilter:
 
     def as_fit(self, origin: float) -> ToneFit:
         """The mean of all filters as a fit whose time origin is ``origin`` in s; the growth is left out."""
-        values, covariance = self._moments(self.probability[..., None])
-        tones = values[:, 0, :-2].unflatten(-1, (-1, 4))
-        place = torch.arange(values.shape[-1], device=values.device)
-        keep = (place % 4 != 2) | (place >= 4 * self.tones)
-        unit = torch.where((place % 4 == 3) & (place < 4 * self.tones), 0.5 / math.pi, 1.0).to(values)
-        covariance = (covariance[:, 0] * unit[:, None] * unit)[:, keep][:, :, keep]
-        coefficients = torch.complex(tones[..., 0], tones[..., 1])
+        values, covariance = (part[:, 0] for part in self._moments(self.probability[..., None]))
+        unit, keep = torch.ones_like(values[0]), torch.ones_like(values[0], dtype=torch.bool)
+        unit[3:-2:4], keep[2:-2:4] = 0.5 / math.pi, False
+        covariance = (covariance * unit[:, None] * unit)[:, keep][:, :, keep]
+        coefficients = torch.complex(values[:, :-2:4], values[:, 1:-2:4])
         return ToneFit(
             coefficients[None],
-            (tones[..., 3] / (2 * math.pi))[None],
+            values[None, :, 3:-2:4] / (2 * math.pi),
             (coefficients.abs() > 0)[None],
-            values[:, 0, -2:][None],
+            values[None, :, -2:],
             torch.block_diag(*covariance)[None],
             values.new_tensor([self.time - origin]),
             MotionModel(1, 2),
         )
+
+
+def _packed(coefficients: Tensor, rates: Tensor, drift: Tensor) -> Tensor:
+    """(..., P) parameters of coefficients and rates (..., K) and drift (..., 2)."""
+    tones = torch.stack([coefficients.real, coefficients.imag, rates.real, rates.imag], -1)
+    return torch.cat([tones.flatten(-2), drift], -1)
 
 
 def _between(values: Tensor) -> Tensor:

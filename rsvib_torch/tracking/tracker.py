@@ -2,19 +2,19 @@
 
 Each new frame is warped to the scene by the predicted motion, and the displacements of its rows from the frame before
 are measured as in ``detect_vibration`` (``detection.rows``). They correct the prediction (``tone_filter``). The
-gradients of the scene are kept while the scene stays within a few pixels. ``detect_vibration`` itself is only called to
-begin, and again if the rows contradict the prediction.
+gradients of the scene are kept while the scene stays within a few pixels. Detection from several frames
+(``detection.pipeline``) is only needed to begin, and again if the rows contradict the prediction.
+
+All that the tracker knows is one immutable ``_State``. A frame takes it through these steps, each of which returns
+another state: ``_measured`` or, for a late frame, ``_predicted``; then, if the motion is not known or contradicted,
+``_detected``. The result for the user (``tracked_frame``) is made from the last state.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -23,157 +23,126 @@ from rsvib_torch.core.arguments import as_numbers, checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels, as_tensor
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.option_types import DetectionMethod
-from rsvib_torch.core.precision import full_precision, outside_graphs, outside_inference, without_gradients
-from rsvib_torch.detection import DetectionResult, detect_vibration
-from rsvib_torch.detection.assemble import offset_curve
+from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
 from rsvib_torch.detection.reliability import contradicted_axes, judge
 from rsvib_torch.detection.result import OtherMotion
-from rsvib_torch.detection.rows.displacements import (
-    FrameGroup,
-    differential_motion,
-    measure_group,
-    stack_spectra,
-)
-from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
+from rsvib_torch.detection.rows.displacements import FrameGroup, differential_motion, measure_group, stack_spectra
+from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import (
     MIN_GAIN,
+    MotionModel,
     ToneFit,
     displacement_std,
     motion_of_fit,
     offset_gain,
-    residual_of,
     vibration_of_fit,
 )
 from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE
-from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
+from rsvib_torch.frames.grey import GreyFrames, without_mosaic
+from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.registration import RegistrationOptions
 from rsvib_torch.registration.gradients import RowGradients
+from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.registration.row_spectra import RowSpectra
-from rsvib_torch.restoration.frame_motion import visible_pixels
-from rsvib_torch.restoration.restore import METHODS, check_method_options, restore_prepared, unchanged_frames
+from rsvib_torch.restoration.restore import METHODS, check_method_options
 from rsvib_torch.tracking.tone_filter import ToneFilter
+from rsvib_torch.tracking.tracked_frame import TrackedFrame, TrackedTones, TrackingState, time_to_middle
 
-__all__ = ["TrackedFrame", "TrackingState", "VibrationTracker", "displaced"]
-
-TrackingState = Literal["searching", "tracking", "unusable"]
+__all__ = ["VibrationTracker"]
 
 _MAX_PREDICTED_STD = 0.5  # px; the gradients of rows reach a few tenths of a pixel, and there are several rounds
 _MAX_UNMEASURED_STD = 0.1  # px; paths of hand-held cameras are predicted within 0.25 px, with 1 px within 0.6 px
 _MAX_UNEXPLAINED = 1.0  # px, residual displacement of rows; they are not measured correctly over larger distances
 _MAX_CHANGE = 0.2  # px, by which a round may change the displacement of a row; otherwise the frame is measured again
-_MAX_ROUNDS = 3
+_MAX_ROUNDS = 3  # measurements of one frame
 _MAX_PATH = 4.0  # px; the scene may move so far before its gradients are computed again
 _MAX_AGE = 30  # frames; then gradients are computed again, because the scene may have changed
 _DRIFT_STD = (10.0, 500.0)  # px/s and px/s^2, at the start; tones and drift are correlated, their sum is more accurate
-_STARTS: tuple[tuple[DetectionMethod, Literal["auto"] | int], ...] = (("bands", "auto"), ("direct", 1))
+_GROWTH_STD = 0.5  # 1/s, at the start; amplitudes that double within a second or two are followed
+# Methods and numbers of tones of a detection, in this order. Bands are a sufficient start, because the filter measures
+# the rows. The direct method takes up to ten times as long (9 s for eight frames of a flying drone without a tone).
+_STARTS: tuple[tuple[DetectionMethod, int | None], ...] = (("bands", None), ("direct", 1))
+_BANDS = RegistrationOptions()
+_DIRECT_ATTEMPTS = 2  # consecutive attempts; after them only bands are tried
+_FEW_ROWS = 256  # rows of a frame; smaller frames have few bands, and every attempt uses the direct method as well
+_MIN_VALID = 0.1  # of the pixels of each frame, to detect the vibration; as in detect_vibration
 _MIN_CORRELATION = 0.3  # of the typical band with the next frame; bands of independent noise reach 0.1
 _MAX_DOUBLED = 4  # times that the number of frames between two attempts to detect the vibration is doubled
-# The direct method takes up to ten times as long as bands (9 s for eight frames of a flying drone without a tone)
-_DIRECT_ATTEMPTS, _FEW_ROWS = 2, 256  # consecutive attempts, after which only bands are tried unless there are few
-_PATIENCE = 3  # consecutive frames that contradict the tones, before the vibration is detected again
+_PATIENCE = 3  # consecutive frames that contradict the tones, before the state is "searching"
 
 
 @dataclass(frozen=True, eq=False)
-class TrackedFrame:
-    """Result of ``VibrationTracker.update``.
+class _GreyFrame:
+    """A frame as it is measured."""
 
-    Attributes:
-        time: s, exposure start of its first row.
-        latency: Number of frames that were given after this one.
-        state: ``"tracking"``: the motion is known; ``"searching"``: it is not, or the rows contradict it;
-            ``"unusable"``: the frame is constant, or a copy of the frame before.
-        motion: The motion to remove, in image axes; its time origin is the middle of the frame. Axes whose vibration is
-            not reliable are still.
-        path: (2,) px, axes (x, y): image motion without vibration from the first tracked frame to the middle of this
-            one; NaN if it is not known.
-        detected: Whether ``detect_vibration`` was called for this frame.
-        measurements: Displacements of the rows of this frame and of the frame before, in row order; times count
-            from the first row of this frame. None if they were not measured.
-    """
+    images: Tensor  # (1, 1, H, W) grey, in row order; missing pixels hold local means
+    valid: Tensor | None  # bool of that shape, False at missing pixels; None if there are none
+    time: float  # s, exposure start of its first row
 
-    time: float
-    latency: int
-    state: TrackingState
-    motion: Vibration
-    path: Tensor
-    detected: bool
-    measurements: Measurements | None
-    _restore: Callable[[Vibration], Tensor] = field(repr=False)
-    _result: Callable[[], DetectionResult | None] = field(repr=False)
-    _visible: Callable[[Vibration], Tensor] = field(repr=False)
+    @classmethod
+    def of(cls, prepared: PreparedFrames, time: float) -> Self:
+        """The mean of the channels."""
+        grey = prepared.filled[:, :, 0] if prepared.images.shape[2] == 1 else prepared.filled.mean(2)
+        return cls(grey, None if prepared.missing is None else ~prepared.missing.any(2), time)
 
-    @cached_property
-    def restored(self) -> Tensor:
-        """The frame without the motion, in its shape; as taken if no motion is known. Computed at the first use.
+    def shows_nothing_new(self, before: "_GreyFrame | None") -> bool:
+        """Whether the frame is constant, or a copy of the frame before."""
+        for step in (16, 1):  # some rows are enough to find that it is not
+            grey = self.images[..., ::step, :]
+            is_constant = bool(grey.amax() - grey.amin() <= 1e-6 * grey.abs().amax())
+            if not is_constant and (before is None or not torch.equal(before.images[..., ::step, :], grey)):
+                return False
+        return True
 
-        Another thread may use it while the next frame is tracked.
-        """
-        return outside_inference(self._restore(self.motion))
-
-    @cached_property
-    def detection(self) -> DetectionResult | None:
-        """The vibration at this frame, with its time origin at the first row of this frame; None if none is known."""
-        return outside_inference(self._result())
-
-    @cached_property
-    def visible(self) -> Tensor:
-        """(H, W) bool, pixels of the restored frame that the sensor recorded; the others are extrapolated."""
-        return outside_inference(self._visible(self.motion))
-
-    def moved_to(self, place: Tensor) -> "TrackedFrame":
-        """The same frame with its content at another place (2,) of the path in px, to stabilise a video.
-
-        Content stays at ``path`` if the frame is not moved.
-        """
-        return replace(self, motion=displaced(self.motion, self.path - place))
+    def spectra(self, columns: slice) -> RowSpectra:
+        """Spectra of the rows in some columns."""
+        valid = None if self.valid is None else self.valid[..., columns]
+        return stack_spectra(self.images[..., columns], valid)
 
 
 @dataclass(frozen=True, eq=False)
-class _Reference:
-    """The frame before.
+class _Scene:
+    """The scene that rows are compared with."""
 
-    Attributes:
-        spectra: Its spectra.
-        start: s, exposure start of its first row.
-        gradients: Gradients of the scene; None if they are not known.
-        apart: Their ``differential_motion``.
-        path: Path at which they were computed.
-        age: Number of frames since then.
-    """
-
-    spectra: RowSpectra
-    start: float
-    gradients: RowGradients | None = None
-    apart: Tensor | None = None
-    path: Tensor | None = None
-    age: int = 0
+    gradients: RowGradients  # of its rows
+    differential: Tensor  # (1, 2) px, their ``differential_motion``
+    path: Tensor  # (2,) px, place on the path where they were computed
+    age: int = 0  # number of frames that they have been used for
 
 
 @dataclass(frozen=True, eq=False)
-class _Verdict:
-    """State of the tones according to the last pair of frames, in row order.
+class _Track:
+    """The motion that is followed."""
 
-    Attributes:
-        time: s, exposure start of the frame that the tones belong to.
-        fit: The tones; the time origin is ``time``.
-        measurements: Displacements of the rows of the pair, with the same time origin.
-        other_motion: Motion that the tones do not explain.
-        reliable: (2,) bool.
-        reasons: Against each axis.
-        contradicted: Axes whose rows the tones do not explain.
-    """
+    filter: ToneFilter  # tones and image motion
+    spectra: RowSpectra  # of the last frame that was measured, which the next one is compared with
+    start: float  # s, exposure start of that frame
+    columns: slice  # that are measured
+    scene: _Scene | None = None  # None before a frame has been measured, as are the tones
+    tones: TrackedTones | None = None  # at the last frame
+    trusted: tuple[Tensor, ...] = ()  # (2,) bool for each of the last frames: axes whose tones were reliable
 
-    time: float
-    fit: ToneFit
-    measurements: Measurements
-    other_motion: OtherMotion
-    reliable: Tensor
-    reasons: tuple[tuple[str, ...], ...]
-    contradicted: tuple[bool, bool]
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """All that the tracker knows after a frame. It is never changed: a step returns another one."""
+
+    time: float = -math.inf  # s, exposure start of the last frame
+    frames: tuple[_GreyFrame, ...] = ()  # the last ones that could be used, at most a window
+    track: _Track | None = None  # the motion that is followed; None if it is not known
+    path: Tensor = field(  # (2,) px, image motion from the first tracked frame to the reference time of the filter
+        default_factory=lambda: torch.zeros(2, dtype=torch.float64)
+    )
+    places: tuple[tuple[float, Tensor], ...] = ()  # times and paths of the frames that the steady image follows
+    untried: int = 0  # frames since the last attempt to detect the vibration
+    attempts: int = 0  # to detect the vibration, since the rows last agreed with the tones
+    contradictions: int = 0  # consecutive frames, and starts of the filter, whose rows contradict the tones
 
 
 class VibrationTracker:
@@ -183,7 +152,7 @@ class VibrationTracker:
     every frame and corrected by the displacements of its rows from the frame before. Amplitudes may grow and
     frequencies may sweep; the filter estimates how fast. Times of frames may have gaps. If the rows contradict the
     prediction, the vibration is detected again from the last frames, which takes as long as a few frames.
-    Roll and zoom are not followed.
+    Roll and zoom are not followed. A copy of a tracker (``copy.copy``) follows on its own.
 
     Args:
         timing: The sensor, without ``frame_start_times``.
@@ -232,9 +201,7 @@ class VibrationTracker:
         **options: Any,
     ) -> None:
         if timing.frame_start_times is not None:
-            raise ValueError(
-                "timing must not have frame_start_times: pass the time of each frame to update(frame, time)"
-            )
+            raise ValueError("timing must not have frame_start_times: pass the time of each frame to update")
         check_method_options(method, options)
         self.timing, self.method, self.options = timing, method, options
         self.window = check_whole_number("window", window, at_least=2)
@@ -247,15 +214,7 @@ class VibrationTracker:
 
     def reset(self) -> None:
         """Forget all frames, e.g. after a change of the camera's settings."""
-        self._filter: ToneFilter | None = None
-        self._reference: _Reference | None = None
-        self._verdict: _Verdict | None = None
-        self._path = torch.zeros(2, dtype=torch.float64)
-        self._paths: deque[tuple[float, Tensor]] = deque()
-        self._last: deque[tuple[Tensor, Tensor | None, float]] = deque(maxlen=self.window)
-        self._untried, self._attempts, self._contradictions, self._time = 0, 0, 0, -math.inf
-        self._trusted: deque[Tensor] = deque(maxlen=self.window)
-        self._columns = slice(None)
+        self._state = _State()
 
     @outside_graphs
     @full_precision
@@ -277,408 +236,317 @@ class VibrationTracker:
             TypeError: If the frame is not numbers.
             ValueError: If the frame has another shape than the frames before, or its time is not later.
         """
+        # 1. Input. Frames that show nothing new do not count, except for the time of the next one.
         time = self._checked_time(time)
-        prepared = prepare_frames(
-            as_tensor("frame", frame)[None],
-            self.timing,
-            full_scale=self.full_scale,
-            channels=self.channels,
-            saturation="auto" if "clipped" in METHODS[self.method].masks else None,
-        )
-        grey = prepared.filled[:, :, 0] if prepared.images.shape[2] == 1 else prepared.filled.mean(2)
-        valid = None if prepared.missing is None else ~prepared.missing.any(2)
-        if self._last and self._last[-1][0].shape != grey.shape:
-            raise ValueError(
-                f"frame has {grey.shape[-2]} rows of {grey.shape[-1]} px, the frames before had "
-                f"{self._last[-1][0].shape[-2]} of {self._last[-1][0].shape[-1]}; call reset() before another size"
+        with torch.inference_mode(mode=False), torch.no_grad():  # the result keeps the frame, not a copy of it
+            prepared = prepare_frames(
+                as_tensor("frame", frame)[None],
+                self.timing,
+                full_scale=self.full_scale,
+                channels=self.channels,
+                saturation="auto" if "clipped" in METHODS[self.method].masks else None,
             )
-        self._time = time
-        if self._is_unusable(grey):
-            return self._unchanged(prepared, time, "unusable")
-        self._last.append((grey, valid, time))
-        self._untried += 1
-        if not measure and self._predict(time):
-            return self._result(prepared, time, measured=False)
-        self._follow(grey, valid, time)
-        count = self._frames_to_detect()
-        if count:
-            self._detect(count)
-        return self._result(prepared, time, detected=count > 0)
+            latest = _GreyFrame.of(prepared, time)
+        before = self._state.frames[-1] if self._state.frames else None
+        if before is not None and before.images.shape != latest.images.shape:
+            (rows, columns), (rows_before, columns_before) = latest.images.shape[-2:], before.images.shape[-2:]
+            raise ValueError(
+                f"frame has {rows} rows of {columns} px, the frames before had {rows_before} of {columns_before}; "
+                "call reset() before another size"
+            )
+        state = replace(self._state, time=time)
+        if latest.shows_nothing_new(before):
+            self._state = state
+            return self._result(prepared, state, usable=False)
+        state = replace(state, frames=(*state.frames, latest)[-self.window :], untried=state.untried + 1)
 
-    # Input
+        # 2. Predict the motion of a late frame, measure that of any other; detect the vibration if it is not known, or
+        # if the rows contradict it.
+        predicted = None if measure else self._predicted(state)
+        state = self._detected(self._measured(state)) if predicted is None else predicted
+
+        # 3. The result, moved to where the steady image is.
+        tracked = self._result(prepared, state)
+        if self.steady and tracked.tones is not None:
+            places = (*state.places, (time, tracked.path))
+            state = replace(state, places=tuple(place for place in places if place[0] >= time - self.steady))
+            tracked = tracked.moved_to(_end_of_line(state.places))
+        self._state = state
+        return tracked
 
     def _checked_time(self, time: float | None) -> float:
+        before = self._state.time
         if time is None:
-            return 0.0 if math.isinf(self._time) else self._time + self.timing.frame_period
+            return 0.0 if math.isinf(before) else before + self.timing.frame_period
         value = float(as_numbers("time", time))
-        if value <= self._time:
-            raise ValueError(f"time must be later than that of the frame before, {self._time:.6g} s, got {value:.6g} s")
+        if value <= before:
+            raise ValueError(f"time must be later than that of the frame before, {before:.6g} s, got {value:.6g} s")
         return value
-
-    def _is_unusable(self, grey: Tensor) -> bool:
-        """Whether a frame is constant, or a copy of the frame before; some rows are enough to find that it is not."""
-        some = grey[..., ::16, :]
-        if bool(some.amax() - some.amin() <= 1e-6 * some.abs().amax()):
-            return bool((grey.amax() - grey.amin()) <= 1e-6 * grey.abs().amax())
-        before = self._last[-1][0] if self._last else None
-        return before is not None and torch.equal(before[..., ::16, :], some) and torch.equal(before, grey)
 
     # Tracking
 
-    def _follow(self, grey: Tensor, valid: Tensor | None, time: float) -> None:
-        """Predict the state, measure the new frame against the one before, correct the state."""
-        if self._filter is None or self._reference is None:
-            return
-        height, before = grey.shape[-2], self._reference
-        centre = 0.5 * (before.start + time) + 0.5 * height * self._rows.row_time
-        state = self._filter.predicted(centre)
-        fit = state.as_fit(centre)
-        starts = torch.tensor([before.start, time], dtype=torch.float64, device=grey.device) - centre
-        if not state.displacement_std() < _MAX_PREDICTED_STD:
-            self._filter = self._verdict = None
-            return
-        step, previous = centre - self._filter.time, self._path
-        path = previous + self._filter.path(step)
-        spectra = self._spectra(grey, valid)
-        group = FrameGroup(before.spectra.followed_by(spectra), starts[None])
-        gradients, age, anchor = before.gradients, before.age + 1, path if before.path is None else before.path
-        if age > _MAX_AGE or float((path - anchor).abs().amax()) > _MAX_PATH:
-            gradients, age, anchor = None, 0, path
+    def _measured(self, state: _State) -> _State:
+        """Compare the last frame with the one before, and correct the motion that is followed."""
+        track = state.track
+        if track is None:
+            return state
+        frame, height = state.frames[-1], state.frames[-1].images.shape[-2]
+
+        # 1. Predict the motion in the middle of the two frames.
+        centre = 0.5 * (track.start + frame.time) + 0.5 * height * self._rows.row_time
+        prediction = track.filter.predicted(centre)
+        if not prediction.displacement_std() < _MAX_PREDICTED_STD:  # also if it is not a number
+            return replace(state, track=None)
+        fit, step = prediction.as_fit(centre), centre - track.filter.time
+        path = state.path + track.filter.path(step)
+
+        # 2. The gradients of the scene are used again unless they are old or the scene has moved.
+        scene = track.scene
+        if scene is not None and (scene.age > _MAX_AGE or float((path - scene.path).abs().amax()) > _MAX_PATH):
+            scene = None
+
+        # 3. Measure the rows around the prediction and correct it; again if the correction is large. Neighbouring pairs
+        # share a frame: after many pairs, the variance of a tone is gain^2 / 2 times that of independent offsets.
+        spectra = frame.spectra(track.columns)
+        starts = torch.tensor([track.start, frame.time], dtype=torch.float64, device=path.device) - centre
+        group = FrameGroup(track.spectra.followed_by(spectra), starts[None])
         gain = offset_gain(fit.frequencies, (starts[1] - starts[0])[None])[0] * fit.active[0]
-        # neighbouring pairs share a frame: after many pairs, the variance of a tone is gain^2 / 2 times that of
-        # independent offsets
         noise_factor = (0.5 * gain.amax(-1).square()).clamp(min=1.0)
         for _ in range(_MAX_ROUNDS):
-            motion = displaced(motion_of_fit(fit), (path - anchor)[None])
-            measurements, found = measure_group(group, self._rows, motion, gradients)
-            corrected = state.updated(measurements, centre, noise_factor)
-            tones, drift = corrected.explained(measurements, centre)
-            change = tones + drift
-            change -= measurements.relative(
-                motion.mean_displacement(measurements.exposure_starts, self._rows.exposure_time)
-            )
-            if float(change.abs().amax()) < _MAX_CHANGE:
+            anchor, known = (path, None) if scene is None else (scene.path, scene.gradients)
+            motion = replace(motion_of_fit(fit), image_shift=(path - anchor)[None])
+            measurements, gradients = measure_group(group, self._rows, motion, known)
+            corrected = prediction.updated(measurements, centre, noise_factor)
+            by_tones, by_drift = corrected.explained(measurements, centre)
+            around = motion.mean_displacement(measurements.exposure_starts, self._rows.exposure_time)
+            change = by_tones + by_drift - measurements.relative(around)
+            largest = float(change.abs().amax())
+            if not math.isfinite(largest):  # the rows were not measured
+                return replace(state, track=None)
+            if largest < _MAX_CHANGE:
                 break
-            fit, path, gradients = corrected.as_fit(centre), previous - corrected.path(-step), None
-            age, anchor = 0, path
-        self._path, self._filter = previous - corrected.path(-step), corrected
-        apart = before.apart if found is before.gradients and before.apart is not None else differential_motion([found])
-        self._reference = _Reference(spectra, time, found, apart, anchor, age)
-        self._verdict = self._judged(
-            time,
-            corrected.predicted(time + self._half(height), mixed=False).as_fit(time),
-            replace(measurements, exposure_starts=measurements.exposure_starts + (centre - time)),
-            tones,
-            measurements.displacements - tones - drift,
-            apart,
-        )
-        if not float(self._verdict.other_motion.unexplained.amax()) < _MAX_UNEXPLAINED:
-            self._filter = self._verdict = None  # rows further away are not measured correctly
-            return
-        contradicted = any(self._verdict.contradicted)
-        self._contradictions = self._contradictions + 1 if contradicted else 0
-        if not contradicted:
-            self._attempts = 0
-        self._trusted.append(self._verdict.reliable)
+            fit, path, scene = corrected.as_fit(centre), state.path - corrected.path(-step), None
+        scene = scene or _Scene(gradients, differential_motion([gradients]), path)
+        scene = replace(scene, age=scene.age + 1)
+        state = replace(state, path=state.path - corrected.path(-step))
 
-    def _half(self, height: int) -> float:
-        """Time in s from the exposure start of a frame to its middle."""
-        return 0.5 * ((height - 1) * self._rows.row_time + self._rows.exposure_time)
-
-    def _predict(self, time: float) -> bool:
-        """Predict the tones of a frame that starts at ``time`` in s; False if the frame must be measured.
-
-        The state is not changed: the next frame that is measured is compared with the last one that was.
-        """
-        if self._filter is None or self._reference is None or self._verdict is None or self._contradictions:
-            return False
-        before, middle = self._verdict.measurements, time + self._half(self._last[-1][0].shape[-2])
-        predicted = self._filter.predicted(middle, mixed=False)
-        path_std = self._filter.path_std(middle - self._filter.time)
-        if not max(predicted.displacement_std(), path_std) < _MAX_UNMEASURED_STD:
-            return False
-        later = time - self._verdict.time
-        measurements = replace(before, exposure_starts=before.exposure_starts - later)
-        self._verdict = replace(self._verdict, fit=predicted.as_fit(time), measurements=measurements, time=time)
-        return True
-
-    def _spectra(self, grey: Tensor, valid: Tensor | None) -> RowSpectra:
-        mask = None if valid is None else valid[..., self._columns]
-        return stack_spectra(grey[..., self._columns], mask)
-
-    def _row_starts(self, height: int, device: torch.device, step: int = 8) -> Tensor:
-        """(N,) s, exposure starts of every eighth row from that of the first."""
-        return torch.arange(0, height, step, dtype=torch.float64, device=device) * self._rows.row_time
+        # 4. Judge the tones by the rows. Rows far from where the motion places them are not measured correctly.
+        residual = measurements.displacements - by_tones - by_drift
+        other = OtherMotion.of(measurements, by_tones, residual, scene.differential)[0]
+        if not float(other.unexplained.amax()) < _MAX_UNEXPLAINED:
+            return replace(state, track=None)
+        fit = corrected.predicted(frame.time + time_to_middle(height, self._rows), mixed=False).as_fit(frame.time)
+        measurements = replace(measurements, exposure_starts=measurements.exposure_starts + (centre - frame.time))
+        tones = self._judged(frame, fit, measurements, other)
+        trusted = torch.tensor([not against for against in tones.reasons], device=path.device)
+        trusted_axes = (*track.trusted, trusted)[-self.window :]
+        track = _Track(corrected, spectra, frame.time, track.columns, scene, tones, trusted_axes)
+        if any(tones.contradicted):
+            return replace(state, track=track, contradictions=state.contradictions + 1)
+        return replace(state, track=track, contradictions=0, attempts=0)
 
     def _judged(
-        self, time: float, fit: ToneFit, measurements: Measurements, tones: Tensor, residual: Tensor, apart: Tensor
-    ) -> _Verdict:
-        """Verdict by the rows of one pair, from their displacements (1, N, 2, 2) by the tones and their residuals.
-
-        ``apart`` is the ``differential_motion``.
-        """
-        visible = measurements.num_differences > 0
-        measured = (visible & (measurements.weights > 0).any(-1)).double().sum(1) / visible.double().sum(1).clamp(min=1)
-        other = OtherMotion(
-            size=math.sqrt(2) * measurements.distances(tones).square().nanmean(1).sqrt(),
-            unexplained=measurements.unexplained(residual),
-            correlated=measurements.correlated(residual),
-            differential=apart,
-            measured=measured,
-            blur=measured.new_tensor([[1.0, 0.0, 0.0]]),
-        )[0]
-        vibration, std = vibration_of_fit(fit)
-        starts = self._row_starts(self._last[-1][0].shape[-2], measured.device)
-        own_std = displacement_std(fit, starts, self._rows.exposure_time)
-        moved = vibration.mean_displacement(starts[None], self._rows.exposure_time) - vibration.drift(starts[None])
+        self, frame: _GreyFrame, fit: ToneFit, measurements: Measurements, other_motion: OtherMotion
+    ) -> TrackedTones:
+        """The tones of a frame, whose first row is the time origin, with the verdict of its rows."""
+        exposure_time = self._rows.exposure_time
         offsets = measurements.displacements[0, :, 1] - measurements.displacements[0, :, 0]
-        reliable, reasons = judge(
+        # Displacement of the rows of the frame by the tones, and its standard deviation.
+        vibration, std = vibration_of_fit(fit)
+        starts = self._rows.row_starts(1, frame.images.shape[-2], offsets.device)[:, ::8]
+        moved = vibration.mean_displacement(starts, exposure_time) - vibration.drift(starts)
+        own_std = displacement_std(fit, starts[0], exposure_time)
+        _, reasons = judge(
             vibration[0],
             replace(std, displacement=own_std)[0],
             offsets=offsets,
             fitted=offsets,
-            visible=visible[0],
-            intervals=self._intervals(measurements),
+            visible=measurements.num_differences[0] > 0,
+            intervals=measurements.exposure_starts.diff(dim=-1).mean((1, 2)),
             displacement=moved[0].std(0, correction=0),
             own_std=own_std[0],
             timing=self._rows,
-            other_motion=other,
+            other_motion=other_motion,
             max_tones=MAX_TONES,
         )
-        contradicted = contradicted_axes(vibration[0], other, MAX_TONES)
-        return _Verdict(time, fit, measurements, other, reliable, reasons, contradicted)
+        contradicted = contradicted_axes(vibration[0], other_motion, MAX_TONES)
+        return TrackedTones(frame.time, fit, measurements, reasons, contradicted)
 
-    @staticmethod
-    def _intervals(measurements: Measurements) -> Tensor:
-        starts = measurements.exposure_starts
-        return (starts[..., 1] - starts[..., 0]).mean(1)
+    def _predicted(self, state: _State) -> _State | None:
+        """The state with predicted tones of the last frame; None if the frame must be measured.
+
+        The filter stays where it is: the next frame that is measured is compared with the last one that was.
+        """
+        track, frame = state.track, state.frames[-1]
+        if track is None or track.tones is None or state.contradictions:
+            return None
+        middle = frame.time + time_to_middle(frame.images.shape[-2], self._rows)
+        predicted = track.filter.predicted(middle, mixed=False)
+        path_std = track.filter.path_std(middle - track.filter.time)
+        if not max(predicted.displacement_std(), path_std) < _MAX_UNMEASURED_STD:
+            return None
+        before = track.tones.measurements
+        measurements = replace(before, exposure_starts=before.exposure_starts - (frame.time - track.tones.time))
+        tones = replace(track.tones, time=frame.time, fit=predicted.as_fit(frame.time), measurements=measurements)
+        return replace(state, track=replace(track, tones=tones))
 
     # Detection
 
-    def _frames_to_detect(self) -> int:
+    def _frames_to_detect(self, state: _State) -> int:
         """Number of last frames to detect the vibration from; 0 if it is known, or if it is too early to try again.
 
         After a change of the vibration, only frames behind the change are used: half a window first, then whole windows
         at times that double, up to 32 frames apart (with a window of 8).
         """
-        new = len(self._last) if self._filter is None and self._attempts == 0 else self._contradictions
-        if self._filter is None:
-            new = max(new, self._untried)
-        needed = max(2, self.window // 2) * 2 ** min(self._attempts, _MAX_DOUBLED)
-        if new < needed or self._untried < needed // 2:
+        new = state.contradictions
+        if state.track is None:
+            new = max(new, len(state.frames) if state.attempts == 0 else 0, state.untried)
+        needed = max(2, self.window // 2) * 2 ** min(state.attempts, _MAX_DOUBLED)
+        if new < needed or state.untried < needed // 2:
             return 0
-        return min(new, self.window, len(self._last))
+        return min(new, len(state.frames))
 
-    def _detect(self, count: int) -> None:
-        """Detect the vibration in the last ``count`` frames, and start the filter with its tones."""
-        frames, masks, times = zip(*list(self._last)[-count:], strict=True)
-        self._untried, self._attempts = 0, self._attempts + 1
-        middle = 0.5 * (times[0] + times[-1]) + 0.5 * frames[0].shape[-2] * self._rows.row_time
+    def _detected(self, state: _State) -> _State:
+        """Detect the vibration in the last frames if that is due, and follow its tones from the last frame."""
+        count = self._frames_to_detect(state)
+        if count == 0:
+            return state
+        state = replace(state, untried=0, attempts=state.attempts + 1)
+        frames = state.frames[-count:]
+        stacks = self._stacked(frames)
+        if stacks is None:
+            return state
+        times, height = [frame.time for frame in frames], stacks.images.shape[-2]
+        middle = 0.5 * (times[0] + times[-1]) + 0.5 * height * self._rows.row_time
         timing = replace(self._rows, frame_start_times=tuple(time - middle for time in times))
-        ignore = None
-        if any(mask is not None for mask in masks):
-            ignore = torch.cat([~one if one is not None else torch.zeros_like(masks[-1]) for one in masks], 1)[0]
-        names = ("_filter", "_reference", "_verdict", "_path", "_columns", "_trusted")
-        before, stack = {name: getattr(self, name) for name in names}, torch.cat(frames, 1)[0]
-        # too few bands are registered, or the fit diverges: the next frames may be better
-        with suppress(ValueError, OverflowError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
-            # the filter measures the rows, so that bands are a sufficient start; small frames have too few of them
-            only_bands = self._attempts > _DIRECT_ATTEMPTS and stack.shape[-2] >= _FEW_ROWS
-            for method, tones in _STARTS[:1] if only_bands else _STARTS:
-                found = detect_vibration(
-                    stack,
-                    timing,
-                    method=method,
-                    tones=tones,
-                    image_acceleration=len(times) > 2,
-                    window=len(times),
-                    columns=self.columns,
-                    ignore=ignore,
-                    roll=False,
-                    zoom=False,
-                )[0]
-                if method == "bands" and float(found.offsets.quality.median()) < _MIN_CORRELATION:
-                    break  # the frames do not show the same scene
-                plausible = _plausible(found)
-                for chosen in (plausible, plausible & False):  # without tones, the path is followed at least
-                    self._start(found, chosen, middle, times[-1] - times[0])
-                    if self._filter is not None:
-                        break
-                if self._filter is not None and self._contradictions == 0:
-                    return
-        if before["_filter"] is not None:  # no better
-            vars(self).update(before)
+        hypothesis = Hypothesis(FieldScale(2, stacks.images.shape[-1], height))
+        model = MotionModel(drift_order=2 if count > 2 else 1)
+        only_bands = state.attempts > _DIRECT_ATTEMPTS and height >= _FEW_ROWS
+        started = state
+        for method, number in _STARTS[:1] if only_bands else _STARTS:
+            found = attempt(stacks, timing, DetectionOptions(method, number, model, _BANDS), hypothesis)
+            quality = found.fitted.offsets.quality
+            other_scene = method == "bands" and float(quality.median()) < _MIN_CORRELATION
+            if other_scene or found.statuses[0] == "not visible":
+                break
+            # Tones that the last frame contradicts are not used: without tones, the path is followed at least.
+            plausible = _plausible(found)
+            for chosen in (plausible, torch.zeros_like(plausible)):
+                started = self._started(started, found, chosen, middle, times[-1] - times[0])
+                if started.track is not None:
+                    break
+            if started.track is not None and started.contradictions == 0:
+                return started
+        if state.track is None:
+            return started
+        return replace(state, contradictions=started.contradictions)  # the new start is no better
 
-    def _start(self, found: DetectionResult, chosen: Tensor, middle: float, record: float) -> None:
-        """Start the filter with chosen tones (2, K) of a record of ``record`` s about ``middle`` s, follow its end."""
-        vibration, std = found.vibration, found.std
-        # a record does not distinguish a tone of less than one period from a drift, and its amplitude is not known
-        slow = vibration.frequency * record < 1.0
+    def _stacked(self, frames: tuple[_GreyFrame, ...]) -> GreyFrames | None:
+        """Frames as one stack for a detection; None if they are too small for bands, or have too few valid pixels."""
+        images = torch.cat([frame.images for frame in frames], 1)
+        everywhere = torch.ones_like(frames[0].images, dtype=torch.bool)
+        valid = torch.cat([everywhere if frame.valid is None else frame.valid for frame in frames], 1)
+        height, width = images.shape[-2:]
+        is_large_enough = fits_frame(height, width if self.columns is None else min(width, self.columns), _BANDS)
+        if not is_large_enough or bool((valid.float().mean((-2, -1)) < _MIN_VALID).any()):
+            return None
+        mask = None if bool(valid.all()) else valid
+        stacks = GreyFrames(without_mosaic(images), mask, batched=False, timing=self._rows)
+        return stacks if self.columns is None else stacks.narrowed(self.columns)
+
+    def _started(self, state: _State, found: Attempt, chosen: Tensor, middle: float, record: float) -> _State:
+        """Start the filter with tones of a detection, and measure the last frame.
+
+        Args:
+            state: The state.
+            found: The detection from the last frames.
+            chosen: (2, K) bool, the tones.
+            middle: s, the time origin of the detection.
+            record: s, from the first to the last frame of it.
+        """
+        vibration, std, curve = found.vibration[0], found.std[0], found.fitted.offsets[0]
+        # 1. Image motion. A record does not distinguish a tone of less than one period from a drift, and its amplitude
+        # is not known: it becomes a part of the drift. Without tones, the drift of the fit is wrong as well.
         tones = torch.polar(vibration.amplitude, vibration.phase - 0.5 * math.pi) * chosen
-        rate = 2j * math.pi * vibration.frequency
+        slow, rate = vibration.frequency * record < 1.0, 2j * math.pi * vibration.frequency
         drift = torch.stack([vibration.image_motion, vibration.image_acceleration], -1)
-        if not bool(chosen.any()):  # the drift of a fit with wrong tones is wrong as well
-            apart = found.offsets.offsets[-1].nanmedian(0).values
-            starts = (found.offsets.later_times - found.offsets.times)[-1]
-            drift = torch.stack([apart / starts.mean(), torch.zeros_like(apart)], -1)
+        if not bool(chosen.any()):
+            offset = curve.offsets[-1].nanmedian(0).values
+            speed = offset / (curve.later_times - curve.times)[-1].mean()
+            drift = torch.stack([speed, torch.zeros_like(speed)], -1)
         drift = drift + torch.stack([(tones * rate).real, (tones * rate.square()).real], -1).mul(slow[..., None]).sum(1)
+        if not bool(torch.isfinite(drift).all()):  # no row of the last frame was measured
+            return replace(state, track=None)
+        # 2. Tones, with twice the standard deviations, because the last frame is measured again. Those of a record
+        # allow for further tones, which the filter does not.
         tones = tones * ~slow
-        growth_std = torch.full_like(std.amplitude, 0.5)  # 1/s
-        # the standard deviations of a record allow for other tones
         size_std = torch.minimum(std.amplitude, 0.05 * vibration.amplitude)
+        growth_std = torch.full_like(size_std, _GROWTH_STD)
         parts = torch.stack([size_std, size_std, growth_std, 2 * math.pi * std.frequency], -1)
-        # the last frame is measured again
         tone_std = torch.where((tones.abs() > 0)[..., None], 2.0 * parts, 0.0).flatten(-2)
-        self._filter = ToneFilter.started(
-            middle,
-            tones,
-            vibration.frequency,
-            drift,
-            torch.cat([tone_std, tone_std.new_tensor(_DRIFT_STD).expand(2, -1)], -1),
-            self._rows.exposure_time,
-        )
-        (grey, valid, time), last = self._last[-2], self._last[-1]
-        self._columns = slice(None) if self.columns is None else detailed_columns(last[0][0, 0], self.columns)
-        self._reference, self._path = _Reference(self._spectra(grey, valid), time), self._path.to(grey.device)
-        self._trusted = deque(maxlen=self.window)
-        self._follow(*last)
+        all_std = torch.cat([tone_std, tone_std.new_tensor(_DRIFT_STD).expand(2, -1)], -1)
+        started = ToneFilter.started(middle, tones, vibration.frequency, drift, all_std, self._rows.exposure_time)
+        # 3. The last frame is compared with the one before.
+        before, last = state.frames[-2:]
+        columns = slice(None) if self.columns is None else detailed_columns(last.images[0, 0], self.columns)
+        track = _Track(started, before.spectra(columns), before.time, columns)
+        return self._measured(replace(state, track=track, path=state.path.to(drift.device)))
 
     # Results
 
-    def _result(
-        self, prepared: PreparedFrames, time: float, *, detected: bool = False, measured: bool = True
-    ) -> TrackedFrame:
-        if self._filter is None or self._verdict is None:  # nothing is known
-            return self._unchanged(prepared, time, "searching", detected)
-        height = prepared.images.shape[-2]
-        half = self._half(height)
-        fit = self._verdict.fit  # its time origin is the first row; that of the motion is the middle of the frame
-        motion = motion_of_fit(replace(fit, centre=fit.centre - half))
-        trusted = torch.stack(list(self._trusted)).any(0)
-        followed = ~trusted.new_tensor(self._verdict.contradicted) if self.wobble else trusted
-        motion = Vibration(
-            motion.amplitude * trusted[..., None],
-            motion.frequency,
-            motion.phase,
-            motion.image_motion * followed,
-            motion.image_acceleration * followed,
-        ).from_row_order(self.timing)[0]
-        timing = replace(self.timing, frame_start_times=(-half,))
-        framed = replace(prepared, timing=timing.in_row_order(), image_timing=timing)
-        method, options = self.method, self.options
-        shape = tuple(prepared.images.shape[-2:])
-        size = (shape[0], shape[1]) if self.timing.scan_axis == -2 else (shape[1], shape[0])
-        state: TrackingState = "searching" if self._contradictions >= _PATIENCE else "tracking"
-        verdict = self._verdict
-        path = self._path + self._filter.path(time + half - self._filter.time)
-        tracked = TrackedFrame(
-            time,
-            0,
-            state,
-            motion,
-            offsets_from_row_order(path, self.timing),
-            detected,
-            verdict.measurements if measured else None,
-            lambda motion: framed.from_row_order(_restored(framed, motion, method, options))[0],
-            lambda: self._detection(verdict, height),
-            lambda motion: visible_pixels(timing, motion, size, 1)[0][0],
-        )
-        return tracked.moved_to(self._steady_place(tracked)) if self.steady else tracked
-
-    def _steady_place(self, tracked: TrackedFrame) -> Tensor:
-        """(2,) px, place at this frame of the straight line that fits the last part of the path."""
-        self._paths.append((tracked.time, tracked.path))
-        while self._paths[0][0] < tracked.time - self.steady:
-            self._paths.popleft()
-        if len(self._paths) < 3:
-            return tracked.path
-        times = torch.tensor([time for time, _ in self._paths], dtype=torch.float64, device=tracked.path.device)
-        columns = torch.stack([torch.ones_like(times), times - tracked.time], -1)
-        place: Tensor = torch.linalg.lstsq(columns, torch.stack([path for _, path in self._paths])).solution[0]
-        return place
-
-    def _unchanged(
-        self, prepared: PreparedFrames, time: float, state: TrackingState, detected: bool = False
-    ) -> TrackedFrame:
-        def visible(motion: Vibration) -> Tensor:
-            mask = torch.ones_like(prepared.images[0, 0, :1], dtype=torch.bool)
-            return frames_from_row_order(mask, self.timing)[0]
-
-        device = prepared.images.device
+    def _result(self, prepared: PreparedFrames, state: _State, *, usable: bool = True) -> TrackedFrame:
+        """The result for the last frame."""
+        label: TrackingState = "searching" if usable else "unusable"
+        device, measurements = prepared.images.device, None
+        motion, path = Vibration.still(device=device), torch.full((2,), math.nan, dtype=torch.float64, device=device)
+        track = state.track if usable else None
+        tones = None if track is None else track.tones
+        if track is not None and tones is not None:
+            if track.start == state.time:  # the frame was measured
+                measurements = tones.measurements
+            # The time origin of the tones is the first row, that of the motion the middle of the frame.
+            half = time_to_middle(prepared.images.shape[-2], self._rows)
+            motion = motion_of_fit(replace(tones.fit, centre=tones.fit.centre - half))[0]
+            # An axis moves if its tones were reliable in one of the last frames.
+            trusted = torch.stack(track.trusted).any(0)
+            followed = ~trusted.new_tensor(tones.contradicted) if self.wobble else trusted
+            motion = replace(motion.scaled(followed), amplitude=motion.amplitude * trusted[:, None])
+            motion = motion.from_row_order(self.timing)
+            path = state.path + track.filter.path(state.time + half - track.filter.time)
+            path = offsets_from_row_order(path, self.timing)
+            label = "searching" if state.contradictions >= _PATIENCE else "tracking"
         return TrackedFrame(
-            time,
-            0,
-            state,
-            Vibration.still(device=device),
-            torch.full((2,), math.nan, dtype=torch.float64, device=device),
-            detected,
-            None,
-            lambda motion: unchanged_frames(prepared, joint=False)[0],
-            lambda: None,
-            visible,
+            time=state.time,
+            state=label,
+            motion=motion,
+            path=path,
+            detected=usable and state.untried == 0,
+            measurements=measurements,
+            frame=prepared,
+            tones=tones,
+            window=self.window,
+            method=self.method,
+            options=self.options,
         )
 
-    def _detection(self, verdict: _Verdict, height: int) -> DetectionResult:
-        """The state as the result of a detection in image axes."""
-        fit, measurements = verdict.fit, verdict.measurements
-        robust = measurements.reweighted(residual_of(measurements, fit))
-        weights = robust.weights / measurements.weights.clamp(min=1e-300)
-        curve, fitted = offset_curve(robust, fit, weights, [2])
-        vibration, std = vibration_of_fit(fit)
-        own_std = displacement_std(fit, self._row_starts(height, weights.device), self._rows.exposure_time)
-        std = replace(std, displacement=own_std)
-        intervals = self._intervals(measurements)
-        swap = self.timing.scan_axis == -1
-        order = [1, 0] if swap else [0, 1]
-        sensitivity = timing_sensitivity(fit, self._rows, self.window, height).mapped(
-            lambda values: values[..., order, :]
-        )
-        in_image = vibration.from_row_order(self.timing)
-        residual = (curve.offsets - fitted).abs().nanmean(dim=(1, 2))
-        result = DetectionResult(
-            vibration=in_image,
-            std=std.from_row_order(self.timing),
-            offsets=replace(
-                curve,
-                offsets=offsets_from_row_order(curve.offsets, self.timing),
-                std=None if curve.std is None else curve.std[..., order],
-            ),
-            fitted=offsets_from_row_order(fitted, self.timing),
-            gain=in_image.gain(float(intervals[0])),
-            residual=residual[..., order],
-            reliable=verdict.reliable[None, order],
-            reasons=(tuple(verdict.reasons[axis] for axis in order),),
-            sensitivity=sensitivity,
-            assumptions=(assumptions(in_image[0], sensitivity[0], self._rows, self.window, height),),
-            timing=self.timing,
-        )
-        return result[0]
 
-
-def _plausible(found: DetectionResult) -> Tensor:
+def _plausible(found: Attempt) -> Tensor:
     """(2, K) bool, tones to start with: significant ones, and the strongest of each axis above its standard deviation.
 
     The verdict on a record may be that the motion changes, which the filter follows. It has its own verdict.
     """
-    amplitude, std = found.vibration.amplitude, found.std.amplitude
+    vibration, amplitude, std = found.vibration[0], found.vibration[0].amplitude, found.std[0].amplitude
     strongest = amplitude == amplitude.amax(-1, keepdim=True)
     plausible = (amplitude > MIN_SIGNIFICANCE * std) | (strongest & (amplitude > std))
-    return plausible & (found.gain.abs() > MIN_GAIN)  # blind tones may have any amplitude
+    return plausible & (vibration.gain(found.interval).abs() > MIN_GAIN)  # blind tones may have any amplitude
 
 
-@torch.no_grad()
-def _restored(frames: PreparedFrames, motion: Vibration, method: str, options: dict[str, Any]) -> Tensor:
-    return restore_prepared(frames, motion, method, options)
-
-
-def displaced(motion: Vibration, displacement: Tensor) -> Vibration:
-    """The motion with a constant displacement (..., 2) in px added, as a tone of frequency 0."""
-    size = displacement.abs()[..., None]
-    zero = torch.zeros_like(size)
-    return Vibration(
-        torch.cat([motion.amplitude, size], -1),
-        torch.cat([motion.frequency, zero], -1),
-        torch.cat([motion.phase, torch.copysign(zero + 0.5 * math.pi, displacement[..., None])], -1),
-        motion.image_motion,
-        motion.image_acceleration,
-    )
+def _end_of_line(places: tuple[tuple[float, Tensor], ...]) -> Tensor:
+    """(2,) px, place at the last time of the straight line that fits paths (2,) at times in s."""
+    last, path = places[-1]
+    if len(places) < 3:
+        return path
+    times = torch.tensor([time for time, _ in places], dtype=torch.float64, device=path.device)
+    columns = torch.stack([torch.ones_like(times), times - last], -1)
+    place: Tensor = torch.linalg.lstsq(columns, torch.stack([path for _, path in places])).solution[0]
+    return place

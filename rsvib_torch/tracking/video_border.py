@@ -1,6 +1,6 @@
 """Pixels of restored video frames that the sensor did not record: a border that moves from frame to frame."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, astuple, dataclass
 from typing import Any, TypeVar
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.option_types import BorderName
-from rsvib_torch.tracking.tracker import TrackedFrame
+from rsvib_torch.tracking.tracked_frame import TrackedFrame
 
 __all__ = ["Margins", "VideoBorder"]
 
@@ -34,8 +34,8 @@ class Margins:
     right: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("top", "bottom", "left", "right"):
-            check_whole_number(name, getattr(self, name), at_least=0)
+        for name, value in asdict(self).items():
+            check_whole_number(name, value, at_least=0)
 
     @classmethod
     def of(cls, visible: Tensor) -> "Margins":
@@ -53,8 +53,7 @@ class Margins:
 
     def widest(self, other: "Margins") -> "Margins":
         """The wider margin of each side."""
-        names = ("top", "bottom", "left", "right")
-        return Margins(*(max(getattr(self, name), getattr(other, name)) for name in names))
+        return Margins(*map(max, astuple(self), astuple(other)))
 
     def cut(self, images: Pixels) -> Pixels:
         """Images (..., H, W) without the margins; height and width remain even, as video encoders require.

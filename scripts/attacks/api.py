@@ -469,6 +469,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
                 "phase": 0.3,
                 "image_motion": (5.0, 3.0),
                 "image_acceleration": (0.0, 0.0),
+                "image_shift": (0.0, 0.0),
             },
         ),
         "VibrationDetector": Call(

@@ -132,12 +132,14 @@ def test_vibration_json_of_version_0_1_0_loads(tmp_path):
     assert detected.reasons == ((), ("only a third of a period is seen",))
 
 
-def test_vibration_json_without_image_acceleration_loads(tmp_path):
+def test_vibration_json_without_image_acceleration_and_shift_loads(tmp_path):
     data = json.loads(OLD_VIBRATION)
+    assert "image_shift" not in data["vibration"]
     del data["vibration"]["image_acceleration"], data["std"]["image_acceleration"]
     (tmp_path / "vibration.json").write_text(json.dumps(data))
     detected = read_vibration(tmp_path / "vibration.json", TIMING)
     assert detected.vibration.image_acceleration.tolist() == [0.0, 0.0]
+    assert detected.vibration.image_shift.tolist() == [0.0, 0.0]
     assert detected.std.image_acceleration.tolist() == [math.inf, math.inf]
 
 
@@ -192,7 +194,9 @@ def test_timing_is_read_back_exactly(axis, direction, starts):
 
 
 def test_vibration_is_read_back_exactly():
-    vibration = Vibration([[2.0, 0.5], [1.0, 0.0]], [[60.0, 145.1], [1 / 3, 0.0]], 0.3, [20.0, 0.0], [0.0, -3.0])
+    vibration = Vibration(
+        [[2.0, 0.5], [1.0, 0.0]], [[60.0, 145.1], [1 / 3, 0.0]], 0.3, [20.0, 0.0], [0.0, -3.0], [1.5, 0.0]
+    )
     data = json.loads(json.dumps(VibrationRecord.from_vibration(vibration).model_dump()))
     back = VibrationRecord.model_validate(data).to_vibration()
     for name in VibrationRecord.model_fields:

@@ -1,5 +1,6 @@
 """The contract of ``Motion``, checked for every motion type."""
 
+import dataclasses
 import math
 
 import pytest
@@ -9,7 +10,12 @@ from rsvib_torch import FreeMotion, Vibration
 from rsvib_torch.motion.motion import Motion
 
 TONES = Vibration(
-    [[3.1, 0.4], [5.2, 0.7]], [[50.0, 155.0], [30.0, 88.0]], [[0.4, -1.0], [1.3, 2.2]], [90.0, -40.0], [30.0, 400.0]
+    amplitude=[[3.1, 0.4], [5.2, 0.7]],
+    frequency=[[50.0, 155.0], [30.0, 88.0]],
+    phase=[[0.4, -1.0], [1.3, 2.2]],
+    image_motion=[90.0, -40.0],
+    image_acceleration=[30.0, 400.0],
+    image_shift=[-3.0, 7.0],
 )
 KNOTS = torch.linspace(0, 0.2, 101, dtype=torch.float64)
 PATH = torch.stack([2 * torch.sin(60 * KNOTS) * torch.exp(-9 * KNOTS), (400 * KNOTS).cos()], -1)
@@ -61,6 +67,15 @@ def test_batches_of_equal_motions(motion):
     torch.testing.assert_close(batch[1].velocity(TIMES), motion.velocity(TIMES))
     with pytest.raises(IndexError, match="not a batch"):
         motion[0]
+
+
+def test_image_shift_is_a_constant_displacement():
+    without = dataclasses.replace(TONES, image_shift=[0.0, 0.0])
+    shift = torch.tensor([-3.0, 7.0], dtype=torch.float64)
+    for function in (lambda motion: motion.displacement(TIMES), lambda motion: motion.mean_displacement(TIMES, 2e-3)):
+        torch.testing.assert_close(function(TONES) - function(without), shift.expand(len(TIMES), 2))
+    assert torch.equal(TONES.velocity(TIMES), without.velocity(TIMES))
+    assert torch.equal(TONES.drift(TIMES), without.drift(TIMES))
 
 
 def test_moving_axes():

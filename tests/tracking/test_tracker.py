@@ -1,5 +1,6 @@
 """VibrationTracker: against truth from an independent camera, and against the batch on the same frames."""
 
+import copy
 import pickle
 from dataclasses import dataclass, replace
 
@@ -233,6 +234,53 @@ def test_frames_that_cannot_be_used_do_not_disturb(steady):
             assert torch.equal(tracked.restored, given)
     assert [index for index, state in enumerate(states) if state == "unusable"] == [8, 10]
     assert np.abs(errors(tracked.detection)).max() < 0.004
+
+
+def test_a_copy_of_a_tracker_does_not_affect_the_tracker(steady):
+    frames, tracked = steady
+    tracker = rsv.VibrationTracker(TIMING, columns=None)
+    for frame in frames[:8]:
+        tracker.update(frame)
+    other = copy.copy(tracker)
+    for frame in frames[16:20]:
+        other.update(frame)
+    again = [tracker.update(frame) for frame in frames[8:12]]
+    for ours, theirs in zip(again, tracked[8:12], strict=True):
+        assert torch.equal(ours.path, theirs.path)
+        assert torch.equal(ours.detection.vibration.phase, theirs.detection.vibration.phase)
+
+
+def test_content_is_moved_by_a_constant_displacement(steady):
+    place = torch.tensor([3.0, -2.0], dtype=torch.float64)
+    one = steady[1][12]
+    moved = one.moved_to(torch.zeros(2, dtype=torch.float64)).moved_to(place)
+    torch.testing.assert_close(moved.motion.image_shift, one.path - place)
+    assert torch.equal(moved.motion.amplitude, one.motion.amplitude)
+    shift = moved.restored[24:-24, 24:-24] - torch.roll(one.restored, (-2, 3), (0, 1))[24:-24, 24:-24]
+    assert float(shift.abs().mean()) < 0.03  # by whole pixels less the path of some hundredths
+    assert int((~moved.visible).sum()) > int((~one.visible).sum())
+
+
+def test_frames_without_a_common_scene_or_with_few_rows_are_searched_in_vain(steady):
+    frames, _ = steady
+    scene = torch.as_tensor(draw_scene(SIZE, SIZE + 900, seed=9), dtype=torch.float32)
+    sliding = torch.stack([scene[:, 100 * index : 100 * index + SIZE] for index in range(9)])  # overlap: 60 px
+    for given in (sliding, frames[:9, :50]):
+        tracked = track(given)
+        assert {one.state for one in tracked} == {"searching"}
+        assert [index for index, one in enumerate(tracked) if one.detected] == [3]
+        assert all(one.detection is None and one.path.isnan().all() for one in tracked)
+
+
+def test_a_frame_with_almost_no_detail_is_survived(steady):
+    frames = steady[0][:16].clone()
+    frames[8] = 0.3
+    frames[8, 1::2] += 1e-5
+    frames[8, 7, 9] = 0.4  # between the rows of which the contrast is a sample
+    tracked = track(frames)
+    assert all(torch.isfinite(one.restored).all() for one in tracked)
+    assert tracked[-1].state == "tracking"
+    assert np.abs(errors(tracked[-1].detection)).max() < 0.004
 
 
 def test_columns_as_rows_and_the_reverse_readout(steady):

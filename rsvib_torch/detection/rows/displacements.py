@@ -141,7 +141,7 @@ def stack_spectra(frames: Tensor, valid: Tensor | None, strips: ColumnStrips | N
         weight = valid / valid.sum((-2, -1), keepdim=True)
         level = (frames * weight).sum((-2, -1), keepdim=True)
         variance = ((frames - level).square_() * weight).sum((-2, -1), keepdim=True)
-    contrast = variance.sqrt()
+    contrast = torch.where(variance > 0, variance.sqrt(), 1.0)  # detail may lie between the rows that are sampled
     if strips is not None:  # all strips of a frame with the level and contrast of the frame, because they are joined
         frames, valid = strips.cut(frames), None if valid is None else strips.cut(valid)
         level, contrast = (values.repeat_interleave(len(strips.firsts), 0) for values in (level, contrast))

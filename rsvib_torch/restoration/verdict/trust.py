@@ -128,16 +128,7 @@ def trusted_vibration(
                     f"{where}{name} is not restored: its displacement of {float(size[here]):.2g} {unit} has a standard "
                     f"deviation of {float(error[here]):.2g} {unit}; detect it from more frames"
                 )
-    keep = reliable & accurate
-    trusted = Vibration(
-        vibration.amplitude * keep[..., None],
-        vibration.frequency,
-        vibration.phase,
-        vibration.image_motion * keep,
-        vibration.image_acceleration * keep,
-        vibration.camera,
-    )
-    return trusted, tuple(notes)
+    return vibration.scaled(reliable & accurate), tuple(notes)
 
 
 def vibration_to_undo(

@@ -1,0 +1,145 @@
+"""Result of the tracker for one frame; the restored frame and the detection are computed when they are used."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.detection import DetectionResult
+from rsvib_torch.detection.assemble import assembled, offset_curve
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.tones.fit import ToneFit, displacement_std, residual_of, vibration_of_fit
+from rsvib_torch.frames.orientation import frames_from_row_order
+from rsvib_torch.frames.prepare import PreparedFrames
+from rsvib_torch.motion.timing import RowTiming
+from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.restoration.frame_motion import visible_pixels
+from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
+
+__all__ = ["TrackedFrame", "TrackedTones", "TrackingState", "time_to_middle"]
+
+TrackingState = Literal["searching", "tracking", "unusable"]
+
+
+def time_to_middle(height: int, timing: RowTiming) -> float:
+    """Time in s from the exposure start of a frame of ``height`` rows to its middle."""
+    return 0.5 * ((height - 1) * timing.row_time + timing.exposure_time)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedTones:
+    """The tones at one frame, in row order.
+
+    Attributes:
+        time: s, exposure start of the frame.
+        fit: The tones; the time origin is ``time``.
+        measurements: Displacements of the rows of the last frame that was measured and of the one before, with the
+            same time origin.
+        reasons: Against each axis.
+        contradicted: Whether the rows of each axis move in a way that the tones do not explain.
+    """
+
+    time: float
+    fit: ToneFit
+    measurements: Measurements
+    reasons: tuple[tuple[str, ...], ...]
+    contradicted: tuple[bool, bool]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedFrame:
+    """Result of ``VibrationTracker.update``.
+
+    Attributes:
+        time: s, exposure start of its first row.
+        state: ``"tracking"``: the motion is known; ``"searching"``: it is not, or the rows contradict it;
+            ``"unusable"``: the frame is constant, or a copy of the frame before.
+        motion: The motion to remove, in image axes; its time origin is the middle of the frame. Axes whose vibration is
+            not reliable are still.
+        path: (2,) px, axes (x, y): image motion without vibration from the first tracked frame to the middle of this
+            one; NaN if it is not known.
+        detected: Whether the vibration was searched for, as ``detect_vibration`` does, after this frame.
+        measurements: Displacements of the rows of this frame and of the frame before, in row order; times count
+            from the first row of this frame. None if they were not measured.
+        frame: The frame as given.
+        tones: The tones at this frame; None if they are not known.
+        window: Number of frames of a detection, for the sensitivity to the timing.
+        method: Method of ``restore``.
+        options: Options of the method.
+        latency: Number of frames that were given after this one.
+    """
+
+    time: float
+    state: TrackingState
+    motion: Vibration
+    path: Tensor
+    detected: bool
+    measurements: Measurements | None
+    frame: PreparedFrames
+    tones: TrackedTones | None
+    window: int
+    method: str
+    options: Mapping[str, Any]
+    latency: int = 0
+
+    def moved_to(self, place: Tensor) -> "TrackedFrame":
+        """The same frame with its content at another place (2,) of the path in px, to stabilise a video.
+
+        Content stays at ``path`` if the frame is not moved.
+        """
+        return replace(self, motion=replace(self.motion, image_shift=self.path - place))
+
+    @cached_property
+    def restored(self) -> Tensor:
+        """The frame without the motion, in its shape; as taken if no motion is known. Computed at the first use.
+
+        Another thread may use it while the next frame is tracked.
+        """
+        if self.tones is None:
+            return unchanged_frames(self.frame, joint=False)[0]
+        frame = self._timed_from_middle
+        with torch.no_grad():
+            return frame.from_row_order(restore_prepared(frame, self.motion, self.method, self.options))[0]
+
+    @cached_property
+    def visible(self) -> Tensor:
+        """(H, W) bool, pixels of the restored frame that the sensor recorded; the others are extrapolated."""
+        everything = torch.ones_like(self.frame.images[0, 0, 0], dtype=torch.bool)
+        everything = frames_from_row_order(everything, self.frame.image_timing)
+        if self.tones is None:
+            return everything
+        height, width = everything.shape
+        return visible_pixels(self._timed_from_middle.image_timing, self.motion, (height, width), 1)[0][0]
+
+    @cached_property
+    def detection(self) -> DetectionResult | None:
+        """The vibration at this frame, with its time origin at the first row of this frame; None if none is known."""
+        if self.tones is None:
+            return None
+        fit, measurements, timing = self.tones.fit, self.tones.measurements, self.frame.timing
+        height, width = self.frame.images.shape[-2:]
+        # Standard deviations, also of the displacement of the rows of this frame.
+        _, std = vibration_of_fit(fit)
+        starts = timing.row_starts(1, height, fit.centre.device)[0, ::8]
+        std = replace(std, displacement=displacement_std(fit, starts, timing.exposure_time))
+        # The offset curve with the weights that a fit to these rows would have.
+        robust = measurements.reweighted(residual_of(measurements, fit))
+        weights = robust.weights / measurements.weights.clamp(min=1e-300)
+        curve, fitted = offset_curve(robust, fit, weights, [2])
+        interval, scale = float(measurements.exposure_starts.diff(dim=-1).mean()), FieldScale(2, width, height)
+        user_timing, reasons = self.frame.image_timing, (self.tones.reasons,)
+        results = assembled(
+            fit, std, curve, fitted, reasons, user_timing, scale=scale, num_frames=self.window, interval=interval
+        )
+        return results[0]
+
+    @property
+    def _timed_from_middle(self) -> PreparedFrames:
+        """The frame with the time origin of ``motion``."""
+        start = -time_to_middle(self.frame.images.shape[-2], self.frame.timing)
+        timing = replace(self.frame.image_timing, frame_start_times=(start,))
+        return replace(self.frame, timing=timing.in_row_order(), image_timing=timing)
