@@ -4,6 +4,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md), in p
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,16 +12,14 @@ from torch import Tensor
 
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text, text_table, wrapped
-from rsvib_torch.detection.recorded.band_vectors import band_vectors
+from rsvib_torch.detection.recorded.band_vectors import BandVectors
 from rsvib_torch.detection.recorded.clock_range import offset_range
 from rsvib_torch.detection.recorded.rotation_fit import NAMES, RotationFit, RotationModel, components_of, fit_robustly
 from rsvib_torch.detection.recorded.rotation_search import OrientationSearch, orientation_matrix, search_orientations
-from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.registration import RegistrationOptions
 
 __all__ = ["RotationAlignment", "align_rates"]
 
@@ -148,10 +147,10 @@ def _axis(letter: str) -> str:
 
 
 def align_rates(
-    stack: GreyFrames,
+    vectors: BandVectors,
+    shape: Sequence[int],
     timing: SensorTiming,
     rates: AngularRates,
-    options: RegistrationOptions,
     camera: Camera | None,
     *,
     offsets: tuple[float, float] | None,
@@ -159,15 +158,13 @@ def align_rates(
     fit_focal_length: bool,
     fit_row_time: bool,
 ) -> RotationAlignment:
-    """``align_motion`` for angular rates and one stack."""
-    height, width = stack.images.shape[-2:]
-    count = stack.images.shape[1]
+    """``align_motion`` for angular rates, from the ``band_vectors`` of a stack of ``shape`` (T, H, W)."""
+    count, height, width = shape
     if camera is not None:
         camera.check_size(*((height, width) if timing.scan_axis == -1 else (width, height)))
     starts = timing.in_row_order().frame_starts(count).cpu()
     last = float(starts[-1]) + height * timing.row_time + timing.exposure_time
     limits = offset_range(rates, float(starts[0]), last, offsets)
-    vectors = band_vectors(stack, timing, options)
     middle = 0.5 * (float(starts[0]) + last)
     known = None if camera is None or fit_focal_length else camera.focal_length
 

@@ -10,6 +10,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.progress import steps
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.displacements import (
     FrameGroup,
@@ -144,9 +145,10 @@ class StripRows(MeasuredRows):
     def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
         """Components of the motion of every row (B, N, G, A)."""
         each = [None] * len(self.groups) if gradients is None else gradients
-        view, measured = self.view(motion), []
+        view, measured, advance = self.view(motion), [], steps(len(self.groups), "groups of strips")
         for group, own in zip(self.groups, each, strict=True):
             measured.append(measure_strips(group, self.timing, motion, view, self.strips, self.scale.factors, own))
+            advance()
         of_groups = [own for _, own in measured]
         return RowRecord(joined_groups([part for part, _ in measured]), of_groups, self._apart(of_groups))
 
