@@ -15,11 +15,11 @@ import pytest
 import tifffile
 import torch
 from kornia.filters import gaussian_blur2d
-from truth import MARGIN, Motion, crop, draw_scene, take_frames
+from truth import MARGIN, Motion, draw_scene, take_frames
 
-from rsvib_torch import SensorTiming, __version__, detect_vibration
+from rsvib_torch import SensorTiming, __version__
 from rsvib_torch.commands.main import run_command
-from rsvib_torch.io import read_stack, read_stack_info, write_stack
+from rsvib_torch.io import StackFormat, formats, read_stack, read_stack_info, write_stack
 
 AMPLITUDE, FREQUENCY, PHASE = (1.6, 1.1), (71.0, 113.0), (0.6, -1.2)
 CONFIG = f"""
@@ -137,21 +137,6 @@ def test_run_writes_all_results_and_can_be_repeated(place, tmp_path):
     assert cv2.imread(str(out / "before_after.png")).std() > 5
 
 
-def test_other_formats_and_colour(place, tmp_path):
-    frames = read_stack(place / "frames.tif")
-    colour = torch.stack([frames, 0.5 * frames, 0.8 * frames], dim=1)
-    write_stack(tmp_path / "frames", colour, dtype="uint8")
-    assert run("run", tmp_path / "frames", tmp_path / "out", "--config", place / "camera.toml") == 0
-    check_detection(tmp_path / "out")
-    info = read_stack_info(tmp_path / "out" / "restored.tif")
-    assert (info.shape, info.dtype, info.full_scale) == ((2, 3, 448, 256), "uint8", 255.0)
-    write_stack(tmp_path / "frames.npy", frames, dtype="float32")
-    arguments = ("--config", place / "camera.toml", "--vibration", tmp_path / "out" / "vibration.json")
-    assert run("restore", tmp_path / "frames.npy", tmp_path / "restored.npy", *arguments) == 0
-    assert np.load(tmp_path / "restored.npy").dtype == np.float32
-    assert min(psnr(read_stack(tmp_path / "restored.npy"), still_frame(place))) > 38
-
-
 def test_an_unreliable_axis_is_not_restored(place, tmp_path, capsys):
     frames, config = place / "frames.tif", place / "camera.toml"
     assert run("detect", frames, "--config", config, "--out", tmp_path) == 0
@@ -167,64 +152,6 @@ def test_an_unreliable_axis_is_not_restored(place, tmp_path, capsys):
     assert "  2 frames unchanged\n" in shown
     difference = read_stack(tmp_path / "restored.tif") - read_stack(frames)
     assert difference.abs().mean() < 0.01
-
-
-def test_metadata_are_kept_or_listed(place, tmp_path, capsys):
-    tags = [(33550, "d", 3, (0.5, 0.5, 0.0), False), (42113, "s", 0, "0", False)]
-    counts = tifffile.imread(place / "frames.tif")
-    tifffile.imwrite(tmp_path / "geo.tif", counts, photometric="minisblack", extratags=tags, metadata=None)
-    config = ("--config", place / "camera.toml")
-    assert run("run", tmp_path / "geo.tif", tmp_path / "out", *config) == 0
-    assert "not kept" not in capsys.readouterr().out
-    with tifffile.TiffFile(tmp_path / "out" / "restored.tif") as tif:
-        assert [tif.pages[1].tags[code].value for code in (33550, 42113)] == [(0.5, 0.5, 0.0), "0"]
-    assert json.loads((tmp_path / "out" / "restoration.json").read_text())["not_kept"] == []
-    names = ["ModelPixelScaleTag", "GDAL_NODATA"]
-    assert run("run", tmp_path / "geo.tif", tmp_path / "out", *config, "--output", "restored.npy", "--overwrite") == 0
-    assert f"restored.npy: not kept from the input: {', '.join(names)}\n" in capsys.readouterr().out
-    for file in ("restoration.json", "manifest.json"):
-        assert json.loads((tmp_path / "out" / file).read_text())["not_kept"] == names
-    for name, lost in (("r.tif", []), ("r.h5", names)):
-        found = ("--vibration", tmp_path / "out" / "vibration.json", "--report", tmp_path / "report.json")
-        assert run("restore", tmp_path / "geo.tif", tmp_path / name, *config, *found, "--overwrite") == 0
-        assert ("not kept from the input: ModelPixelScaleTag, GDAL_NODATA" in capsys.readouterr().out) == bool(lost)
-        assert json.loads((tmp_path / "report.json").read_text())["not_kept"] == lost
-
-
-def test_pixels_without_data_are_neither_used_nor_changed(tmp_path, capsys):
-    timing = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=210)
-    scene = draw_scene(200 + 2 * MARGIN, 160 + 2 * MARGIN, 3)
-    motion = Motion(AMPLITUDE, FREQUENCY, PHASE)
-    frames = np.clip(4095 * take_frames(scene, timing, motion, 5, 0.003, samples=8), 1, 4095).astype(np.uint16)
-    border = np.arange(160) < 50 - 0.2 * np.arange(200)[:, None]
-    frames[:, border] = 65535
-    tags = [(42113, "s", 0, "65535", False)]
-    tifffile.imwrite(tmp_path / "f.tif", frames, photometric="minisblack", metadata=None, extratags=tags)
-    text = "[sensor]\nrow_time = 4e-5\nexposure_rows = 12\nframe_rows = 210\nfull_scale = 4095\n"
-    (tmp_path / "camera.toml").write_text(text)
-    config = ("--config", tmp_path / "camera.toml")
-    sharp = crop(scene)[24:-24, 24:-24]
-
-    def check(path):
-        restored = tifffile.imread(path)
-        assert (restored[:, border] == 65535).all()
-        assert (restored[:, ~border] <= 4095).all()
-        inside = ~border[24:-24, 24:-24]
-        before, after = (f[:, 24:-24, 24:-24][:, inside] / 4095 - sharp[inside] for f in (frames, restored))
-        assert np.square(after).mean() < np.square(before).mean() / 100  # 20 dB
-
-    assert run("run", tmp_path / "f.tif", tmp_path / "whole", *config) == 0
-    assert run("run", tmp_path / "f.tif", tmp_path / "windows", *config, "--window", "3") == 0
-    found = ("--vibration", tmp_path / "whole" / "vibration.json")
-    assert run("restore", tmp_path / "f.tif", tmp_path / "r.tif", *config, *found) == 0
-    for path in (tmp_path / "whole" / "restored.tif", tmp_path / "windows" / "restored.tif", tmp_path / "r.tif"):
-        check(path)
-    assert "not kept" not in capsys.readouterr().out
-    joint = ("--joint", "all", "--overwrite")
-    assert run("restore", tmp_path / "f.tif", tmp_path / "r.tif", *config, *found, *joint) == 0
-    assert (tifffile.imread(tmp_path / "r.tif") == 65535)[..., border].all()
-    detected = detect_vibration(tmp_path / "f.tif", timing, full_scale=4095)
-    assert detected.vibration.amplitude[:, 0].tolist() == pytest.approx(AMPLITUDE, rel=0.01)
 
 
 def change_vibration(place, folder, change):
@@ -337,18 +264,6 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
         error = capsys.readouterr().err
         assert message in error
         assert error.count("\n") == 1
-
-
-def test_frames_without_vibration_are_unchanged(place, tmp_path, capsys):
-    still = still_frame(place).expand(2, -1, -1)
-    noise = 0.003 * torch.randn(still.shape, generator=torch.Generator().manual_seed(1))
-    write_stack(tmp_path / "still.tif", (still + noise).clamp(0, 1), dtype="uint16", full_scale=4095)
-    assert run("run", tmp_path / "still.tif", tmp_path / "out", "--config", place / "camera.toml") == 0
-    shown = capsys.readouterr()
-    assert "no vibration to remove: the frames are written unchanged" in shown.err
-    assert "x unchanged: its vibration is not reliable, see the reasons above" in shown.out
-    assert (tifffile.imread(tmp_path / "out" / "restored.tif") == tifffile.imread(tmp_path / "still.tif")).all()
-    assert json.loads((tmp_path / "out" / "restoration.json").read_text())["frames"] == "as taken"
 
 
 def test_saturated_and_missing_pixels(place, tmp_path):
@@ -472,25 +387,6 @@ def cut_tiff(place, folder):
     return folder / "bad.tif", place / "camera.toml"
 
 
-def noise_video(place, folder):
-    (folder / "bad.mp4").write_bytes(np.random.default_rng(1).bytes(4000))
-    return folder / "bad.mp4", place / "camera.toml"
-
-
-def sizes_folder(place, folder):
-    (folder / "bad").mkdir()
-    for index, width in enumerate((256, 250)):
-        cv2.imwrite(str(folder / "bad" / f"{index}.png"), np.zeros((448, width), np.uint8))
-    return folder / "bad", place / "camera.toml"
-
-
-def sizes_tiff(place, folder):
-    with tifffile.TiffWriter(folder / "bad.tif") as tif:
-        for width in (256, 250):
-            tif.write(np.zeros((448, width), np.uint8), metadata=None)
-    return folder / "bad.tif", place / "camera.toml"
-
-
 def missing_frames(place, folder):
     return folder / "none.tif", place / "camera.toml"
 
@@ -505,23 +401,11 @@ BAD_INPUT = {
     "Inf pixel": (set_pixel(math.inf), "frames must be finite, but pixel (1, 100, 100) is inf"),
     "constant frames": (save_frames(lambda f: 0 * f + 0.5), ""),
     "more rows than the sensor": (save_frames(lambda f: f.repeat(1, 2, 1)), "frame_rows=512 is less than the 896 rows"),
-    "frames of different size, folder": (sizes_folder, "frames of different size or kind"),
-    "frames of different size, TIFF": (sizes_tiff, "frames of different size or kind"),
     "truncated TIFF": (cut_tiff, "bad.tif: not a readable TIFF stack: "),
-    "unreadable video": (noise_video, "bad.mp4: not a readable video"),
     "no such frames": (missing_frames, "none.tif does not exist"),
     "no such config": (missing_config, "none.toml: No such file or directory"),
-    "exposure of 0": (edit_config("exposure_rows = 12", "exposure_rows = 0"), "exposure_rows must be larger than 0"),
-    "row time in ms": (edit_config("4e-5", "0.04"), "row_time=0.04 s is longer than 10 ms; row_time is in seconds"),
-    "frame period": (edit_config("frame_rows = 512", "frame_rows = 512000"), "is a frame period of 20.48 s, longer"),
-    "wrong type": (edit_config("4e-5", "'40 us'"), "sensor.row_time: expected a number, got '40 us'"),
-    "unknown key": (
-        edit_config("band_step", "bandstep"),
-        "detection.bandstep: unknown key; expected one of registration",
-    ),
     "missing key": (edit_config("frame_rows = 512", ""), "sensor: frame_rate or frame_rows is missing"),
     "wrong value": (edit_config("search = 8", "search = 1"), "search must be at least 2, got 1"),
-    "no TOML": (edit_config("[sensor]", "[sensor"), "bad.toml: not a TOML file"),
 }
 
 
@@ -558,32 +442,6 @@ def restore_arguments(place, folder, **change):
 def detect_once(place):
     assert run("detect", place / "frames.tif", "--config", place / "camera.toml", "--out", place / "detection") == 0
     return (place / "detection" / "vibration.json").read_text()
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        (
-            '"frame_rows": 512.0',
-            '"frame_rows": 540.0',
-            "the vibration was detected with another timing: frame_rows=540.0",
-        ),
-        ('"scan_axis": "y"', '"scan_axis": "x"', "the vibration was detected with another timing"),
-        ('"phase"', '"phases"', "vibration.phase: missing key"),
-        ('"reliable": [true, true]', '"reliable": [1, true]', "reliable[0]: expected true or false, got 1"),
-        ('"gain": ', '"gain": NaN, "gains": ', "not a vibration.json: NaN is not a JSON number"),
-        ("{", "[", "not a vibration.json: "),
-    ],
-)
-def test_bad_vibration_file_is_refused(place, vibration_text, tmp_path, capsys, change):
-    old, new, message = change
-    assert old in vibration_text
-    (tmp_path / "v.json").write_text(vibration_text.replace(old, new, 1))
-    capsys.readouterr()
-    assert run(*restore_arguments(place, tmp_path)) == 2
-    error = capsys.readouterr().err
-    assert f"v.json: {message}" in error
-    assert [path.name for path in tmp_path.iterdir()] == ["v.json"]
 
 
 def test_outputs_that_cannot_be_written(place, vibration_text, tmp_path, capsys, monkeypatch):
@@ -677,14 +535,15 @@ def test_missing_gpu(place, tmp_path, capsys):
 
 
 def test_warnings_are_one_line(place, tmp_path, capsys, monkeypatch):
-    def warn(*args, **kwargs):
+    def warn(_):
         warnings.warn("the displacement within a row time\nis large", UserWarning, stacklevel=1)
         raise ValueError("stopped here")
 
-    monkeypatch.setattr("rsvib_torch.stacks.job.detect_vibration", warn)
+    monkeypatch.setitem(formats.FORMATS, ".warn", StackFormat("warning", (".warn",), warn))
+    (tmp_path / "frames.warn").write_bytes(b"")
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        assert run("run", place / "frames.tif", tmp_path / "out", "--config", place / "camera.toml") == 2
+        assert run("run", tmp_path / "frames.warn", tmp_path / "out", "--config", place / "camera.toml") == 2
     assert capsys.readouterr().err == (
         "rsvib: warning: the displacement within a row time is large\nrsvib: error: stopped here\n"
     )

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import shutil
 import signal
 import subprocess
 import sys
@@ -161,13 +160,6 @@ def test_errors_are_one_line_and_leave_no_files(place, tmp_path, capsys, options
     assert list(tmp_path.iterdir()) == []
 
 
-def test_help_names_every_option(capsys):
-    assert run("run", "--help") == 0
-    shown = capsys.readouterr().out
-    for option in ("--window", "--memory", "--resume", "--bad-frames", "--scheduler", "--output", "--compression"):
-        assert option in shown
-
-
 def test_full_disk_is_one_line(place, tmp_path, capsys, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
@@ -178,32 +170,3 @@ def test_full_disk_is_one_line(place, tmp_path, capsys, monkeypatch):
     assert "No space left on device" in error
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
-
-
-def test_commands_do_not_replace_their_inputs(place, tmp_path, capsys):
-    for name in ("frames.tif", "camera.toml"):
-        shutil.copy(place / name, tmp_path / name)
-    shutil.copy(place / "out" / "manifest.json", tmp_path / "manifest.json")
-    frames, config = tmp_path / "frames.tif", tmp_path / "camera.toml"
-    link = tmp_path / "link.tif"
-    link.symlink_to(frames)
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    options = ("--config", config, "--overwrite")
-    vibration = ("--vibration", tmp_path / "manifest.json")
-    for arguments in (
-        ("restore", frames, frames, *options, *vibration),
-        ("restore", frames, link, *options, *vibration),
-        ("restore", frames, tmp_path / "out.tif", *options, *vibration, "--report", tmp_path / "out.tif"),
-        ("restore", frames, tmp_path / "out.tif", *options, *vibration, "--report", config),
-        ("run", frames, tmp_path, "--output", "frames.tif", *options),
-        ("motion", frames, "--out", config, *options),
-        ("known", frames, frames, *options, "--motion", config, "--unit", "px"),
-        ("simulate", frames, link, *options),
-        ("init", frames, "--out", frames, "--overwrite"),
-        ("calibrate", frames, "--frequency", 100, "--out", frames, "--overwrite"),
-    ):
-        assert run(*arguments) == 2, arguments
-        error = capsys.readouterr().err
-        assert error.count("\n") == 1
-        assert "the same file" in error
-        assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before

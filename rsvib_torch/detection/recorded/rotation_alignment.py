@@ -120,6 +120,7 @@ class RotationAlignment(
     def summary(self) -> str:
         """Clock, axes, bias and focal length with standard deviations, what is not explained, and the verdict."""
         second = measured_text(self.scale, self.scale_std or None, digits=8)
+        axes = [letter.lower() if letter.isupper() else f"-{letter}" for letter in self.orientation]
         verdict = "reliable" if self.reliable else f"not reliable: {'; '.join(self.reasons)}"
         bias, std = self.bias.tolist(), self.bias_std.tolist()
         moved, rest = (self.predicted - self.predicted.mean(0)).square().mean(0).sqrt(), self.unexplained
@@ -128,8 +129,7 @@ class RotationAlignment(
             [
                 f"time 0 of the frames is {measured_text(self.offset, self.offset_std)} s of the gyroscope",
                 f"1 s of the frames is {second} s of the gyroscope",
-                f"axes x, y, z of the camera are {', '.join(_axis(letter) for letter in self.orientation)} of the "
-                "gyroscope",
+                f"axes x, y, z of the camera are {', '.join(axes)} of the gyroscope",
                 f"bias {', '.join(measured_text(b, s) for b, s in zip(bias, std, strict=True))} rad/s, focal length "
                 f"{measured_text(self.focal_length, self.focal_length_std or None)} px, row time "
                 f"{measured_text(1e6 * self.row_time, 1e6 * self.row_time_std or None)} us",
@@ -140,10 +140,6 @@ class RotationAlignment(
                 wrapped(verdict),
             ]
         )
-
-
-def _axis(letter: str) -> str:
-    return letter.lower() if letter.isupper() else f"-{letter}"
 
 
 def align_rates(
