@@ -15,10 +15,10 @@ import pytest
 import tifffile
 import torch
 from kornia.filters import gaussian_blur2d
+from program import rsvib
 from truth import MARGIN, Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, __version__
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.io import StackFormat, formats, read_stack, read_stack_info, write_stack
 
 AMPLITUDE, FREQUENCY, PHASE = (1.6, 1.1), (71.0, 113.0), (0.6, -1.2)
@@ -57,12 +57,8 @@ def make_place(tmp_path_factory):
     scene = gaussian_blur2d(texture, (9, 9), (1.2, 1.2))[0]
     scene = (scene - scene.min()) / (scene.max() - scene.min())
     write_stack(folder / "scene.png", scene, dtype="uint16", full_scale=65535)
-    assert run("simulate", folder / "scene.png", folder / "frames.tif", "--config", folder / "camera.toml") == 0
+    assert rsvib("simulate", folder / "scene.png", folder / "frames.tif", "--config", folder / "camera.toml") == 0
     return folder
-
-
-def run(*arguments):
-    return run_command([str(argument) for argument in arguments])
 
 
 def still_frame(place):
@@ -101,7 +97,7 @@ def test_simulated_frames_are_counts_of_the_camera(place):
 
 def test_detect_then_restore(place, tmp_path, capsys):
     frames, config, out = place / "frames.tif", place / "camera.toml", tmp_path / "detection"
-    assert run("detect", frames, "--config", config, "--out", out, "--device", "cpu") == 0
+    assert rsvib("detect", frames, "--config", config, "--out", out, "--device", "cpu") == 0
     assert sorted(path.name for path in out.iterdir()) == ["offsets.csv", "offsets.png", "vibration.json"]
     check_detection(out)
     shown = capsys.readouterr()
@@ -110,7 +106,7 @@ def test_detect_then_restore(place, tmp_path, capsys):
     assert re.search(r"\b7[01]\.\d", shown.out)
     assert shown.out.count(": reliable") == 2
     restored = tmp_path / "restored.tif"
-    assert run("restore", frames, restored, "--config", config, "--vibration", out / "vibration.json") == 0
+    assert rsvib("restore", frames, restored, "--config", config, "--vibration", out / "vibration.json") == 0
     info = read_stack_info(restored)
     assert (info.shape, info.dtype, info.full_scale) == ((2, 448, 256), "uint16", 4095.0)
     before, after = (psnr(read_stack(path), still_frame(place)) for path in (frames, restored))
@@ -121,7 +117,7 @@ def test_detect_then_restore(place, tmp_path, capsys):
 def test_run_writes_all_results_and_can_be_repeated(place, tmp_path):
     out = tmp_path / "out"
     for more in ((), ("--overwrite",)):
-        assert run("run", place / "frames.tif", out, "--config", place / "camera.toml", *more) == 0
+        assert rsvib("run", place / "frames.tif", out, "--config", place / "camera.toml", *more) == 0
     names = [
         "before_after.png",
         "manifest.json",
@@ -139,13 +135,13 @@ def test_run_writes_all_results_and_can_be_repeated(place, tmp_path):
 
 def test_an_unreliable_axis_is_not_restored(place, tmp_path, capsys):
     frames, config = place / "frames.tif", place / "camera.toml"
-    assert run("detect", frames, "--config", config, "--out", tmp_path) == 0
+    assert rsvib("detect", frames, "--config", config, "--out", tmp_path) == 0
     path = tmp_path / "vibration.json"
     data = json.loads(path.read_text())
     data.update(reliable=[False, False], reasons=[["blind"], ["too short", "noisy"]])
     path.write_text(json.dumps(data))
     capsys.readouterr()
-    assert run("restore", frames, tmp_path / "restored.tif", "--config", config, "--vibration", path) == 0
+    assert rsvib("restore", frames, tmp_path / "restored.tif", "--config", config, "--vibration", path) == 0
     shown = capsys.readouterr().out
     assert "  x: not reliable:\n   - blind\n  y: not reliable:\n   - too short\n   - noisy\n" in shown
     assert "  y unchanged: its vibration is not reliable, see the reasons above\n" in shown
@@ -156,7 +152,7 @@ def test_an_unreliable_axis_is_not_restored(place, tmp_path, capsys):
 
 def change_vibration(place, folder, change):
     """A vibration.json that differs from the detection."""
-    assert run("detect", place / "frames.tif", "--config", place / "camera.toml", "--out", folder / "detected") == 0
+    assert rsvib("detect", place / "frames.tif", "--config", place / "camera.toml", "--out", folder / "detected") == 0
     data = json.loads((folder / "detected" / "vibration.json").read_text())
     change(data)
     (folder / "v.json").write_text(json.dumps(data))
@@ -169,7 +165,7 @@ def test_a_wrong_vibration_leaves_the_frames_unchanged_unless_forced(place, tmp_
     change_vibration(place, tmp_path, turn)
     arguments = restore_arguments(place, tmp_path)
     capsys.readouterr()
-    assert run(*arguments, "--report", tmp_path / "report.json") == 0
+    assert rsvib(*arguments, "--report", tmp_path / "report.json") == 0
     shown = capsys.readouterr()
     assert shown.err.startswith("rsvib: warning: restored is no better than raw")
     assert "--force writes the restored ones" in shown.err
@@ -178,7 +174,7 @@ def test_a_wrong_vibration_leaves_the_frames_unchanged_unless_forced(place, tmp_
     assert (tifffile.imread(tmp_path / "r.tif") == tifffile.imread(place / "frames.tif")).all()
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["frames"], report["outcome"], report["pairs"]["outcome"]) == ("as taken", "worse", ["worse"])
-    assert run(*arguments, "--force", "--report", tmp_path / "report.json", "--overwrite") == 0
+    assert rsvib(*arguments, "--force", "--report", tmp_path / "report.json", "--overwrite") == 0
     assert "restored is no better than raw" in capsys.readouterr().err
     assert (tifffile.imread(tmp_path / "r.tif") != tifffile.imread(place / "frames.tif")).any()
     assert json.loads((tmp_path / "report.json").read_text())["frames"] == "restored"
@@ -206,19 +202,19 @@ def test_known_motion_that_makes_frames_worse_leaves_them_unchanged_unless_force
     (tmp_path / "camera.toml").write_text(text)
     known = ("known", tmp_path / "frames.tif", tmp_path / "k.tif", "--config", tmp_path / "camera.toml")
     known += ("--motion", tmp_path / "motion.csv", "--unit", "px", "--offset", "0")
-    assert run(*known) == 0
+    assert rsvib(*known) == 0
     shown = capsys.readouterr()
     assert "the motion reduces the offsets" in shown.out
     assert "5 frames unchanged" in shown.out
     assert "restored is no better than raw" in shown.err
     assert "--force writes the restored ones" in shown.err
     assert (tifffile.imread(tmp_path / "k.tif") == frames).all()
-    assert run(*known, "--force", "--overwrite") == 0
+    assert rsvib(*known, "--force", "--overwrite") == 0
     assert "5 frames restored" in capsys.readouterr().out
     assert (tifffile.imread(tmp_path / "k.tif") != frames).any()
     with tifffile.TiffFile(tmp_path / "k.tif") as tif:
         assert [tif.pages[1].tags[code].value for code in (33550, 42113)] == [(0.5, 0.5, 0.0), "0"]
-    assert run(*known[:2], tmp_path / "k.npy", *known[3:]) == 0
+    assert rsvib(*known[:2], tmp_path / "k.npy", *known[3:]) == 0
     assert "k.npy: not kept from the input: ModelPixelScaleTag, GDAL_NODATA\n" in capsys.readouterr().out
 
 
@@ -228,7 +224,7 @@ def test_half_of_the_vibration_is_restored_with_a_warning(place, tmp_path, capsy
 
     change_vibration(place, tmp_path, halve)
     capsys.readouterr()
-    assert run(*restore_arguments(place, tmp_path)) == 0
+    assert rsvib(*restore_arguments(place, tmp_path)) == 0
     shown = capsys.readouterr()
     assert shown.err.startswith("rsvib: warning: restoration helps in part only: x: frames lie ")
     assert "2 frames restored" in shown.out
@@ -239,18 +235,18 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     config = tmp_path / "dewarp.toml"
     config.write_text(CONFIG + "[restoration]\nmethod = 'banded'\nhalf_rows = 8\nsaturation = 4000\n")
     common = ("run", place / "frames.tif", out, "--config", config, "--overwrite")
-    assert run(*common) == 0
+    assert rsvib(*common) == 0
     report = json.loads((out / "restoration.json").read_text())
     assert report["options"] == {"method": "banded", "half_rows": 8, "saturation": 4000 / 4095}
     assert (report["outcome"], report["frames"], report["left_alone"]) == ("helps", "restored", [])
     assert "restored frames agree; estimated improvement +" in capsys.readouterr().out
     # options of the configured method are dropped with it
-    assert run(*common, "--method", "exact", "--joint", "all", "--saturation", 4095) == 0
+    assert rsvib(*common, "--method", "exact", "--joint", "all", "--saturation", 4095) == 0
     report = json.loads((out / "restoration.json").read_text())
     assert report["options"] == {"method": "exact", "joint": True, "saturation": 1.0}
     assert read_stack_info(out / "restored.tif").shape == (1, 448, 256)
     assert min(psnr(read_stack(out / "restored.tif"), still_frame(place))) > 40
-    assert run(*common, "--method", "richardson-lucy", "--joint", "all") == 0
+    assert rsvib(*common, "--method", "richardson-lucy", "--joint", "all") == 0
     assert read_stack_info(out / "restored.tif").shape == (1, 448, 256)
     assert min(psnr(read_stack(out / "restored.tif"), still_frame(place))) > 40
     capsys.readouterr()
@@ -260,7 +256,7 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
         (("--method", "exact", "--joint", "many"), "--joint must be 'all' or a number of frames, got 'many'"),
         (("--saturation", "0"), "saturation must be larger than 0, got 0"),
     ):
-        assert run(*common, *options) == 2
+        assert rsvib(*common, *options) == 2
         error = capsys.readouterr().err
         assert message in error
         assert error.count("\n") == 1
@@ -275,7 +271,7 @@ def test_saturated_and_missing_pixels(place, tmp_path):
     write_stack(tmp_path / "holes.npy", lamp, dtype="float32")
     for name, options in (("lamp.tif", ()), ("holes.npy", ("--saturation", 1.0, "--method", "dewarp"))):
         out = tmp_path / name.partition(".")[0]
-        assert run("run", tmp_path / name, out, "--config", place / "camera.toml", *options) == 0
+        assert rsvib("run", tmp_path / name, out, "--config", place / "camera.toml", *options) == 0
         restored = read_stack(out / "restored.tif")
         far = restored.clone()
         far[:, 190:214, 90:116] = still_frame(place)[190:214, 90:116]
@@ -286,44 +282,44 @@ def test_full_scale_comes_from_option_file_or_config(place, tmp_path, capsys):
     counts = tifffile.imread(place / "frames.tif")
     tifffile.imwrite(tmp_path / "plain.tif", counts, photometric="minisblack")
     arguments = (tmp_path / "plain.tif", "--config", place / "camera.toml", "--out", tmp_path / "out", "--overwrite")
-    assert run("detect", *arguments) == 0  # the full scale is in the configuration
+    assert rsvib("detect", *arguments) == 0  # the full scale is in the configuration
     silent = tmp_path / "silent.toml"
     silent.write_text(CONFIG.replace("full_scale = 4095", ""))
-    assert run("detect", arguments[0], "--config", silent, "--out", tmp_path / "o", "--full-scale", 4095) == 0
+    assert rsvib("detect", arguments[0], "--config", silent, "--out", tmp_path / "o", "--full-scale", 4095) == 0
     capsys.readouterr()
-    assert run("detect", arguments[0], "--config", silent, "--out", tmp_path / "out2") == 2
+    assert rsvib("detect", arguments[0], "--config", silent, "--out", tmp_path / "out2") == 2
     assert "full scale of uint16 frames unknown: pass full_scale, e.g. full_scale=4095" in capsys.readouterr().err
     other = tmp_path / "other.toml"
     other.write_text(CONFIG.replace("4095", "16383"))
-    assert run("detect", place / "frames.tif", "--config", other, "--out", tmp_path / "out2") == 2
+    assert rsvib("detect", place / "frames.tif", "--config", other, "--out", tmp_path / "out2") == 2
     assert (
         "the full scale is 4095 in the file and 16383 in the configuration; choose one with --full-scale"
         in capsys.readouterr().err
     )
-    assert run("detect", *arguments, "--full-scale", 100) == 2
+    assert rsvib("detect", *arguments, "--full-scale", 100) == 2
     assert "beyond full_scale=100" in capsys.readouterr().err
     assert not (tmp_path / "out2").exists()
 
 
 def test_options_describe_the_camera_without_a_file(place, tmp_path):
     camera = ("--row-time", "40us", "--exposure", "0.48ms", "--frame-rate", 1 / (512 * 4e-5))
-    assert run("detect", place / "frames.tif", *camera, "--out", tmp_path / "options") == 0
+    assert rsvib("detect", place / "frames.tif", *camera, "--out", tmp_path / "options") == 0
     found = json.loads((tmp_path / "options" / "vibration.json").read_text())
     assert [tones[0] for tones in found["vibration"]["amplitude"]] == pytest.approx(AMPLITUDE, rel=0.02)
     wrong = tmp_path / "wrong.toml"
     wrong.write_text(CONFIG.replace("4e-5", "5e-5").replace("exposure_rows = 12", "exposure_time = 0.48e-3"))
     arguments = (place / "frames.tif", "--config", wrong, "--row-time", "40us", "--out", tmp_path / "replaced")
-    assert run("detect", *arguments) == 0
+    assert rsvib("detect", *arguments) == 0
     check_detection(tmp_path / "replaced")
-    assert run("run", place / "frames.tif", tmp_path / "run", *camera) == 0
+    assert rsvib("run", place / "frames.tif", tmp_path / "run", *camera) == 0
     frames = (place / "frames.tif", tmp_path / "restored.tif", *camera)
-    assert run("restore", *frames, "--vibration", tmp_path / "options" / "vibration.json") == 0
+    assert rsvib("restore", *frames, "--vibration", tmp_path / "options" / "vibration.json") == 0
     assert (tifffile.imread(tmp_path / "restored.tif") == tifffile.imread(tmp_path / "run" / "restored.tif")).all()
 
 
 def test_the_frame_rate_of_the_file_and_the_full_scale_are_in_the_next_command(place, tmp_path, capsys):
     camera = ("--row-time", "40us", "--exposure", "0.48ms")
-    assert run("detect", place / "frames.tif", *camera, "--full-scale", 65535, "--out", tmp_path / "found") == 0
+    assert rsvib("detect", place / "frames.tif", *camera, "--full-scale", 65535, "--out", tmp_path / "found") == 0
     printed = capsys.readouterr()
     found = json.loads((tmp_path / "found" / "vibration.json").read_text())
     assert found["timing"]["frame_rows"] == pytest.approx(512)
@@ -331,12 +327,12 @@ def test_the_frame_rate_of_the_file_and_the_full_scale_are_in_the_next_command(p
     assert "frame rate 48.8281 per second, from the times in" in re.sub(r"\s+", " ", printed.out + printed.err)
     assert "--full-scale 65535" in printed.out
     np.save(tmp_path / "frames.npy", np.zeros((2, 96, 96), np.uint8))
-    assert run("detect", tmp_path / "frames.npy", *camera, "--out", tmp_path / "none") == 2
+    assert rsvib("detect", tmp_path / "frames.npy", *camera, "--out", tmp_path / "none") == 2
     assert "the camera is not described: give --frame-rate, or --config" in capsys.readouterr().err
 
 
 def test_patterns_that_the_shell_expands(place, tmp_path, capsys):
-    assert run("run", tmp_path / "a.png", tmp_path / "b.png", tmp_path / "out") == 2
+    assert rsvib("run", tmp_path / "a.png", tmp_path / "b.png", tmp_path / "out") == 2
     error = capsys.readouterr().err
     assert len(error.splitlines()) == 1
     assert "Got unexpected extra argument" in error
@@ -345,11 +341,11 @@ def test_patterns_that_the_shell_expands(place, tmp_path, capsys):
 
 def test_video_is_a_name_of_the_output(place, tmp_path, capsys):
     config = ("--config", place / "camera.toml")
-    assert run("run", place / "frames.tif", tmp_path / "out", *config, "--method", "dewarp", "--video") == 0
+    assert rsvib("run", place / "frames.tif", tmp_path / "out", *config, "--method", "dewarp", "--video") == 0
     assert not (tmp_path / "out" / "restored.tif").exists()
     assert read_stack(tmp_path / "out" / "restored.mkv").shape == read_stack(place / "frames.tif").shape
     capsys.readouterr()
-    assert run("run", place / "frames.tif", tmp_path / "two", *config, "--video", "--output", "a.tif") == 2
+    assert rsvib("run", place / "frames.tif", tmp_path / "two", *config, "--video", "--output", "a.tif") == 2
     assert "--video and --output a.tif are two names" in capsys.readouterr().err
     assert not (tmp_path / "two").exists()
 
@@ -416,7 +412,7 @@ def test_errors_of_bad_input_are_one_line_and_leave_no_files(place, tmp_path, ca
     frames, config = make(place, tmp_path)
     before = sorted(tmp_path.rglob("*"))
     target = (tmp_path / "out",) if command == "run" else ("--out", tmp_path / "out")
-    assert run(command, frames, *target, "--config", config) == 2
+    assert rsvib(command, frames, *target, "--config", config) == 2
     shown = capfd.readouterr()
     assert shown.err.startswith("rsvib: error: ")
     assert message in shown.err
@@ -440,7 +436,7 @@ def restore_arguments(place, folder, **change):
 
 @pytest.fixture(scope="module", name="vibration_text")
 def detect_once(place):
-    assert run("detect", place / "frames.tif", "--config", place / "camera.toml", "--out", place / "detection") == 0
+    assert rsvib("detect", place / "frames.tif", "--config", place / "camera.toml", "--out", place / "detection") == 0
     return (place / "detection" / "vibration.json").read_text()
 
 
@@ -463,11 +459,11 @@ def test_outputs_that_cannot_be_written(place, vibration_text, tmp_path, capsys,
     before = sorted(tmp_path.iterdir())
     capsys.readouterr()
     for arguments, message in cases:
-        assert run(*arguments) == 2
+        assert rsvib(*arguments) == 2
         assert message in capsys.readouterr().err
     monkeypatch.setattr("tempfile.mkdtemp", refuse)
     for arguments in (("run", frames, tmp_path / "out", *config), restore_arguments(place, tmp_path)):
-        assert run(*arguments) == 2
+        assert rsvib(*arguments) == 2
         assert f"folder {tmp_path} is not writable (Permission denied)" in capsys.readouterr().err
     assert sorted(tmp_path.iterdir()) == before
 
@@ -482,7 +478,7 @@ def test_scenes_that_cannot_be_simulated(place, tmp_path, capsys):
         (place / "scene.png", silent, "silent.toml: simulation: missing key"),
         (place / "scene.png", large, "is too small"),
     ):
-        assert run("simulate", scene, tmp_path / "f.tif", "--config", config) == 2
+        assert rsvib("simulate", scene, tmp_path / "f.tif", "--config", config) == 2
         assert message in capsys.readouterr().err
     assert not (tmp_path / "f.tif").exists()
 
@@ -490,7 +486,7 @@ def test_scenes_that_cannot_be_simulated(place, tmp_path, capsys):
 def test_simulated_noise_has_a_seed(place, tmp_path):
     for name, seed in (("a", 5), ("b", 6)):
         arguments = (place / "scene.png", tmp_path / f"{name}.tif", "--config", place / "camera.toml", "--seed", seed)
-        assert run("simulate", *arguments) == 0
+        assert rsvib("simulate", *arguments) == 0
     first, second = (tifffile.imread(tmp_path / f"{name}.tif").astype(float) for name in "ab")
     assert (first == tifffile.imread(place / "frames.tif")).all()
     assert np.std(first - second) == pytest.approx(0.003 * 4095 * 2**0.5, rel=0.05)
@@ -516,21 +512,21 @@ def test_usage_errors(capsys, tmp_path):
             "Invalid value for '--full-scale'",
         ),
     ):
-        assert run(*arguments) == 2
+        assert rsvib(*arguments) == 2
         error = capsys.readouterr().err
         assert error.startswith("rsvib: error: ")
         assert message in error
         assert error.count("\n") == 1
-    assert run() == 0
+    assert rsvib() == 0
     assert "simulate" in capsys.readouterr().out
-    assert run("--version") == 0
+    assert rsvib("--version") == 0
     assert capsys.readouterr().out == f"rsvib {__version__}\n"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_missing_gpu(place, tmp_path, capsys):
     arguments = (place / "frames.tif", "--config", place / "camera.toml", "--out", tmp_path / "out")
-    assert run("detect", *arguments, "--device", "cuda") == 2
+    assert rsvib("detect", *arguments, "--device", "cuda") == 2
     assert capsys.readouterr().err == "rsvib: error: --device cuda: no CUDA device is available; use auto or cpu\n"
 
 
@@ -543,7 +539,7 @@ def test_warnings_are_one_line(place, tmp_path, capsys, monkeypatch):
     (tmp_path / "frames.warn").write_bytes(b"")
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        assert run("run", tmp_path / "frames.warn", tmp_path / "out", "--config", place / "camera.toml") == 2
+        assert rsvib("run", tmp_path / "frames.warn", tmp_path / "out", "--config", place / "camera.toml") == 2
     assert capsys.readouterr().err == (
         "rsvib: warning: the displacement within a row time is large\nrsvib: error: stopped here\n"
     )

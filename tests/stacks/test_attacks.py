@@ -5,7 +5,6 @@ with links in place of their files, beside others, with workers that die, and wi
 docs/reliability.md has the numbers of many more trials.
 """
 
-from collections import Counter
 from importlib import import_module
 
 import pytest
@@ -33,5 +32,5 @@ def test_no_attack_loses_or_falsifies_a_result(tmp_path, name, factor):
     if name == "disks" and not trials:
         pytest.skip("file systems cannot be mounted here")
     assert [trial for trial in trials if trial.outcome in FAILURES] == []
-    outcomes = Counter(trial.outcome for trial in trials)
-    assert outcomes["completed"] >= least * len(trials) > 0 or outcomes["refused"] > 0
+    assert sum(trial.outcome == "completed" for trial in trials) >= least * len(trials)
+    assert trials
