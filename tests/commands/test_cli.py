@@ -16,9 +16,9 @@ import tifffile
 import torch
 from kornia.filters import gaussian_blur2d
 from program import rsvib
-from truth import MARGIN, Motion, draw_scene, take_frames
+from truth import MARGIN, Motion, crop, draw_scene, take_frames
 
-from rsvib_torch import SensorTiming, __version__
+from rsvib_torch import SensorTiming, __version__, detect_vibration
 from rsvib_torch.io import StackFormat, formats, read_stack, read_stack_info, write_stack
 
 AMPLITUDE, FREQUENCY, PHASE = (1.6, 1.1), (71.0, 113.0), (0.6, -1.2)
@@ -148,6 +148,42 @@ def test_an_unreliable_axis_is_not_restored(place, tmp_path, capsys):
     assert "  2 frames unchanged\n" in shown
     difference = read_stack(tmp_path / "restored.tif") - read_stack(frames)
     assert difference.abs().mean() < 0.01
+
+
+def test_pixels_without_data_are_neither_used_nor_changed(tmp_path, capsys):
+    timing = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=210)
+    scene = draw_scene(200 + 2 * MARGIN, 160 + 2 * MARGIN, 3)
+    motion = Motion(AMPLITUDE, FREQUENCY, PHASE)
+    frames = np.clip(4095 * take_frames(scene, timing, motion, 5, 0.003, samples=8), 1, 4095).astype(np.uint16)
+    border = np.arange(160) < 50 - 0.2 * np.arange(200)[:, None]
+    frames[:, border] = 65535
+    tags = [(42113, "s", 0, "65535", False)]
+    tifffile.imwrite(tmp_path / "f.tif", frames, photometric="minisblack", metadata=None, extratags=tags)
+    text = "[sensor]\nrow_time = 4e-5\nexposure_rows = 12\nframe_rows = 210\nfull_scale = 4095\n"
+    (tmp_path / "camera.toml").write_text(text)
+    config = ("--config", tmp_path / "camera.toml")
+    sharp = crop(scene)[24:-24, 24:-24]
+
+    def check(path):
+        restored = tifffile.imread(path)
+        assert (restored[:, border] == 65535).all()
+        assert (restored[:, ~border] <= 4095).all()
+        inside = ~border[24:-24, 24:-24]
+        before, after = (f[:, 24:-24, 24:-24][:, inside] / 4095 - sharp[inside] for f in (frames, restored))
+        assert np.square(after).mean() < np.square(before).mean() / 100  # 20 dB
+
+    assert rsvib("run", tmp_path / "f.tif", tmp_path / "whole", *config) == 0
+    assert rsvib("run", tmp_path / "f.tif", tmp_path / "windows", *config, "--window", "3") == 0
+    found = ("--vibration", tmp_path / "whole" / "vibration.json")
+    assert rsvib("restore", tmp_path / "f.tif", tmp_path / "r.tif", *config, *found) == 0
+    for path in (tmp_path / "whole" / "restored.tif", tmp_path / "windows" / "restored.tif", tmp_path / "r.tif"):
+        check(path)
+    assert "not kept" not in capsys.readouterr().out
+    joint = ("--joint", "all", "--overwrite")
+    assert rsvib("restore", tmp_path / "f.tif", tmp_path / "r.tif", *config, *found, *joint) == 0
+    assert (tifffile.imread(tmp_path / "r.tif") == 65535)[..., border].all()
+    detected = detect_vibration(tmp_path / "f.tif", timing, full_scale=4095)
+    assert detected.vibration.amplitude[:, 0].tolist() == pytest.approx(AMPLITUDE, rel=0.01)
 
 
 def change_vibration(place, folder, change):
