@@ -1,12 +1,14 @@
 """Files that would exhaust time or memory are refused in a moment, with one line."""
 
 import os
+import struct
 
 import h5py
 import numpy as np
 import psutil
 import pytest
 import tifffile
+import zarr
 from time_limit import at_most
 
 import rsvib_torch as rsv
@@ -58,6 +60,35 @@ def test_headers_of_equal_tiff_pages_are_interpreted_once(tmp_path, monkeypatch)
     for index in (0, 1, 499):
         np.testing.assert_array_equal(reader.frame(index), COUNTS[index % 4])
     reader.close()
+
+
+@pytest.mark.parametrize("name", ["a.tif", "a.npy", "a.png", "a.h5", "a.raw", "a.mp4", "a.jpg"])
+def test_pipes_and_devices_are_not_read(tmp_path, name):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(ValueError, match="expected a regular file, this is a pipe"):
+        read_stack(tmp_path / name)
+    (tmp_path / f"d{name}").symlink_to("/dev/urandom")
+    with pytest.raises(ValueError, match="expected a regular file, this is a device"):
+        read_stack(tmp_path / f"d{name}")
+
+
+def test_zarr_frame_of_too_many_chunks(tmp_path):
+    array = zarr.create_array(tmp_path / "a.zarr", shape=(2, 300, 300), chunks=(1, 1, 1), dtype="u2")
+    array[0, 0, :20] = 1
+    with pytest.raises(ValueError, match="a frame is divided into 90000 chunks; expected at most 16384"):
+        read_stack_info(tmp_path / "a.zarr")
+
+
+def test_npy_headers(tmp_path):
+    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1) + b"{")
+    with pytest.raises(ValueError, match="its header has 4294967295 bytes"):
+        read_stack_info(tmp_path / "a.npy")
+    header = {"descr": "|u1", "fortran_order": False, "shape": (10**8, 1, 1)}
+    with (tmp_path / "b.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+    os.truncate(tmp_path / "b.npy", 10**8 + 1000)
+    with pytest.raises(ValueError, match="100000000 frames; a stack has at most 10000000"):
+        read_stack_info(tmp_path / "b.npy")
 
 
 def test_large_inputs_and_long_messages(tmp_path):

@@ -11,7 +11,7 @@ from small_stack import FRAMES, OPTIONS, STILL, TIMING, process_small, write_sma
 from truth import decibel
 
 import rsvib_torch as rsv
-from rsvib_torch.stacks import read_manifest
+from rsvib_torch.stacks import engines, read_manifest
 
 
 @pytest.fixture(scope="module", name="place")
@@ -51,6 +51,16 @@ def test_run_with_threads_is_resumed_with_dask(place, tmp_path):
         )
     assert report.resumed > 2
     check_same(place, tmp_path)
+
+
+def test_run_ends_if_there_are_no_workers(place, tmp_path, monkeypatch):
+    monkeypatch.setattr(engines, "NO_WORKERS_SECONDS", 0.5)
+    with (
+        distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=None, protocol="inproc") as cluster,
+        pytest.raises(OSError, match=r"no Dask workers for 0.5 s; start workers, and resume the run"),
+    ):
+        process_small(place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address)
+    assert not (tmp_path / "out.tif").exists()
 
 
 @pytest.mark.slow
