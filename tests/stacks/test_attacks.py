@@ -14,7 +14,6 @@ from attacks.trial import FAILURES
 ATTACKS = {
     "concurrent": (4, 1.0),
     "damaged_parts": (7, 1.0),
-    "disks": (6, 0.0),
     "inputs": (20, 0.0),
     "journals": (16, 0.0),
     "kills": (9, 1.0),
@@ -40,5 +39,6 @@ def test_no_attack_loses_or_falsifies_a_result(tmp_path, name, factor):
 
 
 @pytest.mark.slow
-def test_runs_survive_workers_that_die(tmp_path):
-    check("workers", tmp_path, 4, 0, 0.25)
+@pytest.mark.parametrize(("name", "count", "least"), [("disks", 60, 0.0), ("workers", 4, 0.25)])
+def test_full_disks_and_dying_workers(tmp_path, name, count, least):
+    check(name, tmp_path, count, 0, least)
