@@ -2,7 +2,7 @@
 PYTHON := .venv/bin/python
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: help setup format check test slow coverage demo bench pages docs
+.PHONY: help setup format check quick test slow coverage demo bench pages docs
 
 help: ## list the tasks
 	@grep -E '^[a-z]+:.*##' Makefile | sed 's/:.*## /\t/' | expand -t 12
@@ -18,6 +18,9 @@ check: setup ## format, lint and type checks, without tests
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m mypy
+
+quick: setup ## tests that a change of the algorithms needs (about 2 minutes on two cores)
+	OMP_NUM_THREADS=1 $(PYTHON) -m pytest tests --quick -n auto --dist loadfile
 
 test: ## all checks and tests (about 10 minutes on two cores)
 	bash scripts/test.sh

@@ -1,9 +1,34 @@
-"""Fixtures of all tests: the camera of the paper, and seeded random numbers."""
+"""Fixtures of all tests, and the selection of the quick ones: ``pytest tests --quick``, ``make quick``."""
+
+from pathlib import Path
 
 import pytest
 import torch
 
 from rsvib_torch import SensorTiming
+
+TESTS = Path(__file__).parent
+ALGORITHMS = ("detection", "registration", "restoration", "tracking", "test_imports.py")
+SLOWER_TESTS = [line for line in (TESTS / "slower_tests.txt").read_text().splitlines() if not line.startswith("#")]
+
+
+def pytest_addoption(parser):
+    parser.addoption("--quick", action="store_true", help="tests of the algorithms, without tests/slower_tests.txt")
+
+
+def pytest_ignore_collect(collection_path, config):
+    """With ``--quick``, the tests of the algorithms are collected only."""
+    if config.getoption("quick", False) and collection_path != TESTS:
+        return collection_path.relative_to(TESTS).parts[0] not in ALGORITHMS or None
+    return None
+
+
+def pytest_collection_modifyitems(config, items):
+    """With ``--quick``, the tests of ``slower_tests.txt`` are left out."""
+    if config.getoption("quick", False):
+        slower = [item for item in items if item.nodeid.split("[")[0].removeprefix("tests/") in SLOWER_TESTS]
+        config.hook.pytest_deselected(items=slower)
+        items[:] = [item for item in items if item not in slower]
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,5 @@
 """A small vibrating stack, simulated by the independent camera of tests/truth.py, and its processing."""
 
-import multiprocessing
-
 import numpy as np
 import tifffile
 from scipy import ndimage
@@ -27,15 +25,6 @@ window = 3
 _TEXTURE = ndimage.gaussian_filter(np.random.default_rng(4).standard_normal((HEIGHT + 80, WIDTH + 80)), 1.1)
 SCENE = np.clip(0.5 + 0.15 * _TEXTURE / _TEXTURE.std(), 0.0, 1.0)
 STILL = crop(SCENE)
-
-
-def fork_server():
-    """A multiprocessing context in which processes start quickly because libraries are loaded only once."""
-    context = multiprocessing.get_context("forkserver")
-    package = ["rsvib_torch.stacks.process", "rsvib_torch.restoration.restore", "rsvib_torch.detection.detect"]
-    libraries = [*package, "scipy.ndimage", "scipy.interpolate", "h5py", "zarr", "pytest", "_pytest.config"]
-    context.set_forkserver_preload(libraries)
-    return context
 
 
 def draw_counts(frames=FRAMES):

@@ -1,32 +1,20 @@
 """The benchmark of detection: its camera compared with analytic waves, and one complete run at small size."""
 
 import argparse
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from benchmarks import detection, detection_report
+from benchmarks.detection import errors_of
+from benchmarks.independent_camera import Shake, take_frames
 
 import rsvib_torch as rsv
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
 
-
-@pytest.fixture
-def scripts(monkeypatch):
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    yield
-    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
-        monkeypatch.delitem(sys.modules, name)
-
-
-@pytest.mark.usefixtures("scripts")
 @pytest.mark.parametrize("exposure", [4.0, 55.0])
 @pytest.mark.parametrize("wave", [(7, 0), (0, 9), (-11, 20)])
 def test_frames_of_the_camera_equal_the_integral_of_a_wave(wave, exposure):
-    from benchmarks.independent_camera import Shake, take_frames
-
     height, width, size = 96, 80, (48, 40)
     y, x = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
     turn = 2 * np.pi * np.array([wave[0] / width, wave[1] / height])
@@ -47,11 +35,7 @@ def test_frames_of_the_camera_equal_the_integral_of_a_wave(wave, exposure):
         np.testing.assert_allclose(frames[p], expected, rtol=0, atol=3e-6)
 
 
-@pytest.mark.usefixtures("scripts")
 def test_errors_refer_to_the_corresponding_tone():
-    from benchmarks.detection import errors_of
-    from benchmarks.independent_camera import Shake
-
     shake = Shake(
         np.array([[1.0, 0.5], [0.8, 0.0]]),
         np.array([[40.0, 90.0], [60.0, 0.0]]),
@@ -67,11 +51,8 @@ def test_errors_refer_to_the_corresponding_tone():
     assert np.isnan(errors["amplitude"][1]).all()  # error too large: not detected
 
 
-@pytest.mark.usefixtures("scripts")
 @pytest.mark.slow
 def test_a_small_run(tmp_path):
-    from benchmarks import detection, detection_report
-
     parser = argparse.ArgumentParser()
     detection.add_options(parser)
     options = parser.parse_args(["--detection-size", "512", "256", "--detection-noises", "0.01"])

@@ -1,24 +1,16 @@
 """Libraries in the benchmark: their results compared with known offsets, tones and frames."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
+from benchmarks.library_chain import fit_axis, kernel_of_row
+from benchmarks.registration_peers import PEERS
+from benchmarks.restoration_peers import LOOPS, loop_rows, remap_lanczos, slab_kernels
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
 
 TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=100, frame_rows=2048)
-
-
-@pytest.fixture(autouse=True)
-def scripts(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "scripts"))
-    yield
-    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
-        monkeypatch.delitem(sys.modules, name)
 
 
 def shifted_pair(shift, size=(160, 192)):
@@ -41,8 +33,6 @@ def shifted_pair(shift, size=(160, 192)):
     ],
 )
 def test_peers_register_bands(name, tolerance):
-    from benchmarks.registration_peers import PEERS
-
     shift = (2.3, -1.4)
     frames = shifted_pair(shift)
     before = frames.copy()
@@ -54,8 +44,6 @@ def test_peers_register_bands(name, tolerance):
 
 
 def test_libraries_fit_tones():
-    from benchmarks.library_chain import fit_axis
-
     # mean displacements by numerical integration
     def mean_position(starts, amplitude, frequency, phase):
         inside = (np.arange(2000) + 0.5) / 2000 * TIMING.exposure_time
@@ -83,9 +71,6 @@ def with_noise(frames):
 
 
 def test_kernels_of_rows_are_those_of_the_package():
-    from benchmarks.library_chain import kernel_of_row
-    from benchmarks.restoration_peers import slab_kernels
-
     motion, rows = Motion().vibration(), torch.tensor([3, 40, 700])
     middles, kernels = slab_kernels(rows, TIMING, motion)
     shown_by = rows.double()
@@ -101,8 +86,6 @@ def test_kernels_of_rows_are_those_of_the_package():
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_row_loops_and_unwarping_restore_either_frame(scene_and_frames, index):
-    from benchmarks.restoration_peers import LOOPS, loop_rows, remap_lanczos
-
     scene, frames = scene_and_frames
     frame, motion = with_noise(frames)[index], Motion().vibration()
     unwarped = remap_lanczos(frame, TIMING, motion, index).restored.numpy()

@@ -325,28 +325,6 @@ def test_scenes_of_half_precision_are_simulated(dtype):
         rsv.simulate_frames((255 * scene.float()).to(torch.uint8), TIMING, VIBRATION)
 
 
-@pytest.mark.parametrize(("dtype", "full_scale"), [("uint8", None), ("uint16", 4095), ("int32", 2**31 - 1)])
-def test_counts_are_written_as_they_are(tmp_path, dtype, full_scale):
-    largest = 255 if full_scale is None else full_scale
-    counts = np.random.default_rng(0).integers(0, largest, (2, 20, 30), endpoint=True).astype(dtype)
-    rsv.write_stack(tmp_path / "counts.tif", counts, full_scale=full_scale)
-    info, reader = rsv.read_stack_info(tmp_path / "counts.tif"), rsv.open_stack(tmp_path / "counts.tif")
-    assert (info.dtype, info.full_scale) == (dtype, largest)
-    assert all(np.array_equal(reader.frame(index), counts[index]) for index in range(2))
-    reader.close()
-    if full_scale is not None:
-        with pytest.raises(ValueError, match=r"full scale of .* unknown"):
-            rsv.write_stack(tmp_path / "other.tif", counts)
-        assert not (tmp_path / "other.tif").exists()
-
-
-def test_motions_and_kernels_of_another_type_are_refused(grey):
-    with pytest.raises(TypeError, match=r"recorded must be a FreeMotion .*, got Vibration"):
-        rsv.align_motion(grey, TIMING, VIBRATION)
-    with pytest.raises(TypeError, match=r"psf must be a RowPSF \(row_psf\), got SensorTiming"):
-        rsv.RowVaryingBlur(TIMING)
-
-
 def test_copies_of_frames_are_named(grey):
     """A converter that repeats a frame changes the time of all following ones."""
     with pytest.raises(ValueError, match="frames 1 and 2 are identical: one of them is a copy"):

@@ -309,25 +309,3 @@ def test_arrays_equal_tensors(frames, vibration):
         rsv.restore(tensor.numpy(), TIMING, vibration[0], method="dewarp", ignore=ignored),
         rsv.restore(tensor, TIMING, vibration[0], method="dewarp", ignore=torch.from_numpy(ignored)),
     )
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, ">u2", np.float32, np.float64, np.float16])
-def test_arrays_keep_values_shape_and_dtype(frames, vibration, dtype):
-    """Without motion, restored arrays have the values, shape and, for floats, dtype of the input."""
-    array = (frames[0, :, 0].numpy() * (1 if np.dtype(dtype).kind == "f" else 255)).astype(dtype)
-    still = rsv.Vibration.still()
-    scale = None if np.dtype(dtype).kind == "f" else 255.0
-    back = rsv.restore(array, TIMING, still, method="dewarp", full_scale=scale).numpy()
-    assert back.dtype == (array.dtype if scale is None else np.float32)
-    rounding = max(np.finfo(back.dtype).eps, 4e-6)
-    np.testing.assert_allclose(back * (scale or 1), array.astype(np.float64), rtol=0, atol=rounding * (scale or 1))
-    if scale is not None:
-        np.testing.assert_array_equal(np.round(back * scale).astype(dtype), array)
-    numbers = rsv.Vibration(*(getattr(vibration, name).numpy() for name in ("amplitude", "frequency", "phase")))
-    assert torch.equal(numbers.phase, vibration.phase)
-
-
-def test_values_that_are_not_arrays_are_refused():
-    for value in (object(), np.array(["a", "b"]), np.zeros((2, 2), dtype=object)):
-        with pytest.raises(TypeError, match=r"frames must be a tensor or array of numbers, got (object|ndarray)"):
-            rsv.restore(value, TIMING, rsv.Vibration.still())

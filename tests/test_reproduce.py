@@ -3,33 +3,24 @@
 import json
 import math
 import re
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+import reproduce
+from benchmarks.independent_camera import Shake, fine_rows
 from edge_truth import draw_edge, gaussian, through_pixels
+from reproduction.camera import PITCH, Scene, take_frames
+from reproduction.esfr import crossing, straight_edge_mtf
+from reproduction.paper import AMPLITUDE, DETECTED, PERIOD, RESTORED
+from reproduction.targets import shake_of
+from reproduction.trials import detection_values
 
 import rsvib_torch as rsv
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
 
-
-@pytest.fixture
-def scripts(monkeypatch):
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    yield
-    for name in [name for name in sys.modules if name.split(".")[0] in ("benchmarks", "reproduction")]:
-        monkeypatch.delitem(sys.modules, name)
-
-
-@pytest.mark.usefixtures("scripts")
 @pytest.mark.parametrize("wave", [(9, 0), (0, 11), (-40, 31)])
 @pytest.mark.parametrize("row_time", [2e-4, 0.0])
 def test_frames_of_the_camera_equal_the_integral_of_a_wave(wave, row_time):
-    from benchmarks.independent_camera import Shake, fine_rows
-    from reproduction.camera import PITCH, Scene, take_frames
-
     margin, size = (20, 16), (40, 36)
     whole = [PITCH * (s + 2 * m) for s, m in zip(size, margin, strict=True)]
     y, x = np.meshgrid(*(np.arange(n) for n in whole), indexing="ij")
@@ -58,11 +49,8 @@ def test_frames_of_the_camera_equal_the_integral_of_a_wave(wave, row_time):
         assert np.abs(frames[p] - still).max() > 0.02
 
 
-@pytest.mark.usefixtures("scripts")
 @pytest.mark.parametrize("angle", [-6.0, 5.0])
 def test_straight_edge_mtf(angle):
-    from reproduction.esfr import crossing, straight_edge_mtf
-
     frequency = np.linspace(0.0, 0.5, 51)
     for levels in ((0.1, 0.9), (0.9, 0.1)):
         roi = draw_edge(angle, 0.5, levels=levels)
@@ -75,11 +63,7 @@ def test_straight_edge_mtf(angle):
     assert math.isnan(crossing(frequency, np.ones(51)))
 
 
-@pytest.mark.usefixtures("scripts")
 def test_errors_are_signed_and_phases_wrapped():
-    from reproduction.targets import shake_of
-    from reproduction.trials import detection_values
-
     shake = shake_of(4)
     phase = shake.phase[:, 0]
     found = rsv.Vibration([3.1 * 1.02, 5.2 * 0.99], [50.0 / 1.001, 30.0], phase + np.array([0.02, -2.01]) * np.pi)
@@ -93,25 +77,7 @@ def test_errors_are_signed_and_phases_wrapped():
     assert (values["x"]["reliable"], values["y"]["reliable"]) == (True, False)
 
 
-@pytest.mark.usefixtures("scripts")
-def test_cells_contain_the_worst_trial():
-    from reproduction.cells import Cell, Spread, spread
-
-    assert spread([0.1, 0.4], higher_is_better=False) == Spread(0.25, 0.4)
-    assert spread([0.1, 0.4], higher_is_better=True) == Spread(0.25, 0.1)
-    cell = Cell("Table 2", "chart", "", "", "%", 2, 0.3, {"default": Spread(0.25, 0.4)}, False)
-    assert cell.better("default", "mean")
-    assert not cell.better("default")
-    cell = Cell("Table 4", "chart", "", "", "dB", 2, 0.3, {"default": Spread(0.25, 0.1)}, True)
-    assert not cell.better("default", "mean")
-    missing = Cell("Table 4", "chart", "", "", "dB", 2, 0.3, {"default": Spread(math.nan, math.nan)}, True)
-    assert not missing.better("default")
-
-
-@pytest.mark.usefixtures("scripts")
 def test_percentages_of_the_paper_agree_with_its_values():
-    from reproduction.paper import AMPLITUDE, DETECTED, PERIOD, RESTORED
-
     for lines in DETECTED.values():
         for axis, line in lines.items():
             assert line.period_error == pytest.approx(100 * abs(line.period / PERIOD[axis] - 1), abs=0.015)
@@ -122,10 +88,7 @@ def test_percentages_of_the_paper_agree_with_its_values():
                 assert gain == pytest.approx(100 * (after / before - 1), abs=0.05)
 
 
-@pytest.mark.usefixtures("scripts")
 def test_small_run(tmp_path, capsys):
-    import reproduce
-
     out = tmp_path / "reproduction"
     reproduce.main(["--tiny", "--out", str(out)])
     assert str(out) in capsys.readouterr().out
@@ -152,25 +115,3 @@ def test_small_run(tmp_path, capsys):
     assert all(source.startswith("data:image/") for source in sources)
     for name in ("figure_4", "figure_5", "figure_6a_default", "figure_7", "figure_8", "figure_9", "sampling"):
         assert (out / f"{name}.png").stat().st_size > 5000
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("scripts")
-def test_quick_option(tmp_path):
-    import reproduce
-
-    reproduce.main(["--quick", "--out", str(tmp_path)])
-    data = json.loads((tmp_path / "reproduction.json").read_text(encoding="utf-8"))
-    better = {cell["row"]: [] for cell in data["cells"]}
-    for cell in data["cells"]:
-        better[cell["row"]].append(cell["default_better_worst"])
-    for row in ("error of the period", "error of the amplitude", "PSNR, restored", "PSNR, improvement"):
-        assert all(better[row])
-    for trial in data["push_scan"]:
-        for values in trial["detection"]["default"].values():
-            assert abs(values["period_error"]) < 0.02
-            assert abs(values["amplitude_error"]) < 0.3
-    for value in data["closing"]:
-        if value["method"] == "default":
-            assert value["least_share"] > 0.9
-            assert value["largest_share"] < 1.05

@@ -98,20 +98,20 @@ def scale_of_information(recording: Recording) -> Tensor:
     return recording.sensitivity(recording.starts).square().sum((1, 2)) * moved * slope * recording.size[1]
 
 
-def projected_information(recording: Recording, *, chunk: int = 1 << 17) -> Tensor:
+def projected_information(recording: Recording, *, margin: int = _MARGIN, chunk: int = 1 << 17) -> Tensor:
     """Information of the parameters when the scene is unknown, for unit noise.
 
     ``J = D' (1 - A (A' A)^-1 A') D``: D are the derivatives of the frames, A takes a scene to its frames, and the
     part of D that a scene could explain contains no information. The displacement along a row is a phase ramp, so that
     A is a banded matrix for each frequency along the row and the projection needs no iterations.
-    The scene is taken as periodic along rows, and without detail above 0.4 cycles per row; only pixels count whose
-    content is visible in another frame. ``chunk`` rows of all frames times frequencies are worked on at a time.
+    The scene is periodic along rows, ``margin`` px beyond its ends, without detail above 0.4 cycles/row; only pixels
+    count whose content is visible in another frame. ``chunk`` rows of frames times frequencies are computed at once.
 
     Returns:
         Matrix (P, P).
     """
     place = _Places.of(recording)
-    length = fast_length(recording.scene.shape[1] + 2 * _MARGIN)
+    length = fast_length(recording.scene.shape[1] + 2 * margin)
     scene = _within_band(recording.scene)
     if max(recording.axes) > 1:
         x, y = recording.positions()

@@ -15,8 +15,8 @@ from rsvib_torch.io.stack_info import FrameError, StackInfo
 
 __all__ = ["ContiguousReader", "ContiguousWriter", "InterleavedReader", "check_frames_held"]
 
-_BLOCK_BYTES = 1 << 26  # of frames that are read together; the whole file is read once per block
-_BAND_BYTES = 1 << 24  # of the file that are read at once, so that not the whole file is in memory
+BLOCK_BYTES = 1 << 26  # of frames that are read together; the whole file is read once per block
+BAND_BYTES = 1 << 24  # of the file that are read at once, so that not the whole file is in memory
 
 
 def check_frames_held(info: StackInfo, offset: int, size: int, *, fraction: float = 0.5) -> None:
@@ -111,7 +111,7 @@ class InterleavedReader(BlockReader):
     ) -> None:
         check_frames_held(info, offset, path.stat().st_size, fraction=1.0)
         # the pixels of a block in the order of the file, of which a part is read at a time
-        super().__init__(path, info, max(1, _BLOCK_BYTES // info.frame_bytes), info.frame_bytes + _BAND_BYTES)
+        super().__init__(path, info, max(1, BLOCK_BYTES // info.frame_bytes), info.frame_bytes + BAND_BYTES)
         self._offset, self._dtype, self._shape, self._order = offset, dtype, shape, order
         self._time = order[len(order) - len(info.shape)]
         self._file = path.open("rb", buffering=0)
@@ -122,7 +122,7 @@ class InterleavedReader(BlockReader):
         count, size = self._shape[self._time], self._dtype.itemsize
         block = np.empty((before, last - first, after), self._dtype)
         run = count * after * size  # bytes between the same frame's pixels
-        at_once = _BAND_BYTES // run
+        at_once = BAND_BYTES // run
         for begin in range(0, before, max(1, at_once)):
             part = block[begin : begin + max(1, at_once)]
             if at_once:

@@ -609,9 +609,9 @@ def _read(path: Path) -> None:
         rsv.detect_vibration(frames[:3, ..., :256, :256], _TIMING, method="bands", tones=1)
 
 
-def _try(path: Path) -> tuple[Outcome, str]:
+def _try(path: Path, read: Callable[[Path], None]) -> tuple[Outcome, str]:
     try:
-        _read(path)
+        read(path)
     except (ValueError, TypeError, OSError) as error:
         lines = str(error).splitlines()
         if len(lines) > 25 or max(map(len, lines), default=0) > 5000:
@@ -622,23 +622,23 @@ def _try(path: Path) -> tuple[Outcome, str]:
     return "completed", ""
 
 
-def _child(path: Path, sender: multiprocessing.connection.Connection) -> None:
+def _child(path: Path, read: Callable[[Path], None], sender: multiprocessing.connection.Connection) -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     os.chdir(path.parent)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # lines of libpng and ffmpeg
     limit = psutil.Process().memory_info().vms + _BYTES  # free_memory() respects it
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     sender.send(psutil.Process().memory_info().rss)
-    sender.send(_try(path))
+    sender.send(_try(path, read))
     sender.close()
 
 
-def crafted(name: str, folder: Path) -> Trial:
-    """Write one file, and read it in a child process that is forked from this one."""
+def crafted(name: str, folder: Path, *, read: Callable[[Path], None] = _read, seconds: float = _SECONDS) -> Trial:
+    """Write one file, and read it in a child process that is forked from this one, for at most ``seconds``."""
     path = CASES[name](folder)
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
-    child = context.Process(target=_child, args=(path, sender))
+    child = context.Process(target=_child, args=(path, read, sender))
     gc.freeze()  # a collection in the child must not finalise objects of this process, which may wait for its threads
     child.start()
     gc.unfreeze()
@@ -646,7 +646,7 @@ def crafted(name: str, folder: Path) -> Trial:
     begin, inherited = time.monotonic(), receiver.recv()
     watched, peak, cpu = psutil.Process(child.pid), 0, 0.0
     outcome: tuple[Outcome, str] | None = None
-    while outcome is None and cpu < _CPU_SECONDS and time.monotonic() - begin < _SECONDS:
+    while outcome is None and cpu < _CPU_SECONDS and time.monotonic() - begin < seconds:
         try:
             peak = max(peak, watched.memory_info().rss - inherited)
             cpu = sum(watched.cpu_times()[:2])

@@ -106,12 +106,13 @@ def _attacks() -> dict[str, Callable[[Path], None]]:
 
 
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
-    """All attacks in turn, each on its own copy of one interrupted run."""
+    """All attacks in turn, or ``count`` that are spread over them, each on its own copy of one interrupted run."""
     reference, choice = Reference(folder / "reference"), random.Random(seed)
     name, options = FORMATS["TIFF"]
     killed, place = folder / "killed", folder / "trial"
     kill_run(reference, killed, "TIFF", choice, windows=3)
-    for title, attack in list(_attacks().items())[:count]:
+    attacks = list(_attacks().items())
+    for title, attack in attacks[:: max(1, len(attacks) // count)][:count]:
         shutil.copytree(killed, place)
         work = place / f".{name}.rsvib"
         attack(work)

@@ -60,12 +60,12 @@ def _judged(title: str, victim: Path, before: dict[str, bytes], code: Any, resul
 
 
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
-    """All attacks in turn, until ``count``."""
+    """All attacks in turn, or ``count`` that are spread over them."""
     reference, choice = Reference(folder / "reference"), random.Random(seed)
     found = [*_of_the_folder(folder, reference), *_in_the_folder(folder, reference, choice)]
     moments = [choice.uniform(0.02, 0.4) for _ in range(max(0, count - len(found)))]
     kinds = [*found, *(_replaced_meanwhile(folder, reference, moment) for moment in moments)]
-    for attack in kinds[:count]:
+    for attack in kinds[:: max(1, len(kinds) // count)][:count]:
         yield attack()
         for name in ("trial", "victim"):
             shutil.rmtree(folder / name, ignore_errors=True)

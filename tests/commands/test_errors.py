@@ -12,10 +12,9 @@ import pytest
 from small_stack import CONFIG, TIMING, write_small
 
 from rsvib_torch import process_stack
-from rsvib_torch.commands import stack_commands
 from rsvib_torch.commands.main import run_command
 from rsvib_torch.core.text import printable
-from rsvib_torch.io import open_stack
+from rsvib_torch.io import StackFormat, formats, open_stack
 from rsvib_torch.io.png import decode_png
 
 ONE_WINDOW = CONFIG.partition("[stack]")[0]
@@ -29,6 +28,21 @@ def camera(tmp_path, monkeypatch):
     return ["--config", "camera.toml"]
 
 
+@pytest.fixture
+def failing(tmp_path, monkeypatch):
+    """Makes a file whose format has a reader that raises an error."""
+
+    def make(error):
+        def fail(_):
+            raise error
+
+        monkeypatch.setitem(formats.FORMATS, ".fail", StackFormat("failing", (".fail",), fail))
+        (tmp_path / "frames.fail").write_bytes(b"")
+        return tmp_path / "frames.fail"
+
+    return make
+
+
 @pytest.mark.parametrize(
     ("error", "line"),
     [
@@ -40,16 +54,13 @@ def camera(tmp_path, monkeypatch):
         (AttributeError("no attribute"), "unexpected AttributeError: no attribute"),
     ],
 )
-def test_unforeseen_errors_are_one_line(error, line, camera, monkeypatch, capsys):
-    def fail(*_, **__):
-        raise error
-
-    monkeypatch.setattr(stack_commands, "load", fail)
-    assert run_command(["detect", "frames.tif", "--out", "found", *camera]) == 2
+def test_unforeseen_errors_are_one_line(error, line, camera, failing, capsys):
+    failing(error)
+    assert run_command(["detect", "frames.fail", "--out", "found", *camera]) == 2
     shown = capsys.readouterr().err
     assert shown.startswith(f"rsvib: error: {line}")
     assert shown.count("\n") == 1
-    assert run_command(["detect", "frames.tif", "--out", "found", "--debug", *camera]) == 2
+    assert run_command(["detect", "frames.fail", "--out", "found", "--debug", *camera]) == 2
     shown = capsys.readouterr().err
     assert "Traceback (most recent call last)" in shown
     assert shown.splitlines()[-1].startswith(f"rsvib: error: {line}")
@@ -58,13 +69,9 @@ def test_unforeseen_errors_are_one_line(error, line, camera, monkeypatch, capsys
 @pytest.mark.parametrize(
     ("error", "kind"), [(KeyError("x"), ValueError), (MemoryError(), OSError), (ZeroDivisionError(), ValueError)]
 )
-def test_process_stack_raises_what_it_documents(error, kind, tmp_path, monkeypatch):
-    def fail(*_, **__):
-        raise error
-
-    monkeypatch.setattr("rsvib_torch.stacks.process.plan_job", fail)
+def test_process_stack_raises_what_it_documents(error, kind, tmp_path, failing):
     with pytest.raises(kind) as raised:
-        process_stack(tmp_path / "a.npy", tmp_path / "b.npy", TIMING)
+        process_stack(failing(error), tmp_path / "b.npy", TIMING)
     assert raised.value.__cause__ is error
 
 

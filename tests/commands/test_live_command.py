@@ -5,19 +5,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from program import rsvib
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, StackInfo, read_stack, write_stack
-from rsvib_torch.commands.main import run_command
 
 SIZE, COUNT = 128, 12
 TIMING = SensorTiming(row_time=2e-4, exposure_rows=4, frame_rows=1 / 30 / 2e-4)
 CAMERA = ("--row-time", "200us", "--exposure", "0.8ms", "--frame-rate", "30")
 SCENE = draw_scene(SIZE + 80, SIZE + 80, seed=3)
-
-
-def run(*arguments):
-    return run_command([str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module", name="clip")
@@ -34,7 +30,7 @@ def make_clip(tmp_path_factory):
 def test_from_file_to_video_with_spectrogram(clip, tmp_path, capsys):
     out = tmp_path / "still.mkv"
     arguments = ("live", clip, *CAMERA, "--out", out, "--spectrogram", tmp_path / "spectrum", "--json")
-    assert run(*arguments) == 0
+    assert rsvib(*arguments) == 0
     shown = capsys.readouterr()
     answer = json.loads(shown.out)
     assert (answer["frames"], answer["tracked"], answer["dropped"], answer["detections"]) == (COUNT, COUNT - 3, 0, 1)
@@ -45,13 +41,13 @@ def test_from_file_to_video_with_spectrogram(clip, tmp_path, capsys):
     raw, restored = read_stack(clip), read_stack(out)
     assert restored.shape == raw.shape
     assert min(decibel(frame, still) for frame in restored[4:]) > max(decibel(frame, still) for frame in raw[4:]) + 6
-    assert run(*arguments) == 2
+    assert rsvib(*arguments) == 2
     assert "results exist already" in capsys.readouterr().err
 
 
 def test_crop_and_steady_of_a_file(clip, tmp_path, capsys):
     assert (
-        run("live", clip, *CAMERA, "--out", tmp_path / "a.mp4", "--border", "crop", "--steady", "0.2", "--quiet") == 0
+        rsvib("live", clip, *CAMERA, "--out", tmp_path / "a.mp4", "--border", "crop", "--steady", "0.2", "--quiet") == 0
     )
     assert capsys.readouterr().out == ""
     height, width = read_stack(tmp_path / "a.mp4").shape[-2:]
@@ -62,7 +58,7 @@ def test_crop_and_steady_of_a_file(clip, tmp_path, capsys):
 def test_from_pipe_to_pipe(clip, monkeypatch, capfdbinary):
     with clip.with_suffix(".raw8").open("rb") as source:
         monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=source))
-        assert run("live", "-", *CAMERA, "--size", f"{SIZE}x{SIZE}", "--out", "-") == 0
+        assert rsvib("live", "-", *CAMERA, "--size", f"{SIZE}x{SIZE}", "--out", "-") == 0
     shown = capfdbinary.readouterr()
     frames = np.frombuffer(shown.out, np.uint8).reshape(-1, SIZE, SIZE) / 255
     assert len(frames) == COUNT
@@ -71,7 +67,7 @@ def test_from_pipe_to_pipe(clip, monkeypatch, capfdbinary):
 
 
 def test_a_file_at_its_own_rate(clip, capsys):
-    assert run("live", clip, *CAMERA, "--realtime", "--page", 0, "--border", "hold", "--steady", 0.2) == 0
+    assert rsvib("live", clip, *CAMERA, "--realtime", "--page", 0, "--border", "hold", "--steady", 0.2) == 0
     shown = capsys.readouterr()
     assert "rsvib: note: the page is http://127.0.0.1:" in shown.err
     assert "delay: " in shown.out
@@ -97,7 +93,7 @@ def test_a_file_at_its_own_rate(clip, capsys):
 def test_wrong_options_are_refused_in_one_line(clip, arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     given = [str(clip) if argument == "CLIP" else argument for argument in arguments]
-    assert run("live", *given, *CAMERA) == 2
+    assert rsvib("live", *given, *CAMERA) == 2
     shown = capsys.readouterr()
     assert message in shown.err
     assert shown.err.startswith("rsvib: error: ")
@@ -106,10 +102,10 @@ def test_wrong_options_are_refused_in_one_line(clip, arguments, message, capsys,
 
 
 def test_a_missing_file_is_named_before_missing_options(capsys):
-    assert run("live", "none.mp4") == 2
+    assert rsvib("live", "none.mp4") == 2
     assert "none.mp4: no such file; a camera is a number or a URL" in capsys.readouterr().err
 
 
 def test_the_frame_rate_is_that_of_the_file(clip, capsys):
-    assert run("live", clip, *CAMERA[:4]) == 0
+    assert rsvib("live", clip, *CAMERA[:4]) == 0
     assert "per second, from the times in" in capsys.readouterr().out

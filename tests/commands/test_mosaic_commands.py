@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import small_config
+from program import rsvib
 from small_stack import HEIGHT, STILL, WIDTH, write_small
 
 from rsvib_torch import read_stack, read_stack_info
-from rsvib_torch.commands.main import run_command
 
 CAMERA = small_config.CAMERA.partition("[restoration]")[0]
 CONFIG = f"""{CAMERA}
@@ -25,23 +25,19 @@ window = 3
 OPTIONS = ("--scale", 2, "--joint", "all", "--mosaic", "RGGB", "--optics-sigma", 0.4)
 
 
-def run(*arguments):
-    return run_command([str(argument) for argument in arguments])
-
-
 @pytest.fixture(scope="module", name="place")
 def make_place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mosaic")
     write_small(folder / "raw.tif", frames=5)  # of a grey scene
     (folder / "camera.toml").write_text(CAMERA)
     (folder / "mosaic.toml").write_text(CONFIG)
-    assert run("detect", folder / "raw.tif", "--config", folder / "camera.toml", "--out", folder / "found") == 0
+    assert rsvib("detect", folder / "raw.tif", "--config", folder / "camera.toml", "--out", folder / "found") == 0
     return folder
 
 
 def restore(place, out, *more, config="camera.toml"):
     vibration = ("--config", place / config, "--vibration", place / "found" / "vibration.json")
-    return run("restore", place / "raw.tif", out, *vibration, *more)
+    return rsvib("restore", place / "raw.tif", out, *vibration, *more)
 
 
 def test_options(place, tmp_path):
@@ -54,7 +50,7 @@ def test_options(place, tmp_path):
 
 
 def test_run_in_windows_with_keys_of_the_configuration(place, tmp_path):
-    assert run("run", place / "raw.tif", tmp_path / "out", "--config", place / "mosaic.toml", "--workers", 1) == 0
+    assert rsvib("run", place / "raw.tif", tmp_path / "out", "--config", place / "mosaic.toml", "--workers", 1) == 0
     assert read_stack_info(tmp_path / "out" / "restored.tif").shape == (2, 3, 2 * HEIGHT, 2 * WIDTH)
     written = read_stack(tmp_path / "out" / "restored.tif")[0, :, ::2, ::2].double().numpy()
     assert np.sqrt(np.mean((written - STILL)[:, 12:-12, 12:-12] ** 2)) < 0.06
@@ -63,7 +59,7 @@ def test_run_in_windows_with_keys_of_the_configuration(place, tmp_path):
 
 def test_report_of_a_finer_grid(place, tmp_path):
     more = ("--scale", 2, "--joint", "all")
-    assert run("report", place / "raw.tif", tmp_path / "out", "--config", place / "camera.toml", *more) == 0
+    assert rsvib("report", place / "raw.tif", tmp_path / "out", "--config", place / "camera.toml", *more) == 0
     page = (tmp_path / "out" / "report.html").read_text()
     assert "2 x 2 points per px, the input is interpolated" in page
 
@@ -98,5 +94,5 @@ def test_errors(place, tmp_path, capsys, more, message):
 def test_errors_in_a_configuration(place, tmp_path, capsys, line, message):
     (tmp_path / "wrong.toml").write_text(f"{CAMERA}\n[restoration]\n{line}\n")
     vibration = ("--config", tmp_path / "wrong.toml", "--vibration", place / "found" / "vibration.json")
-    assert run("restore", place / "raw.tif", tmp_path / "out.tif", *vibration) == 2
+    assert rsvib("restore", place / "raw.tif", tmp_path / "out.tif", *vibration) == 2
     assert message in capsys.readouterr().err

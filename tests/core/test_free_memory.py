@@ -3,7 +3,6 @@
 import psutil
 import pytest
 
-from rsvib_torch.core import free_memory as module
 from rsvib_torch.core.free_memory import check_fits, free_memory
 
 GB = 10**9
@@ -13,7 +12,6 @@ GB = 10**9
 def _large_machine(monkeypatch):
     memory = psutil.virtual_memory()._replace(available=100 * GB)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
-    monkeypatch.setattr(module, "_free_addresses", list)
 
 
 def write(root, files):

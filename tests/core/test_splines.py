@@ -8,7 +8,6 @@ from scipy.interpolate import BSpline
 
 from rsvib_torch.core.splines import (
     bspline_coefficients,
-    bspline_coefficients_adjoint,
     bspline_weights,
     mirrored,
 )
@@ -50,14 +49,6 @@ def test_splines_interpolate(degree):
     for place in (10, 25, 39):
         taps = torch.arange(degree + 1) - degree // 2 + place
         assert (weights * coefficients[taps]).sum().item() == pytest.approx(samples[place].item(), abs=1e-7)
-
-
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.parametrize("length", [1, 2, 9, 64])
-def test_adjoint_of_the_prefilter(degree, length):
-    a, b = noise(length, 3), noise(length, 3, seed=1)
-    forward = (bspline_coefficients(a, degree, 0) * b).sum().item()
-    assert forward == pytest.approx((a * bspline_coefficients_adjoint(b, degree, 0)).sum().item(), rel=1e-11)
 
 
 def test_accuracy_grows_with_the_degree():

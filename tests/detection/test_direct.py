@@ -7,7 +7,7 @@ import torch
 from scipy import ndimage
 from truth import Motion, draw_scene, take_frames
 
-from rsvib_torch import SensorTiming, Vibration, detect_vibration, register_bands, simulate_frames
+from rsvib_torch import SensorTiming, Vibration, detect_vibration, simulate_frames
 from rsvib_torch.detection.convergence import is_converged
 from rsvib_torch.detection.pipeline import DetectionOptions, Hypothesis, attempt
 from rsvib_torch.detection.refinement import Refinement, with_unknown_changes
@@ -734,13 +734,6 @@ def test_batch_equals_single_stacks(paper_camera):
 def test_bad_options(paper_camera, options, error, message):
     with pytest.raises(error, match=message):
         detect_vibration(torch.rand(3, 256, 256), paper_camera, **options)
-
-
-def test_direct_and_bands_refuse_the_same_input(paper_camera):
-    with pytest.raises(ValueError, match="constant"):
-        detect_vibration(torch.ones(2, 256, 256), paper_camera, method="direct")
-    noise = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(1)).expand(2, -1, -1)
-    assert register_bands(noise, paper_camera).offsets.shape[-1] == 2
 
 
 @pytest.mark.parametrize("largest", [math.inf, math.nan, 1e300])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones import periodogram
+from rsvib_torch.detection.tones.periodogram import strongest_frequencies
 
 EXPOSURE = 4e-4
 
@@ -45,15 +45,13 @@ def decrease(record, weight, frequency, axis):
 
 
 @pytest.mark.parametrize(("rows", "frames"), [(40, 2), (60, 5)])
-def test_power_is_that_of_a_least_squares_fit(rows, frames):
+def test_strongest_frequencies_are_those_of_least_squares_fits(rows, frames):
     record = measurements_of(rows, frames)
     weights = torch.stack([record.weights, record.weights.flip(1)], 1)
-    grid = periodogram._grid(float(record.duration[0]), 6e-4)
-    power = periodogram._power(record, grid, weights)
-    step, first, count = grid
-    for place in range(0, count, count // 7):
-        frequency = step * (first + place)
-        for weighting in range(2):
-            for axis in range(2):
-                expected = decrease(record, weights[0, weighting, :, axis], frequency, axis)
-                assert float(power[0, weighting, axis, place]) == pytest.approx(expected, rel=1e-4, abs=1e-5)
+    found = strongest_frequencies(record, 6e-4, 1, 1, weights)
+    step = 1 / (8 * (float(record.duration[0]) + 6e-4))
+    frequencies = [step * place for place in range(4, int(0.5 / 6e-4 / step) + 1)]
+    for weighting in range(2):
+        for axis in range(2):
+            power = [decrease(record, weights[0, weighting, :, axis], frequency, axis) for frequency in frequencies]
+            assert float(found[0, weighting, axis, 0]) == pytest.approx(frequencies[power.index(max(power))])

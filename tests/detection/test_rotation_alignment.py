@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from truth import draw_scene
 
 import rsvib_torch as rsv
-from rsvib_torch.detection.recorded import rotation_alignment
 from rsvib_torch.detection.recorded.band_vectors import band_vectors
+from rsvib_torch.detection.recorded.rotation_alignment import align_rates
 from rsvib_torch.detection.recorded.rotation_search import ORIENTATIONS, search_orientations
 from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.registration import RegistrationOptions
@@ -85,6 +85,12 @@ def make_vectors(frames):
     return band_vectors(grey_frames(frames, TIMING, None, None, None), TIMING, options)
 
 
+def aligned(vectors, rates, camera=None):
+    """``align_motion`` of frames that were registered before."""
+    options = {"offsets": None, "fit_scale": True, "fit_focal_length": camera is None, "fit_row_time": False}
+    return align_rates(vectors, (COUNT, *SIZE), TIMING, rates, camera, **options)
+
+
 def check(found, orientation, *, limit=4.0):
     """Values within ``limit`` standard deviations, and close."""
     assert found.reliable, found.reasons
@@ -143,9 +149,8 @@ def test_search_finds_all_24_orientations(vectors):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ORIENTATIONS)
-def test_all_24_orientations(frames, vectors, name, monkeypatch):
-    monkeypatch.setattr(rotation_alignment, "band_vectors", lambda *_: vectors)  # the same frames: registered once
-    check(rsv.align_motion(frames, TIMING, recorded(name)), name, limit=5.0)
+def test_all_24_orientations(vectors, name):
+    check(aligned(vectors, recorded(name)), name, limit=5.0)
 
 
 def test_dashboard_is_excluded():
@@ -155,19 +160,17 @@ def test_dashboard_is_excluded():
     assert float((found.bias - torch.tensor(BIAS, dtype=torch.float64)).abs().max()) < 0.02
 
 
-def test_mirrored_axes_are_refused(frames, vectors, monkeypatch):
-    monkeypatch.setattr(rotation_alignment, "band_vectors", lambda *_: vectors)
-    found = rsv.align_motion(frames, TIMING, recorded(mirrored=-1.0))
+def test_mirrored_axes_are_refused(vectors):
+    found = aligned(vectors, recorded(mirrored=-1.0))
     assert not found.reliable
     assert any("mirrored axes xYZ fit better" in reason for reason in found.reasons)
 
 
-def test_recording_of_another_motion_is_refused(frames, vectors, monkeypatch):
-    monkeypatch.setattr(rotation_alignment, "band_vectors", lambda *_: vectors)
+def test_recording_of_another_motion_is_refused(vectors):
     rates = recorded()
     random = np.random.default_rng(4).standard_normal((len(rates.times), 3))
     smooth = np.stack([np.convolve(column, np.hanning(25) / 12, "same") for column in random.T], -1)
-    found = rsv.align_motion(frames, TIMING, rsv.AngularRates(rates.times, torch.from_numpy(0.3 * smooth)))
+    found = aligned(vectors, rsv.AngularRates(rates.times, torch.from_numpy(0.3 * smooth)))
     assert not found.reliable
     assert any("does not explain" in reason for reason in found.reasons)
 
@@ -178,9 +181,8 @@ def test_rest_is_refused():
     assert any("too little" in reason for reason in found.reasons)
 
 
-def test_one_axis_alone_leaves_the_others_open(vectors, frames, monkeypatch):
+def test_one_axis_alone_leaves_the_others_open(vectors):
     # the camera turns about its y axis only: the assignment of x and z, and their signs, are not determined
-    monkeypatch.setattr(rotation_alignment, "band_vectors", lambda *_: only_x)
     rates = recorded()
     alone = torch.zeros_like(rates.rates)
     alone[:, 1] = rates.rates[:, 1] - BIAS[1]
@@ -190,7 +192,7 @@ def test_one_axis_alone_leaves_the_others_open(vectors, frames, monkeypatch):
     yaw = shifted.rotation(first + half, last + half)[:, 1]
     noise = 0.01 * torch.randn(len(yaw), 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     only_x = replace(vectors, offsets=torch.stack([-FOCAL_LENGTH * yaw, 0 * yaw], -1) + noise)
-    found = rsv.align_motion(frames, TIMING, rsv.AngularRates(rates.times, alone), camera=rsv.Camera(FOCAL_LENGTH))
+    found = aligned(only_x, rsv.AngularRates(rates.times, alone), rsv.Camera(FOCAL_LENGTH))
     assert not found.reliable
     assert any("explain the frames as well: rotate the camera about all axes" in reason for reason in found.reasons)
 
@@ -222,7 +224,7 @@ def test_rotation_is_composed_of_small_ones():
 
 
 @pytest.mark.parametrize("parallax", [0.0, 0.02])
-def test_translation_of_the_camera_is_allowed(vectors, frames, monkeypatch, parallax):
+def test_translation_of_the_camera_is_allowed(vectors, parallax):
     # each part at a distance of its own; a third of the places are fixed to the camera
     direction = np.array([0.1, -0.05, 0.99])
     first, last = (times.numpy() + 0.5 * TIMING.exposure_time for times in vectors.times(TIMING.row_time).unbind(-1))
@@ -237,8 +239,7 @@ def test_translation_of_the_camera_is_allowed(vectors, frames, monkeypatch, para
     moved[fixed] = 0.0
     moved += 0.02 * random.standard_normal(moved.shape)
     scene = replace(vectors, offsets=torch.from_numpy(moved))
-    monkeypatch.setattr(rotation_alignment, "band_vectors", lambda *_: scene)
-    found = rsv.align_motion(frames, TIMING, recorded("zxY"), registration="phase")
+    found = aligned(scene, recorded("zxY"))
     assert found.orientation == "zxY"
     assert abs(found.offset - OFFSET) < 4 * found.offset_std < 4e-3
     assert abs(found.focal_length - FOCAL_LENGTH) < min(4 * found.focal_length_std, 0.1 * FOCAL_LENGTH)

@@ -88,8 +88,8 @@ def test_channels_last_in_chunks_of_several_frames(tmp_path):
 @pytest.mark.parametrize("band", [100, 3000, 10**6])
 @pytest.mark.parametrize("axes", ["YXT", "YTX", "XTY", "CTYX", "YXCT", "TXY"])
 def test_interleaved_frames_are_read_in_bands(tmp_path, monkeypatch, axes, band):
-    monkeypatch.setattr(contiguous, "_BLOCK_BYTES", 6 * COUNTS[0].nbytes)
-    monkeypatch.setattr(contiguous, "_BAND_BYTES", band)
+    monkeypatch.setattr(contiguous, "BLOCK_BYTES", 6 * COUNTS[0].nbytes)
+    monkeypatch.setattr(contiguous, "BAND_BYTES", band)
     counts, names = (COLOUR, "TCYX") if "C" in axes else (COUNTS, "TYX")
     write_tiff(tmp_path / "a.tif", axes, counts, names, bigtiff=True, byteorder=">")
     reader = open_stack(tmp_path / "a.tif")

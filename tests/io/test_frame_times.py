@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from program import rsvib
 from small_config import CAMERA
 from small_stack import HEIGHT, MOTION, STILL, TIMING, WIDTH, draw_counts
 from truth import decibel
 
 import rsvib_torch as rsv
 from rsvib_torch import StackInfo, read_stack_info
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io import TimingWarning, describe_stack, exposure_times, timing_from_first_frame, write_stack
 
@@ -40,10 +40,6 @@ def write_stack_with_gaps(tmp_path):
     (tmp_path / "frames.raw.json").write_text(json.dumps(sidecar))
     (tmp_path / "camera.toml").write_text(CAMERA)
     return tmp_path
-
-
-def rsvib(*arguments):
-    return run_command([str(argument) for argument in arguments])
 
 
 def check_restored(path):

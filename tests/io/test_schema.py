@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rsvib_torch.config import read_config
 from rsvib_torch.io.schema import DetectionRecord, TimingRecord, VibrationRecord, check_same_timing, detection_to_json
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
@@ -69,51 +68,6 @@ OLD_MANIFEST = f"""{{
   "bad_frames": {{"4": "all pixels are equal"}}
 }}
 """
-OLD_CONFIG = """
-[sensor]
-row_time = 20.52e-6
-exposure_rows = 20
-frame_rows = 2048
-scan_axis = "x"
-readout_direction = "reverse"
-frame_start_times = [0, 0.05, 0.1]
-full_scale = 4095
-
-[detection]
-method = "bands"
-registration = "phase"
-tones = 2
-band_rows = 32
-band_step = 8
-search = 8
-
-[restoration]
-method = "banded"
-half_rows = 8
-noise_to_signal = 1e-3
-saturation = 4000
-
-[simulation]
-num_frames = 4
-seed = 3
-frame_size = [480, 640]
-
-[simulation.vibration]
-amplitude = [[1.2, 0.4], [0.8, 0.3]]
-frequency = [[83.0, 40.0], [110.0, 55.0]]
-phase = [[0.3, 0.0], [-0.8, 0.1]]
-image_motion = [500.0, 0.0]
-image_acceleration = [0.0, 100.0]
-
-[simulation.noise]
-read_noise = 0.003
-full_well = 10000
-bits = 12
-
-[stack]
-window = 6
-bad_frames = "skip"
-"""
 
 
 def test_vibration_json_of_version_0_1_0_loads(tmp_path):
@@ -166,23 +120,6 @@ def test_runs_of_version_0_1_0_can_be_resumed(tmp_path):
     records = [detection_to_json(detection) for detection in manifest.detections()]
     hashed = hashlib.sha256(json.dumps(records).encode()).hexdigest()
     assert hashed == "b15b1878000c55fff4a9a038d9b61775e4823ce4f5b4b8f7e6050f39baf3848c"  # by version 0.1.0
-
-
-def test_configuration_of_version_0_1_0_loads(tmp_path):
-    (tmp_path / "camera.toml").write_text(OLD_CONFIG)
-    config = read_config(tmp_path / "camera.toml")
-    assert config.timing == SensorTiming(20.52e-6, 20, 2048, "x", "reverse", (0.0, 0.05, 0.1))
-    assert config.full_scale == 4095
-    bands = {"band_rows": 32, "band_step": 8, "search": 8}
-    assert config.detection == {"method": "bands", "registration": "phase", "tones": 2, **bands}
-    assert config.restoration == {"method": "banded", "half_rows": 8, "noise_to_signal": 1e-3, "saturation": 4000}
-    assert config.stack == {"window": 6, "bad_frames": "skip"}
-    simulation = config.simulation
-    assert (simulation.num_frames, simulation.seed, simulation.frame_size) == (4, 3, (480, 640))
-    assert simulation.vibration.amplitude.tolist() == [[1.2, 0.4], [0.8, 0.3]]
-    assert simulation.vibration.frequency.tolist() == [[83.0, 40.0], [110.0, 55.0]]
-    assert simulation.vibration.image_acceleration.tolist() == [0.0, 100.0]
-    assert (simulation.noise.read_noise, simulation.noise.full_well, simulation.noise.bits) == (0.003, 10000, 12)
 
 
 @pytest.mark.parametrize("starts", [None, (0.0, 0.011, 0.03)])

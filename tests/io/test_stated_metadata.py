@@ -10,22 +10,18 @@ import tifffile
 import torch
 import zarr
 from PIL import ExifTags, Image
+from program import rsvib
 from small_config import CAMERA
 from small_stack import OPTIONS, STILL, TIMING
 from small_video import PERIOD, draw_frames
 from truth import decibel
 
 import rsvib_torch as rsv
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.io import TimingWarning, read_stack, read_stack_info, timing_from_first_frame, write_stack
 
 KEPT = np.array([0, 1, 2, 4, 5, 9])  # the other frames were dropped
 TIMES = KEPT * PERIOD
 FRAMES = np.random.default_rng(1).integers(0, 255, (6, 20, 30), dtype=np.uint8)
-
-
-def rsvib(*arguments):
-    return run_command([str(argument) for argument in arguments])
 
 
 def check_dropped_frames(path):

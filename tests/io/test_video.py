@@ -10,12 +10,12 @@ import av
 import numpy as np
 import pytest
 import torch
+from program import rsvib
 from small_config import CAMERA
 from small_stack import MOTION, STILL
 from small_video import PERIOD, draw_frames, sound_of, write_clip, write_video
 from truth import decibel
 
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.io import FrameError, StackInfo, open_stack, read_stack, read_stack_info, write_stack
 
 TIMES = np.arange(6) / 30
@@ -26,10 +26,6 @@ DROPPED = np.array([0, 1, 2, 4, 5, 9, 10, 11]) * PERIOD
 def noise(bits, *shape):
     dtype = np.uint8 if bits == 8 else np.uint16
     return np.random.default_rng(bits).integers(0, 2**bits, (6, 48, 64, *shape), dtype=dtype)
-
-
-def rsvib(*arguments):
-    return run_command([str(argument) for argument in arguments])
 
 
 @pytest.fixture(name="place")

@@ -82,21 +82,6 @@ def test_samples_at_uneven_times():
     assert (uneven.displacement(inside) - motion().displacement(inside)).abs().amax() < 0.02
 
 
-@pytest.mark.parametrize("scan_axis", [-2, -1])
-@pytest.mark.parametrize("direction", ["forward", "reverse"])
-def test_row_order_and_back(scan_axis, direction):
-    timing = rsv.SensorTiming(4e-5, 40, 400, scan_axis=scan_axis, readout_direction=direction)
-    tones = rsv.Vibration([1.0, 0.5], [70.0, 90.0])
-    whole = FreeMotion.through(TIMES, PATH, tones)
-    turned = whole.to_row_order(timing)
-    times = torch.linspace(0, 0.19, 30, dtype=torch.float64)
-    expected = whole.displacement(times)
-    expected = expected.flip(-1) if scan_axis == -1 else expected
-    expected = expected * torch.tensor([1.0, -1.0]) if direction == "reverse" else expected
-    assert torch.allclose(turned.displacement(times), expected)
-    assert torch.allclose(turned.from_row_order(timing).displacement(times), whole.displacement(times))
-
-
 class Free(Motion):
     """The same path for the independent simulator."""
 

@@ -27,7 +27,7 @@ from rsvib_torch.io import write_stack
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
-from rsvib_torch.report.html import Report, before_after, template, write_page, write_report_page
+from rsvib_torch.report.html import Report, before_after, write_page, write_report_page
 from rsvib_torch.report.html.page import frames_in_turn, measure_edges, whole_frame
 from rsvib_torch.report.html.words import TERMS, about_rows, mark_of, verdict_sentences
 from rsvib_torch.report.plots import gain_figure, motion_blur, psf_figure, rows_figure
@@ -314,19 +314,17 @@ def test_page_without_vibration(tmp_path):
     assert "psf.png" not in files
 
 
-def test_large_images_keep_a_part_at_full_resolution(monkeypatch):
-    monkeypatch.setattr(template, "_FULL_PIXELS", 40 * 2048)
-    frame = torch.rand(90, 2100, generator=torch.Generator().manual_seed(1))
-    pair = before_after(frame, 1 - frame, names=("a", "b"), caption="", longest=700, exact=True, full_at=(80, 30))
-    assert (pair.width, pair.height, pair.scale) == (700, 30, pytest.approx(1 / 3))
+def test_large_images_keep_a_part_at_full_resolution():
+    frame = torch.rand(2250, 2100, generator=torch.Generator().manual_seed(1))
+    pair = before_after(frame, 1 - frame, names=("a", "b"), caption="", longest=750, exact=True, full_at=(2200, 30))
+    assert (pair.width, pair.height, pair.scale) == (700, 750, pytest.approx(1 / 3))
     full = pair.full
-    assert (full.left, full.top, full.width, full.height) == (0, 50, 2048, 40)  # as near to row 80 as fits
+    assert (full.left, full.top, full.width, full.height) == (0, 202, 2048, 2048)  # as near to row 2200 as fits
     low, high = pair.levels
     for image, source in zip(full.images, (frame, 1 - frame), strict=True):
-        expected = 255 * ((source[50:90, :2048] - low) / (high - low)).clip(0, 1)
+        expected = 255 * ((source[202:, :2048] - low) / (high - low)).clip(0, 1)
         np.testing.assert_allclose(decoded(image), expected, atol=0.51)
-    monkeypatch.undo()
-    whole = before_after(frame, names=("a",), caption="", longest=700, full_at=(80, 30))
+    whole = before_after(frame[:90], names=("a",), caption="", longest=700, full_at=(80, 30))
     assert (whole.width, whole.scale, whole.full) == (2100, 1.0, None)
 
 

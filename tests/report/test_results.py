@@ -16,8 +16,8 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.report.plots import comparison_figure, detailed_places, offset_figure, save_figure
-from rsvib_torch.report.results import VibrationFile, read_vibration, write_offsets, write_restoration, write_vibration
-from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
+from rsvib_torch.report.results import read_vibration, write_offsets, write_restoration, write_vibration
+from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.stacks import RestoredFrames
 
 TIMING = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
@@ -59,20 +59,6 @@ def draw_result() -> DetectionResult:
         TimingSensitivity(*[gain] * 6),
         ("row_time=2e-05 s: assumed",),
     )
-
-
-def test_vibration_is_read_back_exactly(tmp_path, result):
-    write_vibration(tmp_path / "vibration.json", result, TIMING)
-    back = read_vibration(tmp_path / "vibration.json", TIMING)
-    for name in ("amplitude", "frequency", "phase", "image_motion"):
-        torch.testing.assert_close(getattr(back.vibration, name), getattr(result.vibration, name), rtol=0, atol=0)
-    record = VibrationFile.model_validate(json.loads((tmp_path / "vibration.json").read_text()))
-    assert record.timing.to_timing() == TIMING
-    assert back.reliable.tolist() == [True, False]
-    torch.testing.assert_close(back.gain, result.gain, rtol=0, atol=0)
-    torch.testing.assert_close(back.residual, result.residual, rtol=0, atol=0)
-    assert back.reasons == ((), ("only one period is seen",))
-    assert back.assumptions == ("row_time=2e-05 s: assumed",)
 
 
 def test_vibration_file_is_plain_json(tmp_path, result):
@@ -153,17 +139,6 @@ def test_files_that_are_not_vibration_json(tmp_path, text):
     (tmp_path / "vibration.json").write_text(text)
     with pytest.raises(ValueError, match=r"vibration\.json: "):
         read_vibration(tmp_path / "vibration.json", TIMING)
-
-
-def test_standard_deviations_are_read_back(tmp_path, result):
-    write_vibration(tmp_path / "vibration.json", result, TIMING)
-    back = read_vibration(tmp_path / "vibration.json", TIMING)
-    for name in ("amplitude", "frequency", "period", "phase", "image_motion", "image_acceleration"):
-        torch.testing.assert_close(getattr(back.std, name), getattr(result.std, name), rtol=0, atol=0)
-    assert back.std.period[1, 1] == math.inf
-    vibration, notes = trusted_vibration(back, TIMING, 3, 512)
-    assert vibration.amplitude.tolist() == [[2.0, 0.5], [0.0, 0.0]]
-    assert notes == ("y is not restored: its vibration is not reliable (only one period is seen)",)
 
 
 def test_restoration_json(tmp_path):

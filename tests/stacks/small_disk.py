@@ -11,8 +11,6 @@ from pathlib import Path
 import torch
 from small_stack import process_small
 
-from rsvib_torch.commands.main import run_command
-
 PAGE = 4096
 
 
@@ -63,12 +61,7 @@ def main():
     source, whole, disk, trials = Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), json.loads(sys.argv[4])
     torch.set_num_threads(1)
     results = [try_small_disk(source, whole, disk, *trial) for trial in trials]
-    leave_free(disk, 20)
-    command = ["run", str(source), str(disk / "out"), "--config", str(source.with_name("camera.toml"))]
-    code = run_command([*command, "--output", "out.zarr"])
-    (disk / "ballast").unlink()
-    again = run_command([*command, "--output", "out.zarr", "--resume"])
-    print(json.dumps({"runs": results, "codes": [code, again], "names": sorted(os.listdir(disk / "out"))}))
+    print(json.dumps({"runs": results}))
 
 
 if __name__ == "__main__":

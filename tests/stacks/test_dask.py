@@ -1,7 +1,5 @@
 """Computation with Dask: the same bytes as with threads, killed workers are replaced; blocks of Dask arrays."""
 
-import os
-import signal
 import sys
 
 import dask.array
@@ -13,7 +11,7 @@ from small_stack import FRAMES, OPTIONS, STILL, TIMING, process_small, write_sma
 from truth import decibel
 
 import rsvib_torch as rsv
-from rsvib_torch.stacks import Window, engines, read_manifest
+from rsvib_torch.stacks import engines, read_manifest
 
 
 @pytest.fixture(scope="module", name="place")
@@ -55,27 +53,6 @@ def test_run_with_threads_is_resumed_with_dask(place, tmp_path):
     check_same(place, tmp_path)
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_workers_that_are_killed_are_replaced(place, tmp_path):
-    """Each of two workers is killed once: no data may exist in one worker only."""
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        pids = [worker.process.process.pid for worker in cluster.workers.values()]
-        done_at_death = []
-
-        def kill(done, total):
-            if done > 2 + 6 * len(done_at_death) and pids:
-                done_at_death.append(done)
-                os.kill(pids.pop(), signal.SIGKILL)
-
-        given = [record.detection.to_detection() for record in read_manifest(place / "out.tif.manifest.json").windows]
-        options = {"given": given, "detection": None, "scheduler": cluster.scheduler_address}
-        process_small(place / "frames.tif", tmp_path / "out.tif", **options, progress=kill)
-        assert len(done_at_death) == 2
-        assert max(done_at_death) < FRAMES
-    assert (tmp_path / "out.tif").read_bytes() == (place / "out.tif").read_bytes()
-
-
 def test_run_ends_if_there_are_no_workers(place, tmp_path, monkeypatch):
     monkeypatch.setattr(engines, "NO_WORKERS_SECONDS", 0.5)
     with (
@@ -84,15 +61,6 @@ def test_run_ends_if_there_are_no_workers(place, tmp_path, monkeypatch):
     ):
         process_small(place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address)
     assert not (tmp_path / "out.tif").exists()
-
-
-def test_window_that_kills_its_workers_is_named():
-    class Future:
-        def result(self, timeout):
-            raise distributed.KilledWorker("task", None, 3)
-
-    with pytest.raises(OSError, match=r"workers died 4 times while they computed window 5 \(frames 10 to 12\)"):
-        engines._DaskResult(None, Future(), Window(5, 10, 12, 2)).result()
 
 
 @pytest.mark.slow

@@ -14,9 +14,7 @@ from small_stack import OPTIONS, TIMING, process_small, write_small
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
-from rsvib_torch.core import free_memory
 from rsvib_torch.io import StackInfo
-from rsvib_torch.stacks import memory
 from rsvib_torch.stacks.memory import memory_limit, memory_needed, windows_at_once
 
 LARGE = StackInfo((100, 4096, 4096), "uint16", 4095.0)
@@ -25,11 +23,11 @@ GB = 10**9
 
 @pytest.fixture(name="free")
 def _free(monkeypatch):
-    """Sets the free memory."""
+    """Sets the free memory of the machine."""
 
     def set_free(size):
-        for module in (free_memory, memory):
-            monkeypatch.setattr(module, "free_memory", lambda: size)
+        memory = psutil.virtual_memory()._replace(available=size)
+        monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
 
     return set_free
 

@@ -270,11 +270,6 @@ def test_invalid_options_are_errors_without_files(place, tmp_path, options, erro
     assert list(tmp_path.iterdir()) == []
 
 
-def test_stack_is_not_written_over_itself(place):
-    with pytest.raises(ValueError, match="it is the same file as the input"):
-        process_small(place / "frames.tif", place / "frames.tif")
-
-
 def test_colour_and_axis_order_are_kept(place, tmp_path):
     grey = tifffile.imread(place / "frames.tif")[:5]
     colour = np.stack([grey, grey // 2, grey // 4], axis=-1)

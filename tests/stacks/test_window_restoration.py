@@ -1,4 +1,4 @@
-"""Restoration of a window with a detection: input preparation once, results as from the public functions."""
+"""Restoration of a window with a detection: results as from the public functions."""
 
 from types import SimpleNamespace
 
@@ -7,12 +7,11 @@ import torch
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, judge_restoration, restore
-from rsvib_torch.restoration.verdict import judge
-from rsvib_torch.stacks import restore_trusted, window_restoration
+from rsvib_torch.stacks import restore_trusted
 
 
 @pytest.mark.parametrize("scan_axis", [-2, -1])
-def test_trusted_restoration_prepares_once_and_equals_the_public_functions(monkeypatch, scan_axis):
+def test_trusted_restoration_equals_the_public_functions(scan_axis):
     timing = SensorTiming(2e-5, 20, 256, scan_axis=scan_axis)
     motion = Motion(amplitude=(2.0, 3.0), frequency=(120.0, 90.0))
     upright = SensorTiming(2e-5, 20, 256)
@@ -25,17 +24,7 @@ def test_trusted_restoration_prepares_once_and_equals_the_public_functions(monke
     detected = SimpleNamespace(vibration=vibration, std=std, reliable=torch.tensor([True, True]), reasons=((), ()))
     expected = restore(frames, timing, vibration, check=False, saturation=0.99)
     verdict = judge_restoration(frames, expected, timing, vibration)
-
-    calls, prepare = [], window_restoration.prepare_frames
-
-    def counted(*arguments, **options):
-        calls.append(options)
-        return prepare(*arguments, **options)
-
-    monkeypatch.setattr(window_restoration, "prepare_frames", counted)
-    monkeypatch.setattr(judge, "prepare_frames", None)
     found = restore_trusted(frames, timing, detected, {"saturation": 0.99}, force=True)
-    assert calls == [{"saturation": 0.99, "mosaic": None}]
     assert torch.equal(found.frames, expected)
     assert found.verdict.outcome == verdict.outcome
     torch.testing.assert_close(found.verdict.predicted_gain, verdict.predicted_gain)

@@ -16,6 +16,7 @@ from rsvib_torch.core.precision import full_precision, outside_graphs, without_g
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text, wrapped
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.recorded.band_vectors import band_vectors
 from rsvib_torch.detection.recorded.clock_range import offset_range
 from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment, align_rates
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
@@ -236,10 +237,10 @@ def align_motion(
     if isinstance(recorded, AngularRates):
         options = RegistrationOptions(registration or "phase", band_rows, band_step, search)
         return align_rates(
-            stack,
+            band_vectors(stack, timing, options),
+            grey.shape[1:],
             timing,
             recorded,
-            options,
             camera,
             offsets=offsets,
             fit_scale=fit_scale,

@@ -4,6 +4,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md), in p
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,16 +12,14 @@ from torch import Tensor
 
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text, text_table, wrapped
-from rsvib_torch.detection.recorded.band_vectors import band_vectors
+from rsvib_torch.detection.recorded.band_vectors import BandVectors
 from rsvib_torch.detection.recorded.clock_range import offset_range
 from rsvib_torch.detection.recorded.rotation_fit import NAMES, RotationFit, RotationModel, components_of, fit_robustly
 from rsvib_torch.detection.recorded.rotation_search import OrientationSearch, orientation_matrix, search_orientations
-from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.registration import RegistrationOptions
 
 __all__ = ["RotationAlignment", "align_rates"]
 
@@ -121,6 +120,7 @@ class RotationAlignment(
     def summary(self) -> str:
         """Clock, axes, bias and focal length with standard deviations, what is not explained, and the verdict."""
         second = measured_text(self.scale, self.scale_std or None, digits=8)
+        axes = [letter.lower() if letter.isupper() else f"-{letter}" for letter in self.orientation]
         verdict = "reliable" if self.reliable else f"not reliable: {'; '.join(self.reasons)}"
         bias, std = self.bias.tolist(), self.bias_std.tolist()
         moved, rest = (self.predicted - self.predicted.mean(0)).square().mean(0).sqrt(), self.unexplained
@@ -129,8 +129,7 @@ class RotationAlignment(
             [
                 f"time 0 of the frames is {measured_text(self.offset, self.offset_std)} s of the gyroscope",
                 f"1 s of the frames is {second} s of the gyroscope",
-                f"axes x, y, z of the camera are {', '.join(_axis(letter) for letter in self.orientation)} of the "
-                "gyroscope",
+                f"axes x, y, z of the camera are {', '.join(axes)} of the gyroscope",
                 f"bias {', '.join(measured_text(b, s) for b, s in zip(bias, std, strict=True))} rad/s, focal length "
                 f"{measured_text(self.focal_length, self.focal_length_std or None)} px, row time "
                 f"{measured_text(1e6 * self.row_time, 1e6 * self.row_time_std or None)} us",
@@ -143,15 +142,11 @@ class RotationAlignment(
         )
 
 
-def _axis(letter: str) -> str:
-    return letter.lower() if letter.isupper() else f"-{letter}"
-
-
 def align_rates(
-    stack: GreyFrames,
+    vectors: BandVectors,
+    shape: Sequence[int],
     timing: SensorTiming,
     rates: AngularRates,
-    options: RegistrationOptions,
     camera: Camera | None,
     *,
     offsets: tuple[float, float] | None,
@@ -159,15 +154,13 @@ def align_rates(
     fit_focal_length: bool,
     fit_row_time: bool,
 ) -> RotationAlignment:
-    """``align_motion`` for angular rates and one stack."""
-    height, width = stack.images.shape[-2:]
-    count = stack.images.shape[1]
+    """``align_motion`` for angular rates, from the ``band_vectors`` of a stack of ``shape`` (T, H, W)."""
+    count, height, width = shape
     if camera is not None:
         camera.check_size(*((height, width) if timing.scan_axis == -1 else (width, height)))
     starts = timing.in_row_order().frame_starts(count).cpu()
     last = float(starts[-1]) + height * timing.row_time + timing.exposure_time
     limits = offset_range(rates, float(starts[0]), last, offsets)
-    vectors = band_vectors(stack, timing, options)
     middle = 0.5 * (float(starts[0]) + last)
     known = None if camera is None or fit_focal_length else camera.focal_length
 

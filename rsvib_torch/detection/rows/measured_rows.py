@@ -10,6 +10,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.progress import steps
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.displacements import (
     FrameGroup,
@@ -144,11 +145,11 @@ class StripRows(MeasuredRows):
     def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
         """Components of the motion of every row (B, N, G, A)."""
         known = [None] * len(self.groups) if gradients is None else gradients
-        view, factors = self.view(motion), self.scale.factors
-        measured = [
-            measure_strips(group, self.timing, motion, view, self.strips, factors, of_group)
-            for group, of_group in zip(self.groups, known, strict=True)
-        ]
+        view, measured, advance = self.view(motion), [], steps(len(self.groups), "groups of strips")
+        for group, of_group in zip(self.groups, known, strict=True):
+            factors = self.scale.factors
+            measured.append(measure_strips(group, self.timing, motion, view, self.strips, factors, of_group))
+            advance()
         gradients = [of_group for _, of_group in measured]
         return RowRecord(joined_groups([part for part, _ in measured]), gradients, self._apart(gradients))
 

@@ -1,0 +1,44 @@
+"""Attacks on runs (scripts/attacks): the result is right, or a one-line error changes nothing.
+
+Runs are killed at any call, lose what was not synchronised, are resumed with damaged parts and journals, on full disks,
+with links in place of their files, beside others, with workers that die, and with outputs that are their inputs.
+docs/reliability.md has the numbers of many more trials.
+"""
+
+from importlib import import_module
+
+import pytest
+from attacks.trial import FAILURES
+
+# attack: trials in a test, and least share of them that completes the run; the others are refused
+ATTACKS = {
+    "concurrent": (4, 1.0),
+    "damaged_parts": (7, 1.0),
+    "inputs": (20, 0.0),
+    "journals": (16, 0.0),
+    "kills": (9, 1.0),
+    "links": (16, 0.0),
+    "power_losses": (9, 1.0),
+}
+
+
+def check(name, folder, count, seed, least):
+    trials = list(import_module(f"attacks.{name}").trials(folder, count, seed))
+    if name == "disks" and not trials:
+        pytest.skip("file systems cannot be mounted here")
+    assert [trial for trial in trials if trial.outcome in FAILURES] == []
+    assert sum(trial.outcome == "completed" for trial in trials) >= least * len(trials)
+    assert trials
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+@pytest.mark.parametrize("factor", [1, pytest.param(8, marks=pytest.mark.slow)])
+def test_no_attack_loses_or_falsifies_a_result(tmp_path, name, factor):
+    count, least = ATTACKS[name]
+    check(name, tmp_path, factor * count, factor, least)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "count", "least"), [("disks", 60, 0.0), ("workers", 4, 0.25)])
+def test_full_disks_and_dying_workers(tmp_path, name, count, least):
+    check(name, tmp_path, count, 0, least)
